@@ -1,0 +1,48 @@
+# One command each; every target builds its environment first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SOURCES := src tests benchmarks examples
+export MPLBACKEND := Agg
+
+.PHONY: demo test lint types doctest bench notebooks slow clean
+
+# pip's dependency groups (25.1) install what pyproject.toml lists for developers.
+$(VENV)/.base: pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "jrigid needs Python 3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install --quiet --editable ".[demo]"
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.base
+	$(BIN)/python -m pip install --quiet --group dev
+	touch $@
+
+demo: $(VENV)/.base
+	$(BIN)/python examples/demo.py
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+
+slow: $(VENV)/.dev
+	$(BIN)/python -m pytest -m slow
+
+doctest: $(VENV)/.dev
+	$(BIN)/python -m pytest --override-ini=addopts= --doctest-modules src
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+
+types: $(VENV)/.dev
+	$(BIN)/pyright
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/run.py
+
+notebooks: $(VENV)/.dev
+	$(BIN)/python notebooks/execute.py
+
+clean:
+	rm -rf $(VENV) build dist outputs

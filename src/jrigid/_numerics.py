@@ -1,0 +1,72 @@
+r"""Safe primitives; each states its value and its gradient at the edge.
+
+Functions of an angle or a norm that are even in it are written as functions of its square, which
+makes them analytic where `sqrt`, `norm` and `sin(x) / x` have none or NaN derivatives.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_SERIES_BELOW = 0.5
+_SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
+
+
+def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+    """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector)))
+    zero = largest == 0
+    scale = jnp.where(zero, jnp.ones_like(largest), largest)
+    scaled = vector / scale
+    square = jnp.sum(scaled * scaled)
+    return jnp.where(zero, jnp.zeros_like(square), scale * jnp.sqrt(jnp.where(zero, 1.0, square)))
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root; for x <= 0 the value is 0 and the gradient 0."""
+    edge = x <= 0  # not `x > 0`: NaN stays NaN
+    return jnp.where(edge, 0.0, jnp.sqrt(jnp.where(edge, 1.0, x)))
+
+
+def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`arctan2`; at the origin the value is 0 and the gradient 0, elsewhere it does not overflow."""
+    largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))
+    origin = largest == 0
+    scale = jnp.where(origin, 1.0, largest)
+    angle = jnp.arctan2(y / scale, jnp.where(origin, 1.0, x / scale))
+    return jnp.where(origin, 0.0, angle)
+
+
+def _series(coefficients: list[float], z: Array) -> Array:
+    total = jnp.full_like(z, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = coefficient + z * total
+    return total
+
+
+_COS = [(-1) ** k / math.factorial(2 * k) for k in range(_SERIES_TERMS + 1)]
+_SINC = [(-1) ** k / math.factorial(2 * k + 1) for k in range(_SERIES_TERMS + 1)]
+_ARCTANC = [(-1) ** k / (2 * k + 1) for k in range(26)]
+
+
+def cos_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """cos(sqrt(z)) for z >= 0, analytic at z = 0."""
+    small = z < _SERIES_BELOW
+    root = jnp.sqrt(jnp.where(small, 1.0, z))
+    return jnp.where(small, _series(_COS, jnp.where(small, z, 0.0)), jnp.cos(root))
+
+
+def sinc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """sin(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0."""
+    small = z < _SERIES_BELOW
+    root = jnp.sqrt(jnp.where(small, 1.0, z))
+    return jnp.where(small, _series(_SINC, jnp.where(small, z, 0.0)), jnp.sin(root) / root)
+
+
+def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """arctan(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0."""
+    small = z < 0.2
+    root = jnp.sqrt(jnp.where(small, 1.0, z))
+    return jnp.where(small, _series(_ARCTANC, jnp.where(small, z, 0.0)), jnp.arctan(root) / root)

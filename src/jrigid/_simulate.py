@@ -1,0 +1,430 @@
+"""simulate(): the one call of `diffrax.diffeqsolve`, and the Trajectory it gives."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, Real
+from jaxtyping import ArrayLike as _ArrayLike
+
+from jrigid._adjoint import guard_inputs, guard_outputs
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    float_arrays,
+    is_concrete,
+    is_inertia,
+    nan_where,
+)
+from jrigid._numerics import safe_norm
+from jrigid._types import ScalarLike
+from jrigid.rotation import normalize
+from jrigid.systems import AbstractSystem
+from jrigid.torques._base import has_parts
+
+# One step commits this fraction of rtol. The error of the energy adds up over the turns and that
+# of the phase over the energy's: what is promised of the state after thousands of turns, and of
+# its derivatives through a near-separatrix, asks for much more than rtol at each step.
+_STEP_FRACTION = 1e-3
+# Beyond this many radians the phase error, quadratic in time, asks for a smaller fraction still.
+_LONG_RADIANS = 1e5
+# No step turns the body further than this [rad]: near an equilibrium of omega the error estimate
+# sees nothing, and a step too long to be stable leaves the value right and the derivative wrong.
+_LARGEST_STEP = 0.4
+# Below this many eps of the state the error estimate is rounding noise.
+_NOISE = 40.0
+_DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
+_SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
+_DEFAULT_MAX_STEPS = 20_000_000
+_DEFAULT_MAX_STEPS_DIRECT = 4096
+_CHECKPOINTS = 100
+
+
+class Trajectory(eqx.Module):
+    """States at the times asked for, and what became of the integration.
+
+    Attributes:
+        ts: Times [s], in the shape they were given.
+        states: State at each time; the leading axes of its leaves are those of `ts`. NaN where
+            the integration did not get to; attitudes are normalised.
+        result: Result code, `jrigid.RESULTS.successful` if all went well; one for each lane under
+            vmap. After an event it is `event_occurred`.
+        stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+        final_time: Where the integration ended [s]: the last of `ts`, or the event.
+        final_state: The state there.
+        system: The system that moved.
+        args: What its torques were given.
+    """
+
+    ts: Float[Array, "..."]
+    states: Any
+    result: Any
+    stats: dict[str, Array]
+    final_time: Float[Array, "..."]
+    final_state: Any
+    system: AbstractSystem
+    args: Any
+
+    @property
+    def energy(self) -> Float[Array, "..."]:
+        """Total energy at each time [J]."""
+        return self._each(lambda system, t, state, args: system.energy(t, state, args))
+
+    @property
+    def angular_momentum(self) -> Float[Array, "... 3"]:
+        """Total angular momentum at each time [kg m^2/s], space components."""
+        return self._each(lambda system, t, state, args: system.angular_momentum(t, state, args))
+
+    def _each(self, fn: Callable[..., Array]) -> Array:
+        lanes = jnp.ndim(self.result._value)
+
+        def one(ts: Array, states: Any, system: Any, args: Any) -> Array:
+            flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[ts.ndim :]), states)
+            values = jax.vmap(lambda t, state: fn(system, t, state, args))(ts.reshape(-1), flat)
+            return values.reshape(*ts.shape, *values.shape[1:])
+
+        for _ in range(lanes):
+            one = eqx.filter_vmap(one)
+        return one(self.ts, self.states, self.system, self.args)
+
+
+def simulate(
+    system: AbstractSystem,
+    state0: Any,
+    ts: Real[_ArrayLike, "..."],
+    args: Any = None,
+    *,
+    t0: ScalarLike = 0.0,
+    solver: diffrax.AbstractAdaptiveSolver | None = None,
+    rtol: ScalarLike | None = None,
+    atol: ScalarLike | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int | None = None,
+    event: diffrax.Event | None = None,
+    throw: bool = True,
+    progress: bool | diffrax.AbstractProgressMeter = False,
+) -> Trajectory:
+    r"""Integrate the motion of a body and return its states at the times `ts`.
+
+    Nothing needs tuning: the variables are measured in their own scales, so the answer does not
+    depend on the unit of time, and the error control is set for the promises below.
+
+    Args:
+        system: A `RigidBody`, a `FloatingBody`, or another `AbstractSystem`.
+        state0: Its state at `t0`. Where a damper or a rotor needs an internal state and none is
+            given, it starts at rest relative to the body.
+        ts: Times [s], non-decreasing in the order of their memory, none before `t0`; any shape.
+        args: Passed to torques and forces.
+        t0: Time of `state0` [s].
+        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
+        rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
+            phi [rad] the relative error of energy and space angular momentum stays below
+            rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
+            floor of 100 eps (1 + phi). Each step is held to a thousandth of rtol for that.
+        atol: The same for components near zero, as a fraction of the scale of their variable (the
+            initial rate of turning, say); `rtol` by default.
+        adjoint: How derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`,
+            `jax.jacrev`) works; `diffrax.ForwardMode()` gives `jax.jvp`, `jax.jacfwd` and forward
+            over forward; `diffrax.DirectAdjoint()` every mode and order.
+        max_steps: Largest number of steps; by default 2e7, which is never in the way, but 4096
+            for `DirectAdjoint`, whose cost grows with it.
+        event: A `diffrax.Event` that ends the motion; its condition functions are called with
+            (t, state, args), in SI units.
+        throw: If True, bad input and a failed integration raise an error, under jit too; if
+            False, they set the lane's result code and its states to NaN.
+        progress: True prints a progress meter, or give one of diffrax's.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        ValueError: Wrong shape or option, or an `rtol` the dtype cannot serve (trace time).
+        RuntimeError: Bad value or failed integration, with `throw=True` (run time, any lane).
+
+    Gradients: those of the motion, in the state, the system's parameters, `args`, `t0` and `ts`,
+    also at pure spin and the sleeping top. Their relative error is at most 1000 rtol; a mode that
+    the adjoint cannot serve raises an error that names one that can.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.01, 1.0, 0.0]))
+    >>> trajectory = jr.simulate(body, state0, jnp.linspace(0.0, 100.0, 5))
+    >>> print(trajectory.states.attitude.shape, trajectory.energy.round(6))
+    (5, 4) [1.00005 1.00005 1.00005 1.00005 1.00005]
+    """
+    if not isinstance(system, AbstractSystem):
+        raise ValueError(
+            "Argument `system` must be a jrigid system (a RigidBody, a FloatingBody), "
+            f"but it is {type(system).__name__}."
+        )
+    for name, size in (("attitude", 4), ("omega", 3)):
+        check_shape(f"state0.{name}", getattr(state0, name), (size,))
+    ts, t0 = float_arrays(ts, t0)
+    if ts.size == 0:
+        raise ValueError("Argument `ts` must hold at least one time, but it is empty.")
+    check_shape("t0", t0, ())
+    dtype = jnp.result_type(*(x.dtype for x in jtu.tree_leaves(state0)))
+    if jnp.dtype(dtype).itemsize not in _DEFAULT_RTOL:
+        raise ValueError(
+            f"Argument `state0` must be float32 or float64, but it is {jnp.dtype(dtype).name}."
+        )
+    ts, t0 = ts.astype(dtype), t0.astype(dtype)
+    if solver is None:
+        solver = diffrax.Dopri8()
+    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(
+            "Argument `solver` must be a diffrax solver with an error estimate, "
+            f"but it is {type(solver).__name__}."
+        )
+    if adjoint is None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_CHECKPOINTS)
+    if max_steps is None:
+        direct = isinstance(adjoint, diffrax.DirectAdjoint)
+        max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
+    rtol, atol = _tolerances(rtol, atol, dtype)
+    if progress is True:
+        meter: diffrax.AbstractProgressMeter = diffrax.TextProgressMeter()
+    elif progress is False:
+        meter = diffrax.NoProgressMeter()
+    else:
+        meter = progress
+    return _simulate(
+        system, state0, ts, t0, args, solver, rtol, atol, adjoint, max_steps, event, throw, meter
+    )
+
+
+def _tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Array, Array]:
+    size = jnp.dtype(dtype).itemsize
+    if rtol is None:
+        rtol = _DEFAULT_RTOL[size]
+    if atol is None:
+        atol = rtol
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        check_shape(name, jnp.asarray(value), ())
+        smallest = _SMALLEST_RTOL[size]
+        if is_concrete(value) and not smallest <= float(value) < 1:
+            raise ValueError(
+                f"Argument `{name}` must be at least {smallest} and below 1 in "
+                f"{jnp.dtype(dtype).name}, but it is {float(value)}."
+            )
+    if size == 4:
+        warnings.warn(
+            "simulate() runs in float32: errors of 1e-6 a radian are usual. Switch on "
+            "`jax_enable_x64` and pass float64 arrays for more.",
+            stacklevel=3,
+        )
+    return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
+
+
+@eqx.filter_jit
+def _simulate(
+    system: Any,
+    state0: Any,
+    ts: Array,
+    t0: Array,
+    args: Any,
+    solver: Any,
+    rtol: Array,
+    atol: Array,
+    adjoint: Any,
+    max_steps: int,
+    event: Any,
+    throw: bool,
+    meter: Any,
+) -> Trajectory:
+    if not has_parts(state0.internal):
+        state0 = dataclasses.replace(state0, internal=system.torque.internal_at_rest(state0))
+    expected = jtu.tree_structure(system.torque.internal_at_rest(state0))
+    if jtu.tree_structure(state0.internal) != expected:
+        raise ValueError(
+            f"Argument `state0.internal` must have the structure {expected}, "
+            f"but it has {jtu.tree_structure(state0.internal)}."
+        )
+
+    flat = ts.reshape(-1)
+    findings = Findings()
+    _check(findings, system, state0, flat, t0, args)
+    ok = findings.ok
+    # A bad lane integrates a harmless motion instead, so that no other lane waits for it.
+    system = _where_ok(ok, system)
+    state0 = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), state0)
+    identity = jnp.zeros(4, state0.attitude.dtype).at[0].set(1)
+    attitude = normalize(jnp.where(ok, state0.attitude, identity))
+    state0 = dataclasses.replace(state0, attitude=attitude)
+    flat = jnp.where(ok, flat, jnp.zeros_like(flat))
+    t0 = jnp.where(ok, t0, jnp.zeros_like(t0))
+    state0 = findings.apply(state0, throw)
+    system, state0, flat, t0, args = guard_inputs(adjoint, (system, state0, flat, t0, args))
+
+    units = jax.lax.stop_gradient(_units(system, state0, flat[-1], t0, args))
+    rate, scales = units
+    moving = flat[-1] > t0  # all times at t0: nothing to integrate
+    stretch = jnp.where(moving, rate, 1.0)
+    taus = jnp.where(moving, (flat - t0) * stretch, jnp.zeros_like(flat))
+    end = jnp.where(moving, taus[-1], 1.0)
+
+    def to_state(y: Any) -> Any:
+        return _unravel(y * scales, state0)
+
+    def vector_field(tau: Any, y: Any, args: Any) -> Any:
+        rates = system.vector_field(t0 + tau / stretch, to_state(y), args)
+        return _ravel(rates) / (scales * stretch)
+
+    y0 = _ravel(state0) / scales
+    eps = jnp.finfo(flat.dtype).eps
+    radians = jax.lax.stop_gradient(end)
+    fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
+    step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
+    controller = diffrax.ClipStepSizeController(
+        diffrax.PIDController(
+            rtol=step_rtol,
+            atol=step_atol,
+            dtmin=16 * eps * radians,
+            force_dtmin=False,
+            dtmax=jnp.asarray(_LARGEST_STEP, flat.dtype),
+        ),
+        step_ts=jax.lax.stop_gradient(taus),
+    )
+    zero = jnp.zeros_like(end)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field),
+        solver,
+        zero,
+        end,
+        jnp.minimum(jnp.asarray(0.05, flat.dtype), radians),
+        y0,
+        args,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=taus), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        event=_event_in_si(event, t0, stretch, to_state),
+        throw=False,
+        progress_meter=meter,
+    )
+    solution_ts: Any = solution.ts
+    solution_ys: Any = solution.ys
+    (reached_tau, end_tau), (ys, end_y) = solution_ts, solution_ys
+    result: Any = RESULTS.promote(solution.result)
+    reached = jnp.isfinite(reached_tau)
+
+    def finish(y: Any, valid: Array) -> Any:
+        state = jax.vmap(to_state)(jnp.where(valid[:, None], y, 1.0))
+        attitude = jax.vmap(normalize)(state.attitude)
+        state = dataclasses.replace(state, attitude=attitude)
+        return jtu.tree_map(
+            lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.nan), state
+        )
+
+    states = finish(ys, reached)
+    final_state = jtu.tree_map(lambda x: x[0], finish(end_y, jnp.isfinite(end_tau)))
+    finite = all_finite(final_state) | (result != RESULTS.successful)
+    result = RESULTS.where(finite, result, RESULTS.nonfinite_state)
+    result = RESULTS.where(ok, result, findings.result)
+    failed = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+    states = nan_where(~ok, states)
+    final_state = nan_where(failed, final_state)
+    final_time = jnp.where(moving, t0 + end_tau[0] / stretch, t0)
+    final_time = jnp.where(failed, jnp.nan, final_time)
+    states, final_state, final_time = guard_outputs(adjoint, (states, final_state, final_time))
+    if throw:
+        states = result.error_if(states, failed)
+    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, *x.shape[1:]), states)
+    stats = {
+        name: solution.stats[name]
+        for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")
+    }
+    return Trajectory(ts, states, result, stats, final_time, final_state, system, args)
+
+
+def _check(
+    findings: Findings, system: AbstractSystem, state0: Any, flat: Array, t0: Array, args: Any
+) -> None:
+    eps = jnp.finfo(state0.attitude.dtype).eps
+    square = jnp.sum(state0.attitude**2)
+    ordered = jnp.all(flat[1:] >= flat[:-1]) & (flat[0] >= t0)
+    findings.require(is_inertia(system.inertia), RESULTS.invalid_inertia)
+    findings.require(all_finite(state0), RESULTS.invalid_state)
+    # Four significant digits typed by hand are not a unit quaternion; rounding is.
+    findings.require(jnp.abs(square - 1) < 30 * jnp.sqrt(eps), RESULTS.invalid_attitude)
+    findings.require(all_finite((flat, t0)) & ordered, RESULTS.invalid_times)
+    field = system.vector_field(t0, state0, args)
+    findings.require(all_finite(field), RESULTS.invalid_vector_field)
+
+
+def _where_ok(ok: Array, system: AbstractSystem) -> AbstractSystem:
+    arrays, rest = eqx.partition(system, eqx.is_inexact_array)
+    arrays = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.ones_like(x)), arrays)
+    return eqx.combine(arrays, rest)
+
+
+def _ravel(tree: Any) -> Array:
+    """All components of a pytree in one array, which is how diffrax steps fastest."""
+    return jnp.concatenate([x.reshape(-1) for x in jtu.tree_leaves(tree)])
+
+
+def _unravel(components: Array, like: Any) -> Any:
+    """The pytree like `like` whose components these are."""
+    leaves, structure = jtu.tree_flatten(like)
+    parts, start = [], 0
+    for leaf in leaves:
+        parts.append(components[start : start + leaf.size].reshape(leaf.shape))
+        start += leaf.size
+    return structure.unflatten(parts)
+
+
+def _units(
+    system: AbstractSystem, state0: Any, t_end: Array, t0: Array, args: Any
+) -> tuple[Array, Any]:
+    """The rate of turning [rad/s] that measures time, and a scale for each component of the state.
+
+    A body at rest turns at the rate its torque would give it within a radian; one that nothing
+    turns is measured by the length of the run.
+    """
+    rates = system.vector_field(t0, state0, args)
+    span = jnp.where(t_end > t0, t_end - t0, jnp.ones_like(t_end))
+    turning, spinning_up = safe_norm(state0.omega), safe_norm(rates.omega)
+    rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
+    rate = jnp.where(rate > 0, rate, 1 / span)
+    scale: dict[str, Any] = {
+        "attitude": jnp.ones_like(rate),
+        "omega": rate,
+        "internal": system.torque.internal_scale(rate),
+    }
+    if hasattr(state0, "velocity"):
+        # Motion of the centre of mass in one radian of turning, or in the whole run if that is
+        # shorter; a body at rest on which no force acts is measured in metres.
+        time = jnp.minimum(span, 1 / rate)
+        speed = safe_norm(state0.velocity) + safe_norm(rates.velocity) * time
+        length = safe_norm(state0.position) + speed * time
+        length = jnp.where(length > 0, length, 1.0)
+        speed = jnp.where(speed > 0, speed, length / time)
+        scale |= {"position": length, "velocity": speed}
+    spread = {
+        name: jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name))
+        for name, value in scale.items()
+    }
+    return rate, _ravel(dataclasses.replace(state0, **spread))
+
+
+def _event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:
+    if event is None:
+        return None
+
+    def in_si(condition: Callable) -> Callable:
+        def wrapped(t: Array, y: Any, args: Any, **kwargs: Any) -> Any:
+            return condition(t0 + t / stretch, to_state(y), args, **kwargs)
+
+        return wrapped
+
+    return diffrax.Event(
+        jtu.tree_map(in_si, event.cond_fn, is_leaf=callable), event.root_finder, event.direction
+    )

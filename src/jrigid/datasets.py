@@ -1,0 +1,188 @@
+"""Small records of real and synthetic rotation, to fit and to test against.
+
+Records are NumPy arrays in float64 whatever JAX's precision is set to: turn them into JAX arrays
+where they are used.
+"""
+
+import importlib.resources
+import math
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Shaped
+
+_ARCSECOND = math.pi / 648000.0
+_DAY = 86400.0
+
+
+class EarthPole(eqx.Module):
+    """Daily polar motion of the Earth, as published.
+
+    The coordinates are those of the celestial intermediate pole in the terrestrial frame. `x` is
+    positive toward the meridian of Greenwich, `y` positive toward 90 degrees WEST. With the
+    terrestrial axes (Greenwich, 90 degrees east, north) the pole is therefore at (x, -y): its
+    complex number is `x - 1j * y`, and it turns counter-clockwise, with the spin. Read as
+    `x + 1j * y` the pole turns backwards, as that of a prolate body.
+
+    Attributes:
+        mjd: Modified Julian Date [days, UTC, 0h], one a day.
+        x: Pole coordinate toward Greenwich [rad].
+        y: Pole coordinate toward 90 degrees west [rad].
+        x_sigma: Published standard error of `x` [rad]: 30 mas in 1962, 0.05 mas since about 2000.
+        y_sigma: Published standard error of `y` [rad].
+    """
+
+    mjd: Float[np.ndarray, " days"]
+    x: Float[np.ndarray, " days"]
+    y: Float[np.ndarray, " days"]
+    x_sigma: Float[np.ndarray, " days"]
+    y_sigma: Float[np.ndarray, " days"]
+
+
+class ToutatisRecord(eqx.Module):
+    """Attitude and spin of the asteroid 4179 Toutatis, observed by radar, with a published fit.
+
+    Body axes: x the principal axis of the intermediate moment, y of the short body axis (largest
+    moment), z of the long body axis (smallest moment). In this order they are right-handed.
+    Space axes: ecliptic J2000.
+
+    Attributes:
+        times: Seconds since 1992-11-09T17:49:47 UTC; 17 days of December 1992, and one of 2008.
+        attitudes: Unit quaternions (w, x, y, z), body to space.
+        omegas: Angular velocity, body components [rad/s].
+        moments: Published principal moments about (x, y, z), in units of the smallest.
+        epoch_attitude: Published attitude at time 0, fitted to all of the record.
+        epoch_omega: Published angular velocity at time 0, body components [rad/s].
+    """
+
+    times: Float[np.ndarray, " rows"]
+    attitudes: Float[np.ndarray, "rows 4"]
+    omegas: Float[np.ndarray, "rows 3"]
+    moments: Float[np.ndarray, " 3"]
+    epoch_attitude: Float[np.ndarray, " 4"]
+    epoch_omega: Float[np.ndarray, " 3"]
+
+
+class GyroRecord(eqx.Module):
+    """SYNTHETIC readings of a three-axis gyro on a freely tumbling body, with the truth behind.
+
+    Attributes:
+        times: Sampling times [s], equally spaced from 0.
+        omegas: Readings [rad/s], body components, with noise.
+        sigma: Standard deviation of the noise on each component [rad/s].
+        true_moments: Principal moments of the body about the gyro's axes, scaled to a trace of 1.
+        true_omegas: What a perfect gyro would have read [rad/s].
+    """
+
+    times: Float[np.ndarray, " samples"]
+    omegas: Float[np.ndarray, "samples 3"]
+    sigma: float
+    true_moments: Float[np.ndarray, " 3"]
+    true_omegas: Float[np.ndarray, "samples 3"]
+
+
+def earth_pole() -> EarthPole:
+    """The Earth's polar motion since 1962: the IERS 20 C04 record, one pole a day.
+
+    Read from the package astropy-iers-data, which ships the file `eopc04.1962-now`; no network is
+    touched. A newer version of that package has a longer record.
+
+    Returns:
+        The whole record, about 24 000 days.
+
+    Raises:
+        ImportError: astropy-iers-data is not installed.
+
+    Source: IERS Earth Orientation Centre, Paris Observatory, EOP 20 C04, consistent with ITRF 2020;
+    Bizouard et al., J. Geodesy 93, 621 (2019).
+    """
+    try:
+        import astropy_iers_data
+    except ImportError as error:
+        raise ImportError(
+            "earth_pole needs the package astropy-iers-data, which carries the record: "
+            "`pip install jrigid[data]`."
+        ) from error
+    columns = np.loadtxt(
+        astropy_iers_data.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True
+    )
+    return EarthPole(columns[0], *(columns[1:] * _ARCSECOND))
+
+
+def toutatis_1992() -> ToutatisRecord:
+    """Radar observations of Toutatis, a body that tumbles about no axis, and their published fit.
+
+    Free rotation with the published moments from the published epoch state passes the 17 attitudes
+    of 1992 at a median of 5.6 degrees (16 at most) and their spins at a median of 6.6 degrees a
+    day, which is what the observations are worth. The spins of rows 5 and 12 alone are off by 45
+    degrees a day, though the attitudes beside them fit. The tides of the Earth's passage on
+    8 December 1992 (day 29) and of all those since are no free rotation: the row of 2008 is off by
+    130 degrees.
+
+    Returns:
+        The record.
+
+    Source: Takahashi, Busch and Scheeres, Astron. J. 146, 95 (2013), tables 1 and 2; observations
+    by Hudson, Ostro and others.
+    """
+    path = importlib.resources.files("jrigid") / "data" / "toutatis_1992.csv"
+    with path.open(encoding="ascii") as file:
+        rows = [line for line in file if not line.startswith("#")]
+    table = np.loadtxt(rows[1:], delimiter=",")
+    degree = math.pi / 180.0
+    return ToutatisRecord(
+        times=table[:, 0] * _DAY,
+        attitudes=_attitude(table[:, 1:4] * degree),
+        omegas=table[:, 4:7] * degree / _DAY,
+        moments=np.array([3.0836, 3.235, 1.0]),
+        epoch_attitude=_attitude(np.array([145.498, 65.865, 241.524]) * degree),
+        epoch_omega=np.array([14.51, 33.529, -98.709]) * degree / _DAY,
+    )
+
+
+def gyro_example() -> GyroRecord:
+    """A SYNTHETIC gyro record of a tumbling box: 200 readings, 2 % noise, the same at every call.
+
+    A body of moments in the ratio 2 : 3 : 4 spins about its middle axis, flips over every 5.7 s,
+    and is watched for 20 s at 10 Hz. Made for examples and tests; nothing was measured.
+
+    Returns:
+        Readings and truth.
+    """
+    times = np.arange(200) / 10.0
+    moments = np.array([2.0, 3.0, 4.0]) / 9.0
+    true_omegas = _tumble(moments, np.array([0.3, 3.0, 0.4]), times)
+    sigma = 0.06
+    noise = np.random.default_rng(1758).normal(scale=sigma, size=true_omegas.shape)
+    return GyroRecord(times, true_omegas + noise, sigma, moments, true_omegas)
+
+
+def _attitude(angles: Shaped[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4"]:
+    """Quaternion of Rz(a) Rx(b) Rz(c); in NumPy, so that the record does not depend on x64."""
+    a, b, c = np.moveaxis(angles, -1, 0)
+    cosine, sine = np.cos(b / 2), np.sin(b / 2)
+    plus, minus = (a + c) / 2, (a - c) / 2
+    return np.stack(
+        [cosine * np.cos(plus), sine * np.cos(minus), sine * np.sin(minus), cosine * np.sin(plus)],
+        axis=-1,
+    )
+
+
+def _tumble(moments, omega, times, substeps=10):
+    """Free rotation by Runge-Kutta's fourth-order steps, in NumPy: error 1e-8 of the rate."""
+    differences = np.roll(moments, -1) - np.roll(moments, -2)
+
+    def rate(omega):
+        return differences / moments * np.roll(omega, -1) * np.roll(omega, -2)
+
+    omegas = [omega]
+    for duration in np.diff(times):
+        step = duration / substeps
+        for _ in range(substeps):
+            k1 = rate(omega)
+            k2 = rate(omega + step / 2 * k1)
+            k3 = rate(omega + step / 2 * k2)
+            k4 = rate(omega + step * k3)
+            omega = omega + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        omegas.append(omega)
+    return np.stack(omegas)

@@ -1,0 +1,233 @@
+"""Other forms of an attitude: matrices, z-x-z Euler angles, scipy's scalar-last order."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jrigid._checks import array_of_shape
+from jrigid._numerics import safe_arctan2, safe_norm
+from jrigid._types import (
+    Matrix,
+    MatrixLike,
+    Quaternion,
+    QuaternionLike,
+    Vector,
+    VectorLike,
+)
+from jrigid.rotation._quaternion import normalize, rotate
+
+
+def hat(vector: VectorLike) -> Matrix:
+    """Skew matrix with `hat(a) b = a x b`.
+
+    Args:
+        vector: Components a [any unit].
+
+    Returns:
+        Skew-symmetric matrix, same unit.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: linear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> a, b = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, -1.0, 2.0])
+    >>> bool(jnp.allclose(jr.rotation.hat(a) @ b, jnp.cross(a, b)))
+    True
+    """
+    x, y, z = array_of_shape("vector", vector, 3)
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+
+
+def vee(matrix: MatrixLike) -> Vector:
+    """Vector of the skew-symmetric part of a matrix: `vee(hat(a)) = a`.
+
+    Args:
+        matrix: Any matrix; its symmetric part is dropped.
+
+    Returns:
+        The vector, same unit.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: linear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.vee(jr.rotation.hat(jnp.array([1.0, 2.0, 3.0]))))
+    [1. 2. 3.]
+    """
+    m = array_of_shape("matrix", matrix, 3, 3)
+    return 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+
+
+def to_matrix(attitude: QuaternionLike) -> Matrix:
+    """Rotation matrix R with `v_space = R v_body`.
+
+    Args:
+        attitude: Unit quaternion, body to space.
+
+    Returns:
+        Rotation matrix; its columns are the body axes in space.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite for any non-zero quaternion.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.to_matrix(jnp.array([1.0, 0.0, 0.0, 0.0])))
+    [[1. 0. 0.]
+     [0. 1. 0.]
+     [0. 0. 1.]]
+    """
+    q = array_of_shape("attitude", attitude, 4)
+    return jax.vmap(rotate, in_axes=(None, 1), out_axes=1)(q, jnp.eye(3, dtype=q.dtype))
+
+
+def from_matrix(matrix: MatrixLike) -> Quaternion:
+    """Unit quaternion, w >= 0, of a rotation matrix.
+
+    Args:
+        matrix: Rotation matrix, body to space. It is not checked; the result is normalised.
+
+    Returns:
+        Unit quaternion. Where w = 0 (half turns) the sign makes the largest component positive.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: those of a smooth extension off the rotation group; exact along it, everywhere.
+    Source: S. W. Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978) 223.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.from_matrix(jnp.diag(jnp.array([1.0, -1.0, -1.0]))))
+    [0. 1. 0. 0.]
+    """
+    m = array_of_shape("matrix", matrix, 3, 3)
+    a, b, c = m[0, 0], m[1, 1], m[2, 2]
+    p, q, r = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    s, t, u = m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2]
+    # Each row is 4 q_k q; the one with the largest q_k is the accurate one.
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + a + b + c, p, q, r]),
+            jnp.stack([p, 1 + a - b - c, s, t]),
+            jnp.stack([q, s, 1 - a + b - c, u]),
+            jnp.stack([r, t, u, 1 - a - b + c]),
+        ]
+    )
+    row = rows[jnp.argmax(jnp.diagonal(rows))]
+    return normalize(jnp.where(row[0] < 0, -row, row))
+
+
+def to_scipy(attitude: QuaternionLike) -> Quaternion:
+    """Scalar-last order (x, y, z, w), as `scipy.spatial.transform.Rotation` takes.
+
+    Args:
+        attitude: Quaternion, scalar first.
+
+    Returns:
+        The same quaternion, scalar last.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: linear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.to_scipy(jnp.array([1.0, 2.0, 3.0, 4.0])))
+    [2. 3. 4. 1.]
+    """
+    return jnp.roll(array_of_shape("attitude", attitude, 4), -1)
+
+
+def from_scipy(quaternion: QuaternionLike) -> Quaternion:
+    """Scalar-first order (w, x, y, z) from scipy's scalar-last one.
+
+    Args:
+        quaternion: Quaternion, scalar last.
+
+    Returns:
+        The same quaternion, scalar first.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: linear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.from_scipy(jnp.array([2.0, 3.0, 4.0, 1.0])))
+    [1. 2. 3. 4.]
+    """
+    return jnp.roll(array_of_shape("quaternion", quaternion, 4), 1)
+
+
+def from_euler(angles: VectorLike) -> Quaternion:
+    """Attitude of z-x-z Euler angles: `R = Rz(phi) Rx(theta) Rz(psi)`.
+
+    Args:
+        angles: (phi, theta, psi) [rad]: precession, nutation, spin.
+
+    Returns:
+        Unit quaternion, body to space.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: analytic everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.from_euler(jnp.array([0.0, jnp.pi, 0.0])).round(6))
+    [0. 1. 0. 0.]
+    """
+    phi, theta, psi = 0.5 * array_of_shape("angles", angles, 3)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack(
+        [
+            c * jnp.cos(phi + psi),
+            s * jnp.cos(phi - psi),
+            s * jnp.sin(phi - psi),
+            c * jnp.sin(phi + psi),
+        ]
+    )
+
+
+def to_euler(attitude: QuaternionLike) -> Vector:
+    """z-x-z Euler angles of an attitude.
+
+    At theta = 0 only phi + psi is defined, at theta = pi only phi - psi: there psi = 0 is chosen
+    and phi carries the whole rotation about the vertical.
+
+    Args:
+        attitude: Unit quaternion, body to space; its norm drops out.
+
+    Returns:
+        (phi, theta, psi) [rad], theta in [0, pi], phi and psi in [-pi, pi].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: exact for 0 < theta < pi. At the two poles theta has a cone (gradient 0) and phi
+    and psi the derivatives along the choice psi = 0: finite always.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> angles = jnp.array([0.3, 0.8, -1.2])
+    >>> print(jr.rotation.to_euler(jr.rotation.from_euler(angles)).round(6))
+    [ 0.3  0.8 -1.2]
+    """
+    w, x, y, z = array_of_shape("attitude", attitude, 4)
+    upper, lower = (w == 0) & (z == 0), (x == 0) & (y == 0)
+    half_sum = safe_arctan2(z, w)
+    half_difference = safe_arctan2(y, x)
+    half_difference = jnp.where(lower, half_sum, half_difference)
+    half_sum = jnp.where(upper, half_difference, half_sum)
+    theta = 2 * safe_arctan2(safe_norm(jnp.stack([x, y])), safe_norm(jnp.stack([w, z])))
+    phi, psi = half_sum + half_difference, half_sum - half_difference
+    return jnp.stack([_wrap(phi), theta, _wrap(psi)])
+
+
+def _wrap(angle: Array) -> Array:
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))

@@ -1,0 +1,248 @@
+"""The algebra of unit quaternions: products, rotation of vectors, exp and log."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jrigid._checks import array_of_shape, pair_of_shapes
+from jrigid._numerics import arctanc_sqrt, cos_sqrt, safe_norm, sinc_sqrt
+from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
+
+
+def normalize(quaternion: QuaternionLike) -> Quaternion:
+    """Quaternion scaled to norm 1; the zero quaternion stays zero, with gradient zero.
+
+    Args:
+        quaternion: Any quaternion, scalar first.
+
+    Returns:
+        The unit quaternion.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: projected on the tangent of the unit sphere; zero at the zero quaternion.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.normalize(jnp.array([0.0, 3.0, 0.0, 4.0])))
+    [0.  0.6 0.  0.8]
+    """
+    q = array_of_shape("quaternion", quaternion, 4)
+    return _direction(q)
+
+
+def _direction(vector: Array) -> Array:
+    """Vector over its norm; at zero the value is zero and the gradient zero."""
+    norm = safe_norm(vector)
+    zero = norm == 0
+    return jnp.where(zero, jnp.zeros_like(vector), vector / jnp.where(zero, 1.0, norm))
+
+
+def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
+    """Hamilton product p q: `R(p q) = R(p) R(q)`, q is applied first.
+
+    Args:
+        p: Left factor, scalar first.
+        q: Right factor, scalar first.
+
+    Returns:
+        The product.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: bilinear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> i, j = jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])
+    >>> print(jr.rotation.multiply(i, j))
+    [0. 0. 0. 1.]
+    """
+    (a, b, c, d), (w, x, y, z) = pair_of_shapes("p", p, (4,), "q", q, (4,))
+    return jnp.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+    )
+
+
+def conjugate(quaternion: QuaternionLike) -> Quaternion:
+    """Conjugate; for a unit quaternion the inverse rotation.
+
+    Args:
+        quaternion: Scalar first.
+
+    Returns:
+        (w, -x, -y, -z).
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: linear, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])))
+    [ 1. -2. -3. -4.]
+    """
+    w, x, y, z = array_of_shape("quaternion", quaternion, 4)
+    return jnp.stack([w, -x, -y, -z])
+
+
+def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
+    """Space components of a vector given in body components.
+
+    Args:
+        attitude: Unit quaternion, body to space.
+        vector: Body components [any unit].
+
+    Returns:
+        Space components, same unit. Exact for any non-zero quaternion: its norm drops out.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite for any non-zero quaternion.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> quarter = jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> print(jr.rotation.rotate(quarter, jnp.array([1.0, 0.0, 0.0])).round(6))
+    [0. 1. 0.]
+    """
+    (w, x, y, z), (a, b, c) = pair_of_shapes("attitude", attitude, (4,), "vector", vector, (3,))
+    # v + 2 (w u x v + u x (u x v)) / |q|^2
+    scale = 2 / (w * w + x * x + y * y + z * z)
+    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+    return jnp.stack(
+        [
+            a + scale * (w * p + y * r - z * q),
+            b + scale * (w * q + z * p - x * r),
+            c + scale * (w * r + x * q - y * p),
+        ]
+    )
+
+
+def rotate_inverse(attitude: QuaternionLike, vector: VectorLike) -> Vector:
+    """Body components of a vector given in space components.
+
+    Args:
+        attitude: Unit quaternion, body to space.
+        vector: Space components [any unit].
+
+    Returns:
+        Body components, same unit.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite for any non-zero quaternion.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> quarter = jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> print(jr.rotation.rotate_inverse(quarter, jnp.array([0.0, 1.0, 0.0])).round(6))
+    [1. 0. 0.]
+    """
+    return rotate(conjugate(attitude), vector)
+
+
+def exp(rotation_vector: VectorLike) -> Quaternion:
+    """Quaternion of a rotation vector: axis times angle.
+
+    Args:
+        rotation_vector: Axis times angle [rad].
+
+    Returns:
+        Unit quaternion (cos(a/2), axis sin(a/2)).
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: analytic everywhere, also at the zero vector, to any order.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.exp(jnp.array([jnp.pi, 0.0, 0.0])).round(6))
+    [0. 1. 0. 0.]
+    """
+    v = array_of_shape("rotation_vector", rotation_vector, 3)
+    z = 0.25 * jnp.sum(v * v)
+    return jnp.concatenate([cos_sqrt(z)[None], 0.5 * sinc_sqrt(z) * v])
+
+
+def log(attitude: QuaternionLike) -> Vector:
+    """Rotation vector, of length at most pi, of a quaternion.
+
+    Args:
+        attitude: Unit quaternion; its norm drops out, and q and -q give the same.
+
+    Returns:
+        Axis times angle [rad].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite everywhere, analytic at the identity; across a half turn the value itself
+    jumps from +pi to -pi along the axis.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> v = jnp.array([0.1, -0.2, 0.3])
+    >>> bool(jnp.allclose(jr.rotation.log(-jr.rotation.exp(v)), v))
+    True
+    """
+    q = array_of_shape("attitude", attitude, 4)
+    q = jnp.where(q[0] < 0, -q, q)
+    w, v = q[0], q[1:]
+    square = jnp.sum(v * v)
+    near = square <= w * w  # angle up to a quarter turn
+    w_near = jnp.where(near, w, 1.0)
+    half_near = arctanc_sqrt(jnp.where(near, square, 0.0) / (w_near * w_near)) / w_near
+    norm = jnp.sqrt(jnp.where(near, 1.0, square))
+    half_far = (jnp.pi / 2 - jnp.arctan(jnp.where(near, 0.0, w) / norm)) / norm
+    return 2 * jnp.where(near, half_near, half_far) * v
+
+
+def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
+    """Angle of the rotation that takes attitude p to attitude q.
+
+    Args:
+        p: Unit quaternion.
+        q: Unit quaternion.
+
+    Returns:
+        Angle in [0, pi] [rad], accurate also for tiny angles.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: at p = q the angle has a cone; the gradient there is 0.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> q = jr.rotation.exp(jnp.array([0.0, 1e-3, 0.0]))
+    >>> print(round(float(jr.rotation.angle_between(jnp.array([1.0, 0.0, 0.0, 0.0]), q)), 9))
+    0.001
+    """
+    p, q = pair_of_shapes("p", p, (4,), "q", q, (4,))
+    return safe_norm(log(multiply(conjugate(p), q)))
+
+
+def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
+    """Attitude turned by an angle about an axis.
+
+    Args:
+        axis: Direction of the axis, of any non-zero length.
+        angle: Angle [rad], right-handed about the axis.
+
+    Returns:
+        Unit quaternion; the identity, with gradient zero in `axis`, if the axis is zero.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.from_axis_angle(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(6))
+    [0. 0. 0. 1.]
+    """
+    v, a = pair_of_shapes("axis", axis, (3,), "angle", angle, ())
+    return normalize(jnp.concatenate([jnp.cos(0.5 * a)[None], jnp.sin(0.5 * a) * _direction(v)]))

@@ -1,0 +1,508 @@
+"""Mass properties of homogeneous solids and shells, in closed form.
+
+Every body has its centre of mass at the origin of the coordinates, except where a function says
+otherwise, its axis of symmetry along z and its principal axes along x, y, z. Move it with
+`.translated` and `.rotated`, join bodies with `+`.
+
+Source: Beer, Johnston, Mazurek and Cornwell, Vector Mechanics for Engineers: Dynamics, 10th ed.,
+9.11-9.17 and inside cover; torus and capsule by integration.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Real
+
+from jrigid._checks import RESULTS, Findings, check_shape, float_arrays
+from jrigid._types import ScalarLike, VectorLike
+from jrigid.mass import MassProperties, _answer, _inertia_of
+
+
+def _arrays(mass: ArrayLike, **lengths: tuple[ArrayLike, tuple[int, ...]]) -> list[Array]:
+    arrays = float_arrays(mass, *(value for value, _ in lengths.values()))
+    check_shape("mass", arrays[0], ())
+    for array, (name, (_, shape)) in zip(arrays[1:], lengths.items(), strict=True):
+        check_shape(name, array, shape)
+    return list(arrays)
+
+
+def _body(
+    mass: Array,
+    inertia_per_mass: Array,
+    throw: bool,
+    *,
+    positive: dict[str, Array],
+    others: tuple[tuple[Bool[Array, ""], str], ...] = (),
+    center: Array | None = None,
+) -> MassProperties:
+    findings = Findings()
+    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
+    for name, length in positive.items():
+        fine = jnp.all((length > 0) & jnp.isfinite(length))
+        message = RESULTS[RESULTS.invalid_length].format(name)
+        findings.require(fine, RESULTS.invalid_inertia, message)
+    for fine, message in others:
+        findings.require(fine, RESULTS.invalid_inertia, message)
+    tensor = jnp.diag(inertia_per_mass) if inertia_per_mass.ndim == 1 else inertia_per_mass
+    center = jnp.zeros(3, mass.dtype) if center is None else center
+    return MassProperties(*_answer(findings, (mass, center, mass * tensor), throw), throw=None)
+
+
+def box(mass: ScalarLike, lengths: VectorLike, *, throw: bool = True) -> MassProperties:
+    """Homogeneous rectangular box, edges along x, y, z.
+
+    Args:
+        mass: Mass [kg].
+        lengths: Full edge lengths along x, y, z [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.box(12.0, jnp.array([1.0, 2.0, 3.0])).inertia))
+    [13. 10.  5.]
+    """
+    mass, lengths = _arrays(mass, lengths=(lengths, (3,)))
+    x, y, z = lengths * lengths
+    return _body(mass, jnp.stack([y + z, x + z, x + y]) / 12, throw, positive={"lengths": lengths})
+
+
+def sphere(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
+    """Homogeneous ball.
+
+    Args:
+        mass: Mass [kg].
+        radius: Radius [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or radius not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
+    [2. 2. 2.]
+    """
+    mass, radius = _arrays(mass, radius=(radius, ()))
+    moment = 0.4 * radius * radius
+    return _body(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
+
+
+def shell(
+    mass: ScalarLike,
+    radius: ScalarLike,
+    *,
+    inner_radius: ScalarLike | None = None,
+    throw: bool = True,
+) -> MassProperties:
+    """Spherical shell: infinitely thin, or a ball with a concentric spherical cavity.
+
+    Args:
+        mass: Mass [kg].
+        radius: Outer radius [m].
+        inner_radius: Radius of the cavity [m], below `radius`; None for a thin shell.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a radius not positive and finite, or `inner_radius` not below
+            `radius` (run time, any lane).
+
+    Gradients: finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.shell(3.0, 1.0).inertia))
+    [2. 2. 2.]
+    """
+    if inner_radius is None:
+        mass, radius = _arrays(mass, radius=(radius, ()))
+        moment = 2 * radius * radius / 3
+        return _body(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
+    mass, radius, inner = _arrays(mass, radius=(radius, ()), inner_radius=(inner_radius, ()))
+    # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
+    q = inner / radius
+    ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
+    moment = 0.4 * radius * radius * ratio
+    return _body(
+        mass,
+        jnp.stack([moment] * 3),
+        throw,
+        positive={"radius": radius, "inner_radius": inner},
+        others=(
+            (inner < radius, "Argument `inner_radius` must be below `radius`, but it is not."),
+        ),
+    )
+
+
+def ellipsoid(mass: ScalarLike, semi_axes: VectorLike, *, throw: bool = True) -> MassProperties:
+    """Homogeneous ellipsoid, axes along x, y, z.
+
+    Args:
+        mass: Mass [kg].
+        semi_axes: Semi-axes along x, y, z [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a semi-axis not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.ellipsoid(5.0, jnp.array([1.0, 2.0, 3.0])).inertia))
+    [13. 10.  5.]
+    """
+    mass, semi_axes = _arrays(mass, semi_axes=(semi_axes, (3,)))
+    x, y, z = semi_axes * semi_axes
+    moments = jnp.stack([y + z, x + z, x + y]) / 5
+    return _body(mass, moments, throw, positive={"semi_axes": semi_axes})
+
+
+def cylinder(
+    mass: ScalarLike, radius: ScalarLike, height: ScalarLike, *, throw: bool = True
+) -> MassProperties:
+    """Homogeneous circular cylinder along z.
+
+    Args:
+        mass: Mass [kg].
+        radius: Radius [m].
+        height: Full height [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin. The transverse moment is M h^2 / 12 + M r^2 / 4 (a source
+        in circulation prints M h^2 / 2).
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.cylinder(12.0, 2.0, 1.0).inertia))
+    [13. 13. 24.]
+    """
+    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    transverse = height * height / 12 + radius * radius / 4
+    moments = jnp.stack([transverse, transverse, radius * radius / 2])
+    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
+
+
+def tube(
+    mass: ScalarLike,
+    inner_radius: ScalarLike,
+    outer_radius: ScalarLike,
+    height: ScalarLike,
+    *,
+    throw: bool = True,
+) -> MassProperties:
+    """Homogeneous circular tube along z.
+
+    Args:
+        mass: Mass [kg].
+        inner_radius: Radius of the bore [m].
+        outer_radius: Outer radius [m], not below the inner; equal radii are a thin wall.
+        height: Full height [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite, or `inner_radius` above
+            `outer_radius` (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.tube(12.0, 1.0, 3.0, 2.0).inertia))
+    [34. 34. 60.]
+    """
+    mass, inner, outer, height = _arrays(
+        mass, inner_radius=(inner_radius, ()), outer_radius=(outer_radius, ()), height=(height, ())
+    )
+    squares = inner * inner + outer * outer
+    transverse = height * height / 12 + squares / 4
+    message = "Argument `inner_radius` must not exceed `outer_radius`, but it does."
+    return _body(
+        mass,
+        jnp.stack([transverse, transverse, squares / 2]),
+        throw,
+        positive={"inner_radius": inner, "outer_radius": outer, "height": height},
+        others=((inner <= outer, message),),
+    )
+
+
+def cone(
+    mass: ScalarLike, radius: ScalarLike, height: ScalarLike, *, throw: bool = True
+) -> MassProperties:
+    """Homogeneous circular cone along z, apex up.
+
+    Args:
+        mass: Mass [kg].
+        radius: Radius of the base [m].
+        height: From base to apex [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre of mass at the origin: the apex is at z = 3 height / 4, the base at
+        z = -height / 4.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.cone(80.0, 2.0, 4.0).inertia))
+    [96. 96. 96.]
+    """
+    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    transverse = 3 * (4 * radius * radius + height * height) / 80
+    moments = jnp.stack([transverse, transverse, 3 * radius * radius / 10])
+    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
+
+
+def rod(mass: ScalarLike, length: ScalarLike, *, throw: bool = True) -> MassProperties:
+    """Infinitely thin homogeneous rod along z; its moment about z is zero.
+
+    Args:
+        mass: Mass [kg].
+        length: Full length [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or length not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.rod(12.0, 1.0).inertia))
+    [1. 1. 0.]
+    """
+    mass, length = _arrays(mass, length=(length, ()))
+    moment = length * length / 12
+    moments = jnp.stack([moment, moment, jnp.zeros_like(moment)])
+    return _body(mass, moments, throw, positive={"length": length})
+
+
+def lamina(
+    mass: ScalarLike, lengths: Real[ArrayLike, "2"], *, throw: bool = True
+) -> MassProperties:
+    """Infinitely thin homogeneous rectangle in the plane z = 0.
+
+    Args:
+        mass: Mass [kg].
+        lengths: Full edge lengths along x and y [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin; I3 = I1 + I2.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
+    [4. 1. 5.]
+    """
+    mass, lengths = _arrays(mass, lengths=(lengths, (2,)))
+    x, y = lengths * lengths / 12
+    return _body(mass, jnp.stack([y, x, x + y]), throw, positive={"lengths": lengths})
+
+
+def disk(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
+    """Infinitely thin homogeneous disk in the plane z = 0.
+
+    Args:
+        mass: Mass [kg].
+        radius: Radius [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin; I3 = I1 + I2.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or radius not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.disk(4.0, 1.0).inertia))
+    [1. 1. 2.]
+    """
+    mass, radius = _arrays(mass, radius=(radius, ()))
+    moment = radius * radius / 4
+    moments = jnp.stack([moment, moment, 2 * moment])
+    return _body(mass, moments, throw, positive={"radius": radius})
+
+
+def hoop(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
+    """Infinitely thin homogeneous circular hoop in the plane z = 0.
+
+    Args:
+        mass: Mass [kg].
+        radius: Radius [m].
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin; I3 = I1 + I2.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or radius not positive and finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.hoop(2.0, 1.0).inertia))
+    [1. 1. 2.]
+    """
+    mass, radius = _arrays(mass, radius=(radius, ()))
+    moment = radius * radius / 2
+    moments = jnp.stack([moment, moment, 2 * moment])
+    return _body(mass, moments, throw, positive={"radius": radius})
+
+
+def torus(
+    mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike, *, throw: bool = True
+) -> MassProperties:
+    """Homogeneous solid torus around z.
+
+    Args:
+        mass: Mass [kg].
+        ring_radius: From the centre of the torus to the centre of the tube [m].
+        tube_radius: Radius of the tube [m], not above the ring's.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a radius not positive and finite, or `tube_radius` above
+            `ring_radius` (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.torus(8.0, 3.0, 2.0).inertia))
+    [56. 56. 96.]
+    """
+    mass, ring, tube_ = _arrays(mass, ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ()))
+    ring2, tube2 = ring * ring, tube_ * tube_
+    transverse = ring2 / 2 + 5 * tube2 / 8
+    message = "Argument `tube_radius` must not exceed `ring_radius`, but it does."
+    return _body(
+        mass,
+        jnp.stack([transverse, transverse, ring2 + 3 * tube2 / 4]),
+        throw,
+        positive={"ring_radius": ring, "tube_radius": tube_},
+        others=((tube_ <= ring, message),),
+    )
+
+
+def capsule(
+    mass: ScalarLike, radius: ScalarLike, height: ScalarLike, *, throw: bool = True
+) -> MassProperties:
+    """Homogeneous cylinder along z with a half ball at each end.
+
+    Args:
+        mass: Mass of the whole [kg].
+        radius: Radius of the cylinder and of the half balls [m].
+        height: Of the cylinder alone [m]; the whole is longer by two radii.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre at the origin.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass or a length not positive and finite (run time, any lane).
+
+    Gradients: finite everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.solids.capsule(140.0, 1.0, 2.0).inertia).round(3))
+    [169.4 169.4  64.4]
+    """
+    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
+    whole = height + 4 * radius / 3
+    middle, ends = height / whole, 4 * radius / (3 * whole)
+    r2, h2 = radius * radius, height * height
+    along = middle * r2 / 2 + ends * 2 * r2 / 5
+    # A half ball has its centre of mass 3 r / 8 above its base and 2/5 m r^2 about the base.
+    transverse = middle * (h2 / 12 + r2 / 4) + ends * (
+        2 * r2 / 5 + h2 / 4 + 3 * radius * height / 8
+    )
+    moments = jnp.stack([transverse, transverse, along])
+    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
+
+
+def tetrahedron(
+    mass: ScalarLike, vertices: Real[ArrayLike, "4 3"], *, throw: bool = True
+) -> MassProperties:
+    """Homogeneous tetrahedron with given corners, in their coordinates.
+
+    Args:
+        mass: Mass [kg].
+        vertices: Coordinates of the corners, in any order [m]. A flat one is a plate.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        The body, centre of mass at the mean of the corners.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Mass not positive and finite, or a corner not finite (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+    Source: Tonon, J. Math. Stat. 1 (2005) 8-11.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> corners = jnp.array([[0.0, 0, 0], [4.0, 0, 0], [0, 4.0, 0], [0, 0, 4.0]])
+    >>> print(jr.solids.tetrahedron(5.0, corners).inertia)
+    [[6. 1. 1.]
+     [1. 6. 1.]
+     [1. 1. 6.]]
+    """
+    mass, vertices = _arrays(mass, vertices=(vertices, (4, 3)))
+    origin = vertices[0]
+    center = origin + jnp.sum(vertices - origin[None, :], axis=0) / 4
+    arms = vertices - center[None, :]
+    second = jnp.sum(arms[:, :, None] * arms[:, None, :], axis=0) / 20
+    finite = jnp.all(jnp.isfinite(vertices))
+    message = "Argument `vertices` must be finite, but it is not."
+    findings = Findings()
+    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
+    findings.require(finite, RESULTS.invalid_position, message)
+    values = _answer(findings, (mass, center, mass * _inertia_of(second)), throw)
+    return MassProperties(*values, throw=None)

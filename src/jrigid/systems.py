@@ -1,0 +1,318 @@
+"""Systems for diffrax: vector fields and invariants of bodies that turn, and that fly."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jrigid._checks import check_inertia_shape, check_shape, float_arrays
+from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
+from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
+from jrigid.mass import MassProperties
+from jrigid.rotation import attitude_rate, rotate
+from jrigid.torques import AbstractTorque, TorqueFunction, as_torque
+
+
+class AbstractSystem(eqx.Module):
+    """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants."""
+
+    inertia: eqx.AbstractVar[Float[Array, "..."]]
+    torque: eqx.AbstractVar[AbstractTorque]
+
+    @abc.abstractmethod
+    def vector_field(self, t: ScalarLike, state: Any, args: Any) -> Any:
+        """Time derivative of the state, in the state's own structure."""
+
+    @abc.abstractmethod
+    def energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+        """Total energy [J]: kinetic, potential and that of internal parts."""
+
+    @abc.abstractmethod
+    def angular_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Total angular momentum [kg m^2/s], space components, internal parts included."""
+
+
+class FloatingState(eqx.Module):
+    """State of a body in flight.
+
+    Attributes:
+        position: Centre of mass, space components [m].
+        velocity: Velocity of the centre of mass, space components [m/s].
+        attitude: Unit quaternion, scalar first, body to space.
+        omega: Angular velocity, body components [rad/s].
+        internal: What internal dampers and rotors carry, as in `State`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> state = jr.FloatingState(
+    ...     jnp.zeros(3), jnp.array([3.0, 0.0, 4.0]), jnp.array([1.0, 0, 0, 0]), jnp.ones(3)
+    ... )
+    """
+
+    position: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    velocity: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    attitude: Float[Array, "*batch 4"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    omega: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    internal: Any = ()
+
+
+def _rotational_momentum(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
+    inertia = system.inertia.astype(state.omega.dtype)
+    own = angular_momentum(inertia, state.omega)
+    return rotate(state.attitude, own + system.torque.internal_momentum(t, state, args))
+
+
+def _rotational_energy(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
+    inertia = system.inertia.astype(state.omega.dtype)
+    own = kinetic_energy(inertia, state.omega)
+    return own + system.torque.internal_energy(t, state, args)
+
+
+def _omega_rate(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
+    inertia = system.inertia.astype(state.omega.dtype)
+    return euler_equations(inertia, state.omega, system.torque(t, state, args))
+
+
+class RigidBody(AbstractSystem):
+    """A body that turns about a fixed point or about its centre of mass.
+
+    Attributes:
+        inertia: Principal moments or symmetric tensor about that point [kg m^2], body axes.
+        torque: The torque on the body.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 1.0, 1.0]))
+    >>> print(body.energy(0.0, state, None), body.angular_momentum(0.0, state, None))
+    3.0 [1. 2. 3.]
+    """
+
+    inertia: Float[Array, "..."]
+    torque: AbstractTorque
+
+    def __init__(self, inertia: InertiaLike, torque: TorqueFunction | None = None):
+        """A body.
+
+        Args:
+            inertia: Principal moments or symmetric tensor [kg m^2].
+            torque: `(t, state, args) -> (3,)` body components [N m], a torque of
+                `jrigid.torques`, or None.
+
+        Raises:
+            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
+        """
+        (self.inertia,) = float_arrays(inertia)
+        check_inertia_shape(self.inertia)
+        self.torque = as_torque(torque)
+
+    def vector_field(self, t: ScalarLike, state: State, args: Any) -> State:
+        """Time derivative of the state.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to the torque.
+
+        Returns:
+            (q' [1/s], omega' [rad/s^2], rate of the internal state) as a `State`.
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        return State(
+            attitude_rate(state.attitude, state.omega),
+            _omega_rate(self, t, state, args),
+            self.torque.internal_rate(t, state, args),
+        )
+
+    def energy(self, t: ScalarLike, state: State, args: Any) -> Scalar:
+        """Total energy [J]: kinetic, potential, and that of internal parts.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to the torque.
+
+        Returns:
+            Energy [J].
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        potential = self.torque.potential(t, state, args)
+        return _rotational_energy(self, t, state, args) + potential
+
+    def angular_momentum(self, t: ScalarLike, state: State, args: Any) -> Vector:
+        """Total angular momentum about the fixed point, internal parts included.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to the torque.
+
+        Returns:
+            Space components [kg m^2/s].
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        return _rotational_momentum(self, t, state, args)
+
+
+class Force(eqx.Module):
+    """A force with a potential energy, for `FloatingBody`; a plain callable is one without.
+
+    Attributes:
+        fn: `(t, state, args) -> (3,)` space components [N].
+        potential: `(t, state, args) -> ()` potential energy [J].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> weight = jr.systems.Force(
+    ...     lambda t, state, args: jnp.array([0.0, 0.0, -9.8]),
+    ...     lambda t, state, args: 9.8 * state.position[2],
+    ... )
+    """
+
+    fn: Callable[[Any, Any, Any], Any]
+    potential: Callable[[Any, Any, Any], Any]
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Force [N], space components."""
+        return self.fn(t, state, args)
+
+
+class FloatingBody(AbstractSystem):
+    """A body in flight: its centre of mass moves under forces while it turns.
+
+    Attributes:
+        mass_properties: Mass and inertia; the centre of mass in body coordinates plays no role.
+        force: `(t, state, args) -> (3,)` total force, space components [N], or None.
+        torque: The torque about the centre of mass.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> weight = lambda t, state, args: jnp.array([0.0, 0.0, -9.8])
+    >>> racket = jr.FloatingBody(jr.solids.box(1.0, jnp.array([0.1, 0.3, 0.05])), weight)
+    """
+
+    mass_properties: MassProperties
+    force: Callable[[Any, Any, Any], Any] | None
+    torque: AbstractTorque
+
+    def __init__(
+        self,
+        mass_properties: MassProperties,
+        force: Callable[[Any, Any, Any], Any] | None = None,
+        torque: TorqueFunction | None = None,
+    ):
+        """A body in flight.
+
+        Args:
+            mass_properties: Mass and inertia about the centre of mass.
+            force: `(t, state, args) -> (3,)` space components [N]; a `Force` adds a potential.
+            torque: About the centre of mass, as for `RigidBody`.
+        """
+        self.mass_properties = mass_properties
+        self.force = force
+        self.torque = as_torque(torque)
+
+    @property
+    def inertia(self) -> Float[Array, "..."]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Inertia tensor about the centre of mass [kg m^2]."""
+        return self.mass_properties.inertia
+
+    def _force(self, t: ScalarLike, state: Any, args: Any) -> Array:
+        if self.force is None:
+            return jnp.zeros_like(state.velocity)
+        force = jnp.asarray(self.force(t, state, args), state.velocity.dtype)
+        check_shape("force", force, (3,))
+        return force
+
+    def vector_field(self, t: ScalarLike, state: FloatingState, args: Any) -> FloatingState:
+        """Time derivative of the state.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to force and torque.
+
+        Returns:
+            (velocity, acceleration, q', omega', rate of the internal state).
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        mass = self.mass_properties.mass.astype(state.velocity.dtype)
+        return FloatingState(
+            state.velocity,
+            self._force(t, state, args) / mass,
+            attitude_rate(state.attitude, state.omega),
+            _omega_rate(self, t, state, args),
+            self.torque.internal_rate(t, state, args),
+        )
+
+    def translational_energy(self, state: FloatingState) -> Scalar:
+        """Kinetic energy of the centre of mass [J], m v^2 / 2.
+
+        Args:
+            state: State of the body.
+
+        Returns:
+            Energy [J]; with the rotational kinetic energy the whole kinetic energy (Koenig).
+        """
+        mass = self.mass_properties.mass.astype(state.velocity.dtype)
+        return 0.5 * mass * jnp.sum(state.velocity**2)
+
+    def rotational_energy(self, state: FloatingState) -> Scalar:
+        """Kinetic energy of the rotation about the centre of mass [J].
+
+        Args:
+            state: State of the body.
+
+        Returns:
+            omega . I omega / 2 [J]; internal parts are counted by `energy`.
+        """
+        return kinetic_energy(self.inertia.astype(state.omega.dtype), state.omega)
+
+    def energy(self, t: ScalarLike, state: FloatingState, args: Any) -> Scalar:
+        """Total energy [J]: both kinetic parts, potentials, and that of internal parts.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to force and torque.
+
+        Returns:
+            Energy [J].
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        total = self.translational_energy(state) + _rotational_energy(self, t, state, args)
+        total = total + self.torque.potential(t, state, args)
+        if isinstance(self.force, Force):
+            total = total + jnp.asarray(self.force.potential(t, state, args), total.dtype)
+        return total
+
+    def momentum(self, state: FloatingState) -> Vector:
+        """Linear momentum m v.
+
+        Args:
+            state: State of the body.
+
+        Returns:
+            Space components [kg m/s].
+        """
+        return self.mass_properties.mass.astype(state.velocity.dtype) * state.velocity
+
+    def angular_momentum(self, t: ScalarLike, state: FloatingState, args: Any) -> Vector:
+        """Total angular momentum about the origin of space: orbital plus rotational.
+
+        Args:
+            t: Time [s].
+            state: State at t.
+            args: Passed to force and torque.
+
+        Returns:
+            Space components [kg m^2/s].
+
+        Gradients: finite for any non-zero attitude quaternion.
+        """
+        orbital = jnp.cross(state.position, self.momentum(state))
+        return orbital + _rotational_momentum(self, t, state, args)

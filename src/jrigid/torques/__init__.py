@@ -1,0 +1,20 @@
+"""Torques on a body: composable, added with `+` and `sum()`.
+
+A torque is any callable `(t, state, args) -> (3,)` body components [N m]. The classes here add
+what a plain function cannot carry: a potential energy, and internal parts (a damper, a rotor)
+with a state, a momentum and an energy of their own.
+"""
+
+from jrigid.torques._base import AbstractTorque as AbstractTorque
+from jrigid.torques._base import Constant as Constant
+from jrigid.torques._base import Sum as Sum
+from jrigid.torques._base import Torque as Torque
+from jrigid.torques._base import TorqueFunction as TorqueFunction
+from jrigid.torques._base import as_torque as as_torque
+from jrigid.torques._external import GravityGradient as GravityGradient
+from jrigid.torques._external import LinearDrag as LinearDrag
+from jrigid.torques._external import QuadraticDrag as QuadraticDrag
+from jrigid.torques._external import UniformGravity as UniformGravity
+from jrigid.torques._internal import InternalDamper as InternalDamper
+from jrigid.torques._internal import Rotor as Rotor
+from jrigid.torques._internal import SpinningMass as SpinningMass

@@ -1,0 +1,160 @@
+"""Torques from outside: gravity, the gradient of gravity, drag."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jrigid._checks import array_of_shape, check_inertia_shape, float_arrays
+from jrigid._numerics import safe_norm
+from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
+from jrigid.dynamics import angular_momentum
+from jrigid.rotation import rotate, rotate_inverse
+from jrigid.torques._base import AbstractTorque
+
+
+class UniformGravity(AbstractTorque):
+    """Torque of uniform gravity on a body with a fixed point: lever x (m g).
+
+    Attributes:
+        mass: Mass [kg].
+        lever: From the pivot to the centre of mass, body components [m].
+        gravity: Acceleration of gravity, space components [m/s^2].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> lever, g = jnp.array([0.0, 0.0, 0.1]), jnp.array([0.0, 0.0, -9.8])
+    >>> gravity = jr.torques.UniformGravity(2.0, lever, g)
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    >>> print(gravity.potential(0.0, state, None).round(6))
+    1.96
+    """
+
+    mass: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    lever: Float[Array, "3"] = eqx.field(converter=lambda x: array_of_shape("lever", x, 3))
+    gravity: Float[Array, "3"] = eqx.field(converter=lambda x: array_of_shape("gravity", x, 3))
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        del t, args
+        dtype = state.omega.dtype
+        weight = self.mass.astype(dtype) * self.gravity.astype(dtype)
+        return jnp.cross(self.lever.astype(dtype), rotate_inverse(state.attitude, weight))
+
+    def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+        """Potential energy [J], zero with the centre of mass level with the pivot."""
+        del t, args
+        dtype = state.omega.dtype
+        arm = rotate(state.attitude, self.lever.astype(dtype))
+        return -self.mass.astype(dtype) * jnp.sum(self.gravity.astype(dtype) * arm)
+
+
+class GravityGradient(AbstractTorque):
+    """Gravity-gradient torque of a distant attractor: 3 mu / r^3 (n x I n).
+
+    First order in body size over distance; n is the direction of the attractor in the body.
+
+    Attributes:
+        inertia: Principal moments or tensor about the centre of mass [kg m^2].
+        mu: Gravitational parameter of the attractor [m^3/s^2].
+        position: `position(t)`, from the attractor to the body, space components [m].
+
+    Source: Hughes, Spacecraft Attitude Dynamics (1986), section 8.1.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> orbit = lambda t: 7e6 * jnp.stack([jnp.cos(1e-3 * t), jnp.sin(1e-3 * t), 0 * t])
+    >>> torque = jr.torques.GravityGradient(jnp.array([10.0, 20.0, 25.0]), 3.986e14, orbit)
+    """
+
+    inertia: Float[Array, "..."]
+    mu: Float[Array, ""]
+    position: Callable[[Any], Any]
+
+    def __init__(self, inertia: InertiaLike, mu: ScalarLike, position: Callable[[Any], Any]):
+        """Attractor seen from the body.
+
+        Args:
+            inertia: Principal moments or tensor about the centre of mass [kg m^2].
+            mu: Gravitational parameter [m^3/s^2].
+            position: `position(t) -> (3,)`, attractor to body, space components [m].
+        """
+        self.inertia, self.mu = float_arrays(inertia, mu)
+        check_inertia_shape(self.inertia)
+        self.position = position
+
+    def _direction(self, t: ScalarLike, state: Any) -> tuple[Array, Array]:
+        dtype = state.omega.dtype
+        position = jnp.asarray(self.position(t), dtype)
+        distance = safe_norm(position)
+        # mu / r^3 without overflow in float32
+        strength = self.mu.astype(dtype) / distance / distance / distance
+        return rotate_inverse(state.attitude, position / distance), strength
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        del args
+        n, strength = self._direction(t, state)
+        moment = angular_momentum(self.inertia.astype(n.dtype), n)
+        return 3 * strength * jnp.cross(n, moment)
+
+    def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+        """Attitude-dependent potential energy [J]: -mu / (2 r^3) (tr I - 3 n . I n)."""
+        del args
+        n, strength = self._direction(t, state)
+        inertia = self.inertia.astype(n.dtype)
+        trace = jnp.sum(inertia) if inertia.ndim == 1 else jnp.trace(inertia)
+        return -0.5 * strength * (trace - 3 * jnp.sum(n * angular_momentum(inertia, n)))
+
+
+def _apply_coefficient(coefficient: Array, omega: Array) -> Array:
+    coefficient = coefficient.astype(omega.dtype)
+    if coefficient.ndim == 0:
+        return coefficient * omega
+    return angular_momentum(coefficient, omega)
+
+
+def _coefficient(value: Any) -> Array:
+    (array,) = float_arrays(value)
+    if array.shape not in ((), (3,), (3, 3)):
+        raise ValueError(
+            "Argument `coefficient` must have shape (), (3,) or (3, 3), "
+            f"but it has shape {array.shape}."
+        )
+    return array
+
+
+class LinearDrag(AbstractTorque):
+    """Drag proportional to the angular velocity: -c omega.
+
+    Attributes:
+        coefficient: c [N m s]: a number, one for each body axis, or a tensor.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> drag = jr.torques.LinearDrag(0.1)
+    """
+
+    coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient)
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        del t, args
+        return -_apply_coefficient(self.coefficient, state.omega)
+
+
+class QuadraticDrag(AbstractTorque):
+    """Drag quadratic in the angular velocity: -|omega| c omega; at rest zero, its gradient too.
+
+    Attributes:
+        coefficient: c [N m s^2]: a number, one for each body axis, or a tensor.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> drag = jr.torques.QuadraticDrag(0.1)
+    """
+
+    coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient)
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        del t, args
+        return -safe_norm(state.omega) * _apply_coefficient(self.coefficient, state.omega)

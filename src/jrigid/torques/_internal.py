@@ -1,0 +1,188 @@
+"""Torques of internal parts with a momentum of their own: a damper, a rotor."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jrigid._checks import array_of_shape, check_shape, float_arrays
+from jrigid._numerics import safe_norm
+from jrigid._types import Scalar, ScalarLike, Vector, VectorLike
+from jrigid.torques._base import AbstractTorque, TorqueFunction, zero_like
+
+
+class InternalDamper(AbstractTorque):
+    """A sphere inside the body, coupled to it by a viscous layer.
+
+    The sphere has an angular velocity of its own; the layer exerts c (omega_sphere - omega) on
+    the body and the opposite on the sphere. The total angular momentum in space is constant, the
+    energy falls at the rate c |omega_sphere - omega|^2. `State.internal` is omega_sphere, the
+    absolute angular velocity of the sphere in the components of the body's axes [rad/s]; by
+    default the sphere starts at rest relative to the body. The inertia of the body does not
+    include the sphere's own.
+
+    Attributes:
+        inertia: Moment of inertia of the sphere [kg m^2].
+        coupling: c [N m s].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.2, 0.05))
+    """
+
+    inertia: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    coupling: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        del t, args
+        return self.coupling.astype(state.omega.dtype) * (state.internal - state.omega)
+
+    def internal_at_rest(self, state: Any) -> PyTree:
+        """The sphere turning with the body."""
+        return state.omega
+
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+        """Rate of the sphere's angular velocity, in the turning axes of the body."""
+        pull = self(t, state, args) / self.inertia.astype(state.omega.dtype)
+        return -pull - jnp.cross(state.omega, state.internal)
+
+    def internal_scale(self, rate: Scalar) -> PyTree:
+        """The sphere turns about as fast as the body."""
+        return rate
+
+    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Angular momentum of the sphere [kg m^2/s]."""
+        del t, args
+        return self.inertia.astype(state.omega.dtype) * state.internal
+
+    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+        """Kinetic energy of the sphere [J]."""
+        del t, args
+        return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(state.internal**2)
+
+
+class SpinningMass(eqx.Module):
+    """A wheel with a spin of its own, for `Rotor`.
+
+    Attributes:
+        inertia: Moment of inertia about its axis [kg m^2].
+        axis: Direction of the axis, body components, of any length.
+        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
+            wheel turns freely on its axis.
+    """
+
+    inertia: Float[Array, ""]
+    axis: Float[Array, "3"]
+    motor_torque: TorqueFunction | None
+
+    def __init__(
+        self,
+        inertia: ScalarLike,
+        axis: VectorLike,
+        motor_torque: TorqueFunction | None = None,
+    ):
+        """A wheel.
+
+        Args:
+            inertia: Moment of inertia about its axis [kg m^2].
+            axis: Direction of the axis, body components.
+            motor_torque: Torque of the motor on the wheel [N m].
+        """
+        self.inertia, axis = float_arrays(inertia, axis)
+        check_shape("axis", axis, (3,))
+        self.axis = axis / safe_norm(axis)
+        self.motor_torque = motor_torque
+
+
+class Rotor(AbstractTorque):
+    """A rotor inside the body (a gyrostat): prescribed momentum, or a wheel with its own spin.
+
+    With a prescribed momentum h (an array, or a function of time, in body components, relative to
+    the body) the torque on the body is -h' - omega x h and the body's inertia includes the locked
+    rotor. With a `SpinningMass` of axial moment J the wheel's absolute spin s about its axis a is
+    `State.internal` [rad/s], J s' = motor torque, and the body's inertia includes the wheel except
+    for J about a; by default the wheel starts at rest relative to the body.
+
+    Attributes:
+        momentum: h [kg m^2/s] as an array or `h(t)`, or a `SpinningMass`.
+
+    Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> rotor = jr.torques.Rotor(jnp.array([0.0, 0.5, 0.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0]))
+    >>> print(rotor(0.0, state, None))
+    [-0.  -0.  -0.5]
+    """
+
+    momentum: Any
+
+    def __init__(self, momentum: Any):
+        """A rotor.
+
+        Args:
+            momentum: (3,) array [kg m^2/s], `momentum(t) -> (3,)`, or a `SpinningMass`.
+        """
+        if isinstance(momentum, SpinningMass) or callable(momentum):
+            self.momentum = momentum
+        else:
+            self.momentum = array_of_shape("momentum", momentum, 3)
+
+    @property
+    def _wheel(self) -> SpinningMass | None:
+        return self.momentum if isinstance(self.momentum, SpinningMass) else None
+
+    def _momentum_and_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Array, Array]:
+        dtype = state.omega.dtype
+        wheel = self._wheel
+        if wheel is not None:
+            axis = wheel.axis.astype(dtype)
+            motor = self._motor(t, state, args)
+            return wheel.inertia.astype(dtype) * state.internal * axis, motor * axis
+        if callable(self.momentum):
+            time = jnp.asarray(t, dtype)
+            value, rate = eqx.filter_jvp(
+                lambda s: jnp.asarray(self.momentum(s), dtype), (time,), (jnp.ones_like(time),)
+            )
+            return value, rate
+        value = self.momentum.astype(dtype)
+        return value, jnp.zeros_like(value)
+
+    def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
+        wheel = self._wheel
+        if wheel is None or wheel.motor_torque is None:
+            return zero_like(state)
+        return jnp.asarray(wheel.motor_torque(t, state, args), state.omega.dtype)
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        momentum, rate = self._momentum_and_rate(t, state, args)
+        return -rate - jnp.cross(state.omega, momentum)
+
+    def internal_at_rest(self, state: Any) -> PyTree:
+        """The wheel turning with the body."""
+        if self._wheel is None:
+            return ()
+        return jnp.sum(self._wheel.axis.astype(state.omega.dtype) * state.omega)
+
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+        """Rate of the wheel's spin [rad/s^2]."""
+        if self._wheel is None:
+            return ()
+        return self._motor(t, state, args) / self._wheel.inertia.astype(state.omega.dtype)
+
+    def internal_scale(self, rate: Scalar) -> PyTree:
+        """The wheel's spin is judged against the body's."""
+        return () if self._wheel is None else rate
+
+    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Angular momentum of the rotor [kg m^2/s], body components."""
+        return self._momentum_and_rate(t, state, args)[0]
+
+    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+        """Kinetic energy of a wheel [J]; zero for a prescribed momentum, whose motor does work."""
+        del t, args
+        if self._wheel is None:
+            return zero_like(state)
+        return 0.5 * self._wheel.inertia.astype(state.omega.dtype) * state.internal**2

@@ -1,0 +1,24 @@
+"""Tolerances by dtype, and motions that several test files share."""
+
+import numpy as np
+
+# A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot show.
+TENSOR = np.array([[2.0, -0.3, 0.2], [-0.3, 2.5, 0.4], [0.2, 0.4, 1.7]])
+MOMENTS = np.array([1.0, 2.0, 3.0])
+ATTITUDE = np.array([0.5, -0.1, 0.7, 0.5])
+OMEGA = np.array([0.3, -0.5, 0.8])
+DTYPES = (np.float32, np.float64)
+
+
+def ulps(dtype, count):
+    """`count` units in the last place of 1."""
+    return count * float(np.finfo(dtype).eps)
+
+
+def central_difference(function, x, direction, step=None):
+    """Directional derivative of a function of an array, to about eps^(2/3)."""
+    x = np.asarray(x)
+    if step is None:
+        step = float(np.finfo(x.dtype).eps) ** (1 / 3)
+    up, down = function(x + step * direction), function(x - step * direction)
+    return (np.asarray(up) - np.asarray(down)) / (2 * step)
