@@ -18,7 +18,7 @@ import jrigid as jr
 MOMENTS = np.array([1.0, 2.0, 3.0])
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 OMEGA = np.array([0.3, 0.5, 0.8])
-END = 200 * np.pi / np.linalg.norm(OMEGA)
+END = float(200 * np.pi / np.linalg.norm(OMEGA))
 
 
 def ours(rtol, adjoint=None):
@@ -59,7 +59,7 @@ def by_hand(rtol, adjoint=None):
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             adjoint=adjoint, max_steps=2**17,
         )  # fmt: skip
-        return solution.ys[0]
+        return jnp.asarray(solution.ys)[0]
 
     return final
 

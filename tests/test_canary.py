@@ -44,7 +44,7 @@ def test_version_is_that_of_the_distribution():
 
 def test_import_leaves_jax_configuration_alone():
     code = (
-        "import jax; before = dict(jax.config.values); import jrigid; "
+        "import diffrax, jax; before = dict(jax.config.values); import jrigid; "
         "assert dict(jax.config.values) == before; "
         "import jax.numpy as jnp; assert jnp.ones(3).dtype == jnp.float32"
     )

@@ -10,7 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -58,7 +58,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     nonfinite_state = "The motion ran out of the range of floating point numbers."
 
 
-def float_arrays(*values: ArrayLike) -> tuple[Array, ...]:
+def float_arrays(*values: Any) -> tuple[Array, ...]:
     """Convert to arrays of one floating point dtype, that of the inputs taken together."""
     values = tuple(v if eqx.is_array_like(v) else np.asarray(v) for v in values)
     with jax.numpy_dtype_promotion("standard"):
@@ -79,7 +79,7 @@ def check_shape(name: str, value: Array | np.ndarray, shape: tuple[int | None, .
         )
 
 
-def array_of_shape(name: str, value: ArrayLike, *shape: int | None) -> Array:
+def array_of_shape(name: str, value: Any, *shape: int | None) -> Array:
     """Convert to a floating point array, or raise ValueError if the shape is wrong."""
     (array,) = float_arrays(value)
     check_shape(name, array, shape)
@@ -88,10 +88,10 @@ def array_of_shape(name: str, value: ArrayLike, *shape: int | None) -> Array:
 
 def pair_of_shapes(
     name_a: str,
-    a: ArrayLike,
+    a: Any,
     shape_a: tuple[int | None, ...],
     name_b: str,
-    b: ArrayLike,
+    b: Any,
     shape_b: tuple[int | None, ...],
 ) -> tuple[Array, Array]:
     """Convert two arguments to one dtype, or raise ValueError if a shape is wrong."""

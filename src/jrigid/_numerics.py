@@ -31,7 +31,7 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`arctan2`; at the origin the value is 0 and the gradient 0, elsewhere it does not overflow."""
+    """`arctan2` without overflow; at the origin the value is 0 and the gradient 0."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))
     origin = largest == 0
     scale = jnp.where(origin, 1.0, largest)
@@ -70,3 +70,12 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     small = z < 0.2
     root = jnp.sqrt(jnp.where(small, 1.0, z))
     return jnp.where(small, _series(_ARCTANC, jnp.where(small, z, 0.0)), jnp.arctan(root) / root)
+
+
+# Without it float32 products run in TF32 (10 bits) on recent GPUs.
+_EXACT = jax.lax.Precision.HIGHEST
+
+
+def product(subscripts: str, *operands: Array) -> Array:
+    """`jnp.einsum` in the full precision of the dtype on every device."""
+    return jnp.einsum(subscripts, *operands, precision=_EXACT)

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._adjoint import guard_inputs, guard_outputs
@@ -25,6 +25,7 @@ from jrigid._checks import (
     nan_where,
 )
 from jrigid._numerics import safe_norm
+from jrigid._trajectory import Trajectory
 from jrigid._types import ScalarLike
 from jrigid.rotation import normalize
 from jrigid.systems import AbstractSystem
@@ -41,6 +42,8 @@ _LONG_RADIANS = 1e5
 _LARGEST_STEP = 0.4
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
+# After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
+_GROWTH = 1e16
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
 _SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
@@ -48,52 +51,20 @@ _DEFAULT_MAX_STEPS_DIRECT = 4096
 _CHECKPOINTS = 100
 
 
-class Trajectory(eqx.Module):
-    """States at the times asked for, and what became of the integration.
+class _GiveUp(diffrax.PIDController):
+    """A PID controller that reports a step rejected at the resolution of time.
 
-    Attributes:
-        ts: Times [s], in the shape they were given.
-        states: State at each time; the leading axes of its leaves are those of `ts`. NaN where
-            the integration did not get to; attitudes are normalised.
-        result: Result code, `jrigid.RESULTS.successful` if all went well; one for each lane under
-            vmap. After an event it is `event_occurred`.
-        stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-        final_time: Where the integration ended [s]: the last of `ts`, or the event.
-        final_state: The state there.
-        system: The system that moved.
-        args: What its torques were given.
+    Its own `dtmin` would also stop a step that is short only because a time asked for is near.
     """
 
-    ts: Float[Array, "..."]
-    states: Any
-    result: Any
-    stats: dict[str, Array]
-    final_time: Float[Array, "..."]
-    final_state: Any
-    system: AbstractSystem
-    args: Any
+    resolution: Any = 0.0
 
-    @property
-    def energy(self) -> Float[Array, "..."]:
-        """Total energy at each time [J]."""
-        return self._each(lambda system, t, state, args: system.energy(t, state, args))
-
-    @property
-    def angular_momentum(self) -> Float[Array, "... 3"]:
-        """Total angular momentum at each time [kg m^2/s], space components."""
-        return self._each(lambda system, t, state, args: system.angular_momentum(t, state, args))
-
-    def _each(self, fn: Callable[..., Array]) -> Array:
-        lanes = jnp.ndim(self.result._value)
-
-        def one(ts: Array, states: Any, system: Any, args: Any) -> Array:
-            flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[ts.ndim :]), states)
-            values = jax.vmap(lambda t, state: fn(system, t, state, args))(ts.reshape(-1), flat)
-            return values.reshape(*ts.shape, *values.shape[1:])
-
-        for _ in range(lanes):
-            one = eqx.filter_vmap(one)
-        return one(self.ts, self.states, self.system, self.args)
+    def adapt_step_size(self, t0: Any, t1: Any, *args: Any) -> Any:
+        """As the PID controller; a torque that turns NaN or infinite ends here."""
+        keep, next_t0, next_t1, made_jump, state, result = super().adapt_step_size(t0, t1, *args)
+        stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
+        result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
+        return keep, next_t0, next_t1, made_jump, state, result
 
 
 def simulate(
@@ -261,13 +232,12 @@ def _simulate(
     state0 = dataclasses.replace(state0, attitude=attitude)
     flat = jnp.where(ok, flat, jnp.zeros_like(flat))
     t0 = jnp.where(ok, t0, jnp.zeros_like(t0))
-    state0 = findings.apply(state0, throw)
     system, state0, flat, t0, args = guard_inputs(adjoint, (system, state0, flat, t0, args))
 
     units = jax.lax.stop_gradient(_units(system, state0, flat[-1], t0, args))
     rate, scales = units
     moving = flat[-1] > t0  # all times at t0: nothing to integrate
-    stretch = jnp.where(moving, rate, 1.0)
+    stretch = _power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
     taus = jnp.where(moving, (flat - t0) * stretch, jnp.zeros_like(flat))
     end = jnp.where(moving, taus[-1], 1.0)
 
@@ -284,16 +254,19 @@ def _simulate(
     fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
     step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
     controller = diffrax.ClipStepSizeController(
-        diffrax.PIDController(
+        _GiveUp(
             rtol=step_rtol,
             atol=step_atol,
-            dtmin=16 * eps * radians,
-            force_dtmin=False,
-            dtmax=jnp.asarray(_LARGEST_STEP, flat.dtype),
+            dtmax=_LARGEST_STEP * stretch / jnp.where(moving, rate, 1.0),
+            factormax=_GROWTH,
+            resolution=16 * eps * radians,
         ),
         step_ts=jax.lax.stop_gradient(taus),
     )
     zero = jnp.zeros_like(end)
+    subs = [diffrax.SubSaveAt(ts=taus)]
+    if event is not None:
+        subs.append(diffrax.SubSaveAt(t1=True))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(vector_field),
         solver,
@@ -302,7 +275,7 @@ def _simulate(
         jnp.minimum(jnp.asarray(0.05, flat.dtype), radians),
         y0,
         args,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=taus), diffrax.SubSaveAt(t1=True)]),
+        saveat=diffrax.SaveAt(subs=subs),
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
@@ -310,30 +283,29 @@ def _simulate(
         throw=False,
         progress_meter=meter,
     )
-    solution_ts: Any = solution.ts
-    solution_ys: Any = solution.ys
-    (reached_tau, end_tau), (ys, end_y) = solution_ts, solution_ys
+    reached_taus: Any = solution.ts
+    ys: Any = solution.ys
     result: Any = RESULTS.promote(solution.result)
-    reached = jnp.isfinite(reached_tau)
 
-    def finish(y: Any, valid: Array) -> Any:
+    def to_states(taus: Array, y: Array) -> Any:
+        valid = jnp.isfinite(taus)
         state = jax.vmap(to_state)(jnp.where(valid[:, None], y, 1.0))
-        attitude = jax.vmap(normalize)(state.attitude)
-        state = dataclasses.replace(state, attitude=attitude)
+        state = dataclasses.replace(state, attitude=jax.vmap(normalize)(state.attitude))
         return jtu.tree_map(
             lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.nan), state
         )
 
-    states = finish(ys, reached)
-    final_state = jtu.tree_map(lambda x: x[0], finish(end_y, jnp.isfinite(end_tau)))
+    states = to_states(reached_taus[0], ys[0])
+    # Without an event the motion ends at the last of the times.
+    ends = to_states(reached_taus[-1], ys[-1]) if event is not None else states
+    final_state = jtu.tree_map(lambda x: x[-1], ends)
+    final_time = jnp.where(moving, t0 + reached_taus[-1][-1] / stretch, t0)
     finite = all_finite(final_state) | (result != RESULTS.successful)
     result = RESULTS.where(finite, result, RESULTS.nonfinite_state)
     result = RESULTS.where(ok, result, findings.result)
     failed = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
     states = nan_where(~ok, states)
-    final_state = nan_where(failed, final_state)
-    final_time = jnp.where(moving, t0 + end_tau[0] / stretch, t0)
-    final_time = jnp.where(failed, jnp.nan, final_time)
+    final_state, final_time = nan_where(failed, (final_state, final_time))
     states, final_state, final_time = guard_outputs(adjoint, (states, final_state, final_time))
     if throw:
         states = result.error_if(states, failed)
@@ -381,6 +353,12 @@ def _unravel(components: Array, like: Any) -> Any:
     return structure.unflatten(parts)
 
 
+def _power_of_two(x: Array) -> Array:
+    """The power of two next above x, to scale by without rounding."""
+    _, exponent = jnp.frexp(x)
+    return jnp.ldexp(jnp.ones_like(x), exponent)
+
+
 def _units(
     system: AbstractSystem, state0: Any, t_end: Array, t0: Array, args: Any
 ) -> tuple[Array, Any]:
@@ -412,7 +390,7 @@ def _units(
         name: jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name))
         for name, value in scale.items()
     }
-    return rate, _ravel(dataclasses.replace(state0, **spread))
+    return rate, _power_of_two(_ravel(dataclasses.replace(state0, **spread)))
 
 
 def _event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:

@@ -10,16 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike as NumpyArrayLike
 
-# Without it float32 products run in TF32 (10 bits) on recent GPUs.
-_EXACT = jax.lax.Precision.HIGHEST
+from jrigid._numerics import product
+
 _ROTATIONS = 18  # six sweeps; convergence is quadratic and four reach float64 rounding
 _NEAR = 0.1  # gaps below this fraction of the moment are integrated, wider ones divided
 _NODES = 8  # Gauss-Legendre: the error of 1/x across such a gap is below 1e-24
-
-
-def product(subscripts: str, *operands: Array) -> Array:
-    """`jnp.einsum` in the full precision of the dtype on every device."""
-    return jnp.einsum(subscripts, *operands, precision=_EXACT)
 
 
 def _rotate(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -50,6 +51,9 @@ def _solve(inertia: Array, vector: Array) -> Array:
     """I^-1 v for a symmetric tensor, through the cofactors."""
     if inertia.ndim == 1:
         return vector / inertia
+    # In units of the largest moment: a product of three can be out of the range of float32.
+    unit = jax.lax.stop_gradient(jnp.max(jnp.diagonal(inertia)))
+    inertia, vector = inertia / unit, vector / unit
     a, b, c = inertia[0, 0], inertia[1, 1], inertia[2, 2]
     d, e, f = inertia[0, 1], inertia[0, 2], inertia[1, 2]
     aa, bb, cc = b * c - f * f, a * c - e * e, a * b - d * d

@@ -58,7 +58,8 @@ class GravityGradient(AbstractTorque):
     Attributes:
         inertia: Principal moments or tensor about the centre of mass [kg m^2].
         mu: Gravitational parameter of the attractor [m^3/s^2].
-        position: `position(t)`, from the attractor to the body, space components [m].
+        position: `position(t)`, from the attractor to the body, space components [m]; None for
+            the body's own position, that of a `FloatingState` with the attractor at the origin.
 
     Source: Hughes, Spacecraft Attitude Dynamics (1986), section 8.1.
 
@@ -69,15 +70,21 @@ class GravityGradient(AbstractTorque):
 
     inertia: Float[Array, "..."]
     mu: Float[Array, ""]
-    position: Callable[[Any], Any]
+    position: Callable[[Any], Any] | None
 
-    def __init__(self, inertia: InertiaLike, mu: ScalarLike, position: Callable[[Any], Any]):
+    def __init__(
+        self,
+        inertia: InertiaLike,
+        mu: ScalarLike,
+        position: Callable[[Any], Any] | None = None,
+    ):
         """Attractor seen from the body.
 
         Args:
             inertia: Principal moments or tensor about the centre of mass [kg m^2].
             mu: Gravitational parameter [m^3/s^2].
-            position: `position(t) -> (3,)`, attractor to body, space components [m].
+            position: `position(t) -> (3,)`, attractor to body, space components [m]; None for the
+                body's own.
         """
         self.inertia, self.mu = float_arrays(inertia, mu)
         check_inertia_shape(self.inertia)
@@ -85,7 +92,8 @@ class GravityGradient(AbstractTorque):
 
     def _direction(self, t: ScalarLike, state: Any) -> tuple[Array, Array]:
         dtype = state.omega.dtype
-        position = jnp.asarray(self.position(t), dtype)
+        where = state.position if self.position is None else self.position(t)
+        position = jnp.asarray(where, dtype)
         distance = safe_norm(position)
         # mu / r^3 without overflow in float32
         strength = self.mu.astype(dtype) / distance / distance / distance

@@ -1,75 +1,10 @@
-"""Mass properties of homogeneous solids and shells, in closed form.
-
-Every body has its centre of mass at the origin of the coordinates, except where a function says
-otherwise, its axis of symmetry along z and its principal axes along x, y, z. Move it with
-`.translated` and `.rotated`, join bodies with `+`.
-
-Source: Beer, Johnston, Mazurek and Cornwell, Vector Mechanics for Engineers: Dynamics, 10th ed.,
-9.11-9.17 and inside cover; torus and capsule by integration.
-"""
+"""Solids with curved faces."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Real
 
-from jrigid._checks import RESULTS, Findings, check_shape, float_arrays
 from jrigid._types import ScalarLike, VectorLike
-from jrigid.mass import MassProperties, _answer, _inertia_of
-
-
-def _arrays(mass: ArrayLike, **lengths: tuple[ArrayLike, tuple[int, ...]]) -> list[Array]:
-    arrays = float_arrays(mass, *(value for value, _ in lengths.values()))
-    check_shape("mass", arrays[0], ())
-    for array, (name, (_, shape)) in zip(arrays[1:], lengths.items(), strict=True):
-        check_shape(name, array, shape)
-    return list(arrays)
-
-
-def _body(
-    mass: Array,
-    inertia_per_mass: Array,
-    throw: bool,
-    *,
-    positive: dict[str, Array],
-    others: tuple[tuple[Bool[Array, ""], str], ...] = (),
-    center: Array | None = None,
-) -> MassProperties:
-    findings = Findings()
-    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
-    for name, length in positive.items():
-        fine = jnp.all((length > 0) & jnp.isfinite(length))
-        message = RESULTS[RESULTS.invalid_length].format(name)
-        findings.require(fine, RESULTS.invalid_inertia, message)
-    for fine, message in others:
-        findings.require(fine, RESULTS.invalid_inertia, message)
-    tensor = jnp.diag(inertia_per_mass) if inertia_per_mass.ndim == 1 else inertia_per_mass
-    center = jnp.zeros(3, mass.dtype) if center is None else center
-    return MassProperties(*_answer(findings, (mass, center, mass * tensor), throw), throw=None)
-
-
-def box(mass: ScalarLike, lengths: VectorLike, *, throw: bool = True) -> MassProperties:
-    """Homogeneous rectangular box, edges along x, y, z.
-
-    Args:
-        mass: Mass [kg].
-        lengths: Full edge lengths along x, y, z [m].
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
-
-    Returns:
-        The body, centre at the origin.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Mass or a length not positive and finite (run time, any lane).
-
-    Gradients: polynomial, finite everywhere.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jnp.diag(jr.solids.box(12.0, jnp.array([1.0, 2.0, 3.0])).inertia))
-    [13. 10.  5.]
-    """
-    mass, lengths = _arrays(mass, lengths=(lengths, (3,)))
-    x, y, z = lengths * lengths
-    return _body(mass, jnp.stack([y + z, x + z, x + y]) / 12, throw, positive={"lengths": lengths})
+from jrigid.mass import MassProperties
+from jrigid.solids._common import mass_and_lengths, solid
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -93,9 +28,9 @@ def sphere(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassP
     >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
     [2. 2. 2.]
     """
-    mass, radius = _arrays(mass, radius=(radius, ()))
+    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
     moment = 0.4 * radius * radius
-    return _body(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
+    return solid(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
 
 
 def shell(
@@ -128,15 +63,17 @@ def shell(
     [2. 2. 2.]
     """
     if inner_radius is None:
-        mass, radius = _arrays(mass, radius=(radius, ()))
+        mass, radius = mass_and_lengths(mass, radius=(radius, ()))
         moment = 2 * radius * radius / 3
-        return _body(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
-    mass, radius, inner = _arrays(mass, radius=(radius, ()), inner_radius=(inner_radius, ()))
+        return solid(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
+    mass, radius, inner = mass_and_lengths(
+        mass, radius=(radius, ()), inner_radius=(inner_radius, ())
+    )
     # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
     q = inner / radius
     ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
     moment = 0.4 * radius * radius * ratio
-    return _body(
+    return solid(
         mass,
         jnp.stack([moment] * 3),
         throw,
@@ -168,10 +105,10 @@ def ellipsoid(mass: ScalarLike, semi_axes: VectorLike, *, throw: bool = True) ->
     >>> print(jnp.diag(jr.solids.ellipsoid(5.0, jnp.array([1.0, 2.0, 3.0])).inertia))
     [13. 10.  5.]
     """
-    mass, semi_axes = _arrays(mass, semi_axes=(semi_axes, (3,)))
+    mass, semi_axes = mass_and_lengths(mass, semi_axes=(semi_axes, (3,)))
     x, y, z = semi_axes * semi_axes
     moments = jnp.stack([y + z, x + z, x + y]) / 5
-    return _body(mass, moments, throw, positive={"semi_axes": semi_axes})
+    return solid(mass, moments, throw, positive={"semi_axes": semi_axes})
 
 
 def cylinder(
@@ -199,10 +136,10 @@ def cylinder(
     >>> print(jnp.diag(jr.solids.cylinder(12.0, 2.0, 1.0).inertia))
     [13. 13. 24.]
     """
-    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     transverse = height * height / 12 + radius * radius / 4
     moments = jnp.stack([transverse, transverse, radius * radius / 2])
-    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
+    return solid(mass, moments, throw, positive={"radius": radius, "height": height})
 
 
 def tube(
@@ -236,13 +173,13 @@ def tube(
     >>> print(jnp.diag(jr.solids.tube(12.0, 1.0, 3.0, 2.0).inertia))
     [34. 34. 60.]
     """
-    mass, inner, outer, height = _arrays(
+    mass, inner, outer, height = mass_and_lengths(
         mass, inner_radius=(inner_radius, ()), outer_radius=(outer_radius, ()), height=(height, ())
     )
     squares = inner * inner + outer * outer
     transverse = height * height / 12 + squares / 4
     message = "Argument `inner_radius` must not exceed `outer_radius`, but it does."
-    return _body(
+    return solid(
         mass,
         jnp.stack([transverse, transverse, squares / 2]),
         throw,
@@ -276,65 +213,10 @@ def cone(
     >>> print(jnp.diag(jr.solids.cone(80.0, 2.0, 4.0).inertia))
     [96. 96. 96.]
     """
-    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     transverse = 3 * (4 * radius * radius + height * height) / 80
     moments = jnp.stack([transverse, transverse, 3 * radius * radius / 10])
-    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
-
-
-def rod(mass: ScalarLike, length: ScalarLike, *, throw: bool = True) -> MassProperties:
-    """Infinitely thin homogeneous rod along z; its moment about z is zero.
-
-    Args:
-        mass: Mass [kg].
-        length: Full length [m].
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
-
-    Returns:
-        The body, centre at the origin.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Mass or length not positive and finite (run time, any lane).
-
-    Gradients: polynomial, finite everywhere.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jnp.diag(jr.solids.rod(12.0, 1.0).inertia))
-    [1. 1. 0.]
-    """
-    mass, length = _arrays(mass, length=(length, ()))
-    moment = length * length / 12
-    moments = jnp.stack([moment, moment, jnp.zeros_like(moment)])
-    return _body(mass, moments, throw, positive={"length": length})
-
-
-def lamina(
-    mass: ScalarLike, lengths: Real[ArrayLike, "2"], *, throw: bool = True
-) -> MassProperties:
-    """Infinitely thin homogeneous rectangle in the plane z = 0.
-
-    Args:
-        mass: Mass [kg].
-        lengths: Full edge lengths along x and y [m].
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
-
-    Returns:
-        The body, centre at the origin; I3 = I1 + I2.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Mass or a length not positive and finite (run time, any lane).
-
-    Gradients: polynomial, finite everywhere.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
-    [4. 1. 5.]
-    """
-    mass, lengths = _arrays(mass, lengths=(lengths, (2,)))
-    x, y = lengths * lengths / 12
-    return _body(mass, jnp.stack([y, x, x + y]), throw, positive={"lengths": lengths})
+    return solid(mass, moments, throw, positive={"radius": radius, "height": height})
 
 
 def disk(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -358,10 +240,10 @@ def disk(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassPro
     >>> print(jnp.diag(jr.solids.disk(4.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    mass, radius = _arrays(mass, radius=(radius, ()))
+    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
     moment = radius * radius / 4
     moments = jnp.stack([moment, moment, 2 * moment])
-    return _body(mass, moments, throw, positive={"radius": radius})
+    return solid(mass, moments, throw, positive={"radius": radius})
 
 
 def hoop(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -385,10 +267,10 @@ def hoop(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassPro
     >>> print(jnp.diag(jr.solids.hoop(2.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    mass, radius = _arrays(mass, radius=(radius, ()))
+    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
     moment = radius * radius / 2
     moments = jnp.stack([moment, moment, 2 * moment])
-    return _body(mass, moments, throw, positive={"radius": radius})
+    return solid(mass, moments, throw, positive={"radius": radius})
 
 
 def torus(
@@ -416,11 +298,13 @@ def torus(
     >>> print(jnp.diag(jr.solids.torus(8.0, 3.0, 2.0).inertia))
     [56. 56. 96.]
     """
-    mass, ring, tube_ = _arrays(mass, ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ()))
+    mass, ring, tube_ = mass_and_lengths(
+        mass, ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ())
+    )
     ring2, tube2 = ring * ring, tube_ * tube_
     transverse = ring2 / 2 + 5 * tube2 / 8
     message = "Argument `tube_radius` must not exceed `ring_radius`, but it does."
-    return _body(
+    return solid(
         mass,
         jnp.stack([transverse, transverse, ring2 + 3 * tube2 / 4]),
         throw,
@@ -453,7 +337,7 @@ def capsule(
     >>> print(jnp.diag(jr.solids.capsule(140.0, 1.0, 2.0).inertia).round(3))
     [169.4 169.4  64.4]
     """
-    mass, radius, height = _arrays(mass, radius=(radius, ()), height=(height, ()))
+    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
     whole = height + 4 * radius / 3
     middle, ends = height / whole, 4 * radius / (3 * whole)
@@ -464,45 +348,4 @@ def capsule(
         2 * r2 / 5 + h2 / 4 + 3 * radius * height / 8
     )
     moments = jnp.stack([transverse, transverse, along])
-    return _body(mass, moments, throw, positive={"radius": radius, "height": height})
-
-
-def tetrahedron(
-    mass: ScalarLike, vertices: Real[ArrayLike, "4 3"], *, throw: bool = True
-) -> MassProperties:
-    """Homogeneous tetrahedron with given corners, in their coordinates.
-
-    Args:
-        mass: Mass [kg].
-        vertices: Coordinates of the corners, in any order [m]. A flat one is a plate.
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
-
-    Returns:
-        The body, centre of mass at the mean of the corners.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Mass not positive and finite, or a corner not finite (run time, any lane).
-
-    Gradients: polynomial, finite everywhere.
-    Source: Tonon, J. Math. Stat. 1 (2005) 8-11.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> corners = jnp.array([[0.0, 0, 0], [4.0, 0, 0], [0, 4.0, 0], [0, 0, 4.0]])
-    >>> print(jr.solids.tetrahedron(5.0, corners).inertia)
-    [[6. 1. 1.]
-     [1. 6. 1.]
-     [1. 1. 6.]]
-    """
-    mass, vertices = _arrays(mass, vertices=(vertices, (4, 3)))
-    origin = vertices[0]
-    center = origin + jnp.sum(vertices - origin[None, :], axis=0) / 4
-    arms = vertices - center[None, :]
-    second = jnp.sum(arms[:, :, None] * arms[:, None, :], axis=0) / 20
-    finite = jnp.all(jnp.isfinite(vertices))
-    message = "Argument `vertices` must be finite, but it is not."
-    findings = Findings()
-    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
-    findings.require(finite, RESULTS.invalid_position, message)
-    values = _answer(findings, (mass, center, mass * _inertia_of(second)), throw)
-    return MassProperties(*values, throw=None)
+    return solid(mass, moments, throw, positive={"radius": radius, "height": height})

@@ -1,0 +1,60 @@
+"""Trajectory: the states of an integrated motion, and its invariants when asked."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from jrigid.systems import AbstractSystem
+
+
+class Trajectory(eqx.Module):
+    """States at the times asked for, and what became of the integration.
+
+    Attributes:
+        ts: Times [s], in the shape they were given.
+        states: State at each time; the leading axes of its leaves are those of `ts`. NaN where
+            the integration did not get to; attitudes are normalised.
+        result: Result code, `jrigid.RESULTS.successful` if all went well; one for each lane under
+            vmap. After an event it is `event_occurred`.
+        stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+        final_time: Where the integration ended [s]: the last of `ts`, or the event.
+        final_state: The state there.
+        system: The system that moved.
+        args: What its torques were given.
+    """
+
+    ts: Float[Array, "..."]
+    states: Any
+    result: Any
+    stats: dict[str, Array]
+    final_time: Float[Array, "..."]
+    final_state: Any
+    system: AbstractSystem
+    args: Any
+
+    @property
+    def energy(self) -> Float[Array, "..."]:
+        """Total energy at each time [J]."""
+        return self._each(lambda system, t, state, args: system.energy(t, state, args))
+
+    @property
+    def angular_momentum(self) -> Float[Array, "... 3"]:
+        """Total angular momentum at each time [kg m^2/s], space components."""
+        return self._each(lambda system, t, state, args: system.angular_momentum(t, state, args))
+
+    def _each(self, fn: Callable[..., Array]) -> Array:
+        lanes = jnp.ndim(self.result._value)
+
+        def one(ts: Array, states: Any, system: Any, args: Any) -> Array:
+            flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[ts.ndim :]), states)
+            values = jax.vmap(lambda t, state: fn(system, t, state, args))(ts.reshape(-1), flat)
+            return values.reshape(*ts.shape, *values.shape[1:])
+
+        for _ in range(lanes):
+            one = eqx.filter_vmap(one)
+        return one(self.ts, self.states, self.system, self.args)

@@ -1,0 +1,178 @@
+"""Tensors: parallel axis, principal axes, functions of a tensor."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    check_inertia_shape,
+    check_shape,
+    float_arrays,
+)
+from jrigid._spectral import eigh, spectral_function
+from jrigid._types import (
+    InertiaLike,
+    Matrix,
+    ScalarLike,
+    VectorLike,
+)
+from jrigid.mass._body import (
+    NOT_SYMMETRIC,
+    PrincipalAxes,
+    as_tensor,
+    checked_tensor,
+    is_finite_symmetric,
+    is_semidefinite,
+    unit_steiner,
+)
+
+
+def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+    r"""Inertia tensor about a point displaced from the centre of mass.
+
+    $I = I_{com} + m (|d|^2 1 - d d^T)$.
+
+    Args:
+        inertia_com: Moments or tensor about the centre of mass [kg m^2].
+        mass: Mass [kg].
+        displacement: Between centre of mass and point, either way round [m].
+
+    Returns:
+        Tensor about the point, same axes [kg m^2].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+    Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> d = jnp.array([0.0, 0.0, 2.0])
+    >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
+    [13. 13.  0.]
+    """
+    tensor, mass, displacement = checked_tensor(inertia_com, mass, displacement)
+    check_shape("mass", mass, ())
+    check_shape("displacement", displacement, (3,))
+    return tensor + mass * unit_steiner(displacement)
+
+
+def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+    r"""Inertia tensor about the centre of mass, from that about a displaced point.
+
+    The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$.
+
+    Args:
+        inertia: Moments or tensor about the point [kg m^2].
+        mass: Mass [kg].
+        displacement: Between centre of mass and point, either way round [m].
+
+    Returns:
+        Tensor about the centre of mass, same axes [kg m^2].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: The tensor is not finite or not symmetric, or less than `mass` at
+            `displacement` has, so that a moment comes out negative (run time, any lane).
+
+    Gradients: polynomial, finite everywhere.
+    Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> d = jnp.array([0.0, 0.0, 2.0])
+    >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
+    [1. 1. 0.]
+    """
+    tensor, mass, displacement = checked_tensor(inertia, mass, displacement)
+    check_shape("mass", mass, ())
+    check_shape("displacement", displacement, (3,))
+    reduced = tensor - mass * unit_steiner(displacement)
+    fixed, trace = jax.lax.stop_gradient((reduced, jnp.trace(tensor)))
+    return eqx.error_if(
+        reduced,
+        ~is_semidefinite(fixed, trace),
+        "Argument `inertia` must be at least that of `mass` at `displacement`, but a moment about "
+        "the centre of mass comes out negative.",
+    )
+
+
+def principal_axes(inertia: InertiaLike, *, throw: bool = True) -> PrincipalAxes:
+    """Principal moments and axes of an inertia tensor.
+
+    Moments ascend; axes are the columns of a right-handed rotation. In axes 1 and 3 the first
+    component that has at least 0.9 of the largest magnitude is positive, so that the signs do not
+    hang on the last bit where two components tie; axis 2 completes the rotation.
+
+    Args:
+        inertia: Moments or tensor [kg m^2]; any finite symmetric tensor will do.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
+
+    Returns:
+        Moments and axes, tensor = axes diag(moments) axes^T to a few ulps of the largest.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
+
+    Gradients: d moments = diag(axes^T dI axes). First derivatives of symmetric functions of
+    the moments (`sum(1 / moments)`) are right everywhere, repeated moments included. The moments
+    one by one, and the axes, have no derivative where moments repeat: there d axes is finite and
+    leaves out the axes of equal moments, so functions composed of moments and axes by hand, and
+    second derivatives, cannot be right there. Use `tensor_function` for them.
+    Source: Golub and Van Loan, Matrix Computations, 4th ed., 8.5 (Jacobi).
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.principal_axes(jnp.array([3.0, 1.0, 2.0])).moments)
+    [1. 2. 3.]
+    """
+    (inertia,) = float_arrays(inertia)
+    check_inertia_shape(inertia)
+    tensor = as_tensor(inertia)
+    findings = Findings()
+    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
+    tensor = findings.apply(tensor, throw)
+    return PrincipalAxes(*eigh(jnp.where(findings.ok, tensor, jnp.nan)))
+
+
+def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
+    """Function of a tensor, axes diag(f(moments)) axes^T, with derivatives right everywhere.
+
+    Args:
+        f: Maps a scalar to a scalar, smooth on the range of the moments, by jax operations;
+            forward-differentiable. It may close over parameters that are differentiated. Across
+            gaps below a tenth of a moment its derivatives are integrated with eight nodes.
+        inertia: Moments or tensor [kg m^2]; any finite symmetric tensor in the domain of f.
+
+    Returns:
+        Symmetric tensor in the units of f.
+
+    Raises:
+        ValueError: Wrong shape, or f does not map scalars to scalars (trace time).
+        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
+        NotImplementedError: A third derivative in the tensor (trace time).
+
+    Gradients: first and second, in every mode, in the tensor and in what f closes over, right at
+    repeated and nearly repeated moments (divided differences), where moments and axes composed by
+    hand give NaN or finite wrong numbers. So are those of its trace.
+    Source: Higham, Functions of Matrices (2008), theorem 3.11 (Daleckii and Krein).
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr
+    >>> trace = lambda inertia: jnp.trace(jr.tensor_function(jnp.sqrt, inertia))
+    >>> print(jax.grad(trace)(4 * jnp.eye(3)))
+    [[0.25 0.   0.  ]
+     [0.   0.25 0.  ]
+     [0.   0.   0.25]]
+    """
+    (tensor,) = checked_tensor(inertia)
+    moment = jax.ShapeDtypeStruct((), tensor.dtype)
+    shape = jax.eval_shape(f, moment)
+    if getattr(shape, "shape", None) != () or shape.dtype != tensor.dtype:
+        raise ValueError(f"Argument `f` must map {moment} to the same, but it gives {shape}.")
+    hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
+    return spectral_function(hoisted, tensor, *parameters)

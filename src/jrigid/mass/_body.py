@@ -1,0 +1,349 @@
+"""The mass properties of a body: checks, composition, motion."""
+
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_inertia_shape,
+    check_shape,
+    float_arrays,
+    is_symmetric,
+)
+from jrigid._numerics import product
+from jrigid._spectral import eigh
+from jrigid._types import (
+    InertiaLike,
+    Matrix,
+    QuaternionLike,
+    Scalar,
+    ScalarLike,
+    Vector,
+    VectorLike,
+)
+from jrigid.rotation import to_matrix
+
+ULPS = 64  # rounding allowed in "symmetric", "not negative" and "I3 <= I1 + I2"
+
+
+@final
+class PrincipalAxes(eqx.Module):
+    """Principal moments and axes of an inertia tensor.
+
+    Attributes:
+        moments: Principal moments, ascending [kg m^2].
+        axes: Rotation whose columns are the principal axes: v_body = axes @ v_principal.
+    """
+
+    moments: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+
+    @property
+    def result(self) -> RESULTS:
+        """Code of what became of the call: `successful` or `invalid_inertia`."""
+
+        def judge(moments: Array) -> RESULTS:
+            findings = Findings()
+            findings.require(all_finite(moments), RESULTS.invalid_inertia)
+            return findings.result  # pyright: ignore[reportReturnType]
+
+        for _ in range(self.moments.ndim - 1):
+            judge = jax.vmap(judge)
+        return judge(self.moments)
+
+
+@final
+class MassProperties(eqx.Module):
+    """Mass, centre of mass, and inertia tensor about the centre of mass, of a real body.
+
+    Thin bodies are bodies too: a plate may have I3 = I1 + I2, a rod one zero moment, a point
+    three. `a + b` is the two bodies rigidly joined (coordinates in common), and `sum` works.
+
+    Attributes:
+        mass: Mass [kg].
+        center_of_mass: Coordinates of the centre of mass [m].
+        inertia: Tensor about the centre of mass [kg m^2].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> center = jnp.array([0.0, 0.0, 1.0])
+    >>> rod = jr.MassProperties(3.0, center, jnp.array([1.0, 1.0, 0.0]))
+    >>> print(rod.about(jnp.zeros(3)))
+    [[4. 0. 0.]
+     [0. 4. 0.]
+     [0. 0. 0.]]
+    """
+
+    mass: Float[Array, ""]
+    center_of_mass: Float[Array, "3"]
+    inertia: Float[Array, "3 3"]
+
+    def __init__(
+        self,
+        mass: ScalarLike,
+        center_of_mass: VectorLike,
+        inertia: InertiaLike,
+        *,
+        throw: bool | None = True,
+    ) -> None:
+        """Check and store; principal moments become a diagonal tensor.
+
+        Args:
+            mass: Mass [kg], positive.
+            center_of_mass: Coordinates of the centre of mass [m].
+            inertia: Moments or tensor about the centre of mass [kg m^2], positive semi-definite,
+                with I3 <= I1 + I2, to rounding. It is stored symmetrised.
+            throw: True: a bad value is an error. False: it turns into NaN and `result` says what
+                was wrong. None: values known to be good are not looked at.
+
+        Raises:
+            ValueError: Wrong shape (trace time).
+            RuntimeError: Mass not positive, a value not finite, a tensor that is not symmetric or
+                has a negative moment or violates I3 <= I1 + I2 (run time, any lane).
+
+        Gradients: the identity, on symmetric tensors.
+        """
+        mass, center_of_mass, inertia = float_arrays(mass, center_of_mass, inertia)
+        check_shape("mass", mass, ())
+        check_shape("center_of_mass", center_of_mass, (3,))
+        check_inertia_shape(inertia)
+        tensor = as_tensor(inertia)
+        if throw is not None:
+            findings = _judge(mass, center_of_mass, tensor)
+            mass, center_of_mass, tensor = raise_or_mark(
+                findings, (mass, center_of_mass, tensor), throw
+            )
+        self.mass = mass
+        self.center_of_mass = center_of_mass
+        self.inertia = 0.5 * (tensor + tensor.T)
+
+    @property
+    def result(self) -> RESULTS:
+        """Code of what these values are, computed when asked.
+
+        `successful`, `invalid_mass`, `invalid_position`, `invalid_inertia` or
+        `unphysical_inertia`; one code a lane where the leaves carry batch axes.
+        """
+        judge = lambda mass, center, tensor: _judge(mass, center, tensor).result  # noqa: E731
+        for _ in range(self.mass.ndim):
+            judge = jax.vmap(judge)
+        return judge(self.mass, self.center_of_mass, self.inertia)  # pyright: ignore[reportReturnType]
+
+    def about(self, point: VectorLike) -> Matrix:
+        """Inertia tensor about any point.
+
+        Args:
+            point: Coordinates, not relative to the centre of mass [m].
+
+        Returns:
+            Tensor about the point, same axes [kg m^2].
+
+        Raises:
+            ValueError: Wrong shape (trace time).
+
+        Gradients: polynomial, finite everywhere.
+        Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> ball = jr.MassProperties(2.0, jnp.array([1.0, 0.0, 0.0]), jnp.ones(3))
+        >>> print(ball.about(jnp.zeros(3))[2, 2])
+        3.0
+        """
+        (point,) = float_arrays(point)
+        check_shape("point", point, (3,))
+        center, point = float_arrays(self.center_of_mass, point)
+        return self.inertia + self.mass * unit_steiner(point - center)
+
+    def translated(self, displacement: VectorLike) -> "MassProperties":
+        """The body moved by a displacement, without turning it.
+
+        Args:
+            displacement: Added to the centre of mass [m].
+
+        Returns:
+            The moved body.
+
+        Raises:
+            ValueError: Wrong shape (trace time).
+
+        Gradients: linear, finite everywhere.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> ball = jr.MassProperties(1.0, jnp.zeros(3), jnp.ones(3))
+        >>> print(ball.translated(jnp.array([0.0, 2.0, 0.0])).center_of_mass)
+        [0. 2. 0.]
+        """
+        (displacement,) = float_arrays(displacement)
+        check_shape("displacement", displacement, (3,))
+        center, displacement = float_arrays(self.center_of_mass, displacement)
+        return MassProperties(self.mass, center + displacement, self.inertia, throw=None)
+
+    def rotated(self, attitude: QuaternionLike) -> "MassProperties":
+        """The body turned about the origin of the coordinates.
+
+        Args:
+            attitude: Quaternion of the turn, any but zero; its norm drops out.
+
+        Returns:
+            The turned body: centre of mass R c, tensor R I R^T. After a zero quaternion they
+            are NaN and `result` is `invalid_position`.
+
+        Raises:
+            ValueError: Wrong shape (trace time).
+
+        Gradients: finite for any non-zero quaternion.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> rod = jr.solids.rod(1.0, 2.0).translated(jnp.array([0.0, 0.0, 1.0]))
+        >>> turned = rod.rotated(jr.rotation.exp(jnp.array([jnp.pi, 0.0, 0.0])))
+        >>> print(turned.center_of_mass.round(6)[2])
+        -1.0
+        """
+        center, tensor, attitude = float_arrays(self.center_of_mass, self.inertia, attitude)
+        check_shape("attitude", attitude, (4,))
+        turn = to_matrix(attitude)
+        turned = product("ij,jk,lk->il", turn, tensor, turn)
+        # The mark of an unphysical tensor, a diagonal without products, survives the turn.
+        turned = jnp.where(_is_marked_unphysical(tensor), tensor, turned)
+        return MassProperties(self.mass, product("ij,j->i", turn, center), turned, throw=None)
+
+    def principal_axes(self) -> PrincipalAxes:
+        """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`."""
+        return PrincipalAxes(*eigh(self.inertia))
+
+    def __add__(self, other: "MassProperties") -> "MassProperties":
+        """The two bodies rigidly joined."""
+        if not isinstance(other, MassProperties):
+            return NotImplemented
+        mass_a, center_a, inertia_a, mass_b, center_b, inertia_b = float_arrays(
+            self.mass, self.center_of_mass, self.inertia,
+            other.mass, other.center_of_mass, other.inertia,
+        )  # fmt: skip
+        mass = mass_a + mass_b
+        share = mass_b / mass
+        apart = center_b - center_a
+        inertia = inertia_a + inertia_b + mass_a * share * unit_steiner(apart)
+        return MassProperties(mass, center_a + share * apart, inertia, throw=None)
+
+    def __radd__(self, other: int) -> "MassProperties":
+        """Start of `sum`: 0 is no body."""
+        if isinstance(other, int) and other == 0:
+            return self
+        return NotImplemented
+
+
+def as_tensor(inertia: Array) -> Matrix:
+    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+def unit_steiner(displacement: Float[Array, "3"]) -> Matrix:
+    x, y, z = displacement
+    return jnp.stack(
+        [
+            jnp.stack([y * y + z * z, -x * y, -x * z]),
+            jnp.stack([-x * y, x * x + z * z, -y * z]),
+            jnp.stack([-x * z, -y * z, x * x + y * y]),
+        ]
+    )
+
+
+def _is_marked_unphysical(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
+    return jnp.all(jnp.isfinite(jnp.diagonal(tensor))) & jnp.all(
+        jnp.isnan(tensor) | jnp.eye(3, dtype=bool)
+    )
+
+
+@jax.jit
+def is_finite_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
+    return all_finite(tensor) & is_symmetric(tensor)
+
+
+def is_semidefinite(tensor: Float[Array, "3 3"], scale: Scalar) -> Bool[Array, ""]:
+    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots."""
+    # A few ulps off at any moments, where the roots of the cubic lose half the digits.
+    shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
+    rest = tensor + shift * jnp.eye(3, dtype=tensor.dtype)
+    left, fine = jnp.ones(3, bool), jnp.asarray(True)
+    for _ in range(3):
+        k = jnp.argmax(jnp.where(left, jnp.diagonal(rest), -jnp.inf))
+        row, pivot = rest[k], rest[k, k]
+        fine = fine & (pivot >= 0)
+        rest = rest - row[:, None] * row[None, :] / jnp.where(pivot > 0, pivot, 1.0)
+        left = left & (jnp.arange(3) != k)
+    return fine
+
+
+@jax.jit
+def is_physical(tensor: Float[Array, "3 3"]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether a tensor is positive semi-definite, and whether I3 <= I1 + I2, to rounding."""
+    tensor = jax.lax.stop_gradient(tensor)
+    trace = jnp.trace(tensor)
+    second = 0.5 * trace * jnp.eye(3, dtype=tensor.dtype) - tensor
+    return is_semidefinite(tensor, trace), is_semidefinite(second, trace)
+
+
+_NOT_A_BODY = (
+    "Argument `inertia` must hold three finite, non-negative principal moments or be a finite, "
+    "symmetric, positive semi-definite (3, 3) tensor, but it is not. (Three bodies are three "
+    "lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
+)
+
+
+def _judge(mass: Scalar, center_of_mass: Vector, tensor: Matrix) -> Findings:
+    mass, center_of_mass, tensor = jax.lax.stop_gradient((mass, center_of_mass, tensor))
+    findings = Findings()
+    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
+    findings.require(
+        all_finite(center_of_mass),
+        RESULTS.invalid_position,
+        "Argument `center_of_mass` must be finite, but it is not.",
+    )
+    positive, triangle = is_physical(tensor)
+    findings.require(~_is_marked_unphysical(tensor), RESULTS.unphysical_inertia)
+    findings.require(is_finite_symmetric(tensor) & positive, RESULTS.invalid_inertia, _NOT_A_BODY)
+    findings.require(triangle, RESULTS.unphysical_inertia)
+    return findings
+
+
+def raise_or_mark(
+    findings: Findings, body: tuple[Scalar, Vector, Matrix], throw: bool
+) -> tuple[Scalar, Vector, Matrix]:
+    """Raise, or turn what is wrong, and all that follows from it, into NaN.
+
+    What is left finite lets `MassProperties.result` recover the code: of an unphysical tensor
+    the diagonal, of an invalid one mass and centre, of an invalid position the mass.
+    """
+    if throw:
+        return findings.apply(body, throw)
+    mass, center_of_mass, tensor = body
+    unphysical = findings.result == RESULTS.unphysical_inertia
+    bad_tensor = unphysical | (findings.result == RESULTS.invalid_inertia)
+    bad_center = ~findings.ok & ~bad_tensor
+    bad_mass = bad_center & (findings.result != RESULTS.invalid_position)
+    kept = findings.ok | (unphysical & jnp.eye(3, dtype=bool))
+    return (
+        jnp.where(bad_mass, jnp.nan, mass),
+        jnp.where(bad_center, jnp.nan, center_of_mass),
+        jnp.where(kept, tensor, jnp.nan),
+    )
+
+
+def checked_tensor(inertia: ArrayLike, *others: ArrayLike) -> tuple[Array, ...]:
+    inertia, *rest = float_arrays(inertia, *others)
+    check_inertia_shape(inertia)
+    tensor = as_tensor(inertia)
+    findings = Findings()
+    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
+    return (findings.apply(tensor, True), *rest)
+
+
+NOT_SYMMETRIC = (
+    "Argument `inertia` must hold three finite principal moments or be a finite, symmetric (3, 3) "
+    "tensor, but it is not. (Three bodies are three lanes of `jax.vmap`, not the rows of a (3, 3) "
+    "array.)"
+)

@@ -1,0 +1,848 @@
+# ruff: noqa: E501
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import jrigid as jr
+from jrigid.mass import mesh_validity
+from jrigid.mass._mesh import _closed_numpy, _closed_traced
+
+EPS = np.finfo(float).eps
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+CUBE_FACES = np.array(
+    [
+        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+    ]
+)
+OUTWARD = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # of a right-handed tetrahedron
+# F. Tonon, Explicit exact formulas for the 3-D tetrahedron inertia tensor in terms of its vertex
+# coordinates, J. Math. Stat. 1 (2005) 8-11, the numerical example.
+TONON = np.array(
+    [
+        [8.33220, -11.86875, 0.93355],
+        [0.75523, 5.00000, 16.37072],
+        [52.61236, 5.00000, -5.38580],
+        [2.00000, 5.00000, 3.00000],
+    ]
+)
+# About the centroid, density 1: a, b, c and the integrals of y z, x z, x y (his a', b', c').
+TONON_MOMENTS = np.array([43520.33257, 194711.28938, 191168.76173])
+TONON_PRODUCTS = np.array([4417.66150, -46343.16662, 11996.20119])
+
+
+def rotation(seed):
+    axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return axes * np.linalg.det(axes)
+
+
+def symmetric(seed):
+    a = np.random.default_rng(seed).normal(size=(3, 3))
+    return a + a.T
+
+
+def inertia_of(second):
+    return np.trace(second) * np.eye(3) - second
+
+
+def assert_ulps(actual, expected, ulps):
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    scale = np.finfo(actual.dtype).eps * np.max(np.abs(expected))
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * scale)
+
+
+# --- worked examples -------------------------------------------------------------------------
+
+
+def test_cube_about_its_corner_and_its_centre():
+    mass, a = 3.0, 2.0
+    corner = mass * a**2 * (np.eye(3) * (2 / 3 + 1 / 4) - 1 / 4)
+    centre = mass * a**2 / 6 * np.eye(3)
+    density = mass / a**3
+    bodies = {
+        "solid": jr.solids.box(mass, jnp.full(3, a)).translated(jnp.full(3, a / 2)),
+        "mesh": jr.from_mesh(a * CUBE, CUBE_FACES, density),
+        "density": jr.from_density(lambda r: density + 0 * r[0], jnp.zeros(3), jnp.full(3, a)),
+    }
+    for name, body in bodies.items():
+        assert_ulps(body.about(jnp.zeros(3)), corner, 8), name
+        assert_ulps(body.inertia, centre, 8), name
+        assert_ulps(body.center_of_mass, np.full(3, a / 2), 8), name
+    # The space diagonal is a principal axis: M a^2 / 6; across it 11/12 M a^2.
+    principal = jr.principal_axes(bodies["solid"].about(jnp.zeros(3)))
+    assert_ulps(principal.moments, mass * a**2 * np.array([1 / 6, 11 / 12, 11 / 12]), 8)
+    assert_ulps(principal.axes[:, 0], np.full(3, 3**-0.5), 8)
+
+
+def test_rod_about_its_centre_and_its_end():
+    mass, length = 3.0, 2.0
+    rod = jr.solids.rod(mass, length)
+    assert_ulps(rod.inertia, mass * length**2 / 12 * np.diag([1, 1, 0]), 2)
+    end = rod.about(jnp.array([0.0, 0.0, -length / 2]))
+    assert_ulps(end, mass * length**2 / 3 * np.diag([1, 1, 0]), 2)
+
+
+def test_rectangular_lamina_about_a_corner():
+    mass, a, b = 2.0, 3.0, 1.5
+    tensor = jr.solids.lamina(mass, jnp.array([a, b])).about(jnp.array([-a / 2, -b / 2, 0.0]))
+    xy = -mass * a * b / 4
+    expected = [
+        [mass * b**2 / 3, xy, 0],
+        [xy, mass * a**2 / 3, 0],
+        [0, 0, mass * (a**2 + b**2) / 3],
+    ]
+    assert_ulps(tensor, expected, 4)
+    x, y, _ = np.asarray(jr.principal_axes(tensor).axes[:, 0])
+    np.testing.assert_allclose(
+        np.tan(2 * np.arctan2(y, x)), 3 * a * b / (2 * (a**2 - b**2)), rtol=20 * EPS
+    )
+
+
+def test_square_lamina_about_a_corner_has_its_diagonals_as_principal_axes():
+    lamina = jr.solids.lamina(1.0, jnp.array([1.0, 1.0])).about(jnp.array([-0.5, -0.5, 0.0]))
+    principal = jr.principal_axes(lamina)
+    assert_ulps(principal.moments, np.array([1 / 12, 7 / 12, 2 / 3]), 8)
+    root = 0.5**0.5
+    expected = np.array([[root, -root, 0], [root, root, 0], [0, 0, 1]])
+    assert_ulps(principal.axes, expected, 8)
+    # At the next corner the axis is (1, -1, 0): the tie of its components must not decide the sign.
+    flip = np.diag([1.0, -1.0, 1.0])
+    other = flip @ lamina @ flip
+    expected = np.array([[root, root, 0], [-root, root, 0], [0, 0, 1]])
+    for seed in range(8):
+        nudged = jr.principal_axes(other + 1e-13 * symmetric(seed)).axes
+        np.testing.assert_allclose(nudged, expected, atol=1e-11)
+
+
+def test_tonon_tetrahedron_with_products_of_inertia():
+    mesh = jr.from_mesh(TONON, OUTWARD, 1.0)
+    for body in (mesh, jr.solids.tetrahedron(mesh.mass, TONON)):
+        tensor = np.asarray(body.inertia)
+        found = np.concatenate([np.diag(tensor), -tensor[[1, 0, 0], [2, 2, 1]]])
+        printed = np.concatenate([TONON_MOMENTS, TONON_PRODUCTS])
+        # All six are printed 1.64e-8 too small: the volume there was rounded.
+        np.testing.assert_allclose(found, printed, rtol=2e-8)
+        np.testing.assert_allclose(found / found[1], printed / printed[1], rtol=2e-9)
+        np.testing.assert_allclose(body.center_of_mass, TONON.mean(0), rtol=8 * EPS)
+
+
+# --- composition and change of axes ----------------------------------------------------------
+
+
+def test_parallel_axis_round_trip_and_both_moments_and_tensors():
+    d = jnp.array([1.0, -2.0, 0.5])
+    for inertia in (
+        jnp.array([1.0, 2.0, 2.5]),
+        jnp.asarray(rotation(1) @ np.diag([1, 2, 2.5]) @ rotation(1).T),
+    ):
+        displaced = jr.parallel_axis(inertia, 3.0, d)
+        tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
+        direct = tensor + 3.0 * inertia_of(np.outer(d, d))
+        assert_ulps(displaced, direct, 4)
+        assert_ulps(jr.to_center_of_mass(displaced, 3.0, d), tensor, 64)
+
+
+def test_composition_equals_the_cloud_taken_at_once():
+    rng = np.random.default_rng(0)
+    masses, positions = rng.uniform(0.5, 2, 30), rng.normal(size=(30, 3)) + 5.0
+    whole = jr.from_points(masses, positions)
+    parts = sum(jr.from_points(masses[i : i + 10], positions[i : i + 10]) for i in (0, 10, 20))
+    singles = sum(
+        jr.MassProperties(m, r, np.zeros(3)) for m, r in zip(masses[:3], positions[:3], strict=True)
+    )
+    three = jr.from_points(masses[:3], positions[:3])
+    for a, b in ((parts, whole), (singles, three)):
+        assert_ulps(a.mass, b.mass, 8)
+        assert_ulps(a.center_of_mass, b.center_of_mass, 8)
+        assert_ulps(a.inertia, b.inertia, 32)
+    with pytest.raises(TypeError, match="unsupported operand"):
+        _ = whole + 1
+    with pytest.raises(TypeError, match="unsupported operand"):
+        _ = 1 + whole
+
+
+def test_rotation_and_translation_are_those_of_the_points():
+    rng = np.random.default_rng(1)
+    masses, positions = rng.uniform(0.5, 2, 20), rng.normal(size=(20, 3))
+    q, d = jnp.array([0.5, -1.0, 2.0, 0.3]), jnp.array([3.0, 1.0, -2.0])
+    turn = np.asarray(jr.rotation.to_matrix(q))
+    moved = jr.from_points(masses, positions).rotated(q).translated(d)
+    direct = jr.from_points(masses, positions @ turn.T + np.asarray(d))
+    assert_ulps(moved.center_of_mass, direct.center_of_mass, 8)
+    assert_ulps(moved.inertia, direct.inertia, 16)
+    origin = jr.inertia_tensor(masses, positions @ turn.T + np.asarray(d))
+    assert_ulps(moved.about(jnp.zeros(3)), origin, 16)
+    np.testing.assert_allclose(
+        moved.principal_axes().moments, jr.principal_axes(direct.inertia).moments, rtol=1e-14
+    )
+
+
+# --- points, densities, meshes ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("points", [1, 5, 1023, 1024, 5003])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_inertia_of_points_equals_numpy(points, dtype):
+    rng = np.random.default_rng(points)
+    masses = rng.uniform(0.5, 1.5, points).astype(dtype)
+    positions = (rng.normal(size=(points, 3)) @ symmetric(0)).astype(dtype)
+    exact = inertia_of(
+        np.einsum("n,na,nb->ab", *(np.float64(x) for x in (masses, positions, positions)))
+    )
+    tensor = jr.inertia_tensor(masses, positions)
+    assert tensor.dtype == dtype
+    assert_ulps(tensor, exact.astype(dtype), 16)
+    assert jr.from_points(masses, positions).result == jr.RESULTS.successful
+
+
+def test_derivatives_of_the_inertia_of_many_points_in_every_mode():
+    rng = np.random.default_rng(3)
+    m, r = jnp.asarray(rng.uniform(0.5, 1.5, 1500)), jnp.asarray(rng.normal(size=(1500, 3)))
+    weight, dm, dr = jnp.asarray(symmetric(4)), jnp.asarray(rng.normal(size=1500)), r[::-1]
+
+    def f(m, r):
+        return jnp.sum(weight * jr.inertia_tensor(m, r))
+
+    core = np.asarray(jnp.trace(weight) * jnp.eye(3) - weight)
+    gradient_m = np.einsum("na,ab,nb->n", r, core, r)
+    gradient_r = 2 * np.asarray(m)[:, None] * (np.asarray(r) @ core)
+
+    @jax.jit
+    def derivatives(m, r):
+        gradient = jax.grad(f, (0, 1))
+        return (
+            gradient(m, r),
+            jax.jvp(f, (m, r), (dm, dr))[1],
+            jax.jvp(gradient, (m, r), (dm, dr))[1],
+        )
+
+    (by_m, by_r), forward, (second_m, _) = derivatives(m, r)
+    np.testing.assert_allclose(by_m, gradient_m, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(by_r, gradient_r, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        forward, np.sum(gradient_m * dm) + np.sum(gradient_r * dr), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        second_m, 2 * np.einsum("na,ab,nb->n", r, core, dr), rtol=1e-10, atol=1e-11
+    )
+
+
+def test_a_body_far_from_the_origin_keeps_its_digits():
+    far = np.full(3, 1e6)
+    near_mesh, far_mesh = (jr.from_mesh(CUBE + d, CUBE_FACES) for d in (np.zeros(3), far))
+    # The corners themselves round to 1e6 eps = 2e-10, exactly: they are integers.
+    assert_ulps(far_mesh.inertia, near_mesh.inertia, 8)
+    assert_ulps(far_mesh.center_of_mass, far + 0.5, 2)
+    near, distant = (jr.from_points(np.ones(8), CUBE + d) for d in (np.zeros(3), far))
+    assert_ulps(distant.inertia, near.inertia, 8)
+
+
+def test_density_by_quadrature_is_exact_for_polynomials():
+    # rho = x y^2 over [0, 1] x [0, 2] x [1, 2]: moments by hand.
+    body = jr.from_density(
+        lambda r: r[0] * r[1] ** 2, jnp.array([0.0, 0, 1]), jnp.array([1.0, 2, 2]), order=3
+    )
+    x = [1 / 2, 1 / 3, 1 / 4]
+    y = [8 / 3, 4.0, 32 / 5]
+    z = [1.0, 3 / 2, 7 / 3]
+    mass = x[0] * y[0] * z[0]
+    centre = np.array([x[1] / x[0], y[1] / y[0], z[1] / z[0]])
+    second = np.array(
+        [
+            [x[2] * y[0] * z[0], x[1] * y[1] * z[0], x[1] * y[0] * z[1]],
+            [x[1] * y[1] * z[0], x[0] * y[2] * z[0], x[0] * y[1] * z[1]],
+            [x[1] * y[0] * z[1], x[0] * y[1] * z[1], x[0] * y[0] * z[2]],
+        ]
+    )
+    assert_ulps(body.mass, mass, 8)
+    assert_ulps(body.center_of_mass, centre, 8)
+    assert_ulps(body.about(jnp.zeros(3)), inertia_of(second), 8)
+    slope = jax.jit(jax.grad(
+        lambda p: jr.from_density(lambda r: 1 + p * r[0] ** 2, jnp.zeros(3), jnp.ones(3), order=4).mass
+    ))(1.0)  # fmt: skip
+    np.testing.assert_allclose(slope, 1 / 3, rtol=8 * EPS)
+
+
+def test_a_cavity_is_a_surface_turned_inward():
+    vertices = np.concatenate([4 * CUBE, 2 * CUBE + 1])
+    faces = np.concatenate([CUBE_FACES, CUBE_FACES[:, ::-1] + 8])
+    body = jr.from_mesh(vertices, faces)
+    np.testing.assert_allclose(body.mass, 64 - 8, rtol=4 * EPS)
+    assert_ulps(body.inertia, (64 * 16 - 8 * 4) / 6 * np.eye(3), 8)
+
+
+def test_derivatives_of_a_mesh_in_its_vertices():
+    weight, change = jnp.asarray(symmetric(5)), np.random.default_rng(6).normal(size=(8, 3))
+
+    def f(vertices):
+        body = jr.from_mesh(vertices, CUBE_FACES, 2.0)
+        return body.mass + jnp.sum(body.center_of_mass**2) + jnp.sum(weight * body.inertia)
+
+    value = jax.jit(f)
+    reverse, forward = jax.jit(
+        lambda v: (jnp.sum(jax.grad(f)(v) * change), jax.jvp(f, (v,), (jnp.asarray(change),))[1])
+    )(CUBE)
+    h = EPS ** (1 / 3)
+    central = (value(CUBE + h * change) - value(CUBE - h * change)) / (2 * h)
+    np.testing.assert_allclose(reverse, central, rtol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-13)
+    # Gauss: the volume grows by the flux of the displacement, three volumes for a dilation.
+    dilation = jax.jit(
+        lambda v: jax.jvp(lambda v: jr.from_mesh(v, CUBE_FACES).mass, (v,), (v,))[1]
+    )(CUBE)
+    np.testing.assert_allclose(dilation, 3.0, rtol=8 * EPS)
+
+
+def _bad_meshes():
+    flipped = CUBE_FACES.copy()
+    flipped[3] = flipped[3, ::-1]
+    out_of_range, negative = CUBE_FACES.copy(), CUBE_FACES.copy()
+    out_of_range[CUBE_FACES == 7] = 8
+    negative[CUBE_FACES == 7] = -1
+    degenerate = np.concatenate([CUBE_FACES, [[0, 0, 1], [1, 0, 0]]])
+    repeated = np.concatenate([CUBE_FACES, CUBE_FACES[:2]])
+    # Two tetrahedra that share an edge: four faces meet there.
+    four = np.concatenate([OUTWARD, [[0, 4, 1], [0, 1, 5], [0, 5, 4], [1, 4, 5]]])
+    soup = np.arange(36).reshape(12, 3)
+    closed, inside_out = jr.RESULTS.open_mesh, jr.RESULTS.inside_out_mesh
+    apex = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]])
+    big = np.concatenate([CUBE, CUBE * 0.9 + 5])  # a second cube, inside out and not inside
+    return {
+        "open": (CUBE, CUBE_FACES[:-1], closed),
+        "open by two faces": (CUBE, CUBE_FACES[:-2], closed),
+        "one face flipped": (CUBE, flipped, closed),
+        "index out of range": (CUBE, out_of_range, closed),
+        "negative index": (CUBE, negative, closed),
+        "degenerate faces": (CUBE, degenerate, closed),
+        "repeated faces": (CUBE, repeated, closed),
+        "four faces at an edge": (apex, four, closed),
+        "corners not merged": (CUBE[CUBE_FACES.ravel()], soup, closed),
+        "inside out": (CUBE, CUBE_FACES[:, ::-1].copy(), inside_out),
+        "flat": (CUBE * np.array([1, 1, 0]), CUBE_FACES, inside_out),
+        "a part inside out": (
+            big,
+            np.concatenate([CUBE_FACES, CUBE_FACES[:, ::-1] + 8]),
+            inside_out,
+        ),
+        "a corner at NaN": (
+            np.where(CUBE == 1, np.nan, CUBE),
+            CUBE_FACES,
+            jr.RESULTS.invalid_position,
+        ),
+    }
+
+
+BAD_MESHES = _bad_meshes()
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_bad_mesh_is_an_error_for_known_faces(name):
+    vertices, faces, code = BAD_MESHES[name]
+    assert mesh_validity(vertices, faces) == code
+    assert jr.from_mesh(vertices, faces, throw=False).result != jr.RESULTS.successful
+    messages = [
+        (jr.RESULTS.open_mesh, "closed surface"),
+        (jr.RESULTS.inside_out_mesh, "inside out"),
+        (jr.RESULTS.invalid_position, "`vertices` must be finite"),
+    ]
+    (message,) = [text for item, text in messages if item == code]
+    with pytest.raises(RuntimeError, match=message):
+        jr.from_mesh(vertices, faces)
+
+
+@pytest.mark.parametrize("name", ["open by two faces", "one face flipped", "index out of range",
+                                  "negative index", "degenerate faces", "repeated faces",
+                                  "four faces at an edge", "inside out", "corners not merged"])  # fmt: skip
+def test_bad_mesh_is_found_among_traced_faces(name):
+    vertices, faces, code = BAD_MESHES[name]
+    assert jax.jit(mesh_validity)(vertices, faces) == code
+
+
+@pytest.mark.parametrize(
+    "fault", ["two faces gone", "four faces gone", "one flipped", "two doubled"]
+)
+def test_open_meshes_are_found_however_their_vertices_are_numbered(fault):
+    rng = np.random.default_rng(17)
+    meshes = []
+    for _ in range(200):
+        faces = rng.permutation(8)[CUBE_FACES][rng.permutation(12)]
+        if fault == "one flipped":
+            faces[0] = faces[0, ::-1]
+        meshes.append(
+            {
+                "two faces gone": faces[2:],
+                "four faces gone": faces[4:],
+                "one flipped": faces,
+                "two doubled": np.concatenate([faces, faces[:2]]),
+            }[fault]
+        )
+    assert not any(_closed_numpy(faces, 8) for faces in meshes)
+    traced = jax.jit(jax.vmap(lambda faces: _closed_traced(faces, 8)))(np.stack(meshes))
+    assert not np.any(traced)
+
+
+def test_traced_faces_of_a_good_mesh_pass_whatever_their_order():
+    rng = np.random.default_rng(7)
+    for _ in range(3):
+        order, roll = rng.permutation(12), rng.integers(3)
+        faces = np.roll(CUBE_FACES[order], roll, axis=1)
+        assert jax.jit(mesh_validity)(CUBE, faces) == jr.RESULTS.successful
+        assert mesh_validity(CUBE, faces) == jr.RESULTS.successful
+    odd = jax.jit(lambda v, f: jr.from_mesh(v, f, throw=False).result)(CUBE, CUBE_FACES[:-1])
+    assert odd == jr.RESULTS.invalid_mass
+    body = eqx.filter_jit(jr.from_mesh)(CUBE, jnp.asarray(CUBE_FACES))
+    np.testing.assert_allclose(body.mass, 1.0, rtol=4 * EPS)
+
+
+# --- principal axes and functions of a tensor ------------------------------------------------
+
+
+def test_principal_axes_rebuild_the_tensor_in_order_right_handed_with_fixed_signs():
+    rng = np.random.default_rng(8)
+    for dtype in (np.float32, np.float64):
+        axes = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
+        moments = 10 ** rng.uniform(-6, 0, size=(500, 3))
+        moments[:100, 1] = moments[:100, 0]
+        moments[100:200, 2] = moments[100:200, 1] * (1 + 10 ** rng.uniform(-16, -2, 100))
+        tensors = np.einsum("nij,nj,nkj->nik", axes, moments, axes).astype(dtype)
+        tensors = (tensors + np.swapaxes(tensors, 1, 2)) / 2
+        found = jax.jit(jax.vmap(jr.principal_axes))(tensors)
+        turned = np.float64(found.axes)
+        rebuilt = np.einsum("nij,nj,nkj->nik", turned, np.float64(found.moments), turned)
+        eps = np.finfo(dtype).eps
+        scale = np.max(np.abs(tensors), axis=(1, 2), keepdims=True)
+        assert np.max(np.abs(rebuilt - tensors) / scale) < 16 * eps
+        assert np.max(np.abs(np.swapaxes(turned, 1, 2) @ turned - np.eye(3))) < 8 * eps
+        assert np.all(np.linalg.det(turned) > 0)
+        assert np.all(np.diff(found.moments, axis=1) >= 0)
+        leading = np.abs(turned) >= 0.9 * np.max(np.abs(turned), axis=1, keepdims=True)
+        first = np.take_along_axis(turned, np.argmax(leading, axis=1)[:, None], axis=1)[:, 0]
+        assert np.all(first[:, [0, 2]] > 0)
+
+
+def test_principal_axes_of_diagonal_tensors_are_exact():
+    for moments in ([1.0, 2.0, 3.0], [0.1, 0.1, 0.3], [0.7, 0.7, 0.7], [0.0, 0.0, 0.0]):
+        found = jr.principal_axes(jnp.array(moments))
+        np.testing.assert_array_equal(found.moments, moments)
+        np.testing.assert_array_equal(found.axes, np.eye(3))
+    found = jr.principal_axes(jnp.array([3.0, 2.0, 1.0]))
+    np.testing.assert_array_equal(found.axes, [[0, 0, 1], [0, -1, 0], [1, 0, 0]])
+    tiny = jr.principal_axes(jnp.array([3.0, 2.0, 1.0]) * 1e-300).moments
+    np.testing.assert_array_equal(tiny, np.array([1.0, 2.0, 3.0]) * 1e-300)
+
+
+GAPS = [0.0, *(10.0**-k for k in (16, 15, 14, 12, 10, 8, 6, 4, 3))]
+REPEATED = np.array(
+    [
+        *([1 + g, 1 + 2 * g, 1.0] for g in GAPS),  # near the sphere
+        *([1.0, 1 + g, 1.5] for g in GAPS),
+        *([0.7, 1.0, 1 + g] for g in GAPS),
+    ]
+)
+
+
+def near_repeated():
+    turned = [rotation(i) @ np.diag(m) @ rotation(i).T for i, m in enumerate(REPEATED)]
+    tensors = np.concatenate([[np.diag(m) for m in REPEATED], turned])
+    return (tensors + np.swapaxes(tensors, 1, 2)) / 2
+
+
+def test_first_derivatives_of_symmetric_functions_of_moments_at_repeated_moments():
+    # Exact by algebra: sum 1/m = tr I^-1, sum m^3 = tr I^3, prod m = det I.
+    functions = {
+        "sum of reciprocals": (lambda m: jnp.sum(1 / m), lambda a: -np.linalg.inv(a @ a)),
+        "sum of cubes": (lambda m: jnp.sum(m**3), lambda a: 3 * a @ a),
+        "product": (jnp.prod, lambda a: np.linalg.det(a) * np.linalg.inv(a)),
+        "middle of pairs": (
+            lambda m: m[0] * m[1] + m[1] * m[2] + m[0] * m[2],
+            lambda a: np.trace(a) * np.eye(3) - a,
+        ),
+    }
+    tensors = near_repeated()
+    directions = np.stack([symmetric(100 + i) for i in range(len(tensors))])
+
+    @jax.jit
+    @jax.vmap
+    def derivatives(tensor, direction):
+        def composed(name):
+            return lambda tensor: functions[name][0](jr.principal_axes(tensor).moments)
+
+        return {
+            name: (
+                jax.grad(composed(name))(tensor),
+                jax.jvp(composed(name), (tensor,), (direction,))[1],
+            )
+            for name in functions
+        }
+
+    found = derivatives(tensors, directions)
+    for name, (_, exact) in functions.items():
+        reverse, forward = found[name]
+        expected = np.stack([exact(tensor) for tensor in tensors])
+        np.testing.assert_allclose(reverse, expected, atol=2e-14 * np.max(np.abs(expected)))
+        along = np.einsum("nij,nij->n", expected, directions)
+        np.testing.assert_allclose(forward, along, atol=1e-13 * np.max(np.abs(along)))
+
+
+def test_derivatives_of_axes_where_moments_are_apart_and_their_finiteness_where_they_repeat():
+    direction = jnp.asarray(symmetric(9))
+    tensor = jnp.asarray(rotation(2) @ np.diag([1.0, 1.7, 2.3]) @ rotation(2).T)
+    slope = jax.jit(
+        lambda tensor: jax.jvp(lambda x: jr.principal_axes(x).axes, (tensor,), (direction,))[1]
+    )
+    axes = jax.jit(lambda tensor: jr.principal_axes(tensor).axes)
+    h = EPS ** (1 / 3)
+    central = (axes(tensor + h * direction) - axes(tensor - h * direction)) / (2 * h)
+    np.testing.assert_allclose(slope(tensor), central, atol=1e-8)
+    np.testing.assert_array_equal(slope(jnp.eye(3)), 0.0)
+    assert np.all(np.isfinite(slope(jnp.diag(jnp.array([1.0, 1.0, 2.0])))))
+
+
+ORDERS = {
+    "forward over forward": (jax.jacfwd, jax.jacfwd),
+    "forward over reverse": (jax.jacfwd, jax.jacrev),
+    "reverse over forward": (jax.jacrev, jax.jacfwd),
+    "reverse over reverse": (jax.jacrev, jax.jacrev),
+}
+
+
+def test_tensor_function_to_second_order_at_repeated_moments():
+    # Exact by algebra, f = 1/x: D f[H] = -J H J, D2 f[H, G] = J H J G J + J G J H J, J = I^-1;
+    # f = x^3: D f[H] = H I I + I H I + I I H and so on.
+    tensors = near_repeated()
+    h_all = np.stack([symmetric(200 + i) for i in range(len(tensors))])
+    g_all = np.stack([symmetric(300 + i) for i in range(len(tensors))])
+
+    def exact(tensor, h, g):
+        j = np.linalg.inv(tensor)
+        inverse = -j @ h @ j, j @ h @ j @ g @ j + j @ g @ j @ h @ j
+        cube = (
+            h @ tensor @ tensor + tensor @ h @ tensor + tensor @ tensor @ h,
+            sum(a @ b @ c for a, b, c in ((h, g, tensor), (g, h, tensor), (h, tensor, g),
+                                          (g, tensor, h), (tensor, h, g), (tensor, g, h))),
+        )  # fmt: skip
+        return inverse, cube
+
+    @jax.jit
+    @jax.vmap
+    def found(tensor, h, g):
+        def orders(f):
+            def first(tensor):
+                return jax.jvp(lambda x: jr.tensor_function(f, x), (tensor,), (h,))[1]
+
+            return jax.jvp(first, (tensor,), (g,))
+
+        return orders(lambda x: 1 / x), orders(lambda x: x**3)
+
+    expected = [exact(*case) for case in zip(tensors, h_all, g_all, strict=True)]
+    for k, pair in enumerate(found(tensors, h_all, g_all)):
+        for order, values in enumerate(pair):
+            wanted = np.stack([case[k][order] for case in expected])
+            scale = np.max(np.abs(wanted), axis=(1, 2), keepdims=True)
+            assert np.max(np.abs(values - wanted) / scale) < (1e-13, 1e-12)[order]
+
+
+def test_tensor_function_second_derivatives_agree_in_every_mode_and_in_parameters():
+    # sum(weight * I^p), p captured by the closure: d/dp of tr I^p is tr(I^p log I).
+    weight = jnp.asarray(symmetric(11))
+
+    def f(tensor, p):
+        return jnp.sum(weight * jnp.sin(jr.tensor_function(lambda m: m**p, tensor)))
+
+    cases = jnp.stack(
+        [jnp.eye(3), jnp.diag(jnp.array([1.0, 1.0, 1.5])), jnp.asarray(near_repeated()[-3])]
+    )
+    p = jnp.asarray(0.7)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def every(cases):
+        second = {name: jax.vmap(lambda x, o=o: o[0](o[1](f))(x, p))(cases) for name, o in ORDERS.items()}  # fmt: skip
+        mixed = jax.vmap(lambda x: jax.jacrev(jax.grad(f), argnums=1)(x, p))(cases)
+        return second, mixed
+
+    gradient = jax.jit(jax.vmap(jax.grad(f), in_axes=(0, None)))
+    second, mixed = every(cases)
+    reference = second.pop("forward over forward")
+    for other in second.values():
+        np.testing.assert_allclose(other, reference, atol=1e-13)
+    h = EPS ** (1 / 3)
+    for i, j in ((0, 1), (1, 2), (0, 0)):
+        step = np.zeros((3, 3))
+        step[i, j] += h / 2
+        step[j, i] += h / 2
+        central = (gradient(cases + step[None], p) - gradient(cases - step[None], p)) / (2 * h)
+        expected = 0.5 * (reference[..., i, j] + reference[..., j, i])
+        np.testing.assert_allclose(central, expected, atol=1e-9)
+    central = (gradient(cases, p + h) - gradient(cases, p - h)) / (2 * h)
+    np.testing.assert_allclose(mixed, central, atol=1e-9)
+
+
+@functools.partial(jax.jit, compiler_options=QUICK)
+def square_root_and_slopes(tensor, h, g):
+    def first(tensor):
+        return jax.jvp(lambda x: jr.tensor_function(jnp.sqrt, x), (tensor,), (h,))[1]
+
+    return jax.jvp(first, (tensor,), (g,))
+
+
+@pytest.mark.parametrize("moments", [[1.0, 1.0, 1.0], [1.0, 1 + 1e-9, 1.5], [1e-4, 1.0, 1 + 1e-5]])
+def test_tensor_function_square_root_against_mpmath(moments):
+    mpmath.mp.dps = 60
+    tensor = rotation(3) @ np.diag(moments) @ rotation(3).T
+    tensor = (tensor + tensor.T) / 2
+    h, g = symmetric(12), symmetric(13)
+
+    def root(step_h, step_g):
+        steps = [mpmath.matrix(x.tolist()) for x in (tensor, h, g)]
+        values, axes = mpmath.eigsy(steps[0] + step_h * steps[1] + step_g * steps[2])
+        return axes * mpmath.diag([mpmath.sqrt(x) for x in values]) * axes.T
+
+    e = mpmath.mpf(10) ** -15
+    first = (root(e, 0) - root(-e, 0)) / (2 * e)
+    second = (root(e, e) - root(e, -e) - root(-e, e) + root(-e, -e)) / (4 * e * e)
+    first, second = (np.array(x.tolist(), float) for x in (first, second))
+    found = square_root_and_slopes(tensor, h, g)
+    tolerance = 30 * EPS * max(moments) / min(moments)
+    np.testing.assert_allclose(found[0], first, atol=tolerance * np.max(np.abs(first)))
+    np.testing.assert_allclose(found[1], second, atol=30 * tolerance * np.max(np.abs(second)))
+
+
+def test_third_derivatives_of_tensor_function_raise_instead_of_being_wrong():
+    def f(tensor):
+        return jnp.trace(jr.tensor_function(jnp.exp, tensor))
+
+    forward = jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))
+    reverse = jax.grad(lambda x: jax.hessian(f)(x)[0, 0, 0, 0])
+    for third in (forward, reverse):
+        with pytest.raises(NotImplementedError, match="Third derivatives"):
+            jax.jit(third)(jnp.eye(3))
+
+
+# --- transformations and precision -----------------------------------------------------------
+
+
+def every_function(x):
+    """All of the module's functions of one array (3,) near one; x[0] < x[1] + x[2] and so on."""
+    tensor = jnp.diag(x) + 0.1 * x[0] * (jnp.ones((3, 3), x.dtype) - jnp.eye(3, dtype=x.dtype))
+    quaternion = jnp.concatenate([x, x[:1]])
+    body = jr.MassProperties(x[0], x, tensor)
+    points = jnp.stack([x, 2 * x[::-1], -x])
+    principal = jr.principal_axes(tensor)
+    return {
+        "from_points": jr.from_points(x, points),
+        "inertia_tensor": jr.inertia_tensor(x, points),
+        "from_density": jr.from_density(lambda r: 1 + jnp.sum((r * x) ** 2), -x, x, order=3),
+        "from_mesh": jr.from_mesh(jnp.asarray(CUBE, x.dtype) * x[None, :], CUBE_FACES, x[1]),
+        "parallel_axis": jr.parallel_axis(x, x[0], x),
+        "to_center_of_mass": jr.to_center_of_mass(tensor, 0.01 * x[0], x),
+        "principal_axes": principal.moments,
+        "axes": principal.axes,
+        "tensor_function": jr.tensor_function(jnp.log, tensor),
+        "body": body,
+        "about": body.about(2 * x),
+        "sum": body.translated(x).rotated(quaternion) + body,
+        "method": body.principal_axes().moments,
+    }
+
+
+def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
+    x64 = jnp.array([1.0, 1.1, 1.3])
+
+    def everything(x):
+        def total(x):
+            return sum(jnp.sum(jnp.cos(leaf)) for leaf in jax.tree.leaves(every_function(x)))
+
+        slopes, values = jax.jacfwd(lambda x: (every_function(x),) * 2, has_aux=True)(x)
+        return values, slopes, jax.grad(total)(x)
+
+    def forward_total(values, slopes):
+        pairs = zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True)
+        return sum(-np.tensordot(np.sin(v), s, axes=np.ndim(v)) for v, s in pairs)
+
+    batched = jax.jit(jax.vmap(everything), compiler_options=QUICK)
+    results = {}
+    for dtype in (jnp.float64, jnp.float32):
+        values, slopes, gradient = batched(jnp.stack([x64, x64[::-1]]).astype(dtype))
+        assert all(leaf.dtype == dtype for leaf in jax.tree.leaves((values, slopes, gradient)))
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((values, slopes)))
+        one = jax.tree.map(lambda leaf: np.asarray(leaf[0]), (values, slopes))
+        scale = np.max(np.abs(gradient))
+        np.testing.assert_allclose(
+            forward_total(*one), gradient[0], atol=100 * jnp.finfo(dtype).eps * scale
+        )
+        results[dtype] = (values, slopes)
+    eager = every_function(x64)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b[0], atol=1e-14), eager, results[jnp.float64][0]
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4),
+        results[jnp.float32],
+        results[jnp.float64],
+    )
+
+
+def test_a_gradient_in_mass_properties_has_their_shape():
+    body = jr.solids.box(1.0, jnp.array([1.0, 2.0, 3.0]))
+    gradient = jax.grad(lambda body: jnp.trace(body.about(jnp.ones(3))))(body)
+    assert isinstance(gradient, jr.MassProperties)
+    np.testing.assert_allclose(gradient.mass, 6.0)
+    np.testing.assert_allclose(gradient.inertia, np.eye(3))
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+ONES, ZEROS = np.ones(3), np.zeros(3)
+SKEW = np.arange(9.0).reshape(3, 3)
+THREE_LANES = np.array([[1.0, 2.0, 2.5], [1.0, 1.0, 1.5], [2.0, 2.0, 2.0]])
+POINTS = np.eye(3)
+
+BAD_VALUES = {
+    "negative mass": (jr.MassProperties, (-1.0, ZEROS, ONES), "`mass` must be positive"),
+    "zero mass": (jr.MassProperties, (0.0, ZEROS, ONES), "`mass` must be positive"),
+    "NaN mass": (jr.MassProperties, (np.nan, ZEROS, ONES), "`mass` must be positive"),
+    "NaN centre": (jr.MassProperties, (1.0, ZEROS * np.nan, ONES), "`center_of_mass` must be finite"),
+    "NaN moment": (jr.MassProperties, (1.0, ZEROS, ONES * np.nan), "`inertia` must hold three"),
+    "infinite moment": (jr.MassProperties, (1.0, ZEROS, ONES * np.inf), "`inertia` must hold three"),
+    "negative moment": (jr.MassProperties, (1.0, ZEROS, np.array([-0.1, 1, 1])), "`inertia` must hold three"),
+    "three lanes of moments": (jr.MassProperties, (1.0, ZEROS, THREE_LANES), "three lanes of `jax.vmap`"),
+    "triangle inequality": (jr.MassProperties, (1.0, ZEROS, np.array([1.0, 1.0, 2.1])), "real body"),
+    "negative point mass": (jr.from_points, (-ONES, POINTS), "`masses` must be finite and non-negative"),
+    "massless points": (jr.from_points, (ZEROS, POINTS), "`masses` must be finite and non-negative"),
+    "NaN point mass": (jr.from_points, (ONES * np.nan, POINTS), "`masses` must be finite"),
+    "NaN position": (jr.from_points, (ONES, POINTS * np.nan), "`positions` must be finite"),
+    "negative mass in a tensor": (jr.inertia_tensor, (-ONES, POINTS), "`masses` must be finite"),
+    "negative density": (lambda c: jr.from_density(lambda r: c * r[0], ZEROS, ONES), (-1.0,), "`density` must be finite"),
+    "NaN density": (lambda c: jr.from_density(lambda r: c * r[0], ZEROS, ONES), (np.nan,), "`density` must be finite"),
+    "box turned round": (lambda a, b: jr.from_density(lambda r: 1 + r[0], a, b), (ONES, ZEROS), "`lower` < `upper`"),
+    "negative density of a mesh": (lambda d: jr.from_mesh(CUBE, CUBE_FACES, d), (-1.0,), "`density` must be positive"),
+    "skew tensor displaced": (jr.parallel_axis, (SKEW, 1.0, ONES), "symmetric"),
+    "NaN tensor displaced": (jr.parallel_axis, (ONES * np.nan, 1.0, ONES), "finite"),
+    "three lanes displaced back": (jr.to_center_of_mass, (THREE_LANES, 1.0, ONES), "three lanes of `jax.vmap`"),
+    "displaced back too far": (jr.to_center_of_mass, (ONES, 1.0, ONES), "comes out negative"),
+    "axes of a skew tensor": (jr.principal_axes, (SKEW,), "symmetric"),
+    "axes of three lanes": (jr.principal_axes, (THREE_LANES,), "three lanes of `jax.vmap`"),
+    "axes of NaN": (jr.principal_axes, (ONES * np.nan,), "finite"),
+    "function of a skew tensor": (lambda x: jr.tensor_function(jnp.exp, x), (SKEW,), "symmetric"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_VALUES)
+def test_bad_value_is_an_error(name):
+    function, arguments, message = BAD_VALUES[name]
+    with pytest.raises(RuntimeError, match=message):
+        function(*arguments)
+
+
+@pytest.mark.parametrize(
+    "name", ["negative mass", "three lanes of moments", "triangle inequality", "NaN position",
+             "negative density", "displaced back too far", "axes of three lanes"]
+)  # fmt: skip
+def test_bad_value_is_an_error_under_jit(name):
+    function, arguments, message = BAD_VALUES[name]
+    with pytest.raises(RuntimeError, match=message):
+        jax.block_until_ready(eqx.filter_jit(function)(*arguments))
+
+
+def lanes_of(function, lanes):
+    """One good, one bad, one good lane of each argument, under vmap with throw=False."""
+    return jax.jit(jax.vmap(lambda *a: function(*a, throw=False)))(*lanes), [
+        function(*(x[i] for x in lanes)) for i in (0, 2)
+    ]
+
+
+CODES = jr.RESULTS
+BAD_LANES = {
+    "negative mass": (jr.MassProperties, ([1.0, -1, 2], [ONES] * 3, [ONES] * 3), CODES.invalid_mass),
+    "NaN centre": (jr.MassProperties, ([1.0, 1, 2], [ONES, ONES * np.nan, ONES], [ONES] * 3), CODES.invalid_position),
+    "three lanes of moments": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [np.eye(3), THREE_LANES, np.eye(3)]), CODES.invalid_inertia),
+    "NaN inertia": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, ONES * np.nan, ONES]), CODES.invalid_inertia),
+    "triangle inequality": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, [1, 1, 3.0], ONES]), CODES.unphysical_inertia),
+    "points: negative mass": (jr.from_points, ([ONES, -ONES, ONES], [POINTS] * 3), CODES.invalid_mass),
+    "points: NaN": (jr.from_points, ([ONES] * 3, [POINTS, POINTS * np.nan, POINTS]), CODES.invalid_position),
+    "mesh inside out": (lambda v, throw=True: jr.from_mesh(v, CUBE_FACES, throw=throw), ([CUBE, -CUBE, 2 * CUBE],), CODES.invalid_mass),
+    "mesh open": (lambda f, throw=True: jr.from_mesh(CUBE, f, throw=throw), (np.stack([CUBE_FACES, np.roll(CUBE_FACES, 1, 0) * 0 + CUBE_FACES[:1], CUBE_FACES]),), CODES.invalid_mass),
+    "negative density": (lambda c, throw=True: jr.from_density(lambda r: c * r[0], ZEROS, ONES, order=2, throw=throw), ([1.0, -1, 2],), CODES.invalid_mass),
+    "axes": (jr.principal_axes, ([np.eye(3), SKEW, 2 * np.eye(3)],), CODES.invalid_inertia),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_LANES)
+def test_bad_lane_gets_a_code_and_leaves_the_others_alone(name):
+    function, lanes, code = BAD_LANES[name]
+    batch, good = lanes_of(function, [np.asarray(x) for x in lanes])
+    for i, alone in zip((0, 2), good, strict=True):
+        lane = jax.tree.map(lambda x, i=i: x[i], batch)
+        assert lane.result == CODES.successful
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * EPS), lane, alone)
+    bad = jax.tree.map(lambda x: x[1], batch)
+    assert bad.result == code
+    assert any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(bad))
+    assert np.array_equal(np.asarray(batch.result == CODES.successful), [True, False, True])
+
+
+def test_the_code_of_a_bad_body_survives_what_is_done_with_it():
+    good = jr.solids.sphere(1.0, 1.0)
+    bad = [
+        (CODES.invalid_mass, (-1.0, ZEROS, ONES)),
+        (CODES.invalid_position, (1.0, ZEROS * np.nan, ONES)),
+        (CODES.invalid_inertia, (1.0, ZEROS, -ONES)),
+        (CODES.unphysical_inertia, (1.0, ZEROS, np.array([1.0, 1, 3]))),
+    ]
+    q = jnp.array([1.0, 2.0, 3.0, 4.0])
+    for code, values in bad:
+        body = jr.MassProperties(*values, throw=False)
+        for later in (body, good + body, body.translated(jnp.ones(3)), body.rotated(q)):
+            assert later.result == code
+    assert good.rotated(jnp.zeros(4)).result == CODES.invalid_position
+
+
+def test_thin_bodies_are_bodies():
+    for moments in ([1.0, 1.0, 2.0], [0.3, 0.4, 0.7], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]):
+        body = jr.MassProperties(1.0, ZEROS, np.array(moments))
+        for seed in range(4):
+            turned = body.rotated(jnp.asarray(np.random.default_rng(seed).normal(size=4)))
+            assert turned.result == CODES.successful
+
+
+WRONG_SHAPES = {
+    "mass": (jr.MassProperties, (ONES, ZEROS, ONES), r"`mass` must have shape \(\)"),
+    "centre": (jr.MassProperties, (1.0, np.zeros(2), ONES), r"`center_of_mass` must have shape \(3,\)"),
+    "inertia": (jr.MassProperties, (1.0, ZEROS, np.ones(6)), r"`inertia` must have shape \(3,\) or"),
+    "masses": (jr.from_points, (np.ones((3, 1)), POINTS), r"`masses` must have shape \(n,\)"),
+    "positions": (jr.from_points, (ONES, POINTS[:2]), r"`positions` must have shape \(3, 3\)"),
+    "no points": (jr.from_points, (np.ones(0), np.ones((0, 3))), "at least one point"),
+    "tensor of nothing": (jr.inertia_tensor, (np.ones(0), np.ones((0, 3))), "at least one point"),
+    "lower": (lambda: jr.from_density(jnp.sum, np.zeros(2), ONES), (), r"`lower` must have shape"),
+    "upper": (lambda: jr.from_density(jnp.sum, ZEROS, np.ones(2)), (), r"`upper` must have shape"),
+    "order": (lambda: jr.from_density(jnp.sum, ZEROS, ONES, order=1), (), "`order` must be an integer"),
+    "density": (lambda: jr.from_density(lambda r: r, ZEROS, ONES), (), "`density` must map"),
+    "vertices": (jr.from_mesh, (CUBE[:, :2], CUBE_FACES), r"`vertices` must have shape \(n, 3\)"),
+    "faces": (jr.from_mesh, (CUBE, CUBE_FACES.ravel()), r"`faces` must have shape \(n, 3\)"),
+    "fractional faces": (jr.from_mesh, (CUBE, CUBE_FACES * 1.0), "`faces` must hold integers"),
+    "no faces": (jr.from_mesh, (CUBE, CUBE_FACES[:0]), "at least one face"),
+    "mesh density": (jr.from_mesh, (CUBE, CUBE_FACES, ONES), r"`density` must have shape \(\)"),
+    "displaced tensor": (jr.parallel_axis, (np.ones(2), 1.0, ONES), "`inertia` must have shape"),
+    "displaced mass": (jr.parallel_axis, (ONES, ONES, ONES), "`mass` must have shape"),
+    "displacement": (jr.to_center_of_mass, (ONES, 1.0, 1.0), "`displacement` must have shape"),
+    "mass displaced back": (jr.to_center_of_mass, (ONES, ONES, ONES), "`mass` must have shape"),
+    "axes": (jr.principal_axes, (np.ones((3, 2)),), "`inertia` must have shape"),
+    "function": (lambda: jr.tensor_function(lambda x: jnp.stack([x, x]), ONES), (), "`f` must map"),
+    "point": (lambda: jr.solids.rod(1.0, 1.0).about(1.0), (), "`point` must have shape"),
+    "shift": (lambda: jr.solids.rod(1.0, 1.0).translated(1.0), (), "`displacement` must have shape"),
+    "turn": (lambda: jr.solids.rod(1.0, 1.0).rotated(ONES), (), "`attitude` must have shape"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG_SHAPES)
+def test_wrong_shape_is_an_error(name, untyped):
+    function, arguments, message = WRONG_SHAPES[name]
+    with pytest.raises(ValueError, match=message):
+        function(*arguments)

@@ -1,0 +1,494 @@
+"""simulate(): accuracy, conservation, derivatives, result codes, bad input."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy.linalg
+from free_reference import free_motion
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR
+from reference import heavy_body
+
+import jrigid as jr
+
+FORWARD = diffrax.ForwardMode()
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+# Accuracy ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ten_thousand_turns():
+    start = np.array([0.3, 0.5, 0.8])
+    ts = np.array([0.3, 1.0]) * 1e4 * 2 * np.pi / np.linalg.norm(start)
+    motion = free_motion(MOMENTS, ATTITUDE, start, ts)
+    attitudes = np.array([[float(c) for c in q] for q, _ in motion])
+    omegas = np.array([[float(c) for c in w] for _, w in motion])
+    return start, ts, attitudes, omegas
+
+
+@pytest.mark.parametrize(
+    ("rtol", "unit"),
+    [(1e-4, 1), (1e-6, 1), (1e-8, 1), (1e-10, 1), (1e-12, 1), (1e-8, 1e-7), (1e-8, 1e4)],
+)
+def test_ten_thousand_turns_keep_the_promised_accuracy(ten_thousand_turns, rtol, unit):
+    """DESIGN.md's bars for integration; omega in other units of time behaves the same."""
+    start, ts, attitudes, omegas = ten_thousand_turns
+    body = jr.RigidBody(MOMENTS)
+    state0 = jr.State(ATTITUDE, start * unit)
+    trajectory = jr.simulate(body, state0, ts / unit, rtol=rtol)
+    bar = np.maximum(rtol, 100 * 2.2e-16) * (1 + ts * np.linalg.norm(start))
+    energy0 = body.energy(0.0, state0, None)
+    momentum0 = np.asarray(body.angular_momentum(0.0, state0, None))
+    momentum = np.asarray(trajectory.angular_momentum)
+    assert np.all(np.abs(np.asarray(trajectory.energy) / float(energy0) - 1) <= bar)
+    error = np.linalg.norm(momentum - momentum0, axis=1)
+    assert np.all(error <= bar * np.linalg.norm(momentum0))
+    error = np.linalg.norm(np.asarray(trajectory.states.omega) / unit - omegas, axis=1)
+    assert np.all(error <= 10 * bar * np.linalg.norm(start))
+    angle = jax.vmap(jr.rotation.angle_between)(attitudes, trajectory.states.attitude)
+    assert np.all(angle <= 10 * bar)
+    norms = np.linalg.norm(trajectory.states.attitude, axis=1)
+    np.testing.assert_allclose(norms, 1, rtol=0, atol=1e-14)
+
+
+def test_default_tolerance_follows_the_dtype_and_float32_warns():
+    body = jr.RigidBody(MOMENTS.astype(np.float32))
+    state0 = jr.State(UPRIGHT.astype(np.float32), OMEGA.astype(np.float32))
+    ts = np.linspace(0, 100, 5, dtype=np.float32)
+    with pytest.warns(UserWarning, match="float32"):
+        trajectory = jr.simulate(body, state0, ts)
+    assert trajectory.states.omega.dtype == jnp.float32
+    energy = np.asarray(trajectory.energy, float)
+    # floor 100 eps (1 + radians)
+    assert np.all(np.abs(energy / energy[0] - 1) <= 1.2e-5 * (1 + ts))
+    with pytest.raises(ValueError, match="`rtol` must be at least 1e-07"):
+        jr.simulate(body, state0, ts, rtol=1e-9)
+
+
+# Derivatives ---------------------------------------------------------------------------------
+
+WOBBLES = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 0.1)
+
+
+def _spins():
+    cases = []
+    for moments in ((1.0, 1.0, 1.5), (1.0, 2.0, 3.0)):
+        for axis in range(3):
+            for wobble in WOBBLES:
+                omega = np.zeros(3)
+                omega[axis] = 1
+                omega[(axis + 1) % 3], omega[(axis + 2) % 3] = 0.8 * wobble, 0.6 * wobble
+                cases.append((moments, omega, axis, wobble))
+    return cases
+
+
+def _on_the_sphere(jacobian, attitude0, attitude):
+    """Derivatives along unit quaternions: both sides projected on their tangents."""
+    jacobian = np.array(jacobian, dtype=float)
+    jacobian[:, :4] -= np.outer(jacobian[:, :4] @ attitude0, attitude0)
+    jacobian[:4] -= np.outer(attitude, attitude @ jacobian[:4])
+    return jacobian
+
+
+def _final(attitude, omega, moments, weight, rtol):
+    torque = jr.torques.UniformGravity(1.0, weight, jnp.array([0.0, 0.0, -1.0]))
+    body = jr.RigidBody(moments, None if weight is None else torque)
+    state0 = jr.State(attitude, omega)
+    trajectory = jr.simulate(body, state0, jnp.array([40.0]), rtol=rtol, adjoint=FORWARD)
+    return jnp.concatenate([trajectory.states.attitude[0], trajectory.states.omega[0]])
+
+
+@pytest.fixture(scope="module")
+def spin_jacobians():
+    """Jacobians at T = 40 of every spin, by tolerance, and the reference's."""
+    attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
+    cases = _spins()
+    moments = np.array([c[0] for c in cases])
+    omegas = np.array([c[1] for c in cases])
+    _, exact = heavy_body(moments, np.tile(attitude, (len(cases), 1)), omegas, 40.0)
+
+    def value_and_jacobian(omega, moments, rtol):
+        def final(q, w, i):
+            return _final(q, w, i, None, rtol)
+
+        return final(attitude, omega, moments), jnp.concatenate(
+            jax.jacfwd(final, argnums=(0, 1, 2))(jnp.asarray(attitude), omega, moments), axis=1
+        )
+
+    lanes = jax.jit(jax.vmap(value_and_jacobian, in_axes=(0, 0, None)))
+    errors = {}
+    for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
+        finals, jacobians = lanes(omegas, moments, rtol)
+        errors[rtol] = []
+        for final, jacobian, truth in zip(finals, jacobians, exact, strict=True):
+            q = np.asarray(final[:4])
+            truth = _on_the_sphere(truth, attitude, q)
+            error = np.linalg.norm(_on_the_sphere(jacobian, attitude, q) - truth)
+            errors[rtol].append(error / np.linalg.norm(truth))
+    return cases, errors
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10, 1e-12])
+def test_jacobian_of_spin_about_each_axis(spin_jacobians, rtol):
+    """At most 1000 rtol against the variational equations, also where plain integration fails."""
+    cases, errors = spin_jacobians
+    for (moments, _, axis, wobble), error in zip(cases, errors[rtol], strict=True):
+        # Half-way to the separatrix's other end and back, arithmetic itself is amplified: the
+        # invariant that measures the distance to it, about wobble^2, has an absolute rounding
+        # error of some eps.
+        floor = 0.0
+        if moments[1] == 2 and axis == 1 and wobble > 0:
+            floor = 4 * 2.2e-16 / wobble**2 if wobble >= 1e-4 else 0.0
+        assert error <= 1000 * rtol + floor, (moments, axis, wobble, error)
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 1.5), (1.0, 2.0, 3.0)])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_jacobian_of_pure_spin_is_a_matrix_exponential(moments, axis):
+    """Euler's equations linearised about a pure spin have constant coefficients."""
+    omega = np.zeros(3)
+    omega[axis] = 1
+    linear = jax.jacfwd(jr.euler_equations, argnums=1)(np.array(moments), omega)
+    exact = scipy.linalg.expm(40 * np.asarray(linear))
+    weight = jnp.zeros(3)
+    jacobian = jax.jit(jax.jacfwd(_final, argnums=1))(
+        UPRIGHT, omega, np.array(moments), weight, 1e-8
+    )
+    assert np.linalg.norm(jacobian[4:] - exact) <= 1e-5 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("spin", [1.5, 2.5])
+def test_jacobian_of_the_sleeping_top(spin):
+    """Upright and nearly so, below and above the sleeping spin 2 sqrt(mgl I1) / I3 = 2."""
+    moments, weight = np.array([1.0, 1.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    moments[2] = 0.98
+    tilts = np.array(WOBBLES)
+    attitudes = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
+    omega = np.array([0.0, 0.0, spin * 2 / 0.98 / 2])
+    count = len(tilts)
+    _, exact = heavy_body(
+        np.tile(moments, (count, 1)), attitudes, np.tile(omega, (count, 1)), 40.0,
+        np.tile(weight, (count, 1)),
+    )  # fmt: skip
+
+    def value_and_jacobian(attitude, rtol):
+        args = (attitude, omega, moments, weight)
+        jacobians = jax.jacfwd(_final, argnums=(0, 1, 2, 3))(*(jnp.asarray(x) for x in args), rtol)
+        return _final(*args, rtol), jnp.concatenate(jacobians, axis=1)
+
+    lanes = jax.jit(jax.vmap(value_and_jacobian, in_axes=(0, None)))
+    for rtol in (1e-6, 1e-8, 1e-10):
+        finals, jacobians = lanes(attitudes, rtol)
+        for k, tilt in enumerate(tilts):
+            q = np.asarray(finals[k, :4])
+            truth = _on_the_sphere(exact[k], attitudes[k], q)
+            error = np.linalg.norm(_on_the_sphere(jacobians[k], attitudes[k], q) - truth)
+            # An unstable top falls through 1 / tilt^2 of amplification and comes back.
+            floor = 4 * 2.2e-16 / tilt**2 if spin < 2 and tilt >= 1e-6 else 0.0
+            assert error <= (1000 * rtol + floor) * np.linalg.norm(truth), (tilt, rtol, error)
+    # At tilt 0 also the matrix exponential of (omega1, omega2, gamma1, gamma2).
+    w3, ratio = omega[2], (moments[0] - moments[2]) / moments[0]
+    linear = np.array(
+        [[0, ratio * w3, 0, 1], [-ratio * w3, 0, -1, 0], [0, -1, 0, w3], [1, 0, -w3, 0]]
+    )
+    block = scipy.linalg.expm(40 * linear)[:2, :2]
+    assert np.linalg.norm(np.asarray(jacobians[0])[4:6, 4:6] - block) <= 1e-7 * np.linalg.norm(
+        block
+    )
+
+
+def _observable(omega, adjoint=None):
+    state0 = jr.State(jnp.asarray(UPRIGHT), omega)
+    trajectory = jr.simulate(
+        jr.RigidBody(MOMENTS), state0, jnp.array([1.0, 2.0]), adjoint=adjoint, rtol=1e-9
+    )
+    return trajectory.states.omega[-1, 0] * trajectory.states.attitude[-1, 1]
+
+
+def test_reverse_forward_and_direct_agree():
+    omega = jnp.asarray(OMEGA)
+    reverse = jax.jit(jax.grad(_observable))(omega)
+    forward = jax.jit(jax.jacfwd(lambda w: _observable(w, FORWARD)))(omega)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(lambda w: _observable(w, FORWARD))))(omega)
+    direct = diffrax.DirectAdjoint()
+    hessian = jax.jit(jax.hessian(lambda w: _observable(w, direct)))(omega)
+    np.testing.assert_allclose(twice, hessian, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(twice, twice.T, rtol=1e-7, atol=1e-9)
+    step = 1e-5
+    for k in range(3):
+        e = step * jnp.eye(3)[k]
+        difference = (_observable(omega + e) - _observable(omega - e)) / (2 * step)
+        np.testing.assert_allclose(reverse[k], difference, rtol=1e-7, atol=1e-9)
+
+
+def test_derivatives_in_times_and_initial_time():
+    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
+    ts = jnp.array([0.7, 1.9])
+
+    def final(ts, t0):
+        return jr.simulate(body, state0, ts, t0=t0, adjoint=FORWARD).states.omega
+
+    by_time, by_start = jax.jit(jax.jacfwd(final, argnums=(0, 1)))(ts, jnp.array(0.0))
+    omega = final(ts, 0.0)
+    for k in range(2):
+        rate = jr.euler_equations(TENSOR, omega[k])
+        np.testing.assert_allclose(by_time[k, :, k], rate, atol=1e-7)
+        np.testing.assert_allclose(by_start[k], -rate, atol=1e-7)  # autonomous
+    assert np.all(by_time[0, :, 1] == 0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "adjoint", "advice"),
+    [
+        (jax.jacfwd, None, "adjoint=diffrax.ForwardMode()"),
+        (lambda f: jax.jit(jax.jacfwd(f)), None, "adjoint=diffrax.ForwardMode()"),
+        (lambda f: jax.jacfwd(jax.jit(f)), None, "adjoint=diffrax.ForwardMode()"),
+        (jax.hessian, None, "adjoint=diffrax.DirectAdjoint()"),
+        (lambda f: jax.jacrev(jax.jacrev(f)), None, "adjoint=diffrax.DirectAdjoint()"),
+        (jax.grad, FORWARD, "RecursiveCheckpointAdjoint()"),
+        (lambda f: jax.jit(jax.grad(f)), FORWARD, "RecursiveCheckpointAdjoint()"),
+    ],
+)
+def test_a_mode_the_adjoint_cannot_serve_names_one_that_can(mode, adjoint, advice):
+    with pytest.raises(TypeError) as caught:
+        mode(lambda w: _observable(w, adjoint))(jnp.asarray(OMEGA))
+    assert advice in str(caught.value)
+
+
+# Shapes, lanes, events -----------------------------------------------------------------------
+
+
+def test_times_of_any_shape():
+    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
+    flat = jr.simulate(body, state0, np.linspace(0, 5, 6))
+    square = jr.simulate(body, state0, np.linspace(0, 5, 6).reshape(2, 3))
+    single = jr.simulate(body, state0, 5.0)
+    assert square.states.attitude.shape == (2, 3, 4)
+    assert square.energy.shape == (2, 3)
+    assert square.angular_momentum.shape == (2, 3, 3)
+    np.testing.assert_array_equal(square.states.omega.reshape(6, 3), flat.states.omega)
+    np.testing.assert_allclose(single.states.omega, flat.states.omega[-1], atol=1e-9)
+    np.testing.assert_array_equal(flat.states.omega[0], OMEGA)
+
+
+def test_repeated_times_and_all_times_at_the_start():
+    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
+    repeated = jr.simulate(body, state0, np.array([0.0, 0.0, 2.0, 2.0]))
+    np.testing.assert_array_equal(repeated.states.omega[2], repeated.states.omega[3])
+    still = jr.simulate(body, state0, np.array([3.0, 3.0]), t0=3.0)
+    np.testing.assert_array_equal(still.states.omega, [OMEGA, OMEGA])
+    assert float(still.final_time) == 3.0
+
+
+def test_a_time_an_ulp_after_the_end_of_a_step_is_not_a_stall():
+    """A step clipped to a sliver by a sampling time was once taken for a collapsed step."""
+    spacings = np.linspace(0.02, 0.6, 200)
+
+    def lane(spacing):
+        body, state0 = jr.RigidBody(MOMENTS), jr.State(UPRIGHT, np.array([0.3, 0.4, 0.5]))
+        ts = spacing * jnp.arange(1, 201)
+        trajectory = jr.simulate(body, state0, ts, rtol=1e-11, throw=False)
+        return trajectory.result, trajectory.stats["num_rejected_steps"]
+
+    result, rejected = eqx.filter_jit(eqx.filter_vmap(lane))(spacings)
+    assert np.all(result == jr.RESULTS.successful)
+    assert np.max(rejected) < 20
+
+
+def test_a_body_at_rest_stays_at_rest():
+    body = jr.RigidBody(TENSOR)
+    trajectory = jr.simulate(body, jr.State(ATTITUDE, jnp.zeros(3)), np.array([1e6]))
+    np.testing.assert_array_equal(trajectory.states.omega, np.zeros((1, 3)))
+
+
+def test_a_body_spun_up_from_rest_in_any_unit_of_time():
+    for unit in (1e-7, 1.0, 1e4):
+        torque = jr.torques.Constant([0.0, 0.0, 3 * unit**2])
+        trajectory = jr.simulate(
+            jr.RigidBody(MOMENTS, torque), jr.State(UPRIGHT, jnp.zeros(3)), np.array([10 / unit])
+        )
+        np.testing.assert_allclose(trajectory.states.omega[0, 2], 10 * unit, rtol=1e-9)
+        # turned by t^2 / 2 = 50 rad
+        turned = np.cos(25), 0, 0, np.sin(25)
+        assert jr.rotation.angle_between(trajectory.states.attitude[0], turned) < 1e-7
+
+
+def test_invariants_of_a_vmapped_trajectory():
+    body = jr.RigidBody(TENSOR, jr.torques.InternalDamper(0.1, 0.2))
+    ts = np.linspace(0, 2, 3)
+    omegas = jnp.stack([OMEGA, 2 * OMEGA])
+    many = eqx.filter_vmap(lambda w: jr.simulate(body, jr.State(ATTITUDE, w), ts))(omegas)
+    assert many.energy.shape == (2, 3)
+    assert many.angular_momentum.shape == (2, 3, 3)
+    one = jr.simulate(body, jr.State(ATTITUDE, omegas[1]), ts)
+    np.testing.assert_allclose(many.energy[1], one.energy, rtol=1e-9)
+    assert np.all(many.result == jr.RESULTS.successful)
+
+
+def test_an_event_ends_the_motion_in_si_units():
+    """A body turning at 2 rad/s about z has turned by 1.3 rad after 0.65 s."""
+
+    def condition(t, state, args, **kwargs):
+        return state.attitude[0] - jnp.cos(0.65)
+
+    event = diffrax.Event(condition, optx.Newton(1e-12, 1e-12))
+    state0 = jr.State(UPRIGHT, np.array([0.0, 0.0, 2.0]))
+    trajectory = jr.simulate(jr.RigidBody(MOMENTS), state0, np.linspace(0, 5, 11), event=event)
+    assert trajectory.result == jr.RESULTS.event_occurred
+    np.testing.assert_allclose(trajectory.final_time, 0.65, atol=1e-8)
+    np.testing.assert_allclose(trajectory.final_state.omega, [0, 0, 2], atol=1e-9)
+    reached = np.isfinite(trajectory.states.omega[:, 0])
+    np.testing.assert_array_equal(reached, trajectory.ts <= 0.65)
+
+
+def test_progress_meter_prints(capfd):
+    state0 = jr.State(ATTITUDE, OMEGA)
+    jr.simulate(jr.RigidBody(TENSOR), state0, np.array([5.0]), progress=True)
+    jax.effects_barrier()
+    assert "100.00%" in capfd.readouterr().out
+
+
+def test_running_out_of_steps_is_reported():
+    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
+    ts = np.array([1.0, 50.0])
+    trajectory = jr.simulate(body, state0, ts, max_steps=20, throw=False)
+    assert trajectory.result == jr.RESULTS.max_steps_reached
+    assert np.all(np.isfinite(trajectory.states.omega[0]))
+    assert np.all(np.isnan(trajectory.states.omega[1]))
+    with pytest.raises(RuntimeError, match="maximum number of solver steps"):
+        jr.simulate(body, state0, ts, max_steps=20)
+
+
+def test_a_torque_that_turns_nan_on_the_way_is_reported_at_once():
+    body = jr.RigidBody(TENSOR, lambda t, _s, _a: jnp.where(t > 3, jnp.nan, 0.0) * jnp.ones(3))
+    trajectory = jr.simulate(body, jr.State(ATTITUDE, OMEGA), np.array([1.0, 5.0]), throw=False)
+    assert trajectory.result == jr.RESULTS.dt_min_reached
+    assert trajectory.stats["num_steps"] < 300
+    assert np.all(np.isfinite(trajectory.states.omega[0]))
+
+
+# Bad input -----------------------------------------------------------------------------------
+
+GOOD = (MOMENTS, ATTITUDE, OMEGA, np.array([0.5, 1.0]))
+BAD = {
+    "negative moment": (0, np.array([1.0, -2.0, 3.0]), "invalid_inertia"),
+    "NaN moment": (0, np.array([1.0, np.nan, 3.0]), "invalid_inertia"),
+    "zero quaternion": (1, np.zeros(4), "invalid_attitude"),
+    "non-unit quaternion": (1, np.array([1.0, 0.1, 0.0, 0.0]), "invalid_attitude"),
+    "NaN omega": (2, np.array([np.nan, 0.0, 1.0]), "invalid_state"),
+    "infinite omega": (2, np.array([np.inf, 0.0, 1.0]), "invalid_state"),
+    "decreasing times": (3, np.array([1.0, 0.5]), "invalid_times"),
+    "times before t0": (3, np.array([-1.0, 0.5]), "invalid_times"),
+    "NaN time": (3, np.array([0.5, np.nan]), "invalid_times"),
+}
+
+
+def _omega_of(moments, attitude, omega, ts):
+    return jr.simulate(jr.RigidBody(moments), jr.State(attitude, omega), ts).states.omega
+
+
+@eqx.filter_jit
+def _lanes(moments, attitude, omega, ts):
+    def lane(*inputs):
+        moments, attitude, omega, ts = inputs
+        body, state0 = jr.RigidBody(moments), jr.State(attitude, omega)
+        trajectory = jr.simulate(body, state0, ts, throw=False)
+        return trajectory.states.omega, trajectory.result
+
+    return eqx.filter_vmap(lane)(moments, attitude, omega, ts)
+
+
+_omega_jitted = eqx.filter_jit(_omega_of)
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_value_raises_eagerly_and_under_jit_and_marks_its_lane(what):
+    place, value, code = BAD[what]
+    code = getattr(jr.RESULTS, code)
+    inputs = [*GOOD]
+    inputs[place] = value
+    message = jr.RESULTS[code][:40].replace("(", r"\(")
+    with pytest.raises(RuntimeError, match=message):
+        _omega_of(*inputs)
+    with pytest.raises(RuntimeError, match=message):
+        _omega_jitted(*[jnp.asarray(x) for x in inputs])
+    batch = [np.stack([x, x, x]) for x in GOOD]
+    batch[place][1] = value
+    omegas, result = _lanes(*[jnp.asarray(x) for x in batch])
+    codes = [int(c) for c in result._value]
+    assert codes == [0, int(code._value), 0]
+    assert np.all(np.isnan(omegas[1]))
+    np.testing.assert_array_equal(omegas[0], omegas[2])
+    np.testing.assert_allclose(omegas[0], _omega_jitted(*map(jnp.asarray, GOOD)), atol=1e-9)
+
+
+def test_three_bodies_as_a_tensor_is_an_error():
+    three = np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 2.5], [2.0, 2.0, 3.0]])
+    with pytest.raises(RuntimeError, match=r"lanes of `jax\.vmap`"):
+        _omega_of(three, *GOOD[1:])
+
+
+def test_gradients_of_good_lanes_are_untouched_by_a_bad_one():
+    omegas = jnp.stack([OMEGA, jnp.array([jnp.nan, 0.0, 0.0]), OMEGA])
+
+    def total(omegas):
+        def lane(w):
+            state0 = jr.State(jnp.asarray(ATTITUDE), w)
+            trajectory = jr.simulate(jr.RigidBody(MOMENTS), state0, jnp.array([1.0]), throw=False)
+            omega = trajectory.states.omega[0, 0]
+            return jnp.where(trajectory.result == jr.RESULTS.successful, omega, 0.0)
+
+        return jnp.sum(jax.vmap(lane)(omegas))
+
+    gradient = jax.jit(jax.grad(total))(omegas)
+    assert np.all(np.isfinite(gradient))
+    assert np.all(gradient[1] == 0)
+    np.testing.assert_array_equal(gradient[0], gradient[2])
+
+
+def test_nan_in_a_torque_at_the_start_is_an_error():
+    body = jr.RigidBody(MOMENTS, jr.torques.Constant([jnp.nan, 0.0, 0.0]))
+    with pytest.raises(RuntimeError, match="finite vector field"):
+        jr.simulate(body, jr.State(ATTITUDE, OMEGA), np.array([1.0]))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda b, s: jr.simulate(b, s, jnp.zeros((0,))), "`ts` must hold at least one time"),
+        (lambda _, s: jr.simulate(lambda t: t, s, 1.0), "`system` must be a jrigid system"),
+        (lambda b, s: jr.simulate(b, s, 1.0, rtol=2.0), "`rtol` must be at least"),
+        (lambda b, s: jr.simulate(b, s, 1.0, rtol=-1.0), "`rtol` must be at least"),
+        (lambda b, s: jr.simulate(b, s, 1.0, atol=0.0), "`atol` must be at least"),
+        (lambda b, s: jr.simulate(b, s, 1.0, t0=jnp.zeros(2)), "`t0` must have shape"),
+        (lambda b, s: jr.simulate(b, s, 1.0, solver=diffrax.Euler()), "`solver` must be"),
+        (lambda _b, _s: jr.RigidBody(jnp.ones(2)), r"`inertia` must have shape \(3,\) or"),
+        (
+            lambda b, s: jr.simulate(b, jr.State(jnp.ones(3), s.omega), 1.0),
+            "`state0.attitude` must have shape",
+        ),
+        (
+            lambda b, s: jr.simulate(b, jr.State(s.attitude, s.omega, jnp.ones(3)), 1.0),
+            "`state0.internal` must have the structure",
+        ),
+    ],
+)
+def test_wrong_shape_or_option_is_a_value_error(untyped, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA))
+
+
+def test_another_solver_keeps_the_promise():
+    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
+    ts = np.linspace(0, 20, 5)
+    default = jr.simulate(body, state0, ts, rtol=1e-7)
+    other = jr.simulate(body, state0, ts, rtol=1e-7, solver=diffrax.Tsit5())
+    np.testing.assert_allclose(default.states.omega, other.states.omega, atol=1e-6)
+    energy = np.asarray(other.energy)
+    assert np.all(np.abs(energy / energy[0] - 1) <= 1e-7 * (1 + ts))
