@@ -163,10 +163,10 @@ HEADER = ("problem", "what", "who", "compile ms", "min ms", "median ms", "relati
 def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("--points", type=int, default=10**6)
-    parser.add_argument("--subdivisions", type=int, default=6)
+    parser.add_argument("--around", type=int, default=250)
     options = parser.parse_args()
     rows = bench_points(options.points, np.float64) + bench_points(options.points, np.float32)
-    rows += bench_mesh(options.subdivisions)
+    rows += bench_mesh(options.around)
     text = common.table(HEADER, rows)
     common.report("mass", "Mass properties", text, ("jax", "numpy", "trimesh"), options.write)
 

@@ -2,7 +2,7 @@
 
 Private: the pieces that a fit of a rotating body needs whatever the body and the record are.
 
-- `least_squares`: Levenberg-Marquardt with a forward-mode Jacobian.
+- `least_squares`: from a start within the basin of the answer.
 - `doubling_horizon`: the same, blind: a record of many turns is fitted by its beginning first.
 - `influence`, `covariance`, `coloured_covariance`, `block_bootstrap`: what noise in the record,
   white or coloured, does to the parameters.
@@ -10,11 +10,6 @@ Private: the pieces that a fit of a rotating body needs whatever the body and th
 Parameters are any pytree of float arrays, scaled by the caller to be of order one. Residual
 functions have the signature `residuals(params, args) -> array`, and are integrated with an adjoint
 that allows forward mode (`diffrax.ForwardMode()`). Everything can be jitted and vmapped.
-
-Why not optimistix: its Levenberg-Marquardt damps all parameters alike, and evaluates residuals and
-Jacobian apart. On the Earth's pole (19 parameters, 4728 residuals, 2363 steps of an integration) it
-took 100 to 200 steps of 160 ms and compiled for 18 s; damping by the columns of the Jacobian, which
-comes in one pass with the residuals, takes about 30 steps of 60 ms and compiles in 4 s.
 """
 
 import math
@@ -25,10 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 Residuals = Callable[[PyTree, Any], Array]
+
+# Damping of the first step relative to the squared columns of the Jacobian.
+_FIRST_DAMPING = 1e-2
 
 
 class LeastSquaresFit(eqx.Module):
@@ -49,91 +48,31 @@ class LeastSquaresFit(eqx.Module):
     converged: Bool[Array, ""]
 
 
-class _Iterate(eqx.Module):
-    best: Array
-    residuals: Array
-    jacobian: Array
-    candidate: Array
-    predicted: Array  # fall of the sum of squares that the candidate promised
-    damping: Array
-    growth: Array
-    steps: Array
-    converged: Array
+def _value_and_jacobian(function, point):
+    """Both in one pass."""
 
-
-def _levenberg_marquardt(evaluate, start, rows, tolerance, max_steps):
-    """Minimise |residuals|^2; `evaluate(flat)` gives residuals and Jacobian in one pass."""
-    dtype = start.dtype
-    size = start.size
-    eps = jnp.finfo(dtype).eps
-
-    def unfinished(it):
-        return (it.steps < max_steps) & ~it.converged
-
-    def step(it):
-        residuals, jacobian = evaluate(it.candidate)
-        new, old = jnp.sum(residuals**2), jnp.sum(it.residuals**2)
-        better = new < old  # also false for NaN: the step is then rejected and damped
-        # Damping as Nielsen, Damping parameter in Marquardt's method (IMM-REP-1999-05), eq. 2.4.
-        gain = (old - new) / it.predicted
-        shrunk = it.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-        first = it.steps == 0
-        damping = jnp.where(better, jnp.where(first, it.damping, shrunk), it.damping * it.growth)
-        growth = jnp.where(better, 2.0, 2.0 * it.growth).astype(dtype)
-        best = jnp.where(better, it.candidate, it.best)
-        residuals = jnp.where(better, residuals, it.residuals)
-        jacobian = jnp.where(better, jacobian, it.jacobian)
-
-        lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
-        lengths = jnp.where(lengths > 0, lengths, 1.0)
-        scaled = jacobian / lengths[None, :]
-        q, r = jnp.linalg.qr(
-            jnp.concatenate([scaled, jnp.sqrt(damping) * jnp.eye(size, dtype=dtype)])
-        )
-        move = jax.scipy.linalg.solve_triangular(r, -(q[:rows].T @ residuals))
-        promised = scaled @ move
-        predicted = -2 * residuals @ promised - promised @ promised
-        # The step in units of the parameters' standard errors; then the floor of rounding.
-        noise = jnp.sum(residuals**2) / max(rows - size, 1)
-        small = promised @ promised <= tolerance**2 * noise
-        exact = jnp.all(jnp.abs(move / lengths) <= 8 * eps * (1 + jnp.abs(best)))
-        stuck = damping > 1 / eps
-        return _Iterate(
-            best,
-            residuals,
-            jacobian,
-            best + move / lengths,
-            predicted,
-            damping,
-            growth,
-            it.steps + 1,
-            (better & (small | exact)) | (stuck & ~first),
-        )
-
-    first = _Iterate(
-        best=start,
-        residuals=jnp.full((rows,), jnp.inf, dtype),
-        jacobian=jnp.zeros((rows, size), dtype),
-        candidate=start,
-        predicted=jnp.ones((), dtype),
-        damping=jnp.full((), 1e-2, dtype),
-        growth=jnp.full((), 2.0, dtype),
-        steps=jnp.asarray(0),
-        converged=jnp.asarray(False),
-    )
-    return jax.lax.while_loop(unfinished, step, first)
-
-
-def _with_jacobian(function):
-    def twice(flat):
-        value = function(flat)
+    def twice(point):
+        value = function(point)
         return value, value
 
-    def evaluate(flat):
-        jacobian, value = jax.jacfwd(twice, has_aux=True)(flat)
-        return value, jacobian
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(point)
+    return value, jacobian
 
-    return evaluate
+
+def _jacobian_at_once(function):
+    """The same function; where it is linearised its whole Jacobian is formed, beside the value.
+
+    optimistix applies the linearised function anew for every trial of the damping, and each
+    application would integrate again.
+    """
+    wrapped = jax.custom_jvp(function)
+
+    @wrapped.defjvp
+    def _(primals, tangents):
+        value, jacobian = _value_and_jacobian(function, *primals)
+        return value, jacobian @ tangents[0]
+
+    return wrapped
 
 
 def least_squares(
@@ -142,7 +81,7 @@ def least_squares(
     args: Any = None,
     *,
     tolerance: float = 1e-3,
-    max_steps: int = 100,
+    max_steps: int = 40,
 ) -> LeastSquaresFit:
     """Levenberg-Marquardt from a start that is already within the basin of the answer.
 
@@ -156,14 +95,10 @@ def least_squares(
     Returns:
         The fit; check `converged`.
     """
-    flat, unravel = ravel_pytree(start)
-    rows = jax.eval_shape(residuals, start, args).size
-
-    def function(flat):
-        return residuals(unravel(flat), args).reshape(-1)
-
-    end = _levenberg_marquardt(_with_jacobian(function), flat, rows, tolerance, max_steps)
-    return LeastSquaresFit(unravel(end.best), end.residuals, end.jacobian, end.steps, end.converged)
+    times = jnp.zeros(jax.eval_shape(residuals, start, args).shape[0])
+    return doubling_horizon(
+        residuals, start, args, times, jnp.zeros(1), tolerance=tolerance, max_steps=max_steps
+    )
 
 
 def doublings(times: Float[np.ndarray, " times"], first: float) -> Float[Array, " stages"]:
@@ -193,6 +128,10 @@ def doubling_horizon(
     Nuisances can explain away a short record. `stiffness` holds them near their start, by further
     rows `stiffness * (params - start)`, in all stages but the last, which is free.
 
+    optimistix damps all parameters alike, so each stage measures them in units in which the columns
+    of the Jacobian have one length (Marquardt, J. SIAM 11, 431 (1963)): the noise over the column,
+    at the start of the stage.
+
     Args:
         residuals: Residuals, all of the same noise; their first axis runs along `times`.
         start: Parameters of order one.
@@ -201,7 +140,7 @@ def doubling_horizon(
         horizons: Stage by stage, rows with `times <= horizon` take part: see `doublings`.
         stiffness: Non-negative, in the structure of `start`; none by default.
         tolerance: The last stage stops when a step is shorter than this fraction of the standard
-            errors.
+            errors, in each parameter.
         max_steps: Evaluations allowed in each stage. An early stage may run out and do its job.
 
     Returns:
@@ -209,37 +148,53 @@ def doubling_horizon(
     """
     flat, unravel = ravel_pytree(start)
     stiff = jnp.zeros_like(flat) if stiffness is None else ravel_pytree(stiffness)[0]
-    shape = jax.eval_shape(residuals, start, args)
+    shape = jax.eval_shape(residuals, start, args).shape
+    times = jnp.broadcast_to(times.reshape((-1,) + (1,) * (len(shape) - 1)), shape).reshape(-1)
     horizons = jnp.append(horizons, jnp.inf)
     springs = jnp.ones_like(horizons).at[-1].set(0.0)
+    floor = 8 * jnp.finfo(flat.dtype).eps / tolerance
+
+    def function(point):
+        return residuals(unravel(point), args).reshape(-1)
 
     def stage(carry, horizon_and_spring):
-        begin, steps, *_ = carry
+        begin, steps, _ = carry
         horizon, spring = horizon_and_spring
+        value, jacobian = _value_and_jacobian(function, begin)
+        weights = (times <= horizon).astype(flat.dtype)
+        stiffs = spring * stiff
+
+        columns = jnp.sqrt(jnp.sum((weights[:, None] * jacobian) ** 2, axis=0) + stiffs**2)
+        columns = jnp.where(columns > 0, columns, 1.0)
+        squares = jnp.sum((weights * value) ** 2) + jnp.sum((stiffs * (begin - flat)) ** 2)
+        noise = jnp.sqrt(squares / jnp.maximum(jnp.sum(weights) - flat.size, 1))
+        # Residuals may vanish; parameters cannot be told to better than their rounding.
+        noise = jnp.maximum(noise, floor * jnp.max(columns * (1 + jnp.abs(begin))))
+        unit = noise / columns / math.sqrt(_FIRST_DAMPING)
+
+        def scaled(move):
+            point = begin + unit * move
+            rows = [weights * function(point), stiffs * (point - flat)]
+            return jnp.concatenate(rows) / noise
+
+        scaled = _jacobian_at_once(scaled)
         # An early stage only has to start the next one.
         accuracy = jnp.where(spring > 0, max(tolerance, 0.1), tolerance)
-        weights = (times <= horizon).astype(flat.dtype)
-        weights = weights.reshape(weights.shape + (1,) * (len(shape.shape) - 1))
+        solution = optx.least_squares(
+            lambda move, _: scaled(move),
+            optx.LevenbergMarquardt(rtol=0.0, atol=accuracy * math.sqrt(_FIRST_DAMPING)),
+            jnp.zeros_like(flat),
+            options={"jac": "fwd"},
+            max_steps=max_steps,
+            throw=False,
+        )
+        steps = steps + 1 + jnp.asarray(solution.stats["num_steps"])
+        converged = solution.result == optx.RESULTS.successful
+        return (begin + unit * solution.value, steps, converged), None
 
-        def function(point):
-            rows = (residuals(unravel(point), args) * weights).reshape(-1)
-            return jnp.concatenate([rows, spring * stiff * (point - flat)])
-
-        rows = shape.size + flat.size
-        end = _levenberg_marquardt(_with_jacobian(function), begin, rows, accuracy, max_steps)
-        carry = (end.best, steps + end.steps, end.residuals, end.jacobian, end.converged)
-        return carry, None
-
-    rows = shape.size + flat.size
-    carry = (
-        flat,
-        jnp.asarray(0),
-        jnp.zeros(rows, flat.dtype),
-        jnp.zeros((rows, flat.size), flat.dtype),
-        jnp.asarray(False),
-    )
-    (best, steps, value, jacobian, converged), _ = jax.lax.scan(stage, carry, (horizons, springs))
-    value, jacobian = value[: shape.size], jacobian[: shape.size]
+    carry = (flat, jnp.asarray(1), jnp.asarray(False))
+    (best, steps, converged), _ = jax.lax.scan(stage, carry, (horizons, springs))
+    value, jacobian = _value_and_jacobian(function, best)
     return LeastSquaresFit(unravel(best), value, jacobian, steps, converged)
 
 

@@ -178,8 +178,8 @@ def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.39 with omega' = 0.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.bearing_torque(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.0, 1.0, 1.0])))
-    [1. 0. 0.]
+    >>> print(jr.bearing_torque(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
+    [ 1. -2.  1.]
     """
     tensor, w = _inertia_and_vector(inertia, omega)
     return -_momentum_cross_omega(tensor, w)

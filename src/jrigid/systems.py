@@ -210,6 +210,16 @@ class FloatingBody(AbstractSystem):
             force: `(t, state, args) -> (3,)` space components [N]; a `Force` adds a potential.
             torque: About the centre of mass, as for `RigidBody`.
         """
+        if not isinstance(mass_properties, MassProperties):
+            raise ValueError(
+                "Argument `mass_properties` must be a MassProperties, "
+                f"but it is {type(mass_properties).__name__}."
+            )
+        if force is not None and not callable(force):
+            raise ValueError(
+                "Argument `force` must be a callable (t, state, args) -> (3,), "
+                f"but it is {force!r}."
+            )
         self.mass_properties = mass_properties
         self.force = force
         self.torque = as_torque(torque)
@@ -239,6 +249,8 @@ class FloatingBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
+        check_shape("position", state.position, (3,))
+        check_shape("velocity", state.velocity, (3,))
         mass = self.mass_properties.mass.astype(state.velocity.dtype)
         return FloatingState(
             state.velocity,

@@ -33,9 +33,9 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     Gradients: bilinear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> q = jnp.array([1.0, 0.0, 0.0, 0.0])
-    >>> print(jr.rotation.attitude_rate(q, jnp.array([0.0, 0.0, 2.0])))
-    [0. 0. 0. 1.]
+    >>> q = jnp.array([0.6, 0.0, 0.0, 0.8])
+    >>> print(jr.rotation.attitude_rate(q, jnp.array([2.0, 4.0, 6.0])).round(6))
+    [-2.4 -1.   2.   1.8]
     """
     (w, x, y, z), (a, b, c) = pair_of_shapes("attitude", attitude, (4,), "omega", omega, (3,))
     return 0.5 * jnp.stack(

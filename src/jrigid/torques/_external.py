@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import array_of_shape, check_inertia_shape, float_arrays
+from jrigid._checks import array_of_shape, check_inertia_shape, check_shape, float_arrays
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
 from jrigid.dynamics import angular_momentum
@@ -31,7 +31,7 @@ class UniformGravity(AbstractTorque):
     1.96
     """
 
-    mass: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    mass: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("mass", x))
     lever: Float[Array, "3"] = eqx.field(converter=lambda x: array_of_shape("lever", x, 3))
     gravity: Float[Array, "3"] = eqx.field(converter=lambda x: array_of_shape("gravity", x, 3))
 
@@ -88,12 +88,14 @@ class GravityGradient(AbstractTorque):
         """
         self.inertia, self.mu = float_arrays(inertia, mu)
         check_inertia_shape(self.inertia)
+        check_shape("mu", self.mu, ())
         self.position = position
 
     def _direction(self, t: ScalarLike, state: Any) -> tuple[Array, Array]:
         dtype = state.omega.dtype
         where = state.position if self.position is None else self.position(t)
         position = jnp.asarray(where, dtype)
+        check_shape("position", position, (3,))
         distance = safe_norm(position)
         # mu / r^3 without overflow in float32
         strength = self.mu.astype(dtype) / distance / distance / distance

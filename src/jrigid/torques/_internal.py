@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -30,8 +31,8 @@ class InternalDamper(AbstractTorque):
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.2, 0.05))
     """
 
-    inertia: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    coupling: Float[Array, ""] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    inertia: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("inertia", x))
+    coupling: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("coupling", x))
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
@@ -90,6 +91,7 @@ class SpinningMass(eqx.Module):
             motor_torque: Torque of the motor on the wheel [N m].
         """
         self.inertia, axis = float_arrays(inertia, axis)
+        check_shape("inertia", self.inertia, ())
         check_shape("axis", axis, (3,))
         self.axis = axis / safe_norm(axis)
         self.motor_torque = motor_torque
@@ -142,9 +144,10 @@ class Rotor(AbstractTorque):
             return wheel.inertia.astype(dtype) * state.internal * axis, motor * axis
         if callable(self.momentum):
             time = jnp.asarray(t, dtype)
-            value, rate = eqx.filter_jvp(
+            value, rate = jax.jvp(
                 lambda s: jnp.asarray(self.momentum(s), dtype), (time,), (jnp.ones_like(time),)
             )
+            check_shape("momentum", value, (3,))
             return value, rate
         value = self.momentum.astype(dtype)
         return value, jnp.zeros_like(value)
@@ -153,7 +156,9 @@ class Rotor(AbstractTorque):
         wheel = self._wheel
         if wheel is None or wheel.motor_torque is None:
             return zero_like(state)
-        return jnp.asarray(wheel.motor_torque(t, state, args), state.omega.dtype)
+        motor = jnp.asarray(wheel.motor_torque(t, state, args), state.omega.dtype)
+        check_shape("motor_torque", motor, ())
+        return motor
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
