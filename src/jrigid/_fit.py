@@ -9,7 +9,8 @@ Private: the pieces that a fit of a rotating body needs whatever the body and th
 
 Parameters are any pytree of float arrays, scaled by the caller to be of order one. Residual
 functions have the signature `residuals(params, args) -> array`, and are integrated with an adjoint
-that allows forward mode (`diffrax.ForwardMode()`). Everything can be jitted and vmapped.
+that allows forward mode (`diffrax.ForwardMode()`). Everything can be jitted and vmapped; the fits
+cannot be differentiated in their turn (an error, not a wrong number).
 """
 
 import math
@@ -179,7 +180,7 @@ def doubling_horizon(
 
         scaled = _jacobian_at_once(scaled)
         # An early stage only has to start the next one.
-        accuracy = jnp.where(spring > 0, max(tolerance, 0.1), tolerance)
+        accuracy: Any = jnp.where(spring > 0, max(tolerance, 0.1), tolerance)
         solution = optx.least_squares(
             lambda move, _: scaled(move),
             optx.LevenbergMarquardt(rtol=0.0, atol=accuracy * math.sqrt(_FIRST_DAMPING)),

@@ -88,10 +88,15 @@ def earth_pole() -> EarthPole:
     touched. A newer version of that package has a longer record.
 
     Returns:
-        The whole record, about 24 000 days.
+        The whole record, about 24 000 days; pole coordinates and their errors in rad.
 
     Raises:
         ImportError: astropy-iers-data is not installed.
+
+    >>> import jrigid as jr
+    >>> record = jr.datasets.earth_pole()
+    >>> print(record.mjd[0], f"{record.y[0]:.4g} rad")
+    37665.0 1.033e-06 rad
 
     Source: IERS Earth Orientation Centre, Paris Observatory, EOP 20 C04, consistent with ITRF 2020;
     Bizouard et al., J. Geodesy 93, 621 (2019).
@@ -120,7 +125,12 @@ def toutatis_1992() -> ToutatisRecord:
     130 degrees.
 
     Returns:
-        The record.
+        The record: times in s from the epoch, unit quaternions (body to space), rates in rad/s.
+
+    >>> import jrigid as jr
+    >>> record = jr.datasets.toutatis_1992()
+    >>> print(record.attitudes.shape, record.moments)
+    (18, 4) [3.0836 3.235  1.    ]
 
     Source: Takahashi, Busch and Scheeres, Astron. J. 146, 95 (2013), tables 1 and 2; observations
     by Hudson, Ostro and others.
@@ -147,7 +157,12 @@ def gyro_example() -> GyroRecord:
     and is watched for 20 s at 10 Hz. Made for examples and tests; nothing was measured.
 
     Returns:
-        Readings and truth.
+        Readings and truth: times in s, rates in rad/s, moments in units of their sum.
+
+    >>> import jrigid as jr
+    >>> record = jr.datasets.gyro_example()
+    >>> print(record.omegas.shape, record.sigma)
+    (200, 3) 0.06
     """
     times = np.arange(200) / 10.0
     moments = np.array([2.0, 3.0, 4.0]) / 9.0

@@ -1,0 +1,436 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
+
+import jrigid as jr
+from jrigid import rotation as ro
+from jrigid import torques as tq
+
+GRAVITY = np.array([1.0, -2.0, -9.0])
+LEVER = np.array([0.3, -0.2, 0.5])
+MU = 4.0
+H = np.array([0.4, -0.3, 0.6])
+
+
+def orbit(t):
+    return jnp.stack([2.0 + 0.3 * t, 1.0 - t, 0.5 * t * t])
+
+
+def momentum_of_time(t):
+    return jnp.stack([0.2 * jnp.sin(t), 0.5 - 0.1 * t, 0.3 * t**2])
+
+
+STATE = jr.State(ATTITUDE, OMEGA)
+POTENTIALS = {
+    "gravity": tq.UniformGravity(2.0, LEVER, GRAVITY),
+    "gradient, tensor": tq.GravityGradient(TENSOR, MU, orbit),
+    "gradient, moments": tq.GravityGradient(MOMENTS, MU, orbit),
+}
+POTENTIALS["both and a drag"] = POTENTIALS["gravity"] + POTENTIALS["gradient, tensor"]
+
+
+# --- torques that have a potential ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", POTENTIALS)
+def test_a_torque_is_minus_the_gradient_of_its_potential(name):
+    """-dV/de of V(q exp(e)) at e = 0 is the torque in body components."""
+    torque = POTENTIALS[name]
+
+    @jax.jit
+    def both(q, t):
+        state = lambda e: jr.State(ro.multiply(q, ro.exp(e)), OMEGA)  # noqa: E731
+        gradient = jax.grad(lambda e: torque.potential(t, state(e), None))(jnp.zeros(3))
+        return torque(t, jr.State(q, OMEGA), None), -gradient
+
+    for q in (ATTITUDE, np.array([1.0, 0, 0, 0]), np.array([0.0, 0.6, 0.0, -0.8])):
+        found, expected = both(q, 0.7)
+        assert np.linalg.norm(expected) > 1e-3
+        np.testing.assert_allclose(found, expected, atol=ulps(float, 256))
+
+
+def test_uniform_gravity_against_numpy():
+    r = np.asarray(ro.to_matrix(ATTITUDE))
+    gravity = POTENTIALS["gravity"]
+    in_space = np.cross(r @ LEVER, 2.0 * GRAVITY)
+    np.testing.assert_allclose(gravity(0.0, STATE, None), r.T @ in_space, atol=ulps(float, 64))
+    np.testing.assert_allclose(
+        gravity.potential(0.0, STATE, None), -2.0 * GRAVITY @ (r @ LEVER), rtol=ulps(float, 16)
+    )
+
+
+@pytest.mark.parametrize("inertia", [TENSOR, MOMENTS], ids=["tensor", "moments"])
+def test_gravity_gradient_is_that_of_a_body_of_points(inertia):
+    """Six point masses on the principal axes under Newton's force; the rest is of fourth order."""
+    matrix = np.diag(inertia) if inertia.ndim == 1 else inertia
+    moments, axes = np.linalg.eigh(matrix)
+    arms = np.sqrt(moments.sum() / 2 - moments)  # two masses of 1/2 at each end
+    size = 1e-3
+    points = size * np.concatenate([(axes * arms).T, -(axes * arms).T])
+    r = np.asarray(ro.to_matrix(ATTITUDE))
+    center = np.asarray(orbit(0.7))
+    torque, energy = np.zeros(3), 0.0
+    for point in points:
+        where = center + r @ point
+        distance = np.linalg.norm(where)
+        torque += np.cross(point, r.T @ (-0.5 * MU * where / distance**3))
+        energy += -0.5 * MU * (1 / distance - 1 / np.linalg.norm(center))
+    body = tq.GravityGradient(size**2 * inertia, MU, orbit)
+    np.testing.assert_allclose(body(0.7, STATE, None), torque, atol=1e-5 * size**2)
+    np.testing.assert_allclose(body.potential(0.7, STATE, None), energy, atol=1e-5 * size**2)
+
+
+def test_gravity_gradient_of_the_earth_seen_in_float32():
+    """mu / r^3 of the Sun in SI units: r^3 alone is out of the range of float32."""
+    sun = tq.GravityGradient(MOMENTS, 1.327e20, lambda _: jnp.array([1.2e11, 9e10, 0.0]))
+    state = jr.State(np.float32(ATTITUDE), np.float32(OMEGA))
+    found = sun(0.0, state, None)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, sun(0.0, STATE, None), rtol=ulps(np.float32, 32))
+
+
+def test_gravity_gradient_at_the_bodys_own_position():
+    position = np.asarray(orbit(0.7))
+    flying = jr.FloatingState(position, OMEGA, ATTITUDE, OMEGA)
+    own, told = tq.GravityGradient(TENSOR, MU), POTENTIALS["gradient, tensor"]
+    np.testing.assert_array_equal(own(0.0, flying, None), told(0.7, STATE, None))
+    assert own.potential(0.0, flying, None) == told.potential(0.7, STATE, None)
+
+
+# --- drag -------------------------------------------------------------------------------------
+
+COEFFICIENTS = {"number": 0.3, "axes": np.array([0.1, 0.2, 0.4]), "tensor": 0.1 * TENSOR}
+
+
+@pytest.mark.parametrize("name", COEFFICIENTS)
+def test_drag_against_numpy(name):
+    coefficient = COEFFICIENTS[name]
+    matrix = coefficient * np.eye(3) if np.ndim(coefficient) < 2 else coefficient
+    linear, quadratic = tq.LinearDrag(coefficient), tq.QuadraticDrag(coefficient)
+    np.testing.assert_allclose(linear(0.0, STATE, None), -matrix @ OMEGA, atol=ulps(float, 2))
+    np.testing.assert_allclose(
+        quadratic(0.0, STATE, None),
+        -np.linalg.norm(OMEGA) * matrix @ OMEGA,
+        atol=ulps(float, 2),
+    )
+
+
+def test_a_sphere_slows_down_as_linear_and_quadratic_drag_say():
+    """omega0 exp(-c t / I) and omega0 / (1 + c |omega0| t / I), at once in two lanes."""
+    moment, c = 0.8, 0.3
+    ts = np.linspace(0, 10, 6)
+
+    @jax.jit
+    @jax.vmap
+    def lanes(linear, quadratic):
+        torque = tq.LinearDrag(linear) + tq.QuadraticDrag(quadratic)
+        body = jr.RigidBody(jnp.full(3, moment), torque)
+        return jr.simulate(body, STATE, ts, rtol=1e-10).states.omega
+
+    slow, slower = lanes(jnp.array([c, 0.0]), jnp.array([0.0, c]))
+    exact = OMEGA * np.exp(-c * ts / moment)[:, None]
+    np.testing.assert_allclose(slow, exact, rtol=1e-9)
+    rate = np.linalg.norm(OMEGA)
+    np.testing.assert_allclose(slower, OMEGA / (1 + c * rate * ts / moment)[:, None], rtol=1e-9)
+
+
+def test_quadratic_drag_at_rest_has_value_and_gradient_zero():
+    for coefficient in COEFFICIENTS.values():
+        drag = lambda w, c=coefficient: tq.QuadraticDrag(c)(0.0, jr.State(ATTITUDE, w), None)  # noqa: E731
+        for derivative in (jax.jacfwd, jax.jacrev):
+            value, jacobian = jax.jit(lambda w, f=drag, d=derivative: (f(w), d(f)(w)))(jnp.zeros(3))
+            assert np.all(np.asarray(value) == 0)
+            assert np.all(np.asarray(jacobian) == 0)
+
+
+# --- sums and states of internal parts --------------------------------------------------------
+
+WHEEL = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]))
+DAMPER, SLOSH = tq.InternalDamper(0.2, 0.05), tq.InternalDamper(0.4, 0.02)
+
+
+def test_torques_add_with_plus_and_sum_and_with_plain_functions():
+    spring = lambda t, state, args: -args * state.omega + t  # noqa: E731
+    constant, drag = tq.Constant(H), tq.LinearDrag(0.3)
+    expected = np.asarray(H) - 0.3 * OMEGA + (-2.0 * OMEGA + 0.5)
+    sums = [constant + drag + spring, sum([constant, drag, tq.Torque(spring)])]
+    sums += [spring + constant + drag, constant + (drag + spring), sum([constant, drag, spring])]
+    for total in sums:
+        assert len(total.terms) == 3  # flat, whatever the brackets
+        np.testing.assert_allclose(total(0.5, STATE, 2.0), expected, atol=ulps(float, 4))
+        assert total.potential(0.5, STATE, 2.0) == 0
+    assert sum([drag]) is drag
+    nothing = tq.as_torque(None)
+    assert np.all(np.asarray(nothing(0.0, STATE, None)) == 0)
+    assert nothing.internal_at_rest(STATE) == ()
+
+
+def test_potentials_add():
+    height = tq.Torque(lambda *_: jnp.zeros(3), lambda _t, s, _a: 2 * s.attitude[0])
+    total = POTENTIALS["gravity"] + height + tq.LinearDrag(1.0)
+    expected = POTENTIALS["gravity"].potential(0.0, STATE, None) + 2 * ATTITUDE[0]
+    np.testing.assert_allclose(total.potential(0.0, STATE, None), expected, rtol=ulps(float, 2))
+
+
+def test_internal_states_of_a_sum_are_a_tuple_in_the_order_of_the_terms():
+    total = tq.Constant(H) + DAMPER + tq.Rotor(WHEEL) + tq.LinearDrag(0.1) + SLOSH + tq.Rotor(H)
+    rest = total.internal_at_rest(STATE)
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    assert len(rest) == 3
+    np.testing.assert_array_equal(rest[0], OMEGA)
+    np.testing.assert_allclose(rest[1], axis @ OMEGA, rtol=ulps(float, 2))
+    np.testing.assert_array_equal(rest[2], OMEGA)
+    structure = jax.tree.structure
+    inner, spin, outer = np.array([1.0, 2, 3]), 5.0, np.array([-0.5, 0.2, 0.1])
+    state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(inner), jnp.asarray(spin), jnp.asarray(outer)))
+    rate = total.internal_rate(0.0, state, None)
+    assert structure(rate) == structure(rest) == structure(total.internal_scale(jnp.array(2.0)))
+
+    momentum = 0.2 * inner + 0.3 * spin * axis + 0.4 * outer + H
+    found = total.internal_momentum(0.0, state, None)
+    np.testing.assert_allclose(found, momentum, atol=ulps(float, 4))
+    energy = 0.1 * inner @ inner + 0.15 * spin**2 + 0.2 * outer @ outer
+    np.testing.assert_allclose(total.internal_energy(0.0, state, None), energy, rtol=ulps(float, 4))
+    torque = (
+        H - 0.1 * OMEGA + 0.05 * (inner - OMEGA) + 0.02 * (outer - OMEGA)
+        - np.cross(OMEGA, 0.3 * spin * axis + H)
+    )  # fmt: skip
+    np.testing.assert_allclose(total(0.0, state, None), torque, atol=ulps(float, 8))
+    pulls = 0.05 * (inner - OMEGA) / 0.2, 0.02 * (outer - OMEGA) / 0.4
+    expected = [-pulls[0] - np.cross(OMEGA, inner), 0.0, -pulls[1] - np.cross(OMEGA, outer)]
+    for a, b in zip(rate, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=ulps(float, 8))
+
+
+def test_the_internal_state_of_one_carrier_is_not_wrapped():
+    total = tq.LinearDrag(0.1) + DAMPER
+    state = jr.State(ATTITUDE, OMEGA, total.internal_at_rest(STATE))
+    assert state.internal.shape == (3,)
+    alone = jr.State(ATTITUDE, OMEGA, DAMPER.internal_at_rest(STATE))
+    np.testing.assert_array_equal(
+        total.internal_rate(0.0, state, None), DAMPER.internal_rate(0.0, alone, None)
+    )
+    # at rest relative to the body it exerts nothing
+    np.testing.assert_allclose(total(0.0, state, None), -0.1 * OMEGA, atol=ulps(float, 1))
+
+
+def test_internal_parts_exert_what_they_lose():
+    """The space rate of their own momentum is minus their torque, whatever they do."""
+    wheel = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]), lambda t, s, _a: 0.7 * t + s.omega[0])
+    parts = {
+        "damper": (DAMPER, jnp.array([1.0, 2, 3])),
+        "wheel": (tq.Rotor(wheel), jnp.array(5.0)),
+        "prescribed": (tq.Rotor(momentum_of_time), ()),
+    }
+    t = jnp.asarray(0.4)
+    for name, (part, internal) in parts.items():
+        state = jr.State(ATTITUDE, OMEGA, internal)
+        rates = jr.State(
+            ro.attitude_rate(ATTITUDE, OMEGA),
+            jr.euler_equations(TENSOR, OMEGA, part(t, state, None)),
+            part.internal_rate(t, state, None),
+        )
+        momentum = lambda t, s, p=part: ro.rotate(s.attitude, p.internal_momentum(t, s, None))  # noqa: E731
+        _, rate = jax.jvp(momentum, (t, state), (jnp.ones_like(t), rates))
+        expected = -ro.rotate(ATTITUDE, part(t, state, None))
+        np.testing.assert_allclose(rate, expected, atol=ulps(float, 32), err_msg=name)
+
+
+def test_a_damper_loses_energy_as_its_coupling_says():
+    inner = jnp.array([1.0, 2.0, 3.0])
+    body = jr.RigidBody(TENSOR, DAMPER)
+    state = jr.State(ATTITUDE, OMEGA, inner)
+    rates = body.vector_field(0.0, state, None)
+    _, power = jax.jvp(lambda s: body.energy(0.0, s, None), (state,), (rates,))
+    np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 32))
+
+
+def test_damping_ends_in_spin_about_the_major_axis_with_all_momentum_kept():
+    """From near the minor axis through the separatrix; two dampers and a free wheel's state."""
+    body = jr.RigidBody(MOMENTS, tq.InternalDamper(0.3, 0.5) + tq.InternalDamper(0.2, 0.1))
+    state0 = jr.State(ATTITUDE, np.array([3.0, 0.2, 0.1]))
+    ts = np.linspace(0, 100, 201)
+    run = jr.simulate(body, state0, ts, rtol=1e-12)
+    assert [x.shape for x in run.states.internal] == [(201, 3), (201, 3)]
+    momentum = np.asarray(run.angular_momentum)
+    np.testing.assert_allclose(
+        momentum, np.broadcast_to(momentum[0], (201, 3)), atol=1e-12 * np.linalg.norm(momentum[0])
+    )
+    energy = np.asarray(run.energy)
+    alive = energy - energy[-1] > 1e-9
+    assert np.count_nonzero(alive) > 60
+    assert np.all(np.diff(energy)[alive[:-1]] < 0)
+    omega, total = np.asarray(run.states.omega[-1]), np.linalg.norm(momentum[0])
+    assert np.linalg.norm(omega[:2]) < 1e-3 * abs(omega[2])
+    np.testing.assert_allclose(energy[-1], total**2 / (2 * (3.0 + 0.3 + 0.2)), rtol=1e-5)
+    assert np.argmax(np.abs(run.states.omega[0])) == 0
+
+
+# --- rotors -----------------------------------------------------------------------------------
+
+
+def test_a_gyrostat_follows_hand_derived_equations():
+    """(I w)' = (I w + h) x w for constant h, written out and integrated by scipy."""
+
+    def rate(t, w):
+        i1, i2, i3 = MOMENTS
+        h1, h2, h3 = H
+        a, b, c = w
+        return [
+            ((i2 - i3) * b * c + h2 * c - h3 * b) / i1,
+            ((i3 - i1) * c * a + h3 * a - h1 * c) / i2,
+            ((i1 - i2) * a * b + h1 * b - h2 * a) / i3,
+        ]
+
+    ts = np.linspace(0, 20, 5)
+    body = jr.RigidBody(MOMENTS, tq.Rotor(H))
+    run = jr.simulate(body, STATE, ts, rtol=1e-12)
+    exact = scipy.integrate.solve_ivp(rate, (0, 20), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(run.states.omega, exact.y.T, atol=1e-10)
+    momentum = np.asarray(run.angular_momentum)
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (5, 3)), atol=2e-12)
+    np.testing.assert_allclose(momentum[0], ro.rotate(ATTITUDE, MOMENTS * OMEGA + H), atol=1e-14)
+
+
+def test_a_prescribed_function_of_time_may_be_constant():
+    found = tq.Rotor(lambda _: jnp.asarray(H))(0.3, STATE, None)
+    np.testing.assert_allclose(found, -np.cross(OMEGA, H), atol=ulps(float, 2))
+
+
+def test_prescribed_momentum_equals_a_wheel_driven_by_the_motor_that_keeps_it():
+    """J s = h + J a.omega and motor = h' + J a.omega'; the wheel leaves the body's inertia."""
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    moment = 0.3
+    h = lambda t: 0.5 + 0.2 * t - 0.1 * t**3  # noqa: E731
+    t = 0.6
+    value, slope = h(t), 0.2 - 0.3 * t**2
+    prescribed = tq.Rotor(lambda t: h(t) * jnp.asarray(axis))
+    free = jr.RigidBody(TENSOR, prescribed).vector_field(t, STATE, None)
+    momentum = prescribed.internal_momentum(t, STATE, None)
+    np.testing.assert_allclose(momentum, value * axis, rtol=ulps(float, 4))
+
+    motor = slope + moment * axis @ np.asarray(free.omega)
+    spin = value / moment + axis @ OMEGA
+    wheel = tq.Rotor(tq.SpinningMass(moment, axis, lambda *_: motor))
+    body = jr.RigidBody(TENSOR - moment * np.outer(axis, axis), wheel)
+    state = jr.State(ATTITUDE, OMEGA, jnp.asarray(spin))
+    found = body.vector_field(t, state, None)
+    np.testing.assert_allclose(found.omega, free.omega, atol=ulps(float, 16))
+    np.testing.assert_allclose(found.internal, motor / moment, rtol=ulps(float, 4))
+    np.testing.assert_allclose(
+        body.angular_momentum(t, state, None),
+        jr.RigidBody(TENSOR, prescribed).angular_momentum(t, STATE, None),
+        atol=ulps(float, 16),
+    )
+
+
+def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
+    body = jr.RigidBody(TENSOR, tq.Rotor(WHEEL))
+    state = jr.State(ATTITUDE, OMEGA, jnp.asarray(4.0))
+
+    @jax.jit
+    def rates(state):
+        invariants = lambda s: (body.energy(0.0, s, None), body.angular_momentum(0.0, s, None))  # noqa: E731
+        rate = body.vector_field(0.0, state, None)
+        return rate, *jax.jvp(invariants, (state,), (rate,))[1]
+
+    rate, power, momentum_rate = rates(state)
+    assert rate.internal == 0
+    assert np.linalg.norm(rate.omega) > 0.1
+    assert abs(power) <= ulps(float, 16)
+    np.testing.assert_allclose(momentum_rate, np.zeros(3), atol=ulps(float, 16))
+
+
+def test_a_wheel_started_without_a_state_turns_with_the_body():
+    """Then, and only at that instant, body and wheel move as one rigid body with a brake."""
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    body = jr.RigidBody(TENSOR, tq.Rotor(WHEEL))
+    state = jr.State(ATTITUDE, OMEGA, body.torque.internal_at_rest(STATE))
+    whole = TENSOR + 0.3 * np.outer(axis, axis)
+    expected = ro.rotate(ATTITUDE, whole @ OMEGA)
+    np.testing.assert_allclose(
+        body.angular_momentum(0.0, state, None), expected, atol=ulps(float, 16)
+    )
+    np.testing.assert_allclose(
+        body.energy(0.0, state, None), OMEGA @ whole @ OMEGA / 2, rtol=ulps(float, 8)
+    )
+
+
+# --- arguments --------------------------------------------------------------------------------
+
+FOUR = np.ones(4)
+WRONG = {
+    "not callable": (
+        lambda: tq.as_torque(3.0),
+        r"`torque` must be a callable \(t, state, args\) -> \(3,\), but it is 3.0",
+    ),
+    "sum with a number": (lambda: DAMPER + 3.0, r"`torque` must be a callable"),
+    "constant": (lambda: tq.Constant(FOUR), r"`torque` must have shape \(3,\), but it has"),
+    "lever": (
+        lambda: tq.UniformGravity(1.0, FOUR, GRAVITY),
+        r"`lever` must have shape \(3,\), but it has shape \(4,\)",
+    ),
+    "gravity": (
+        lambda: tq.UniformGravity(1.0, LEVER, np.array(9.8)),
+        r"`gravity` must have shape \(3,\), but it has shape \(\)",
+    ),
+    "mass": (
+        lambda: tq.UniformGravity(np.ones(2), LEVER, GRAVITY),
+        r"`mass` must have shape \(\), but it has shape \(2,\)",
+    ),
+    "gradient": (
+        lambda: tq.GravityGradient(FOUR, MU, orbit),
+        r"`inertia` must have shape \(3,\) or \(3, 3\), but it has shape \(4,\)",
+    ),
+    "mu": (
+        lambda: tq.GravityGradient(MOMENTS, np.ones(2), orbit),
+        r"`mu` must have shape \(\), but it has shape \(2,\)",
+    ),
+    "linear": (
+        lambda: tq.LinearDrag(FOUR),
+        r"`coefficient` must have shape \(\), \(3,\) or \(3, 3\), but it has shape \(4,\)",
+    ),
+    "quadratic": (lambda: tq.QuadraticDrag(FOUR), r"`coefficient` must have shape"),
+    "damper": (
+        lambda: tq.InternalDamper(MOMENTS, 0.1),
+        r"`inertia` must have shape \(\), but it has shape \(3,\)",
+    ),
+    "coupling": (
+        lambda: tq.InternalDamper(0.1, MOMENTS),
+        r"`coupling` must have shape \(\), but it has shape \(3,\)",
+    ),
+    "axis": (lambda: tq.SpinningMass(1.0, FOUR), r"`axis` must have shape \(3,\), but"),
+    "wheel": (
+        lambda: tq.SpinningMass(MOMENTS, LEVER),
+        r"`inertia` must have shape \(\), but it has shape \(3,\)",
+    ),
+    "rotor": (lambda: tq.Rotor(FOUR), r"`momentum` must have shape \(3,\), but it has"),
+    "rotor of time": (
+        lambda: tq.Rotor(lambda _: jnp.ones(4))(0.0, STATE, None),
+        r"`momentum` must have shape \(3,\), but it has shape \(4,\)",
+    ),
+    "orbit": (
+        lambda: tq.GravityGradient(MOMENTS, MU, lambda _: jnp.ones(2))(0.0, STATE, None),
+        r"`position` must have shape \(3,\), but it has shape \(2,\)",
+    ),
+    "function": (
+        lambda: tq.Torque(lambda *_: jnp.zeros(()))(0.0, STATE, None),
+        r"`torque` must have shape \(3,\), but it has shape \(\)",
+    ),
+    "motor": (
+        lambda: tq.Rotor(tq.SpinningMass(0.3, LEVER, lambda *_: jnp.ones(3)))(
+            0.0, jr.State(ATTITUDE, OMEGA, jnp.ones(())), None
+        ),
+        r"`motor_torque` must have shape \(\), but it has shape \(3,\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_argument_is_an_error(name, untyped):
+    call, message = WRONG[name]
+    with pytest.raises(ValueError, match="Argument " + message):
+        call()

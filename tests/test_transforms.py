@@ -1,0 +1,410 @@
+"""Every public function under jit, vmap, grad, jacfwd and second derivatives, in both precisions.
+
+A new public name of a module below must be added to `CASES`; the first test says which is missing.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
+from jax.flatten_util import ravel_pytree
+
+import jrigid as jr
+from jrigid import dynamics, rotation, systems, torques
+from jrigid._checks import float_arrays
+from jrigid.mass import MassProperties
+
+MODULES = {"rotation": rotation, "dynamics": dynamics, "torques": torques, "systems": systems}
+# Abstract classes and aliases: nothing to call.
+NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
+
+
+@dataclass
+class Case:
+    """A function of arrays, generic inputs for it, and the public names it goes through."""
+
+    function: Callable[..., Any]
+    inputs: tuple[Any, ...]
+    covers: tuple[str, ...] = ()
+
+
+OTHER_ATTITUDE = np.array([0.1, 0.8, -0.3, 0.5])
+VECTOR = np.array([0.7, 1.2, -0.4])
+AXIS = np.array([2.0, -3.0, 6.0])
+ANGLES = np.array([0.4, 1.1, -0.7])
+MATRIX = np.asarray(rotation.to_matrix(ATTITUDE))
+POSITION, VELOCITY = np.array([1.0, -2.0, 0.5]), np.array([0.4, 3.0, -1.2])
+INNER = np.array([1.0, 0.2, -0.6])
+SAMPLES = np.random.default_rng(0).normal(size=(5, 3))
+TIMES = np.array([0.0, 0.2, 0.35, 0.6, 0.7])
+TORQUE_METHODS = (
+    "__call__",
+    "potential",
+    "internal_at_rest",
+    "internal_rate",
+    "internal_scale",
+    "internal_momentum",
+    "internal_energy",
+)
+
+
+def number(x):
+    """What the functions written here, not the package's, do with integers."""
+    return float_arrays(x)[0]
+
+
+def symmetric(tensor):
+    """A tensor that stays symmetric when its nine numbers are varied one by one."""
+    tensor = number(tensor)
+    return 0.5 * (tensor + tensor.T) if tensor.ndim == 2 else tensor
+
+
+def all_of_a_torque(torque, t, state, args=None):
+    return {
+        "torque": torque(t, state, args),
+        "potential": torque.potential(t, state, args),
+        "rest": torque.internal_at_rest(state),
+        "rate": torque.internal_rate(t, state, args),
+        "scale": torque.internal_scale(state.omega[0] ** 2),
+        "momentum": torque.internal_momentum(t, state, args),
+        "energy": torque.internal_energy(t, state, args),
+    }
+
+
+def methods(name, *own):
+    return tuple(f"{name}.{method}" for method in own)
+
+
+def of_external(make):
+    """All methods of a torque without internal state, as a function of its data and the state."""
+    return lambda *x: all_of_a_torque(make(*x[:-3]), x[-3], jr.State(x[-2], x[-1]))
+
+
+def of_internal(make):
+    return lambda *x: all_of_a_torque(make(*x[:-4]), x[-4], jr.State(x[-3], x[-2], number(x[-1])))
+
+
+def orbit_along(axis):
+    return lambda t: number(axis) * (1 + number(t))
+
+
+def motor(t, state, args):
+    return number(t) + state.omega[0] * state.attitude[1]
+
+
+def two_parts(inertia, coupling, spinning, axis):
+    wheel = torques.Rotor(torques.SpinningMass(spinning, axis, motor))
+    drag = torques.LinearDrag(coupling)
+    return drag + torques.InternalDamper(inertia, coupling) + wheel
+
+
+def custom(scale):
+    return torques.Torque(
+        lambda t, s, _: number(scale) * number(t) * s.attitude[1:] * s.omega,
+        lambda t, s, _: number(scale) * number(t) * s.attitude[0] ** 2,
+    )
+
+
+def rigid_body(inertia, mass, lever, gravity, t, q, w):
+    body = jr.RigidBody(symmetric(inertia), torques.UniformGravity(mass, lever, gravity))
+    state = jr.State(q, w)
+    return [f(t, state, None) for f in (body.vector_field, body.energy, body.angular_momentum)]
+
+
+def floating_body(mass, inertia, stiffness, t, position, velocity, q, w, inner):
+    force = systems.Force(
+        lambda t, s, _: -number(stiffness) * s.position * number(t),
+        lambda t, s, _: 0.5 * number(stiffness) * jnp.sum(s.position**2) * number(t),
+    )
+    properties = MassProperties(
+        mass, jnp.zeros_like(number(position)), symmetric(inertia), throw=None
+    )
+    body = jr.FloatingBody(properties, force, torques.InternalDamper(mass, stiffness))
+    state = jr.FloatingState(position, velocity, q, w, number(inner))
+    return [
+        *(f(t, state, None) for f in (body.vector_field, body.energy, body.angular_momentum)),
+        *(f(state) for f in (body.translational_energy, body.rotational_energy, body.momentum)),
+        body.inertia,
+    ]
+
+
+CASES = {
+    # rotation
+    "rotation.hat": Case(rotation.hat, (VECTOR,)),
+    "rotation.vee": Case(rotation.vee, (MATRIX,)),
+    "rotation.normalize": Case(rotation.normalize, (2 * ATTITUDE,)),
+    "rotation.multiply": Case(rotation.multiply, (ATTITUDE, OTHER_ATTITUDE)),
+    "rotation.conjugate": Case(rotation.conjugate, (ATTITUDE,)),
+    "rotation.rotate": Case(rotation.rotate, (ATTITUDE, VECTOR)),
+    "rotation.rotate_inverse": Case(rotation.rotate_inverse, (ATTITUDE, VECTOR)),
+    "rotation.exp": Case(rotation.exp, (VECTOR,)),
+    "rotation.log": Case(rotation.log, (OTHER_ATTITUDE,)),
+    "rotation.angle_between": Case(rotation.angle_between, (ATTITUDE, OTHER_ATTITUDE)),
+    "rotation.from_axis_angle": Case(rotation.from_axis_angle, (AXIS, 0.8)),
+    "rotation.to_matrix": Case(rotation.to_matrix, (ATTITUDE,)),
+    "rotation.from_matrix": Case(rotation.from_matrix, (MATRIX,)),
+    "rotation.to_euler": Case(rotation.to_euler, (ATTITUDE,)),
+    "rotation.from_euler": Case(rotation.from_euler, (ANGLES,)),
+    "rotation.to_scipy": Case(rotation.to_scipy, (ATTITUDE,)),
+    "rotation.from_scipy": Case(rotation.from_scipy, (ATTITUDE,)),
+    "rotation.attitude_rate": Case(rotation.attitude_rate, (ATTITUDE, OMEGA)),
+    "rotation.angular_velocity": Case(rotation.angular_velocity, (MATRIX, TENSOR)),
+    "rotation.euler_rates_to_omega": Case(rotation.euler_rates_to_omega, (ANGLES, VECTOR)),
+    "rotation.omega_to_euler_rates": Case(rotation.omega_to_euler_rates, (ANGLES, OMEGA)),
+    "rotation.integrate_rate": Case(rotation.integrate_rate, (SAMPLES, TIMES, ATTITUDE)),
+    # dynamics
+    "dynamics.State": Case(lambda q, w, x: jr.State(q, w, x), (ATTITUDE, OMEGA, INNER)),
+    "dynamics.angular_momentum": Case(jr.angular_momentum, (TENSOR, OMEGA)),
+    "dynamics.kinetic_energy": Case(jr.kinetic_energy, (TENSOR, OMEGA)),
+    "dynamics.euler_equations": Case(
+        lambda i, w, n: jr.euler_equations(symmetric(i), w, n), (TENSOR, OMEGA, VECTOR)
+    ),
+    "dynamics.euler_equations, moments": Case(jr.euler_equations, (MOMENTS, OMEGA, VECTOR)),
+    "dynamics.bearing_torque": Case(
+        lambda i, w: jr.bearing_torque(symmetric(i), w), (TENSOR, OMEGA)
+    ),
+    "dynamics.bearing_torque, moments": Case(jr.bearing_torque, (MOMENTS, OMEGA)),
+    # torques
+    "torques.as_torque": Case(
+        lambda q, w: torques.as_torque(lambda _t, s, k: k * s.omega)(0.0, jr.State(q, w), 3.0),
+        (ATTITUDE, OMEGA),
+    ),
+    "torques.Constant": Case(
+        of_external(torques.Constant),
+        (VECTOR, 0.5, ATTITUDE, OMEGA),
+        methods("torques.Constant", "__call__"),
+    ),
+    "torques.Torque": Case(
+        of_external(custom),
+        (1.3, 0.5, ATTITUDE, OMEGA),
+        methods("torques.Torque", "__call__", "potential"),
+    ),
+    "torques.UniformGravity": Case(
+        of_external(torques.UniformGravity),
+        (2.0, VECTOR, AXIS, 0.5, ATTITUDE, OMEGA),
+        methods("torques.UniformGravity", "__call__", "potential"),
+    ),
+    "torques.GravityGradient": Case(
+        of_external(
+            lambda i, mu, axis: torques.GravityGradient(symmetric(i), mu, orbit_along(axis))
+        ),
+        (TENSOR, 4.0, VECTOR, 0.5, ATTITUDE, OMEGA),
+        methods("torques.GravityGradient", "__call__", "potential"),
+    ),
+    "torques.LinearDrag": Case(
+        of_external(torques.LinearDrag),
+        (TENSOR, 0.5, ATTITUDE, OMEGA),
+        methods("torques.LinearDrag", "__call__"),
+    ),
+    "torques.QuadraticDrag": Case(
+        of_external(torques.QuadraticDrag),
+        (0.3, 0.5, ATTITUDE, OMEGA),
+        methods("torques.QuadraticDrag", "__call__"),
+    ),
+    "torques.InternalDamper": Case(
+        of_internal(torques.InternalDamper),
+        (0.2, 0.05, 0.5, ATTITUDE, OMEGA, INNER),
+        methods("torques.InternalDamper", *(set(TORQUE_METHODS) - {"potential"})),
+    ),
+    "torques.Rotor, a wheel": Case(
+        of_internal(lambda i, axis: torques.Rotor(torques.SpinningMass(i, axis, motor))),
+        (0.3, AXIS, 0.5, ATTITUDE, OMEGA, 4.0),
+        (
+            *methods("torques.Rotor", *(set(TORQUE_METHODS) - {"potential"})),
+            "torques.SpinningMass",
+            "torques.Rotor",
+        ),
+    ),
+    "torques.Rotor, prescribed": Case(
+        of_external(lambda axis: torques.Rotor(lambda t: number(axis) * jnp.sin(t))),
+        (AXIS, 0.5, ATTITUDE, OMEGA),
+    ),
+    "torques.Sum": Case(
+        lambda *x: all_of_a_torque(
+            two_parts(*x[:4]), x[4], jr.State(x[5], x[6], (number(x[7]), number(x[8])))
+        ),
+        (0.2, 0.05, 0.3, AXIS, 0.5, ATTITUDE, OMEGA, INNER, 4.0),
+        methods("torques.Sum", *TORQUE_METHODS),
+    ),
+    # systems
+    "systems.FloatingState": Case(
+        lambda r, v, q, w: jr.FloatingState(r, v, q, w), (POSITION, VELOCITY, ATTITUDE, OMEGA)
+    ),
+    "systems.RigidBody": Case(
+        rigid_body,
+        (TENSOR, 2.0, VECTOR, AXIS, 0.5, ATTITUDE, OMEGA),
+        methods("systems.RigidBody", "vector_field", "energy", "angular_momentum"),
+    ),
+    "systems.FloatingBody": Case(
+        floating_body,
+        (2.0, TENSOR, 0.4, 0.5, POSITION, VELOCITY, ATTITUDE, OMEGA, INNER),
+        (
+            *methods("systems.FloatingBody", "vector_field", "energy", "angular_momentum"),
+            *methods("systems.FloatingBody", "translational_energy", "rotational_energy"),
+            *methods("systems.FloatingBody", "momentum", "inertia"),
+            *("systems.Force", "systems.Force.__call__"),
+        ),
+    ),
+}
+
+
+def public_names():
+    """`module.function`, `module.Class` and `module.Class.method` of the modules' own names."""
+    names = set()
+    for short, module in MODULES.items():
+        for name, value in vars(module).items():
+            home = getattr(value, "__module__", "")
+            if name.startswith("_") or inspect.ismodule(value) or module.__name__ not in home:
+                continue
+            names.add(f"{short}.{name}")
+            if inspect.isclass(value) and issubclass(value, eqx.Module):
+                own = set(vars(value)) - set(value.__dataclass_fields__)
+                own = {x for x in own if not x.startswith("_") or x == "__call__"}
+                names.update(f"{short}.{name}.{x}" for x in own)
+    return {n for n in names if not any(n == x or n.startswith(x + ".") for x in NOTHING_TO_CALL)}
+
+
+def test_every_public_name_is_in_the_table():
+    covered = {name.split(",")[0] for name in CASES}.union(*(c.covers for c in CASES.values()))
+    assert public_names() - covered == set()
+    assert covered - public_names() == set()  # no name that is gone
+
+
+def as_arrays(case, dtype):
+    return tuple(np.asarray(x, dtype) for x in case.inputs)
+
+
+def weighted(case, dtype):
+    """The function of one flat vector, and the sum of its outputs with generic weights."""
+    flat, unravel = ravel_pytree(as_arrays(case, dtype))
+
+    def outputs(x):
+        leaves = jax.tree.leaves(case.function(*unravel(x)))
+        assert all(leaf.dtype == dtype for leaf in leaves), [leaf.dtype for leaf in leaves]
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+
+    def total(x):
+        values = outputs(x)
+        weights = np.cos(1.0 + np.arange(values.size)).astype(dtype)
+        return jnp.sum(weights * values)
+
+    return np.asarray(flat), outputs, total
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    """Values and derivatives of a case in a dtype, computed once."""
+    found = {}
+
+    def compute(name, dtype):
+        if (name, dtype) not in found:
+            flat, outputs, total = weighted(CASES[name], dtype)
+
+            @jax.jit
+            def everything(x, direction):
+                reverse, curvature = jax.jvp(jax.grad(total), (x,), (direction,))
+                found = {
+                    "value": outputs(x),
+                    "reverse": reverse,
+                    "forward": jax.jvp(total, (x,), (direction,))[1],
+                    "second": curvature,
+                }
+                if dtype == np.float64:
+                    found["jacobian"] = jax.jacfwd(total)(x)
+                return found
+
+            direction = direction_of(flat)
+            values = jax.tree.map(np.asarray, everything(flat, direction))
+            found[name, dtype] = flat, outputs, everything, values
+        return found[name, dtype]
+
+    return compute
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_jit_and_vmap_equal_a_plain_call_and_a_loop(name, derivatives):
+    flat, outputs, _, found = derivatives(name, np.float64)
+    eager = np.asarray(outputs(jnp.asarray(flat)))
+    scale = max(1.0, np.max(np.abs(eager)))
+    np.testing.assert_allclose(found["value"], eager, rtol=0, atol=ulps(float, 32) * scale)
+    other = flat * (1 + 0.03 * np.sin(np.arange(flat.size)))
+    lanes = jax.jit(jax.vmap(outputs))(np.stack([flat, other, flat]))
+    loop = np.stack([eager, np.asarray(outputs(jnp.asarray(other))), eager])
+    np.testing.assert_allclose(lanes, loop, rtol=0, atol=ulps(float, 64) * scale)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_agree_in_every_mode_and_with_differences(name, derivatives):
+    flat, _, everything, found = derivatives(name, np.float64)
+    direction = direction_of(flat)
+    gradient, curvature = found["reverse"], found["second"]
+    exact = 1e-13 * scale_of(gradient)
+    np.testing.assert_allclose(found["jacobian"], gradient, rtol=0, atol=exact)
+    np.testing.assert_allclose(found["forward"], gradient @ direction, rtol=0, atol=10 * exact)
+    # the second derivative, H d: finite, symmetric (d'.H d = d.H d'), and what differences say
+    other = np.cos(3.0 + 2 * np.arange(flat.size))
+    across = np.asarray(everything(flat, other)["second"])
+    scale = scale_of(curvature) + scale_of(across)
+    np.testing.assert_allclose(other @ curvature, direction @ across, rtol=0, atol=1e-12 * scale)
+    h = np.finfo(float).eps ** (1 / 3)
+    up, down = everything(flat + h * direction, other), everything(flat - h * direction, other)
+    weights = np.cos(1.0 + np.arange(found["value"].size))
+    first = weights @ np.asarray(up["value"] - down["value"]) / (2 * h)
+    second = np.asarray(up["reverse"] - down["reverse"]) / (2 * h)
+    # truncation and rounding are both eps^(2/3) = 4e-11 of the third derivative and the value
+    bound = 1e-8 * (scale_of(gradient) + scale)
+    np.testing.assert_allclose(found["forward"], first, rtol=0, atol=bound)
+    np.testing.assert_allclose(curvature, second, rtol=0, atol=10 * bound)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_float32_in_float32_out_with_its_accuracy(name, derivatives):
+    exact, single = derivatives(name, np.float64)[3], derivatives(name, np.float32)[3]
+    for key, count in (("value", 64), ("forward", 256), ("reverse", 256), ("second", 2048)):
+        assert single[key].dtype == np.float32
+        np.testing.assert_allclose(
+            single[key], exact[key], rtol=0, atol=ulps(np.float32, count) * scale_of(exact[key])
+        )
+
+
+def direction_of(flat):
+    return np.sin(1.0 + 2 * np.arange(flat.size)).astype(flat.dtype)
+
+
+def scale_of(array):
+    return max(1.0, float(np.max(np.abs(array))))
+
+
+def whole_numbers(value):
+    """Integers of the shape of an input, generic and none of them zero."""
+    counted = 1 + (np.arange(np.size(value)) * 7) % 5
+    return counted.reshape(np.shape(value))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_integers_python_numbers_and_numpy_arrays_are_taken(name):
+    case = CASES[name]
+    whole = [whole_numbers(x) for x in case.inputs]
+    if name == "rotation.integrate_rate":
+        whole[1] = np.arange(whole[1].size)
+    exact = case.function(*(jnp.asarray(x, float) for x in whole))
+    as_integers = case.function(*(int(x) if x.ndim == 0 else x for x in whole))
+    as_floats = case.function(*(float(x) if x.ndim == 0 else x.astype(float) for x in whole))
+    as_jax = case.function(*(jnp.asarray(x) for x in whole))
+    for other in (as_integers, as_floats, as_jax):
+        for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(exact), strict=True):
+            np.testing.assert_allclose(a, b, rtol=ulps(float, 4), atol=ulps(float, 4))
+
+
+def test_lists_are_taken_where_no_type_checker_watches(untyped):
+    np.testing.assert_array_equal(rotation.exp([0, 0, 0]), [1, 0, 0, 0])
+    np.testing.assert_array_equal(jr.angular_momentum([1, 2, 3], [1, 1, 2]), [1, 2, 6])
+    assert jr.State([1, 0, 0, 0], [1, 2, 3]).omega.dtype == np.float64
+    assert jr.RigidBody([1, 2, 3]).inertia.dtype == np.float64
