@@ -100,6 +100,10 @@ def test_integrated_body_is_the_exponential_of_linear_theory(pole):
     np.testing.assert_allclose(moved[:, 0] + 1j * moved[:, 1], expected, atol=2e-4)
 
 
+def solve_normal_equations(basis, rows):
+    return np.linalg.solve(basis.conj().T @ basis, basis.conj().T @ rows)
+
+
 def linearised_fit(pole, observed, ellipticity):
     """Linear least squares and its Jacobian, by Gauss-Newton from within the basin."""
     unit = earth_wobble.ellipticity_of_period(earth_wobble.RIGID_PERIOD)
@@ -108,14 +112,14 @@ def linearised_fit(pole, observed, ellipticity):
     others = np.concatenate([seasons, earth_wobble.drift_basis(tau)], axis=1)
     for _ in range(4):
         basis = np.concatenate([np.exp(1j * ellipticity * tau)[:, None], others], axis=1)
-        amplitudes = np.linalg.solve(basis.conj().T @ basis, basis.conj().T @ observed)
+        amplitudes = solve_normal_equations(basis, observed)
         residual = basis @ amplitudes - observed
         slope = 1j * unit * tau * amplitudes[0] * basis[:, 0]
         columns = np.concatenate([slope[:, None], basis, 1j * basis], axis=1)
         jacobian = np.stack([columns.real, columns.imag], axis=1)
         jacobian = jacobian.reshape(-1, columns.shape[1])
         rows = np.stack([residual.real, residual.imag], axis=1).reshape(-1)
-        ellipticity -= unit * np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ rows)[0]
+        ellipticity -= unit * solve_normal_equations(jacobian, rows)[0]
     wobble = earth_wobble.Wobble(
         jnp.asarray(ellipticity / unit), jnp.zeros(2), jnp.zeros((4, 2)), jnp.zeros((4, 2))
     )

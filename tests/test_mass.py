@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jrigid as jr
+from jrigid._checks import is_positive_definite, is_symmetric
 from jrigid.mass import mesh_validity
 from jrigid.mass._mesh import _closed_numpy, _closed_traced
 
@@ -726,6 +727,10 @@ BAD_VALUES = {
     "skew tensor displaced": (jr.parallel_axis, (SKEW, 1.0, ONES), "symmetric"),
     "NaN tensor displaced": (jr.parallel_axis, (ONES * np.nan, 1.0, ONES), "finite"),
     "three lanes displaced back": (jr.to_center_of_mass, (THREE_LANES, 1.0, ONES), "three lanes of `jax.vmap`"),
+    "negative mass displaced": (jr.parallel_axis, (ONES, -1.0, ONES), "`mass` must be finite and non-negative"),
+    "NaN mass displaced back": (jr.to_center_of_mass, (ONES, np.nan, ZEROS), "`mass` must be finite and non-negative"),
+    "displaced to infinity": (jr.parallel_axis, (ONES, 1.0, ONES * np.inf), "`displacement` must be finite"),
+    "displaced back from NaN": (jr.to_center_of_mass, (ONES, 1.0, ONES * np.nan), "`displacement` must be finite"),
     "displaced back too far": (jr.to_center_of_mass, (ONES, 1.0, ONES), "comes out negative"),
     "axes of a skew tensor": (jr.principal_axes, (SKEW,), "symmetric"),
     "axes of three lanes": (jr.principal_axes, (THREE_LANES,), "three lanes of `jax.vmap`"),
@@ -743,7 +748,8 @@ def test_bad_value_is_an_error(name):
 
 @pytest.mark.parametrize(
     "name", ["negative mass", "three lanes of moments", "triangle inequality", "NaN position",
-             "negative density", "displaced back too far", "axes of three lanes"]
+             "negative density", "displaced back too far", "axes of three lanes",
+             "negative mass displaced", "displaced back from NaN"]
 )  # fmt: skip
 def test_bad_value_is_an_error_under_jit(name):
     function, arguments, message = BAD_VALUES[name]
@@ -797,11 +803,73 @@ def test_the_code_of_a_bad_body_survives_what_is_done_with_it():
         (CODES.unphysical_inertia, (1.0, ZEROS, np.array([1.0, 1, 3]))),
     ]
     q = jnp.array([1.0, 2.0, 3.0, 4.0])
-    for code, values in bad:
-        body = jr.MassProperties(*values, throw=False)
+    bodies = [(code, jr.MassProperties(*values, throw=False)) for code, values in bad]
+    bodies.append((CODES.invalid_length, jr.solids.sphere(1.0, -1.0, throw=False)))
+    bodies.append((CODES.invalid_attitude, good.rotated(jnp.zeros(4))))
+    for code, body in bodies:
         for later in (body, good + body, body.translated(jnp.ones(3)), body.rotated(q)):
             assert later.result == code
-    assert good.rotated(jnp.zeros(4)).result == CODES.invalid_position
+        assert np.all(np.isnan(body.about(jnp.zeros(3))))
+    assert good.translated(jnp.full(3, jnp.inf)).result == CODES.invalid_position
+
+
+NAN_LANE = np.array([1.0, np.nan])
+SHARED = {
+    "points, a bad mass": (lambda x, bad: jr.from_points(jnp.stack([bad, 1.0]), x, throw=False), POINTS[:2] + 1),
+    "points, a bad position": (lambda m, bad: jr.from_points(m, POINTS * bad, throw=False), ONES),
+    "mesh, a bad vertex": (lambda d, bad: jr.from_mesh(CUBE * bad, CUBE_FACES, d, throw=False), 2.0),
+    "mesh, a bad density": (lambda v, bad: jr.from_mesh(v, CUBE_FACES, bad, throw=False), CUBE),
+    "density, a bad box": (lambda c, bad: jr.from_density(lambda r: c * r[0], ZEROS, ONES * bad, order=2, throw=False), 2.0),
+    "sum, a bad centre": (lambda m, bad: jr.solids.sphere(m, 1.0) + jr.MassProperties(m, bad * ONES, ONES, throw=False), 2.0),
+    "sum, a bad mass": (lambda x, bad: jr.solids.sphere(1.0, 1.0).translated(x) + jr.MassProperties(bad, ZEROS, ONES, throw=False), ONES),
+    "turn of a bad body": (lambda q, bad: jr.MassProperties(1.0, ONES, bad * ONES, throw=False).rotated(q), np.arange(1.0, 5)),
+    "bad turn": (lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(np.arange(4.0) * bad), 2.0),
+    "zero turn": (lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(jnp.nan_to_num(np.arange(4.0) * bad)), 2.0),
+    "bad shift": (lambda m, bad: jr.solids.sphere(m, 1.0).translated(bad * ONES), 2.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_a_bad_lane_leaves_the_gradient_in_shared_arguments_alone(name):
+    function, shared = SHARED[name]
+
+    def total(x, bad):
+        body = function(x, bad)
+        origin = body.about(jnp.zeros(3))
+        value = body.mass + jnp.sum(jnp.sin(body.center_of_mass)) + jnp.sum(jnp.cos(origin))
+        return jnp.where(body.result == CODES.successful, value, 0.0)
+
+    shared = jnp.asarray(shared)
+    both = jax.jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
+    alone = both(shared, NAN_LANE[:1])
+    assert np.any(alone != 0)
+    np.testing.assert_allclose(both(shared, NAN_LANE), alone, rtol=64 * EPS, atol=64 * EPS)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 4e37])
+def test_checks_of_a_tensor_do_not_depend_on_its_scale(scale):
+    good = np.array([[3.0, 0.3, -0.2], [0.3, 3.5, 0.4], [-0.2, 0.4, 4.0]])
+    turn = rotation(0)
+    negative, odd = (turn @ np.diag(x) @ turn.T for x in ([-0.2, 2.0, 2.1], [1.0, 2.0, 3.5]))
+    for tensor, code in (
+        (good, CODES.successful),
+        (negative, CODES.invalid_inertia),
+        (odd, CODES.unphysical_inertia),
+    ):
+        tensor = jnp.asarray(tensor * scale, jnp.float32)
+        definite = code != CODES.invalid_inertia
+        assert is_symmetric(tensor)
+        assert is_positive_definite(tensor) == definite
+        body = jr.MassProperties(jnp.float32(1), jnp.zeros(3, jnp.float32), tensor, throw=False)
+        assert body.result == code
+    tensor = jnp.asarray(good * scale, jnp.float32)
+    displacement = jnp.asarray([0.5, 0.0, 0.0], jnp.float32)
+    jr.to_center_of_mass(tensor, jnp.float32(scale), displacement)
+    with pytest.raises(RuntimeError, match="comes out negative"):
+        jr.to_center_of_mass(tensor, jnp.float32(8 * scale), 2 * displacement)
+    thin = jnp.diag(jnp.asarray([1e-30, 1e-30, 1.0], jnp.float32))
+    assert is_positive_definite(thin)
+    assert not is_positive_definite(0 * thin)
 
 
 def test_thin_bodies_are_bodies():

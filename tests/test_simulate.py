@@ -139,12 +139,10 @@ def test_jacobian_of_spin_about_each_axis(spin_jacobians, rtol):
     """At most 1000 rtol against the variational equations, also where plain integration fails."""
     cases, errors, _ = spin_jacobians
     for (moments, _, axis, wobble), error in zip(cases, errors[rtol], strict=True):
-        # Half-way to the separatrix's other end and back, arithmetic itself is amplified: the
-        # invariant that measures the distance to it, about wobble^2, has an absolute rounding
-        # error of some eps.
-        floor = 0.0
-        if moments[1] == 2 and axis == 1 and wobble > 0:
-            floor = 4 * 2.2e-16 / wobble**2 if wobble >= 1e-4 else 0.0
+        # At 1e-12 the arithmetic itself shows in one row: it comes back close by the separatrix,
+        # where the invariant that times the next flip is 1e-8, with a rounding error of some eps.
+        returns = moments[1] == 2 and axis == 1 and wobble == 1e-4
+        floor = 1e-7 if returns and rtol == 1e-12 else 0.0
         assert error <= 1000 * rtol + floor, (moments, axis, wobble, error)
 
 
@@ -184,16 +182,55 @@ def test_jacobian_of_the_sleeping_top():
             q = np.asarray(finals[k, :4])
             truth = _on_the_sphere(exact[k], attitudes[k], q)
             error = np.linalg.norm(_on_the_sphere(jacobians[k], attitudes[k], q) - truth)
-            # An unstable top falls through 1 / tilt^2 of amplification and comes back.
-            unstable = spin < threshold and tilt >= 1e-6
-            floor = 4 * 2.2e-16 / tilt**2 if unstable else 0.0
-            assert error <= (1000 * rtol + floor) * np.linalg.norm(truth), (tilt, rtol, error)
+            # One row is beyond arithmetic: a top let go at 1e-6 falls, and rises again to where
+            # tilt^2 = 1e-12 decides what follows; the last bit of the energy is 1e-16.
+            bit = 4 * 2.2e-16 / tilt**2 if spin < threshold and tilt == 1e-6 else 0.0
+            error /= np.linalg.norm(truth)
+            assert error <= 1000 * rtol + bit, (spin, tilt, rtol, error)
             if tilt == 0:  # also the matrix exponential of (omega1, omega2, gamma1, gamma2)
                 drag = (moments[0] - moments[2]) / moments[0] * spin
                 linear = [[0, drag, 0, 1], [-drag, 0, -1, 0], [0, -1, 0, spin], [1, 0, -spin, 0]]
                 block = scipy.linalg.expm(40 * np.array(linear))[:2, :2]
                 difference = np.asarray(jacobians[k])[4:6, 4:6] - block
                 assert np.linalg.norm(difference) <= 1000 * rtol * np.linalg.norm(block)
+
+
+# Equilibria with a rate much faster than the turning itself, and d omega1 / d omega1 there, from
+# the matrix exponential of the linearised motion or, for the damper, of body and sphere together.
+FAST = {
+    "hanging at rest": (
+        (1.0, 1.0, 0.5), jr.torques.UniformGravity(1.0, [0, 0, -1.0], [0, 0, -1.0]), 0.0, 200.0,
+        np.cos(200.0),
+    ),
+    "gyrostat": ((1.0, 1.0, 1.5), jr.torques.Rotor([0, 0, 50.0]), 0.1, 40.0, np.cos(50.05 * 40)),
+    "needle-like wheel": ((0.01, 0.01, 1.0), None, 1.0, 40.0, np.cos(99.0 * 40)),
+    "stiff damper": ((1.0, 1.0, 1.5), jr.torques.InternalDamper(1e-3, 1.0), 1.0, 40.0, None),
+    "stiff drag": ((1.0, 1.0, 1.5), jr.torques.LinearDrag(100.0), 0.0, 40.0, 0.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", FAST)
+def test_derivative_at_an_equilibrium_with_a_fast_rate(what):
+    moments, torque, spin, duration, exact = FAST[what]
+    if exact is None:
+        # omega = Omega to first order in the inertia over the coupling: see the linear system
+        # I (a' + i w a) = ..., solved here for (omega1, omega2, sphere1, sphere2).
+        ratio, coupling, inertia = 0.5, 1.0, 1e-3
+        linear = np.zeros((4, 4))
+        linear[:2, :2] = [[-coupling, -ratio * spin], [ratio * spin, -coupling]]
+        linear[:2, 2:] = coupling * np.eye(2)
+        linear[2:, :2] = coupling / inertia * np.eye(2) + spin * np.array([[0, -1], [1, 0]])
+        linear[2:, 2:] = -coupling / inertia * np.eye(2) + spin * np.array([[0, 1], [-1, 0]])
+        start = np.array([1.0, 0, 1.0, 0])  # the sphere starts with the body
+        exact = (scipy.linalg.expm(duration * linear) @ start)[0]
+
+    def final(omega):
+        body, state0 = jr.RigidBody(np.array(moments), torque), jr.State(UPRIGHT, omega)
+        return jr.simulate(body, state0, duration, adjoint=FORWARD).states.omega
+
+    omega0 = jnp.array([0.0, 0.0, spin])
+    _, column = jax.jit(lambda w: jax.jvp(final, (w,), (jnp.array([1.0, 0, 0]),)))(omega0)
+    assert abs(float(column[0]) - exact) <= 1e-5, (column, exact)
 
 
 def _observable(omega, adjoint=None):
@@ -325,6 +362,38 @@ def test_invariants_of_a_vmapped_trajectory():
     assert np.all(many.result == jr.RESULTS.successful)
 
 
+def test_a_trajectory_with_a_function_torque_passes_through_jit_and_vmap():
+    body = jr.RigidBody(MOMENTS, lambda _t, state, _args: -0.1 * state.omega)
+
+    def motion(omega):
+        return jr.simulate(body, jr.State(UPRIGHT, omega), np.linspace(0, 1, 3))
+
+    many = jax.jit(jax.vmap(motion))(jnp.ones((2, 3)))
+    assert many.energy.shape == (2, 3)
+    assert np.all(np.diff(many.energy, axis=1) < 0)
+    assert isinstance(many.system, jr.RigidBody)
+
+
+def test_max_step_shows_a_pulse_that_falls_between_two_steps():
+    torque = jr.torques.Torque(lambda t, _s, _a: jnp.exp(-(((t - 50) / 0.05) ** 2)) * jnp.ones(3))
+    body, state0 = jr.RigidBody(np.ones(3), torque), jr.State(UPRIGHT, np.array([0, 0, 0.01]))
+    trajectory = jr.simulate(body, state0, 100.0, max_step=0.05)
+    gain = 0.05 * np.sqrt(np.pi)
+    np.testing.assert_allclose(trajectory.states.omega, [gain, gain, gain + 0.01], rtol=1e-6)
+    with pytest.raises(RuntimeError, match="max_step"):
+        jr.simulate(body, state0, 100.0, max_step=-1.0)
+
+
+def test_derivative_in_a_time_at_the_start():
+    body = jr.RigidBody(MOMENTS)
+
+    def omega(ts):
+        return jr.simulate(body, jr.State(ATTITUDE, OMEGA), ts).states.omega
+
+    slope = jax.jacrev(omega)(jnp.array([0.0]))
+    np.testing.assert_allclose(slope[0, :, 0], jr.euler_equations(MOMENTS, OMEGA), atol=1e-9)
+
+
 def test_an_event_ends_the_motion_in_si_units():
     """A body turning at 2 rad/s about z has turned by 1.3 rad after 0.65 s."""
 
@@ -446,6 +515,34 @@ def test_gradients_of_good_lanes_are_untouched_by_a_bad_one():
     np.testing.assert_array_equal(gradient[0], gradient[2])
 
 
+def test_gradients_in_what_lanes_share_are_untouched_by_a_bad_one():
+    attitudes = jnp.stack([ATTITUDE, jnp.zeros(4)])
+    torque = jr.torques.Torque(lambda _t, state, args: -args * state.omega)
+
+    def total(drag, attitudes):
+        def lane(q):
+            body, state0 = jr.RigidBody(TENSOR, torque), jr.State(q, jnp.asarray(OMEGA))
+            trajectory = jr.simulate(body, state0, jnp.array([1.0]), drag, throw=False)
+            omega = trajectory.states.omega[0, 0]
+            return jnp.where(trajectory.result == jr.RESULTS.successful, omega, 0.0)
+
+        return jnp.sum(jax.vmap(lane)(attitudes))
+
+    gradient = jax.jit(jax.grad(total))
+    alone = gradient(jnp.array(0.1), attitudes[:1])
+    np.testing.assert_allclose(gradient(jnp.array(0.1), attitudes), alone, rtol=1e-12)
+
+
+@pytest.mark.parametrize("field", ["final_state", "final_time", "stats", "states"])
+def test_every_field_of_a_trajectory_carries_the_error(field):
+    def part(attitude):
+        state0 = jr.State(attitude, jnp.asarray(OMEGA))
+        return getattr(jr.simulate(jr.RigidBody(MOMENTS), state0, jnp.array([1.0])), field)
+
+    with pytest.raises(RuntimeError, match="unit quaternion"):
+        jax.block_until_ready(eqx.filter_jit(part)(jnp.zeros(4)))
+
+
 def test_nan_in_a_torque_at_the_start_is_an_error():
     body = jr.RigidBody(MOMENTS, jr.torques.Constant([jnp.nan, 0.0, 0.0]))
     with pytest.raises(RuntimeError, match="finite vector field"):
@@ -469,7 +566,17 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
         ),
         (
             lambda b, s: jr.simulate(b, jr.State(s.attitude, s.omega, jnp.ones(3)), 1.0),
-            "`state0.internal` must have the structure",
+            "`state0.internal` must hold arrays of the shapes",
+        ),
+        (
+            lambda b, s: jr.simulate(b, (s.attitude, s.omega), 1.0),
+            "`state0` must be a State, but it is tuple",
+        ),
+        (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a diffrax.Event"),
+        (lambda b, s: jr.simulate(b, s, 1.0, max_steps=0), "`max_steps` must be at least 1"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, adjoint=diffrax.BacksolveAdjoint()),
+            "`adjoint` must be diffrax.RecursiveCheckpointAdjoint",
         ),
     ],
 )

@@ -254,8 +254,13 @@ def test_bad_value_is_an_error_and_a_code(name):
     with pytest.raises(RuntimeError, match=message):
         function(*arguments)
     body = function(*arguments, throw=False)
-    codes = (jr.RESULTS.invalid_mass, jr.RESULTS.invalid_inertia, jr.RESULTS.invalid_position)
-    assert any(body.result == code for code in codes)
+    if "`mass`" in message:
+        code = jr.RESULTS.invalid_mass
+    else:
+        corner = "`vertices`" in message
+        code = jr.RESULTS.invalid_position if corner else jr.RESULTS.invalid_length
+    assert body.result == code
+    assert "{}" not in jr.RESULTS[code]
     assert np.any(np.isnan(body.inertia))
 
 
@@ -275,10 +280,33 @@ def test_bad_lane_gets_a_code_and_leaves_the_others_alone():
         bodies.result == jr.RESULTS.invalid_mass, [False, True, False, False]
     )
     np.testing.assert_array_equal(
-        bodies.result == jr.RESULTS.invalid_inertia, [False, False, True, False]
+        bodies.result == jr.RESULTS.invalid_length, [False, False, True, False]
     )
     moments = np.asarray(bodies.inertia)[[0, 3], 0, 0]
     np.testing.assert_allclose(moments, [0.4, 3.2], rtol=4 * EPS)
+
+
+def test_a_bad_lane_leaves_the_gradient_in_shared_arguments_alone():
+    def total(shared, bad):
+        bodies = [
+            jr.solids.sphere(shared, bad, throw=False),
+            jr.solids.sphere(bad, shared, throw=False),
+            thick_shell(1.0, 2 * bad, shared / 2, throw=False),
+            jr.solids.capsule(shared, bad, bad, throw=False),
+            jr.solids.tetrahedron(shared, CORNERS * bad, throw=False),
+        ]
+        return sum(
+            jnp.where(body.result == jr.RESULTS.successful, jnp.trace(body.inertia), 0.0)
+            for body in bodies
+        )
+
+    both = jax.jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
+    alone = both(2.0, np.array([1.0]))
+    for bad in (np.nan, np.inf, 0.0, -1.0):
+        lanes = both(2.0, np.array([1.0, bad]))
+        # Corners times 0 or -1 are good.
+        corners = jr.solids.tetrahedron(1.0, CORNERS * np.nan_to_num(bad, posinf=0.0)).inertia
+        np.testing.assert_allclose(lanes, alone + jnp.trace(corners), rtol=16 * EPS)
 
 
 @pytest.mark.parametrize("name", SOLIDS)

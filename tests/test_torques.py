@@ -8,6 +8,7 @@ from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
 import jrigid as jr
 from jrigid import rotation as ro
 from jrigid import torques as tq
+from jrigid._checks import Findings
 
 GRAVITY = np.array([1.0, -2.0, -9.0])
 LEVER = np.array([0.3, -0.2, 0.5])
@@ -217,6 +218,42 @@ def test_the_internal_state_of_one_carrier_is_not_wrapped():
     np.testing.assert_allclose(total(0.0, state, None), -0.1 * OMEGA, atol=ulps(float, 1))
 
 
+def test_a_plain_torque_sees_the_whole_internal_state_alone_and_in_a_sum():
+    """Terms that carry a part see their own; the others all of it, in torque and potential."""
+    first = lambda s: jax.tree.leaves(s.internal)[0]  # noqa: E731
+    plain = tq.Torque(lambda _t, s, _a: 1.0 * first(s), lambda _t, s, _a: first(s)[0])
+    inner, outer = jnp.array([1.0, 2, 3]), jnp.array([-0.5, 0.2, 0.1])
+    alone = jr.State(ATTITUDE, OMEGA, inner)
+    one, two = DAMPER + plain, DAMPER + plain + SLOSH
+    np.testing.assert_allclose(
+        one(0.0, alone, None),
+        plain(0.0, alone, None) + DAMPER(0.0, alone, None),
+        atol=ulps(float, 4),
+    )
+    assert one.potential(0.0, alone, None) == plain.potential(0.0, alone, None) == 1
+    both = jr.State(ATTITUDE, OMEGA, (inner, outer))
+    expected = inner + 0.05 * (inner - OMEGA) + 0.02 * (outer - OMEGA)
+    np.testing.assert_allclose(two(0.0, both, None), expected, atol=ulps(float, 4))
+    assert two.potential(0.0, both, None) == 1
+    nested = tq.Sum((DAMPER, tq.Sum((plain,)), SLOSH))
+    np.testing.assert_allclose(nested(0.0, both, None), expected, atol=ulps(float, 4))
+
+
+class Sprung(tq.InternalDamper):
+    """A part whose potential depends on its own state."""
+
+    def potential(self, t, state, args):
+        del t, args
+        return 2 * jnp.sum(state.internal)
+
+
+def test_the_potential_of_a_part_in_a_sum_is_that_of_its_own_state():
+    total = DAMPER + Sprung(0.2, 0.05) + POTENTIALS["gravity"]
+    state = jr.State(ATTITUDE, OMEGA, (jnp.ones(3), jnp.array([0.3, 0.1, 0.3])))
+    expected = 1.4 + POTENTIALS["gravity"].potential(0.0, STATE, None)
+    np.testing.assert_allclose(total.potential(0.0, state, None), expected, rtol=ulps(float, 4))
+
+
 def test_internal_parts_exert_what_they_lose():
     """The space rate of their own momentum is minus their torque, whatever they do."""
     wheel = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]), lambda t, s, _a: 0.7 * t + s.omega[0])
@@ -357,6 +394,67 @@ def test_a_wheel_started_without_a_state_turns_with_the_body():
     np.testing.assert_allclose(
         body.energy(0.0, state, None), OMEGA @ whole @ OMEGA / 2, rtol=ulps(float, 8)
     )
+
+
+# --- values of parameters ---------------------------------------------------------------------
+
+
+def findings_of(torque):
+    findings = Findings()
+    torque.check(findings)
+    return findings
+
+
+INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+ROW = np.array([1.0, -2.0, 0.5])
+SKEW = np.array([[1.0, 0.2, 0.0], [-0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])
+NAN3 = np.array([0.0, np.nan, 0.0])
+BAD_VALUES = {
+    "gradient, moments": (tq.GravityGradient(-MOMENTS, MU, orbit), "invalid_inertia", "inertia"),
+    "gradient, tensor": (tq.GravityGradient(INDEFINITE, MU, orbit), "invalid_inertia", "inertia"),
+    "mu": (tq.GravityGradient(MOMENTS, np.inf, orbit), "invalid_torque", "mu"),
+    "mass": (tq.UniformGravity(-1.0, LEVER, GRAVITY), "invalid_mass", "mass"),
+    "nan mass": (tq.UniformGravity(np.nan, LEVER, GRAVITY), "invalid_mass", "mass"),
+    "lever": (tq.UniformGravity(1.0, NAN3, GRAVITY), "invalid_torque", "lever"),
+    "gravity": (tq.UniformGravity(1.0, LEVER, NAN3), "invalid_torque", "gravity"),
+    "damper": (tq.InternalDamper(0.0, 0.1), "invalid_torque", "inertia"),
+    "coupling": (tq.InternalDamper(0.1, -0.1), "invalid_torque", "coupling"),
+    "nan coupling": (tq.InternalDamper(0.1, np.nan), "invalid_torque", "coupling"),
+    "wheel": (tq.Rotor(tq.SpinningMass(-1.0, LEVER)), "invalid_torque", "inertia"),
+    "axis": (tq.Rotor(tq.SpinningMass(1.0, np.zeros(3))), "invalid_torque", "axis"),
+    "linear": (tq.LinearDrag(-0.1), "invalid_torque", "coefficient"),
+    "linear, axes": (tq.LinearDrag(np.array([1.0, -1.0, 0.0])), "invalid_torque", "coefficient"),
+    "linear, tensor": (tq.LinearDrag(INDEFINITE), "invalid_torque", "coefficient"),
+    "quadratic": (tq.QuadraticDrag(np.inf), "invalid_torque", "coefficient"),
+    "quadratic, tensor": (tq.QuadraticDrag(SKEW), "invalid_torque", "coefficient"),
+    "constant": (tq.Constant(NAN3), "invalid_torque", "torque"),
+    "rotor": (tq.Rotor(NAN3), "invalid_torque", "momentum"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_VALUES)
+def test_a_bad_parameter_is_found_alone_and_in_a_sum(name):
+    torque, code, argument = BAD_VALUES[name]
+    for bad in (torque, tq.LinearDrag(0.1) + torque, tq.Sum((tq.Sum((torque,)),))):
+        findings = findings_of(bad)
+        assert findings.result == getattr(jr.RESULTS, code)
+        with pytest.raises(RuntimeError, match=f"Argument `{argument}` of `"):
+            findings.apply(jnp.zeros(()), throw=True)
+
+
+def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
+    good = [tq.UniformGravity(0.0, LEVER, GRAVITY), tq.GravityGradient(TENSOR, 0.0), DAMPER]
+    good += [tq.InternalDamper(0.1, 0.0), tq.Rotor(WHEEL), tq.Rotor(H), tq.Rotor(momentum_of_time)]
+    good += [tq.LinearDrag(c) for c in (0.0, TENSOR, np.zeros((3, 3)), MOMENTS)]
+    good += [tq.QuadraticDrag(1e-30 * np.outer(ROW, ROW)), tq.Constant(H), tq.as_torque(None)]
+    good += [tq.LinearDrag(np.float32(1e20 * np.outer(ROW, ROW))), tq.Torque(lambda *_: NAN3)]
+    for torque in good:
+        assert findings_of(torque).ok, torque
+
+    lanes = jax.jit(jax.vmap(lambda c: findings_of(tq.LinearDrag(c) + tq.Constant(H)).result))
+    codes = lanes(np.array([0.1, -0.1, np.nan]))
+    for k, code in enumerate(("successful", "invalid_torque", "invalid_torque")):
+        assert (codes == getattr(jr.RESULTS, code))[k]
 
 
 # --- arguments --------------------------------------------------------------------------------

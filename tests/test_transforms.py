@@ -6,6 +6,7 @@ A new public name of a module below must be added to `CASES`; the first test say
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from typing import Any
 
 import equinox as eqx
@@ -24,6 +25,32 @@ from jrigid.mass import MassProperties
 MODULES = {"rotation": rotation, "dynamics": dynamics, "torques": torques, "systems": systems}
 # Abstract classes and aliases: nothing to call.
 NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
+# What answers with a result code, not with numbers: tested where bad input is.
+CODES = {"rotation.rate_record_validity"}
+CODE_METHOD = "check"
+
+
+def quick_jit(function):
+    """jax.jit that spends less on compiling: for large derivatives that are run once."""
+    if jax.default_backend() != "cpu":
+        return jax.jit(function)
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    quick, plain = jax.jit(function, compiler_options=options), jax.jit(function)
+    known = True
+
+    @wraps(function)
+    def call(*args):
+        nonlocal known
+        if known:
+            try:
+                return quick(*args)
+            except jax.errors.JaxRuntimeError as error:
+                if "xla_" not in str(error):
+                    raise
+                known = False  # an older or newer jaxlib does not know an option
+        return plain(*args)
+
+    return call
 
 
 @dataclass
@@ -158,7 +185,10 @@ CASES = {
     "rotation.angular_velocity": Case(rotation.angular_velocity, (MATRIX, TENSOR)),
     "rotation.euler_rates_to_omega": Case(rotation.euler_rates_to_omega, (ANGLES, VECTOR)),
     "rotation.omega_to_euler_rates": Case(rotation.omega_to_euler_rates, (ANGLES, OMEGA)),
-    "rotation.integrate_rate": Case(rotation.integrate_rate, (SAMPLES, TIMES, ATTITUDE)),
+    "rotation.integrate_rate": Case(
+        lambda omegas, ts, q: rotation.integrate_rate(omegas, ts, rotation.normalize(q)),
+        (SAMPLES, TIMES, ATTITUDE),
+    ),
     # dynamics
     "dynamics.State": Case(lambda q, w, x: jr.State(q, w, x), (ATTITUDE, OMEGA, INNER)),
     "dynamics.angular_momentum": Case(jr.angular_momentum, (TENSOR, OMEGA)),
@@ -267,7 +297,9 @@ def public_names():
             if inspect.isclass(value) and issubclass(value, eqx.Module):
                 own = set(vars(value)) - set(value.__dataclass_fields__)
                 own = {x for x in own if not x.startswith("_") or x == "__call__"}
+                own -= {CODE_METHOD, *inspect.get_annotations(value)}
                 names.update(f"{short}.{name}.{x}" for x in own)
+    names -= CODES
     return {n for n in names if not any(n == x or n.startswith(x + ".") for x in NOTHING_TO_CALL)}
 
 
@@ -307,7 +339,7 @@ def derivatives():
         if (name, dtype) not in found:
             flat, outputs, total = weighted(CASES[name], dtype)
 
-            @jax.jit
+            @quick_jit
             def everything(x, direction):
                 reverse, curvature = jax.jvp(jax.grad(total), (x,), (direction,))
                 found = {

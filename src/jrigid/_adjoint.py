@@ -14,9 +14,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 _FORWARD_MESSAGE = (
-    "This adjoint of `jrigid.simulate` serves reverse mode only (jax.grad, jax.vjp, jax.jacrev). "
-    "For jax.jvp, jax.jacfwd and forward over forward pass `adjoint=diffrax.ForwardMode()`; for "
-    "every mode and order `adjoint=diffrax.DirectAdjoint()`."
+    "This adjoint of `jrigid.simulate` serves first derivatives in reverse mode only (jax.grad, "
+    "jax.vjp, jax.jacrev). For jax.jvp, jax.jacfwd and forward over forward pass "
+    "`adjoint=diffrax.ForwardMode()`; for every mode and order `adjoint=diffrax.DirectAdjoint()`."
 )
 _REVERSE_MESSAGE = (
     "`adjoint=diffrax.ForwardMode()` of `jrigid.simulate` serves forward mode only (jax.jvp, "

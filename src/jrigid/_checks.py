@@ -42,7 +42,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Argument `faces` must be ordered counter-clockwise seen from outside, enclosing a "
         "positive volume, but the enclosed volume is not positive: the mesh is inside out or flat."
     )
-    invalid_length = "Argument `{}` must be positive and finite, but it is not."
+    invalid_torque = (
+        "A parameter of a torque must be finite, and masses, moments, couplings and drag "
+        "coefficients must not be negative, but one is."
+    )
+    invalid_length = (
+        "The lengths of a solid must be positive and finite, and fit together, but they do not."
+    )
     invalid_attitude = (
         "Argument `attitude` must be a unit quaternion, but its norm is not 1: "
         "use `jrigid.rotation.normalize`."
@@ -51,6 +57,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     invalid_times = (
         "Argument `ts` must be finite, non-decreasing and not earlier than `t0`, but it is not."
     )
+    invalid_max_step = "Argument `max_step` must be positive, but it is not."
     invalid_vector_field = (
         "Argument `system` must have a finite vector field at the initial state, but it is not: "
         "a torque, force or parameter is NaN or infinite there."
@@ -64,6 +71,11 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*values, float)
     return tuple(jnp.asarray(value, dtype) for value in values)
+
+
+def state_array(value: Any) -> Any:
+    """A floating point array; None and integers pass, for the `in_axes` of a state under vmap."""
+    return value if value is None or isinstance(value, int) else float_arrays(value)[0]
 
 
 def check_shape(name: str, value: Array | np.ndarray, shape: tuple[int | None, ...]) -> None:
@@ -131,12 +143,25 @@ def is_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
     return jnp.all(jnp.abs(tensor - tensor.T) <= tolerance)
 
 
+def of_unit_size(
+    tensor: Float[Array, "3 3"], *others: Float[Array, "3 3"]
+) -> tuple[Float[Array, "3 3"], ...]:
+    """Divide tensors by the largest magnitude of the first one's entries, unless 0 or infinite."""
+    largest = jnp.max(jnp.abs(tensor))
+    # In two steps: XLA flushes the reciprocals of the largest numbers to zero.
+    step = jnp.where(largest > 1, 1 / 256, 256).astype(tensor.dtype)
+    usable = (largest > 0) & jnp.isfinite(largest)
+    divisor = jnp.where(usable, largest * step, 1.0)
+    return tuple(x * step / divisor for x in (tensor, *others))
+
+
 def is_positive_definite(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
-    """True where the leading minors of a symmetric tensor are positive."""
-    (a, d, e), (_, b, f), (_, _, c) = tensor
-    minor = a * b - d * d
-    determinant = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-    return (a > 0) & (minor > 0) & (determinant > 0)
+    """True where the pivots of a symmetric tensor, of whatever scale, are positive."""
+    (a, d, e), (_, b, f), (_, _, c) = of_unit_size(tensor)[0]
+    first = jnp.where(a > 0, a, 1.0)
+    b, c, f = b - d * (d / first), c - e * (e / first), f - d * (e / first)
+    second = jnp.where(b > 0, b, 1.0)
+    return (a > 0) & (b > 0) & (c - f * (f / second) > 0)
 
 
 def is_inertia(inertia: Array) -> Bool[Array, ""]:

@@ -24,7 +24,7 @@ from jrigid._checks import (
     is_inertia,
     nan_where,
 )
-from jrigid._numerics import safe_norm
+from jrigid._scales import fastest_rate, power_of_two, ravel, units, unravel
 from jrigid._trajectory import Trajectory
 from jrigid._types import ScalarLike
 from jrigid.rotation import normalize
@@ -37,8 +37,9 @@ from jrigid.torques._base import has_parts
 _STEP_FRACTION = 1e-3
 # Beyond this many radians the phase error, quadratic in time, asks for a smaller fraction still.
 _LONG_RADIANS = 1e5
-# No step turns the body further than this [rad]: near an equilibrium of omega the error estimate
-# sees nothing, and a step too long to be stable leaves the value right and the derivative wrong.
+# No step is longer than this fraction of the shortest time scale at the start, that of the turning
+# or of the linearised motion: at an equilibrium the error estimate sees nothing, and a step too
+# long to be stable leaves the value right and the derivative wrong.
 _LARGEST_STEP = 0.4
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
@@ -49,6 +50,7 @@ _SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
 _CHECKPOINTS = 100
+_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
 
 
 class _GiveUp(diffrax.PIDController):
@@ -79,6 +81,7 @@ def simulate(
     atol: ScalarLike | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int | None = None,
+    max_step: ScalarLike | None = None,
     event: diffrax.Event | None = None,
     throw: bool = True,
     progress: bool | diffrax.AbstractProgressMeter = False,
@@ -89,7 +92,8 @@ def simulate(
     depend on the unit of time, and the error control is set for the promises below.
 
     Args:
-        system: A `RigidBody`, a `FloatingBody`, or another `AbstractSystem`.
+        system: A `RigidBody`, a `FloatingBody`, or another `AbstractSystem`. Torques that are
+            functions are compiled anew for each new function object: define them once.
         state0: Its state at `t0`. Where a damper or a rotor needs an internal state and none is
             given, it starts at rest relative to the body.
         ts: Times [s], non-decreasing in the order of their memory, none before `t0`; any shape.
@@ -107,6 +111,9 @@ def simulate(
             over forward; `diffrax.DirectAdjoint()` every mode and order.
         max_steps: Largest number of steps; by default 2e7, which is never in the way, but 4096
             for `DirectAdjoint`, whose cost grows with it.
+        max_step: Longest step [s]. A pulse of torque much shorter than a radian of turning, or
+            than the run if the body is at rest, can fall between two steps: bound them by its
+            length.
         event: A `diffrax.Event` that ends the motion; its condition functions are called with
             (t, state, args), in SI units.
         throw: If True, bad input and a failed integration raise an error, under jit too; if
@@ -136,8 +143,15 @@ def simulate(
             "Argument `system` must be a jrigid system (a RigidBody, a FloatingBody), "
             f"but it is {type(system).__name__}."
         )
+    if not isinstance(state0, system.state_type):
+        raise ValueError(
+            f"Argument `state0` must be a {system.state_type.__name__}, "
+            f"but it is {type(state0).__name__}."
+        )
     for name, size in (("attitude", 4), ("omega", 3)):
         check_shape(f"state0.{name}", getattr(state0, name), (size,))
+    internal = jtu.tree_map(lambda x: float_arrays(x)[0], state0.internal)
+    state0 = dataclasses.replace(state0, internal=internal)
     ts, t0 = float_arrays(ts, t0)
     if ts.size == 0:
         raise ValueError("Argument `ts` must hold at least one time, but it is empty.")
@@ -157,6 +171,17 @@ def simulate(
         )
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_CHECKPOINTS)
+    if not isinstance(adjoint, _ADJOINTS):
+        raise ValueError(
+            "Argument `adjoint` must be diffrax.RecursiveCheckpointAdjoint(), ForwardMode() or "
+            f"DirectAdjoint(), but it is {adjoint!r}."
+        )
+    if event is not None and not isinstance(event, diffrax.Event):
+        raise ValueError(f"Argument `event` must be a diffrax.Event, but it is {event!r}.")
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"Argument `max_steps` must be at least 1, but it is {max_steps}.")
+    longest = jnp.asarray(jnp.inf if max_step is None else max_step, dtype)
+    check_shape("max_step", longest, ())
     if max_steps is None:
         direct = isinstance(adjoint, diffrax.DirectAdjoint)
         max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
@@ -168,8 +193,9 @@ def simulate(
     else:
         meter = progress
     return _simulate(
-        system, state0, ts, t0, args, solver, rtol, atol, adjoint, max_steps, event, throw, meter
-    )
+        system, state0, ts, t0, args, solver, rtol, atol, adjoint, max_steps, longest, event, throw,
+        meter,
+    )  # fmt: skip
 
 
 def _tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Array, Array]:
@@ -207,25 +233,30 @@ def _simulate(
     atol: Array,
     adjoint: Any,
     max_steps: int,
+    longest: Array,
     event: Any,
     throw: bool,
     meter: Any,
 ) -> Trajectory:
     if not has_parts(state0.internal):
         state0 = dataclasses.replace(state0, internal=system.torque.internal_at_rest(state0))
-    expected = jtu.tree_structure(system.torque.internal_at_rest(state0))
-    if jtu.tree_structure(state0.internal) != expected:
+    have, want = (
+        [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
+        for tree in (state0.internal, system.torque.internal_at_rest(state0))
+    )
+    if have != want:
         raise ValueError(
-            f"Argument `state0.internal` must have the structure {expected}, "
-            f"but it has {jtu.tree_structure(state0.internal)}."
+            f"Argument `state0.internal` must hold arrays of the shapes {want}, "
+            f"but it holds {have}."
         )
 
     flat = ts.reshape(-1)
     findings = Findings()
-    _check(findings, system, state0, flat, t0, args)
+    _check(findings, system, state0, flat, t0, longest, args)
     ok = findings.ok
-    # A bad lane integrates a harmless motion instead, so that no other lane waits for it.
-    system = _where_ok(ok, system)
+    # A bad lane integrates a harmless motion instead, so that no other lane waits for it, and so
+    # that no NaN reaches the derivatives of what it shares with the others.
+    system, args = _harmless(ok, (system, args))
     state0 = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), state0)
     identity = jnp.zeros(4, state0.attitude.dtype).at[0].set(1)
     attitude = normalize(jnp.where(ok, state0.attitude, identity))
@@ -234,48 +265,51 @@ def _simulate(
     t0 = jnp.where(ok, t0, jnp.zeros_like(t0))
     system, state0, flat, t0, args = guard_inputs(adjoint, (system, state0, flat, t0, args))
 
-    units = jax.lax.stop_gradient(_units(system, state0, flat[-1], t0, args))
-    rate, scales = units
+    rate, scales = jax.lax.stop_gradient(units(system, state0, flat[-1], t0, args))
     moving = flat[-1] > t0  # all times at t0: nothing to integrate
-    stretch = _power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
-    taus = jnp.where(moving, (flat - t0) * stretch, jnp.zeros_like(flat))
+    stretch = power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
+    taus = (flat - t0) * stretch
     end = jnp.where(moving, taus[-1], 1.0)
 
     def to_state(y: Any) -> Any:
-        return _unravel(y * scales, state0)
+        return unravel(y * scales, state0)
 
     def vector_field(tau: Any, y: Any, args: Any) -> Any:
         rates = system.vector_field(t0 + tau / stretch, to_state(y), args)
-        return _ravel(rates) / (scales * stretch)
+        return ravel(rates) / (scales * stretch)
 
-    y0 = _ravel(state0) / scales
+    y0 = ravel(state0) / scales
     eps = jnp.finfo(flat.dtype).eps
     radians = jax.lax.stop_gradient(end)
     fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
     step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
+    fastest = jnp.maximum(fastest_rate(vector_field, y0, args), rate / stretch)
+    fastest = jax.lax.stop_gradient(fastest)
+    largest_step = jnp.where(ok, jnp.minimum(_LARGEST_STEP / fastest, longest * stretch), 1.0)
     controller = diffrax.ClipStepSizeController(
         _GiveUp(
             rtol=step_rtol,
             atol=step_atol,
-            dtmax=_LARGEST_STEP * stretch / jnp.where(moving, rate, 1.0),
+            dtmax=largest_step,
             factormax=_GROWTH,
             resolution=16 * eps * radians,
         ),
         step_ts=jax.lax.stop_gradient(taus),
     )
     zero = jnp.zeros_like(end)
-    subs = [diffrax.SubSaveAt(ts=taus)]
-    if event is not None:
-        subs.append(diffrax.SubSaveAt(t1=True))
+    if event is None:
+        saveat = diffrax.SaveAt(ts=taus)
+    else:
+        saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=taus), diffrax.SubSaveAt(t1=True)])
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(vector_field),
         solver,
         zero,
         end,
-        jnp.minimum(jnp.asarray(0.05, flat.dtype), radians),
+        jnp.minimum(0.1 * largest_step, radians),
         y0,
         args,
-        saveat=diffrax.SaveAt(subs=subs),
+        saveat=saveat,
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
@@ -283,8 +317,7 @@ def _simulate(
         throw=False,
         progress_meter=meter,
     )
-    reached_taus: Any = solution.ts
-    ys: Any = solution.ys
+    saved: Any = (solution.ts, solution.ys)
     result: Any = RESULTS.promote(solution.result)
 
     def to_states(taus: Array, y: Array) -> Any:
@@ -295,11 +328,14 @@ def _simulate(
             lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.nan), state
         )
 
-    states = to_states(reached_taus[0], ys[0])
-    # Without an event the motion ends at the last of the times.
-    ends = to_states(reached_taus[-1], ys[-1]) if event is not None else states
+    if event is None:  # the motion ends at the last of the times
+        states = ends = to_states(*saved)
+        end_taus = saved[0]
+    else:
+        (reached, end_taus), (ys, end_ys) = saved
+        states, ends = to_states(reached, ys), to_states(end_taus, end_ys)
     final_state = jtu.tree_map(lambda x: x[-1], ends)
-    final_time = jnp.where(moving, t0 + reached_taus[-1][-1] / stretch, t0)
+    final_time = jnp.where(moving, t0 + end_taus[-1] / stretch, t0)
     finite = all_finite(final_state) | (result != RESULTS.successful)
     result = RESULTS.where(finite, result, RESULTS.nonfinite_state)
     result = RESULTS.where(ok, result, findings.result)
@@ -307,90 +343,51 @@ def _simulate(
     states = nan_where(~ok, states)
     final_state, final_time = nan_where(failed, (final_state, final_time))
     states, final_state, final_time = guard_outputs(adjoint, (states, final_state, final_time))
-    if throw:
-        states = result.error_if(states, failed)
-    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, *x.shape[1:]), states)
     stats = {
         name: solution.stats[name]
         for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")
     }
-    return Trajectory(ts, states, result, stats, final_time, final_state, system, args)
+    found = (states, final_state, final_time, stats)
+    if throw:
+        found = result.error_if(found, failed)
+    states, final_state, final_time, stats = found
+    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, *x.shape[1:]), states)
+    return Trajectory(ts, states, result, stats, final_time, final_state, (system, args))
 
 
 def _check(
-    findings: Findings, system: AbstractSystem, state0: Any, flat: Array, t0: Array, args: Any
+    findings: Findings,
+    system: AbstractSystem,
+    state0: Any,
+    flat: Array,
+    t0: Array,
+    longest: Array,
+    args: Any,
 ) -> None:
     eps = jnp.finfo(state0.attitude.dtype).eps
     square = jnp.sum(state0.attitude**2)
     ordered = jnp.all(flat[1:] >= flat[:-1]) & (flat[0] >= t0)
     findings.require(is_inertia(system.inertia), RESULTS.invalid_inertia)
+    torque: Any = system.torque
+    torque.check(findings)
     findings.require(all_finite(state0), RESULTS.invalid_state)
     # Four significant digits typed by hand are not a unit quaternion; rounding is.
     findings.require(jnp.abs(square - 1) < 30 * jnp.sqrt(eps), RESULTS.invalid_attitude)
     findings.require(all_finite((flat, t0)) & ordered, RESULTS.invalid_times)
+    findings.require(longest > 0, RESULTS.invalid_max_step)
     field = system.vector_field(t0, state0, args)
     findings.require(all_finite(field), RESULTS.invalid_vector_field)
 
 
-def _where_ok(ok: Array, system: AbstractSystem) -> AbstractSystem:
-    arrays, rest = eqx.partition(system, eqx.is_inexact_array)
-    arrays = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.ones_like(x)), arrays)
-    return eqx.combine(arrays, rest)
+def _harmless(ok: Array, tree: Any) -> Any:
+    """Ones, and unit tensors, in place of the arrays of a bad lane."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
 
+    def replace(x: Array) -> Array:
+        unit = jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else jnp.ones_like(x)
+        return jnp.where(ok, x, unit)
 
-def _ravel(tree: Any) -> Array:
-    """All components of a pytree in one array, which is how diffrax steps fastest."""
-    return jnp.concatenate([x.reshape(-1) for x in jtu.tree_leaves(tree)])
-
-
-def _unravel(components: Array, like: Any) -> Any:
-    """The pytree like `like` whose components these are."""
-    leaves, structure = jtu.tree_flatten(like)
-    parts, start = [], 0
-    for leaf in leaves:
-        parts.append(components[start : start + leaf.size].reshape(leaf.shape))
-        start += leaf.size
-    return structure.unflatten(parts)
-
-
-def _power_of_two(x: Array) -> Array:
-    """The power of two next above x, to scale by without rounding."""
-    _, exponent = jnp.frexp(x)
-    return jnp.ldexp(jnp.ones_like(x), exponent)
-
-
-def _units(
-    system: AbstractSystem, state0: Any, t_end: Array, t0: Array, args: Any
-) -> tuple[Array, Any]:
-    """The rate of turning [rad/s] that measures time, and a scale for each component of the state.
-
-    A body at rest turns at the rate its torque would give it within a radian; one that nothing
-    turns is measured by the length of the run.
-    """
-    rates = system.vector_field(t0, state0, args)
-    span = jnp.where(t_end > t0, t_end - t0, jnp.ones_like(t_end))
-    turning, spinning_up = safe_norm(state0.omega), safe_norm(rates.omega)
-    rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
-    rate = jnp.where(rate > 0, rate, 1 / span)
-    scale: dict[str, Any] = {
-        "attitude": jnp.ones_like(rate),
-        "omega": rate,
-        "internal": system.torque.internal_scale(rate),
-    }
-    if hasattr(state0, "velocity"):
-        # Motion of the centre of mass in one radian of turning, or in the whole run if that is
-        # shorter; a body at rest on which no force acts is measured in metres.
-        time = jnp.minimum(span, 1 / rate)
-        speed = safe_norm(state0.velocity) + safe_norm(rates.velocity) * time
-        length = safe_norm(state0.position) + speed * time
-        length = jnp.where(length > 0, length, 1.0)
-        speed = jnp.where(speed > 0, speed, length / time)
-        scale |= {"position": length, "velocity": speed}
-    spread = {
-        name: jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name))
-        for name, value in scale.items()
-    }
-    return rate, _power_of_two(_ravel(dataclasses.replace(state0, **spread)))
+    return eqx.combine(jtu.tree_map(replace, arrays), rest)
 
 
 def _event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:

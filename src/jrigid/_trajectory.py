@@ -24,8 +24,6 @@ class Trajectory(eqx.Module):
         stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
         final_time: Where the integration ended [s]: the last of `ts`, or the event.
         final_state: The state there.
-        system: The system that moved.
-        args: What its torques were given.
     """
 
     ts: Float[Array, "..."]
@@ -34,8 +32,33 @@ class Trajectory(eqx.Module):
     stats: dict[str, Array]
     final_time: Float[Array, "..."]
     final_state: Any
-    system: AbstractSystem
-    args: Any
+    _arrays: Any
+    _functions: Any = eqx.field(static=True)
+
+    def __init__(
+        self,
+        ts: Array,
+        states: Any,
+        result: Any,
+        stats: dict[str, Array],
+        final_time: Array,
+        final_state: Any,
+        system_and_args: tuple[AbstractSystem, Any],
+    ):
+        """What `simulate` found; functions are kept apart, so that jit and vmap can return it."""
+        self.ts, self.states, self.result, self.stats = ts, states, result, stats
+        self.final_time, self.final_state = final_time, final_state
+        self._arrays, self._functions = eqx.partition(system_and_args, eqx.is_array)
+
+    @property
+    def system(self) -> AbstractSystem:
+        """The system that moved."""
+        return eqx.combine(self._arrays, self._functions)[0]
+
+    @property
+    def args(self) -> Any:
+        """What its torques were given."""
+        return eqx.combine(self._arrays, self._functions)[1]
 
     @property
     def energy(self) -> Float[Array, "..."]:

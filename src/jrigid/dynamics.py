@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_inertia_shape, check_shape, float_arrays
+from jrigid._checks import check_inertia_shape, check_shape, float_arrays, state_array
 from jrigid._types import InertiaLike, Scalar, Vector, VectorLike
 
 
@@ -26,8 +26,8 @@ class State(eqx.Module):
     [0.1 0.  5. ]
     """
 
-    attitude: Float[Array, "*batch 4"] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    omega: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
+    omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
     internal: Any = ()
 
 

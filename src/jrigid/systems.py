@@ -2,13 +2,13 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_inertia_shape, check_shape, float_arrays
+from jrigid._checks import check_inertia_shape, check_shape, float_arrays, state_array
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
 from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
 from jrigid.mass import MassProperties
@@ -19,6 +19,7 @@ from jrigid.torques import AbstractTorque, TorqueFunction, as_torque
 class AbstractSystem(eqx.Module):
     """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants."""
 
+    state_type: eqx.AbstractClassVar[type]
     inertia: eqx.AbstractVar[Float[Array, "..."]]
     torque: eqx.AbstractVar[AbstractTorque]
 
@@ -51,10 +52,10 @@ class FloatingState(eqx.Module):
     ... )
     """
 
-    position: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    velocity: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    attitude: Float[Array, "*batch 4"] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    omega: Float[Array, "*batch 3"] = eqx.field(converter=lambda x: float_arrays(x)[0])
+    position: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
+    velocity: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
+    attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
+    omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
     internal: Any = ()
 
 
@@ -89,6 +90,7 @@ class RigidBody(AbstractSystem):
     3.0 [1. 2. 3.]
     """
 
+    state_type: ClassVar[type] = State
     inertia: Float[Array, "..."]
     torque: AbstractTorque
 
@@ -193,6 +195,7 @@ class FloatingBody(AbstractSystem):
     >>> racket = jr.FloatingBody(jr.solids.box(1.0, jnp.array([0.1, 0.3, 0.05])), weight)
     """
 
+    state_type: ClassVar[type] = FloatingState
     mass_properties: MassProperties
     force: Callable[[Any, Any, Any], Any] | None
     torque: AbstractTorque

@@ -6,13 +6,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import (
     RESULTS,
     Findings,
+    all_finite,
     check_inertia_shape,
     check_shape,
     float_arrays,
+    of_unit_size,
 )
 from jrigid._spectral import eigh, spectral_function
 from jrigid._types import (
@@ -32,6 +35,26 @@ from jrigid.mass._body import (
 )
 
 
+def _steiner_arguments(
+    inertia: ArrayLike, mass: ArrayLike, displacement: ArrayLike
+) -> tuple[Array, ...]:
+    tensor, mass, displacement = checked_tensor(inertia, mass, displacement)
+    check_shape("mass", mass, ())
+    check_shape("displacement", displacement, (3,))
+    findings = Findings()
+    findings.require(
+        (mass >= 0) & jnp.isfinite(mass),
+        RESULTS.invalid_mass,
+        "Argument `mass` must be finite and non-negative, but it is not.",
+    )
+    findings.require(
+        all_finite(displacement),
+        RESULTS.invalid_position,
+        "Argument `displacement` must be finite, but it is not.",
+    )
+    return findings.apply((tensor, mass, displacement), True)
+
+
 def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
     r"""Inertia tensor about a point displaced from the centre of mass.
 
@@ -39,7 +62,7 @@ def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: Vect
 
     Args:
         inertia_com: Moments or tensor about the centre of mass [kg m^2].
-        mass: Mass [kg].
+        mass: Mass [kg], not negative.
         displacement: Between centre of mass and point, either way round [m].
 
     Returns:
@@ -47,7 +70,8 @@ def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: Vect
 
     Raises:
         ValueError: Wrong shape (trace time).
-        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
+        RuntimeError: The tensor is not finite or not symmetric, the mass is negative, or mass or
+            displacement is not finite (run time, any lane).
 
     Gradients: polynomial, finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
@@ -57,9 +81,7 @@ def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    tensor, mass, displacement = checked_tensor(inertia_com, mass, displacement)
-    check_shape("mass", mass, ())
-    check_shape("displacement", displacement, (3,))
+    tensor, mass, displacement = _steiner_arguments(inertia_com, mass, displacement)
     return tensor + mass * unit_steiner(displacement)
 
 
@@ -70,7 +92,7 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
 
     Args:
         inertia: Moments or tensor about the point [kg m^2].
-        mass: Mass [kg].
+        mass: Mass [kg], not negative.
         displacement: Between centre of mass and point, either way round [m].
 
     Returns:
@@ -78,8 +100,9 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
 
     Raises:
         ValueError: Wrong shape (trace time).
-        RuntimeError: The tensor is not finite or not symmetric, or less than `mass` at
-            `displacement` has, so that a moment comes out negative (run time, any lane).
+        RuntimeError: The tensor is not finite or not symmetric, the mass is negative, mass or
+            displacement is not finite, or the tensor is less than `mass` at `displacement` has,
+            so that a moment comes out negative (run time, any lane).
 
     Gradients: polynomial, finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
@@ -89,14 +112,12 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    tensor, mass, displacement = checked_tensor(inertia, mass, displacement)
-    check_shape("mass", mass, ())
-    check_shape("displacement", displacement, (3,))
+    tensor, mass, displacement = _steiner_arguments(inertia, mass, displacement)
     reduced = tensor - mass * unit_steiner(displacement)
-    fixed, trace = jax.lax.stop_gradient((reduced, jnp.trace(tensor)))
+    whole, fixed = of_unit_size(*jax.lax.stop_gradient((tensor, reduced)))
     return eqx.error_if(
         reduced,
-        ~is_semidefinite(fixed, trace),
+        ~is_semidefinite(fixed, jnp.trace(whole)),
         "Argument `inertia` must be at least that of `mass` at `displacement`, but a moment about "
         "the centre of mass comes out negative.",
     )

@@ -5,6 +5,7 @@ from typing import final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import (
@@ -15,12 +16,15 @@ from jrigid._checks import (
     check_shape,
     float_arrays,
     is_symmetric,
+    nan_where,
+    of_unit_size,
 )
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import (
     InertiaLike,
     Matrix,
+    Quaternion,
     QuaternionLike,
     Scalar,
     ScalarLike,
@@ -30,6 +34,8 @@ from jrigid._types import (
 from jrigid.rotation import to_matrix
 
 ULPS = 64  # rounding allowed in "symmetric", "not negative" and "I3 <= I1 + I2"
+
+_Body = tuple[Scalar, Vector, Matrix]  # mass, centre of mass, tensor about it
 
 
 @final
@@ -120,14 +126,15 @@ class MassProperties(eqx.Module):
             )
         self.mass = mass
         self.center_of_mass = center_of_mass
-        self.inertia = 0.5 * (tensor + tensor.T)
+        self.inertia = 0.5 * tensor + 0.5 * tensor.T
 
     @property
     def result(self) -> RESULTS:
         """Code of what these values are, computed when asked.
 
-        `successful`, `invalid_mass`, `invalid_position`, `invalid_inertia` or
-        `unphysical_inertia`; one code a lane where the leaves carry batch axes.
+        `successful`, `invalid_mass`, `invalid_position`, `invalid_inertia`,
+        `unphysical_inertia`, `invalid_length` (of a solid) or `invalid_attitude` (of `rotated`);
+        one code a lane where the leaves carry batch axes.
         """
         judge = lambda mass, center, tensor: _judge(mass, center, tensor).result  # noqa: E731
         for _ in range(self.mass.ndim):
@@ -156,8 +163,8 @@ class MassProperties(eqx.Module):
         """
         (point,) = float_arrays(point)
         check_shape("point", point, (3,))
-        center, point = float_arrays(self.center_of_mass, point)
-        return self.inertia + self.mass * unit_steiner(point - center)
+        *body, point = float_arrays(self.mass, self.center_of_mass, self.inertia, point)
+        return _about(body, point)
 
     def translated(self, displacement: VectorLike) -> "MassProperties":
         """The body moved by a displacement, without turning it.
@@ -180,8 +187,10 @@ class MassProperties(eqx.Module):
         """
         (displacement,) = float_arrays(displacement)
         check_shape("displacement", displacement, (3,))
-        center, displacement = float_arrays(self.center_of_mass, displacement)
-        return MassProperties(self.mass, center + displacement, self.inertia, throw=None)
+        *body, displacement = float_arrays(
+            self.mass, self.center_of_mass, self.inertia, displacement
+        )
+        return MassProperties(*_translated(body, displacement), throw=None)
 
     def rotated(self, attitude: QuaternionLike) -> "MassProperties":
         """The body turned about the origin of the coordinates.
@@ -190,8 +199,8 @@ class MassProperties(eqx.Module):
             attitude: Quaternion of the turn, any but zero; its norm drops out.
 
         Returns:
-            The turned body: centre of mass R c, tensor R I R^T. After a zero quaternion they
-            are NaN and `result` is `invalid_position`.
+            The turned body: centre of mass R c, tensor R I R^T. After a zero quaternion the
+            centre and moments are NaN and `result` is `invalid_attitude`.
 
         Raises:
             ValueError: Wrong shape (trace time).
@@ -204,31 +213,34 @@ class MassProperties(eqx.Module):
         >>> print(turned.center_of_mass.round(6)[2])
         -1.0
         """
-        center, tensor, attitude = float_arrays(self.center_of_mass, self.inertia, attitude)
+        *body, attitude = float_arrays(self.mass, self.center_of_mass, self.inertia, attitude)
         check_shape("attitude", attitude, (4,))
-        turn = to_matrix(attitude)
-        turned = product("ij,jk,lk->il", turn, tensor, turn)
-        # The mark of an unphysical tensor, a diagonal without products, survives the turn.
-        turned = jnp.where(_is_marked_unphysical(tensor), tensor, turned)
-        return MassProperties(self.mass, product("ij,j->i", turn, center), turned, throw=None)
+        return MassProperties(*_rotated(body, attitude), throw=None)
 
     def principal_axes(self) -> PrincipalAxes:
-        """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`."""
+        """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`.
+
+        Returns:
+            Moments and axes; NaN where the tensor is.
+
+        Gradients: as those of `jrigid.principal_axes`.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> box = jr.solids.box(12.0, jnp.array([1.0, 2.0, 3.0]))
+        >>> print(box.principal_axes().moments)
+        [ 5. 10. 13.]
+        """
         return PrincipalAxes(*eigh(self.inertia))
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
         """The two bodies rigidly joined."""
         if not isinstance(other, MassProperties):
             return NotImplemented
-        mass_a, center_a, inertia_a, mass_b, center_b, inertia_b = float_arrays(
+        leaves = float_arrays(
             self.mass, self.center_of_mass, self.inertia,
             other.mass, other.center_of_mass, other.inertia,
         )  # fmt: skip
-        mass = mass_a + mass_b
-        share = mass_b / mass
-        apart = center_b - center_a
-        inertia = inertia_a + inertia_b + mass_a * share * unit_steiner(apart)
-        return MassProperties(mass, center_a + share * apart, inertia, throw=None)
+        return MassProperties(*_joined(list(leaves[:3]), list(leaves[3:])), throw=None)
 
     def __radd__(self, other: int) -> "MassProperties":
         """Start of `sum`: 0 is no body."""
@@ -252,10 +264,86 @@ def unit_steiner(displacement: Float[Array, "3"]) -> Matrix:
     )
 
 
-def _is_marked_unphysical(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
-    return jnp.all(jnp.isfinite(jnp.diagonal(tensor))) & jnp.all(
-        jnp.isnan(tensor) | jnp.eye(3, dtype=bool)
+_MOMENTS = np.eye(3, dtype=bool)
+_LAST_MOMENT = np.diag([False, False, True])
+
+
+@jax.jit
+def _is_marked(tensor: Float[Array, "3 3"], kept: Bool[ArrayLike, "3 3"]) -> Bool[Array, ""]:
+    return jnp.all(jnp.where(kept, jnp.isfinite(tensor), jnp.isnan(tensor)))
+
+
+def _find(findings: Findings, mass: Scalar, center_of_mass: Vector, tensor: Matrix) -> None:
+    """Read what `raise_or_mark` has marked, and find what else is not finite."""
+    mass, center_of_mass, tensor = jax.lax.stop_gradient((mass, center_of_mass, tensor))
+    centered, last = all_finite(center_of_mass), _is_marked(tensor, _LAST_MOMENT)
+    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
+    findings.require(centered | ~last, RESULTS.invalid_attitude)
+    findings.require(
+        centered,
+        RESULTS.invalid_position,
+        "Argument `center_of_mass` must be finite, but it is not.",
     )
+    findings.require(~last, RESULTS.invalid_length)
+    findings.require(~_is_marked(tensor, _MOMENTS), RESULTS.unphysical_inertia)
+    findings.require(all_finite(tensor), RESULTS.invalid_inertia, _NOT_A_BODY)
+
+
+# Derivatives of NaN are NaN, even those that a mask multiplies by zero: what shares a lane with
+# bad values would lose its gradient in all lanes. So bad values do not enter the arithmetic.
+def _harmless(ok: Bool[Array, ""], body: list[Array]) -> _Body:
+    mass, center_of_mass, tensor = body
+    eye = jnp.eye(3, dtype=tensor.dtype)
+    return (
+        jnp.where(ok, mass, 1.0),
+        jnp.where(ok, center_of_mass, 0.0),
+        jnp.where(ok, tensor, eye),
+    )
+
+
+@jax.jit
+def _about(body: list[Array], point: Vector) -> Matrix:
+    findings = Findings()
+    _find(findings, *body)
+    findings.require(all_finite(point), RESULTS.invalid_position)
+    mass, center, tensor = _harmless(findings.ok, body)
+    point = jnp.where(findings.ok, point, 0.0)
+    return nan_where(~findings.ok, tensor + mass * unit_steiner(point - center))
+
+
+@jax.jit
+def _translated(body: list[Array], displacement: Vector) -> _Body:
+    findings = Findings()
+    _find(findings, *body)
+    findings.require(all_finite(displacement), RESULTS.invalid_position)
+    mass, center, tensor = _harmless(findings.ok, body)
+    return raise_or_mark(findings, (mass, center + displacement, tensor), False)
+
+
+@jax.jit
+def _rotated(body: list[Array], attitude: Quaternion) -> _Body:
+    findings = Findings()
+    _find(findings, *body)
+    turnable = all_finite(attitude) & jnp.any(attitude != 0)
+    findings.require(turnable, RESULTS.invalid_attitude)
+    mass, center, tensor = _harmless(findings.ok, body)
+    turn = to_matrix(jnp.where(turnable, attitude, 1.0))
+    turned = product("ij,jk,lk->il", turn, tensor, turn)
+    return raise_or_mark(findings, (mass, product("ij,j->i", turn, center), turned), False)
+
+
+@jax.jit
+def _joined(body_a: list[Array], body_b: list[Array]) -> _Body:
+    findings = Findings()
+    _find(findings, *body_a)
+    _find(findings, *body_b)
+    mass_a, center_a, tensor_a = _harmless(findings.ok, body_a)
+    mass_b, center_b, tensor_b = _harmless(findings.ok, body_b)
+    mass = mass_a + mass_b
+    share = mass_b / mass
+    apart = center_b - center_a
+    tensor = tensor_a + tensor_b + mass_a * share * unit_steiner(apart)
+    return raise_or_mark(findings, (mass, center_a + share * apart, tensor), False)
 
 
 @jax.jit
@@ -264,7 +352,10 @@ def is_finite_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
 
 
 def is_semidefinite(tensor: Float[Array, "3 3"], scale: Scalar) -> Bool[Array, ""]:
-    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots."""
+    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
+
+    Entries and scale are about 1: products of much larger or smaller ones leave the range.
+    """
     # A few ulps off at any moments, where the roots of the cubic lose half the digits.
     shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
     rest = tensor + shift * jnp.eye(3, dtype=tensor.dtype)
@@ -281,7 +372,7 @@ def is_semidefinite(tensor: Float[Array, "3 3"], scale: Scalar) -> Bool[Array, "
 @jax.jit
 def is_physical(tensor: Float[Array, "3 3"]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether a tensor is positive semi-definite, and whether I3 <= I1 + I2, to rounding."""
-    tensor = jax.lax.stop_gradient(tensor)
+    (tensor,) = of_unit_size(jax.lax.stop_gradient(tensor))
     trace = jnp.trace(tensor)
     second = 0.5 * trace * jnp.eye(3, dtype=tensor.dtype) - tensor
     return is_semidefinite(tensor, trace), is_semidefinite(second, trace)
@@ -295,41 +386,37 @@ _NOT_A_BODY = (
 
 
 def _judge(mass: Scalar, center_of_mass: Vector, tensor: Matrix) -> Findings:
-    mass, center_of_mass, tensor = jax.lax.stop_gradient((mass, center_of_mass, tensor))
+    tensor = jax.lax.stop_gradient(tensor)
     findings = Findings()
-    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
-    findings.require(
-        all_finite(center_of_mass),
-        RESULTS.invalid_position,
-        "Argument `center_of_mass` must be finite, but it is not.",
-    )
+    _find(findings, mass, center_of_mass, tensor)
     positive, triangle = is_physical(tensor)
-    findings.require(~_is_marked_unphysical(tensor), RESULTS.unphysical_inertia)
     findings.require(is_finite_symmetric(tensor) & positive, RESULTS.invalid_inertia, _NOT_A_BODY)
     findings.require(triangle, RESULTS.unphysical_inertia)
     return findings
 
 
-def raise_or_mark(
-    findings: Findings, body: tuple[Scalar, Vector, Matrix], throw: bool
-) -> tuple[Scalar, Vector, Matrix]:
+def raise_or_mark(findings: Findings, body: _Body, throw: bool) -> _Body:
     """Raise, or turn what is wrong, and all that follows from it, into NaN.
 
     What is left finite lets `MassProperties.result` recover the code: of an unphysical tensor
-    the diagonal, of an invalid one mass and centre, of an invalid position the mass.
+    the diagonal, of an invalid one mass and centre, of an invalid position the mass; after an
+    invalid length or attitude also the last moment. Other codes turn into `invalid_mass`.
     """
     if throw:
         return findings.apply(body, throw)
     mass, center_of_mass, tensor = body
-    unphysical = findings.result == RESULTS.unphysical_inertia
-    bad_tensor = unphysical | (findings.result == RESULTS.invalid_inertia)
-    bad_center = ~findings.ok & ~bad_tensor
-    bad_mass = bad_center & (findings.result != RESULTS.invalid_position)
-    kept = findings.ok | (unphysical & jnp.eye(3, dtype=bool))
+    code = findings.result
+    unphysical = code == RESULTS.unphysical_inertia
+    length, attitude = code == RESULTS.invalid_length, code == RESULTS.invalid_attitude
+    bad_center = ~(findings.ok | unphysical | length | (code == RESULTS.invalid_inertia))
+    bad_mass = bad_center & ~attitude & (code != RESULTS.invalid_position)
+    kept = (unphysical & _MOMENTS) | ((length | attitude) & _LAST_MOMENT)
+    # A kept moment is finite: the mark must be read again.
+    marked = jnp.where(kept, jnp.where(jnp.isfinite(tensor), tensor, 1.0), jnp.nan)
     return (
         jnp.where(bad_mass, jnp.nan, mass),
         jnp.where(bad_center, jnp.nan, center_of_mass),
-        jnp.where(kept, tensor, jnp.nan),
+        jnp.where(findings.ok, tensor, marked),
     )
 
 

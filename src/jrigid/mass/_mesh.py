@@ -82,10 +82,10 @@ def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vect
     sums do not depend on it, so no derivative runs through it, and far bodies lose no digits.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
     """
-    finite = jnp.isfinite(vertices)
-    count = jnp.maximum(jnp.sum(finite, axis=0), 1).astype(vertices.dtype)
-    columns = [jnp.where(finite[:, i], vertices[:, i], 0.0) for i in range(3)]
-    origin = jax.lax.stop_gradient(jnp.stack([lane_sum(column) for column in columns]) / count)
+    # NaN in the sums would reach the gradients of the other lanes.
+    vertices = jnp.where(all_finite(vertices), vertices, 0.0)
+    sums = jnp.stack([lane_sum(vertices[:, i]) for i in range(3)])
+    origin = jax.lax.stop_gradient(sums / vertices.shape[0])
     local = [vertices[:, i] - origin[i] for i in range(3)]
     a, b, c = ([x.at[faces[:, k]].get(mode="clip") for x in local] for k in range(3))
     six_volumes = (
@@ -179,8 +179,10 @@ def from_mesh(
         "Argument `faces` must describe a surface that does not cut itself and no part of which is "
         "inside out, but the tensor is not that of a real body.",
     )
+    dense = (density > 0) & jnp.isfinite(density)
+    density = jnp.where(dense, density, 1.0)
     findings.require(
-        (density > 0) & jnp.isfinite(density),
+        dense,
         RESULTS.invalid_density,
         "Argument `density` must be positive and finite, but it is not.",
     )
@@ -202,6 +204,8 @@ def mesh_validity(
 
     Raises:
         ValueError: Wrong shape, no faces, or indices that are no integers (trace time).
+
+    Gradients: none, a code is no number.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> corners = jnp.array([[0.0, 0, 0], [6.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])

@@ -146,6 +146,9 @@ def from_points(
     [0. 0. 1.] [2. 2. 0.]
     """
     masses, positions, findings = _points(masses, positions)
+    if not throw:  # NaN in the sums would reach the gradients of the other lanes
+        masses = jnp.where(findings.ok, masses, 1.0)
+        positions = jnp.where(findings.ok, positions, 0.0)
     values = raise_or_mark(findings, _cloud(masses, positions), throw)
     return MassProperties(*values, throw=None)
 
@@ -235,12 +238,14 @@ def from_density(
     nodes, node_weights = np.polynomial.legendre.leggauss(order)
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
+    box = all_finite((lower, upper)) & jnp.all(lower < upper)
+    # A bad box gives way to a unit box: its NaN would reach the gradients of the other lanes.
+    lower, upper = jnp.where(box, lower, 0.0), jnp.where(box, upper, 1.0)
     half = 0.5 * (upper - lower)
     positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(grid, half.dtype)
     values = jax.vmap(density)(positions).astype(half.dtype)
     findings = Findings()
     fine = jnp.all(jnp.isfinite(values) & (values >= 0)) & jnp.any(values > 0)
-    box = all_finite((lower, upper)) & jnp.all(lower < upper)
     findings.require(fine & box, RESULTS.invalid_density)
-    masses = values * jnp.prod(half) * jnp.asarray(weights, half.dtype)
+    masses = jnp.where(fine, values, 1.0) * jnp.prod(half) * jnp.asarray(weights, half.dtype)
     return MassProperties(*raise_or_mark(findings, _cloud(masses, positions), throw), throw=None)

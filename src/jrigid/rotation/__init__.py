@@ -27,3 +27,4 @@ from jrigid.rotation._rates import attitude_rate as attitude_rate
 from jrigid.rotation._rates import euler_rates_to_omega as euler_rates_to_omega
 from jrigid.rotation._rates import integrate_rate as integrate_rate
 from jrigid.rotation._rates import omega_to_euler_rates as omega_to_euler_rates
+from jrigid.rotation._rates import rate_record_validity as rate_record_validity

@@ -176,13 +176,13 @@ def log(attitude: QuaternionLike) -> Vector:
         attitude: Unit quaternion; its norm drops out, and q and -q give the same.
 
     Returns:
-        Axis times angle [rad].
+        Axis times angle [rad]; zero for the zero quaternion.
 
     Raises:
         ValueError: Wrong shape (trace time).
 
-    Gradients: finite everywhere, analytic at the identity; across a half turn the value itself
-    jumps from +pi to -pi along the axis.
+    Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion; across a
+    half turn the value itself jumps from +pi to -pi along the axis.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> v = jnp.array([0.1, -0.2, 0.3])
@@ -194,11 +194,12 @@ def log(attitude: QuaternionLike) -> Vector:
     w, v = q[0], q[1:]
     square = jnp.sum(v * v)
     near = square <= w * w  # angle up to a quarter turn
-    w_near = jnp.where(near, w, 1.0)
+    zero = jnp.all(q == 0)
+    w_near = jnp.where(near & ~zero, w, 1.0)
     half_near = arctanc_sqrt(jnp.where(near, square, 0.0) / (w_near * w_near)) / w_near
     norm = jnp.sqrt(jnp.where(near, 1.0, square))
     half_far = (jnp.pi / 2 - jnp.arctan(jnp.where(near, 0.0, w) / norm)) / norm
-    return 2 * jnp.where(near, half_near, half_far) * v
+    return 2 * jnp.where(zero, 0.0, jnp.where(near, half_near, half_far)) * v
 
 
 def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
@@ -209,12 +210,12 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
         q: Unit quaternion.
 
     Returns:
-        Angle in [0, pi] [rad], accurate also for tiny angles.
+        Angle in [0, pi] [rad], accurate also for tiny angles; 0 if p or q is zero.
 
     Raises:
         ValueError: Wrong shape (trace time).
 
-    Gradients: at p = q the angle has a cone; the gradient there is 0.
+    Gradients: at p = q the angle has a cone; the gradient there is 0, as at a zero quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> q = jr.rotation.exp(jnp.array([0.0, 1e-3, 0.0]))

@@ -1,11 +1,22 @@
 """Rates: between attitude and angular velocity, and from gyro samples back to an attitude."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import array_of_shape, check_shape, float_arrays, pair_of_shapes
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    array_of_shape,
+    check_shape,
+    float_arrays,
+    nan_where,
+    pair_of_shapes,
+)
 from jrigid._types import (
     MatrixLike,
     Quaternion,
@@ -150,6 +161,8 @@ def integrate_rate(
     omegas: Real[_ArrayLike, "samples 3"],
     ts: Real[_ArrayLike, " samples"],
     attitude0: QuaternionLike | None = None,
+    *,
+    throw: bool = True,
 ) -> Float[Array, "samples 4"]:
     r"""Dead-reckon an attitude from sampled gyro rates, coning-corrected, to fourth order.
 
@@ -161,15 +174,19 @@ def integrate_rate(
     Args:
         omegas: Angular velocity at the times `ts`, body components [rad/s]; two or more samples.
         ts: Times of the samples [s], increasing, not necessarily uniform.
-        attitude0: Attitude at the first sample; the identity by default.
+        attitude0: Unit quaternion at the first sample; the identity by default.
+        throw: False: a bad value makes all attitudes of its lane NaN instead of an error;
+            `rate_record_validity` says what is wrong.
 
     Returns:
         Attitude at each sample. With samples h apart the error over a fixed span is O(h^4).
 
     Raises:
         ValueError: Wrong shape or fewer than two samples (trace time).
+        RuntimeError: `ts` is not finite and increasing, a rate is not finite, or `attitude0` is
+            not a unit quaternion, with `throw=True` (run time, any lane).
 
-    Gradients: finite everywhere.
+    Gradients: finite everywhere; zero in a lane of NaN.
     Source: A. Iserles et al., Lie-group methods, Acta Numerica 9 (2000) 215, section 5 (for
     R' = hat(omega) R; the sign of the commutator is the opposite for body rates).
 
@@ -180,24 +197,83 @@ def integrate_rate(
     >>> print(jr.rotation.log(attitudes[-1]).round(5))
     [0. 0. 1.]
     """
+    omegas, ts, start = _record(omegas, ts, attitude0)
+    findings = _record_findings(omegas, ts, start)
+    attitudes = nan_where(~findings.ok, _dead_reckon(omegas, ts, start, findings.ok))
+    return findings.apply(attitudes, throw)
+
+
+def rate_record_validity(
+    omegas: Real[_ArrayLike, "samples 3"],
+    ts: Real[_ArrayLike, " samples"],
+    attitude0: QuaternionLike | None = None,
+) -> RESULTS:
+    """What `integrate_rate` would find wrong with a record of rates, as a code.
+
+    Args:
+        omegas: Angular velocity at the times `ts`, body components [rad/s].
+        ts: Times of the samples [s].
+        attitude0: Attitude at the first sample; the identity by default.
+
+    Returns:
+        `successful`, `invalid_times` (`ts`), `invalid_state` (`omegas`) or `invalid_attitude`
+        (`attitude0`), a code a lane.
+
+    Raises:
+        ValueError: Wrong shape or fewer than two samples (trace time).
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> repeated = jnp.array([0.0, 0.1, 0.1])
+    >>> jr.rotation.rate_record_validity(jnp.ones((3, 3)), repeated) == jr.RESULTS.invalid_times
+    Array(True, dtype=bool)
+    """
+    return _record_findings(*_record(omegas, ts, attitude0)).result
+
+
+def _record(omegas: Any, ts: Any, attitude0: Any) -> tuple[Array, Array, Array]:
     omegas, ts = float_arrays(omegas, ts)
     check_shape("omegas", omegas, (None, 3))
     check_shape("ts", ts, (omegas.shape[0],))
-    count = ts.shape[0]
-    if count < 2:
+    if ts.shape[0] < 2:
         raise ValueError(
             f"Argument `ts` must hold at least two samples, but it has shape {ts.shape}."
         )
     if attitude0 is None:
-        start = jnp.array([1.0, 0.0, 0.0, 0.0], ts.dtype)
-    else:
-        start = jnp.asarray(array_of_shape("attitude0", attitude0, 4), ts.dtype)
-    return _dead_reckon(omegas, ts, start)
+        return omegas, ts, jnp.array([1.0, 0.0, 0.0, 0.0], ts.dtype)
+    return omegas, ts, array_of_shape("attitude0", attitude0, 4).astype(ts.dtype)
+
+
+def _record_findings(omegas: Array, ts: Array, start: Quaternion) -> Findings:
+    omegas, ts, start = jax.lax.stop_gradient((omegas, ts, start))
+    step = ts[1:] - ts[:-1]
+    excess = jnp.abs(jnp.sum(start * start) - 1)
+    findings = Findings()
+    findings.require(
+        jnp.all((step > 0) & jnp.isfinite(step)),  # no time is infinite or NaN then
+        RESULTS.invalid_times,
+        "Argument `ts` must be finite and increasing, but it is not.",
+    )
+    findings.require(
+        all_finite(omegas),
+        RESULTS.invalid_state,
+        "Argument `omegas` must be finite, but it is not.",
+    )
+    findings.require(
+        excess < 30 * jnp.sqrt(jnp.finfo(start.dtype).eps),
+        RESULTS.invalid_attitude,
+        "Argument `attitude0` must be a unit quaternion, but its norm is not 1: "
+        "use `jrigid.rotation.normalize`.",
+    )
+    return findings
 
 
 @jax.jit  # run eagerly, each level of the scan would be compiled by itself
-def _dead_reckon(omegas: Array, ts: Array, start: Quaternion) -> Array:
+def _dead_reckon(omegas: Array, ts: Array, start: Quaternion, ok: Bool[Array, ""]) -> Array:
     count = ts.shape[0]
+    # A bad lane reckons a body at rest instead, so that no NaN reaches a derivative.
+    omegas = jnp.where(ok, omegas, 0.0)
+    ts = jnp.where(ok, ts, jnp.arange(count, dtype=ts.dtype))
+    start = jnp.where(ok, start, jnp.zeros_like(start).at[0].set(1))
     width = min(4, count)
     first = jnp.clip(jnp.arange(count - 1) - (width - 2) // 2, 0, count - width)
     window = first[:, None] + jnp.arange(width)[None, :]

@@ -28,9 +28,9 @@ def sphere(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassP
     >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
     [2. 2. 2.]
     """
-    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
+    found, (mass, radius) = mass_and_lengths(mass, radius=(radius, ()))
     moment = 0.4 * radius * radius
-    return solid(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
+    return solid(found, mass, jnp.stack([moment] * 3), throw)
 
 
 def shell(
@@ -63,10 +63,10 @@ def shell(
     [2. 2. 2.]
     """
     if inner_radius is None:
-        mass, radius = mass_and_lengths(mass, radius=(radius, ()))
+        found, (mass, radius) = mass_and_lengths(mass, radius=(radius, ()))
         moment = 2 * radius * radius / 3
-        return solid(mass, jnp.stack([moment] * 3), throw, positive={"radius": radius})
-    mass, radius, inner = mass_and_lengths(
+        return solid(found, mass, jnp.stack([moment] * 3), throw)
+    found, (mass, radius, inner) = mass_and_lengths(
         mass, radius=(radius, ()), inner_radius=(inner_radius, ())
     )
     # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
@@ -74,13 +74,11 @@ def shell(
     ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
     moment = 0.4 * radius * radius * ratio
     return solid(
+        found,
         mass,
         jnp.stack([moment] * 3),
         throw,
-        positive={"radius": radius, "inner_radius": inner},
-        others=(
-            (inner < radius, "Argument `inner_radius` must be below `radius`, but it is not."),
-        ),
+        fits=(inner < radius, "Argument `inner_radius` must be below `radius`, but it is not."),
     )
 
 
@@ -105,10 +103,10 @@ def ellipsoid(mass: ScalarLike, semi_axes: VectorLike, *, throw: bool = True) ->
     >>> print(jnp.diag(jr.solids.ellipsoid(5.0, jnp.array([1.0, 2.0, 3.0])).inertia))
     [13. 10.  5.]
     """
-    mass, semi_axes = mass_and_lengths(mass, semi_axes=(semi_axes, (3,)))
+    found, (mass, semi_axes) = mass_and_lengths(mass, semi_axes=(semi_axes, (3,)))
     x, y, z = semi_axes * semi_axes
     moments = jnp.stack([y + z, x + z, x + y]) / 5
-    return solid(mass, moments, throw, positive={"semi_axes": semi_axes})
+    return solid(found, mass, moments, throw)
 
 
 def cylinder(
@@ -136,10 +134,10 @@ def cylinder(
     >>> print(jnp.diag(jr.solids.cylinder(12.0, 2.0, 1.0).inertia))
     [13. 13. 24.]
     """
-    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
+    found, (mass, radius, height) = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     transverse = height * height / 12 + radius * radius / 4
     moments = jnp.stack([transverse, transverse, radius * radius / 2])
-    return solid(mass, moments, throw, positive={"radius": radius, "height": height})
+    return solid(found, mass, moments, throw)
 
 
 def tube(
@@ -173,18 +171,18 @@ def tube(
     >>> print(jnp.diag(jr.solids.tube(12.0, 1.0, 3.0, 2.0).inertia))
     [34. 34. 60.]
     """
-    mass, inner, outer, height = mass_and_lengths(
+    found, (mass, inner, outer, height) = mass_and_lengths(
         mass, inner_radius=(inner_radius, ()), outer_radius=(outer_radius, ()), height=(height, ())
     )
     squares = inner * inner + outer * outer
     transverse = height * height / 12 + squares / 4
     message = "Argument `inner_radius` must not exceed `outer_radius`, but it does."
     return solid(
+        found,
         mass,
         jnp.stack([transverse, transverse, squares / 2]),
         throw,
-        positive={"inner_radius": inner, "outer_radius": outer, "height": height},
-        others=((inner <= outer, message),),
+        fits=(inner <= outer, message),
     )
 
 
@@ -213,10 +211,10 @@ def cone(
     >>> print(jnp.diag(jr.solids.cone(80.0, 2.0, 4.0).inertia))
     [96. 96. 96.]
     """
-    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
+    found, (mass, radius, height) = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     transverse = 3 * (4 * radius * radius + height * height) / 80
     moments = jnp.stack([transverse, transverse, 3 * radius * radius / 10])
-    return solid(mass, moments, throw, positive={"radius": radius, "height": height})
+    return solid(found, mass, moments, throw)
 
 
 def disk(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -240,10 +238,10 @@ def disk(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassPro
     >>> print(jnp.diag(jr.solids.disk(4.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
+    found, (mass, radius) = mass_and_lengths(mass, radius=(radius, ()))
     moment = radius * radius / 4
     moments = jnp.stack([moment, moment, 2 * moment])
-    return solid(mass, moments, throw, positive={"radius": radius})
+    return solid(found, mass, moments, throw)
 
 
 def hoop(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -267,10 +265,10 @@ def hoop(mass: ScalarLike, radius: ScalarLike, *, throw: bool = True) -> MassPro
     >>> print(jnp.diag(jr.solids.hoop(2.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    mass, radius = mass_and_lengths(mass, radius=(radius, ()))
+    found, (mass, radius) = mass_and_lengths(mass, radius=(radius, ()))
     moment = radius * radius / 2
     moments = jnp.stack([moment, moment, 2 * moment])
-    return solid(mass, moments, throw, positive={"radius": radius})
+    return solid(found, mass, moments, throw)
 
 
 def torus(
@@ -298,18 +296,18 @@ def torus(
     >>> print(jnp.diag(jr.solids.torus(8.0, 3.0, 2.0).inertia))
     [56. 56. 96.]
     """
-    mass, ring, tube_ = mass_and_lengths(
+    found, (mass, ring, tube_) = mass_and_lengths(
         mass, ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ())
     )
     ring2, tube2 = ring * ring, tube_ * tube_
     transverse = ring2 / 2 + 5 * tube2 / 8
     message = "Argument `tube_radius` must not exceed `ring_radius`, but it does."
     return solid(
+        found,
         mass,
         jnp.stack([transverse, transverse, ring2 + 3 * tube2 / 4]),
         throw,
-        positive={"ring_radius": ring, "tube_radius": tube_},
-        others=((tube_ <= ring, message),),
+        fits=(tube_ <= ring, message),
     )
 
 
@@ -337,7 +335,7 @@ def capsule(
     >>> print(jnp.diag(jr.solids.capsule(140.0, 1.0, 2.0).inertia).round(3))
     [169.4 169.4  64.4]
     """
-    mass, radius, height = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
+    found, (mass, radius, height) = mass_and_lengths(mass, radius=(radius, ()), height=(height, ()))
     # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
     whole = height + 4 * radius / 3
     middle, ends = height / whole, 4 * radius / (3 * whole)
@@ -348,4 +346,4 @@ def capsule(
         2 * r2 / 5 + h2 / 4 + 3 * radius * height / 8
     )
     moments = jnp.stack([transverse, transverse, along])
-    return solid(mass, moments, throw, positive={"radius": radius, "height": height})
+    return solid(found, mass, moments, throw)

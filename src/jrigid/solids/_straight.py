@@ -3,12 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Real
 
-from jrigid._checks import RESULTS, Findings
+from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays
 from jrigid._types import ScalarLike, VectorLike
 from jrigid.mass import MassProperties
-from jrigid.mass._body import raise_or_mark
 from jrigid.mass._points import inertia_of_second_moment
-from jrigid.solids._common import mass_and_lengths, solid
+from jrigid.solids._common import checked_mass, mass_and_lengths, solid
 
 
 def box(mass: ScalarLike, lengths: VectorLike, *, throw: bool = True) -> MassProperties:
@@ -32,9 +31,9 @@ def box(mass: ScalarLike, lengths: VectorLike, *, throw: bool = True) -> MassPro
     >>> print(jnp.diag(jr.solids.box(12.0, jnp.array([1.0, 2.0, 3.0])).inertia))
     [13. 10.  5.]
     """
-    mass, lengths = mass_and_lengths(mass, lengths=(lengths, (3,)))
+    found, (mass, lengths) = mass_and_lengths(mass, lengths=(lengths, (3,)))
     x, y, z = lengths * lengths
-    return solid(mass, jnp.stack([y + z, x + z, x + y]) / 12, throw, positive={"lengths": lengths})
+    return solid(found, mass, jnp.stack([y + z, x + z, x + y]) / 12, throw)
 
 
 def rod(mass: ScalarLike, length: ScalarLike, *, throw: bool = True) -> MassProperties:
@@ -58,10 +57,10 @@ def rod(mass: ScalarLike, length: ScalarLike, *, throw: bool = True) -> MassProp
     >>> print(jnp.diag(jr.solids.rod(12.0, 1.0).inertia))
     [1. 1. 0.]
     """
-    mass, length = mass_and_lengths(mass, length=(length, ()))
+    found, (mass, length) = mass_and_lengths(mass, length=(length, ()))
     moment = length * length / 12
     moments = jnp.stack([moment, moment, jnp.zeros_like(moment)])
-    return solid(mass, moments, throw, positive={"length": length})
+    return solid(found, mass, moments, throw)
 
 
 def lamina(
@@ -87,9 +86,9 @@ def lamina(
     >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
     [4. 1. 5.]
     """
-    mass, lengths = mass_and_lengths(mass, lengths=(lengths, (2,)))
+    found, (mass, lengths) = mass_and_lengths(mass, lengths=(lengths, (2,)))
     x, y = lengths * lengths / 12
-    return solid(mass, jnp.stack([y, x, x + y]), throw, positive={"lengths": lengths})
+    return solid(found, mass, jnp.stack([y, x, x + y]), throw)
 
 
 def tetrahedron(
@@ -119,15 +118,17 @@ def tetrahedron(
      [1. 6. 1.]
      [1. 1. 6.]]
     """
-    mass, vertices = mass_and_lengths(mass, vertices=(vertices, (4, 3)))
+    mass, vertices = float_arrays(mass, vertices)
+    check_shape("mass", mass, ())
+    check_shape("vertices", vertices, (4, 3))
+    found = Findings()
+    mass = checked_mass(found, mass)
+    finite = all_finite(vertices)
+    message = "Argument `vertices` must be finite, but it is not."
+    found.require(finite, RESULTS.invalid_position, message)
+    vertices = jnp.where(finite, vertices, 0.0)
     origin = vertices[0]
     center = origin + jnp.sum(vertices - origin[None, :], axis=0) / 4
     arms = vertices - center[None, :]
     second = jnp.sum(arms[:, :, None] * arms[:, None, :], axis=0) / 20
-    finite = jnp.all(jnp.isfinite(vertices))
-    message = "Argument `vertices` must be finite, but it is not."
-    findings = Findings()
-    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
-    findings.require(finite, RESULTS.invalid_position, message)
-    values = raise_or_mark(findings, (mass, center, mass * inertia_of_second_moment(second)), throw)
-    return MassProperties(*values, throw=None)
+    return solid(found, mass, inertia_of_second_moment(second), throw, center=center)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import array_of_shape, check_shape
+from jrigid._checks import RESULTS, Findings, all_finite, array_of_shape, check_shape
 from jrigid._types import Scalar, ScalarLike, Vector
 
 TorqueFunction = Callable[[Any, Any, Any], Any]
@@ -19,6 +20,16 @@ TorqueFunction = Callable[[Any, Any, Any], Any]
 def zero_like(state: Any) -> Scalar:
     """Zero of the dtype of a state."""
     return jnp.zeros((), state.omega.dtype)
+
+
+def require_finite(findings: Findings, owner: Any, *names: str) -> None:
+    """Note each of the named parameters of a torque that is not finite."""
+    for name in names:
+        findings.require(
+            all_finite(jax.lax.stop_gradient(getattr(owner, name))),
+            RESULTS.invalid_torque,
+            f"Argument `{name}` of `{type(owner).__name__}` must be finite, but it is not.",
+        )
 
 
 def has_parts(internal: PyTree) -> bool:
@@ -30,6 +41,21 @@ class AbstractTorque(eqx.Module):
     """A torque, its potential energy, and the internal parts that exert it.
 
     Subclasses give `__call__`; the rest defaults to a torque without potential or internal parts.
+
+    Gradients: those of the subclass's own functions.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> class Spring(jr.torques.AbstractTorque):
+    ...     stiffness: float
+    ...
+    ...     def __call__(self, t, state, args):
+    ...         return -self.stiffness * jr.rotation.log(state.attitude)
+    ...
+    ...     def potential(self, t, state, args):
+    ...         return 0.5 * self.stiffness * jnp.sum(jr.rotation.log(state.attitude) ** 2)
+    >>> turned = jr.State(jr.rotation.exp(jnp.array([0.0, 0.5, 0.0])), jnp.zeros(3))
+    >>> print((Spring(2.0) + jr.torques.LinearDrag(0.1))(0.0, turned, None).round(6))
+    [ 0. -1.  0.]
     """
 
     @abc.abstractmethod
@@ -65,6 +91,14 @@ class AbstractTorque(eqx.Module):
         """Kinetic energy of the internal parts [J]."""
         del t, args
         return zero_like(state)
+
+    def check(self, findings: Findings) -> None:
+        """Note parameters with bad values, for `simulate`; by default there are none.
+
+        Args:
+            findings: What has been found so far; `require` adds to it.
+        """
+        del findings
 
     def __add__(self, other: TorqueFunction) -> "Sum":
         """Both torques together."""
@@ -113,10 +147,19 @@ class Sum(AbstractTorque):
     """Torques acting together; what `+` makes.
 
     The internal state is `()` if no term carries one, the term's own if just one does, and
-    otherwise a tuple with one entry for each term that does, in their order.
+    otherwise a tuple with one entry for each term that does, in their order. A term that carries
+    one sees its own as `state.internal`; the others see all of it.
 
     Attributes:
         terms: The torques.
+
+    Gradients: the sum of those of the terms.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> total = jr.torques.Constant(jnp.ones(3)) + jr.torques.LinearDrag(2.0)
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 2.0, 3.0]))
+    >>> print(total(0.0, state, None))
+    [-1. -3. -5.]
     """
 
     terms: tuple[AbstractTorque, ...]
@@ -125,17 +168,12 @@ class Sum(AbstractTorque):
         return [i for i, x in enumerate(self.terms) if has_parts(x.internal_at_rest(state))]
 
     def _states(self, state: Any) -> list[Any]:
-        """The state as each term sees it: with its own internal part."""
+        """The state as each term sees it: with its own internal part, or all if it has none."""
+        views = [state] * len(self.terms)
         carriers = self._carriers(state)
-        views = []
-        for i in range(len(self.terms)):
-            if i not in carriers:
-                own: Any = ()
-            elif len(carriers) == 1:
-                own = state.internal
-            else:
-                own = state.internal[carriers.index(i)]
-            views.append(dataclasses.replace(state, internal=own))
+        if len(carriers) > 1:
+            for i, own in zip(carriers, state.internal, strict=True):
+                views[i] = dataclasses.replace(state, internal=own)
         return views
 
     def _pack(self, state: Any, parts: list[Any]) -> PyTree:
@@ -151,7 +189,8 @@ class Sum(AbstractTorque):
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Sum of the potential energies [J]."""
-        return sum((x.potential(t, state, args) for x in self.terms), zero_like(state))
+        pairs = zip(self.terms, self._states(state), strict=True)
+        return sum((x.potential(t, own, args) for x, own in pairs), zero_like(state))
 
     def internal_at_rest(self, state: Any) -> PyTree:
         """Internal states of the terms that have one."""
@@ -180,6 +219,11 @@ class Sum(AbstractTorque):
         pairs = zip(self.terms, self._states(state), strict=True)
         return sum((x.internal_energy(t, own, args) for x, own in pairs), zero_like(state))
 
+    def check(self, findings: Findings) -> None:
+        """Note bad parameters of the terms."""
+        for term in self.terms:
+            term.check(findings)
+
 
 class Torque(AbstractTorque):
     """Any function as a torque, with its potential energy if it has one.
@@ -187,6 +231,13 @@ class Torque(AbstractTorque):
     Attributes:
         fn: `(t, state, args) -> (3,)` body components [N m].
         potential_fn: `(t, state, args) -> ()` potential energy [J], or None.
+
+    `state.internal` is that of the whole body, also in a sum.
+
+    Raises:
+        ValueError: A value of `fn` of the wrong shape (trace time, when called).
+
+    Gradients: those of the functions.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> spring = jr.torques.Torque(lambda t, state, args: -args * state.omega)
@@ -227,6 +278,11 @@ class Constant(AbstractTorque):
     Attributes:
         torque: Body components [N m].
 
+    Raises:
+        ValueError: Wrong shape (trace time). That it is finite is checked by `simulate`.
+
+    Gradients: linear in the torque.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> thruster = jr.torques.Constant(jnp.array([0.0, 0.0, 0.1]))
     """
@@ -237,3 +293,7 @@ class Constant(AbstractTorque):
         """Torque on the body [N m], body components."""
         del t, args
         return self.torque.astype(state.omega.dtype)
+
+    def check(self, findings: Findings) -> None:
+        """Note a torque that is not finite."""
+        require_finite(findings, self, "torque")

@@ -4,15 +4,26 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jrigid._checks import array_of_shape, check_inertia_shape, check_shape, float_arrays
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    array_of_shape,
+    check_inertia_shape,
+    check_shape,
+    float_arrays,
+    is_inertia,
+    is_symmetric,
+)
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
 from jrigid.dynamics import angular_momentum
 from jrigid.rotation import rotate, rotate_inverse
-from jrigid.torques._base import AbstractTorque
+from jrigid.torques._base import AbstractTorque, require_finite
 
 
 class UniformGravity(AbstractTorque):
@@ -22,6 +33,12 @@ class UniformGravity(AbstractTorque):
         mass: Mass [kg].
         lever: From the pivot to the centre of mass, body components [m].
         gravity: Acceleration of gravity, space components [m/s^2].
+
+    Raises:
+        ValueError: Wrong shape (trace time). Values (finite, mass not negative) are checked by
+            `simulate`.
+
+    Gradients: analytic in the attitude, linear in each parameter.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> lever, g = jnp.array([0.0, 0.0, 0.1]), jnp.array([0.0, 0.0, -9.8])
@@ -49,6 +66,16 @@ class UniformGravity(AbstractTorque):
         arm = rotate(state.attitude, self.lever.astype(dtype))
         return -self.mass.astype(dtype) * jnp.sum(self.gravity.astype(dtype) * arm)
 
+    def check(self, findings: Findings) -> None:
+        """Note a negative mass and what is not finite."""
+        mass = jax.lax.stop_gradient(self.mass)
+        findings.require(
+            jnp.isfinite(mass) & (mass >= 0),
+            RESULTS.invalid_mass,
+            "Argument `mass` of `UniformGravity` must be finite and not negative, but it is not.",
+        )
+        require_finite(findings, self, "lever", "gravity")
+
 
 class GravityGradient(AbstractTorque):
     """Gravity-gradient torque of a distant attractor: 3 mu / r^3 (n x I n).
@@ -61,11 +88,19 @@ class GravityGradient(AbstractTorque):
         position: `position(t)`, from the attractor to the body, space components [m]; None for
             the body's own position, that of a `FloatingState` with the attractor at the origin.
 
+    Raises:
+        ValueError: Wrong shape (trace time). Values (a valid inertia, a finite mu) are checked by
+            `simulate`.
+
+    Gradients: finite except where the attractor is at the body (r = 0), where all is NaN.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), section 8.1.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> orbit = lambda t: 7e6 * jnp.stack([jnp.cos(1e-3 * t), jnp.sin(1e-3 * t), 0 * t])
     >>> torque = jr.torques.GravityGradient(jnp.array([10.0, 20.0, 25.0]), 3.986e14, orbit)
+    >>> turned = jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 4]))
+    >>> print((1e5 * torque(0.0, jr.State(turned, jnp.zeros(3)), None)).round(3))
+    [ 0.     0.    -1.743]
     """
 
     inertia: Float[Array, "..."]
@@ -85,6 +120,9 @@ class GravityGradient(AbstractTorque):
             mu: Gravitational parameter [m^3/s^2].
             position: `position(t) -> (3,)`, attractor to body, space components [m]; None for the
                 body's own.
+
+        Raises:
+            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
         """
         self.inertia, self.mu = float_arrays(inertia, mu)
         check_inertia_shape(self.inertia)
@@ -116,6 +154,16 @@ class GravityGradient(AbstractTorque):
         trace = jnp.sum(inertia) if inertia.ndim == 1 else jnp.trace(inertia)
         return -0.5 * strength * (trace - 3 * jnp.sum(n * angular_momentum(inertia, n)))
 
+    def check(self, findings: Findings) -> None:
+        """Note an inertia that is none and a mu that is not finite."""
+        findings.require(
+            is_inertia(self.inertia),
+            RESULTS.invalid_inertia,
+            "Argument `inertia` of `GravityGradient` must hold three positive, finite principal "
+            "moments or be a finite, symmetric, positive definite (3, 3) tensor, but it is not.",
+        )
+        require_finite(findings, self, "mu")
+
 
 def _apply_coefficient(coefficient: Array, omega: Array) -> Array:
     coefficient = coefficient.astype(omega.dtype)
@@ -134,14 +182,46 @@ def _coefficient(value: Any) -> Array:
     return array
 
 
+def _is_dissipative(coefficient: Array) -> Bool[Array, ""]:
+    """True where a drag takes energy or nothing: no negative number, axis or eigenvalue."""
+    c = jax.lax.stop_gradient(coefficient)
+    if c.ndim < 2:
+        return all_finite(c) & jnp.all(c >= 0)
+    largest = jnp.max(jnp.abs(c))
+    (a, d, e), (_, b, f), (_, _, g) = m = c / jnp.where(largest > 0, largest, 1.0)
+    # Positive semi-definite: no principal minor is negative, to rounding.
+    determinant = a * (b * g - f * f) - d * (d * g - f * e) + e * (d * f - b * e)
+    minors = jnp.stack([a, b, g, a * b - d * d, a * g - e * e, b * g - f * f, determinant])
+    floor = -64 * jnp.finfo(c.dtype).eps
+    return all_finite(c) & is_symmetric(m) & jnp.all(minors >= floor)
+
+
+def _check_coefficient(findings: Findings, drag: Any) -> None:
+    findings.require(
+        _is_dissipative(drag.coefficient),
+        RESULTS.invalid_torque,
+        f"Argument `coefficient` of `{type(drag).__name__}` must be finite and not negative (a "
+        "tensor symmetric and positive semi-definite), but it is not.",
+    )
+
+
 class LinearDrag(AbstractTorque):
     """Drag proportional to the angular velocity: -c omega.
 
     Attributes:
         coefficient: c [N m s]: a number, one for each body axis, or a tensor.
 
+    Raises:
+        ValueError: Wrong shape (trace time). Values (finite, not negative; a tensor symmetric and
+            positive semi-definite) are checked by `simulate`.
+
+    Gradients: linear in the coefficient and in omega.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> drag = jr.torques.LinearDrag(0.1)
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([3.0, 0.0, 4.0]))
+    >>> print(drag(0.0, state, None).round(6))
+    [-0.3 -0.  -0.4]
     """
 
     coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient)
@@ -151,6 +231,10 @@ class LinearDrag(AbstractTorque):
         del t, args
         return -_apply_coefficient(self.coefficient, state.omega)
 
+    def check(self, findings: Findings) -> None:
+        """Note a coefficient that is negative or not finite."""
+        _check_coefficient(findings, self)
+
 
 class QuadraticDrag(AbstractTorque):
     """Drag quadratic in the angular velocity: -|omega| c omega; at rest zero, its gradient too.
@@ -158,8 +242,17 @@ class QuadraticDrag(AbstractTorque):
     Attributes:
         coefficient: c [N m s^2]: a number, one for each body axis, or a tensor.
 
+    Raises:
+        ValueError: Wrong shape (trace time). Values (finite, not negative; a tensor symmetric and
+            positive semi-definite) are checked by `simulate`.
+
+    Gradients: finite everywhere; in omega zero at rest.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> drag = jr.torques.QuadraticDrag(0.1)
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([3.0, 0.0, 4.0]))
+    >>> print(drag(0.0, state, None).round(6))
+    [-1.5 -0.  -2. ]
     """
 
     coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient)
@@ -168,3 +261,7 @@ class QuadraticDrag(AbstractTorque):
         """Torque on the body [N m], body components."""
         del t, args
         return -safe_norm(state.omega) * _apply_coefficient(self.coefficient, state.omega)
+
+    def check(self, findings: Findings) -> None:
+        """Note a coefficient that is negative or not finite."""
+        _check_coefficient(findings, self)

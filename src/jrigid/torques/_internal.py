@@ -7,10 +7,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import array_of_shape, check_shape, float_arrays
+from jrigid._checks import RESULTS, Findings, array_of_shape, check_shape, float_arrays
 from jrigid._numerics import safe_norm
 from jrigid._types import Scalar, ScalarLike, Vector, VectorLike
-from jrigid.torques._base import AbstractTorque, TorqueFunction, zero_like
+from jrigid.torques._base import AbstractTorque, TorqueFunction, require_finite, zero_like
+
+
+def _require_moment(findings: Findings, part: Any) -> None:
+    inertia = jax.lax.stop_gradient(part.inertia)
+    findings.require(
+        jnp.isfinite(inertia) & (inertia > 0),
+        RESULTS.invalid_torque,
+        f"Argument `inertia` of `{type(part).__name__}` must be positive and finite, but it is "
+        "not.",
+    )
 
 
 class InternalDamper(AbstractTorque):
@@ -27,8 +37,18 @@ class InternalDamper(AbstractTorque):
         inertia: Moment of inertia of the sphere [kg m^2].
         coupling: c [N m s].
 
+    Raises:
+        ValueError: Wrong shape (trace time). Values (finite, inertia positive, coupling not
+            negative) are checked by `simulate`.
+
+    Gradients: finite everywhere.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.2, 0.05))
+    >>> sphere = jnp.array([0.0, 0.0, 3.0])
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]), sphere)
+    >>> print(body.torque(0.0, state, None).round(6))
+    [0.  0.  0.1]
     """
 
     inertia: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("inertia", x))
@@ -62,6 +82,17 @@ class InternalDamper(AbstractTorque):
         del t, args
         return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(state.internal**2)
 
+    def check(self, findings: Findings) -> None:
+        """Note an inertia that is not positive and a coupling that is negative."""
+        _require_moment(findings, self)
+        coupling = jax.lax.stop_gradient(self.coupling)
+        findings.require(
+            jnp.isfinite(coupling) & (coupling >= 0),
+            RESULTS.invalid_torque,
+            "Argument `coupling` of `InternalDamper` must be finite and not negative, but it is "
+            "not.",
+        )
+
 
 class SpinningMass(eqx.Module):
     """A wheel with a spin of its own, for `Rotor`.
@@ -71,6 +102,18 @@ class SpinningMass(eqx.Module):
         axis: Direction of the axis, body components, of any length.
         motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
             wheel turns freely on its axis.
+
+    Raises:
+        ValueError: Wrong shape (trace time). Values (a positive, finite inertia, an axis that is
+            finite and not zero) are checked by `simulate`.
+
+    Gradients: finite for any axis but zero.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), jnp.array(10.0))
+    >>> print(jr.torques.Rotor(wheel).internal_momentum(0.0, state, None).round(6))
+    [0.  1.2 1.6]
     """
 
     inertia: Float[Array, ""]
@@ -89,12 +132,25 @@ class SpinningMass(eqx.Module):
             inertia: Moment of inertia about its axis [kg m^2].
             axis: Direction of the axis, body components.
             motor_torque: Torque of the motor on the wheel [N m].
+
+        Raises:
+            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
         """
         self.inertia, axis = float_arrays(inertia, axis)
         check_shape("inertia", self.inertia, ())
         check_shape("axis", axis, (3,))
         self.axis = axis / safe_norm(axis)
         self.motor_torque = motor_torque
+
+    def check(self, findings: Findings) -> None:
+        """Note an inertia that is not positive and an axis that has no direction."""
+        _require_moment(findings, self)
+        axis = jax.lax.stop_gradient(self.axis)
+        findings.require(
+            jnp.all(jnp.isfinite(axis)) & jnp.any(axis != 0),  # a zero axis normalised is NaN
+            RESULTS.invalid_torque,
+            "Argument `axis` of `SpinningMass` must be finite and not zero, but it is not.",
+        )
 
 
 class Rotor(AbstractTorque):
@@ -109,6 +165,11 @@ class Rotor(AbstractTorque):
     Attributes:
         momentum: h [kg m^2/s] as an array or `h(t)`, or a `SpinningMass`.
 
+    Raises:
+        ValueError: Wrong shape (trace time; of a function, when called). That an array is finite
+            is checked by `simulate`.
+
+    Gradients: finite everywhere; a function of time must be differentiable.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -125,6 +186,9 @@ class Rotor(AbstractTorque):
 
         Args:
             momentum: (3,) array [kg m^2/s], `momentum(t) -> (3,)`, or a `SpinningMass`.
+
+        Raises:
+            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
         """
         if isinstance(momentum, SpinningMass) or callable(momentum):
             self.momentum = momentum
@@ -191,3 +255,10 @@ class Rotor(AbstractTorque):
         if self._wheel is None:
             return zero_like(state)
         return 0.5 * self._wheel.inertia.astype(state.omega.dtype) * state.internal**2
+
+    def check(self, findings: Findings) -> None:
+        """Note a momentum that is not finite, or what is wrong with the wheel."""
+        if self._wheel is not None:
+            self._wheel.check(findings)
+        elif not callable(self.momentum):
+            require_finite(findings, self, "momentum")
