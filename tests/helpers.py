@@ -1,5 +1,8 @@
 """Tolerances by dtype, and motions that several test files share."""
 
+from functools import wraps
+
+import jax
 import numpy as np
 
 # A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot show.
@@ -22,3 +25,26 @@ def central_difference(function, x, direction, step=None):
         step = float(np.finfo(x.dtype).eps) ** (1 / 3)
     up, down = function(x + step * direction), function(x - step * direction)
     return (np.asarray(up) - np.asarray(down)) / (2 * step)
+
+
+def quick_jit(function):
+    """jax.jit that spends less on compiling: for large derivatives that are run once."""
+    if jax.default_backend() != "cpu":
+        return jax.jit(function)
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    quick, plain = jax.jit(function, compiler_options=options), jax.jit(function)
+    known = True
+
+    @wraps(function)
+    def call(*args):
+        nonlocal known
+        if known:
+            try:
+                return quick(*args)
+            except jax.errors.JaxRuntimeError as error:
+                if "xla_" not in str(error):
+                    raise
+                known = False  # an older or newer jaxlib does not know an option
+        return plain(*args)
+
+    return call

@@ -10,7 +10,6 @@ from jrigid._numerics import (
     cos_sqrt,
     safe_arctan2,
     safe_norm,
-    safe_sqrt,
     sinc_sqrt,
 )
 
@@ -45,22 +44,6 @@ def test_norm_neither_overflows_nor_underflows_and_nor_does_its_gradient(dtype):
         value, gradient = both(jnp.asarray(vector))
         np.testing.assert_allclose(value, 7 * dtype(size), rtol=ulps(dtype, 4))
         np.testing.assert_allclose(gradient, np.array([2, -3, 6]) / 7, rtol=ulps(dtype, 4))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_square_root_at_and_below_zero_has_value_and_gradient_zero(dtype):
-    for x in (0.0, -0.0, -1e-30, -1.0):
-        value, gradient = jax.value_and_grad(safe_sqrt)(jnp.asarray(x, dtype))
-        assert value == 0
-        assert gradient == 0
-        assert value.dtype == dtype
-    value, gradient = jax.value_and_grad(safe_sqrt)(jnp.asarray(0.25, dtype))
-    assert value == 0.5
-    assert gradient == 1
-
-
-def test_square_root_does_not_swallow_nan():
-    assert np.isnan(safe_sqrt(jnp.asarray(np.nan)))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

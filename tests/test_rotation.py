@@ -1,6 +1,5 @@
 import itertools
 import math
-from functools import wraps
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from helpers import ATTITUDE, DTYPES, MOMENTS, OMEGA, ulps
+from helpers import ATTITUDE, DTYPES, MOMENTS, OMEGA, quick_jit, ulps
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,29 +19,6 @@ from jrigid import rotation as ro
 AXIS = np.array([2.0, -3.0, 6.0]) / 7
 ANGLES = [0.0, 1e-300, 1e-16, 1e-12, 1e-8, 1e-4, 1.0, np.pi - 1e-8, np.pi]
 DEGENERATE = [0.0, 1e-300, 1e-16, 1e-8, 1e-4]
-
-
-def quick_jit(function):
-    """jax.jit that spends less on compiling: for large derivatives that are run once."""
-    if jax.default_backend() != "cpu":
-        return jax.jit(function)
-    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    quick, plain = jax.jit(function, compiler_options=options), jax.jit(function)
-    known = True
-
-    @wraps(function)
-    def call(*args):
-        nonlocal known
-        if known:
-            try:
-                return quick(*args)
-            except jax.errors.JaxRuntimeError as error:
-                if "xla_" not in str(error):
-                    raise
-                known = False  # an older or newer jaxlib does not know an option
-        return plain(*args)
-
-    return call
 
 
 def scipy_rotation(q):

@@ -6,7 +6,6 @@ A new public name of a module below must be added to `CASES`; the first test say
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import wraps
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 from jax.flatten_util import ravel_pytree
 
 import jrigid as jr
@@ -28,29 +27,6 @@ NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.
 # What answers with a result code, not with numbers: tested where bad input is.
 CODES = {"rotation.rate_record_validity"}
 CODE_METHOD = "check"
-
-
-def quick_jit(function):
-    """jax.jit that spends less on compiling: for large derivatives that are run once."""
-    if jax.default_backend() != "cpu":
-        return jax.jit(function)
-    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    quick, plain = jax.jit(function, compiler_options=options), jax.jit(function)
-    known = True
-
-    @wraps(function)
-    def call(*args):
-        nonlocal known
-        if known:
-            try:
-                return quick(*args)
-            except jax.errors.JaxRuntimeError as error:
-                if "xla_" not in str(error):
-                    raise
-                known = False  # an older or newer jaxlib does not know an option
-        return plain(*args)
-
-    return call
 
 
 @dataclass

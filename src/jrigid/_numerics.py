@@ -24,12 +24,6 @@ def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.where(zero, jnp.zeros_like(square), scale * jnp.sqrt(jnp.where(zero, 1.0, square)))
 
 
-def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root; for x <= 0 the value is 0 and the gradient 0."""
-    edge = x <= 0  # not `x > 0`: NaN stays NaN
-    return jnp.where(edge, 0.0, jnp.sqrt(jnp.where(edge, 1.0, x)))
-
-
 def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """`arctan2` without overflow; at the origin the value is 0 and the gradient 0."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))
