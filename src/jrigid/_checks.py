@@ -137,6 +137,12 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
     return ok
 
 
+def is_unit(quaternion: Float[Array, "4"]) -> Bool[Array, ""]:
+    """True where a quaternion is of norm 1 to rounding; four digits typed by hand are not."""
+    excess = jnp.abs(jnp.sum(quaternion**2) - 1)
+    return excess < 30 * jnp.sqrt(jnp.finfo(quaternion.dtype).eps)
+
+
 def is_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
     """True where a tensor equals its transpose to rounding."""
     tolerance = 64 * jnp.finfo(tensor.dtype).eps * jnp.max(jnp.abs(tensor))

@@ -22,6 +22,7 @@ from jrigid._checks import (
     float_arrays,
     is_concrete,
     is_inertia,
+    is_unit,
     nan_where,
 )
 from jrigid._scales import fastest_rate, power_of_two, ravel, units, unravel
@@ -364,15 +365,12 @@ def _check(
     longest: Array,
     args: Any,
 ) -> None:
-    eps = jnp.finfo(state0.attitude.dtype).eps
-    square = jnp.sum(state0.attitude**2)
     ordered = jnp.all(flat[1:] >= flat[:-1]) & (flat[0] >= t0)
     findings.require(is_inertia(system.inertia), RESULTS.invalid_inertia)
     torque: Any = system.torque
     torque.check(findings)
     findings.require(all_finite(state0), RESULTS.invalid_state)
-    # Four significant digits typed by hand are not a unit quaternion; rounding is.
-    findings.require(jnp.abs(square - 1) < 30 * jnp.sqrt(eps), RESULTS.invalid_attitude)
+    findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude)
     findings.require(all_finite((flat, t0)) & ordered, RESULTS.invalid_times)
     findings.require(longest > 0, RESULTS.invalid_max_step)
     field = system.vector_field(t0, state0, args)

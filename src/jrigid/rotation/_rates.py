@@ -14,6 +14,7 @@ from jrigid._checks import (
     array_of_shape,
     check_shape,
     float_arrays,
+    is_unit,
     nan_where,
     pair_of_shapes,
 )
@@ -246,7 +247,6 @@ def _record(omegas: Any, ts: Any, attitude0: Any) -> tuple[Array, Array, Array]:
 def _record_findings(omegas: Array, ts: Array, start: Quaternion) -> Findings:
     omegas, ts, start = jax.lax.stop_gradient((omegas, ts, start))
     step = ts[1:] - ts[:-1]
-    excess = jnp.abs(jnp.sum(start * start) - 1)
     findings = Findings()
     findings.require(
         jnp.all((step > 0) & jnp.isfinite(step)),  # no time is infinite or NaN then
@@ -259,7 +259,7 @@ def _record_findings(omegas: Array, ts: Array, start: Quaternion) -> Findings:
         "Argument `omegas` must be finite, but it is not.",
     )
     findings.require(
-        excess < 30 * jnp.sqrt(jnp.finfo(start.dtype).eps),
+        is_unit(start),
         RESULTS.invalid_attitude,
         "Argument `attitude0` must be a unit quaternion, but its norm is not 1: "
         "use `jrigid.rotation.normalize`.",
