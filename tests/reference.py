@@ -115,3 +115,99 @@ def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
     derivative_columns = [np.array(v) for v in zip(*derivatives, strict=True)]
     x, dx = _flow(columns_of, derivative_columns, x, dx, duration)
     return x[:7].T, np.moveaxis(dx[:7], -1, 0)
+
+
+def _products(x, y):
+    """The n-th Taylor coefficient of all x_j y_k; x (n, J, B) and y (n, K, columns, B)."""
+    return np.einsum("njb,nkcb->jkcb", x, y[::-1])
+
+
+def _turned(products):
+    """Of products (4, 3, ...) of quaternion and rate, the rates of the quaternion."""
+    out = np.zeros((4, *products.shape[2:]), LONG)
+    for i, j, k, sign in _QUATERNION:
+        out[i] += sign * products[j, k] / 2
+    return out
+
+
+def free_hessian_vector(moments, attitude, omega, duration, direction):
+    """The derivative of `heavy_body`'s Jacobian along a direction, for free bodies.
+
+    By the second variational equations. As there, the attitude's norm is a free input: the motion
+    is q' = q (0, omega) / 2 for any q, so that its last state is linear in the first attitude.
+
+    Args:
+        moments: (B, 3).
+        attitude: (B, 4).
+        omega: (B, 3).
+        duration: A number or (B,), of either sign.
+        direction: (B, 10) or (10,): attitude (4), omega (3), moments (3).
+
+    Returns:
+        (B, 7, 10), long doubles: d/ds of the Jacobian at inputs + s direction.
+    """
+    moments, attitude, omega = (np.asarray(v, LONG).T for v in (moments, attitude, omega))
+    bodies = moments.shape[1]
+    along = np.broadcast_to(np.asarray(direction, LONG), (bodies, 10)).T
+    # omega_i' = ratio_i omega_j omega_k, ratio_i = (I_j - I_k) / I_i, and its derivatives with
+    # respect to the moments, along the direction, and both
+    ratio = np.zeros((3, bodies), LONG)
+    slope = np.zeros((3, 3, bodies), LONG)
+    turned_slope = np.zeros((3, 3, bodies), LONG)
+    change = along[7:]
+    for i, j, k in _CYCLIC:
+        ratio[i] = (moments[j] - moments[k]) / moments[i]
+        slope[i, j], slope[i, k], slope[i, i] = 1, -1, -ratio[i]
+        slope[i] /= moments[i]
+    turned_ratio = np.sum(slope * change, axis=1)
+    for i, j, k in _CYCLIC:
+        turned_slope[i, j] = -change[i] / moments[i] ** 2
+        turned_slope[i, k] = change[i] / moments[i] ** 2
+        turned_slope[i, i] = -(turned_ratio[i] + slope[i, i] * change[i]) / moments[i]
+
+    # The turn r since the start, q = q0 r, depends on omega and the moments alone (6 columns).
+    # Columns of dx: 0-5 the derivatives, 6 that along the direction, 7-12 both.
+    x = np.zeros((7, bodies), LONG)
+    dx = np.zeros((7, 13, bodies), LONG)
+    x[0], x[4:] = 1, omega
+    dx[[4, 5, 6], [0, 1, 2]] = 1
+    dx[4:, 6] = along[4:7]
+    speed = np.sqrt(np.sum(omega**2, axis=0)) * np.maximum(1, np.max(np.abs(ratio), axis=0))
+    steps = max(1, int(np.ceil(np.max(np.abs(duration) * speed) / LARGEST_STEP)))
+    h = np.broadcast_to(np.asarray(duration, LONG), (bodies,)) / steps
+    first, second = [1, 2, 0], [2, 0, 1]
+    for _ in range(steps):
+        series = np.zeros((ORDER + 1, *x.shape), LONG)
+        slopes = np.zeros((ORDER + 1, *dx.shape), LONG)
+        series[0], slopes[0] = x, dx
+        for n in range(ORDER):
+            here, there = series[: n + 1], slopes[: n + 1]
+            r, w, dr, dw = here[:, :4], here[:, 4:], there[:, :4], there[:, 4:]
+            yr, yw, jr, jw = dr[:, :, 6], dw[:, :, 6], dr[:, :, :6], dw[:, :, :6]
+            product = _products(w, w[:, :, None])[first, second, 0]
+            both = _products(w, dw)
+            both = both[first, second] + both[second, first]
+            across = _products(yw, jw)
+            across = across[first, second] + across[second, first]
+            new = series[n + 1], slopes[n + 1]
+            new[0][:4] = _turned(_products(r, w[:, :, None]))[:, 0]
+            new[0][4:] = ratio * product
+            new[1][:4] = _turned(_products(r, dw) + _products(w, dr).swapaxes(0, 1))
+            new[1][:4, 7:] += _turned(_products(yr, jw) + _products(yw, jr).swapaxes(0, 1))
+            new[1][4:] = ratio[:, None] * both
+            new[1][4:, 3:6] += slope * product[:, None]
+            new[1][4:, 6] += turned_ratio * product
+            new[1][4:, 7:] += turned_ratio[:, None] * both[:, :6] + ratio[:, None] * across
+            new[1][4:, 10:] += slope * both[:, 6:7] + turned_slope * product[:, None]
+            new[0][:] /= n + 1
+            new[1][:] /= n + 1
+        x, dx = series[ORDER], slopes[ORDER]
+        for n in range(ORDER - 1, -1, -1):
+            x, dx = series[n] + h * x, slopes[n] + h * dx
+
+    out = np.zeros((7, 10, bodies), LONG)
+    for i, j, k, sign in (*_QUATERNION, *((i, i, -1, 1) for i in range(4))):
+        out[i, j] += sign * dx[k + 1, 6]
+        out[i, 4:] += sign * (along[j] * dx[k + 1, :6] + attitude[j] * dx[k + 1, 7:])
+    out[4:, 4:] = dx[4:, 7:]
+    return np.moveaxis(out, -1, 0)

@@ -195,7 +195,9 @@ def test_inertia_of_points_equals_numpy(points, dtype):
     masses = rng.uniform(0.5, 1.5, points).astype(dtype)
     positions = (rng.normal(size=(points, 3)) @ symmetric(0)).astype(dtype)
     exact = inertia_of(
-        np.einsum("n,na,nb->ab", *(np.float64(x) for x in (masses, positions, positions)))
+        np.einsum(
+            "n,na,nb->ab", *(np.asarray(x, np.float64) for x in (masses, positions, positions))
+        )
     )
     tensor = jr.inertia_tensor(masses, positions)
     assert tensor.dtype == dtype

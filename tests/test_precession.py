@@ -194,8 +194,9 @@ def test_sun_and_moon_move_the_equinox_by_50_arcseconds_a_year():
     np.testing.assert_allclose(rate, mean, rtol=1e-4)
     assert averaged_rate(MU_SUN, sun) / ARCSECOND * YEAR == pytest.approx(16, abs=0.1)
     assert averaged_rate(MU_MOON, moon) / ARCSECOND * YEAR == pytest.approx(34, abs=0.5)
-    # Against the sky: the Sun's pull on the Moon's orbit, left out, brings 0.2 per cent.
-    assert rate / ARCSECOND * YEAR == pytest.approx(50.40705, rel=5e-3)
+    # Against the sky: the published rate is 0.2 per cent more; the pull of the Sun on the orbit of
+    # the Moon, left out of the two ellipses, is of that order.
+    assert 0.9975 < rate / ARCSECOND * YEAR / 50.40705 < 0.9985
     assert 2 * np.pi / rate / YEAR == pytest.approx(25_750, abs=100)
     # The real Earth, which yields, nods by 0.3 per cent less than a rigid one.
     assert fitted[2] / ARCSECOND == pytest.approx(-17.2064161, rel=5e-3)
