@@ -16,12 +16,14 @@ phi' = L (omega_a L_a + omega_b L_b) / (L_a^2 + L_b^2), which the functions abov
     n = -(I_c / I_a) (I_a - I_b) / (I_b - I_c),
 
 an elliptic integral of the third kind with n <= 0, so that it is Carlson's R_J of positive
-arguments. Which formula applies is decided by D = L^2 - 2 E I_b = I_a (I_a - I_b) omega_a^2 +
-I_c (I_c - I_b) omega_c^2, computed without rounding from the doubles given:
+arguments. (Their derivation is checked by Taylor series in test_free_reference.py.) A body that
+turns steadily, (I omega) x omega = 0, is one rotation. Else the sign of
 
-    D = 0, the body turns steadily (sphere, spin about a principal axis, rest): one rotation;
-    D = 0 otherwise, the exact separatrix: sech and tanh, and phi' = L / I_b about the middle axis;
-    D > 0 or D < 0: c is the axis of the largest or smallest moment.
+    D = L^2 - 2 E I_b = I_a (I_a - I_b) omega_a^2 + I_c (I_c - I_b) omega_c^2,
+
+without rounding from the doubles given, says which formula applies: with a the axis of the smallest
+moment and c that of the largest, D > 0 circles c, D < 0 circles a (their names then change places),
+and D = 0 is the exact separatrix: sech and tanh, and phi' = L / I_b about the middle axis.
 
 Every other quantity is a sum of terms of one sign or is bounded away from cancellation by D, and
 carries 60 digits and two more for each decade by which D, or 1 - m, is small.

@@ -118,8 +118,8 @@ def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
 
 
 def _products(x, y):
-    """The n-th Taylor coefficient of all x_j y_k; x (n, J, B) and y (n, K, columns, B)."""
-    return np.einsum("njb,nkcb->jkcb", x, y[::-1])
+    """The n-th Taylor coefficient of all x_j y_k; x (J, B, n) and y (K, columns, B, n)."""
+    return np.einsum("jbn,kcbn->jkcb", x, y[..., ::-1])
 
 
 def _turned(products):
@@ -172,38 +172,38 @@ def free_hessian_vector(moments, attitude, omega, duration, direction):
     x[0], x[4:] = 1, omega
     dx[[4, 5, 6], [0, 1, 2]] = 1
     dx[4:, 6] = along[4:7]
-    speed = np.sqrt(np.sum(omega**2, axis=0)) * np.maximum(1, np.max(np.abs(ratio), axis=0))
+    speed = np.sqrt(np.sum(omega**2, axis=0)) * np.maximum(0.5, np.max(np.abs(ratio), axis=0))
     steps = max(1, int(np.ceil(np.max(np.abs(duration) * speed) / LARGEST_STEP)))
     h = np.broadcast_to(np.asarray(duration, LONG), (bodies,)) / steps
     first, second = [1, 2, 0], [2, 0, 1]
     for _ in range(steps):
-        series = np.zeros((ORDER + 1, *x.shape), LONG)
-        slopes = np.zeros((ORDER + 1, *dx.shape), LONG)
-        series[0], slopes[0] = x, dx
+        # One series a component, its coefficients along the last axis: that is fastest.
+        series = np.zeros((*x.shape, ORDER + 1), LONG)
+        slopes = np.zeros((*dx.shape, ORDER + 1), LONG)
+        series[..., 0], slopes[..., 0] = x, dx
         for n in range(ORDER):
-            here, there = series[: n + 1], slopes[: n + 1]
-            r, w, dr, dw = here[:, :4], here[:, 4:], there[:, :4], there[:, 4:]
-            yr, yw, jr, jw = dr[:, :, 6], dw[:, :, 6], dr[:, :, :6], dw[:, :, :6]
-            product = _products(w, w[:, :, None])[first, second, 0]
+            here, there = series[..., : n + 1], slopes[..., : n + 1]
+            r, w, dr, dw = here[:4], here[4:], there[:4], there[4:]
+            yr, yw, jr, jw = dr[:, 6], dw[:, 6], dr[:, :6], dw[:, :6]
+            product = _products(w, w[:, None])[first, second, 0]
             both = _products(w, dw)
             both = both[first, second] + both[second, first]
             across = _products(yw, jw)
             across = across[first, second] + across[second, first]
-            new = series[n + 1], slopes[n + 1]
-            new[0][:4] = _turned(_products(r, w[:, :, None]))[:, 0]
-            new[0][4:] = ratio * product
-            new[1][:4] = _turned(_products(r, dw) + _products(w, dr).swapaxes(0, 1))
-            new[1][:4, 7:] += _turned(_products(yr, jw) + _products(yw, jr).swapaxes(0, 1))
-            new[1][4:] = ratio[:, None] * both
-            new[1][4:, 3:6] += slope * product[:, None]
-            new[1][4:, 6] += turned_ratio * product
-            new[1][4:, 7:] += turned_ratio[:, None] * both[:, :6] + ratio[:, None] * across
-            new[1][4:, 10:] += slope * both[:, 6:7] + turned_slope * product[:, None]
-            new[0][:] /= n + 1
-            new[1][:] /= n + 1
-        x, dx = series[ORDER], slopes[ORDER]
+            new, slopes_new = np.zeros(x.shape, LONG), np.zeros(dx.shape, LONG)
+            new[:4] = _turned(_products(r, w[:, None]))[:, 0]
+            new[4:] = ratio * product
+            slopes_new[:4] = _turned(_products(r, dw) + _products(w, dr).swapaxes(0, 1))
+            slopes_new[:4, 7:] += _turned(_products(yr, jw) + _products(yw, jr).swapaxes(0, 1))
+            slopes_new[4:] = ratio[:, None] * both
+            slopes_new[4:, 3:6] += slope * product[:, None]
+            slopes_new[4:, 6] += turned_ratio * product
+            slopes_new[4:, 7:] += turned_ratio[:, None] * both[:, :6] + ratio[:, None] * across
+            slopes_new[4:, 10:] += slope * both[:, 6:7] + turned_slope * product[:, None]
+            series[..., n + 1], slopes[..., n + 1] = new / (n + 1), slopes_new / (n + 1)
+        x, dx = series[..., ORDER], slopes[..., ORDER]
         for n in range(ORDER - 1, -1, -1):
-            x, dx = series[n] + h * x, slopes[n] + h * dx
+            x, dx = series[..., n] + h * x, slopes[..., n] + h * dx
 
     out = np.zeros((7, 10, bodies), LONG)
     for i, j, k, sign in (*_QUATERNION, *((i, i, -1, 1) for i in range(4))):

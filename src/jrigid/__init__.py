@@ -4,6 +4,8 @@ from importlib.metadata import version as _version
 
 from jrigid import datasets as datasets
 from jrigid import dynamics as dynamics
+from jrigid import elliptic as elliptic
+from jrigid import free as free
 from jrigid import mass as mass
 from jrigid import rotation as rotation
 from jrigid import solids as solids
@@ -17,6 +19,7 @@ from jrigid.dynamics import angular_momentum as angular_momentum
 from jrigid.dynamics import bearing_torque as bearing_torque
 from jrigid.dynamics import euler_equations as euler_equations
 from jrigid.dynamics import kinetic_energy as kinetic_energy
+from jrigid.free import free_rotation as free_rotation
 from jrigid.mass import MassProperties as MassProperties
 from jrigid.mass import PrincipalAxes as PrincipalAxes
 from jrigid.mass import from_density as from_density

@@ -66,6 +66,40 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(small, _series(_ARCTANC, jnp.where(small, z, 0.0)), jnp.arctan(root) / root)
 
 
+def cosh_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """cosh(sqrt(z)) for any real z (the cosine where z < 0), analytic at z = 0."""
+    large = z > _SERIES_BELOW
+    root = jnp.sqrt(jnp.where(large, z, 1.0))
+    return jnp.where(large, jnp.cosh(root), cos_sqrt(jnp.where(large, 0.0, -z)))
+
+
+def sinhc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """sinh(sqrt(z)) / sqrt(z) for any real z, analytic at z = 0."""
+    large = z > _SERIES_BELOW
+    root = jnp.sqrt(jnp.where(large, z, 1.0))
+    return jnp.where(large, jnp.sinh(root) / root, sinc_sqrt(jnp.where(large, 0.0, -z)))
+
+
+def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The power of two next above x, to scale by without rounding; 1 at 0."""
+    _, exponent = jnp.frexp(x)
+    return jnp.ldexp(jnp.ones_like(x), exponent)
+
+
+def materialize(*arrays: Array) -> tuple[Array, ...]:
+    """The arrays themselves, computed once.
+
+    XLA's CPU compiler fuses by computing what is used twice twice: a long formula, and more so
+    its derivative, then runs hundreds of times slower than its operations. It does not
+    look into a loop, and a loop of two trips is not removed.
+    """
+
+    def trip(values: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
+        return tuple(jnp.where(i == 2, -x, x) for x in values), None
+
+    return jax.lax.scan(trip, arrays, jnp.arange(2))[0]
+
+
 # Without it float32 products run in TF32 (10 bits) on recent GPUs.
 _EXACT = jax.lax.Precision.HIGHEST
 

@@ -9,14 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._numerics import product, safe_norm
+from jrigid._numerics import power_of_two, product, safe_norm
 from jrigid.systems import AbstractSystem
-
-
-def power_of_two(x: Array) -> Array:
-    """The power of two next above x, to scale by without rounding."""
-    _, exponent = jnp.frexp(x)
-    return jnp.ldexp(jnp.ones_like(x), exponent)
 
 
 def ravel(tree: Any) -> Array:

@@ -25,7 +25,8 @@ from jrigid._checks import (
     is_unit,
     nan_where,
 )
-from jrigid._scales import fastest_rate, power_of_two, ravel, units, unravel
+from jrigid._numerics import power_of_two
+from jrigid._scales import fastest_rate, ravel, units, unravel
 from jrigid._trajectory import Trajectory
 from jrigid._types import ScalarLike
 from jrigid.rotation import normalize

@@ -83,12 +83,29 @@ def eigh(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "
 
 @eigh.defjvp
 def _eigh_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (tensor,), (change,) = primals, tangents
+    return _turn_of_axes(primals[0], tangents[0], 4 * jnp.finfo(primals[0].dtype).eps, 0.0)
+
+
+@jax.custom_jvp
+def eigh_of_distinct(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """As `eigh`; but where a gap is below 1e-6 of the largest moment d axes is NaN."""
+    return _jacobi(tensor)
+
+
+@eigh_of_distinct.defjvp
+def _eigh_of_distinct_jvp(primals: tuple, tangents: tuple) -> tuple:
+    return _turn_of_axes(primals[0], tangents[0], 1e-6, jnp.nan)
+
+
+def _turn_of_axes(tensor: Array, change: Array, closest: Any, otherwise: float) -> tuple:
     moments, axes = eigh(tensor)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     gap = moments[None, :] - moments[:, None]
-    resolved = jnp.abs(gap) > 4 * jnp.finfo(gap.dtype).eps * jnp.max(jnp.abs(moments))
-    inverse = jnp.where(resolved, 1 / jnp.where(resolved, gap, 1.0), 0.0)
+    resolved = jnp.abs(gap) > closest * jnp.max(jnp.abs(moments))
+    off_diagonal = ~np.eye(3, dtype=bool)
+    inverse = jnp.where(
+        resolved, 1 / jnp.where(resolved, gap, 1.0), jnp.where(off_diagonal, otherwise, 0.0)
+    )
     return (moments, axes), (jnp.diagonal(inside), product("ik,kj->ij", axes, inverse * inside))
 
 

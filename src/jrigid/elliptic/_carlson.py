@@ -1,0 +1,427 @@
+"""Carlson's symmetric elliptic integrals, and the kernels that the other functions are made of.
+
+The kernels take the square roots a, b, c, q of the arguments x, y, z, p. In them the duplication
+step is a' = sqrt((a + b)(a + c)) / 2: free of subtractions, smooth where an argument is zero, and
+never out of range. Every tangent of that step is positive, so differentiating it along an axis is
+as stable as the step itself, also where arguments coincide.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, Float, Real
+
+from jrigid._checks import float_arrays
+
+Values: TypeAlias = Float[Array, "..."]
+ValuesLike: TypeAlias = Real[ArrayLike, "..."]
+
+# A square root quotient of 1e-300 (float64) or 1e-38 (float32) is down to 1e-3 after so many steps.
+_STEPS = {"float64": 15}
+_STEPS_OTHERS = 11
+
+
+def elementwise(*values: Any) -> list[Array]:
+    """Arrays of one floating point dtype and one shape."""
+    return jnp.broadcast_arrays(*float_arrays(*values))
+
+
+def _steps(x: Array) -> int:
+    return _STEPS.get(x.dtype.name, _STEPS_OTHERS)
+
+
+# --- kernels of roots of order one -------------------------------------------------------------
+
+
+def _next_roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    """One duplication, x' = (x + lambda) / 4 (DLMF 19.26.18), in the roots."""
+    ab, ac, bc = jnp.sqrt(a + b), jnp.sqrt(a + c), jnp.sqrt(b + c)
+    return 0.5 * ab * ac, 0.5 * ab * bc, 0.5 * ac * bc
+
+
+def _rf_series(a: Array, b: Array, c: Array) -> Array:
+    """R_F of nearly equal arguments, DLMF 19.36.1."""
+    x, y, z = a * a, b * b, c * c
+    mean = (x + y + z) / 3
+    dx, dy = (mean - x) / mean, (mean - y) / mean
+    dz = -dx - dy
+    e2, e3 = dx * dy - dz * dz, dx * dy * dz
+    series = e2 * (-1 / 10 + e2 * (1 / 24 - 5 / 208 * e2) + e3 * (-3 / 44 + e2 / 16))
+    return (1 + (series + e3 * (1 / 14 + 3 / 104 * e3))) / jnp.sqrt(mean)
+
+
+def _rj_series(mean: Array, e2: Array, e3: Array, e4: Array, e5: Array) -> Array:
+    """R_J of nearly equal arguments, DLMF 19.36.2."""
+    series = e2 * (-3 / 14 + e2 * (9 / 88 - e2 / 16) + e3 * (-9 / 52 + 45 / 272 * e2))
+    series = series + e3 * (1 / 6 + 3 / 40 * e3) + e4 * (-3 / 22 + 3 / 20 * e2)
+    series = series + 3 / 26 * e5 - 9 / 68 * (e3 * e4 + e2 * e5)
+    return (1 + series) / (mean * jnp.sqrt(mean))
+
+
+def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+    """R_F and c R_D / 3 of the squares; at most one root zero (a double zero gives nonsense)."""
+
+    def step(_: Any, carry: Any) -> Any:
+        a, b, c, weight, total = carry
+        total = total + weight / (c * (c + a) * (c + b))
+        return *_next_roots(a, b, c), 0.25 * weight, total
+
+    # The first step by hand: its c cancels, and c may be zero.
+    total = 1 / ((c + a) * (c + b))
+    start = (*_next_roots(a, b, c), 0.25 * c, total)
+    a, b, c, weight, total = jax.lax.fori_loop(1, _steps(a), step, start)
+    x, y, z = a * a, b * b, c * c
+    mean = (x + y + 3 * z) / 5
+    dx, dy = (mean - x) / mean, (mean - y) / mean
+    dz = -(dx + dy) / 3
+    xy, zz = dx * dy, dz * dz
+    e2, e3, e4 = xy - 6 * zz, (3 * xy - 8 * zz) * dz, 3 * (xy - zz) * zz
+    rest = _rj_series(mean, e2, e3, e4, xy * zz * dz)
+    return _rf_series(a, b, c), total + weight * rest / 3
+
+
+def _rc_of_one(root: Array) -> Array:
+    """R_C(1, root^2), differentiable as it stands; DLMF 19.2.17, 19.2.18."""
+    e = (root - 1) * (root + 1)
+    near = jnp.abs(e) < 0.1
+    series = jnp.zeros_like(e)
+    safe = jnp.where(near, e, 0.0)
+    for k in range(15, -1, -1):
+        series = 1 / (2 * k + 1) - safe * series
+    above = e > 0
+    up = jnp.sqrt(jnp.where(above & ~near, e, 1.0))
+    down = jnp.sqrt(jnp.where(above | near, 0.75, -e))
+    low = jnp.where(above | near, 0.5, root)
+    logarithm = jnp.log1p((1 - low + down) / low) / down
+    return jnp.where(near, series, jnp.where(above, jnp.arctan(up) / up, logarithm))
+
+
+def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
+    """R_F and R_J of the squares; q > 0 and not many times the largest of the others."""
+
+    def step(_: Any, carry: Any) -> Any:
+        a, b, c, q, weight, total = carry
+        sides = q * q + a * b + a * c + b * c
+        # DLMF 19.26.22 with alpha, beta there as sums of positive terms
+        alpha = q * q * (a + b + c) + a * b * c
+        total = total + 3 * weight / alpha * _rc_of_one(q * sides / alpha)
+        return *_next_roots(a, b, c), 0.5 * jnp.sqrt(sides), 0.25 * weight, total
+
+    start = (a, b, c, q, jnp.ones_like(a), jnp.zeros_like(a))
+    a, b, c, q, weight, total = jax.lax.fori_loop(0, _steps(a) + 1, step, start)
+    x, y, z, p = a * a, b * b, c * c, q * q
+    mean = (x + y + z + 2 * p) / 5
+    dx, dy, dz = (mean - x) / mean, (mean - y) / mean, (mean - z) / mean
+    dp = -(dx + dy + dz) / 2
+    pp, xyz = dp * dp, dx * dy * dz
+    e2 = dx * dy + dx * dz + dy * dz - 3 * pp
+    e3 = xyz + dp * (2 * e2 + 4 * pp)
+    e4 = (2 * xyz + dp * (e2 + 3 * pp)) * dp
+    return _rf_series(a, b, c), total + weight * _rj_series(mean, e2, e3, e4, xyz * pp)
+
+
+# --- kernels of any roots, with their derivatives ----------------------------------------------
+
+
+def _varied(tangents: Any) -> list[int]:
+    return [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
+
+
+def _two_zero(a: Array, b: Array, c: Array) -> Array:
+    return ((a == 0) & (b == 0)) | ((a == 0) & (c == 0)) | ((b == 0) & (c == 0))
+
+
+def _scale(*roots: Array) -> Array:
+    """The largest root, by which all are divided; NaN where one is NaN, 1 where all are 0."""
+    largest = roots[0]
+    for root in roots[1:]:
+        largest = jnp.maximum(largest, root)
+    return jax.lax.stop_gradient(jnp.where(largest == 0, jnp.ones_like(largest), largest))
+
+
+def _rf_g_scaled(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+    scale = _scale(a, b, c)
+    two = _two_zero(a, b, c)
+    # Where the answer is infinite or zero the loop runs on ones.
+    plain = ~two & (scale < jnp.inf)
+    size = jnp.where(jnp.isinf(scale), 1.0, scale)
+    a, b, c = (jnp.where(plain | jnp.isnan(root), root / size, 1.0) for root in (a, b, c))
+    rf, g = _rf_g_kernel(a, b, c)
+    answer = jnp.where(two, jnp.inf, jnp.zeros_like(scale))
+    nan = jnp.isnan(scale)
+    per = 1 / size
+    return jnp.where(plain | nan, rf * per, answer), jnp.where(plain | nan, g * per * per, answer)
+
+
+def _rf_rj_scaled(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
+    scale = _scale(a, b, c, q)
+    two = _two_zero(a, b, c)
+    pole = two | (q == 0)  # of R_J; a zero q does not spoil R_F
+    nan = jnp.isnan(scale)
+    plain = (~two & (scale < jnp.inf)) | nan
+    size = jnp.where(jnp.isinf(scale), 1.0, scale)
+    a, b, c = (jnp.where(plain, root / size, 1.0) for root in (a, b, c))
+    rf, rj = _rf_rj_kernel(a, b, c, jnp.where(plain & (q != 0), q / size, 1.0))
+    zero, per = jnp.zeros_like(scale), 1 / size
+    of_rf = jnp.where(plain, rf * per, jnp.where(two, jnp.inf, zero))
+    infinite = jnp.where(pole, jnp.inf, zero)
+    return of_rf, jnp.where(plain & ~pole | nan, rj * per * per * per, infinite)
+
+
+def _along_axes(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """A rule: the partial derivatives of a kernel, in one loop, which the tangents do not enter.
+
+    An argument that is not varied costs nothing, and its infinite derivative does no harm.
+    """
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        varied = _varied(tangents)
+        axes = [
+            jnp.stack([jnp.full_like(x, float(i == k)) for i in varied])
+            for k, x in enumerate(primals)
+        ]
+        values, partials = jax.vmap(
+            lambda *axis: jax.jvp(kernel, tuple(primals), axis), out_axes=(None, 0)
+        )(*axes)
+        totals = []
+        for value, partial in zip(values, partials, strict=True):
+            slope = jnp.where(jnp.isposinf(value), -jnp.inf, partial)
+            totals.append(sum(slope[n] * tangents[i] for n, i in enumerate(varied)))
+        return values, tuple(totals)
+
+    return rule
+
+
+@jax.custom_jvp
+def rf_g(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+    """R_F(a^2, b^2, c^2) and G = (c / 3) R_D(a^2, b^2, c^2), the derivative of -R_F by c.
+
+    G is 1 / (a b) at c = 0; where two roots are zero both are infinite.
+    """
+    return _rf_g_scaled(a, b, c)
+
+
+@jax.custom_jvp
+def rf_rj(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
+    """R_F and R_J of the squares, for q not many times the largest of the others."""
+    return _rf_rj_scaled(a, b, c, q)
+
+
+rf_g.defjvp(_along_axes(_rf_g_scaled), symbolic_zeros=True)
+rf_rj.defjvp(_along_axes(_rf_rj_scaled), symbolic_zeros=True)
+
+
+def g_of(a: Array, b: Array, c: Array) -> Array:
+    """G = (c / 3) R_D(a^2, b^2, c^2); see `rf_g`."""
+    return rf_g(a, b, c)[1]
+
+
+@jax.custom_jvp
+def rf_of(a: Array, b: Array, c: Array) -> Array:
+    """R_F(a^2, b^2, c^2)."""
+    return rf_g(a, b, c)[0]
+
+
+@jax.custom_jvp
+def rc_of(a: Array, b: Array) -> Array:
+    """R_C(a^2, b^2), DLMF 19.2.17 and 19.2.18."""
+    gap = jnp.abs(b - a)
+    # Where a = b any other value of `root` will do.
+    safe = (gap > 0) & (b > 0) & jnp.isfinite(a + b)
+    root = jnp.where(safe, jnp.sqrt(gap) * jnp.sqrt(b + a), 1.0)
+    circular = jnp.arctan2(root, a) / root
+    hyperbolic = jnp.log1p((a - b + root) / jnp.where(b > 0, b, 1.0)) / root
+    value = jnp.where(b > a, circular, hyperbolic)
+    edge = jnp.where(b == 0, jnp.inf, jnp.where(jnp.isinf(a + b), 0.0, 1 / jnp.where(b > 0, b, 1)))
+    return jnp.where(safe | jnp.isnan(a + b), value, edge)
+
+
+def _rf_rule(primals: Any, tangents: Any) -> Any:
+    a, b, c = primals
+    slopes = (lambda: g_of(b, c, a), lambda: g_of(a, c, b), lambda: g_of(a, b, c))
+    total = jnp.zeros_like(a)
+    for i in _varied(tangents):
+        total = total - slopes[i]() * tangents[i]
+    return rf_of(a, b, c), total
+
+
+def _rc_rule(primals: Any, tangents: Any) -> Any:
+    a, b = primals
+    slopes = (lambda: g_of(b, b, a), lambda: 2 * g_of(a, b, b))
+    total = jnp.zeros_like(a)
+    for i in _varied(tangents):
+        total = total - slopes[i]() * tangents[i]
+    return rc_of(a, b), total
+
+
+rf_of.defjvp(_rf_rule, symbolic_zeros=True)
+rc_of.defjvp(_rc_rule, symbolic_zeros=True)
+
+
+# --- principal values --------------------------------------------------------------------------
+
+
+def rc_signed(a: Array, y: Array) -> Array:
+    """R_C(a^2, y), for y < 0 its Cauchy principal value, DLMF 19.2.20."""
+    negative = y < 0
+    shifted = jnp.sqrt(jnp.where(negative, a * a - y, 1.0))
+    values = rc_of(jnp.where(negative, shifted, a), jnp.sqrt(jnp.where(negative, -y, y)))
+    return jnp.where(negative, a / shifted, 1.0) * values
+
+
+def _ordered(a: Array, b: Array) -> tuple[Array, Array]:
+    return jnp.where(a > b, b, a), jnp.where(a > b, a, b)
+
+
+def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
+    """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p), for p < 0 its Cauchy principal value.
+
+    A negative and a very large p are replaced by the q of DLMF 19.21.12,
+    (p - x)(q - x) = (y - x)(z - x), where x is the middle, or the largest, of the three arguments.
+    """
+    size = _scale(a, b, c, 1e-10 * jnp.sqrt(jnp.abs(p)))
+    size = jnp.where(jnp.isinf(size), 1.0, size)
+    # Products, since XLA makes x / size / size / size into x / size^3, which overflows.
+    per = 1 / size
+    a, b, c, p = a * per, b * per, c * per, p * per * per
+    low, high = _ordered(a, b)
+    middle, high = _ordered(high, c)
+    low, middle = _ordered(low, middle)
+    large = p > 16 * high * high
+    other = (p < 0) | large
+    base, second = jnp.where(large, high, middle), jnp.where(large, middle, high)
+    base = jnp.where(base > 0, base, 1.0)
+    distance = jnp.where(other, p - base * base, 1.0)
+    gap = (low - base) * (low + base) * (second - base) * (second + base) / distance
+    q = jnp.where(other, base * base + gap, p)
+    rf, rj = rf_rj(a, b, c, jnp.sqrt(q))
+    xi = jnp.where(other, low * second / base, 1.0)
+    eta = jnp.where(other, (p / base) * (q / base), 1.0)
+    moved = (3 * (rf - rc_signed(xi, eta)) - gap * rj) / distance
+    moved = jnp.where(_two_zero(a, b, c), jnp.copysign(jnp.inf, p), moved)
+    return rf * per, jnp.where(other, moved, rj) * per * per * per
+
+
+# --- the public face ---------------------------------------------------------------------------
+
+# Compiled, so that a call outside of jit does not compile its loop anew.
+
+
+@jax.jit
+def _rf(x: Array, y: Array, z: Array) -> Array:
+    return rf_of(jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z))
+
+
+@jax.jit
+def _rc(x: Array, y: Array) -> Array:
+    return rc_signed(jnp.sqrt(x), y)
+
+
+@jax.jit
+def _rd(x: Array, y: Array, z: Array) -> Array:
+    root = jnp.sqrt(z)
+    return 3 * g_of(jnp.sqrt(x), jnp.sqrt(y), root) / root
+
+
+@jax.jit
+def _rj(x: Array, y: Array, z: Array, p: Array) -> Array:
+    return rf_rj_signed(jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z), p)[1]
+
+
+def rf(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
+    r"""Carlson's symmetric elliptic integral of the first kind.
+
+    $R_F(x, y, z) = \frac12 \int_0^\infty dt / \sqrt{(t + x)(t + y)(t + z)}$.
+
+    Args:
+        x: Non-negative.
+        y: Non-negative.
+        z: Non-negative; at most one of the three zero.
+
+    Returns:
+        R_F to 6 ulps, over the whole range of the dtype; inf where two arguments are zero, 0 where
+        one is infinite, NaN where one is negative. Arguments broadcast.
+
+    Gradients: R_D of the same arguments, to any order; -inf with respect to an argument at 0.
+    Source: DLMF 19.16.1; the duplication theorem 19.26.18, the series 19.36.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.rf(1.0, 2.0, 0.0).round(12))
+    1.311028777146
+    """
+    return _rf(*elementwise(x, y, z))
+
+
+def rc(x: ValuesLike, y: ValuesLike) -> Values:
+    r"""Carlson's degenerate elliptic integral, $R_C(x, y) = R_F(x, y, y)$, an elementary function.
+
+    Args:
+        x: Non-negative.
+        y: Not zero; where it is negative the value is Cauchy's principal value.
+
+    Returns:
+        R_C to 6 ulps; inf where y = 0, NaN where x < 0. Arguments broadcast.
+
+    Gradients: R_D, to any order, right also at x = y; infinite with respect to x at x = 0.
+    Source: DLMF 19.2.17-19.2.20.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.rc(0.0, 0.25).round(12))
+    3.14159265359
+    """
+    return _rc(*elementwise(x, y))
+
+
+def rd(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
+    r"""Carlson's symmetric elliptic integral of the second kind, $R_D(x, y, z) = R_J(x, y, z, z)$.
+
+    $R_D(x, y, z) = \frac32 \int_0^\infty dt / ((t + z) \sqrt{(t + x)(t + y)(t + z)})$.
+
+    Args:
+        x: Non-negative.
+        y: Non-negative; not zero together with x.
+        z: Positive.
+
+    Returns:
+        R_D to 8 ulps; inf where z = 0 or x = y = 0, NaN where an argument is negative. Arguments
+        broadcast.
+
+    Gradients: of the duplication along each argument, which has no cancellation: right also where
+        arguments coincide; -inf with respect to an argument at 0.
+    Source: DLMF 19.16.5; Carlson, Numerical Algorithms 10 (1995) 13.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.rd(0.0, 2.0, 1.0).round(12))
+    1.797210352103
+    """
+    return _rd(*elementwise(x, y, z))
+
+
+def rj(x: ValuesLike, y: ValuesLike, z: ValuesLike, p: ValuesLike) -> Values:
+    r"""Carlson's symmetric elliptic integral of the third kind.
+
+    $R_J(x, y, z, p) = \frac32 \int_0^\infty dt / ((t + p) \sqrt{(t + x)(t + y)(t + z)})$.
+
+    Args:
+        x: Non-negative.
+        y: Non-negative.
+        z: Non-negative; at most one of the three zero.
+        p: Not zero; where it is negative the value is Cauchy's principal value.
+
+    Returns:
+        R_J to 8 ulps for p > 0, and as well as the terms of DLMF 19.21.12 allow for p < 0 (it
+        changes sign there); inf where p = 0 or two of x, y, z are zero, NaN where one of them is
+        negative. Arguments broadcast.
+
+    Gradients: of the duplication along each argument, which has no cancellation: right also where
+        arguments coincide; -inf with respect to x, y or z at 0.
+    Source: DLMF 19.16.2, 19.26.22, 19.36.2; Carlson, Numerical Algorithms 10 (1995) 13.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.rj(2.0, 3.0, 4.0, 5.0).round(12))
+    0.142975796672
+    """
+    return _rj(*elementwise(x, y, z, p))

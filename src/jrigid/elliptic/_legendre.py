@@ -1,0 +1,362 @@
+"""Legendre's elliptic integrals, as sums of positive terms in Carlson's.
+
+Inside, m and mc = 1 - m travel together: each is exact where the other is rounded. A derivative
+with respect to the parameter is taken along mc, whose tangent is minus that of m.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jrigid.elliptic._carlson import (
+    Values,
+    ValuesLike,
+    elementwise,
+    g_of,
+    rc_of,
+    rf_g,
+    rf_of,
+    rf_rj_signed,
+)
+
+
+def with_parameters(m: Any, mc: Any, *others: Any) -> tuple[Array, ...]:
+    """The other arguments, m and mc, of one dtype and shape."""
+    if mc is None:
+        if m is None:
+            raise ValueError("Argument `m` must be given, or else `mc`, but neither is.")
+        *rest, m = elementwise(*others, m)
+        return *rest, m, 1 - m
+    *rest, mc = elementwise(*others, mc)
+    return *rest, 1 - mc, mc
+
+
+def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
+    """Half turns j, and sine and cosine (not negative) of phi - j pi."""
+    turns = jax.lax.stop_gradient(jnp.round(phi / jnp.pi))
+    sign = 1 - 2 * jnp.mod(turns, 2.0)
+    sine, cosine = sign * jnp.sin(phi), sign * jnp.cos(phi)
+    beyond = cosine < 0  # the quotient was rounded to the wrong side of a half
+    turns = turns + jnp.where(beyond, jnp.where(sine > 0, 1.0, -1.0), 0.0)
+    return turns, jnp.where(beyond, -sine, sine), jnp.where(beyond, -cosine, cosine)
+
+
+def _times(turns: Array, value: Array) -> Array:
+    """Turns * value, zero where there are no turns, whatever the value."""
+    some = turns != 0
+    return jnp.where(some, turns * jnp.where(some, value, 1.0), 0.0)
+
+
+def root_where_turned(turns: Array, mc: Array) -> Array:
+    """sqrt(mc), or 1 where there are no turns that need it: infinite slopes stay out of there."""
+    return jnp.sqrt(jnp.where(turns == 0, 1.0, mc))
+
+
+# --- complete ----------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def _e_complete(m: Array, mc: Array) -> Array:
+    """DLMF 19.25.1, as a sum of positive terms on either side of m = 0."""
+    root = jnp.sqrt(mc)
+    one = jnp.ones_like(root)
+    above = m > 0
+    rf, g = rf_g(jnp.zeros_like(root), jnp.where(above, one, root), jnp.where(above, root, one))
+    value = jnp.where(above, mc * rf + m * root * g, rf - m * g)
+    return jnp.where(mc == 0, 1.0, value)
+
+
+@_e_complete.defjvp
+def _e_complete_rule(primals: Any, tangents: Any) -> Any:
+    m, mc = primals
+    root = jnp.sqrt(mc)
+    slope = 0.5 * g_of(jnp.zeros_like(root), root, jnp.ones_like(root))
+    return _e_complete(m, mc), slope * tangents[1]
+
+
+@jax.jit
+def _k(mc: Array) -> Array:
+    return rf_of(jnp.zeros_like(mc), jnp.sqrt(mc), jnp.ones_like(mc))
+
+
+@jax.jit
+def _pi(n: Array, m: Array, mc: Array) -> Array:
+    return _pi_of(jnp.ones_like(m), jnp.zeros_like(m), n, m, mc)
+
+
+_e = jax.jit(_e_complete)
+
+
+def ellipk(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the first kind, as `scipy.special.ellipk`.
+
+    $K(m) = \int_0^{\pi/2} d\theta / \sqrt{1 - m \sin^2 \theta}$.
+
+    Args:
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments broadcast.
+
+    Gradients: R_D(0, 1, mc) / 6, positive, to any order, right at m = 0; inf at m = 1.
+    Source: DLMF 19.2.8, 19.25.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipk(0.5).round(12))
+    1.854074677301
+    >>> print(jrigid.elliptic.ellipk(None, mc=1e-300).round(3))
+    346.774
+    """
+    return _k(with_parameters(m, mc)[1])
+
+
+def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the second kind, as `scipy.special.ellipe`.
+
+    $E(m) = \int_0^{\pi/2} \sqrt{1 - m \sin^2 \theta} \, d\theta$.
+
+    Args:
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
+
+    Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m = 1.
+    Source: DLMF 19.2.8, 19.25.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipe(0.5).round(12))
+    1.350643881048
+    """
+    return _e(*with_parameters(m, mc))
+
+
+def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the third kind, as `mpmath.ellippi`.
+
+    $\Pi(n, m) = \int_0^{\pi/2} d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
+
+    Args:
+        n: Characteristic. For n > 1 the value is Cauchy's principal value, the real part of
+            mpmath's.
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n, m) for
+        n > 1; inf at n = 1 and at m = 1 (-inf there for n > 1), NaN for m > 1. Arguments
+        broadcast.
+
+    Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at m = 1.
+    Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive terms.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellippi(0.3, 0.5).round(12))
+    2.250376821944
+    """
+    return _pi(*with_parameters(m, mc, n))
+
+
+# --- incomplete --------------------------------------------------------------------------------
+
+
+def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
+    """sqrt(1 - m sin^2 phi)."""
+    return jnp.sqrt(cosine * cosine + mc * sine * sine)
+
+
+@jax.custom_jvp
+def _f_incomplete(phi: Array, mc: Array) -> Array:
+    turns, sine, cosine = reduce_amplitude(phi)
+    one = jnp.ones_like(sine)
+    first = sine * rf_of(cosine, _delta(sine, cosine, mc), one)
+    complete = rf_of(jnp.zeros_like(one), root_where_turned(turns, mc), one)
+    return first + _times(2 * turns, complete)
+
+
+@_f_incomplete.defjvp
+def _f_incomplete_rule(primals: Any, tangents: Any) -> Any:
+    phi, mc = primals
+    turns, sine, cosine = reduce_amplitude(phi)
+    delta = _delta(sine, cosine, mc)
+    one = jnp.ones_like(sine)
+    root = root_where_turned(turns, mc)
+    by_m = sine * sine * sine / (2 * delta) * g_of(cosine, one, delta)
+    by_m = by_m + _times(turns, g_of(jnp.zeros_like(one), one, root) / root)
+    return _f_incomplete(phi, mc), tangents[0] / delta - by_m * tangents[1]
+
+
+@jax.custom_jvp
+def _e_incomplete(phi: Array, m: Array, mc: Array) -> Array:
+    """DLMF 19.25.9 for m <= 0, 19.25.10 for 0 < m <= 1, 19.25.11 above: positive terms each."""
+    turns, s, c = reduce_amplitude(phi)
+    d = _delta(s, c, mc)
+    one = jnp.ones_like(s)
+    low, high = m <= 0, mc < 0
+    last = jnp.where(low, one, jnp.where(high, c, d))
+    rf, g = rf_g(jnp.where(high, d, c), jnp.where(low, d, one), last)
+    cube = s * s * s
+    middle = mc * s * rf + m * s * (c / last) + m * mc * cube * (g / last)
+    above = s * d / last - mc * cube * (g / last)
+    first = jnp.where(low, s * rf - m * cube * g, jnp.where(high, above, middle))
+    complete = _e_complete(jnp.where(turns == 0, 0.0, m), jnp.where(turns == 0, 1.0, mc))
+    return first + _times(2 * turns, complete)
+
+
+@_e_incomplete.defjvp
+def _e_incomplete_rule(primals: Any, tangents: Any) -> Any:
+    phi, m, mc = primals
+    turns, sine, cosine = reduce_amplitude(phi)
+    delta = _delta(sine, cosine, mc)
+    one = jnp.ones_like(sine)
+    by_mc = 0.5 * sine * sine * sine * g_of(cosine, delta, one)
+    complete = g_of(jnp.zeros_like(one), root_where_turned(turns, mc), one)
+    by_mc = by_mc + _times(turns, complete)
+    return _e_incomplete(phi, m, mc), delta * tangents[0] + by_mc * tangents[2]
+
+
+def _pi_of(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
+    """Pi for |phi| <= pi/2; m > 1 by the reciprocal modulus, DLMF 19.7.4."""
+    end = (cosine == 0) & (mc == 0)
+    delta = _delta(sine, cosine, jnp.where(end, 1.0, mc))
+    above = mc < 0
+    k = jnp.sqrt(jnp.where(above, m, 1.0))
+    s = k * sine
+    c, d = jnp.where(above, delta, cosine), jnp.where(above, cosine, delta)
+    n, mc = n / (k * k), jnp.where(above, -mc / (k * k), mc)
+    # DLMF 19.25.14; for n far below 0, where its terms cancel, (t + 1) / (t + p) is split into
+    # 1 / (1 - n) and the rest, to which 19.21.12 is applied: q - c^2 = s^2 mc / (1 - n)
+    negative = n * s * s < -0.5
+    share = jnp.where(negative, 1 / (1 - n), 1.0)
+    p = c * c + (1 - n) * s * s
+    step = s * s * mc * share
+    # Complete and mc out of range or 0: what tends to a limit is at it, and at 0 the rest diverges.
+    limit = (c == 0) & (step < 64 * jnp.finfo(s.dtype).tiny)
+    split = negative & ~limit
+    q = jnp.where(split, c * c + step, 1.0)
+    # In units in which d is 1, where R_J itself can be out of range below.
+    unit = jax.lax.stop_gradient(jnp.where(split, 1 / jnp.maximum(d, 1.0), 1.0))
+    at = jnp.where(negative, (q * unit) * unit, p)
+    rf, rj = rf_rj_signed(c * unit, d * unit, unit, at)
+    rf = rf * unit
+    of_n = jnp.where(limit, jnp.where(negative, p, 1.0), p * q)
+    rc = rc_of(jnp.where(limit, 1.0, d), jnp.sqrt(jnp.where(negative, of_n, 1.0)))
+    rest = jnp.where(limit, rc, c * rc + ((step / 3 * unit) * unit) * (rj * unit))
+    value = jnp.where(negative, share * (rf - n * rest), rf + n * s * s / 3 * rj)
+    infinite = jnp.where(n > 1, 0.5, -0.5) * jnp.log(jnp.where(end, mc, 1.0))
+    return jnp.where(end, infinite, s / k * value)
+
+
+def _pi_of_parameters(phi: Array, n: Array, m: Array, mc: Array) -> Array:
+    """Pi(n, phi, m) for any phi, with parts that can be differentiated by n, m and mc."""
+    turns, sine, cosine = reduce_amplitude(phi)
+    none = turns == 0
+    zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
+    turned = [jnp.where(none, 0.0, n), jnp.where(none, 0.0, m), jnp.where(none, 1.0, mc)]
+    complete = jnp.where(turned[2] < 0, jnp.nan, _pi_of(one, zero, *turned))
+    return _pi_of(sine, cosine, n, m, mc) + _times(2 * turns, complete)
+
+
+_pi_incomplete = jax.custom_jvp(_pi_of_parameters)
+
+
+@_pi_incomplete.defjvp
+def _pi_incomplete_rule(primals: Any, tangents: Any) -> Any:
+    phi, n, m, mc = primals
+    d_phi, d_n, _, d_mc = tangents
+    _, sine, cosine = reduce_amplitude(phi)
+    pole = (cosine * cosine + (1 - n) * sine * sine) * _delta(sine, cosine, mc)
+    _, by_parameters = jax.jvp(
+        lambda n, m, mc: _pi_of_parameters(phi, n, m, mc), (n, m, mc), (d_n, -d_mc, d_mc)
+    )
+    return _pi_incomplete(phi, n, m, mc), d_phi / pole + by_parameters
+
+
+_f, _e_of_phi, _pi_of_phi = map(jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete))
+
+
+def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Incomplete elliptic integral of the first kind, as `scipy.special.ellipkinc`.
+
+    $F(\phi, m) = \int_0^\phi d\theta / \sqrt{1 - m \sin^2 \theta}$.
+
+    Args:
+        phi: Amplitude [rad], any.
+        m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
+            |phi| <= pi/2 and m sin^2 phi <= 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        F to 8 ulps (8 ulps of the amplitude where F itself is steep); +-inf at m = 1 beyond
+        |phi| = pi/2, NaN outside the domain. Arguments broadcast.
+
+    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; infinite where
+        m sin^2 phi = 1.
+    Source: DLMF 19.2.4, 19.25.5; derivative 19.4.4 in the form of 19.18.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipkinc(1.0, 0.5).round(12))
+    1.083216772845
+    """
+    phi, _, mc = with_parameters(m, mc, phi)
+    return _f(phi, mc)
+
+
+def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Incomplete elliptic integral of the second kind, as `scipy.special.ellipeinc`.
+
+    $E(\phi, m) = \int_0^\phi \sqrt{1 - m \sin^2 \theta} \, d\theta$.
+
+    Args:
+        phi: Amplitude [rad], any.
+        m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
+            |phi| <= pi/2 and m sin^2 phi <= 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        E to 8 ulps, NaN outside the domain. Arguments broadcast.
+
+    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; at m = 1 -inf with
+        respect to m beyond |phi| = pi/2.
+    Source: DLMF 19.2.5, 19.25.9-19.25.11.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipeinc(1.0, 0.5).round(9))
+    0.927329884
+    """
+    return _e_of_phi(*with_parameters(m, mc, phi))
+
+
+def ellippiinc(
+    n: ValuesLike, phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+) -> Values:
+    r"""Incomplete elliptic integral of the third kind, as `mpmath.ellippi(n, phi, m)`.
+
+    $\Pi(n, \phi, m) = \int_0^\phi d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
+
+    Args:
+        n: Characteristic. Where n sin^2 phi > 1 the value is Cauchy's principal value.
+        phi: Amplitude [rad], any.
+        m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
+            |phi| <= pi/2 and m sin^2 phi <= 1.
+        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+
+    Returns:
+        The integral to 10 ulps (of its terms for a principal value); infinite where
+        n sin^2 phi = 1 and at m = 1 beyond |phi| = pi/2, NaN outside the domain. Arguments
+        broadcast.
+
+    Gradients: in phi the integrand; in n and m those of R_F and R_J, to any order, right at
+        m = 0, m = 1 and n = 0.
+    Source: DLMF 19.2.7, 19.25.14, 19.21.12.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellippiinc(0.3, 1.0, 0.5).round(12))
+    1.192325436935
+    """
+    n, phi, m, mc = with_parameters(m, mc, n, phi)
+    return _pi_of_phi(phi, n, m, mc)

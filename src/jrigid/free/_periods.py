@@ -1,0 +1,263 @@
+"""Periods, phases and the kind of a free rotation of any body."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from jrigid._checks import (
+    nan_where,
+)
+from jrigid._numerics import safe_norm
+from jrigid._types import InertiaLike, Scalar, VectorLike
+from jrigid.free._flow import Motion
+from jrigid.free._inputs import motion_of
+
+# Below this many eps, relative, two moments are one and a motion is on the separatrix.
+_ROUNDING = 64
+
+REGIMES = (
+    "at rest",
+    "sphere",
+    "steady rotation",
+    "about the axis of the smallest moment",
+    "about the axis of the largest moment",
+    "separatrix",
+)
+
+
+def polhode_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Time after which the angular velocity of a free body comes back, in the body.
+
+    4 K(m) / lam of Jacobi's solution; 2 pi / |wobble rate| for a symmetric body; of spin about a
+    stable axis the limit of small wobbles. Infinite where nothing comes round: sphere, separatrix,
+    spin about the middle axis or an axis of no distinction, rest.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        Period [s].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: right wherever the period is finite; zero where it is infinite.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.12.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.free.polhode_period(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0])).round(4))
+    6.2884
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    period = jnp.where(motion.circles, 4 * motion.quarter / motion.unit, jnp.inf)
+    return nan_where(~findings.ok, period)
+
+
+def mean_precession_rate(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Mean rate at which the axis that the momentum circles turns about the momentum in space.
+
+    |L| / I1 for a symmetric body; |L| / I2 on the separatrix and about an axis of no distinction.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        Rate [rad/s].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: right off the separatrix; there the rate has infinite slope, and |L| / I2's is given.
+    Source: the complete integral of the third kind in docs/free_rotation.md.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> rate = jr.free.mean_precession_rate(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0]))
+    >>> print(rate.round(4))
+    2.0008
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    rate = motion.unit * safe_norm(jnp.stack(motion.momentum)) * _advance(motion)
+    return nan_where(~findings.ok, rate)
+
+
+def _advance(motion: Motion) -> Scalar:
+    """Mean precession rate over |L|."""
+    quarter = jnp.where(motion.circles, motion.quarter, 1.0)
+    extra = motion.al * motion.v * motion.quarter_w / quarter
+    return 1 / motion.moments[1] + jnp.where(motion.circles, extra, 0.0)
+
+
+def precession_per_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Angle about the momentum by which a free body has turned after one polhode period.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        Angle [rad], not reduced: `mean_precession_rate` times `polhode_period`; infinite where the
+        period is.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: right wherever the angle is finite; zero where it is infinite.
+    Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body, omega = jnp.array([1.0, 1.0, 2.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> print(jr.free.precession_per_period(body, omega).round(4))
+    12.5821
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    turned = 4 * motion.quarter * safe_norm(jnp.stack(motion.momentum)) * _advance(motion)
+    return nan_where(~findings.ok, jnp.where(motion.circles, turned, jnp.inf))
+
+
+def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Part of `precession_per_period` beyond the dynamic phase 2 E T / |L|.
+
+    Up to whole turns it is minus the solid angle that the momentum circles in the body (positive
+    where it goes round the axis in the right-handed sense): it depends on the shape of the polhode
+    and not on the pace.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        Angle [rad], not reduced.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: right wherever the period is finite; zero where it is infinite.
+    Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body, omega = jnp.array([1.0, 1.0, 2.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> print(f"{jr.free.geometric_phase(body, omega):.4f}")
+    6.2753
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    square = motion.momentum_square
+    size = safe_norm(jnp.stack(motion.momentum))
+    # 1 / I2 - 2 E / |L|^2, without the difference: al be (2 E - |L|^2 / I2) is -al v
+    gap = motion.v / jnp.where(motion.be == 0, 1.0, motion.be)
+    gap = jnp.where(motion.be == 0, motion.u / jnp.where(motion.al == 0, 1.0, motion.al), gap)
+    slow = motion.quarter * gap / jnp.where(square == 0, 1.0, square)
+    phase = 4 * size * (slow + motion.al * motion.v * motion.quarter_w)
+    return nan_where(~findings.ok, jnp.where(motion.circles, phase, 0.0))
+
+
+def parameter(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Parameter m = k^2 of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: right where the body is not a sphere and not at rest; there zero.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.free.parameter(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])).round(6))
+    0.003333
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    return nan_where(~findings.ok, _parameter(motion))
+
+
+def _parameter(motion: Motion) -> Scalar:
+    al, be = motion.al, motion.be
+    l1, l2, _ = motion.momentum
+    p = al * ((al + be) * l1 * l1 + be * l2 * l2)
+    q = motion.kap + motion.v
+    return jnp.where(q > 0, p / jnp.where(q > 0, q, 1.0), 0.0)
+
+
+def modulus(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+    """Modulus k of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        k = sqrt(m), see `parameter`.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth there.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> k = jr.free.modulus(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0]))
+    >>> print(f"{k:.6f}")
+    0.057735
+    """
+    m = parameter(inertia, omega, throw=throw)
+    return jnp.where(m == 0, 0.0, jnp.sqrt(jnp.where(m == 0, 1.0, m)))
+
+
+def regime(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Int[Array, ""]:
+    """Which kind of motion it is: an index into `free.REGIMES`.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        omega: Angular velocity, body components [rad/s].
+        throw: False: bad values give -1 instead of an error.
+
+    Returns:
+        Integer code. A symmetric body goes about the axis of its smallest moment (prolate) or its
+        largest (oblate). Equalities hold to a few eps.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> code = jr.free.regime(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0]))
+    >>> jr.free.REGIMES[code]
+    'about the axis of the largest moment'
+    """
+    findings, motion = motion_of(inertia, omega, throw)
+    rounding = _ROUNDING * jnp.finfo(motion.kap.dtype).eps
+    i1, _, i3 = motion.moments
+    l1, l2, l3 = motion.momentum
+    largest = jnp.maximum(i1, i3)
+    al, be = motion.al, motion.be
+    rate = jnp.stack([be * l2 * l3, (al + be) * l3 * l1, al * l1 * l2])
+    size = jnp.maximum(jnp.abs(al), jnp.abs(be)) * motion.momentum_square
+    above = al * l1 * l1 - be * l3 * l3
+    cases = [
+        motion.momentum_square == 0,
+        jnp.abs(i3 - i1) <= rounding * largest,
+        jnp.max(jnp.abs(rate)) <= rounding * size,
+        (jnp.abs(above) <= rounding * jnp.maximum(jnp.abs(al) * l1 * l1, jnp.abs(be) * l3 * l3)),
+        i3 < i1,
+    ]
+    code = jnp.select(cases, [jnp.asarray(n) for n in (0, 1, 2, 5, 3)], jnp.asarray(4))
+    return jnp.where(findings.ok, code, -1)

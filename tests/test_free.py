@@ -1,0 +1,424 @@
+"""The exact flow of the free body: values, invariants, derivatives, edges, bad input.
+
+The reference values of tests/data/free_rotation.npz come from a closed form at 60 digits, which
+tests/test_free_reference.py checks against Taylor series; the derivatives are compared with
+variational equations in 80-bit arithmetic (tests/reference.py).
+"""
+
+from pathlib import Path
+
+import free_reference
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
+from scipy.spatial.transform import Rotation
+
+import jrigid as jr
+from jrigid import free
+
+EPS = np.finfo(float).eps
+RECORD = np.load(Path(__file__).parent / "data" / "free_rotation.npz")
+REGIMES = list(dict.fromkeys(RECORD["regime"].tolist()))
+UNSTABLE = {"separatrix", "near separatrix", "near spin, middle", "spin, middle"}
+
+
+def state_at(inertia, attitude, omega, t):
+    state = jr.free_rotation(inertia, jr.State(attitude, omega), t, throw=False)
+    return jnp.concatenate([state.attitude, state.omega])
+
+
+def jacobian(inertia, attitude, omega, t):
+    return jax.jacfwd(state_at, argnums=(0, 1, 2))(inertia, attitude, omega, t)
+
+
+def rows(regime):
+    chosen = RECORD["regime"] == regime
+    names = ("tensor" if regime == "tensor" else "inertia", "attitude", "omega", "time")
+    return tuple(RECORD[name][chosen] for name in names)
+
+
+def same_sign(found, exact):
+    """The attitudes of `found` with the signs of those of `exact`: q and -q are one attitude."""
+    signs = np.sign(np.sum(found[:, :4] * exact[:, :4], axis=1))[:, None]
+    return np.concatenate([signs * found[:, :4], found[:, 4:]], axis=1)
+
+
+def exact_states(regime):
+    chosen = RECORD["regime"] == regime
+    return np.concatenate([RECORD["attitude_out"][chosen], RECORD["omega_out"][chosen]], axis=1)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return {
+        "value": jax.jit(jax.vmap(state_at)),
+        "jacobian": quick_jit(jax.vmap(jacobian)),
+    }
+
+
+def test_the_record_holds_at_least_fifty_cases_a_regime():
+    assert all(np.sum(RECORD["regime"] == regime) >= 50 for regime in REGIMES)
+    assert len(REGIMES) >= 20
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_values_to_the_bar_against_30_digits(regime, compiled):
+    inertia, attitude, omega, time = rows(regime)
+    exact = exact_states(regime)
+    found = same_sign(np.asarray(compiled["value"](inertia, attitude, omega, time)), exact)
+    size = np.linalg.norm(omega, axis=1)
+    size = np.where(size == 0, 1.0, size)[:, None]
+    radians = size * np.abs(time)[:, None]
+    error = np.abs(found - exact) / np.concatenate(
+        [np.ones((1, 4)) + 0 * size, size + np.zeros((1, 3))], 1
+    )
+    # What the last bits of the inputs do: 8 eps |d state / d inputs| |inputs|.
+    amplified = np.zeros_like(radians)
+    if regime in UNSTABLE or regime.startswith("unphysical"):
+        columns = compiled["jacobian"](inertia, attitude, omega, time)
+        for column, x in zip(columns, (inertia, attitude, omega), strict=True):
+            scaled = np.asarray(column) / np.where(np.arange(7) < 4, 1.0, size)[:, :, None]
+            norm = np.linalg.norm(scaled, axis=(1, 2)) * np.linalg.norm(x, axis=1)
+            assert np.all(np.isfinite(norm))
+            amplified[:, 0] += norm
+    bar = 1e-13 * (1 + radians) + 8 * EPS * amplified
+    assert np.all(error <= bar), np.max(error / bar)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_energy_and_momentum_in_space_to_1e_14_at_all_times(regime, compiled):
+    inertia, attitude, omega, time = rows(regime)
+    found = np.asarray(compiled["value"](inertia, attitude, omega, time))
+    tensor = inertia if inertia.ndim == 3 else inertia[:, :, None] * np.eye(3)
+    scale = np.max(np.abs(omega), axis=1)
+    scale = np.where(scale == 0, 1.0, scale)[:, None]  # squares of 1e-160 underflow
+    before, after = omega / scale, found[:, 4:] / scale
+    momentum = [np.einsum("nij,nj->ni", tensor, w) for w in (before, after)]
+    energy = [np.sum(w * m, axis=1) for w, m in zip((before, after), momentum, strict=True)]
+    np.testing.assert_allclose(energy[1], energy[0], rtol=1e-14)
+    in_space = [
+        Rotation.from_quat(q, scalar_first=True).apply(m)
+        for q, m in zip((attitude, found[:, :4]), momentum, strict=True)
+    ]
+    length = np.linalg.norm(momentum[0], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(momentum[1], axis=1), length, rtol=1e-14)
+    assert np.all(np.linalg.norm(in_space[1] - in_space[0], axis=1) <= 1e-14 * length)
+    np.testing.assert_allclose(np.linalg.norm(found[:, :4], axis=1), 1.0, rtol=1e-14)
+
+
+# --- Derivatives --------------------------------------------------------------------------------
+
+OF_THE_SCALE = {"rest", "tensor", "omega x 1e-160", "omega x 1e-7", "omega x 1e4"}
+DERIVATIVE_REGIMES = [r for r in REGIMES if r not in OF_THE_SCALE and not r.startswith("unphys")]
+
+
+def of_unit_rate(per_regime):
+    """A few bodies of every regime with |omega| = 1 and the middle moment 1, side by side."""
+    chosen = np.concatenate(
+        [
+            np.flatnonzero(RECORD["regime"] == regime)[
+                np.linspace(0, np.sum(RECORD["regime"] == regime) - 1, per_regime).astype(int)
+            ]
+            for regime in DERIVATIVE_REGIMES
+        ]
+    )
+    inertia, attitude, omega = (RECORD[name][chosen] for name in ("inertia", "attitude", "omega"))
+    inertia = inertia / np.median(inertia, axis=1)[:, None]
+    attitude = attitude / np.linalg.norm(attitude, axis=1)[:, None]
+    omega = omega / np.linalg.norm(omega, axis=1)[:, None]
+    return np.concatenate([attitude, omega, inertia], axis=1), RECORD["regime"][chosen]
+
+
+def of_inputs(x, t):
+    return state_at(x[7:], x[:4], x[4:7], t)
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    def along(x, v, t):
+        """Jacobian by columns and by rows, and its derivative along v in both orders."""
+        forward, by_columns = jax.jvp(lambda y: jax.jacfwd(of_inputs)(y, t), (x,), (v,))
+        reverse, by_rows = jax.jvp(lambda y: jax.jacrev(of_inputs)(y, t), (x,), (v,))
+        return of_inputs(x, t), forward, reverse, by_columns, by_rows
+
+    return quick_jit(jax.vmap(along, (0, 0, None)))
+
+
+@pytest.mark.parametrize(("duration", "per_regime"), [(20.0, 5), (-200.0, 2)])
+def test_derivatives_equal_the_variational_equations(duration, per_regime, derivatives):
+    inputs, regimes = of_unit_rate(per_regime)
+    if duration < -20:  # exp(lambda t) of an unstable motion is beyond 80 bits then
+        stable = ~np.isin(regimes, list(UNSTABLE))
+        inputs, regimes = inputs[stable], regimes[stable]
+    attitude, omega, inertia = inputs[:, :4], inputs[:, 4:7], inputs[:, 7:]
+    direction = np.random.default_rng(3).normal(size=inputs.shape)
+    direction[:, :4] = 0  # the package normalises the attitude, the reference does not
+    state, exact = reference.heavy_body(inertia, attitude, omega, duration)
+    curvature = reference.free_hessian_vector(inertia, attitude, omega, duration, direction)
+    tangent = np.tile(np.eye(10), (len(inputs), 1, 1))
+    tangent[:, :4, :4] -= attitude[:, :, None] * attitude[:, None, :]
+    exact = np.einsum("nij,njk->nik", exact.astype(float), tangent)
+    curvature = np.einsum("nij,njk->nik", curvature.astype(float), tangent)
+
+    found, *firsts_and_seconds = (np.asarray(x) for x in derivatives(inputs, direction, duration))
+    signs = np.ones((len(inputs), 7, 1))
+    signs[:, :4] = np.sign(np.sum(found[:, :4] * state[:, :4].astype(float), 1))[:, None, None]
+    forward, reverse, by_columns, by_rows = (signs * x for x in firsts_and_seconds)
+
+    def norm(x):
+        return np.linalg.norm(x, axis=(1, 2))
+
+    # A bit of the inputs changes the Jacobian itself by this much.
+    rounding = 8 * EPS * norm(curvature) / norm(exact)
+    for first in (forward, reverse):
+        relative = norm(first - exact) / norm(exact)
+        assert np.all(relative <= 1e-9 + rounding), dict(zip(regimes, relative, strict=True))
+    for second in (by_columns, by_rows):
+        relative = norm(second - curvature) / np.maximum(norm(curvature), norm(exact))
+        assert np.all(relative <= 1e-9 + 10 * rounding), dict(zip(regimes, relative, strict=True))
+
+
+def test_derivatives_at_rest_are_finite_and_right():
+    attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
+    by_moments, _, by_omega = (np.asarray(x) for x in jacobian(MOMENTS, attitude, np.zeros(3), 2.0))
+    np.testing.assert_array_equal(by_moments, 0.0)
+    np.testing.assert_allclose(by_omega[4:], np.eye(3), atol=ulps(float, 2))
+    # q (1, t d omega / 2)
+    w, x, y, z = attitude
+    exact = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
+    np.testing.assert_allclose(by_omega[:4], exact, atol=ulps(float, 2))
+
+
+@pytest.mark.parametrize("times", [0.7, 40.0])
+def test_derivative_in_time_is_euler_s_equation(times):
+    attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
+    rates = jax.jacfwd(state_at, argnums=3)(MOMENTS, attitude, OMEGA, times)
+    state = state_at(MOMENTS, attitude, OMEGA, times)
+    np.testing.assert_allclose(
+        rates[:4], jr.rotation.attitude_rate(state[:4], state[4:]), atol=1e-13
+    )
+    np.testing.assert_allclose(rates[4:], jr.euler_equations(MOMENTS, state[4:]), atol=1e-13)
+
+
+# Exact doubles: every change of the size of the differences below is exact too.
+TENSORS = {
+    "sphere": 2.0 * np.eye(3),
+    "symmetric about axis 3": np.diag([1.0, 1.0, 2.0]),
+    "symmetric, turned": np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]),
+    "nearly a sphere": np.diag([2.0, 2.0 + 2.0**-13, 2.0 + 2.0**-12]),
+    "nearly symmetric": np.diag([1.0, 1.0 + 2.0**-30, 1.5]),
+    "generic": np.array([[2.0, 0.25, -0.5], [0.25, 1.5, 0.125], [-0.5, 0.125, 3.0]]),
+    "generic, unphysical": np.array([[2.0, 1.25, -0.5], [1.25, 1.5, 0.125], [-0.5, 0.125, 7.0]]),
+}
+
+
+@pytest.fixture(scope="module")
+def of_tensor():
+    def along(tensor, omega, change, turn, t):
+        def moved(s):
+            return state_at(tensor + s * change, jnp.eye(4)[0], omega + s * turn, t)
+
+        first = jax.jvp(moved, (0.0,), (1.0,))[1]
+        back = jax.vjp(moved, 0.0)[1]
+        reverse = jax.vmap(lambda row: back(row)[0])(jnp.eye(7))
+        return moved(0.0), first, reverse
+
+    return quick_jit(along)
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_tensor):
+    """Against differences of the 30-digit motion, extrapolated to zero step."""
+    tensor, t = TENSORS[name], 9.0
+    omega, turn = np.array([0.5, -0.75, 0.25]), np.array([0.25, 0.5, -1.0])
+    change = np.array([[0.5, -0.25, 0.75], [-0.25, -1.0, 0.5], [0.75, 0.5, 0.25]])
+
+    def motion(s):
+        ((q, w),) = free_reference.free_motion(
+            tensor + s * change, np.eye(4)[0], omega + s * turn, [t]
+        )
+        return np.array([*q, *w])
+
+    def slope(h):
+        return (motion(h) - motion(-h)) / (2 * h)
+
+    h = 2.0**-14
+    exact = np.array((64 * slope(h / 4) - 20 * slope(h / 2) + slope(h)) / 45, float)
+    value, forward, reverse = (np.asarray(x) for x in of_tensor(tensor, omega, change, turn, t))
+    sign = np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
+    exact[:4] *= sign
+    bound = 1e-9 * np.linalg.norm(exact)
+    np.testing.assert_allclose(forward, exact, rtol=0, atol=bound)
+    np.testing.assert_allclose(reverse, exact, rtol=0, atol=bound)
+
+
+def test_second_derivatives_in_a_tensor_of_distinct_moments():
+    tensor, t = TENSORS["generic"], 9.0
+    omega, turn = np.array([0.5, -0.75, 0.25]), np.array([0.25, 0.5, -1.0])
+    change = np.array([[0.5, -0.25, 0.75], [-0.25, -1.0, 0.5], [0.75, 0.5, 0.25]])
+
+    def motion(s):
+        ((q, w),) = free_reference.free_motion(
+            tensor + s * change, np.eye(4)[0], omega + s * turn, [t]
+        )
+        return np.array([*q, *w])
+
+    def bend(h):
+        return (motion(h) - 2 * motion(0.0) + motion(-h)) / (h * h)
+
+    h = 2.0**-13
+    exact = np.array((64 * bend(h / 4) - 20 * bend(h / 2) + bend(h)) / 45, float)
+
+    @quick_jit
+    def second(tensor, omega):
+        def moved(s):
+            return state_at(tensor + s * change, jnp.eye(4)[0], omega + s * turn, t)
+
+        return moved(0.0), jax.jacfwd(jax.jacfwd(moved))(0.0)
+
+    value, found = (np.asarray(x) for x in second(tensor, omega))
+    exact[:4] *= np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.linalg.norm(exact))
+
+
+# --- float32, shapes, modes ---------------------------------------------------------------------
+
+# Errors of the attitude and of omega / |omega|, in float32 eps (1 + radians of the motion). The
+# moments of a tensor come from its six elements with an error of a few eps of the largest.
+FLOAT32_MULTIPLE = 16
+FLOAT32_MULTIPLE_OF_A_TENSOR = 64
+
+
+@pytest.mark.parametrize("regime", [r for r in REGIMES if r not in UNSTABLE | {"omega x 1e-160"}])
+def test_float32_within_a_multiple_of_its_eps(regime, compiled):
+    inertia, attitude, omega, time = (x.astype(np.float32) for x in rows(regime))
+    if regime == "tensor":
+        inertia = 0.5 * (inertia + np.swapaxes(inertia, 1, 2))
+    with jax.numpy_dtype_promotion("standard"):
+        found = np.asarray(compiled["value"](inertia, attitude, omega, time), float)
+        exact_inputs = [x.astype(float) for x in (inertia, attitude, omega, time)]
+        exact = np.asarray(compiled["value"](*exact_inputs))
+    assert not np.any(np.isnan(found))
+    size = np.linalg.norm(omega.astype(float), axis=1)
+    size = np.where(size == 0, 1.0, size)
+    # the inputs' own bits: a body with moments 1 : 1e3 has motions that fast
+    spread = 1.0
+    if regime.startswith("unphysical"):
+        spread = np.max(inertia, axis=1) / np.min(inertia, axis=1)
+    radians = size * np.abs(time) * spread
+    found = same_sign(found, exact)
+    error = np.maximum(
+        np.max(np.abs(found - exact)[:, :4], axis=1),
+        np.max(np.abs(found - exact)[:, 4:], axis=1) / size,
+    )
+    short = radians < 1e5  # beyond, float32 does not know the phase
+    multiple = FLOAT32_MULTIPLE_OF_A_TENSOR if regime == "tensor" else FLOAT32_MULTIPLE
+    bar = multiple * np.finfo(np.float32).eps * (1 + radians)
+    assert np.all(error[short] <= bar[short]), np.max(error[short] / bar[short])
+
+
+def test_dtype_follows_the_arguments():
+    single = [np.float32(x) for x in (MOMENTS, ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 3.0)]
+    state = jr.free_rotation(single[0], jr.State(single[1], single[2]), single[3])
+    assert state.attitude.dtype == state.omega.dtype == np.float32
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3), (0,)])
+def test_times_of_any_shape_and_order(shape):
+    ts = np.random.default_rng(0).normal(scale=30.0, size=shape)
+    state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
+    states = jr.free_rotation(TENSOR, state0, ts, t0=-1.5)
+    assert states.attitude.shape == (*shape, 4)
+    assert states.omega.shape == (*shape, 3)
+    for index in np.ndindex(shape):
+        one = jr.free_rotation(TENSOR, state0, ts[index], t0=-1.5)
+        np.testing.assert_allclose(states.attitude[index], one.attitude, atol=1e-14)
+        np.testing.assert_allclose(states.omega[index], one.omega, atol=1e-14)
+
+
+def test_there_and_back_again_and_in_two_steps():
+    state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
+    there = jr.free_rotation(TENSOR, state0, 12.5)
+    back = jr.free_rotation(TENSOR, there, 0.0, t0=12.5)
+    np.testing.assert_allclose(back.attitude, state0.attitude, atol=1e-14)
+    np.testing.assert_allclose(back.omega, state0.omega, atol=1e-14)
+    further = jr.free_rotation(TENSOR, there, 30.0, t0=12.5)
+    at_once = jr.free_rotation(TENSOR, state0, 30.0)
+    np.testing.assert_allclose(further.attitude, at_once.attitude, atol=1e-13)
+
+
+def test_equals_simulate():
+    state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
+    ts = np.linspace(0.0, 30.0, 7)
+    exact = jr.free_rotation(TENSOR, state0, ts)
+    integrated = jr.simulate(jr.RigidBody(TENSOR), state0, ts, rtol=1e-11).states
+    np.testing.assert_allclose(exact.attitude, integrated.attitude, atol=1e-11)
+    np.testing.assert_allclose(exact.omega, integrated.omega, atol=1e-11)
+
+
+# --- Bad input ----------------------------------------------------------------------------------
+
+GOOD = {
+    "inertia": MOMENTS,
+    "attitude": np.array([1.0, 0.0, 0.0, 0.0]),
+    "omega": OMEGA,
+    "ts": np.array([1.0, 2.0]),
+}
+BAD = {
+    "negative moment": ({"inertia": np.array([1.0, -2.0, 3.0])}, "invalid_inertia", "`inertia`"),
+    "NaN moment": ({"inertia": np.array([1.0, np.nan, 3.0])}, "invalid_inertia", "`inertia`"),
+    "NaN rate": ({"omega": np.array([1.0, np.nan, 3.0])}, "invalid_state", "`state0`"),
+    "zero quaternion": ({"attitude": np.zeros(4)}, "invalid_attitude", "unit quaternion"),
+    "not unit": ({"attitude": 2.0 * GOOD["attitude"]}, "invalid_attitude", "unit quaternion"),
+    "infinite time": ({"ts": np.array([1.0, np.inf])}, "invalid_times", "`ts` must be finite"),
+}
+
+
+def run(inertia, attitude, omega, ts, throw=True):
+    return jr.free_rotation(inertia, jr.State(attitude, omega), ts, throw=throw)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_value_is_an_error_eagerly_and_under_jit_and_marks_its_lane(name):
+    change, code, message = BAD[name]
+    bad = {**GOOD, **change}
+    for call in (run, jax.jit(run)):
+        with pytest.raises(Exception, match=message):
+            jax.block_until_ready(call(**bad))
+    lanes = {key: jnp.stack([GOOD[key], bad[key], GOOD[key]]) for key in GOOD}
+
+    def total(lanes):
+        states = jax.vmap(lambda lane: run(**lane, throw=False))(lanes)
+        return jnp.sum(states.omega[0] ** 3) + jnp.sum(states.attitude[2]), states
+
+    (_, states), slopes = jax.value_and_grad(total, has_aux=True)(lanes)
+    assert np.all(np.isnan(states.omega[1]))
+    assert np.all(np.isnan(states.attitude[1]))
+    assert np.all(np.isfinite(states.omega[jnp.array([0, 2])]))
+    assert all(np.all(np.isfinite(slope[::2])) for slope in slopes.values())
+    codes = jax.vmap(
+        lambda lane: free.motion_validity(
+            lane["inertia"], jr.State(lane["attitude"], lane["omega"]), lane["ts"]
+        )
+    )(lanes)
+    expected = getattr(jr.RESULTS, code)
+    np.testing.assert_array_equal(codes == expected, [False, True, False])
+    np.testing.assert_array_equal(codes == jr.RESULTS.successful, [True, False, True])
+
+
+def test_wrong_shapes_and_types(untyped):
+    state0 = jr.State(GOOD["attitude"], OMEGA)
+    with pytest.raises(ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"):
+        jr.free_rotation(np.ones(4), state0, 1.0)
+    with pytest.raises(ValueError, match="must be a State"):
+        jr.free_rotation(MOMENTS, OMEGA, 1.0)
+    with pytest.raises(ValueError, match=r"`state0\.omega` must have shape \(3,\)"):
+        jr.free_rotation(MOMENTS, jr.State(GOOD["attitude"], np.ones(4)), 1.0)
+    with pytest.raises(ValueError, match=r"`state0\.internal` must be empty"):
+        jr.free_rotation(MOMENTS, jr.State(GOOD["attitude"], OMEGA, np.ones(3)), 1.0)
+    half = jr.State(GOOD["attitude"].astype(np.float16), OMEGA.astype(np.float16))
+    with pytest.raises(ValueError, match="float32 or float64"):
+        jr.free_rotation(MOMENTS.astype(np.float16), half, np.float16(1.0))
