@@ -11,7 +11,7 @@ import pytest
 import jrigid as jr
 from jrigid._checks import is_positive_definite, is_symmetric
 from jrigid.mass import mesh_validity
-from jrigid.mass._mesh import _closed_numpy, _closed_traced
+from jrigid.mass._surface import closed_parts, closed_traced
 
 EPS = np.finfo(float).eps
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
@@ -349,7 +349,7 @@ BAD_MESHES = _bad_meshes()
 def test_bad_mesh_is_an_error_for_known_faces(name):
     vertices, faces, code = BAD_MESHES[name]
     assert mesh_validity(vertices, faces) == code
-    assert jr.from_mesh(vertices, faces, throw=False).result != jr.RESULTS.successful
+    assert jr.from_mesh(vertices, faces, throw=False).result == code
     messages = [
         (jr.RESULTS.open_mesh, "closed surface"),
         (jr.RESULTS.inside_out_mesh, "inside out"),
@@ -386,8 +386,8 @@ def test_open_meshes_are_found_however_their_vertices_are_numbered(fault):
                 "two doubled": np.concatenate([faces, faces[:2]]),
             }[fault]
         )
-    assert not any(_closed_numpy(faces, 8) for faces in meshes)
-    traced = jax.jit(jax.vmap(lambda faces: _closed_traced(faces, 8)))(np.stack(meshes))
+    assert not any(closed_parts(faces, 8)[0] for faces in meshes)
+    traced = jax.jit(jax.vmap(lambda faces: closed_traced(faces, 8)))(np.stack(meshes))
     assert not np.any(traced)
 
 
@@ -399,9 +399,103 @@ def test_traced_faces_of_a_good_mesh_pass_whatever_their_order():
         assert jax.jit(mesh_validity)(CUBE, faces) == jr.RESULTS.successful
         assert mesh_validity(CUBE, faces) == jr.RESULTS.successful
     odd = jax.jit(lambda v, f: jr.from_mesh(v, f, throw=False).result)(CUBE, CUBE_FACES[:-1])
-    assert odd == jr.RESULTS.invalid_mass
+    assert odd == jr.RESULTS.open_mesh
     body = eqx.filter_jit(jr.from_mesh)(CUBE, jnp.asarray(CUBE_FACES))
     np.testing.assert_allclose(body.mass, 1.0, rtol=4 * EPS)
+
+
+def test_an_inside_out_mesh_is_an_error_under_jit():
+    body = eqx.filter_jit(lambda v: jr.from_mesh(v, CUBE_FACES))
+    assert body(CUBE).mass == 1
+    with pytest.raises(RuntimeError, match="inside out"):
+        jax.block_until_ready(body(-CUBE))
+
+
+def cubes(*parts):
+    """Vertices and faces of cubes (centre, edge); a negative edge turns its cube inside out."""
+    vertices = [edge * (CUBE - 0.5) + np.asarray(centre) for centre, edge in parts]
+    faces = [CUBE_FACES + 8 * k for k in range(len(parts))]
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+BIG = ([0.0, 0, 0], 2.0)
+BAD_PARTS = {
+    "inside out beside": (BIG, ([3.0, 0, 0], -0.5)),
+    "overlapping along an axis": (BIG, ([0.5, 0, 0], 2.0)),
+    "overlapping at a corner": (BIG, ([1.5, 1.5, 1.5], 2.0)),
+    "the same twice": (BIG, BIG),
+    "one in another": (BIG, ([0.1, 0.2, 0], 1.0)),
+    "a cavity in a cavity": (BIG, ([0.0, 0, 0], -1.5), ([0.1, 0, 0], -0.5)),
+    "a cavity twice": (BIG, ([0.0, 0, 0], -1.0), ([0.0, 0, 0], -1.0)),
+    "a cavity through the wall": (BIG, ([0.8, 0, 0], -1.0)),
+    "the last of many": (*(([3.0 * k, 0, 0], 2.0) for k in range(20)), ([57.0, 0, 0], 1.0)),
+}
+GOOD_PARTS = {
+    "hollow": (BIG, ([0.1, 0.2, 0], -1.0)),
+    "apart": (BIG, ([3.0, 0, 0], 1.0)),
+    "face to face": (BIG, ([2.0, 0, 0], 2.0)),
+    "a smaller one on a face": (BIG, ([1.5, 0.2, 0.1], 1.0)),
+    "an island in a cavity": (BIG, ([0.0, 0, 0], -1.5), ([0.1, 0, 0], 0.5)),
+    "many": tuple(([3.0 * k, 0, 0], 2.0) for k in range(20)),
+    "far away": (([1e4, 0, 0], 2.0), ([1e4 + 3, 0, 0], 2.0)),
+}
+
+
+@pytest.mark.parametrize("name", [*BAD_PARTS, *GOOD_PARTS])
+def test_surfaces_that_do_not_bound_a_body_together_are_found(name):
+    vertices, faces = cubes(*{**BAD_PARTS, **GOOD_PARTS}[name])
+    code = jr.RESULTS.inside_out_mesh if name in BAD_PARTS else jr.RESULTS.successful
+    for dtype in (np.float32, np.float64):
+        assert mesh_validity(vertices.astype(dtype), faces) == code
+
+
+@pytest.mark.parametrize(
+    "name", ["inside out beside", "overlapping along an axis", "the same twice"]
+)
+def test_contradicting_surfaces_are_an_error_eagerly_and_under_jit_and_a_code_in_a_lane(name):
+    vertices, faces = cubes(*BAD_PARTS[name])
+    good = cubes(BIG, ([3.0, 0, 0], 0.5))[0]
+    for body in (jr.from_mesh, eqx.filter_jit(lambda v, _: jr.from_mesh(v, faces))):
+        with pytest.raises(RuntimeError, match="bound one body together"):
+            jax.block_until_ready(body(vertices, faces))
+    body = jax.jit(jax.vmap(lambda v: jr.from_mesh(v, faces, throw=False)))
+    lanes = body(np.stack([good, vertices, good]))
+    bad = jr.RESULTS.inside_out_mesh
+    np.testing.assert_array_equal(lanes.result == bad, [False, True, False])
+    np.testing.assert_array_equal(np.isnan(lanes.mass), [False, True, False])
+    np.testing.assert_allclose(lanes.mass[::2], 8.125, rtol=8 * EPS)
+
+
+def test_known_faces_fall_into_parts_however_their_vertices_are_numbered():
+    rng = np.random.default_rng(18)
+    parts = [([5.0 * k, 0, 0], 1.0) for k in range(6)]
+    _, faces = cubes(*parts)
+    for _ in range(50):
+        number = rng.permutation(48 + 5)  # five vertices belong to no face
+        mixed = number[faces][rng.permutation(len(faces))]
+        closed, samples = closed_parts(mixed, 48 + 5)
+        assert closed
+        part_of = np.full(53, -1)
+        part_of[number[:48]] = np.arange(48) // 8
+        assert np.array_equal(np.bincount(part_of[samples[:, 0]]), [2] * 6)
+        turned = {tuple(np.roll(face, k)) for face in mixed for k in range(3)}
+        assert {tuple(sample) for sample in samples} <= turned
+    assert closed_parts(CUBE_FACES, 8) == (True, None)
+
+
+def test_a_part_without_area_decides_nothing():
+    vertices, faces = cubes(BIG, ([0.1, 0.2, 0.0], 0.0), ([3.0, 0, 0], 1.0))
+    assert mesh_validity(vertices, faces) == jr.RESULTS.successful
+
+
+def test_derivatives_of_a_hollow_mesh_in_its_vertices():
+    vertices, faces = cubes(BIG, ([0.1, 0.2, 0], -1.0))
+    volume = lambda v, faces: jr.from_mesh(v, faces).mass  # noqa: E731
+    found = jax.jit(jax.grad(lambda v: volume(v, faces)))(vertices)
+    outer = jax.grad(volume)(vertices[:8], CUBE_FACES)
+    # The cavity's own volume grows by as much as the body loses.
+    inner = jax.grad(volume)(vertices[8:], CUBE_FACES[:, ::-1].copy())
+    np.testing.assert_allclose(found, np.concatenate([outer, -inner]), atol=8 * EPS)
 
 
 # --- principal axes and functions of a tensor ------------------------------------------------
@@ -636,6 +730,7 @@ def every_function(x):
     tensor = jnp.diag(x) + 0.1 * x[0] * (jnp.ones((3, 3), x.dtype) - jnp.eye(3, dtype=x.dtype))
     quaternion = jnp.concatenate([x, x[:1]])
     body = jr.MassProperties(x[0], x, tensor)
+    moved = body.translated(x)
     points = jnp.stack([x, 2 * x[::-1], -x])
     principal = jr.principal_axes(tensor)
     return {
@@ -646,13 +741,28 @@ def every_function(x):
         "parallel_axis": jr.parallel_axis(x, x[0], x),
         "to_center_of_mass": jr.to_center_of_mass(tensor, 0.01 * x[0], x),
         "principal_axes": principal.moments,
-        "axes": principal.axes,
+        "PrincipalAxes": principal.axes,
         "tensor_function": jr.tensor_function(jnp.log, tensor),
-        "body": body,
-        "about": body.about(2 * x),
-        "sum": body.translated(x).rotated(quaternion) + body,
-        "method": body.principal_axes().moments,
+        "MassProperties": body,
+        "MassProperties.about": body.about(2 * x),
+        "MassProperties.translated": moved.center_of_mass,
+        "MassProperties.rotated": moved.rotated(quaternion) + body,
+        "MassProperties.principal_axes": body.principal_axes().moments,
     }
+
+
+def test_every_public_name_is_among_the_functions():
+    names = {
+        name
+        for name, value in vars(jr.mass).items()
+        if not name.startswith("_") and "jrigid.mass" in getattr(value, "__module__", "")
+    }
+    for name in ("MassProperties", "PrincipalAxes"):
+        kind = getattr(jr.mass, name)
+        own = set(vars(kind)) - set(kind.__dataclass_fields__) - {"result"}
+        names |= {f"{name}.{method}" for method in own if not method.startswith("_")}
+    codes = {"mesh_validity"}
+    assert set(jax.eval_shape(every_function, jnp.ones(3))) == names - codes
 
 
 def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
@@ -690,6 +800,52 @@ def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
         results[jnp.float32],
         results[jnp.float64],
     )
+
+
+def weighted_sum(body):
+    """A number that mass, centre and every moment enter with curvature."""
+    weights = np.cos(1.0 + np.arange(9.0)).reshape(3, 3)
+    return body.mass**2 + jnp.sum(jnp.sin(body.center_of_mass)) + jnp.sum(weights * body.inertia**2)
+
+
+HOLLOW, HOLLOW_FACES = cubes(([0.0, 0, 0], 1.0), ([0.1, 0.05, 0], -0.5))
+CLOUD = np.random.default_rng(0).normal(size=(40, 3))
+CURVED = {
+    "mesh": (lambda v: jr.from_mesh(v, CUBE_FACES, 2.0), CUBE),
+    "mesh with a cavity": (lambda v: jr.from_mesh(v, HOLLOW_FACES, 2.0), HOLLOW),
+    "positions": (lambda r: jr.from_points(jnp.arange(1.0, 41.0) / 40, r), CLOUD),
+    "positions of many": (lambda r: jr.from_points(jnp.ones(1200) / 1200, jnp.concatenate([r] * 30)), CLOUD),
+    "masses": (lambda m: jr.from_points(m, CLOUD), np.arange(1.0, 41.0) / 40),
+    "density": (lambda c: jr.from_density(lambda r: 1 + jnp.sum((r * c) ** 2), -ONES, ONES, order=4), np.array([1.0, 0.5, 2.0])),
+    "box of a density": (lambda a: jr.from_density(lambda r: jnp.exp(r[0] - r[1]), -a, ONES, order=4), np.array([1.0, 0.5, 2.0])),
+    "capsule": (lambda x: jr.solids.capsule(*x), np.array([1.0, 0.5, 2.0])),
+    "shell": (lambda x: jr.solids.shell(x[0], x[1], inner_radius=x[2]), np.array([1.0, 1.2, 0.5])),
+    "tetrahedron": (lambda v: jr.solids.tetrahedron(1.5, v), np.array([[0.1, 0, 0.3], [1, 0.2, -0.1], [0.3, 1.5, 0.2], [0.2, 0.4, 2]])),
+    "turned": (lambda q: jr.solids.box(1.0, np.arange(1.0, 4)).translated(ONES).rotated(q), np.array([1.0, 0.2, 0.3, 0.4])),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CURVED)
+def test_second_derivatives_equal_differences_of_the_gradient(name):
+    body, x = CURVED[name]
+    total = lambda x: weighted_sum(body(x))  # noqa: E731
+    rng = np.random.default_rng(1)
+    along, across = rng.normal(size=x.shape), rng.normal(size=x.shape)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def derivatives(x):
+        gradient, curvature = jax.jvp(jax.grad(total), (x,), (along,))
+        forward = jax.jvp(lambda x: jax.jvp(total, (x,), (across,))[1], (x,), (along,))[1]
+        return gradient, curvature, forward
+
+    _, curvature, forward = derivatives(x)
+    h = 1e-5
+    difference = (derivatives(x + h * along)[0] - derivatives(x - h * along)[0]) / (2 * h)
+    scale = np.max(np.abs(difference))
+    # truncation is about h^2 of the fourth derivative, rounding eps / h
+    np.testing.assert_allclose(curvature, difference, rtol=0, atol=1e-8 * scale)
+    size = scale * np.sum(np.abs(across))
+    np.testing.assert_allclose(np.sum(curvature * across), forward, rtol=0, atol=64 * EPS * size)
 
 
 def test_a_gradient_in_mass_properties_has_their_shape():
@@ -773,11 +929,12 @@ BAD_LANES = {
     "three lanes of moments": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [np.eye(3), THREE_LANES, np.eye(3)]), CODES.invalid_inertia),
     "NaN inertia": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, ONES * np.nan, ONES]), CODES.invalid_inertia),
     "triangle inequality": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, [1, 1, 3.0], ONES]), CODES.unphysical_inertia),
-    "points: negative mass": (jr.from_points, ([ONES, -ONES, ONES], [POINTS] * 3), CODES.invalid_mass),
+    "points: negative mass": (jr.from_points, ([ONES, -ONES, ONES], [POINTS] * 3), CODES.invalid_masses),
     "points: NaN": (jr.from_points, ([ONES] * 3, [POINTS, POINTS * np.nan, POINTS]), CODES.invalid_position),
-    "mesh inside out": (lambda v, throw=True: jr.from_mesh(v, CUBE_FACES, throw=throw), ([CUBE, -CUBE, 2 * CUBE],), CODES.invalid_mass),
-    "mesh open": (lambda f, throw=True: jr.from_mesh(CUBE, f, throw=throw), (np.stack([CUBE_FACES, np.roll(CUBE_FACES, 1, 0) * 0 + CUBE_FACES[:1], CUBE_FACES]),), CODES.invalid_mass),
-    "negative density": (lambda c, throw=True: jr.from_density(lambda r: c * r[0], ZEROS, ONES, order=2, throw=throw), ([1.0, -1, 2],), CODES.invalid_mass),
+    "mesh inside out": (lambda v, throw=True: jr.from_mesh(v, CUBE_FACES, throw=throw), ([CUBE, -CUBE, 2 * CUBE],), CODES.inside_out_mesh),
+    "mesh open": (lambda f, throw=True: jr.from_mesh(CUBE, f, throw=throw), (np.stack([CUBE_FACES, np.roll(CUBE_FACES, 1, 0) * 0 + CUBE_FACES[:1], CUBE_FACES]),), CODES.open_mesh),
+    "mesh of a negative density": (lambda d, throw=True: jr.from_mesh(CUBE, CUBE_FACES, d, throw=throw), ([1.0, -1, 2],), CODES.invalid_density),
+    "negative density": (lambda c, throw=True: jr.from_density(lambda r: c * r[0], ZEROS, ONES, order=2, throw=throw), ([1.0, -1, 2],), CODES.invalid_density),
     "axes": (jr.principal_axes, ([np.eye(3), SKEW, 2 * np.eye(3)],), CODES.invalid_inertia),
 }  # fmt: skip
 
@@ -796,6 +953,54 @@ def test_bad_lane_gets_a_code_and_leaves_the_others_alone(name):
     assert np.array_equal(np.asarray(batch.result == CODES.successful), [True, False, True])
 
 
+BAD_TENSORS = {
+    "skew tensor displaced": (jr.parallel_axis, ([np.eye(3), SKEW], [1.0, 1], [ONES] * 2)),
+    "negative mass displaced": (jr.parallel_axis, ([ONES] * 2, [1.0, -1], [ONES] * 2)),
+    "displaced to infinity": (jr.parallel_axis, ([ONES] * 2, [1.0, 1], [ONES, ONES * np.inf])),
+    "NaN displaced back": (jr.to_center_of_mass, ([3 * ONES, ONES * np.nan], [0.1, 0.1], [ONES] * 2)),
+    "displaced back too far": (jr.to_center_of_mass, ([3 * ONES] * 2, [0.1, 3.0], [ONES] * 2)),
+    "negative mass of a point": (jr.inertia_tensor, ([ONES, -ONES], [POINTS] * 2)),
+    "NaN position of a point": (jr.inertia_tensor, ([ONES] * 2, [POINTS, POINTS * np.nan])),
+    "function of a skew tensor": (lambda x, **k: jr.tensor_function(jnp.log, x, **k), ([np.eye(3) * 2, SKEW],)),
+    "function of NaN": (lambda x, **k: jr.tensor_function(jnp.log, x, **k), ([ONES * 2, ONES * np.nan],)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_TENSORS)
+def test_a_bad_lane_of_a_tensor_is_nan_and_leaves_the_other_and_its_gradient_alone(name):
+    function, lanes = BAD_TENSORS[name]
+    lanes = [np.asarray(x, float) for x in lanes]
+    with pytest.raises(RuntimeError, match="Argument"):
+        jax.block_until_ready(jax.vmap(function)(*lanes))
+    quietly = lambda *lane: function(*lane, throw=False)  # noqa: E731
+    found = np.asarray(jax.jit(jax.vmap(quietly))(*lanes))
+    alone = function(*(x[0] for x in lanes))
+    np.testing.assert_allclose(found[0], alone, rtol=4 * EPS, atol=4 * EPS)
+    assert np.all(np.isnan(found[1]))
+
+    def total(*lanes):
+        tensors = jax.vmap(quietly)(*lanes)
+        return jnp.sum(jnp.where(jnp.isnan(tensors), 0.0, jnp.sin(tensors)))
+
+    slopes = jax.jit(jax.grad(total, tuple(range(len(lanes)))))(*lanes)
+    expected = jax.grad(lambda *lane: jnp.sum(jnp.sin(quietly(*lane))), tuple(range(len(lanes))))
+    expected = expected(*(jnp.asarray(x[0]) for x in lanes))
+    for slope, of_one in zip(slopes, expected, strict=True):
+        np.testing.assert_allclose(slope[0], of_one, atol=16 * EPS)
+        np.testing.assert_array_equal(slope[1], 0.0)
+
+
+def test_a_bad_tensor_leaves_the_gradient_in_the_parameters_of_its_function_alone():
+    def total(p, tensors):
+        found = jax.vmap(lambda x: jr.tensor_function(lambda m: m**p, x, throw=False))(tensors)
+        return jnp.sum(jnp.where(jnp.isnan(found), 0.0, found))
+
+    slope = jax.jit(jax.grad(total))
+    lanes = np.stack([2 * np.eye(3), SKEW])
+    np.testing.assert_allclose(slope(0.7, lanes), slope(0.7, lanes[:1]), rtol=8 * EPS)
+    np.testing.assert_allclose(slope(0.7, lanes), 3 * 2**0.7 * np.log(2), rtol=8 * EPS)
+
+
 def test_the_code_of_a_bad_body_survives_what_is_done_with_it():
     good = jr.solids.sphere(1.0, 1.0)
     bad = [
@@ -808,6 +1013,10 @@ def test_the_code_of_a_bad_body_survives_what_is_done_with_it():
     bodies = [(code, jr.MassProperties(*values, throw=False)) for code, values in bad]
     bodies.append((CODES.invalid_length, jr.solids.sphere(1.0, -1.0, throw=False)))
     bodies.append((CODES.invalid_attitude, good.rotated(jnp.zeros(4))))
+    bodies.append((CODES.invalid_masses, jr.from_points(-ONES, POINTS, throw=False)))
+    bodies.append((CODES.invalid_density, jr.from_mesh(CUBE, CUBE_FACES, 0.0, throw=False)))
+    bodies.append((CODES.open_mesh, jr.from_mesh(CUBE, CUBE_FACES[2:], throw=False)))
+    bodies.append((CODES.inside_out_mesh, jr.from_mesh(-CUBE, CUBE_FACES, throw=False)))
     for code, body in bodies:
         for later in (body, good + body, body.translated(jnp.ones(3)), body.rotated(q)):
             assert later.result == code

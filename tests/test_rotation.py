@@ -243,6 +243,78 @@ def test_axis_and_angle_about_no_axis_is_the_identity_with_gradient_zero_in_the_
     )
 
 
+def sizes(dtype):
+    """Norms over nearly all of the range of a dtype; squares of most of them are out of it."""
+    tiny, most = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
+    return [256 * tiny, tiny**0.9, tiny**0.55, tiny**0.3, 1.0, most**0.3, most**0.55, most / 256]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_norm_drops_out_whatever_it_is(dtype):
+    vector = jnp.asarray(OMEGA, dtype)
+    other = jnp.asarray([0.1, 0.8, -0.3, 0.5], dtype)
+
+    @jax.jit
+    @jax.vmap
+    def everything(q):
+        return {
+            "rotate": ro.rotate(q, vector),
+            "inverse": ro.rotate_inverse(q, vector),
+            "matrix": ro.to_matrix(q),
+            "log": ro.log(q),
+            "angle": ro.angle_between(q, other),
+            "angle to the same": ro.angle_between(other, q),
+            "angles": ro.to_euler(q),
+            "unit": ro.normalize(q),
+            "axis": ro.from_axis_angle(q[1:], jnp.asarray(1.3, dtype)),
+        }
+
+    found = everything(np.stack([size * ATTITUDE for size in sizes(dtype)]).astype(dtype))
+    for name, values in found.items():
+        values = np.asarray(values)
+        expected = np.broadcast_to(values[4], values.shape)
+        np.testing.assert_allclose(values, expected, atol=ulps(dtype, 8), err_msg=name)
+
+
+OF_ANY_NORM = {
+    "rotate": lambda q: ro.rotate(q, OMEGA.astype(q.dtype)),
+    "log": ro.log,
+    "normalize": ro.normalize,
+    "euler": ro.to_euler,
+    "axis": lambda q: ro.from_axis_angle(q[1:], jnp.asarray(1.3, q.dtype)),
+}
+
+
+@pytest.mark.parametrize("name", OF_ANY_NORM)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_derivatives_go_as_powers_of_the_norm_whatever_it_is(dtype, name):
+    function = OF_ANY_NORM[name]
+    first = jax.jit(jax.vmap(lambda q: (jax.jacfwd(function)(q), jax.jacrev(function)(q))))
+    second = jax.jit(jax.vmap(jax.jacfwd(jax.jacrev(function))))
+    powers = {1: sizes(dtype)[1:-1], 2: [x**0.5 for x in sizes(dtype)[1:-1]]}
+    q = {k: np.stack([x * ATTITUDE for x in (1.0, *powers[k])]).astype(dtype) for k in (1, 2)}
+    for k, found in ((1, first(q[1])), (2, (second(q[2]),))):
+        for derivative in found:
+            # in two steps: the powers of the greatest norms are at the edge of the range
+            scaled = np.asarray(derivative, np.float64)
+            for _ in range(k):
+                size = np.array([1.0, *powers[k]]).reshape(-1, *[1] * (scaled.ndim - 1))
+                scaled = scaled * size
+            scale = np.max(np.abs(scaled[0]))
+            expected = np.broadcast_to(scaled[0], scaled.shape)
+            np.testing.assert_allclose(scaled, expected, rtol=0, atol=ulps(dtype, 32) * scale)
+
+
+def test_a_body_turns_by_a_quaternion_of_any_norm():
+    body = jr.solids.box(1.0, np.array([1.0, 2.0, 3.0])).translated(OMEGA)
+    expected = body.rotated(ATTITUDE)
+    for size in (1e-300, 1e-170, 1e170, 1e300):
+        turned = body.rotated(size * ATTITUDE)
+        assert turned.result == jr.RESULTS.successful
+        np.testing.assert_allclose(turned.inertia, expected.inertia, atol=ulps(float, 16))
+        np.testing.assert_allclose(turned.center_of_mass, expected.center_of_mass, atol=1e-15)
+
+
 # --- z-x-z Euler angles -----------------------------------------------------------------------
 
 

@@ -28,6 +28,11 @@ SOLIDS = {
 }
 
 
+def test_every_public_name_is_in_the_table():
+    names = {n for n, value in vars(jr.solids).items() if callable(value) and n[0] != "_"}
+    assert set(SOLIDS) == names
+
+
 def thick_shell(mass, radius, inner_radius, throw=True):
     return jr.solids.shell(mass, radius, inner_radius=inner_radius, throw=throw)
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -15,33 +14,42 @@ from jrigid._checks import (
     check_inertia_shape,
     check_shape,
     float_arrays,
+    nan_where,
     of_unit_size,
 )
 from jrigid._spectral import eigh, spectral_function
 from jrigid._types import (
     InertiaLike,
     Matrix,
+    Scalar,
     ScalarLike,
+    Vector,
     VectorLike,
 )
 from jrigid.mass._body import (
-    NOT_SYMMETRIC,
     PrincipalAxes,
     as_tensor,
-    checked_tensor,
-    is_finite_symmetric,
-    is_semidefinite,
     unit_steiner,
 )
+from jrigid.mass._validity import NOT_SYMMETRIC, is_finite_symmetric, is_semidefinite
+
+
+def _tensor(inertia: ArrayLike, *others: ArrayLike) -> tuple[Findings, Matrix, list[Array]]:
+    inertia, *rest = float_arrays(inertia, *others)
+    check_inertia_shape(inertia)
+    tensor = as_tensor(inertia)
+    findings = Findings()
+    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
+    return findings, tensor, rest
 
 
 def _steiner_arguments(
     inertia: ArrayLike, mass: ArrayLike, displacement: ArrayLike
-) -> tuple[Array, ...]:
-    tensor, mass, displacement = checked_tensor(inertia, mass, displacement)
+) -> tuple[Findings, tuple[Matrix, Scalar, Vector]]:
+    """What is wrong, and the arguments; zeros, whose derivatives are finite, where it is."""
+    findings, tensor, (mass, displacement) = _tensor(inertia, mass, displacement)
     check_shape("mass", mass, ())
     check_shape("displacement", displacement, (3,))
-    findings = Findings()
     findings.require(
         (mass >= 0) & jnp.isfinite(mass),
         RESULTS.invalid_mass,
@@ -52,10 +60,19 @@ def _steiner_arguments(
         RESULTS.invalid_position,
         "Argument `displacement` must be finite, but it is not.",
     )
-    return findings.apply((tensor, mass, displacement), True)
+    tensor, mass, displacement = (
+        jnp.where(findings.ok, x, 0.0) for x in (tensor, mass, displacement)
+    )
+    return findings, (tensor, mass, displacement)
 
 
-def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+def _answer(findings: Findings, tensor: Matrix, throw: bool) -> Matrix:
+    return findings.apply(tensor, True) if throw else nan_where(~findings.ok, tensor)
+
+
+def parallel_axis(
+    inertia_com: InertiaLike, mass: ScalarLike, displacement: VectorLike, *, throw: bool = True
+) -> Matrix:
     r"""Inertia tensor about a point displaced from the centre of mass.
 
     $I = I_{com} + m (|d|^2 1 - d d^T)$.
@@ -64,6 +81,7 @@ def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: Vect
         inertia_com: Moments or tensor about the centre of mass [kg m^2].
         mass: Mass [kg], not negative.
         displacement: Between centre of mass and point, either way round [m].
+        throw: False: a bad value makes the tensor of its lane NaN instead of an error.
 
     Returns:
         Tensor about the point, same axes [kg m^2].
@@ -81,11 +99,13 @@ def parallel_axis(inertia_com: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    tensor, mass, displacement = _steiner_arguments(inertia_com, mass, displacement)
-    return tensor + mass * unit_steiner(displacement)
+    findings, (tensor, mass, displacement) = _steiner_arguments(inertia_com, mass, displacement)
+    return _answer(findings, tensor + mass * unit_steiner(displacement), throw)
 
 
-def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+def to_center_of_mass(
+    inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike, *, throw: bool = True
+) -> Matrix:
     r"""Inertia tensor about the centre of mass, from that about a displaced point.
 
     The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$.
@@ -94,6 +114,7 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
         inertia: Moments or tensor about the point [kg m^2].
         mass: Mass [kg], not negative.
         displacement: Between centre of mass and point, either way round [m].
+        throw: False: a bad value makes the tensor of its lane NaN instead of an error.
 
     Returns:
         Tensor about the centre of mass, same axes [kg m^2].
@@ -112,15 +133,16 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    tensor, mass, displacement = _steiner_arguments(inertia, mass, displacement)
+    findings, (tensor, mass, displacement) = _steiner_arguments(inertia, mass, displacement)
     reduced = tensor - mass * unit_steiner(displacement)
     whole, fixed = of_unit_size(*jax.lax.stop_gradient((tensor, reduced)))
-    return eqx.error_if(
-        reduced,
-        ~is_semidefinite(fixed, jnp.trace(whole)),
+    findings.require(
+        is_semidefinite(fixed, jnp.trace(whole)),
+        RESULTS.invalid_inertia,
         "Argument `inertia` must be at least that of `mass` at `displacement`, but a moment about "
         "the centre of mass comes out negative.",
     )
+    return _answer(findings, reduced, throw)
 
 
 def principal_axes(inertia: InertiaLike, *, throw: bool = True) -> PrincipalAxes:
@@ -152,16 +174,12 @@ def principal_axes(inertia: InertiaLike, *, throw: bool = True) -> PrincipalAxes
     >>> print(jr.principal_axes(jnp.array([3.0, 1.0, 2.0])).moments)
     [1. 2. 3.]
     """
-    (inertia,) = float_arrays(inertia)
-    check_inertia_shape(inertia)
-    tensor = as_tensor(inertia)
-    findings = Findings()
-    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
+    findings, tensor, _ = _tensor(inertia)
     tensor = findings.apply(tensor, throw)
     return PrincipalAxes(*eigh(jnp.where(findings.ok, tensor, jnp.nan)))
 
 
-def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
+def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike, *, throw: bool = True) -> Matrix:
     """Function of a tensor, axes diag(f(moments)) axes^T, with derivatives right everywhere.
 
     Args:
@@ -169,6 +187,8 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
             forward-differentiable. It may close over parameters that are differentiated. Across
             gaps below a tenth of a moment its derivatives are integrated with eight nodes.
         inertia: Moments or tensor [kg m^2]; any finite symmetric tensor in the domain of f.
+        throw: False: a bad tensor makes the answer of its lane NaN instead of an error;
+            `principal_axes` gives the code.
 
     Returns:
         Symmetric tensor in the units of f.
@@ -190,10 +210,12 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
      [0.   0.25 0.  ]
      [0.   0.   0.25]]
     """
-    (tensor,) = checked_tensor(inertia)
+    findings, tensor, _ = _tensor(inertia)
     moment = jax.ShapeDtypeStruct((), tensor.dtype)
     shape = jax.eval_shape(f, moment)
     if getattr(shape, "shape", None) != () or shape.dtype != tensor.dtype:
         raise ValueError(f"Argument `f` must map {moment} to the same, but it gives {shape}.")
     hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
-    return spectral_function(hoisted, tensor, *parameters)
+    # NaN would reach the derivatives in the parameters; 1 is in the domain of most functions.
+    good = jnp.where(findings.ok, tensor, jnp.eye(3, dtype=tensor.dtype))
+    return _answer(findings, spectral_function(hoisted, good, *parameters), throw)

@@ -5,8 +5,7 @@ from typing import final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jrigid._checks import (
     RESULTS,
@@ -15,9 +14,7 @@ from jrigid._checks import (
     check_inertia_shape,
     check_shape,
     float_arrays,
-    is_symmetric,
     nan_where,
-    of_unit_size,
 )
 from jrigid._numerics import product
 from jrigid._spectral import eigh
@@ -26,16 +23,12 @@ from jrigid._types import (
     Matrix,
     Quaternion,
     QuaternionLike,
-    Scalar,
     ScalarLike,
     Vector,
     VectorLike,
 )
+from jrigid.mass._validity import Body, find, judge, raise_or_mark
 from jrigid.rotation import to_matrix
-
-ULPS = 64  # rounding allowed in "symmetric", "not negative" and "I3 <= I1 + I2"
-
-_Body = tuple[Scalar, Vector, Matrix]  # mass, centre of mass, tensor about it
 
 
 @final
@@ -120,7 +113,7 @@ class MassProperties(eqx.Module):
         check_inertia_shape(inertia)
         tensor = as_tensor(inertia)
         if throw is not None:
-            findings = _judge(mass, center_of_mass, tensor)
+            findings = judge(mass, center_of_mass, tensor)
             mass, center_of_mass, tensor = raise_or_mark(
                 findings, (mass, center_of_mass, tensor), throw
             )
@@ -133,13 +126,14 @@ class MassProperties(eqx.Module):
         """Code of what these values are, computed when asked.
 
         `successful`, `invalid_mass`, `invalid_position`, `invalid_inertia`,
-        `unphysical_inertia`, `invalid_length` (of a solid) or `invalid_attitude` (of `rotated`);
-        one code a lane where the leaves carry batch axes.
+        `unphysical_inertia`, `invalid_length` (of a solid), `invalid_attitude` (of `rotated`),
+        `invalid_masses` (of points), `invalid_density`, `open_mesh` or `inside_out_mesh`; one code
+        a lane where the leaves carry batch axes.
         """
-        judge = lambda mass, center, tensor: _judge(mass, center, tensor).result  # noqa: E731
+        code = lambda *body: judge(*body).result  # noqa: E731
         for _ in range(self.mass.ndim):
-            judge = jax.vmap(judge)
-        return judge(self.mass, self.center_of_mass, self.inertia)  # pyright: ignore[reportReturnType]
+            code = jax.vmap(code)
+        return code(self.mass, self.center_of_mass, self.inertia)  # pyright: ignore[reportReturnType]
 
     def about(self, point: VectorLike) -> Matrix:
         """Inertia tensor about any point.
@@ -264,34 +258,9 @@ def unit_steiner(displacement: Float[Array, "3"]) -> Matrix:
     )
 
 
-_MOMENTS = np.eye(3, dtype=bool)
-_LAST_MOMENT = np.diag([False, False, True])
-
-
-@jax.jit
-def _is_marked(tensor: Float[Array, "3 3"], kept: Bool[ArrayLike, "3 3"]) -> Bool[Array, ""]:
-    return jnp.all(jnp.where(kept, jnp.isfinite(tensor), jnp.isnan(tensor)))
-
-
-def _find(findings: Findings, mass: Scalar, center_of_mass: Vector, tensor: Matrix) -> None:
-    """Read what `raise_or_mark` has marked, and find what else is not finite."""
-    mass, center_of_mass, tensor = jax.lax.stop_gradient((mass, center_of_mass, tensor))
-    centered, last = all_finite(center_of_mass), _is_marked(tensor, _LAST_MOMENT)
-    findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass)
-    findings.require(centered | ~last, RESULTS.invalid_attitude)
-    findings.require(
-        centered,
-        RESULTS.invalid_position,
-        "Argument `center_of_mass` must be finite, but it is not.",
-    )
-    findings.require(~last, RESULTS.invalid_length)
-    findings.require(~_is_marked(tensor, _MOMENTS), RESULTS.unphysical_inertia)
-    findings.require(all_finite(tensor), RESULTS.invalid_inertia, _NOT_A_BODY)
-
-
 # Derivatives of NaN are NaN, even those that a mask multiplies by zero: what shares a lane with
 # bad values would lose its gradient in all lanes. So bad values do not enter the arithmetic.
-def _harmless(ok: Bool[Array, ""], body: list[Array]) -> _Body:
+def _harmless(ok: Bool[Array, ""], body: list[Array]) -> Body:
     mass, center_of_mass, tensor = body
     eye = jnp.eye(3, dtype=tensor.dtype)
     return (
@@ -301,136 +270,49 @@ def _harmless(ok: Bool[Array, ""], body: list[Array]) -> _Body:
     )
 
 
+def _examined(
+    *bodies: list[Array], also: tuple[Bool[Array, ""], RESULTS] | None = None
+) -> tuple[Findings, list[Body]]:
+    """What is wrong with bodies, or else with `also`, and the bodies made harmless."""
+    findings = Findings()
+    for body in bodies:
+        find(findings, *body)
+    if also is not None:
+        findings.require(*also)
+    return findings, [_harmless(findings.ok, body) for body in bodies]
+
+
 @jax.jit
 def _about(body: list[Array], point: Vector) -> Matrix:
-    findings = Findings()
-    _find(findings, *body)
-    findings.require(all_finite(point), RESULTS.invalid_position)
-    mass, center, tensor = _harmless(findings.ok, body)
+    also = all_finite(point), RESULTS.invalid_position
+    findings, [(mass, center, tensor)] = _examined(body, also=also)
     point = jnp.where(findings.ok, point, 0.0)
     return nan_where(~findings.ok, tensor + mass * unit_steiner(point - center))
 
 
 @jax.jit
-def _translated(body: list[Array], displacement: Vector) -> _Body:
-    findings = Findings()
-    _find(findings, *body)
-    findings.require(all_finite(displacement), RESULTS.invalid_position)
-    mass, center, tensor = _harmless(findings.ok, body)
+def _translated(body: list[Array], displacement: Vector) -> Body:
+    also = all_finite(displacement), RESULTS.invalid_position
+    findings, [(mass, center, tensor)] = _examined(body, also=also)
     return raise_or_mark(findings, (mass, center + displacement, tensor), False)
 
 
 @jax.jit
-def _rotated(body: list[Array], attitude: Quaternion) -> _Body:
-    findings = Findings()
-    _find(findings, *body)
+def _rotated(body: list[Array], attitude: Quaternion) -> Body:
     turnable = all_finite(attitude) & jnp.any(attitude != 0)
-    findings.require(turnable, RESULTS.invalid_attitude)
-    mass, center, tensor = _harmless(findings.ok, body)
+    also = turnable, RESULTS.invalid_attitude
+    findings, [(mass, center, tensor)] = _examined(body, also=also)
     turn = to_matrix(jnp.where(turnable, attitude, 1.0))
     turned = product("ij,jk,lk->il", turn, tensor, turn)
     return raise_or_mark(findings, (mass, product("ij,j->i", turn, center), turned), False)
 
 
 @jax.jit
-def _joined(body_a: list[Array], body_b: list[Array]) -> _Body:
-    findings = Findings()
-    _find(findings, *body_a)
-    _find(findings, *body_b)
-    mass_a, center_a, tensor_a = _harmless(findings.ok, body_a)
-    mass_b, center_b, tensor_b = _harmless(findings.ok, body_b)
+def _joined(body_a: list[Array], body_b: list[Array]) -> Body:
+    findings, bodies = _examined(body_a, body_b)
+    (mass_a, center_a, tensor_a), (mass_b, center_b, tensor_b) = bodies
     mass = mass_a + mass_b
     share = mass_b / mass
     apart = center_b - center_a
     tensor = tensor_a + tensor_b + mass_a * share * unit_steiner(apart)
     return raise_or_mark(findings, (mass, center_a + share * apart, tensor), False)
-
-
-@jax.jit
-def is_finite_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
-    return all_finite(tensor) & is_symmetric(tensor)
-
-
-def is_semidefinite(tensor: Float[Array, "3 3"], scale: Scalar) -> Bool[Array, ""]:
-    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
-
-    Entries and scale are about 1: products of much larger or smaller ones leave the range.
-    """
-    # A few ulps off at any moments, where the roots of the cubic lose half the digits.
-    shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
-    rest = tensor + shift * jnp.eye(3, dtype=tensor.dtype)
-    left, fine = jnp.ones(3, bool), jnp.asarray(True)
-    for _ in range(3):
-        k = jnp.argmax(jnp.where(left, jnp.diagonal(rest), -jnp.inf))
-        row, pivot = rest[k], rest[k, k]
-        fine = fine & (pivot >= 0)
-        rest = rest - row[:, None] * row[None, :] / jnp.where(pivot > 0, pivot, 1.0)
-        left = left & (jnp.arange(3) != k)
-    return fine
-
-
-@jax.jit
-def is_physical(tensor: Float[Array, "3 3"]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a tensor is positive semi-definite, and whether I3 <= I1 + I2, to rounding."""
-    (tensor,) = of_unit_size(jax.lax.stop_gradient(tensor))
-    trace = jnp.trace(tensor)
-    second = 0.5 * trace * jnp.eye(3, dtype=tensor.dtype) - tensor
-    return is_semidefinite(tensor, trace), is_semidefinite(second, trace)
-
-
-_NOT_A_BODY = (
-    "Argument `inertia` must hold three finite, non-negative principal moments or be a finite, "
-    "symmetric, positive semi-definite (3, 3) tensor, but it is not. (Three bodies are three "
-    "lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
-)
-
-
-def _judge(mass: Scalar, center_of_mass: Vector, tensor: Matrix) -> Findings:
-    tensor = jax.lax.stop_gradient(tensor)
-    findings = Findings()
-    _find(findings, mass, center_of_mass, tensor)
-    positive, triangle = is_physical(tensor)
-    findings.require(is_finite_symmetric(tensor) & positive, RESULTS.invalid_inertia, _NOT_A_BODY)
-    findings.require(triangle, RESULTS.unphysical_inertia)
-    return findings
-
-
-def raise_or_mark(findings: Findings, body: _Body, throw: bool) -> _Body:
-    """Raise, or turn what is wrong, and all that follows from it, into NaN.
-
-    What is left finite lets `MassProperties.result` recover the code: of an unphysical tensor
-    the diagonal, of an invalid one mass and centre, of an invalid position the mass; after an
-    invalid length or attitude also the last moment. Other codes turn into `invalid_mass`.
-    """
-    if throw:
-        return findings.apply(body, throw)
-    mass, center_of_mass, tensor = body
-    code = findings.result
-    unphysical = code == RESULTS.unphysical_inertia
-    length, attitude = code == RESULTS.invalid_length, code == RESULTS.invalid_attitude
-    bad_center = ~(findings.ok | unphysical | length | (code == RESULTS.invalid_inertia))
-    bad_mass = bad_center & ~attitude & (code != RESULTS.invalid_position)
-    kept = (unphysical & _MOMENTS) | ((length | attitude) & _LAST_MOMENT)
-    # A kept moment is finite: the mark must be read again.
-    marked = jnp.where(kept, jnp.where(jnp.isfinite(tensor), tensor, 1.0), jnp.nan)
-    return (
-        jnp.where(bad_mass, jnp.nan, mass),
-        jnp.where(bad_center, jnp.nan, center_of_mass),
-        jnp.where(findings.ok, tensor, marked),
-    )
-
-
-def checked_tensor(inertia: ArrayLike, *others: ArrayLike) -> tuple[Array, ...]:
-    inertia, *rest = float_arrays(inertia, *others)
-    check_inertia_shape(inertia)
-    tensor = as_tensor(inertia)
-    findings = Findings()
-    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
-    return (findings.apply(tensor, True), *rest)
-
-
-NOT_SYMMETRIC = (
-    "Argument `inertia` must hold three finite principal moments or be a finite, symmetric (3, 3) "
-    "tensor, but it is not. (Three bodies are three lanes of `jax.vmap`, not the rows of a (3, 3) "
-    "array.)"
-)

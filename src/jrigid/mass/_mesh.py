@@ -22,40 +22,14 @@ from jrigid._types import (
     ScalarLike,
     Vector,
 )
-from jrigid.mass._body import ULPS, MassProperties, is_physical, raise_or_mark
+from jrigid.mass._body import MassProperties
 from jrigid.mass._points import inertia_of_second_moment, lane_sum
+from jrigid.mass._surface import closed_parts, closed_traced, winds_once
+from jrigid.mass._validity import ULPS, is_physical, raise_or_mark
 
 
-def _closed_numpy(faces: np.ndarray, vertices: int) -> bool:
-    faces = faces.astype(np.int64)
-    if faces.min() < 0 or faces.max() >= vertices:
-        return False
-    a, b, c = faces.T
-    start, end = np.concatenate([a, b, c]), np.concatenate([b, c, a])
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    edges = np.sort(2 * (low * vertices + high) + (start > end))
-    forth, back = edges[::2], edges[1::2]
-    # Sorted, every edge once forth and once back leaves no room for a third run or a point.
-    return bool(edges.size % 2 == 0 and np.all(forth % 2 == 0) and np.all(back == forth + 1))
-
-
-def _closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array, ""]:
-    if faces.shape[0] % 2:
-        return jnp.asarray(False)
-    a, b, c = faces.T
-    start, end = jnp.concatenate([a, b, c]), jnp.concatenate([b, c, a])
-    back = (start > end).astype(start.dtype)
-    # Keys stay apart: their product overflows int32.
-    low, high, back = jax.lax.sort(
-        (jnp.minimum(start, end), jnp.maximum(start, end), back), num_keys=3
-    )
-    same = (low[::2] == low[1::2]) & (high[::2] == high[1::2])
-    alternate = (back[::2] == 0) & (back[1::2] == 1)
-    inside = jnp.all((faces >= 0) & (faces < vertices))
-    return inside & jnp.all(same & alternate)
-
-
-def _mesh(vertices: Array, faces: Any) -> tuple[Any, Bool[Array, ""]]:
+def _mesh(vertices: Array, faces: Any) -> tuple[Any, Bool[Array, ""], np.ndarray | None]:
+    """Faces, whether they are closed, and where to ask how often they wind (`closed_parts`)."""
     check_shape("vertices", vertices, (None, 3))
     if not eqx.is_array_like(faces):
         faces = np.asarray(faces)
@@ -69,9 +43,9 @@ def _mesh(vertices: Array, faces: Any) -> tuple[Any, Bool[Array, ""]]:
     if faces.shape[0] == 0:
         raise ValueError("Argument `faces` must hold at least one face, but it is empty.")
     if isinstance(faces, np.ndarray):
-        closed = _closed_numpy(faces, vertices.shape[0])
-        return faces.astype(np.int32), jnp.asarray(closed)
-    return faces, _closed_traced(faces, vertices.shape[0])
+        closed, samples = closed_parts(faces, vertices.shape[0])
+        return faces.astype(np.int32), jnp.asarray(closed), samples
+    return faces, closed_traced(faces, vertices.shape[0]), None
 
 
 @jax.jit
@@ -111,19 +85,35 @@ def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vect
     return volume, magnitude, origin + center, about_center
 
 
-_NOT_FINITE_VERTICES = "Argument `vertices` must be finite, but it is not."
-
-
-def _mesh_findings(
-    vertices: Array, closed: Bool[Array, ""], volume: Scalar, magnitude: Scalar
-) -> Findings:
-    volume, magnitude = jax.lax.stop_gradient((volume, magnitude))
+def _judged(vertices: Array, faces: Any) -> tuple[Findings, tuple[Scalar, Vector, Matrix]]:
+    """What is wrong with a mesh, and volume, centre, and tensor about it, of unit density."""
+    faces, closed, samples = _mesh(vertices, faces)
+    volume, magnitude, center, second = _mesh_integrals(vertices, faces)
+    tensor = inertia_of_second_moment(second)
     findings = Findings()
-    findings.require(all_finite(vertices), RESULTS.invalid_position, _NOT_FINITE_VERTICES)
+    findings.require(
+        all_finite(vertices),
+        RESULTS.invalid_position,
+        "Argument `vertices` must be finite, but it is not.",
+    )
     findings.require(closed, RESULTS.open_mesh)
-    rounding = ULPS * jnp.finfo(vertices.dtype).eps * magnitude
-    findings.require(volume > rounding, RESULTS.inside_out_mesh)
-    return findings
+    rounding = ULPS * jnp.finfo(vertices.dtype).eps * jax.lax.stop_gradient(magnitude)
+    findings.require(jax.lax.stop_gradient(volume) > rounding, RESULTS.inside_out_mesh)
+    if samples is not None:
+        findings.require(
+            winds_once(vertices, faces, samples),
+            RESULTS.inside_out_mesh,
+            "Argument `faces` must describe surfaces that bound one body together, but a part is "
+            "inside out or lies within another or at the same place.",
+        )
+    positive, triangle = is_physical(tensor)
+    findings.require(
+        positive & triangle,
+        RESULTS.inside_out_mesh,
+        "Argument `faces` must describe a surface that does not cut itself and no part of which is "
+        "inside out, but the tensor is not that of a real body.",
+    )
+    return findings, (volume, center, tensor)
 
 
 def from_mesh(
@@ -139,21 +129,30 @@ def from_mesh(
         vertices: Coordinates of the corners [m]. Corners at one place must be one vertex.
         faces: Indices of the corners of each triangle, counter-clockwise seen from outside. A
             cavity is a surface of its own, counter-clockwise seen from inside the cavity. Known
-            values are checked once, at trace time; traced ones by a sort at run time.
+            values are checked once, at trace time; traced ones by a sort at run time, which does
+            not tell surfaces apart.
         density: Density [kg/m^3], positive.
-        throw: False: bad values give NaN and a code in `.result` instead of an error;
-            `mesh_validity` says what is wrong with the mesh.
+        throw: False: bad values give NaN and a code in `.result` instead of an error.
 
     Returns:
         The body, its tensor about the centre of mass. Accurate far from the origin too.
+
+    Where known faces make several surfaces that share no vertex, points on both sides of each
+    are asked how often all of them wind around: more than once or less than never is an error.
+    This finds a surface inside out where there is no body, one within another that is no cavity,
+    and one at the place of another; each point costs a solid angle a face. Of surfaces that cut
+    through each other or through themselves it finds those that have one of up to 16 corners,
+    spread over all of them, on the wrong side: not all. Nor are parts that share a vertex told
+    apart.
 
     Raises:
         ValueError: Wrong shape, no faces, or indices that are no integers (trace time).
         RuntimeError: A vertex is not finite; an edge is not shared by exactly two faces that run
             through it in opposite directions (an open mesh, a flipped, repeated or degenerate
             face, an index out of range, three faces at an edge); the volume is not positive (inside
-            out or flat); the tensor is not that of a real body (the surface cuts itself); the
-            density is not positive and finite (run time, any lane).
+            out or flat); surfaces contradict each other, as said above; the tensor is not that of a
+            real body (the surface cuts itself); the density is not positive and finite (run time,
+            any lane).
 
     Gradients: exact in the vertices and the density.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
@@ -167,18 +166,7 @@ def from_mesh(
     """
     vertices, density = float_arrays(vertices, density)
     check_shape("density", density, ())
-    faces, closed = _mesh(vertices, faces)
-    volume, magnitude, center, second = _mesh_integrals(vertices, faces)
-    findings = _mesh_findings(vertices, closed, volume, magnitude)
-    tensor = inertia_of_second_moment(second)
-    # One NaN or inside-out lane must not be reported as unphysical too: the first finding wins.
-    positive, triangle = is_physical(tensor)
-    findings.require(
-        positive & triangle,
-        RESULTS.inside_out_mesh,
-        "Argument `faces` must describe a surface that does not cut itself and no part of which is "
-        "inside out, but the tensor is not that of a real body.",
-    )
+    findings, (volume, center, tensor) = _judged(vertices, faces)
     dense = (density > 0) & jnp.isfinite(density)
     density = jnp.where(dense, density, 1.0)
     findings.require(
@@ -186,6 +174,7 @@ def from_mesh(
         RESULTS.invalid_density,
         "Argument `density` must be positive and finite, but it is not.",
     )
+    volume = jnp.where(findings.ok, volume, 1.0)  # a code may stand on a mass that is good
     values = raise_or_mark(findings, (density * volume, center, density * tensor), throw)
     return MassProperties(*values, throw=None)
 
@@ -214,9 +203,4 @@ def mesh_validity(
     Array(True, dtype=bool)
     """
     (vertices,) = float_arrays(vertices)
-    faces, closed = _mesh(vertices, faces)
-    volume, magnitude, _, second = _mesh_integrals(vertices, faces)
-    findings = _mesh_findings(vertices, closed, volume, magnitude)
-    positive, triangle = is_physical(inertia_of_second_moment(second))
-    findings.require(positive & triangle, RESULTS.inside_out_mesh)
-    return findings.result  # pyright: ignore[reportReturnType]
+    return _judged(vertices, faces)[0].result  # pyright: ignore[reportReturnType]

@@ -14,6 +14,7 @@ from jrigid._checks import (
     all_finite,
     check_shape,
     float_arrays,
+    nan_where,
 )
 from jrigid._numerics import product
 from jrigid._types import (
@@ -22,7 +23,8 @@ from jrigid._types import (
     Vector,
     VectorLike,
 )
-from jrigid.mass._body import MassProperties, raise_or_mark
+from jrigid.mass._body import MassProperties
+from jrigid.mass._validity import raise_or_mark
 
 # Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU reductions
 # and products of tall thin matrices run below numpy's speed; lanes of partial sums mend both.
@@ -102,7 +104,7 @@ def _cloud_checks(masses: Array, positions: Array) -> tuple[Bool[Array, ""], Boo
     return fine, all_finite(positions)
 
 
-def _points(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Findings]:
+def _points(masses: ArrayLike, positions: ArrayLike, throw: bool) -> tuple[Array, Array, Findings]:
     masses, positions = float_arrays(masses, positions)
     check_shape("masses", masses, (None,))
     check_shape("positions", positions, (masses.shape[0], 3))
@@ -112,6 +114,9 @@ def _points(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Find
     fine_masses, fine_positions = _cloud_checks(*jax.lax.stop_gradient((masses, positions)))
     findings.require(fine_masses, RESULTS.invalid_masses)
     findings.require(fine_positions, RESULTS.invalid_position)
+    if not throw:  # NaN in the sums would reach the gradients of the other lanes
+        masses = jnp.where(findings.ok, masses, 1.0)
+        positions = jnp.where(findings.ok, positions, 0.0)
     return masses, positions, findings
 
 
@@ -145,16 +150,16 @@ def from_points(
     >>> print(dumbbell.center_of_mass, jnp.diag(dumbbell.inertia))
     [0. 0. 1.] [2. 2. 0.]
     """
-    masses, positions, findings = _points(masses, positions)
-    if not throw:  # NaN in the sums would reach the gradients of the other lanes
-        masses = jnp.where(findings.ok, masses, 1.0)
-        positions = jnp.where(findings.ok, positions, 0.0)
+    masses, positions, findings = _points(masses, positions, throw)
     values = raise_or_mark(findings, _cloud(masses, positions), throw)
     return MassProperties(*values, throw=None)
 
 
 def inertia_tensor(
-    masses: Real[ArrayLike, " points"], positions: Real[ArrayLike, "points 3"]
+    masses: Real[ArrayLike, " points"],
+    positions: Real[ArrayLike, "points 3"],
+    *,
+    throw: bool = True,
 ) -> Matrix:
     r"""Inertia tensor of point masses about the origin of their coordinates.
 
@@ -163,6 +168,8 @@ def inertia_tensor(
     Args:
         masses: Point masses [kg], non-negative, not all zero.
         positions: Coordinates [m].
+        throw: False: a bad value makes the tensor of its lane NaN instead of an error;
+            `from_points` gives the code.
 
     Returns:
         Symmetric positive semi-definite tensor [kg m^2].
@@ -170,7 +177,7 @@ def inertia_tensor(
     Raises:
         ValueError: Wrong shapes or no points (trace time).
         RuntimeError: A mass is negative or not finite or all are zero, or a position is not
-            finite (run time, any lane). `from_points` answers with a code instead.
+            finite (run time, any lane).
 
     Gradients: finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.7-5.8.
@@ -181,8 +188,9 @@ def inertia_tensor(
      [ 0. 18.  0.]
      [ 0.  0.  0.]]
     """
-    masses, positions, findings = _points(masses, positions)
-    return findings.apply(_inertia_about_origin(masses, positions), True)
+    masses, positions, findings = _points(masses, positions, throw)
+    tensor = _inertia_about_origin(masses, positions)
+    return findings.apply(tensor, True) if throw else nan_where(~findings.ok, tensor)
 
 
 @jax.jit

@@ -14,7 +14,7 @@ from jrigid._types import (
     Vector,
     VectorLike,
 )
-from jrigid.rotation._quaternion import normalize, rotate
+from jrigid.rotation._quaternion import normalize, of_unit_size, rotate
 
 
 def hat(vector: VectorLike) -> Matrix:
@@ -218,7 +218,7 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     >>> print(jr.rotation.to_euler(jr.rotation.from_euler(angles)).round(6))
     [ 0.3  0.8 -1.2]
     """
-    w, x, y, z = array_of_shape("attitude", attitude, 4)
+    w, x, y, z = of_unit_size(array_of_shape("attitude", attitude, 4))
     upper, lower = (w == 0) & (z == 0), (x == 0) & (y == 0)
     half_sum = safe_arctan2(z, w)
     half_difference = safe_arctan2(y, x)

@@ -5,7 +5,7 @@ from jaxtyping import Array, ArrayLike, Bool
 
 from jrigid._checks import RESULTS, Findings, check_shape, float_arrays
 from jrigid.mass import MassProperties
-from jrigid.mass._body import raise_or_mark
+from jrigid.mass._validity import raise_or_mark
 
 
 def mass_and_lengths(
