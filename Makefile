@@ -39,6 +39,7 @@ types: $(VENV)/.dev
 	$(BIN)/pyright
 
 bench: $(VENV)/.dev
+	-$(BIN)/python -m pip install --quiet --group peers
 	$(BIN)/python benchmarks/run.py
 
 notebooks: $(VENV)/.dev

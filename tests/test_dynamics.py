@@ -180,7 +180,7 @@ def test_state_is_a_pytree_of_arrays():
     assert [x.shape for x in leaves] == [(4,), (3,), (3,), ()]
     again = jax.tree.unflatten(structure, leaves)
     assert jax.tree.structure(again) == structure
-    assert jr.State(ATTITUDE, OMEGA).internal == ()
+    assert jr.State(ATTITUDE, OMEGA).internal is None
     assert jr.State(np.float32(ATTITUDE), np.float32(OMEGA)).attitude.dtype == np.float32
     lanes = jax.vmap(lambda w: jr.State(jnp.asarray(ATTITUDE), w))(jnp.ones((5, 3)))
     assert lanes.attitude.shape == (5, 4)

@@ -577,7 +577,10 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
             "`state0` must be a State, but it is tuple",
         ),
         (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a diffrax.Event"),
-        (lambda b, s: jr.simulate(b, s, 1.0, max_steps=0), "`max_steps` must be at least 1"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, max_steps=0),
+            "`max_steps` must be an integer and at least 1",
+        ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, adjoint=diffrax.BacksolveAdjoint()),
             "`adjoint` must be diffrax.RecursiveCheckpointAdjoint",

@@ -1,3 +1,4 @@
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -328,3 +329,21 @@ def test_wrong_argument_is_an_error(name, untyped):
     call, message = WRONG[name]
     with pytest.raises(ValueError, match="Argument " + message):
         call()
+
+
+def test_a_vector_field_is_diffrax_s_with_states_saved():
+    """`State` itself is a state for diffeqsolve, internal parts or none."""
+    for system, state in (
+        (jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)),
+        (
+            jr.RigidBody(MOMENTS, jr.torques.InternalDamper(0.3, 0.1)),
+            jr.State(ATTITUDE, OMEGA, jnp.array([0.1, 0.2, 0.3])),
+        ),
+    ):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(system.vector_field), diffrax.Tsit5(), 0.0, 1.0, 0.01, state,
+            saveat=diffrax.SaveAt(ts=jnp.array([0.5, 1.0])),
+        )  # fmt: skip
+        state = jr.State(jr.rotation.normalize(ATTITUDE), OMEGA, state.internal)
+        exact = jr.simulate(system, state, 1.0).states
+        np.testing.assert_allclose(solution.ys.omega[1], exact.omega, atol=1e-7)

@@ -17,15 +17,23 @@ from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 from jax.flatten_util import ravel_pytree
 
 import jrigid as jr
-from jrigid import dynamics, rotation, systems, torques
+from jrigid import dynamics, elliptic, free, rotation, solvers, systems, torques
 from jrigid._checks import float_arrays
 from jrigid.mass import MassProperties
 
-MODULES = {"rotation": rotation, "dynamics": dynamics, "torques": torques, "systems": systems}
+MODULES = {
+    "elliptic": elliptic,
+    "rotation": rotation,
+    "dynamics": dynamics,
+    "torques": torques,
+    "systems": systems,
+    "free": free,
+    "solvers": solvers,
+}
 # Abstract classes and aliases: nothing to call.
 NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
-# What answers with a result code, not with numbers: tested where bad input is.
-CODES = {"rotation.rate_record_validity"}
+# What answers with a code, not with numbers: tested where it belongs.
+CODES = {"rotation.rate_record_validity", "free.motion_validity", "free.regime"}
 CODE_METHOD = "check"
 
 
@@ -138,7 +146,51 @@ def floating_body(mass, inertia, stiffness, t, position, velocity, q, w, inner):
     ]
 
 
+def of_body(function):
+    """A function of a free motion, of three moments and a rate."""
+    return Case(function, (MOMENTS, OMEGA))
+
+
+def of_symmetric_body(function, *covers):
+    def of(i1, i3, omega):
+        i1, i3, omega = float_arrays(i1, i3, omega)
+        return function(jnp.stack([i1, i1, i3]), omega)
+
+    return Case(of, (1.0, 1.5, OMEGA), covers)
+
+
+def free_state(function):
+    """Of moments, attitude, rate and time, the attitude made a unit quaternion first."""
+    return Case(
+        lambda i, q, w, t: function(i, jr.State(rotation.normalize(q), w), t),
+        (MOMENTS, ATTITUDE, OMEGA, 3.0),
+    )
+
+
+def exact_step(inertia, state, t):
+    t = number(t)
+    term, solver = solvers.FreeRotation(inertia), solvers.ExactFree()
+    assert solver.order(term) is None
+    start = solver.init(term, 0.0, t, state, None)
+    end, *_ = solver.step(term, 0.0, t, state, None, start, made_jump=False)
+    rate = term.prod(solver.func(term, 0.0, state, None), term.contr(0.0, t))
+    return end, rate, term.after(state, t)
+
+
 CASES = {
+    # elliptic
+    "elliptic.rf": Case(elliptic.rf, (0.3, 1.2, 2.0)),
+    "elliptic.rc": Case(elliptic.rc, (0.3, 1.2)),
+    "elliptic.rd": Case(elliptic.rd, (0.3, 1.2, 2.0)),
+    "elliptic.rj": Case(elliptic.rj, (0.3, 1.2, 2.0, 0.7)),
+    "elliptic.ellipk": Case(elliptic.ellipk, (0.4,)),
+    "elliptic.ellipe": Case(elliptic.ellipe, (0.4,)),
+    "elliptic.ellippi": Case(elliptic.ellippi, (0.3, 0.4)),
+    "elliptic.ellipkinc": Case(elliptic.ellipkinc, (1.1, 0.4)),
+    "elliptic.ellipeinc": Case(elliptic.ellipeinc, (1.1, 0.4)),
+    "elliptic.ellippiinc": Case(elliptic.ellippiinc, (0.3, 1.1, 0.4)),
+    "elliptic.ellipj": Case(elliptic.ellipj, (1.7, 0.4), ("elliptic.JacobiFunctions",)),
+    "elliptic.am": Case(elliptic.am, (1.7, 0.4)),
     # rotation
     "rotation.hat": Case(rotation.hat, (VECTOR,)),
     "rotation.vee": Case(rotation.vee, (MATRIX,)),
@@ -240,6 +292,35 @@ CASES = {
         methods("torques.Sum", *TORQUE_METHODS),
     ),
     # systems
+    # free
+    "free.free_rotation": free_state(jr.free_rotation),
+    "free.herpolhode": free_state(free.herpolhode),
+    "free.wobble_rate": of_symmetric_body(free.wobble_rate),
+    "free.precession_rate": of_symmetric_body(free.precession_rate),
+    "free.cone_angles": of_symmetric_body(free.cone_angles, "free.ConeAngles"),
+    "free.polhode_period": of_body(free.polhode_period),
+    "free.mean_precession_rate": of_body(free.mean_precession_rate),
+    "free.precession_per_period": of_body(free.precession_per_period),
+    "free.geometric_phase": of_body(free.geometric_phase),
+    "free.parameter": of_body(free.parameter),
+    "free.modulus": of_body(free.modulus),
+    "free.polhode": of_body(lambda i, w: free.polhode(i, w, 5)),
+    "free.separatrix": Case(free.separatrix, (MOMENTS,), ("free.Separatrix",)),
+    "free.poinsot": Case(free.poinsot, (MOMENTS, OMEGA), ("free.Poinsot",)),
+    "free.growth_rate_squared": Case(
+        lambda i, spin: free.growth_rate_squared(i, 1, spin), (MOMENTS, 1.3)
+    ),
+    "free.linearized": Case(lambda i, w, t: free.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)),
+    # solvers
+    "solvers.FreeRotation": Case(
+        free_state(exact_step).function,
+        (MOMENTS, ATTITUDE, OMEGA, 3.0),
+        (
+            *methods("solvers.FreeRotation", "vf", "contr", "prod", "after"),
+            "solvers.ExactFree",
+            *methods("solvers.ExactFree", "order", "init", "step", "func"),
+        ),
+    ),
     "systems.FloatingState": Case(
         lambda r, v, q, w: jr.FloatingState(r, v, q, w), (POSITION, VELOCITY, ATTITUDE, OMEGA)
     ),

@@ -9,6 +9,7 @@ from jrigid import free as free
 from jrigid import mass as mass
 from jrigid import rotation as rotation
 from jrigid import solids as solids
+from jrigid import solvers as solvers
 from jrigid import systems as systems
 from jrigid import torques as torques
 from jrigid._checks import RESULTS as RESULTS

@@ -63,6 +63,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "a torque, force or parameter is NaN or infinite there."
     )
     nonfinite_state = "The motion ran out of the range of floating point numbers."
+    invalid_tolerance = (
+        "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in float32), but "
+        "one is not."
+    )
 
 
 def float_arrays(*values: Any) -> tuple[Array, ...]:
@@ -76,6 +80,11 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
 def state_array(value: Any) -> Any:
     """A floating point array; None and integers pass, for the `in_axes` of a state under vmap."""
     return value if value is None or isinstance(value, int) else float_arrays(value)[0]
+
+
+def internal_parts(internal: Any) -> Any:
+    """An internal state; None for `()`, which diffrax cannot save (equinox takes it for a leaf)."""
+    return None if isinstance(internal, tuple) and not internal else internal
 
 
 def check_shape(name: str, value: Array | np.ndarray, shape: tuple[int | None, ...]) -> None:
@@ -138,9 +147,12 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
 
 
 def is_unit(quaternion: Float[Array, "4"]) -> Bool[Array, ""]:
-    """True where a quaternion is of norm 1 to rounding; four digits typed by hand are not."""
+    """True where a quaternion is of norm 1 to rounding, be it float32's in float64.
+
+    Four digits typed by hand are not in float64.
+    """
     excess = jnp.abs(jnp.sum(quaternion**2) - 1)
-    return excess < 30 * jnp.sqrt(jnp.finfo(quaternion.dtype).eps)
+    return excess < max(300 * float(jnp.finfo(quaternion.dtype).eps), 4.5e-7)
 
 
 def is_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:

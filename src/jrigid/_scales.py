@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._numerics import power_of_two, product, safe_norm
+from jrigid._checks import internal_parts
+from jrigid._numerics import power_of_two, safe_norm
 from jrigid.systems import AbstractSystem
 
 
@@ -30,56 +31,93 @@ def unravel(components: Array, like: Any) -> Any:
 
 def units(
     system: AbstractSystem, state0: Any, t_end: Array, t0: Array, args: Any
-) -> tuple[Array, Any]:
-    """The rate of turning [rad/s] that measures time, and a scale for each component of the state.
+) -> tuple[Array, Array, Any]:
+    """Rates that measure time [rad/s], and a scale for each component of the state.
 
-    A body at rest turns at the rate its torque would give it within a radian; one that nothing
-    turns is measured by the length of the run.
+    The first rate is that of turning: a body at rest turns at the rate its torque would give it
+    within a radian, and one that nothing turns is measured by the length of the run. The second is
+    the fastest rate of the whole motion, an orbit's included.
     """
     rates = system.vector_field(t0, state0, args)
     span = jnp.where(t_end > t0, t_end - t0, jnp.ones_like(t_end))
     turning, spinning_up = safe_norm(state0.omega), safe_norm(rates.omega)
     rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
     rate = jnp.where(rate > 0, rate, 1 / span)
-    scale: dict[str, Any] = {
-        "attitude": jnp.ones_like(rate),
-        "omega": rate,
-        "internal": system.torque.internal_scale(rate),
-    }
-    if hasattr(state0, "velocity"):
-        # Motion of the centre of mass in one radian of turning, or in the whole run if that is
-        # shorter; a body at rest on which no force acts is measured in metres.
-        time = jnp.minimum(span, 1 / rate)
-        speed = safe_norm(state0.velocity) + safe_norm(rates.velocity) * time
-        length = safe_norm(state0.position) + speed * time
-        length = jnp.where(length > 0, length, 1.0)
-        speed = jnp.where(speed > 0, speed, length / time)
-        scale |= {"position": length, "velocity": speed}
-    spread = {
-        name: jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name))
-        for name, value in scale.items()
-    }
-    return rate, power_of_two(ravel(dataclasses.replace(state0, **spread)))
+
+    def spread(length: Array, speed: Array) -> Array:
+        scale: dict[str, Any] = {
+            "attitude": jnp.ones_like(rate),
+            "omega": rate,
+            "internal": internal_parts(system.torque.internal_scale(rate)),
+        }
+        if hasattr(state0, "velocity"):
+            scale |= {"position": length, "velocity": speed}
+        full = {
+            name: jtu.tree_map(
+                lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name)
+            )
+            for name, value in scale.items()
+        }
+        return power_of_two(ravel(dataclasses.replace(state0, **full)))
+
+    def fastest(scales: Array) -> Array:
+        def vector_field(t: Array, y: Array, args: Any) -> Array:
+            return ravel(system.vector_field(t, unravel(y * scales, state0), args)) / scales
+
+        there = jacobian(vector_field, t0, ravel(state0) / scales, args)
+        radius = spectral_radius(there, 2)
+        return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
+
+    if not hasattr(state0, "velocity"):
+        scales = spread(rate, rate)
+        return rate, fastest(scales), scales
+    # First scales of the place alone, to find how fast the motion of the centre of mass changes;
+    # then its way in that time, or in the whole run if that is shorter. A run of many orbits is
+    # not to be measured by |a| T^2. A body at rest on which no force acts is measured in metres.
+    position, velocity, pull = (
+        safe_norm(x) for x in (state0.position, state0.velocity, rates.velocity)
+    )
+    time = jnp.minimum(span, 1 / rate)
+    speed = jnp.where(velocity > 0, velocity, pull * time)
+    bend = jnp.where(pull > 0, velocity / jnp.where(pull > 0, pull, 1.0), time)
+    way = jnp.maximum(position, velocity * jnp.minimum(time, bend))
+    length = jnp.where(way > 0, way, speed * time)
+    length = jnp.where(length > 0, length, 1.0)
+    speed = jnp.where(speed > 0, speed, length / time)
+    quickest = fastest(spread(length, speed))
+    time = jnp.minimum(span, 1 / quickest)
+    speed = jnp.maximum(velocity, pull * time)
+    length = jnp.maximum(position, speed * time)
+    length = jnp.where(length > 0, length, 1.0)
+    speed = jnp.where(speed > 0, speed, length / time)
+    return rate, quickest, spread(length, speed)
 
 
-def fastest_rate(vector_field: Callable, y0: Array, args: Any) -> Array:
-    """Upper estimate of the fastest rate of the motion linearised about its start.
+def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
+    """Jacobian of the vector field by differences, which ask nothing of a torque but its value.
 
-    The spectral radius of the Jacobian is at most ||J^64||^(1/64), whatever the scales of the
-    components; differences will do for J, and ask nothing of a torque but its value.
+    A row for each component of y: the transpose of the usual one.
     """
-    size = y0.size
-    step = jnp.sqrt(jnp.finfo(y0.dtype).eps)
-    nudged = y0[None, :] + step * jnp.eye(size, dtype=y0.dtype)
-    zero = jnp.zeros((), y0.dtype)
-    there = jax.vmap(lambda y: vector_field(zero, y, args))(nudged)
-    jacobian = (there - vector_field(zero, y0, args)[None, :]) / step
-    power, exponent = jacobian, zero
-    for _ in range(6):
-        largest = jnp.max(jnp.abs(power))
-        scale = jnp.where(largest > 0, largest, 1.0)
-        exponent = 2 * (exponent + jnp.log(scale))
-        power = product("ij,jk->ik", power / scale, power / scale)
-    norm = jnp.max(jnp.sum(jnp.abs(power), axis=1))
-    rate = jnp.exp((exponent + jnp.log(jnp.where(norm > 0, norm, 1.0))) / 64)
-    return jnp.where((norm > 0) & jnp.isfinite(rate), rate, 0.0)
+    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y))
+    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
+    there = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
+    return (there[1:] - there[:1]) / step[:, None]
+
+
+def spectral_radius(matrix: Array, rounds: int) -> Array:
+    """Upper estimate of the largest magnitude of an eigenvalue: ||J^n||^(1/n), n = 8^rounds.
+
+    It does not depend much on the scales of the components, as a norm would. Products are written
+    out: a dot of this size costs several times more.
+    """
+    scales = []
+    for _ in range(rounds):
+        largest = jnp.max(jnp.abs(matrix))
+        scales.append(jnp.where(largest > 0, largest, 1.0))
+        matrix = matrix / scales[-1]
+        for _ in range(3):
+            matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
+    radius = jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
+    for scale in reversed(scales):
+        radius = scale * jnp.sqrt(jnp.sqrt(jnp.sqrt(radius)))
+    return radius

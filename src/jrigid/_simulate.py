@@ -1,7 +1,6 @@
 """simulate(): the one call of `diffrax.diffeqsolve`, and the Trajectory it gives."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
@@ -20,17 +20,25 @@ from jrigid._checks import (
     all_finite,
     check_shape,
     float_arrays,
-    is_concrete,
-    is_inertia,
-    is_unit,
     nan_where,
 )
+from jrigid._controller import (
+    LARGEST_STEP,
+    WatchfulController,
+    constant,
+    fastest_on_the_way,
+    guarded,
+    standing_still,
+)
+from jrigid._inputs import DEFAULT_RTOL, check_values, harmless, numbers, tolerances
 from jrigid._numerics import power_of_two
-from jrigid._scales import fastest_rate, ravel, units, unravel
+from jrigid._scales import ravel, units, unravel
 from jrigid._trajectory import Trajectory
 from jrigid._types import ScalarLike
 from jrigid.rotation import normalize
-from jrigid.systems import AbstractSystem
+from jrigid.solvers import ExactFree, FreeRotation
+from jrigid.systems import AbstractSystem, RigidBody
+from jrigid.torques import Sum
 from jrigid.torques._base import has_parts
 
 # One step commits this fraction of rtol. The error of the energy adds up over the turns and that
@@ -38,37 +46,15 @@ from jrigid.torques._base import has_parts
 # its derivatives through a near-separatrix, asks for much more than rtol at each step.
 _STEP_FRACTION = 1e-3
 # Beyond this many radians the phase error, quadratic in time, asks for a smaller fraction still.
-_LONG_RADIANS = 1e5
-# No step is longer than this fraction of the shortest time scale at the start, that of the turning
-# or of the linearised motion: at an equilibrium the error estimate sees nothing, and a step too
-# long to be stable leaves the value right and the derivative wrong.
-_LARGEST_STEP = 0.4
+_LONG_RADIANS = 2e4
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
 # After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
 _GROWTH = 1e16
-_DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
-_SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
 _CHECKPOINTS = 100
 _ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
-
-
-class _GiveUp(diffrax.PIDController):
-    """A PID controller that reports a step rejected at the resolution of time.
-
-    Its own `dtmin` would also stop a step that is short only because a time asked for is near.
-    """
-
-    resolution: Any = 0.0
-
-    def adapt_step_size(self, t0: Any, t1: Any, *args: Any) -> Any:
-        """As the PID controller; a torque that turns NaN or infinite ends here."""
-        keep, next_t0, next_t1, made_jump, state, result = super().adapt_step_size(t0, t1, *args)
-        stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
-        result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
-        return keep, next_t0, next_t1, made_jump, state, result
 
 
 def simulate(
@@ -78,7 +64,7 @@ def simulate(
     args: Any = None,
     *,
     t0: ScalarLike = 0.0,
-    solver: diffrax.AbstractAdaptiveSolver | None = None,
+    solver: diffrax.AbstractSolver | None = None,
     rtol: ScalarLike | None = None,
     atol: ScalarLike | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -101,21 +87,27 @@ def simulate(
         ts: Times [s], non-decreasing in the order of their memory, none before `t0`; any shape.
         args: Passed to torques and forces.
         t0: Time of `state0` [s].
-        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
+        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default. For a
+            `RigidBody` without torque `jrigid.solvers.ExactFree()` gives the closed form.
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
             phi [rad] the relative error of energy and space angular momentum stays below
             rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
-            floor of 100 eps (1 + phi). Each step is held to a thousandth of rtol for that.
+            floor of 100 eps (1 + phi). Each step is held to a thousandth of rtol for that. What
+            counts is the fastest part of the motion: for a body in flight that turns slowly, or
+            not at all, phi is the angle of its orbit, and errors of position and velocity are
+            relative to their initial magnitudes (to those they reach in the run, or in a radian,
+            where they start at zero).
         atol: The same for components near zero, as a fraction of the scale of their variable (the
             initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`,
             `jax.jacrev`) works; `diffrax.ForwardMode()` gives `jax.jvp`, `jax.jacfwd` and forward
             over forward; `diffrax.DirectAdjoint()` every mode and order.
-        max_steps: Largest number of steps; by default 2e7, which is never in the way, but 4096
+        max_steps: Largest number of steps; by default 2e7, enough for some 5e5 turns, but 4096
             for `DirectAdjoint`, whose cost grows with it.
-        max_step: Longest step [s]. A pulse of torque much shorter than a radian of turning, or
-            than the run if the body is at rest, can fall between two steps: bound them by its
-            length.
+        max_step: Longest step [s]. Steps follow the fastest rate of the motion, which is looked
+            at where each begins and ends. A pulse of torque much shorter than a radian of
+            turning, or than the run if the body is at rest, can fall between two such looks:
+            bound the step by its length.
         event: A `diffrax.Event` that ends the motion; its condition functions are called with
             (t, state, args), in SI units.
         throw: If True, bad input and a failed integration raise an error, under jit too; if
@@ -123,15 +115,18 @@ def simulate(
         progress: True prints a progress meter, or give one of diffrax's.
 
     Returns:
-        The trajectory.
+        The trajectory. With `throw=False` look at its `result` before its states.
 
     Raises:
         ValueError: Wrong shape or option, or an `rtol` the dtype cannot serve (trace time).
         RuntimeError: Bad value or failed integration, with `throw=True` (run time, any lane).
 
     Gradients: those of the motion, in the state, the system's parameters, `args`, `t0` and `ts`,
-    also at pure spin and the sleeping top. Their relative error is at most 1000 rtol; a mode that
-    the adjoint cannot serve raises an error that names one that can.
+    also at pure spin and the sleeping top. Their error, relative to the norm of the Jacobian, is
+    at most 1000 rtol up to 1e4 radians; from there on it grows as radians^2. A mode that the
+    adjoint cannot serve raises an error that names one that can. A lane that fails, from its
+    input or on the way, has no part in the gradients of what lanes share once its states are
+    masked by `result`, unless the vector field itself has no finite derivative where it starts.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -139,6 +134,15 @@ def simulate(
     >>> trajectory = jr.simulate(body, state0, jnp.linspace(0.0, 100.0, 5))
     >>> print(trajectory.states.attitude.shape, trajectory.energy.round(6))
     (5, 4) [1.00005 1.00005 1.00005 1.00005 1.00005]
+
+    Without raising, one result code tells what became of it, and has a message:
+
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.01, jnp.nan, 0.0]))
+    >>> trajectory = jr.simulate(body, state0, 100.0, throw=False)
+    >>> print(trajectory.result == jr.RESULTS.successful)
+    False
+    >>> print(jr.RESULTS[trajectory.result])
+    Argument `state0` must be finite, but a component is not.
     """
     if not isinstance(system, AbstractSystem):
         raise ValueError(
@@ -150,25 +154,38 @@ def simulate(
             f"Argument `state0` must be a {system.state_type.__name__}, "
             f"but it is {type(state0).__name__}."
         )
-    for name, size in (("attitude", 4), ("omega", 3)):
-        check_shape(f"state0.{name}", getattr(state0, name), (size,))
+    for name, size in (("attitude", 4), ("omega", 3), ("position", 3), ("velocity", 3)):
+        value = getattr(state0, name, jnp.zeros(size))  # only a body in flight has all
+        if not eqx.is_array(value):
+            raise ValueError(
+                f"Argument `state0.{name}` must be an array of shape ({size},), "
+                f"but it is {value!r}."
+            )
+        check_shape(f"state0.{name}", value, (size,))
     internal = jtu.tree_map(lambda x: float_arrays(x)[0], state0.internal)
     state0 = dataclasses.replace(state0, internal=internal)
-    ts, t0 = float_arrays(ts, t0)
+    ts, t0 = numbers(ts=ts, t0=t0)
     if ts.size == 0:
         raise ValueError("Argument `ts` must hold at least one time, but it is empty.")
     check_shape("t0", t0, ())
     dtype = jnp.result_type(*(x.dtype for x in jtu.tree_leaves(state0)))
-    if jnp.dtype(dtype).itemsize not in _DEFAULT_RTOL:
+    if jnp.dtype(dtype).itemsize not in DEFAULT_RTOL:
         raise ValueError(
             f"Argument `state0` must be float32 or float64, but it is {jnp.dtype(dtype).name}."
         )
-    ts, t0 = ts.astype(dtype), t0.astype(dtype)
     if solver is None:
         solver = diffrax.Dopri8()
-    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+    if isinstance(solver, ExactFree):
+        torque = system.torque
+        free = isinstance(system, RigidBody) and isinstance(torque, Sum) and not torque.terms
+        if not free:
+            raise ValueError(
+                "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
+                "torque, but it is."
+            )
+    elif not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
-            "Argument `solver` must be a diffrax solver with an error estimate, "
+            "Argument `solver` must be a diffrax solver with an error estimate, or ExactFree(), "
             f"but it is {type(solver).__name__}."
         )
     if adjoint is None:
@@ -180,51 +197,37 @@ def simulate(
         )
     if event is not None and not isinstance(event, diffrax.Event):
         raise ValueError(f"Argument `event` must be a diffrax.Event, but it is {event!r}.")
-    if max_steps is not None and max_steps < 1:
-        raise ValueError(f"Argument `max_steps` must be at least 1, but it is {max_steps}.")
-    longest = jnp.asarray(jnp.inf if max_step is None else max_step, dtype)
+    if max_steps is not None and (not isinstance(max_steps, int | np.integer) or max_steps < 1):
+        raise ValueError(
+            f"Argument `max_steps` must be an integer and at least 1, but it is {max_steps!r}."
+        )
+    (longest,) = numbers(max_step=jnp.inf if max_step is None else max_step)
     check_shape("max_step", longest, ())
+    longest = longest.astype(dtype)
     if max_steps is None:
         direct = isinstance(adjoint, diffrax.DirectAdjoint)
         max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
-    rtol, atol = _tolerances(rtol, atol, dtype)
+    rtol, atol = tolerances(rtol, atol, dtype)
     if progress is True:
         meter: diffrax.AbstractProgressMeter = diffrax.TextProgressMeter()
     elif progress is False:
         meter = diffrax.NoProgressMeter()
-    else:
+    elif isinstance(progress, diffrax.AbstractProgressMeter):
         meter = progress
-    return _simulate(
-        system, state0, ts, t0, args, solver, rtol, atol, adjoint, max_steps, longest, event, throw,
-        meter,
-    )  # fmt: skip
-
-
-def _tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Array, Array]:
-    size = jnp.dtype(dtype).itemsize
-    if rtol is None:
-        rtol = _DEFAULT_RTOL[size]
-    if atol is None:
-        atol = rtol
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        check_shape(name, jnp.asarray(value), ())
-        smallest = _SMALLEST_RTOL[size]
-        if is_concrete(value) and not smallest <= float(value) < 1:
-            raise ValueError(
-                f"Argument `{name}` must be at least {smallest} and below 1 in "
-                f"{jnp.dtype(dtype).name}, but it is {float(value)}."
-            )
-    if size == 4:
-        warnings.warn(
-            "simulate() runs in float32: errors of 1e-6 a radian are usual. Switch on "
-            "`jax_enable_x64` and pass float64 arrays for more.",
-            stacklevel=3,
+    else:
+        raise ValueError(
+            "Argument `progress` must be True, False or a progress meter of diffrax, "
+            f"but it is {progress!r}."
         )
-    return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
+    return _simulate(
+        dtype, system, state0, ts, t0, args, solver, rtol, atol, adjoint, int(max_steps), longest,
+        event, throw, meter,
+    )  # fmt: skip
 
 
 @eqx.filter_jit
 def _simulate(
+    dtype: Any,
     system: Any,
     state0: Any,
     ts: Array,
@@ -254,81 +257,91 @@ def _simulate(
 
     flat = ts.reshape(-1)
     findings = Findings()
-    _check(findings, system, state0, flat, t0, longest, args)
+    check_values(findings, system, state0, flat, t0, longest, rtol, atol, args)
     ok = findings.ok
-    # A bad lane integrates a harmless motion instead, so that no other lane waits for it, and so
-    # that no NaN reaches the derivatives of what it shares with the others.
-    system, args = _harmless(ok, (system, args))
-    state0 = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), state0)
+    # A bad lane integrates a body that keeps still instead, so that no other lane waits for it,
+    # and so that no NaN reaches the derivatives of what it shares with the others: ones, since
+    # there are forces that are singular at the origin.
+    system, args = harmless(ok, (system, args))
+    state0, rtol, atol = harmless(ok, (state0, rtol, atol))
     identity = jnp.zeros(4, state0.attitude.dtype).at[0].set(1)
     attitude = normalize(jnp.where(ok, state0.attitude, identity))
     state0 = dataclasses.replace(state0, attitude=attitude)
     flat = jnp.where(ok, flat, jnp.zeros_like(flat))
     t0 = jnp.where(ok, t0, jnp.zeros_like(t0))
     system, state0, flat, t0, args = guard_inputs(adjoint, (system, state0, flat, t0, args))
+    # Times may come in more digits than states: they are subtracted in their own precision.
+    since_start = (flat - t0).astype(dtype)
+    start = t0.astype(dtype)
 
-    rate, scales = jax.lax.stop_gradient(units(system, state0, flat[-1], t0, args))
-    moving = flat[-1] > t0  # all times at t0: nothing to integrate
+    measures = units(system, state0, since_start[-1], start, args)
+    rate, fastest, scales = harmless(ok, jax.lax.stop_gradient(measures))
+    moving = since_start[-1] > 0  # all times at t0: nothing to integrate
     stretch = power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
-    taus = (flat - t0) * stretch
+    taus = since_start * stretch
     end = jnp.where(moving, taus[-1], 1.0)
-
-    def to_state(y: Any) -> Any:
-        return unravel(y * scales, state0)
-
-    def vector_field(tau: Any, y: Any, args: Any) -> Any:
-        rates = system.vector_field(t0 + tau / stretch, to_state(y), args)
-        return ravel(rates) / (scales * stretch)
-
-    y0 = ravel(state0) / scales
-    eps = jnp.finfo(flat.dtype).eps
-    radians = jax.lax.stop_gradient(end)
-    fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
-    step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
-    fastest = jnp.maximum(fastest_rate(vector_field, y0, args), rate / stretch)
-    fastest = jax.lax.stop_gradient(fastest)
-    largest_step = jnp.where(ok, jnp.minimum(_LARGEST_STEP / fastest, longest * stretch), 1.0)
-    controller = diffrax.ClipStepSizeController(
-        _GiveUp(
-            rtol=step_rtol,
-            atol=step_atol,
-            dtmax=largest_step,
-            factormax=_GROWTH,
-            resolution=16 * eps * radians,
-        ),
-        step_ts=jax.lax.stop_gradient(taus),
-    )
-    zero = jnp.zeros_like(end)
+    stop = jax.lax.stop_gradient(end)
+    radians = stop * fastest / stretch
+    largest_step = jnp.minimum(LARGEST_STEP * stretch / fastest, longest * stretch)
+    largest_step = jnp.where(ok, largest_step, 1.0)
+    if isinstance(solver, ExactFree):
+        terms, y0, to_state = _exact_problem(system, state0, stretch)
+        controller: Any = diffrax.ConstantStepSize()
+        first_step = stop if event is None else jnp.minimum(largest_step, stop)
+    else:
+        to_state, terms, y0, field, turning = _problem(
+            ok, adjoint, system, state0, args, start, stretch, scales
+        )
+        fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
+        eps = jnp.finfo(dtype).eps
+        step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
+        controller = diffrax.ClipStepSizeController(
+            WatchfulController(
+                rtol=step_rtol,
+                atol=step_atol,
+                dtmax=largest_step,
+                factormax=_GROWTH,
+                resolution=16 * eps * stop,
+                start_rate=fastest / stretch,
+                fastest=constant(jtu.Partial(fastest_on_the_way, ok, field, turning)),
+            ),
+            step_ts=jax.lax.stop_gradient(taus),
+        )
+        first_step = jnp.minimum(0.1 * largest_step, stop)
     if event is None:
         saveat = diffrax.SaveAt(ts=taus)
     else:
         saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=taus), diffrax.SubSaveAt(t1=True)])
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(vector_field),
+        terms,
         solver,
-        zero,
+        jnp.zeros_like(end),
         end,
-        jnp.minimum(0.1 * largest_step, radians),
+        first_step,
         y0,
         args,
         saveat=saveat,
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
-        event=_event_in_si(event, t0, stretch, to_state),
+        event=_event_in_si(event, start, stretch, to_state),
         throw=False,
         progress_meter=meter,
     )
     saved: Any = (solution.ts, solution.ys)
     result: Any = RESULTS.promote(solution.result)
 
-    def to_states(taus: Array, y: Array) -> Any:
+    def to_states(taus: Array, y: Any) -> Any:
         valid = jnp.isfinite(taus)
-        state = jax.vmap(to_state)(jnp.where(valid[:, None], y, 1.0))
+
+        def where_valid(tree: Any, otherwise: float) -> Any:
+            return jtu.tree_map(
+                lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, otherwise), tree
+            )
+
+        state = jax.vmap(to_state)(where_valid(y, 1.0))
         state = dataclasses.replace(state, attitude=jax.vmap(normalize)(state.attitude))
-        return jtu.tree_map(
-            lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.nan), state
-        )
+        return where_valid(state, jnp.nan)
 
     if event is None:  # the motion ends at the last of the times
         states = ends = to_states(*saved)
@@ -337,7 +350,7 @@ def _simulate(
         (reached, end_taus), (ys, end_ys) = saved
         states, ends = to_states(reached, ys), to_states(end_taus, end_ys)
     final_state = jtu.tree_map(lambda x: x[-1], ends)
-    final_time = jnp.where(moving, t0 + end_taus[-1] / stretch, t0)
+    final_time = jnp.where(moving, t0 + (end_taus[-1] / stretch).astype(t0.dtype), t0)
     finite = all_finite(final_state) | (result != RESULTS.successful)
     result = RESULTS.where(finite, result, RESULTS.nonfinite_state)
     result = RESULTS.where(ok, result, findings.result)
@@ -357,36 +370,49 @@ def _simulate(
     return Trajectory(ts, states, result, stats, final_time, final_state, (system, args))
 
 
-def _check(
-    findings: Findings,
-    system: AbstractSystem,
+def _problem(
+    ok: Array,
+    adjoint: Any,
+    system: Any,
     state0: Any,
-    flat: Array,
-    t0: Array,
-    longest: Array,
     args: Any,
-) -> None:
-    ordered = jnp.all(flat[1:] >= flat[:-1]) & (flat[0] >= t0)
-    findings.require(is_inertia(system.inertia), RESULTS.invalid_inertia)
-    torque: Any = system.torque
-    torque.check(findings)
-    findings.require(all_finite(state0), RESULTS.invalid_state)
-    findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude)
-    findings.require(all_finite((flat, t0)) & ordered, RESULTS.invalid_times)
-    findings.require(longest > 0, RESULTS.invalid_max_step)
-    field = system.vector_field(t0, state0, args)
-    findings.require(all_finite(field), RESULTS.invalid_vector_field)
+    start: Array,
+    stretch: Array,
+    scales: Array,
+) -> tuple[Any, ...]:
+    """The motion as one array in its own scales, and time in radians."""
+
+    def to_state(y: Any) -> Any:
+        return unravel(y * scales, state0)
+
+    def plain_field(tau: Any, y: Any, args: Any) -> Any:
+        rates = system.vector_field(start + tau / stretch, to_state(y), args)
+        return ravel(rates) / (scales * stretch)
+
+    y0 = ravel(state0) / scales
+    y_start = jax.lax.stop_gradient(y0)
+    # What the functions of a user close over becomes visible.
+    converted = eqx.filter_closure_convert(plain_field, jnp.zeros_like(stretch), y0, args)
+    field: Any = harmless(ok, converted)
+
+    def vector_field(tau: Any, y: Any, args: Any) -> Any:
+        if isinstance(adjoint, diffrax.ForwardMode):  # NaN goes no way but its own lane's
+            return standing_still(ok, field(tau, y, args))
+        return standing_still(ok, guarded(field, y_start, tau, y, args))
+
+    still = jtu.tree_map(jnp.zeros_like, state0)
+    turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
+    return to_state, diffrax.ODETerm(vector_field), y0, field, turning * scales / stretch
 
 
-def _harmless(ok: Array, tree: Any) -> Any:
-    """Ones, and unit tensors, in place of the arrays of a bad lane."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+def _exact_problem(system: Any, state0: Any, stretch: Array) -> tuple[Any, Any, Callable]:
+    """The free body with time in radians, for `ExactFree`."""
 
-    def replace(x: Array) -> Array:
-        unit = jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else jnp.ones_like(x)
-        return jnp.where(ok, x, unit)
+    def to_state(y: Any) -> Any:
+        return dataclasses.replace(y, omega=y.omega * stretch)
 
-    return eqx.combine(jtu.tree_map(replace, arrays), rest)
+    y0 = dataclasses.replace(state0, omega=state0.omega / stretch)
+    return FreeRotation(system.inertia.astype(y0.omega.dtype)), y0, to_state
 
 
 def _event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:

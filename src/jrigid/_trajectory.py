@@ -20,7 +20,9 @@ class Trajectory(eqx.Module):
         states: State at each time; the leading axes of its leaves are those of `ts`. NaN where
             the integration did not get to; attitudes are normalised.
         result: Result code, `jrigid.RESULTS.successful` if all went well; one for each lane under
-            vmap. After an event it is `event_occurred`.
+            vmap. After an event it is `event_occurred`. Test it by
+            `trajectory.result == jrigid.RESULTS.successful`, an array of booleans under vmap;
+            `jrigid.RESULTS[trajectory.result]` is the message of a single one.
         stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
         final_time: Where the integration ended [s]: the last of `ts`, or the event.
         final_state: The state there.
@@ -75,7 +77,9 @@ class Trajectory(eqx.Module):
 
         def one(ts: Array, states: Any, system: Any, args: Any) -> Array:
             flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[ts.ndim :]), states)
-            values = jax.vmap(lambda t, state: fn(system, t, state, args))(ts.reshape(-1), flat)
+            # Torques see time in the precision of the state, as they did on the way.
+            times = ts.reshape(-1).astype(flat.omega.dtype)
+            values = jax.vmap(lambda t, state: fn(system, t, state, args))(times, flat)
             return values.reshape(*ts.shape, *values.shape[1:])
 
         for _ in range(lanes):

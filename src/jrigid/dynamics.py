@@ -7,7 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_inertia_shape, check_shape, float_arrays, state_array
+from jrigid._checks import (
+    check_inertia_shape,
+    check_shape,
+    float_arrays,
+    internal_parts,
+    state_array,
+)
 from jrigid._types import InertiaLike, Scalar, Vector, VectorLike
 
 
@@ -18,7 +24,7 @@ class State(eqx.Module):
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
         internal: What an internal damper or a spinning rotor carries, in the order of the torques
-            that carry something (see `jrigid.torques`); empty by default.
+            that carry something (see `jrigid.torques`); empty by default, and then None.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 0.0, 5.0]))
@@ -28,7 +34,7 @@ class State(eqx.Module):
 
     attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
     omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
-    internal: Any = ()
+    internal: Any = eqx.field(default=(), converter=internal_parts)
 
 
 def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:

@@ -5,10 +5,21 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_inertia_shape, check_shape, float_arrays, state_array
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_inertia_shape,
+    check_shape,
+    float_arrays,
+    internal_parts,
+    is_inertia,
+    state_array,
+)
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
 from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
 from jrigid.mass import MassProperties
@@ -35,6 +46,15 @@ class AbstractSystem(eqx.Module):
     def angular_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Total angular momentum [kg m^2/s], space components, internal parts included."""
 
+    def check(self, findings: Findings) -> None:
+        """Note parameters with bad values, for `simulate`.
+
+        Args:
+            findings: What has been found so far; `require` adds to it.
+        """
+        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia)
+        self.torque.check(findings)
+
 
 class FloatingState(eqx.Module):
     """State of a body in flight.
@@ -56,7 +76,7 @@ class FloatingState(eqx.Module):
     velocity: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
     attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
     omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
-    internal: Any = ()
+    internal: Any = eqx.field(default=(), converter=internal_parts)
 
 
 def _rotational_momentum(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
@@ -105,6 +125,12 @@ class RigidBody(AbstractSystem):
         Raises:
             ValueError: Wrong shape (trace time). Values are checked by `simulate`.
         """
+        if isinstance(inertia, MassProperties):
+            raise ValueError(
+                "Argument `inertia` must hold moments or a tensor, but it is a MassProperties: "
+                "pass its `.inertia`, or `.principal_axes().moments` for body axes along the "
+                "principal ones."
+            )
         (self.inertia,) = float_arrays(inertia)
         check_inertia_shape(self.inertia)
         self.torque = as_torque(torque)
@@ -182,11 +208,20 @@ class Force(eqx.Module):
         return self.fn(t, state, args)
 
 
+# What `MassProperties` made with `throw=False` remembers of a bad input.
+_MARKS: tuple[Any, ...] = (
+    RESULTS.invalid_position,
+    RESULTS.unphysical_inertia,
+    RESULTS.invalid_length,
+    RESULTS.invalid_attitude,
+)
+
+
 class FloatingBody(AbstractSystem):
     """A body in flight: its centre of mass moves under forces while it turns.
 
     Attributes:
-        mass_properties: Mass and inertia; the centre of mass in body coordinates plays no role.
+        mass_properties: Mass and inertia; where in the body the centre of mass is plays no role.
         force: `(t, state, args) -> (3,)` total force, space components [N], or None.
         torque: The torque about the centre of mass.
 
@@ -231,6 +266,21 @@ class FloatingBody(AbstractSystem):
     def inertia(self) -> Float[Array, "..."]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Inertia tensor about the centre of mass [kg m^2]."""
         return self.mass_properties.inertia
+
+    def check(self, findings: Findings) -> None:
+        """Note what was found wrong with the mass properties, then as any system.
+
+        Args:
+            findings: What has been found so far; `require` adds to it.
+        """
+        mass = jax.lax.stop_gradient(self.mass_properties.mass)
+        marked = ~all_finite(jax.lax.stop_gradient(self.inertia))
+        result: Any = self.mass_properties.result
+        for code in _MARKS:
+            findings.require(~marked | (result != code), code)
+        findings.require(jnp.isfinite(mass) & (mass > 0), RESULTS.invalid_mass)
+        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia)
+        self.torque.check(findings)
 
     def _force(self, t: ScalarLike, state: Any, args: Any) -> Array:
         if self.force is None:

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import (
     RESULTS,
+    float_arrays,
     nan_where,
 )
 from jrigid._numerics import safe_norm
@@ -138,7 +139,8 @@ def separatrix(inertia: InertiaLike, *, throw: bool = True) -> Separatrix:
     >>> print(jr.free.separatrix(jnp.array([1.0, 2.0, 3.0])).momentum_ratio.round(6))
     1.732051
     """
-    findings, (inertia, _) = checked(inertia, jnp.zeros(3), throw)
+    (inertia,) = float_arrays(inertia)
+    findings, (inertia, _) = checked(inertia, jnp.zeros(3, inertia.dtype), throw)
     moments = jnp.sort(inertia) if inertia.ndim == 1 else eigh(inertia)[0]
     i1, i2, i3 = moments
     findings.require(

@@ -209,6 +209,7 @@ class Motion(NamedTuple):
     quarter_w: Scalar
 
 
+@jax.jit  # outside of jit a loop defined in a function is compiled at every call
 def invariants(moments: Vector, omega: Vector) -> Motion:
     """The labels, the invariants and the period of a motion; values are not checked."""
     unit = power_of_two(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))

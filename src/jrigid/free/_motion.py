@@ -144,13 +144,18 @@ def _findings(inertia: Array, state0: State, ts: Array, t0: Array) -> Findings:
     return findings
 
 
+@jax.jit
 def _states(inertia: Array, attitude: Array, omega: Array, times: Array) -> tuple[Array, Array]:
-    if inertia.ndim == 1:
-        motion = invariants(inertia, omega)
-        relative, rates = jax.vmap(lambda t: at(motion, t))(times)
-    else:
-        relative, rates = jax.vmap(lambda t: _of_tensor(inertia, omega, t))(times)
+    relative, rates = jax.vmap(lambda t: relative_motion(inertia, omega, t))(times)
     return jax.vmap(lambda p: multiply(attitude, p))(relative), rates
+
+
+@jax.jit
+def relative_motion(inertia: Array, omega: Vector, t: Scalar) -> tuple[Quaternion, Vector]:
+    """Attitude relative to that at the start, q(t) = q(0) p(t), and angular velocity; unchecked."""
+    if inertia.ndim == 1:
+        return of_moments(inertia, omega, t)
+    return _of_tensor(inertia, omega, t)
 
 
 def of_moments(moments: Vector, omega: Vector, t: Scalar) -> tuple[Quaternion, Vector]:

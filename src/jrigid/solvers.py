@@ -1,0 +1,135 @@
+"""diffrax solvers made for rotation."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from jrigid._checks import check_inertia_shape, float_arrays
+from jrigid._types import InertiaLike
+from jrigid.dynamics import euler_equations
+from jrigid.free._motion import relative_motion
+from jrigid.rotation import attitude_rate, multiply
+
+
+class FreeRotation(diffrax.AbstractTerm):
+    """The equations of a free body, for any diffrax solver, and for `ExactFree` to solve exactly.
+
+    The state is a `State`, or any dataclass with `attitude` and `omega`, whose other fields rest.
+
+    Attributes:
+        inertia: Principal moments or tensor [kg m^2]; not checked.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> term = jr.solvers.FreeRotation(jnp.array([1.0, 2.0, 3.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 1.0, 1.0]))
+    >>> print(term.vf(0.0, state, None).omega.round(6))
+    [-1.        1.       -0.333333]
+    """
+
+    inertia: Float[Array, "..."]
+
+    def __init__(self, inertia: InertiaLike):
+        """The free body with this inertia."""
+        (self.inertia,) = float_arrays(inertia)
+        check_inertia_shape(self.inertia)
+
+    def vf(self, t: Any, y: Any, args: Any) -> Any:
+        """Time derivative of the state."""
+        del t, args
+        rest = jtu.tree_map(lambda x: 0 * x, y)
+        return dataclasses.replace(
+            rest,
+            attitude=attitude_rate(y.attitude, y.omega),
+            omega=euler_equations(self.inertia.astype(y.omega.dtype), y.omega),
+        )
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        """The step of time."""
+        del kwargs
+        return t1 - t0
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        """Derivative times step."""
+        return jtu.tree_map(lambda rate: control * rate, vf)
+
+    def after(self, y: Any, step: Any) -> Any:
+        """The state a time `step` later [s], exactly."""
+        inertia, omega, step = (
+            x.astype(y.omega.dtype) for x in float_arrays(self.inertia, y.omega, step)
+        )
+        turn, omega = relative_motion(inertia, omega, step)
+        return dataclasses.replace(y, attitude=multiply(y.attitude, turn), omega=omega)
+
+
+class _ExactInterpolation(diffrax.AbstractLocalInterpolation):
+    """Dense output that is the exact motion."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    inertia: Any
+    direction: Any
+
+    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Any:
+        """The state at t0, or its change from t0 to t1."""
+        del left
+        term = FreeRotation(self.inertia)
+        early = term.after(self.y0, self.direction * (t0 - self.t0))
+        if t1 is None:
+            return early
+        late = term.after(self.y0, self.direction * (t1 - self.t0))
+        return jtu.tree_map(lambda a, b: b - a, early, late)
+
+
+class ExactFree(diffrax.AbstractSolver):
+    """The exact flow of the free body as a diffrax solver: one step goes any distance.
+
+    `simulate(RigidBody(inertia), ..., solver=ExactFree())` evaluates the closed form at the times
+    asked for. In `diffrax.diffeqsolve` it solves the term `FreeRotation(inertia)`, its dense output
+    exact too; a splitting scheme can call its `step`, or `FreeRotation.after`, as a stage.
+    Attitudes keep the norm they start with.
+
+    Gradients: those of the motion, see `jrigid.free_rotation`.
+    Source: docs/free_rotation.md; as a stage: A. Dullweber, B. Leimkuhler, R. McLachlan, J. Chem.
+    Phys. 107 (1997) 5840.
+
+    >>> import diffrax, jax.numpy as jnp, jrigid as jr
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
+    >>> solution = diffrax.diffeqsolve(
+    ...     jr.solvers.FreeRotation(jnp.array([1.0, 2.0, 3.0])), jr.solvers.ExactFree(),
+    ...     t0=0.0, t1=jnp.pi, dt0=jnp.pi, y0=state)
+    >>> print(solution.ys.attitude[-1].round(6))
+    [-1.  0.  0.  0.]
+    """
+
+    term_structure: ClassVar = FreeRotation
+    interpolation_cls: ClassVar[Callable[..., _ExactInterpolation]] = _ExactInterpolation
+
+    def order(self, terms: Any) -> None:
+        """None: there is no error to speak of."""
+        del terms
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        """Nothing is carried from step to step."""
+        del terms, t0, t1, y0, args
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Any, None, dict[str, Any], None, Any]:
+        """The state at t1, with no error estimate."""
+        del args, solver_state, made_jump
+        # diffeqsolve lets time grow, and wraps the term in one that knows its direction.
+        term = getattr(terms, "term", terms)
+        direction = jnp.asarray(getattr(terms, "direction", 1), y0.omega.dtype)
+        info = {"y0": y0, "inertia": term.inertia, "direction": direction}
+        y1 = term.after(y0, direction * (t1 - t0))
+        return y1, None, info, None, diffrax.RESULTS.successful
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """The vector field."""
+        return terms.vf(t0, y0, args)
