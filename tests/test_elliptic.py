@@ -752,3 +752,16 @@ def test_mc_wins_over_m():
 def test_neither_m_nor_mc_is_an_error():
     with pytest.raises(ValueError, match="`m` must be given, or else `mc`, but neither"):
         elliptic.ellipk(None)
+
+
+@pytest.mark.parametrize("p", [1e200, 1e250, 1e300, 1e307, -1e300])
+def test_rj_of_very_large_and_relatively_large_p(p):
+    with mp.workdps(40):
+        # (3 / p)(R_F - pi/(2 sqrt p)) for large p, DLMF 19.27.11; the next term is below 1e-100
+        rf = mp.elliprf(1, 2, 3)
+        exact = 3 / mp.mpf(p) * (rf - (mp.pi / (2 * mp.sqrt(p)) if p > 0 else 0))
+    np.testing.assert_allclose(elliptic.rj(1.0, 2.0, 3.0, p), float(exact), rtol=4e-15)
+    small = 2.0**-997
+    scaled = elliptic.rj(small, 2 * small, 3 * small, 1.0)
+    exact = 3 * float(mp.elliprf(1, 2, 3)) / np.sqrt(small)
+    np.testing.assert_allclose(scaled, exact, rtol=4e-15)

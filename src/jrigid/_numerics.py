@@ -66,17 +66,22 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(small, _series(_ARCTANC, jnp.where(small, z, 0.0)), jnp.arctan(root) / root)
 
 
+def _within_range(root: Array) -> Array:
+    """An exponent whose exponential is finite, so that none is multiplied with zero."""
+    return jnp.minimum(root, 0.95 * math.log(float(jnp.finfo(root.dtype).max)))
+
+
 def cosh_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """cosh(sqrt(z)) for any real z (the cosine where z < 0), analytic at z = 0."""
+    """cosh(sqrt(z)) for any real z (the cosine where z < 0), analytic at z = 0; never infinite."""
     large = z > _SERIES_BELOW
-    root = jnp.sqrt(jnp.where(large, z, 1.0))
+    root = _within_range(jnp.sqrt(jnp.where(large, z, 1.0)))
     return jnp.where(large, jnp.cosh(root), cos_sqrt(jnp.where(large, 0.0, -z)))
 
 
 def sinhc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """sinh(sqrt(z)) / sqrt(z) for any real z, analytic at z = 0."""
+    """sinh(sqrt(z)) / sqrt(z) for any real z, analytic at z = 0; never infinite."""
     large = z > _SERIES_BELOW
-    root = jnp.sqrt(jnp.where(large, z, 1.0))
+    root = _within_range(jnp.sqrt(jnp.where(large, z, 1.0)))
     return jnp.where(large, jnp.sinh(root) / root, sinc_sqrt(jnp.where(large, 0.0, -z)))
 
 

@@ -300,7 +300,9 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     rf, rj = rf_rj(a, b, c, jnp.sqrt(q))
     xi = jnp.where(other, low * second / base, 1.0)
     eta = jnp.where(other, (p / base) * (q / base), 1.0)
-    moved = (3 * (rf - rc_signed(xi, eta)) - gap * rj) / distance
+    # R_J can be out of range where its factor is nothing.
+    rest = gap * jnp.where(jnp.isfinite(rj), rj, 0.0)
+    moved = (3 * (rf - rc_signed(xi, eta)) - rest) / distance
     moved = jnp.where(_two_zero(a, b, c), jnp.copysign(jnp.inf, p), moved)
     return rf * per, jnp.where(other, moved, rj) * per * per * per
 

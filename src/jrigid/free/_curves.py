@@ -132,7 +132,7 @@ def separatrix(inertia: InertiaLike, *, throw: bool = True) -> Separatrix:
         ValueError: Wrong shape (trace time).
         RuntimeError: Bad value, or a sphere, which has none (run time, any lane).
 
-    Gradients: infinite where two moments are equal, as the truth is.
+    Gradients: infinite in two equal moments, as the truth is.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -149,8 +149,10 @@ def separatrix(inertia: InertiaLike, *, throw: bool = True) -> Separatrix:
     )  # fmt: skip
     i1, i2, i3 = findings.apply((i1, i2, i3), throw)
     i1 = jnp.where(findings.ok, i1, 0.5 * i2)
-    up, across = jnp.sqrt((i2 - i1) * i3), jnp.sqrt((i3 - i2) * i1)
-    omega_up, omega_across = jnp.sqrt((i2 - i1) * i1), jnp.sqrt((i3 - i2) * i3)
+    # Roots of products would have NaN slopes in the third moment where two are equal.
+    low, high = jnp.sqrt(i2 - i1), jnp.sqrt(i3 - i2)
+    up, across = low * jnp.sqrt(i3), high * jnp.sqrt(i1)
+    omega_up, omega_across = low * jnp.sqrt(i1), high * jnp.sqrt(i3)
     return nan_where(
         ~findings.ok,
         Separatrix(

@@ -34,14 +34,15 @@ from jrigid._numerics import cos_sqrt, materialize, power_of_two, sinc_sqrt
 from jrigid._types import Quaternion, Scalar, Vector
 from jrigid.rotation import multiply, rotate_inverse
 
-_DOUBLINGS = 10
-_MEANS = 10  # arithmetic-geometric means: quadratic convergence, from a ratio of 1e-30
+_DOUBLINGS = 11
+_MEANS = 11  # arithmetic-geometric means: quadratic convergence, from a ratio of 1e-60
 # Half-periods are taken off beyond this phase; a quarter period is pi/2 of phase or more.
 _SHORT_PHASE = 0.7
-# On the separatrix to this fraction the half-period is out of reach, and beyond this phase the
-# momentum is at the axis to all digits.
-_ON_SEPARATRIX = {8: 1e-60, 4: 1e-28}
-_LONGEST_PHASE = {8: 40.0, 4: 17.0}
+# Nearer to the separatrix than this fraction the half-period is out of reach, and beyond this phase
+# the momentum is taken to stay: a start within 1e-60 (float32: 1e-18) of the unstable axis, whose
+# departure would begin only then.
+_ON_SEPARATRIX = {8: 1e-120, 4: 1e-36}
+_LONGEST_PHASE = {8: 80.0, 4: 24.0}
 
 Components = tuple[Array, ...]
 
@@ -117,7 +118,7 @@ def _twice(kap: Array, u: Array, v: Array, at_half: Components) -> Components:
         * s_twice
         / (cq_twice * cq_twice + v * s_twice * s_twice + kap * s2 * cp_twice * cq_twice)
     )
-    return s_twice, cp_twice, cq_twice, 2 * w + g * _arctanc(kap * u * v * g * g)
+    return s_twice, cp_twice, cq_twice, 2 * w + g * _arctanc(kap * (u * g) * (v * g))
 
 
 @_with_columns

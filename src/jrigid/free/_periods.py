@@ -134,7 +134,7 @@ def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tr
         throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Angle [rad], not reduced.
+        Angle [rad], not reduced; 0 where the period is infinite and nothing is circled.
 
     Raises:
         ValueError: Wrong shape (trace time).
@@ -174,7 +174,8 @@ def parameter(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) ->
         ValueError: Wrong shape (trace time).
         RuntimeError: Bad value (run time, any lane).
 
-    Gradients: right where the body is not a sphere and not at rest; there zero.
+    Gradients: right where no two moments are equal; where two are, m has a kink at 0 and the slope
+    of one side is given; zero for a sphere and at rest.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -189,7 +190,7 @@ def _parameter(motion: Motion) -> Scalar:
     al, be = motion.al, motion.be
     l1, l2, _ = motion.momentum
     p = al * ((al + be) * l1 * l1 + be * l2 * l2)
-    q = motion.kap + motion.v
+    q = p + (motion.u + motion.v)  # not kap + v: never below p
     return jnp.where(q > 0, p / jnp.where(q > 0, q, 1.0), 0.0)
 
 
@@ -208,7 +209,7 @@ def modulus(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> S
         ValueError: Wrong shape (trace time).
         RuntimeError: Bad value (run time, any lane).
 
-    Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth there.
+    Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth at a stable spin.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr

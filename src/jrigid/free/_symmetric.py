@@ -37,7 +37,9 @@ def _symmetric(inertia: Any, omega: Any, throw: bool) -> tuple[Findings, Array, 
     findings, (inertia, omega) = checked(inertia, omega, throw)
     tensor = inertia if inertia.ndim == 2 else jnp.diag(inertia)
     rest = jnp.stack([tensor[0, 0] - tensor[1, 1], tensor[0, 1], tensor[0, 2], tensor[1, 2]])
-    tolerance = jnp.sqrt(jnp.finfo(tensor.dtype).eps) * jnp.max(jnp.abs(tensor))
+    eps = jnp.finfo(tensor.dtype).eps
+    tolerance = jnp.sqrt(eps) * jnp.abs(tensor[2, 2] - tensor[0, 0])
+    tolerance = tolerance + 16 * eps * jnp.max(jnp.abs(tensor))
     findings.require(
         jnp.all(jnp.abs(jax.lax.stop_gradient(rest)) <= tolerance),
         RESULTS.invalid_inertia,
@@ -117,7 +119,8 @@ def cone_angles(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) 
         ValueError: Wrong shape (trace time).
         RuntimeError: Bad value, or a body not symmetric about axis 3 (run time, any lane).
 
-    Gradients: finite; where the angles are zero they have a kink and the gradient is zero.
+    Gradients: finite; right where no angle is zero and omega3 is not. At zero wobble, where the
+    angles have a kink, zero.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
