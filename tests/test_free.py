@@ -136,8 +136,8 @@ OF_THE_SCALE = {"rest", "tensor", "omega x 1e-160", "omega x 1e-7", "omega x 1e4
 DERIVATIVE_REGIMES = [r for r in REGIMES if r not in OF_THE_SCALE and not r.startswith("unphys")]
 
 
-# Classic test problems that no real body has, in units of the middle moment.
-UNPHYSICAL = np.array([[0.25, 1.0, 1.5], [0.6, 1.0, 1.8], [0.1, 1.0, 3.0], [1.0, 0.2, 1.9]])
+# Moments that no real body has, in units of the middle one, as in classic test problems.
+UNPHYSICAL = np.array([[0.25, 1.0, 1.5], [0.6, 1.0, 1.8], [0.5, 1.0, 2.4], [1.0, 0.2, 1.9]])
 
 
 def of_unit_rate(per_regime):

@@ -424,7 +424,7 @@ def test_jit_and_vmap_equal_a_plain_call_and_a_loop(name, derivatives):
     scale = max(1.0, np.max(np.abs(eager)))
     np.testing.assert_allclose(found["value"], eager, rtol=0, atol=ulps(float, 32) * scale)
     other = flat * (1 + 0.03 * np.sin(np.arange(flat.size)))
-    lanes = jax.jit(jax.vmap(outputs))(np.stack([flat, other, flat]))
+    lanes = quick_jit(jax.vmap(outputs))(np.stack([flat, other, flat]))
     loop = np.stack([eager, np.asarray(outputs(jnp.asarray(other))), eager])
     np.testing.assert_allclose(lanes, loop, rtol=0, atol=ulps(float, 64) * scale)
 
