@@ -13,10 +13,10 @@ import sys
 import time
 
 import common
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import peers
 import scipy.special
 
 import jrigid as jr
@@ -41,6 +41,7 @@ def final(x, t):
 
 
 INPUTS = np.concatenate([np.tile(MOMENTS, (BODIES, 1)), OMEGAS], axis=1)
+STARTS = np.concatenate([np.tile(ATTITUDE, (BODIES, 1)), OMEGAS], axis=1)
 
 
 def loss(x, t):
@@ -62,67 +63,17 @@ def error(states):
     return worst
 
 
-def field(_t, y, _args):
-    w, x, y_, z, a, b, c = y
+def rates(w, x, y, z, a, b, c):
     i1, i2, i3 = MOMENTS
-    return jnp.stack(
-        [
-            0.5 * (-x * a - y_ * b - z * c),
-            0.5 * (w * a + y_ * c - z * b),
-            0.5 * (w * b + z * a - x * c),
-            0.5 * (w * c + x * b - y_ * a),
-            (i2 - i3) / i1 * b * c,
-            (i3 - i1) / i2 * c * a,
-            (i1 - i2) / i3 * a * b,
-        ]
-    )
-
-
-def by_diffrax(x):
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, END, 0.01,
-        jnp.concatenate([ATTITUDE, x[3:]]), max_steps=100_000,
-        stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9),
-    )  # fmt: skip
-    return jnp.asarray(solution.ys)[0]
-
-
-def by_heyoka(tolerance):
-    """The compiled integrator, as a function without arguments; None where heyoka is missing."""
-    try:
-        import heyoka as hy  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None, None
-    w, x, y, z, a, b, c = hy.make_vars("w", "x", "y", "z", "a", "b", "c")
-    i1, i2, i3 = MOMENTS
-    rates = [
-        (w, 0.5 * (-x * a - y * b - z * c)),
-        (x, 0.5 * (w * a + y * c - z * b)),
-        (y, 0.5 * (w * b + z * a - x * c)),
-        (z, 0.5 * (w * c + x * b - y * a)),
-        (a, (i2 - i3) / i1 * b * c),
-        (b, (i3 - i1) / i2 * c * a),
-        (c, (i1 - i2) / i3 * a * b),
+    return [
+        0.5 * (-x * a - y * b - z * c),
+        0.5 * (w * a + y * c - z * b),
+        0.5 * (w * b + z * a - x * c),
+        0.5 * (w * c + x * b - y * a),
+        (i2 - i3) / i1 * b * c,
+        (i3 - i1) / i2 * c * a,
+        (i1 - i2) / i3 * a * b,
     ]
-    width = hy.recommended_simd_size()
-    start = time.perf_counter()
-    integrator = hy.taylor_adaptive_batch(rates, np.zeros((7, width)), tol=tolerance)
-    compile_ms = (time.perf_counter() - start) * 1e3
-
-    def run():
-        states = np.empty((BODIES, 7))
-        for first in range(0, BODIES, width):
-            rows = slice(first, first + width)
-            count = len(OMEGAS[rows])
-            integrator.set_time(0.0)
-            integrator.state[:] = 0.0
-            integrator.state[0] = 1.0
-            integrator.state[4:, :count] = OMEGAS[rows].T
-            integrator.propagate_until(END)
-            states[rows] = integrator.state[:, :count].T
-        return states
-
-    return run, compile_ms
 
 
 def main(write: bool) -> None:
@@ -139,7 +90,7 @@ def main(write: bool) -> None:
     add("reverse gradient", jax.grad(loss), INPUTS, END)
     add("Hessian-vector product", hessian_vector, INPUTS, END)
     for tolerance in (1e-9, 1e-15):
-        run, ms = by_heyoka(tolerance)
+        run, ms = peers.by_heyoka(rates, STARTS, END, tolerance)
         if run is not None:
             name = f"heyoka, one thread, tolerance {tolerance:g}"
             cases[name], compile_ms[name] = run, ms
@@ -151,9 +102,9 @@ def main(write: bool) -> None:
             [f"10,000 bodies: {name}", compile_ms[name], least, median, least / value, worst]
         )
 
-    program, ms = common.compiled(jax.vmap(by_diffrax), INPUTS)
+    program, ms = common.compiled(jax.vmap(lambda x: peers.by_diffrax(rates, x, END)), STARTS)
     start = time.perf_counter()
-    answer = jax.block_until_ready(program(INPUTS))
+    answer = jax.block_until_ready(program(STARTS))
     once = (time.perf_counter() - start) * 1e3
     name = "10,000 bodies: hand-written diffrax, Dopri8, 1e-9, vmapped (one run)"
     rows.append([name, ms, once, once, once / value, error(answer)])

@@ -6,11 +6,13 @@ from jrigid import datasets as datasets
 from jrigid import dynamics as dynamics
 from jrigid import elliptic as elliptic
 from jrigid import free as free
+from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
 from jrigid import rotation as rotation
 from jrigid import solids as solids
 from jrigid import solvers as solvers
 from jrigid import systems as systems
+from jrigid import top as top
 from jrigid import torques as torques
 from jrigid._checks import RESULTS as RESULTS
 from jrigid._simulate import simulate as simulate
@@ -34,5 +36,7 @@ from jrigid.mass import to_center_of_mass as to_center_of_mass
 from jrigid.systems import FloatingBody as FloatingBody
 from jrigid.systems import FloatingState as FloatingState
 from jrigid.systems import RigidBody as RigidBody
+from jrigid.top import SymmetricTop as SymmetricTop
+from jrigid.top import top_motion as top_motion
 
 __version__ = _version("jrigid")

@@ -22,15 +22,21 @@ formulas (addition theorems with equal arguments) do the rest, after whole half-
 momentum have been taken off.
 """
 
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jrigid._numerics import cos_sqrt, materialize, power_of_two, sinc_sqrt
+from jrigid._numerics import (
+    Components,
+    arctanc_sqrt,
+    cos_sqrt,
+    materialize,
+    power_of_two,
+    sinc_sqrt,
+    with_columns,
+)
 from jrigid._types import Quaternion, Scalar, Vector
 from jrigid.rotation import multiply, rotate_inverse
 
@@ -43,44 +49,6 @@ _SHORT_PHASE = 0.7
 # departure would begin only then.
 _ON_SEPARATRIX = {8: 1e-120, 4: 1e-36}
 _LONGEST_PHASE = {8: 80.0, 4: 24.0}
-
-Components = tuple[Array, ...]
-
-
-def _with_columns(function: Callable[..., Components]) -> Callable[..., Components]:
-    """Give a function of scalars a derivative rule that computes its Jacobian with its value.
-
-    Reverse mode then transposes a small matrix, not the loops in `function`. The rule is plain
-    code, which every mode differentiates again.
-    """
-
-    @jax.custom_jvp
-    @functools.wraps(function)
-    def wrapped(*arguments: Array) -> Components:
-        return function(*arguments)
-
-    @wrapped.defjvp
-    def rule(arguments: Components, changes: Components) -> tuple[Components, Components]:
-        columns = jnp.eye(len(arguments), dtype=arguments[0].dtype)
-        values, jacobian = jax.vmap(
-            lambda column: jax.jvp(function, arguments, tuple(column)), out_axes=(None, 0)
-        )(columns)
-        weights = jnp.stack(changes)
-        return values, tuple(jnp.sum(row * weights) for row in jacobian)
-
-    return wrapped
-
-
-def _arctanc(z: Array) -> Array:
-    """arctan(sqrt z) / sqrt z: the angle is halved three times, then a series."""
-    factor = jnp.ones_like(z)
-    for _ in range(3):
-        below = 1 + jnp.sqrt(1 + z)
-        factor, z = factor * (2 / below), z / (below * below)
-    total = jnp.full_like(z, -1 / 23)
-    for k in range(10, -1, -1):
-        total = (-1) ** k / (2 * k + 1) + z * total
-    return factor * total
 
 
 def _short_time(kap: Array, p: Array, q: Array, h: Array) -> Components:
@@ -118,17 +86,17 @@ def _twice(kap: Array, u: Array, v: Array, at_half: Components) -> Components:
         * s_twice
         / (cq_twice * cq_twice + v * s_twice * s_twice + kap * s2 * cp_twice * cq_twice)
     )
-    return s_twice, cp_twice, cq_twice, 2 * w + g * _arctanc(kap * (u * g) * (v * g))
+    return s_twice, cp_twice, cq_twice, 2 * w + g * arctanc_sqrt(kap * (u * g) * (v * g))
 
 
-@_with_columns
+@with_columns
 def scaled_jacobi(kap: Array, u: Array, v: Array, t: Array) -> Components:
     """Functions s, cP, cQ and w of kap, u, v >= 0 and a time of at most a quarter period."""
     start = _short_time(kap, kap - u, kap + v, t * 2.0**-_DOUBLINGS)
     return jax.lax.fori_loop(0, _DOUBLINGS, lambda _, x: _twice(kap, u, v, x), start)
 
 
-@_with_columns
+@with_columns
 def quarter_period(kap: Array, u: Array, v: Array) -> Components:
     """Time K / lam in which s grows to its maximum, and w there; v > 0.
 

@@ -1,0 +1,396 @@
+"""Mechanics from any Lagrangian: accelerations, canonical momenta, energy, cyclic coordinates.
+
+A Lagrangian is a pure function `L(q, q_dot, *params) -> scalar` of n generalised coordinates,
+their rates and whatever parameters it needs (numbers, arrays, any pytree). Time is no argument:
+along a motion the parameters are constants.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Real
+
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    float_arrays,
+    nan_where,
+)
+from jrigid._numerics import power_of_two, product
+from jrigid._types import Scalar
+
+Lagrangian: TypeAlias = Callable[..., Any]
+Coordinates: TypeAlias = Float[Array, " n"]
+CoordinatesLike: TypeAlias = Real[ArrayLike, " n"]
+
+_SCALING_SWEEPS = 5  # each takes the square root of what is left of a ratio of 1e16
+_PROBES = 4
+_ROUNDING_ERRORS = 64
+
+
+def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
+    q, q_dot = float_arrays(q, q_dot)
+    check_shape("q", q, (None,))
+    check_shape("q_dot", q_dot, q.shape)
+    return q, q_dot
+
+
+def _bind(
+    lagrangian: Lagrangian, params: tuple[Any, ...], dtype: Any
+) -> Callable[[Array, Array], Array]:
+    """The Lagrangian of coordinates and rates alone, known to be a real scalar."""
+
+    def bound(q: Array, q_dot: Array) -> Array:
+        value = jnp.asarray(lagrangian(q, q_dot, *params))
+        if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+            raise ValueError(
+                "Argument `lagrangian` must return a real scalar, but it returns an array of "
+                f"shape {value.shape} and dtype {value.dtype}."
+            )
+        return value.astype(dtype)
+
+    return bound
+
+
+def _equations(
+    lagrangian: Callable[[Array, Array], Array], q: Array, q_dot: Array
+) -> tuple[Array, Array]:
+    """Mass matrix M and generalised force f of M q'' = f."""
+    momenta = jax.grad(lagrangian, argnums=1)
+
+    def rate_of_momenta(dq: Array, dq_dot: Array) -> Array:
+        return jax.jvp(momenta, (q, q_dot), (dq, dq_dot))[1]
+
+    none = jnp.zeros_like(q)
+    mass = jax.vmap(rate_of_momenta, (None, 0))(none, jnp.eye(q.size, dtype=q.dtype))
+    force = jax.grad(lagrangian)(q, q_dot) - rate_of_momenta(q_dot, none)
+    return 0.5 * (mass + mass.T), force
+
+
+def _scales(mass: Array) -> Array:
+    """Powers of two s, such that the rows of s_i M_ij s_j are all of order one.
+
+    The diagonal is enough for a definite matrix; Ruiz's iteration (RAL-TR-2001-034) is for one
+    with zeros on its diagonal.
+    """
+    mass = jnp.abs(mass)
+    diagonal = jnp.diagonal(mass)
+    scales = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    for _ in range(_SCALING_SWEEPS):
+        rows = jnp.max(scales[:, None] * mass * scales[None, :], axis=1)
+        scales = scales / jnp.sqrt(jnp.where(rows > 0, rows, 1.0))
+    return power_of_two(scales)
+
+
+def _norm(matrix: Array) -> Array:
+    return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
+
+
+@jax.jit  # for eager callers: one compilation for each n, not fifty
+def _solve(mass: Array, force: Array) -> tuple[Array, Bool[Array, ""]]:
+    """M^-1 f and whether M is regular; NaN, and derivatives zero, where it is not.
+
+    LU, since a mass matrix is symmetric but need not be definite. `custom_linear_solve` takes the
+    derivatives, because those of `lineax.linear_solve` bring run-time errors of their own: one
+    bad lane would stop all, and every step of an integration would call the host.
+    """
+    size, solver = force.size, lx.LU()
+    scales = jax.lax.stop_gradient(_scales(mass))
+    mass, force = scales[:, None] * mass * scales[None, :], scales * force
+    identity = jnp.eye(size, dtype=mass.dtype)
+
+    def operator(matrix: Array) -> lx.MatrixLinearOperator:
+        return lx.MatrixLinearOperator(jax.lax.stop_gradient(matrix), lx.symmetric_tag)
+
+    factors = solver.init(operator(mass), {})
+
+    def solution(vector: Array) -> Array:
+        return lx.linear_solve(operator(mass), vector, solver, state=factors, throw=False).value
+
+    inverse = jax.vmap(solution)(identity)
+    threshold = 16 * size * float(jnp.finfo(mass.dtype).eps)
+    # 1 >= threshold * condition number, false for inf and NaN
+    regular = threshold * _norm(jax.lax.stop_gradient(mass)) * _norm(inverse) <= 1
+    regular = regular & all_finite(force)
+    mass, force = jnp.where(regular, mass, identity), jnp.where(regular, force, 0.0)
+    result = jax.lax.custom_linear_solve(
+        lambda vector: product("ij,j->i", mass, vector),
+        force,
+        lambda _, vector: solution(vector),
+        symmetric=True,
+    )
+    return nan_where(~regular, scales * result), regular
+
+
+def acceleration(
+    lagrangian: Lagrangian,
+    q: CoordinatesLike,
+    q_dot: CoordinatesLike,
+    *params: Any,
+    throw: bool = True,
+) -> Coordinates:
+    r"""Accelerations q'' of the motion that a Lagrangian makes stationary.
+
+    Solves $M q'' = \partial L/\partial q - (\partial^2 L/\partial\dot q\,\partial q)\,\dot q$
+    with the mass matrix $M = \partial^2 L/\partial\dot q^2$, which need not be positive definite.
+    M counts as singular when, in units that bring its rows to order one, its reciprocal condition
+    number (row-sum norm) is below 16 n rounding errors: the answer would have no correct digit.
+
+    Args:
+        lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
+        q: Generalised coordinates [coordinate units].
+        q_dot: Their rates [coordinate units/s].
+        params: Further arguments of the Lagrangian, constants of the motion. A time among them is
+            right where the momenta do not depend on it, as in a driven potential; with a moving
+            support write L without the total time derivative, as a force of inertia.
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        q'' [coordinate units/s^2], in the dtype of `q` and `q_dot`.
+
+    Raises:
+        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time).
+        RuntimeError: Coordinates or derivatives of L that are not finite, or a mass matrix that
+            is singular, as that of Euler angles is at theta = 0 (run time, any lane).
+
+    Gradients: those of the solution, of any order that L has; zero where `throw=False` gives NaN.
+    Source: Goldstein, Classical Mechanics, 3rd ed., eq. 1.57.
+
+    >>> import jax.numpy as jnp
+    >>> from jrigid import lagrangian
+    >>> def pendulum(q, q_dot, g, length):
+    ...     return 0.5 * length**2 * q_dot[0] ** 2 + g * length * jnp.cos(q[0])
+    >>> q, q_dot = jnp.array([jnp.pi / 6]), jnp.array([0.3])
+    >>> print(lagrangian.acceleration(pendulum, q, q_dot, 9.81, 2.0))
+    [-2.4525]
+    """
+    q, q_dot = _coordinates(q, q_dot)
+    mass, force = _equations(_bind(lagrangian, params, q.dtype), q, q_dot)
+    result, regular = _solve(mass, force)
+    findings = Findings()
+    findings.require(
+        all_finite((q, q_dot)),
+        RESULTS.invalid_state,
+        "Arguments `q` and `q_dot` must be finite, but a component is not.",
+    )
+    findings.require(
+        all_finite((mass, force)),
+        RESULTS.invalid_state,
+        "Argument `lagrangian` must have finite first and second derivatives at this `q` and "
+        "`q_dot`, but one is NaN or infinite there.",
+    )
+    findings.require(
+        regular,
+        RESULTS.invalid_state,
+        "Argument `lagrangian` must determine the accelerations, but its mass matrix "
+        "d2L/dq_dot2 is singular at this `q`, as that of Euler angles is at theta = 0: use other "
+        "coordinates there (`jrigid.RigidBody` turns without any).",
+    )
+    findings.require(
+        all_finite(result),
+        RESULTS.nonfinite_state,
+        "The accelerations are out of the range of floating point numbers at this `q`.",
+    )
+    return findings.apply(nan_where(~findings.ok, result), throw)
+
+
+def vector_field(lagrangian: Lagrangian) -> Callable[..., tuple[Coordinates, Coordinates]]:
+    """Vector field of the motion for diffrax: `(t, (q, q_dot), args) -> (q_dot, q'')`.
+
+    Nothing is checked at run time. Where the mass matrix is singular, judged as in
+    `acceleration`, q'' is NaN, never infinite or a large wrong number: an adaptive solve that
+    meets it rejects its steps and ends with an error at `max_steps`, one of constant steps goes on
+    with NaN. Steps may jump over an isolated point such as theta = 0 and not see it.
+
+    Args:
+        lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
+
+    Returns:
+        A function of the time, which is not passed on; the pair (q, q_dot) [coordinate units,
+        coordinate units/s]; and `args`, the tuple of the Lagrangian's parameters, None for none.
+        It gives the pair of rates.
+
+    Raises:
+        ValueError: By that function: wrong shape, `args` is not a tuple, or the Lagrangian is not
+            a real scalar (trace time).
+
+    Gradients: as of `acceleration`.
+
+    >>> import diffrax, jax.numpy as jnp
+    >>> from jrigid import lagrangian
+    >>> def oscillator(q, q_dot, stiffness):
+    ...     return 0.5 * jnp.sum(q_dot**2) - 0.5 * stiffness * jnp.sum(q**2)
+    >>> solution = diffrax.diffeqsolve(
+    ...     diffrax.ODETerm(lagrangian.vector_field(oscillator)),
+    ...     diffrax.Tsit5(),
+    ...     t0=0.0,
+    ...     t1=jnp.pi,
+    ...     dt0=None,
+    ...     y0=(jnp.array([1.0]), jnp.array([0.0])),
+    ...     args=(4.0,),
+    ...     stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+    ... )
+    >>> q, q_dot = solution.ys
+    >>> print(q[-1].round(6))
+    [1.]
+    """
+
+    def field(t: Any, y: Any, args: Any) -> tuple[Array, Array]:  # noqa: ARG001
+        if args is not None and type(args) not in (tuple, list):
+            raise ValueError(
+                "Argument `args` must be a tuple of the Lagrangian's parameters or None, but it "
+                f"is a {type(args).__name__}: write `(args,)`."
+            )
+        q, q_dot = _coordinates(*y)
+        result, _ = _solve(*_equations(_bind(lagrangian, tuple(args or ()), q.dtype), q, q_dot))
+        return q_dot, nan_where(~all_finite(result), result)
+
+    return field
+
+
+def momenta(
+    lagrangian: Lagrangian, q: CoordinatesLike, q_dot: CoordinatesLike, *params: Any
+) -> Coordinates:
+    r"""Canonical momenta $p = \partial L / \partial \dot q$.
+
+    Those of cyclic coordinates are constants of the motion: see `cyclic_coordinates`.
+
+    Args:
+        lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
+        q: Generalised coordinates [coordinate units].
+        q_dot: Their rates [coordinate units/s].
+        params: Further arguments of the Lagrangian.
+
+    Returns:
+        p [J s/coordinate unit].
+
+    Raises:
+        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
+            not checked.
+
+    Gradients: those of L.
+    Source: Goldstein, Classical Mechanics, 3rd ed., eq. 2.44.
+
+    >>> import jax.numpy as jnp
+    >>> from jrigid import lagrangian
+    >>> def charge(q, q_dot, field):  # of unit mass and charge, symmetric gauge
+    ...     return 0.5 * jnp.sum(q_dot**2) + 0.5 * field * (q[0] * q_dot[1] - q[1] * q_dot[0])
+    >>> print(lagrangian.momenta(charge, jnp.array([1.0, 2.0]), jnp.zeros(2), 3.0))
+    [-3.   1.5]
+    """
+    q, q_dot = _coordinates(q, q_dot)
+    return jax.grad(_bind(lagrangian, params, q.dtype), argnums=1)(q, q_dot)
+
+
+def energy(
+    lagrangian: Lagrangian, q: CoordinatesLike, q_dot: CoordinatesLike, *params: Any
+) -> Scalar:
+    """Energy function q_dot . p - L, constant along a motion of constant parameters.
+
+    It is the kinetic plus the potential energy where the kinetic energy is quadratic in q_dot;
+    terms linear in q_dot, as of a magnetic field, drop out.
+
+    Args:
+        lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
+        q: Generalised coordinates [coordinate units].
+        q_dot: Their rates [coordinate units/s].
+        params: Further arguments of the Lagrangian.
+
+    Returns:
+        Energy, in the unit of L [J].
+
+    Raises:
+        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
+            not checked.
+
+    Gradients: those of L.
+    Source: Goldstein, Classical Mechanics, 3rd ed., eq. 2.53.
+
+    >>> import jax.numpy as jnp
+    >>> from jrigid import lagrangian
+    >>> def oscillator(q, q_dot, stiffness):
+    ...     return 0.5 * jnp.sum(q_dot**2) - 0.5 * stiffness * jnp.sum(q**2)
+    >>> print(lagrangian.energy(oscillator, jnp.array([1.0]), jnp.array([2.0]), 4.0))
+    4.0
+    """
+    q, q_dot = _coordinates(q, q_dot)
+    bound = _bind(lagrangian, params, q.dtype)
+    value, slope = jax.value_and_grad(bound, argnums=1)(q, q_dot)
+    return product("i,i->", q_dot, slope) - value
+
+
+def cyclic_coordinates(
+    lagrangian: Lagrangian,
+    q: CoordinatesLike,
+    q_dot: CoordinatesLike,
+    *params: Any,
+    reach: Real[ArrayLike, ""] | CoordinatesLike | None = None,
+) -> Bool[Array, " n"]:
+    """Which coordinates the Lagrangian does not depend on: their momenta are conserved.
+
+    A numerical verdict: dL/dq_i must vanish, to 64 rounding errors of the largest of the terms
+    p_j q_dot_j and reach_j dL/dq_j, at four fixed generic points about `q`, each at rest and in
+    motion. So an angle that drops out of L only because cos^2 + sin^2 = 1 is found to be cyclic.
+    A term of L that is switched off about `q`, or so weak that it is lost in rounding, is not
+    seen; a point where L is not finite makes every coordinate count as not cyclic; and only the
+    given coordinates are asked, not their combinations (of two coupled bodies neither position is
+    cyclic).
+
+    Args:
+        lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
+        q: Generalised coordinates where L is defined [coordinate units].
+        q_dot: Their rates, of typical size [coordinate units/s]; all zero stands for 1.
+        params: Further arguments of the Lagrangian.
+        reach: How far the points lie from `q`, at most [coordinate units], one number or one a
+            coordinate. By default (1 + |q_i|) / 4, which suits angles.
+
+    Returns:
+        True for a cyclic coordinate. `jnp.where(cyclic, p, 0)` with p of `momenta` are then
+        constants of the motion.
+
+    Raises:
+        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
+            not checked: with NaN no coordinate is cyclic.
+
+    Gradients: none, the answer is boolean.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 2.6.
+
+    >>> import jax.numpy as jnp
+    >>> from jrigid import lagrangian
+    >>> def kepler(q, q_dot, mu):
+    ...     (r, _), (r_dot, angle_dot) = q, q_dot
+    ...     return 0.5 * (r_dot**2 + (r * angle_dot) ** 2) + mu / r
+    >>> print(lagrangian.cyclic_coordinates(kepler, jnp.array([1.0, 0]), jnp.array([0, 1.0]), 1.0))
+    [False  True]
+    """
+    q, q_dot = _coordinates(q, q_dot)
+    slopes = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=(0, 1))
+    if reach is None:
+        spread = 0.25 * (1 + jnp.abs(q))
+    else:
+        spread = float_arrays(reach)[0].astype(q.dtype)
+        if spread.shape != ():
+            check_shape("reach", spread, q.shape)
+        spread = jnp.broadcast_to(spread, q.shape)
+    fastest = jnp.max(jnp.abs(q_dot))
+    speed = jnp.where(fastest == 0, 1.0, fastest)
+    tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
+
+    def flat(q: Array, q_dot: Array) -> Array:
+        value, (slope, momentum) = slopes(q, q_dot)
+        # As changes of L over the reach, which coordinates of any unit have in common
+        change = jnp.abs(slope) * spread
+        largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
+        return (change <= tolerance * largest) & jnp.isfinite(value)
+
+    steps = np.random.default_rng(0).uniform(-1, 1, (2, _PROBES, q.size))
+    places, rates = jnp.asarray(steps, q.dtype)
+    places, rates = q[None, :] + places * spread[None, :], q_dot[None, :] + rates * speed
+    moving, resting = jax.vmap(flat)(places, rates), jax.vmap(flat)(places, jnp.zeros_like(rates))
+    return jnp.all(moving & resting, axis=0)

@@ -1,0 +1,252 @@
+"""The symmetric top in Euler angles: Lagrangian, momenta, and the motion reduced to the tilt."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
+
+from jrigid._checks import check_shape, nan_where
+from jrigid._numerics import product
+from jrigid._types import Scalar, ScalarLike
+from jrigid.dynamics import State
+from jrigid.rotation import rotate_inverse
+from jrigid.top._top import SymmetricTop, as_arrays, checked
+
+
+class Conserved(NamedTuple):
+    """What a symmetric top's motion keeps.
+
+    Attributes:
+        p_phi: Angular momentum about the vertical [kg m^2/s].
+        p_psi: Angular momentum about the axis, I3 omega3 [kg m^2/s].
+        energy: Kinetic and potential, the latter zero with the axis level [J].
+    """
+
+    p_phi: Scalar
+    p_psi: Scalar
+    energy: Scalar
+
+
+class AngleRates(NamedTuple):
+    """Rates of the Euler angles that turn about the vertical and about the axis [rad/s]."""
+
+    phi: Scalar
+    psi: Scalar
+
+
+def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> Scalar:
+    """Kinetic less potential energy in z-x-z Euler angles, for `jrigid.lagrangian`.
+
+    Args:
+        q: Angles (phi, theta, psi) [rad].
+        q_dot: Their rates [rad/s].
+        top: The top.
+
+    Returns:
+        The Lagrangian [J].
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: analytic; the mass matrix is singular at theta = 0 and pi.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    >>> q, q_dot = jnp.array([0.0, jnp.pi / 3, 0.0]), jnp.array([0.0, 1.0, 2.0])
+    >>> print(jr.top.lagrangian(q, q_dot, top).round(6))
+    0.5
+    """
+    i1, i3, mgl, q, q_dot = as_arrays(top, q, q_dot)
+    check_shape("q", q, (3,))
+    check_shape("q_dot", q_dot, (3,))
+    _, theta, _ = q
+    phi_dot, theta_dot, psi_dot = q_dot
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    spin = psi_dot + phi_dot * cos
+    across = theta_dot * theta_dot + (phi_dot * sin) ** 2
+    return 0.5 * (i1 * across + i3 * spin * spin) - mgl * cos
+
+
+def conserved(top: SymmetricTop, state: State, *, throw: bool = True) -> Conserved:
+    """Angular momenta about the vertical and the axis, and the energy.
+
+    Args:
+        top: The top.
+        state: Any state of the motion.
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        The three constants of the motion.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: Bad value (run time, any lane).
+
+    Gradients: analytic.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    >>> state = jr.top.initial_state(top, jnp.pi / 3, psi_dot=4.0)
+    >>> print(*(x.round(6) for x in jr.top.conserved(top, state)))
+    1.0 2.0 5.0
+    """
+    findings, top, state = checked(top, state, throw)
+    moments = jnp.stack([top.I1, top.I1, top.I3])
+    up = rotate_inverse(state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype))
+    momentum = moments * state.omega
+    energy = 0.5 * product("i,i->", momentum, state.omega) + top.mgl * up[2]
+    found = Conserved(product("i,i->", momentum, up), momentum[2], energy)
+    return nan_where(~findings.ok, found)
+
+
+def _half_angle_momenta(
+    theta: Array, p_phi: Array, p_psi: Array
+) -> tuple[Array, Array, Array, Array]:
+    """(p_phi - p_psi) / 2 sin^2 and (p_phi + p_psi) / 2 cos^2 of half the tilt, and sin, cos of it.
+
+    0 / 0, an axis that may stand upright (upside down), is 0.
+    """
+    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+
+    def quotient(momentum: Array, side: Array) -> Array:
+        zero = momentum == 0
+        return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side * side))
+
+    return quotient(p_phi - p_psi, sin), quotient(p_phi + p_psi, cos), sin, cos
+
+
+def angle_rates(
+    top: SymmetricTop, theta: ScalarLike, p_phi: ScalarLike, p_psi: ScalarLike
+) -> AngleRates:
+    """Precession phi' and spin psi' of a top at a tilt.
+
+    Args:
+        top: The top.
+        theta: Tilt of the axis from the vertical [rad].
+        p_phi: Angular momentum about the vertical [kg m^2/s].
+        p_psi: Angular momentum about the axis [kg m^2/s].
+
+    Returns:
+        phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi' cos theta
+        [rad/s]. Infinite at the vertical, unless the momenta let the axis pass: then the mean of
+        the two sides.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite inside 0 < theta < pi; at p_phi = +-p_psi without the singular part.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> rates = jr.top.angle_rates(jr.SymmetricTop(1.0, 0.5, 2.0), jnp.pi / 2, 3.0, 1.0)
+    >>> print(rates.phi.round(6), rates.psi.round(6))
+    3.0 2.0
+    """
+    i1, i3, _, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
+    upper, lower, _, _ = _half_angle_momenta(theta, p_phi, p_psi)
+    phi = 0.5 * (upper + lower) / i1
+    # phi' cos theta, of the two parts of which only the difference is large at the vertical
+    return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
+
+
+def effective_potential(
+    theta: ScalarLike, top: SymmetricTop, p_phi: ScalarLike, p_psi: ScalarLike
+) -> Scalar:
+    """Potential of the tilt alone: I1 theta'^2 / 2 + V(theta) = E - p_psi^2 / (2 I3).
+
+    Args:
+        theta: Tilt of the axis from the vertical [rad].
+        top: The top.
+        p_phi: Angular momentum about the vertical [kg m^2/s].
+        p_psi: Angular momentum about the axis [kg m^2/s].
+
+    Returns:
+        V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J]; infinite at the
+        vertical unless the momenta let the axis pass.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: finite where V is; in the momenta at an upright p_phi = p_psi without the
+    singular part.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    >>> print(jr.top.effective_potential(jnp.pi / 2, top, 1.0, 3.0).round(6))
+    0.5
+    """
+    i1, _, mgl, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
+    upper, lower, sin, cos = _half_angle_momenta(theta, p_phi, p_psi)
+    across = upper * sin * cos + lower * sin * cos  # (p_phi - p_psi cos theta) / sin theta
+    across = jnp.where(p_phi == p_psi, lower * sin * cos, across)
+    return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
+
+
+def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
+    """Coefficients of the cubic of the reduced motion: u'^2 = f(u), u = cos theta.
+
+    Args:
+        top: The top.
+        conserved: Its momenta and energy.
+
+    Returns:
+        Coefficients of f [1/s^2], the highest power first, as `jnp.polyval` takes them: f = (1 -
+        u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: analytic.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    >>> print(jr.top.cubic(top, jr.top.Conserved(1.0, 2.0, 5.0)))
+    [ 4. -6.  0.  1.]
+    """
+    i1, i3, mgl, p_phi, p_psi, energy = as_arrays(top, *conserved)
+    alpha = (2 * energy - p_psi * p_psi / i3) / i1
+    beta, a, b = 2 * mgl / i1, p_psi / i1, p_phi / i1
+    return jnp.stack([beta, -alpha - a * a, 2 * a * b - beta, alpha - b * b])
+
+
+def reduced_vector_field(
+    top: SymmetricTop, conserved: Conserved
+) -> Callable[[Any, Float[Array, "4"], Any], Float[Array, "4"]]:
+    """The one-dimensional motion of the tilt, with the angles that follow from it, for diffrax.
+
+    Args:
+        top: The top.
+        conserved: Its momenta; the energy is not used.
+
+    Returns:
+        The rates `(t, y, args) -> y'` of y = (phi, theta, psi, theta') [rad, rad/s]: theta'' =
+        -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the vertical.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+
+    Gradients: analytic inside 0 < theta < pi.
+    Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    >>> rates = jr.top.reduced_vector_field(top, jr.top.Conserved(1.0, 2.0, 5.0))
+    >>> print(rates(0.0, jnp.array([0.0, jnp.pi / 2, 0.0, 0.3]), None).round(6))
+    [1.  0.3 4.  0. ]
+    """
+    i1, i3, mgl, p_phi, p_psi, _ = as_arrays(top, *conserved)
+
+    def rates(t: Any, y: Float[Array, "4"], args: Any) -> Float[Array, "4"]:
+        del t, args
+        _, theta, _, theta_dot = y
+        cos, sin = jnp.cos(theta), jnp.sin(theta)
+        across = (p_phi - p_psi * cos) / (i1 * sin)
+        phi_dot = across / sin
+        pull = mgl * sin / i1 - across * (p_psi / i1 - phi_dot * cos)
+        return jnp.stack([phi_dot, theta_dot, p_psi / i3 - phi_dot * cos, pull])
+
+    return rates

@@ -1,0 +1,371 @@
+"""The exact flow of Lagrange's top: values, invariants, derivatives, edges, bad input.
+
+tests/data/top_motion.npz holds Taylor series at 30 digits, top_derivatives.npz variational
+equations in 80-bit arithmetic (tests/data/make_top_motion.py).
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import reference
+from helpers import ATTITUDE, OMEGA, central_difference, quick_jit, ulps
+from scipy.spatial.transform import Rotation
+from taylor_reference import taylor_top
+from top_reference import closed_form
+
+import jrigid as jr
+
+EPS = np.finfo(float).eps
+HERE = Path(__file__).parent / "data"
+RECORD = np.load(HERE / "top_motion.npz")
+SLOPES = np.load(HERE / "top_derivatives.npz")
+REGIMES = list(dict.fromkeys(RECORD["regime"].tolist()))
+
+
+def state_at(parameters, attitude, omega, t):
+    top = jr.SymmetricTop(*parameters)
+    state = jr.top_motion(top, jr.State(attitude, omega), t, throw=False)
+    return jnp.concatenate([state.attitude, state.omega])
+
+
+def jacobian(parameters, attitude, omega, t):
+    return jax.jacfwd(state_at, argnums=(0, 1, 2))(parameters, attitude, omega, t)
+
+
+def rows(regime):
+    chosen = RECORD["regime"] == regime
+    parameters = np.concatenate([RECORD["moments"], RECORD["mgl"][:, None]], axis=1)[chosen]
+    return (parameters, *(RECORD[name][chosen] for name in ("attitude", "omega", "time")))
+
+
+def rates(parameters, omega):
+    """The fastest rate of a top: of its body, its precession, its pendulum."""
+    i1, i3, mgl = parameters.T
+    own = np.concatenate([omega, (i3 / i1 * omega[:, 2])[:, None]], axis=1)
+    rate = np.maximum(np.max(np.abs(own), axis=1), np.sqrt(np.abs(mgl) / i1))
+    return np.where(rate == 0, 1.0, rate)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return {
+        "value": jax.jit(jax.vmap(state_at)),
+        "jacobian": quick_jit(jax.vmap(jacobian)),
+    }
+
+
+def test_the_record_holds_at_least_fifty_cases_a_regime():
+    assert all(np.sum(RECORD["regime"] == regime) >= 50 for regime in REGIMES)
+    assert len(REGIMES) >= 19
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_values_to_the_bar_against_30_digits(regime, compiled):
+    parameters, attitude, omega, time = rows(regime)
+    chosen = RECORD["regime"] == regime
+    exact = np.concatenate([RECORD["attitude_out"], RECORD["omega_out"]], axis=1)[chosen]
+    found = np.asarray(compiled["value"](parameters, attitude, omega, time))  # sign included
+    rate = rates(parameters, omega)[:, None]
+    unit = np.concatenate([np.ones((len(rate), 4)), np.tile(rate, (1, 3))], axis=1)
+    error = np.max(np.abs(found - exact) / unit, axis=1)
+    radians = rate[:, 0] * np.abs(time)
+    bar = 1e-13 * (1 + radians)
+    if regime == "pendulum":  # near its separatrix the motion amplifies the inputs' last bits
+        columns = compiled["jacobian"](parameters, attitude, omega, time)
+        for column, x in zip(columns, (parameters, attitude, omega), strict=True):
+            scaled = np.linalg.norm(np.asarray(column) / unit[:, :, None], axis=1)
+            bar = bar + 8 * EPS * np.linalg.norm(scaled * x, axis=1)
+        assert np.sum(bar < 1e-6) >= 50
+    assert np.all(error <= bar), np.max(error / bar)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_energy_and_momenta_keep_their_values(regime, compiled):
+    parameters, attitude, omega, time = rows(regime)
+    found = np.asarray(compiled["value"](parameters, attitude, omega, time))
+    i1, i3, mgl = parameters.T
+    rate = rates(parameters, omega)
+    size = i1 * rate**2 * np.maximum(1.0, i3 / i1)
+
+    def invariants(q, w):
+        up = Rotation.from_quat(q, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+        momentum = np.stack([i1 * w[:, 0], i1 * w[:, 1], i3 * w[:, 2]], axis=1)
+        energy = 0.5 * np.sum(momentum * w, axis=1) + mgl * up[:, 2]
+        return np.stack([energy / size, np.sum(momentum * up, axis=1) * rate / size])
+
+    change = invariants(found[:, :4], found[:, 4:]) - invariants(attitude, omega)
+    assert np.max(np.abs(change)) <= 2e-14
+    np.testing.assert_array_equal(found[:, 6], omega[:, 2])
+    np.testing.assert_allclose(np.linalg.norm(found[:, :4], axis=1), 1.0, rtol=1e-14)
+
+
+def test_a_million_turns_err_no_more_than_their_phase():
+    """Against the same closed form at 50 digits, itself checked against the Taylor series."""
+    parameters, attitude, omega, _ = rows("generic nutation")
+    time = 2e6 * np.pi / rates(parameters, omega)
+    found = np.asarray(jax.jit(jax.vmap(state_at))(parameters, attitude, omega, time))
+    for k in range(0, 60, 6):
+        q, w = closed_form(*parameters[k], attitude[k], omega[k], time[k])
+        exact = np.array([*q, *w], float)
+        unit = np.where(np.arange(7) < 4, 1.0, rates(parameters[k : k + 1], omega[k : k + 1]))
+        assert np.max(np.abs(found[k] - exact) / unit) < 1e-13 * 2e6 * np.pi
+
+
+@pytest.mark.parametrize("regime", ["generic nutation", "loops", "through upright", "fast spin"])
+def test_the_closed_form_at_50_digits_is_the_taylor_series(regime):
+    parameters, attitude, omega, time = rows(regime)
+    stored = [
+        [[mp.mpf(x) for x in row] for row in RECORD[name][RECORD["regime"] == regime].tolist()]
+        for name in ("attitude_out", "attitude_low", "omega_out", "omega_low")
+    ]
+    for k in range(0, len(time), 6):
+        q, w = closed_form(*parameters[k], attitude[k], omega[k], time[k])
+        with mp.workdps(40):
+            high, low = ([*stored[i][k], *stored[i + 2][k]] for i in (0, 1))
+            assert max(abs(a - b - c) for a, b, c in zip((*q, *w), high, low, strict=True)) < 1e-29
+
+
+def test_without_gravity_it_is_the_free_body():
+    parameters, attitude, omega, time = rows("no gravity")
+    for x, q, w, t in zip(parameters[:8], attitude, omega, time, strict=False):
+        found = state_at(x, q, w, t)
+        free = jr.free_rotation(np.array([x[0], x[0], x[1]]), jr.State(q, w), t)
+        bound = 1e-13 * (1 + np.linalg.norm(w) * abs(t)) * max(1, np.max(np.abs(w)))
+        sign = np.sign(np.sum(found[:4] * free.attitude))
+        np.testing.assert_allclose(sign * found[:4], free.attitude, atol=bound)
+        np.testing.assert_allclose(found[4:], free.omega, atol=bound)
+
+
+@pytest.mark.parametrize("mgl", [1.0, -1.0])
+def test_a_fall_that_begins_very_near_upright_goes_through(mgl):
+    """At any time the motion obeys Euler's equations, and it comes down."""
+    top = jr.SymmetricTop(1.0, 0.5, mgl)
+    tilt = 1e-25
+    attitude = np.array([1.0, 0.5 * tilt, 0, 0]) if mgl > 0 else np.array([0.5 * tilt, 1.0, 0, 0])
+    body = top.as_rigid_body()
+    x = jnp.array([1.0, 0.5, mgl])
+    rate = jax.jit(jax.jacfwd(state_at, argnums=3))
+    growth = np.sqrt(1 - 0.25**2)
+    lowest = 1.0
+    for t in np.linspace(0.93, 1.1, 13) * np.log(4 / tilt) / growth:
+        state = state_at(x, attitude, jnp.array([0.0, 0.0, 1.0]), t)
+        found = rate(x, attitude, jnp.array([0.0, 0.0, 1.0]), t)
+        exact = body.vector_field(0.0, jr.State(state[:4], state[4:]), None)
+        np.testing.assert_allclose(found[4:], exact.omega, atol=1e-12)
+        np.testing.assert_allclose(found[:4], exact.attitude, atol=1e-12)
+        height = np.sign(mgl) * (1 - 2 * (state[1] ** 2 + state[2] ** 2))
+        lowest = min(lowest, float(height))
+    assert lowest < -0.5
+
+
+# --- Derivatives --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    def of_inputs(x, t):
+        return state_at(x[7:], x[:4], x[4:7], t)
+
+    def both(x, t):
+        return of_inputs(x, t), jax.jacfwd(of_inputs)(x, t), jax.jacrev(of_inputs)(x, t)
+
+    return quick_jit(jax.vmap(both))
+
+
+@pytest.mark.parametrize("duration", [20.0, -20.0, -200.0])
+def test_derivatives_equal_the_variational_equations(duration, derivatives):
+    chosen = SLOPES["duration"] == duration
+    inputs, regimes = SLOPES["inputs"][chosen], SLOPES["regime"][chosen]
+    exact = SLOPES["jacobian"][chosen]
+    _, *found = (np.asarray(x) for x in derivatives(inputs, SLOPES["duration"][chosen]))
+    # The package normalises the attitude, the reference does not.
+    tangent = np.tile(np.eye(10), (len(inputs), 1, 1))
+    tangent[:, :4, :4] -= inputs[:, :4, None] * inputs[:, None, :4]
+    exact = np.einsum("nij,njk->nik", exact, tangent)
+    size = np.linalg.norm(exact, axis=(1, 2))
+    # A bit of the inputs changes an unstable motion's Jacobian too, by about its square.
+    bar = 1e-9 + 8 * EPS * size
+    for one in found:
+        relative = np.linalg.norm(one - exact, axis=(1, 2)) / size
+        assert np.all(relative <= bar), dict(zip(regimes, relative / bar, strict=True))
+    assert np.sum(bar < 2e-9) > 0.8 * len(bar)
+    assert set(regimes) >= set(REGIMES) - {"slow units", "fast units"} or duration < -100
+
+
+def test_stored_derivatives_are_those_of_the_variational_equations():
+    """A few rows again, over a shorter time, beside differences of the 30-digit motion."""
+    x = np.array([0.5, -0.1, 0.7, 0.5, 0.3, -0.4, 0.6, 1.5, 0.5, 0.75])
+    x[:4] /= np.linalg.norm(x[:4])
+    lever = np.array([[0.0, 0.0, x[9]]])
+    moments = np.array([[x[7], x[7], x[8]]])
+    _, full = reference.heavy_body(moments, x[None, :4], x[None, 4:7], 2.0, lever)
+
+    def motion(z):
+        q, w = taylor_top(z[1], z[2], z[3], x[:4], [z[0], x[5], x[6]], 2.0)
+        return np.array([*q, *w], float)
+
+    columns = [full[0, :, 4], full[0, :, 7] + full[0, :, 8], full[0, :, 9], full[0, :, 12]]
+    for k, column in enumerate(columns):
+        slope = central_difference(motion, x[[4, 7, 8, 9]], np.eye(4)[k], 2.0**-17)
+        np.testing.assert_allclose(column.astype(float), slope, atol=1e-9)
+
+
+SPECIAL = {
+    "generic": ([1.0, 0.5, 1.0], ATTITUDE, OMEGA),
+    "sleeping": ([1.0, 0.5, 1.0], [1.0, 0, 0, 0], [0, 0, 4.5]),
+    "threshold": ([1.0, 0.5, 1.0], [1.0, 0, 0, 0], [0, 0, 4.0]),
+    "falling": ([1.0, 0.5, 1.0], [0.6, 0, 0, 0.8], [0, 0, 2.0]),
+    "hanging": ([1.0, 0.5, 1.0], [0.0, 1, 0, 0], [0, 0, 1.0]),
+    "upright, mgl < 0": ([1.0, 0.5, -1.0], [1.0, 0, 0, 0], [0, 0, 1.0]),
+    "no gravity": ([1.0, 0.5, 0.0], ATTITUDE, OMEGA),
+    "rest": ([1.0, 0.5, 0.0], ATTITUDE, [0.0, 0, 0]),
+    "pendulum": ([1.0, 0.5, 1.0], [0.8, 0.6, 0, 0], [0.5, 0, 0]),
+}
+
+
+@pytest.fixture(scope="module")
+def second():
+    def along(x, v, t):
+        def moved(s):
+            y = x + s * v
+            q = y[3:7] / jnp.linalg.norm(y[3:7])
+            return state_at(y[:3], q, y[7:], t)
+
+        first = jax.jacfwd(moved)
+        return first(0.0), jax.jacfwd(first)(0.0)
+
+    return quick_jit(along)
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_second_derivatives_are_differences_of_the_first(name, second):
+    parameters, attitude, omega = (np.asarray(v, float) for v in SPECIAL[name])
+    x = np.concatenate([parameters, attitude / np.linalg.norm(attitude), omega])
+    v = np.random.default_rng(4).normal(size=10)
+    _, found = second(x, v, 3.0)
+    h = 1e-3
+    firsts = [np.asarray(second(x + s * v, v, 3.0)[0]) for s in (h, -h, 2 * h, -2 * h)]
+    slope = (8 * (firsts[0] - firsts[1]) - (firsts[2] - firsts[3])) / (12 * h)
+    np.testing.assert_allclose(found, slope, atol=1e-8 * max(1, np.max(np.abs(slope))))
+
+
+def test_derivative_in_time_is_euler_s_equation():
+    top = jr.SymmetricTop(1.3, 0.7, 0.9)
+    attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
+    for t in (0.7, 40.0):
+        found = jax.jacfwd(state_at, argnums=3)(jnp.array([1.3, 0.7, 0.9]), attitude, OMEGA, t)
+        state = jr.top_motion(top, jr.State(attitude, OMEGA), t)
+        exact = top.as_rigid_body().vector_field(t, state, None)
+        np.testing.assert_allclose(found[:4], exact.attitude, atol=1e-13)
+        np.testing.assert_allclose(found[4:], exact.omega, atol=1e-13)
+
+
+# --- float32, shapes, modes ---------------------------------------------------------------------
+
+FLOAT32_MULTIPLE = 32
+# Where a motion amplifies its inputs' last bits.
+AMPLIFIED = {"pendulum", "sleeping", "near sleeping spin", "through upright"}
+
+
+@pytest.mark.parametrize("regime", [r for r in REGIMES if r not in AMPLIFIED and "units" not in r])
+def test_float32_within_a_multiple_of_its_eps(regime, compiled):
+    parameters, attitude, omega, time = (x.astype(np.float32) for x in rows(regime))
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    found = np.asarray(compiled["value"](parameters, attitude, omega, time))
+    assert found.dtype == np.float32
+    wide = [x.astype(float) for x in (parameters, attitude, omega, time)]
+    exact = np.asarray(compiled["value"](*wide))
+    rate = rates(wide[0], wide[2])[:, None]
+    error = np.abs(found - exact) / np.concatenate([0 * rate + np.ones(4), rate + np.zeros(3)], 1)
+    columns = compiled["jacobian"](*wide)
+    scaled = sum(np.linalg.norm(c, axis=(1, 2)) for c in columns) / np.minimum(1, rate[:, 0])
+    eps = float(np.finfo(np.float32).eps)
+    bar = FLOAT32_MULTIPLE * eps * (1 + rate[:, 0] * np.abs(wide[3]))
+    calm = scaled < 30 * (1 + rate[:, 0] * np.abs(wide[3]))
+    assert np.mean(calm) > 0.5
+    assert np.all(np.max(error, axis=1)[calm] <= bar[calm]), np.max((np.max(error, 1) / bar)[calm])
+
+
+def test_times_of_any_shape_and_the_time_of_the_start():
+    top, state = jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(ATTITUDE, OMEGA)
+    times = np.linspace(-3, 5, 6).reshape(2, 3)
+    motion = jr.top_motion(top, state, times, t0=1.5)
+    assert motion.attitude.shape == (2, 3, 4)
+    assert motion.omega.shape == (2, 3, 3)
+    single = jr.top_motion(top, state, float(times[1, 2]) - 1.5)
+    np.testing.assert_allclose(motion.omega[1, 2], single.omega, atol=ulps(float, 8))
+    assert jr.top_motion(top, state, np.zeros((0,))).omega.shape == (0, 3)
+
+
+# --- Bad input ----------------------------------------------------------------------------------
+
+GOOD = {"I1": 1.0, "I3": 0.5, "mgl": 1.0, "attitude": np.eye(4)[0], "omega": OMEGA, "t": 1.0}
+BAD = {
+    "negative I1": ({"I1": -1.0}, "invalid_inertia", "`top` must have I1 > 0"),
+    "I3 zero": ({"I3": 0.0}, "invalid_inertia", "`top` must have I1 > 0"),
+    "mgl NaN": ({"mgl": np.nan}, "invalid_inertia", "finite mgl"),
+    "omega infinite": ({"omega": np.array([np.inf, 0, 0])}, "invalid_state", "finite"),
+    "attitude of norm 2": ({"attitude": 2 * np.eye(4)[0]}, "invalid_attitude", "unit quaternion"),
+    "time NaN": ({"t": np.nan}, "invalid_times", "`ts` must be finite"),
+}
+
+
+def _motion(values, throw=True):
+    top = jr.SymmetricTop(values["I1"], values["I3"], values["mgl"])
+    return jr.top_motion(
+        top, jr.State(values["attitude"], values["omega"]), values["t"], throw=throw
+    )
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_values_are_errors_with_a_code(name):
+    changed, code, message = BAD[name]
+    values = {**GOOD, **changed}
+    with pytest.raises(RuntimeError, match=message):
+        _motion(values)
+    with pytest.raises(RuntimeError, match=message):
+        jax.block_until_ready(jax.jit(_motion)(values))
+    state = _motion(values, throw=False)
+    assert np.all(np.isnan(state.attitude)) and np.all(np.isnan(state.omega))  # noqa: PT018
+    top = jr.SymmetricTop(values["I1"], values["I3"], values["mgl"])
+    found = jr.top.motion_validity(top, jr.State(values["attitude"], values["omega"]), values["t"])
+    assert found == getattr(jr.RESULTS, code)
+
+
+def test_a_bad_lane_leaves_the_others_and_shared_gradients_alone():
+    def total(i1, omegas):
+        def one(omega):
+            state = jr.top_motion(
+                jr.SymmetricTop(i1, 0.5, 1.0), jr.State(np.eye(4)[0], omega), 2.0, throw=False
+            )
+            return jnp.where(jnp.isnan(state.omega), 0.0, state.omega)
+
+        return jnp.sum(jax.vmap(one)(omegas))
+
+    good = jnp.array([OMEGA, 2 * OMEGA])
+    bad = jnp.array([OMEGA, [np.nan, 0, 0], 2 * OMEGA])
+    value, slope = jax.value_and_grad(total)(1.0, bad)
+    value_, slope_ = jax.value_and_grad(total)(1.0, good)
+    np.testing.assert_allclose([value, slope], [value_, slope_], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.array([1.0, 1.0, 0.5]), jr.State(np.eye(4)[0], OMEGA), 1.0), "`top` must be a Symm"),
+        ((jr.SymmetricTop(1.0, 0.5, 1.0), OMEGA, 1.0), "`state` must be a State"),
+        ((jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(3)[0], OMEGA), 1.0), "shape \\(4,\\)"),
+    ],
+)
+def test_wrong_shapes_and_types_are_value_errors(arguments, message, untyped):
+    with pytest.raises(ValueError, match=message):
+        jr.top_motion(*arguments)
+
+
+def test_a_top_of_arrays_is_a_value_error():
+    with pytest.raises(ValueError, match="`I1` must have shape"):
+        jr.SymmetricTop(np.ones(2), 0.5, 1.0)
