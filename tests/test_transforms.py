@@ -17,7 +17,7 @@ from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 from jax.flatten_util import ravel_pytree
 
 import jrigid as jr
-from jrigid import dynamics, elliptic, free, rotation, solvers, systems, torques
+from jrigid import dynamics, elliptic, free, lagrangian, rotation, solvers, systems, top, torques
 from jrigid._checks import float_arrays
 from jrigid.mass import MassProperties
 
@@ -28,12 +28,17 @@ MODULES = {
     "torques": torques,
     "systems": systems,
     "free": free,
+    "lagrangian": lagrangian,
+    "top": top,
     "solvers": solvers,
 }
 # Abstract classes and aliases: nothing to call.
 NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
 # What answers with a code, not with numbers: tested where it belongs.
-CODES = {"rotation.rate_record_validity", "free.motion_validity", "free.regime"}
+CODES = {
+    "rotation.rate_record_validity", "free.motion_validity", "free.regime", "top.motion_validity",
+    "top.motion_class", "lagrangian.cyclic_coordinates",
+}  # fmt: skip
 CODE_METHOD = "check"
 
 
@@ -165,6 +170,61 @@ def free_state(function):
         lambda i, q, w, t: function(i, jr.State(rotation.normalize(q), w), t),
         (MOMENTS, ATTITUDE, OMEGA, 3.0),
     )
+
+
+def of_top(function, *covers):
+    """Of a top's motion, by its three numbers, an attitude and a rate."""
+
+    def of(i1, i3, mgl, q, w):
+        return function(jr.SymmetricTop(i1, i3, mgl), jr.State(rotation.normalize(q), w))
+
+    return Case(of, (1.0, 0.6, 0.8, ATTITUDE, OMEGA), covers)
+
+
+def of_tilt(function, *covers):
+    """Of a top and two numbers more, a tilt and a rate or a momentum."""
+    return Case(
+        lambda i1, i3, mgl, *x: function(jr.SymmetricTop(i1, i3, mgl), *x),
+        (1.0, 0.6, 0.8, 0.7, 5.0),
+        covers,
+    )
+
+
+def all_of_a_lagrangian(mass, stiffness, q, q_dot):
+    def energies(q, q_dot, mass, stiffness):
+        return 0.5 * mass * jnp.sum(q_dot**2 * (1 + q**2)) - stiffness * jnp.sum(q**4)
+
+    params = float_arrays(mass, stiffness)
+    of = [lagrangian.acceleration, lagrangian.momenta, lagrangian.energy]
+    q, q_dot = float_arrays(q, q_dot)
+    field = lagrangian.vector_field(energies)(0.0, (q, q_dot), params)
+    return [f(energies, q, q_dot, *params) for f in of], field
+
+
+def shapes_of_a_top(i1, i3, mgl):
+    i1, i3, mgl = float_arrays(i1, i3, mgl)
+    held = jr.SymmetricTop(i1, i3, mgl)
+    body = MassProperties(mgl, 0 * MATRIX[0].astype(i1.dtype), i1 * jnp.eye(3, dtype=i1.dtype))
+    lever = jnp.stack([0 * i3, 0 * i3, i3])
+    shifted = jr.SymmetricTop.from_mass_properties(body, lever)
+    rigid = held.as_rigid_body()
+    return held, shifted, rigid.inertia, rigid.torque.lever
+
+
+def nutation(one, state):
+    return (
+        top.nutation_bounds(one, state),
+        top.nutation_period(one, state),
+        top.advance_per_nutation(one, state),
+        top.mean_precession(one, state),
+    )
+
+
+def extra_integrals(i1, i3, lever, q, w):
+    i1, i3, lever = float_arrays(i1, i3, lever)
+    gravity = torques.UniformGravity(i3, lever, jnp.stack([0 * i3, 0 * i3, -i1]))
+    body = jr.RigidBody(jnp.stack([i1, i1, i3]), gravity)
+    return top.integrals(body, jr.State(rotation.normalize(q), w))
 
 
 def exact_step(inertia, state, t):
@@ -311,6 +371,49 @@ CASES = {
         lambda i, spin: free.growth_rate_squared(i, 1, spin), (MOMENTS, 1.3)
     ),
     "free.linearized": Case(lambda i, w, t: free.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)),
+    # lagrangian
+    "lagrangian.acceleration": Case(
+        all_of_a_lagrangian,
+        (1.3, 0.4, VECTOR, OMEGA),
+        ("lagrangian.momenta", "lagrangian.energy", "lagrangian.vector_field"),
+    ),
+    # top
+    "top.SymmetricTop": Case(
+        shapes_of_a_top,
+        (1.0, 0.6, 0.8),
+        methods("top.SymmetricTop", "as_rigid_body", "from_mass_properties"),
+    ),
+    "top.top_motion": Case(
+        lambda i1, i3, mgl, q, w, t: jr.top_motion(
+            jr.SymmetricTop(i1, i3, mgl), jr.State(rotation.normalize(q), w), t
+        ),
+        (1.0, 0.6, 0.8, ATTITUDE, OMEGA, 3.0),
+    ),
+    "top.conserved": of_top(top.conserved, "top.Conserved"),
+    "top.cubic": of_top(lambda one, s: top.cubic(one, top.conserved(one, s))),
+    "top.reduced_vector_field": of_top(
+        lambda one, s: top.reduced_vector_field(one, top.conserved(one, s))(0.0, s.attitude, None)
+    ),
+    "top.nutation_period": of_top(
+        nutation,
+        *("top.NutationBounds", "top.nutation_bounds", "top.Advance", "top.advance_per_nutation"),
+        "top.mean_precession",
+    ),
+    "top.lagrangian": Case(
+        lambda i1, i3, mgl, q, v: top.lagrangian(q, v, jr.SymmetricTop(i1, i3, mgl)),
+        (1.0, 0.6, 0.8, VECTOR, OMEGA),
+    ),
+    "top.effective_potential": of_tilt(lambda one, x, y: top.effective_potential(one, x, y, y + 1)),
+    "top.angle_rates": of_tilt(
+        lambda one, x, y: top.angle_rates(one, x, y, y + 1), "top.AngleRates"
+    ),
+    "top.steady_precession": of_tilt(
+        lambda one, x, y: top.steady_precession(one, x, y)[:2], "top.SteadyPrecession"
+    ),
+    "top.gyroscopic": of_tilt(top.gyroscopic, "top.Gyroscopic"),
+    "top.sleeping_spin": of_tilt(lambda one, *_: top.sleeping_spin(one)),
+    "top.initial_state": of_tilt(lambda one, x, y: top.initial_state(one, x, omega3=y)),
+    "top.integrals": Case(extra_integrals, (1.0, 0.5, VECTOR, ATTITUDE, OMEGA), ("top.Integrals",)),
     # solvers
     "solvers.FreeRotation": Case(
         free_state(exact_step).function,

@@ -1,5 +1,7 @@
 """The heavy top: Lagrange's in closed form, and what a textbook asks of it."""
 
+from jrigid.top._integrals import Integrals as Integrals
+from jrigid.top._integrals import integrals as integrals
 from jrigid.top._motion import motion_validity as motion_validity
 from jrigid.top._motion import top_motion as top_motion
 from jrigid.top._nutation import CLASSES as CLASSES

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import check_shape, nan_where
 from jrigid._numerics import product
@@ -101,20 +101,10 @@ def conserved(top: SymmetricTop, state: State, *, throw: bool = True) -> Conserv
     return nan_where(~findings.ok, found)
 
 
-def _half_angle_momenta(
-    theta: Array, p_phi: Array, p_psi: Array
-) -> tuple[Array, Array, Array, Array]:
-    """(p_phi - p_psi) / 2 sin^2 and (p_phi + p_psi) / 2 cos^2 of half the tilt, and sin, cos of it.
-
-    0 / 0, an axis that may stand upright (upside down), is 0.
-    """
-    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
-
-    def quotient(momentum: Array, side: Array) -> Array:
-        zero = momentum == 0
-        return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side * side))
-
-    return quotient(p_phi - p_psi, sin), quotient(p_phi + p_psi, cos), sin, cos
+def _over(momentum: Array, side: Array) -> Array:
+    """Half the quotient; 0 / 0, an axis that may stand at the vertical, is 0."""
+    zero = momentum == 0
+    return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
 
 
 def angle_rates(
@@ -145,20 +135,21 @@ def angle_rates(
     3.0 2.0
     """
     i1, i3, _, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
-    upper, lower, _, _ = _half_angle_momenta(theta, p_phi, p_psi)
+    # The parts that are large near upright and near upside down, by half the angle.
+    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+    upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
     phi = 0.5 * (upper + lower) / i1
-    # phi' cos theta, of the two parts of which only the difference is large at the vertical
     return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
 
 
 def effective_potential(
-    theta: ScalarLike, top: SymmetricTop, p_phi: ScalarLike, p_psi: ScalarLike
-) -> Scalar:
+    top: SymmetricTop, theta: Real[ArrayLike, "..."], p_phi: ScalarLike, p_psi: ScalarLike
+) -> Float[Array, "..."]:
     """Potential of the tilt alone: I1 theta'^2 / 2 + V(theta) = E - p_psi^2 / (2 I3).
 
     Args:
-        theta: Tilt of the axis from the vertical [rad].
         top: The top.
+        theta: Tilts of the axis from the vertical [rad], of any shape.
         p_phi: Angular momentum about the vertical [kg m^2/s].
         p_psi: Angular momentum about the axis [kg m^2/s].
 
@@ -175,13 +166,13 @@ def effective_potential(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 2.0)
-    >>> print(jr.top.effective_potential(jnp.pi / 2, top, 1.0, 3.0).round(6))
+    >>> print(jr.top.effective_potential(top, jnp.pi / 2, 1.0, 3.0).round(6))
     0.5
     """
     i1, _, mgl, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
-    upper, lower, sin, cos = _half_angle_momenta(theta, p_phi, p_psi)
-    across = upper * sin * cos + lower * sin * cos  # (p_phi - p_psi cos theta) / sin theta
-    across = jnp.where(p_phi == p_psi, lower * sin * cos, across)
+    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+    # (p_phi - p_psi cos theta) / sin theta
+    across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
     return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
 
 
@@ -224,7 +215,8 @@ def reduced_vector_field(
 
     Returns:
         The rates `(t, y, args) -> y'` of y = (phi, theta, psi, theta') [rad, rad/s]: theta'' =
-        -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the vertical.
+        -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the vertical; an axis that
+        may pass there (p_phi = +-p_psi) does pass, theta changing its sign (or beyond pi).
 
     Raises:
         ValueError: Wrong shape (trace time).

@@ -13,8 +13,8 @@ from jrigid.rotation import euler_rates_to_omega, from_euler
 from jrigid.top._top import SymmetricTop, as_arrays, require_top
 
 _NO_STEADY = (
-    "Argument `omega3` must be at least 2 sqrt(mgl I1 cos(theta)) / I3 for steady precession, but "
-    "it is not."
+    "Arguments `omega3` or `psi_dot` must be large enough for steady precession at `theta`, at one "
+    "rate that is finite, but they are not: see `steady_precession`."
 )
 
 
@@ -49,19 +49,21 @@ class Gyroscopic(NamedTuple):
 
 
 def _steady(
-    i1: Array, i3: Array, mgl: Array, theta: Array, omega3: Array
+    i1: Array, i3: Array, mgl: Array, theta: Array, spin: Array, *, of_psi: bool
 ) -> tuple[Array, Array, Array]:
-    momentum = i3 * omega3
+    momentum = i3 * spin
+    # psi' = omega3 - p cos(theta) in place of omega3 takes I3 off I1.
+    i1 = i1 - i3 if of_psi else i1
     cos = jnp.cos(theta)
     square = momentum * momentum - 4 * i1 * mgl * cos
     # Level within rounding, there is one rate.
-    level = jnp.abs(cos) <= 4 * jnp.finfo(cos.dtype).eps
+    level = (jnp.abs(cos) <= 4 * jnp.finfo(cos.dtype).eps) | (i1 == 0)
     positive = square > 0
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
     total = momentum + jnp.where(momentum < 0, -root, root)
     still = total == 0
     slow = jnp.where(still, 0.0, 2 * mgl / jnp.where(still, 1.0, total))
-    fast = 0.5 * total / (i1 * jnp.where(level, 1.0, cos))
+    fast = 0.5 * total / jnp.where(level, 1.0, i1 * cos)
     fast = jnp.where(level, jnp.where(total < 0, -jnp.inf, jnp.inf), fast)
     # At the threshold itself the square is zero to rounding only.
     eps = jnp.finfo(square.dtype).eps
@@ -69,7 +71,12 @@ def _steady(
 
 
 def steady_precession(
-    top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike, *, throw: bool = True
+    top: SymmetricTop,
+    theta: ScalarLike,
+    omega3: ScalarLike | None = None,
+    *,
+    psi_dot: ScalarLike | None = None,
+    throw: bool = True,
 ) -> SteadyPrecession:
     """The rates at which a top may precess at a constant tilt.
 
@@ -79,14 +86,16 @@ def steady_precession(
     Args:
         top: The top.
         theta: Tilt of the axis from the vertical [rad].
-        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s].
+        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s]; or
+        psi_dot: spin about the axis, as seen by one who precesses with it [rad/s]; one of the two.
+            Then I1 - I3 takes the place of I1.
         throw: False: bad values give NaN instead of an error.
 
     Returns:
         Both rates, and whether there are any.
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape; omega3 and psi_dot both given, or neither (trace time).
         RuntimeError: Bad value (run time, any lane). Too little spin is none: see `exists`.
 
     Gradients: right where the two rates differ; where they meet, without the infinite part.
@@ -97,8 +106,11 @@ def steady_precession(
     >>> print(rates.slow.round(6), rates.fast.round(6), rates.exists)
     0.354249 5.645751 True
     """
-    findings, values = _checked(top, theta, omega3)
-    slow, fast, exists = _steady(*findings.apply(values, throw))
+    spin = psi_dot if omega3 is None else omega3
+    if spin is None or (omega3 is not None and psi_dot is not None):
+        raise ValueError("One of the arguments `omega3` and `psi_dot` must be given, and one only.")
+    findings, values = _checked(top, theta, spin)
+    slow, fast, exists = _steady(*findings.apply(values, throw), of_psi=omega3 is None)
     exists = exists & findings.ok
     slow, fast = nan_where(~exists, (slow, fast))
     return SteadyPrecession(slow, fast, exists)
@@ -209,7 +221,7 @@ def initial_state(
         omega3: third component of the angular velocity, psi' + phi' cos theta [rad/s]; one of the
             two, or neither for no spin (omega3 = 0).
         phi_dot: Precession [rad/s], or "slow" or "fast" for that of steady precession with the
-            given omega3 (see `steady_precession`).
+            given spin (see `steady_precession`).
         theta_dot: Rate of the tilt [rad/s].
         phi: Azimuth of the axis, from -y towards +x [rad].
         psi: Angle about the axis [rad].
@@ -219,8 +231,7 @@ def initial_state(
         Attitude and angular velocity.
 
     Raises:
-        ValueError: Wrong shape, psi_dot and omega3 both given, psi_dot with a steady precession
-            (trace time).
+        ValueError: Wrong shape, psi_dot and omega3 both given (trace time).
         RuntimeError: Bad value, or too little spin for steady precession (run time, any lane).
 
     Gradients: analytic; of a steady precession those of its rate.
@@ -236,11 +247,6 @@ def initial_state(
     steady = phi_dot if isinstance(phi_dot, str) else None
     if steady is not None:
         check_option("phi_dot", steady, ("slow", "fast"))
-        if psi_dot is not None:
-            raise ValueError(
-                "Argument `psi_dot` must be None where `phi_dot` is that of steady precession, but "
-                "it is not: give `omega3`."
-            )
     spin = 0.0 if psi_dot is None and omega3 is None else (omega3 if psi_dot is None else psi_dot)
     rate = 0.0 if steady is not None else phi_dot
     i1, i3, mgl, *values = as_arrays(top, theta, spin, rate, theta_dot, phi, psi)
@@ -265,7 +271,7 @@ def initial_state(
     i1, i3, mgl = (jnp.where(ok, x, 1.0) for x in (i1, i3, mgl))
     theta, spin, rate, theta_dot, phi, psi = (jnp.where(ok, x, 0.0) for x in values)
     if steady is not None:
-        slow, fast, exists = _steady(i1, i3, mgl, theta, spin)
+        slow, fast, exists = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
         rate = slow if steady == "slow" else fast
         findings.require(
             exists & jnp.isfinite(jax.lax.stop_gradient(rate)), RESULTS.invalid_state, _NO_STEADY

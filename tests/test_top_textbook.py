@@ -1,0 +1,646 @@
+"""What a textbook says of the heavy top, against other routes to it and printed numbers."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from helpers import quick_jit, ulps
+from scipy.spatial.transform import Rotation
+
+import jrigid as jr
+from jrigid import lagrangian, rotation, top
+
+TOP = jr.SymmetricTop(1.0, 0.5, 1.0)
+# The kinds of motion, by what is said of their start.
+STARTS = {
+    "wave": {"theta": 0.7, "omega3": 5.0, "phi_dot": 0.25},
+    "cusp": {"theta": 0.7, "omega3": 5.0},
+    "loop": {"theta": 0.7, "omega3": 5.0, "phi_dot": -0.4},
+    "steady, slow": {"theta": 0.7, "omega3": 5.0, "phi_dot": "slow"},
+    "steady, fast": {"theta": 0.7, "omega3": 5.0, "phi_dot": "fast"},
+    "below the horizontal": {"theta": 2.1, "omega3": 1.0, "phi_dot": 0.8, "theta_dot": 0.3},
+    "spherical pendulum": {"theta": 2.0, "phi_dot": 0.7, "theta_dot": 0.2},
+    "plane pendulum": {"theta": 2.0, "theta_dot": 0.4},
+    "through upright": {"theta": 0.0, "omega3": 1.5, "theta_dot": 0.8},
+}
+KINDS = {
+    "wave": "wave",
+    "cusp": "cusp",
+    "loop": "loop",
+    "steady, slow": "steady",
+    "steady, fast": "steady",
+    "below the horizontal": "wave",
+    "spherical pendulum": "wave",
+    "plane pendulum": "pendulum",
+    "through upright": "through the vertical",
+}
+
+
+def start(name, **more):
+    return top.initial_state(TOP, **STARTS[name], **more)
+
+
+def angles_of(state):
+    return np.asarray(rotation.to_euler(state.attitude))
+
+
+def state_of_angles(q, q_dot):
+    return jr.State(rotation.from_euler(q), rotation.euler_rates_to_omega(q, q_dot))
+
+
+# --- Four ways ----------------------------------------------------------------------------------
+
+
+TIMES = jnp.linspace(0.0, 12.0, 13)[1:]
+
+
+def integrated(field, y0, args):
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, TIMES[-1], 1e-3, y0, args,
+        saveat=diffrax.SaveAt(ts=TIMES), max_steps=100_000,
+        stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12),
+    )  # fmt: skip
+    return solution.ys
+
+
+def by_lagrangian(q0, q_dot0):
+    q, q_dot = integrated(lagrangian.vector_field(top.lagrangian), (q0, q_dot0), (TOP,))
+    return jax.vmap(state_of_angles)(q, q_dot)
+
+
+def by_reduction(q0, q_dot0):
+    keeps = top.conserved(TOP, state_of_angles(q0, q_dot0))
+    y0 = jnp.array([q0[0], q0[1], q0[2], q_dot0[1]])
+    y = integrated(top.reduced_vector_field(TOP, keeps), y0, None)
+
+    def to_state(y):
+        rates = top.angle_rates(TOP, y[1], keeps.p_phi, keeps.p_psi)
+        return state_of_angles(y[:3], jnp.stack([rates.phi, y[3], rates.psi]))
+
+    return jax.vmap(to_state)(y)
+
+
+def heights_by_cubic(state0):
+    """Cosines of the tilt from u'' = f'(u) / 2, regular at the vertical."""
+    slope = jnp.polyder(top.cubic(TOP, top.conserved(TOP, state0)))
+    up = rotation.rotate_inverse(state0.attitude, jnp.array([0.0, 0.0, 1.0]))
+    u0 = jnp.stack([up[2], jnp.cross(up, state0.omega)[2]])
+    return integrated(lambda _t, y, _: jnp.stack([y[1], 0.5 * jnp.polyval(slope, y[0])]), u0, None)
+
+
+@pytest.fixture(scope="module")
+def routes():
+    def two(state0):
+        by_quaternions = jr.simulate(TOP.as_rigid_body(), state0, TIMES, rtol=1e-11).states
+        return jr.top_motion(TOP, state0, TIMES), by_quaternions, heights_by_cubic(state0)
+
+    return jax.jit(two), jax.jit(
+        lambda q0, rates: (by_lagrangian(q0, rates), by_reduction(q0, rates))
+    )
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_four_ways_to_the_same_motion(name, routes):
+    state0 = start(name)
+    exact, by_quaternions, heights = routes[0](state0)
+    others = {"Euler-Poisson": by_quaternions}
+    if name != "through upright":  # where Euler's angles stop at the vertical
+        q0 = jnp.asarray(angles_of(state0))
+        rates = rotation.omega_to_euler_rates(q0, state0.omega)
+        others["Lagrangian"], others["reduced"] = routes[1](q0, rates)
+    here = Rotation.from_quat(exact.attitude, scalar_first=True)
+    for route, states in others.items():
+        away = here.inv() * Rotation.from_quat(states.attitude, scalar_first=True)
+        assert np.max(away.magnitude()) < 3e-9, route
+        np.testing.assert_allclose(states.omega, exact.omega, atol=3e-8, err_msg=route)
+    np.testing.assert_allclose(heights[:, 0], here.as_matrix()[:, 2, 2], atol=1e-8)
+
+
+def test_where_the_angles_fail_it_is_said():
+    asleep = top.initial_state(TOP, 0.0, omega3=5.0)
+    motion = jr.top_motion(TOP, asleep, 7.0)
+    other = jr.simulate(TOP.as_rigid_body(), asleep, np.array([7.0])).states
+    np.testing.assert_allclose(motion.omega, other.omega[0], atol=1e-12)
+    np.testing.assert_allclose(motion.attitude, other.attitude[0], atol=1e-6)
+    q, q_dot = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
+    with pytest.raises(RuntimeError, match="singular"):
+        lagrangian.acceleration(top.lagrangian, q, q_dot, TOP)
+
+
+# --- Momenta, energy, potential -----------------------------------------------------------------
+
+ANGLES, RATES = jnp.array([0.4, 1.1, -0.7]), jnp.array([0.8, -0.5, 2.0])
+
+
+def test_momenta_and_energy_are_those_of_the_lagrangian():
+    keeps = top.conserved(TOP, state_of_angles(ANGLES, RATES))
+    p = lagrangian.momenta(top.lagrangian, ANGLES, RATES, TOP)
+    energy = lagrangian.energy(top.lagrangian, ANGLES, RATES, TOP)
+    np.testing.assert_allclose(
+        [keeps.p_phi, keeps.p_psi, keeps.energy], [p[0], p[2], energy], 1e-14
+    )
+    cyclic = lagrangian.cyclic_coordinates(top.lagrangian, ANGLES, RATES, TOP)
+    assert list(np.asarray(cyclic)) == [True, False, True]
+
+
+def test_potential_cubic_and_rates_of_the_angles():
+    keeps = top.conserved(TOP, state_of_angles(ANGLES, RATES))
+    _, theta, _ = ANGLES
+    rates = top.angle_rates(TOP, theta, keeps.p_phi, keeps.p_psi)
+    np.testing.assert_allclose([rates.phi, rates.psi], RATES[::2], rtol=1e-14)
+    v = top.effective_potential(TOP, theta, keeps.p_phi, keeps.p_psi)
+    spin_energy = 0.5 * keeps.p_psi**2 / TOP.I3
+    left = 0.5 * TOP.I1 * RATES[1] ** 2 + v
+    np.testing.assert_allclose(left, keeps.energy - spin_energy, rtol=1e-14)
+    u_dot = -jnp.sin(theta) * RATES[1]
+    np.testing.assert_allclose(jnp.polyval(top.cubic(TOP, keeps), jnp.cos(theta)), u_dot**2, 1e-13)
+    _, theta_dot, _, theta_acceleration = top.reduced_vector_field(TOP, keeps)(
+        0.0, jnp.array([*ANGLES, RATES[1]]), None
+    )
+    slope = jax.grad(top.effective_potential, argnums=1)(TOP, theta, keeps.p_phi, keeps.p_psi)
+    np.testing.assert_allclose(theta_acceleration, -slope / TOP.I1, rtol=1e-13)
+    assert theta_dot == RATES[1]
+
+
+def test_potential_at_the_vertical():
+    def v(theta, p_phi, p_psi):
+        return top.effective_potential(TOP, theta, p_phi, p_psi)
+
+    assert v(0.0, 2.0, 2.0) == 1.0
+    assert v(np.pi, 1.0, 2.0) > 1e30
+    assert v(0.0, 1.0, 2.0) == np.inf
+    # p^2 tan^2(theta / 2) / (2 I1) + mgl cos theta: curvature p^2 / 4 - mgl
+    assert jax.grad(jax.grad(v))(0.0, 3.0, 3.0) == pytest.approx(9 / 4 - 1, rel=1e-13)
+    slopes = jax.grad(v, argnums=(0, 1, 2))(0.0, 3.0, 3.0)
+    assert np.all(np.isfinite(slopes))
+
+
+# --- Nutation -----------------------------------------------------------------------------------
+
+
+def quadratures(name):
+    """Bounds, period and advance of phi and psi by integrals over u = cos theta, 25 digits."""
+    keeps = [mp.mpf(float(x)) for x in top.conserved(TOP, start(name))]
+    p_phi, p_psi, energy = keeps
+    i1, i3, mgl = (mp.mpf(float(x)) for x in (TOP.I1, TOP.I3, TOP.mgl))
+    alpha, beta, a, b = (2 * energy - p_psi**2 / i3) / i1, 2 * mgl / i1, p_psi / i1, p_phi / i1
+    u1, u2, u3 = sorted(
+        mp.re(x) for x in mp.polyroots(
+            [alpha - b * b, 2 * a * b - beta, -alpha - a * a, beta], 200, extraprec=200, asc=True
+        )
+    )  # fmt: skip
+
+    def over(f):
+        # u = u1 + (u2 - u1) sin^2 x: no singular ends
+        def integrand(x):
+            u = u1 + (u2 - u1) * mp.sin(x) ** 2
+            return 2 * f(u) / mp.sqrt(beta * (u3 - u))
+
+        return 2 * mp.quad(integrand, mp.linspace(0, mp.pi / 2, 5))
+
+    period = over(lambda _: 1)
+    phi = over(lambda u: (b - a * u) / (1 - u * u))
+    psi = over(lambda u: p_psi / i3 - u * (b - a * u) / (1 - u * u))
+    return mp.acos(u2), mp.acos(u1), period, phi, psi
+
+
+@pytest.mark.parametrize("name", ["wave", "cusp", "loop", "below the horizontal"])
+def test_bounds_period_and_advance_are_the_textbook_s_integrals(name):
+    with mp.workdps(25):
+        low, high, period, phi, psi = (float(x) for x in quadratures(name))
+    state = start(name)
+    bounds = top.nutation_bounds(TOP, state)
+    np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13)
+    assert top.nutation_period(TOP, state) == pytest.approx(period, rel=1e-13)
+    advance = top.advance_per_nutation(TOP, state)
+    np.testing.assert_allclose([advance.phi, advance.psi], [phi, psi], rtol=1e-12)
+    assert top.mean_precession(TOP, state) == pytest.approx(phi / period, rel=1e-12)
+
+
+@pytest.mark.parametrize("mgl", [1.0, -1.0, 0.0])
+def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
+    """Any state, either sign of gravity: against the exact motion over one nutation."""
+    for _ in range(6):
+        one = jr.SymmetricTop(1.3, rng.uniform(0.3, 2), mgl)
+        q = rng.normal(size=4)
+        state = jr.State(q / np.linalg.norm(q), rng.normal(size=3) * rng.choice([0.3, 1, 3]))
+        period = float(top.nutation_period(one, state))
+        motion = np.asarray(jr.top_motion(one, state, np.linspace(0, period, 4001)).attitude)
+        sum_ = np.unwrap(np.arctan2(motion[:, 3], motion[:, 0]))
+        difference = np.unwrap(np.arctan2(motion[:, 2], motion[:, 1]))
+        phi, psi = sum_ + difference, sum_ - difference
+        tilt = np.arccos(np.clip(2 * (motion[:, 0] ** 2 + motion[:, 3] ** 2) - 1, -1, 1))
+        bounds = top.nutation_bounds(one, state)
+        extent = [tilt.min(), tilt.max()]
+        np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], extent, atol=1e-4)
+        assert tilt[-1] == pytest.approx(tilt[0], abs=1e-11)
+        advance = top.advance_per_nutation(one, state)
+        np.testing.assert_allclose(advance, [phi[-1] - phi[0], psi[-1] - psi[0]], atol=1e-11)
+        steps = np.diff(phi)
+        kind = "loop" if np.min(steps) < 0 < np.max(steps) else "wave"
+        assert top.CLASSES[int(top.motion_class(one, state))] == kind
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_kinds_of_motion(name):
+    assert top.CLASSES[int(top.motion_class(TOP, start(name)))] == KINDS[name]
+    # Any later state is of the same kind, and a top seen from below too.
+    if name != "cusp":
+        later = jr.top_motion(TOP, start(name), 1.7)
+        assert top.CLASSES[int(top.motion_class(TOP, later))] == KINDS[name]
+
+
+@pytest.mark.parametrize("theta", [0.0, np.pi])
+@pytest.mark.parametrize("omega3", [0.0, 3.0, 4.0, 5.0])
+def test_a_top_at_the_vertical_sleeps(theta, omega3):
+    state = top.initial_state(TOP, theta, omega3=omega3)
+    state = jr.State(np.round(state.attitude, 15), state.omega)
+    assert top.CLASSES[int(top.motion_class(TOP, state))] == "sleeping"
+
+
+def test_a_bad_state_has_no_kind():
+    state = jr.State(np.eye(4)[0], np.array([np.nan, 0, 0]))
+    assert top.motion_class(TOP, state, throw=False) == -1
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    def both(s, direction, state):
+        x = jnp.concatenate([jnp.array([1.0, 0.5, 1.0]), state.omega]) + s * direction
+        one, moved = jr.SymmetricTop(x[0], x[1], x[2]), jr.State(state.attitude, x[3:])
+        return jnp.stack([top.nutation_period(one, moved), top.mean_precession(one, moved)])
+
+    return jax.jit(both), quick_jit(jax.jacfwd(both)), quick_jit(jax.jacrev(both))
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_derivatives_of_period_and_precession_are_differences(name, slopes):
+    state = start(name)
+    direction = np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])
+    if name in ("plane pendulum", "through upright"):  # stay in the plane, or pass the vertical
+        direction[3:] = [0.4, 0.0, 0.0]
+    value, forward, reverse = slopes
+
+    def both(s):
+        return np.asarray(value(s, direction, state))
+
+    h = 1e-4
+    found = forward(0.0, direction, state)
+    difference = (8 * (both(h) - both(-h)) - (both(2 * h) - both(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(found, difference, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(reverse(0.0, direction, state), found, rtol=1e-11)
+
+
+SPECIAL = {
+    "steady": {"theta": 0.7, "omega3": 5.0, "phi_dot": "slow"},
+    "sleeping": {"theta": 0.0, "omega3": 5.0},
+    "threshold": {"theta": 0.0, "omega3": 4.0},
+    "upright, unstable": {"theta": 0.0, "omega3": 2.0},
+    "through the vertical": {"theta": 0.0, "omega3": 2.0, "theta_dot": 1.0},
+    "pendulum": {"theta": 1.0},
+    "at rest upright": {"theta": 0.0},
+}
+
+
+@pytest.fixture(scope="module")
+def special():
+    def everything(x, attitude):
+        one, moved = jr.SymmetricTop(x[0], x[1], x[2]), jr.State(attitude, x[3:])
+        found = (
+            top.nutation_bounds(one, moved),
+            top.mean_precession(one, moved),
+            top.advance_per_nutation(one, moved),
+            top.conserved(one, moved),
+            1 / top.nutation_period(one, moved),
+        )
+        return jnp.stack(jax.tree.leaves(found))
+
+    def with_derivatives(x, attitude):
+        forward, reverse = (d(everything)(x, attitude) for d in (jax.jacfwd, jax.jacrev))
+        return everything(x, attitude), forward, reverse
+
+    return quick_jit(with_derivatives)
+
+
+@pytest.mark.parametrize("mgl", [1.0, 0.0, -1.0])
+@pytest.mark.parametrize("name", SPECIAL)
+def test_no_nan_in_any_derivative_at_the_special_motions(name, mgl, special):
+    state = top.initial_state(TOP, **SPECIAL[name])
+    for found in special(jnp.array([1.0, 0.5, mgl, *state.omega]), state.attitude):
+        assert np.all(np.isfinite(found))
+
+
+# --- Special motions ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("branch", ["slow", "fast"])
+@pytest.mark.parametrize("theta", [0.4, 1.3, 2.2])
+@pytest.mark.parametrize("spin", [{"omega3": 6.0}, {"psi_dot": -7.0}])
+def test_steady_precession_is_steady(branch, theta, spin):
+    state0 = top.initial_state(TOP, theta, phi_dot=branch, **spin)
+    rate = float(getattr(top.steady_precession(TOP, theta, **spin), branch))
+    ts = np.array([0.3, 5.0, 50.0])
+    motion = jr.top_motion(TOP, state0, ts)
+    axis = Rotation.from_quat(motion.attitude, scalar_first=True).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(axis[:, 2], np.cos(theta), atol=1e-12)
+    advance = rate * ts
+    expected = np.sin(theta) * np.stack([np.sin(advance), -np.cos(advance)], axis=1)
+    np.testing.assert_allclose(axis[:, :2], expected, atol=1e-11)
+    assert top.mean_precession(TOP, state0) == pytest.approx(rate, rel=1e-12)
+
+
+def test_when_steady_precession_exists():
+    theta = 0.7
+    least = 2 * np.sqrt(np.cos(theta)) / 0.5
+    assert not top.steady_precession(TOP, theta, 0.999 * least).exists
+    at_least = top.steady_precession(TOP, theta, least)
+    assert at_least.exists
+    # Where the two meet their difference is the root of a rounding error.
+    np.testing.assert_allclose(at_least.slow, at_least.fast, rtol=1e-7)
+    assert top.steady_precession(TOP, 2.0, 0.0).exists
+    level = top.steady_precession(TOP, np.pi / 2, 5.0)
+    assert level.slow == pytest.approx(1 / (0.5 * 5.0))
+    assert level.fast == np.inf
+    with pytest.raises(RuntimeError, match="large enough for steady"):
+        top.initial_state(TOP, theta, omega3=1.0, phi_dot="slow")
+    with pytest.raises(RuntimeError, match="finite"):
+        top.initial_state(TOP, np.pi / 2, omega3=5.0, phi_dot="fast")
+    slopes = jax.grad(lambda w: top.steady_precession(TOP, theta, w).slow)(6.0)
+    assert slopes == pytest.approx(
+        float(
+            top.steady_precession(TOP, theta, 6.0 + 1e-6).slow
+            - top.steady_precession(TOP, theta, 6.0 - 1e-6).slow
+        )
+        / 2e-6,
+        rel=1e-8,
+    )
+
+
+@pytest.mark.parametrize(("factor", "least", "most"), [(0.999, 5.12, 5.13), (1.001, 1e-4, 5e-3)])
+def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least, most):
+    """Started at a tilt of 1e-6: below, the largest tilt is arccos(2 0.999^2 - 1) = 5.125 deg."""
+    spin = factor * float(top.sleeping_spin(TOP))
+    assert spin == factor * 4.0
+    state = top.initial_state(TOP, 1e-6, omega3=spin)
+    largest = np.degrees(top.nutation_bounds(TOP, state).theta_max)
+    assert least < largest < most
+    if factor < 1:
+        assert largest == pytest.approx(np.degrees(np.arccos(2 * factor**2 - 1)), rel=1e-6)
+    times = np.linspace(0.0, 2 * float(top.nutation_period(TOP, state)), 4001)
+    motion = np.asarray(jr.top_motion(TOP, state, times).attitude)
+    reached = np.degrees(2 * np.arcsin(np.hypot(motion[:, 1], motion[:, 2]).max()))
+    assert reached == pytest.approx(largest, rel=1e-4)
+
+
+def test_gyroscopic_approximation_becomes_exact():
+    theta = 0.8
+    errors = []
+    for omega3 in (40.0, 80.0):
+        state = top.initial_state(TOP, theta, omega3=omega3)
+        bounds = top.nutation_bounds(TOP, state)
+        exact = np.array(
+            [
+                top.mean_precession(TOP, state),
+                2 * np.pi / top.nutation_period(TOP, state),
+                bounds.theta_max - bounds.theta_min,
+            ]
+        )
+        errors.append(np.abs(np.array(top.gyroscopic(TOP, theta, omega3)) / exact - 1))
+    assert np.all(errors[0] < 4 * 1.0 / (0.5 * 40) ** 2)
+    np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.05)
+    with pytest.raises(RuntimeError, match="`omega3` must not be zero"):
+        top.gyroscopic(TOP, theta, 0.0)
+
+
+def test_starts_mean_what_they_say(untyped):
+    state = top.initial_state(TOP, 0.7, psi_dot=4.0, phi_dot=0.3, theta_dot=-0.2, phi=0.5, psi=1.1)
+    angles = angles_of(state)
+    np.testing.assert_allclose(angles, [0.5, 0.7, 1.1], atol=1e-14)
+    rates = rotation.omega_to_euler_rates(angles, state.omega)
+    np.testing.assert_allclose(rates, [0.3, -0.2, 4.0], atol=1e-14)
+    by_component = top.initial_state(TOP, 0.7, omega3=5.0, phi_dot=0.3)
+    assert by_component.omega[2] == 5.0
+    assert np.all(np.asarray(top.initial_state(TOP, 0.7).omega) == 0)
+    with pytest.raises(ValueError, match="`psi_dot` must be None where `omega3`"):
+        top.initial_state(TOP, 0.7, psi_dot=1.0, omega3=1.0)
+    with pytest.raises(ValueError, match="must be one of 'slow', 'fast'"):
+        top.initial_state(TOP, 0.7, omega3=5.0, phi_dot="quick")
+    with pytest.raises(RuntimeError, match="must be finite"):
+        top.initial_state(TOP, np.nan)
+
+
+def test_a_top_from_mass_properties():
+    """A disk on a thin rod: parallel axes by hand."""
+    disk = jr.solids.disk(0.3, 0.05).translated(np.array([0.0, 0.0, 0.08]))
+    rod = jr.solids.rod(0.1, 0.2).translated(np.array([0.0, 0.0, 0.1]))
+    body = disk + rod
+    held = jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, 9.8)
+    across = 0.3 * 0.05**2 / 4 + 0.3 * 0.08**2 + 0.1 * 0.2**2 / 3
+    np.testing.assert_allclose(held.I1, across, rtol=1e-14)
+    np.testing.assert_allclose(held.I3, 0.3 * 0.05**2 / 2, rtol=1e-14)
+    np.testing.assert_allclose(held.mgl, 9.8 * (0.3 * 0.08 + 0.1 * 0.1), rtol=1e-14)
+    below = jr.SymmetricTop.from_mass_properties(body, -body.center_of_mass, 9.8)
+    np.testing.assert_allclose([below.I1, below.mgl], [held.I1, -held.mgl], rtol=1e-14)
+    with pytest.raises(RuntimeError, match="symmetric about body axis 3"):
+        jr.SymmetricTop.from_mass_properties(body, np.array([0.01, 0.0, 0.1]))
+    box = jr.solids.box(1.0, np.array([1.0, 2.0, 3.0]))
+    with pytest.raises(RuntimeError, match="symmetric about body axis 3"):
+        jr.SymmetricTop.from_mass_properties(box, np.array([0.0, 0.0, 1.5]))
+    bad = jr.SymmetricTop.from_mass_properties(body, np.array([0.01, 0, 0.1]), throw=False)
+    assert np.isnan(bad.I1)
+
+
+# --- Other integrable bodies --------------------------------------------------------------------
+
+
+def heavy(moments, lever):
+    gravity = jr.torques.UniformGravity(1.0, np.array(lever), np.array([0.0, 0.0, -1.0]))
+    return jr.RigidBody(np.array(moments), gravity)
+
+
+ATTITUDE = np.asarray(rotation.normalize(np.array([0.5, -0.1, 0.7, 0.4])))
+LEVEL = np.array([0.6, -0.5, 0.9])
+
+
+def of_no_vertical_momentum(moments):
+    up = Rotation.from_quat(ATTITUDE, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+    momentum = np.array(moments) * LEVEL
+    return (momentum - (momentum @ up) * up) / moments
+
+
+INTEGRABLE = {
+    "kovalevskaya": (heavy([2.0, 2.0, 1.0], [0.4, 0.3, 0.0]), LEVEL),
+    "goryachev-chaplygin": (
+        heavy([4.0, 4.0, 1.0], [0.4, 0.3, 0.0]),
+        of_no_vertical_momentum([4.0, 4.0, 1.0]),
+    ),
+    "lagrange": (heavy([1.0, 1.0, 0.5], [0.0, 0.0, 1.0]), LEVEL),
+    "euler": (heavy([1.0, 2.0, 3.0], [0.0, 0.0, 0.0]), LEVEL),
+}
+
+
+@pytest.mark.parametrize("case", INTEGRABLE)
+def test_extra_integrals_are_constant_to_1e_12_over_a_thousand_turns(case):
+    body, omega = INTEGRABLE[case]
+    state0 = jr.State(ATTITUDE, omega)
+    ts = np.linspace(0.0, 2000 * np.pi / np.linalg.norm(omega), 101)
+    states = jr.simulate(body, state0, ts, rtol=1e-13, max_step=0.05).states
+    first = top.integrals(body, state0, case)
+    later = jax.vmap(lambda s: top.integrals(body, s, case))(states)
+    for before, after in zip(first, later, strict=True):
+        assert np.max(np.abs(after - before)) < 1e-12 * max(1.0, abs(float(before)))
+
+
+def test_the_extra_integral_s_rate_is_zero_for_generic_bodies_of_the_case(rng):
+    """By the chain rule along the vector field: no integration."""
+    for case, ratio in (("kovalevskaya", 2.0), ("goryachev-chaplygin", 4.0), ("lagrange", None)):
+        i3 = rng.uniform(0.5, 2)
+        i1 = rng.uniform(0.5, 2) if ratio is None else ratio * i3
+        lever = np.array([0, 0, 0.7]) if ratio is None else np.array([*rng.normal(size=2), 0])
+        pull = rng.normal(size=3)
+        gravity = jr.torques.UniformGravity(1.7, lever, pull)
+        body = jr.RigidBody(np.array([i1, i1, i3]), gravity)
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        omega = rng.normal(size=3)
+        if case == "goryachev-chaplygin":
+            up = -Rotation.from_quat(q, scalar_first=True).inv().apply(pull) / np.linalg.norm(pull)
+            momentum = np.asarray(body.inertia) * omega
+            omega = (momentum - (momentum @ up) * up) / np.asarray(body.inertia)
+        state = jr.State(q, omega)
+        rate = body.vector_field(0.0, state, None)
+        values, slopes = jax.jvp(
+            lambda s, body=body, case=case: top.integrals(body, s, case), (state,), (rate,)
+        )
+        assert np.max(np.abs(jax.tree.leaves(slopes))) < 1e-13
+        assert values.energy == pytest.approx(float(body.energy(0.0, state, None)), rel=1e-13)
+        # Of a body that is not of the case, though the check lets it pass, it is not a constant.
+        nearly = jr.RigidBody(np.array([i1 * (1 + 1e-8), i1, i3]), gravity)
+        rate = nearly.vector_field(0.0, state, None)
+        _, moved = jax.jvp(
+            lambda s, body=nearly, case=case: top.integrals(body, s, case), (state,), (rate,)
+        )
+        assert abs(moved.extra) > 1e-11
+
+
+def test_a_body_that_is_not_of_the_case_is_an_error(untyped):
+    body, omega = INTEGRABLE["kovalevskaya"]
+    state = jr.State(ATTITUDE, omega)
+    with pytest.raises(RuntimeError, match="I1 = I2 = 4 I3"):
+        top.integrals(body, state, "goryachev-chaplygin")
+    with pytest.raises(RuntimeError, match="Lagrange's case"):
+        top.integrals(body, state, "lagrange")
+    with pytest.raises(RuntimeError, match="Euler's case"):
+        top.integrals(body, state, "euler")
+    with pytest.raises(RuntimeError, match="no angular momentum about the vertical"):
+        top.integrals(INTEGRABLE["goryachev-chaplygin"][0], state, "goryachev-chaplygin")
+    with pytest.raises(ValueError, match="must be one of"):
+        top.integrals(body, state, "steklov")
+    with pytest.raises(ValueError, match="UniformGravity"):
+        top.integrals(jr.RigidBody(np.ones(3)), state)
+    with pytest.raises(ValueError, match="principal moments"):
+        top.integrals(heavy(np.eye(3), [0.0, 0, 1]), state, "lagrange")
+    assert np.isnan(top.integrals(body, state, "lagrange", throw=False).extra)
+    assert top.integrals(heavy(np.eye(3), [0.0, 0, 1]), state).extra is None
+
+
+# --- Printed numbers ----------------------------------------------------------------------------
+
+
+def test_bruls_cardona_heavy_top_in_closed_form():
+    """See tests/test_published.py: symmetric about body axis 2, which is axis 3 here.
+
+    At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own error is
+    1.2e-7 m; at 0.03 s and 0.2 s the five digits of EXUDYN.
+    """
+    bruls = jr.SymmetricTop(15.234375, 0.46875, 15.0 * 9.81)
+    # The axes (3, 1, 2) of the benchmark are (1, 2, 3): q = q_benchmark * p.
+    p = rotation.from_matrix(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+    state0 = jr.State(p, np.array([-4.61538, 0.0, 150.0]))
+    motion = jr.top_motion(bruls, state0, np.array([0.03, 0.2, 1.0, 2.0]))
+    attitudes = jax.vmap(lambda q: rotation.multiply(q, rotation.conjugate(p)))(motion.attitude)
+    printed = [
+        ([-0.62679, 0.057939, 0.77611, 0.037845], 5e-6),
+        ([-0.70828, 0.43878, 0.54573, 0.0894], 5e-6),
+        ([0.7329439942283007, -0.2782856278135421, 0.5318246439927058, -0.3201761370231893], 5e-7),
+        ([0.1229471344095339, -0.4910798717314375, 0.3504301068655838, -0.7879868665928781], 5e-7),
+    ]
+    for found, (quaternion, digit) in zip(np.asarray(attitudes), printed, strict=True):
+        found = found * np.sign(found @ np.array(quaternion))
+        np.testing.assert_allclose(found, quaternion, rtol=0, atol=digit)
+    np.testing.assert_allclose(motion.omega[0], [1.8644, -4.2537, 150.0], rtol=1e-5)
+    # And against the quaternions' equations, to their accuracy over 300 radians.
+    body = heavy([15.234375, 15.234375, 0.46875], [0.0, 0.0, 15.0 * 9.81])
+    states = jr.simulate(body, state0, np.array([1.0, 2.0]), rtol=1e-12).states
+    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(states.attitude), strict=True):
+        np.testing.assert_allclose(a, b * np.sign(a @ b), atol=1e-9)
+
+
+def test_simo_wong_heavy_top_in_closed_form():
+    """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
+
+    A fast top: it precesses at mgl / (I3 omega3) = 0.4 rad/s to 2 I1 mgl / (I3 omega3)^2.
+    """
+    simo = jr.SymmetricTop(5.0, 1.0, 20.0)
+    state0 = jr.State(rotation.exp(np.array([0.05, 0, 0])), np.array([0.0, 0.0, 50.0]))
+    keeps = top.conserved(simo, state0)
+    assert keeps.energy == pytest.approx(1269.975, abs=5e-4)
+    states = jr.top_motion(simo, state0, np.linspace(0.0, 10.0, 101))
+    energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states)
+    np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
+    assert np.cos(top.nutation_bounds(simo, state0).theta_min) == pytest.approx(0.99875, abs=5e-6)
+    assert top.mean_precession(simo, state0) == pytest.approx(0.4, rel=0.09)
+
+
+def test_curtis_example_11_15():
+    """Steady precession of a top at 60 degrees and 1000 rpm: 51.93 rpm as printed.
+
+    H. D. Curtis, Orbital Mechanics for Engineering Students, 4th ed., example 11.15: moments 12e-4
+    and 4.5e-4 kg m^2 about the fixed point, 0.5 kg at 5 cm, g = 9.807 m/s^2.
+    """
+    curtis = jr.SymmetricTop(12e-4, 4.5e-4, 0.5 * 9.807 * 0.05)
+    rpm = 2 * np.pi / 60
+    rates = top.steady_precession(curtis, np.radians(60), psi_dot=1000 * rpm)
+    assert rates.slow / rpm == pytest.approx(51.93, abs=0.005)
+    state = top.initial_state(curtis, np.radians(60), psi_dot=1000 * rpm, phi_dot="slow")
+    assert top.mean_precession(curtis, state) / rpm == pytest.approx(51.93, abs=0.005)
+
+
+# --- Bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        top.conserved, top.nutation_bounds, top.nutation_period, top.mean_precession,
+        top.advance_per_nutation, top.motion_class,
+    ],
+)  # fmt: skip
+def test_bad_tops_and_states_are_errors_or_nan_in_their_lane(function):
+    state = start("wave")
+    with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
+        function(jr.SymmetricTop(1.0, -0.5, 1.0), state)
+    with pytest.raises(RuntimeError, match="unit quaternion"):
+        jax.jit(function)(TOP, jr.State(2 * state.attitude, state.omega))
+    i1 = jnp.array([1.0, -1.0, 1.2])
+    lanes = jax.vmap(lambda x: function(jr.SymmetricTop(x, 0.5, 1.0), state, throw=False))(i1)
+    for leaf in jax.tree.leaves(lanes):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            assert list(np.isnan(leaf)) == [False, True, False]
+        else:
+            assert list(leaf == -1) == [False, True, False]
+
+
+def test_bad_values_of_special_motions():
+    with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
+        top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0))
+    with pytest.raises(RuntimeError, match="must be finite"):
+        top.steady_precession(TOP, np.nan, 1.0)
+    with pytest.raises(ValueError, match="must be given, and one only"):
+        top.steady_precession(TOP, 0.5)
+    assert np.isnan(top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0), throw=False))
+    assert top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, -1.0)) == 0
+    assert float(jax.grad(lambda m: top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, m)))(-1.0)) == 0
+    assert top.sleeping_spin(TOP) == pytest.approx(4.0, abs=ulps(float, 4))
