@@ -26,6 +26,9 @@ SLOPES = np.load(HERE / "top_derivatives.npz")
 REGIMES = list(dict.fromkeys(RECORD["regime"].tolist()))
 
 
+UNSTABLE = {"pendulum", "near sleeping spin"}
+
+
 def state_at(parameters, attitude, omega, t):
     top = jr.SymmetricTop(*parameters)
     state = jr.top_motion(top, jr.State(attitude, omega), t, throw=False)
@@ -50,7 +53,7 @@ def rates(parameters, omega):
     return np.where(rate == 0, 1.0, rate)
 
 
-LANES = 72  # of one compilation for every regime
+LANES = 168  # of one compilation for every regime
 
 
 def of_lanes(function):
@@ -73,6 +76,8 @@ def compiled():
 def test_the_record_holds_at_least_fifty_cases_a_regime():
     assert all(np.sum(RECORD["regime"] == regime) >= 50 for regime in REGIMES)
     assert len(REGIMES) >= 19
+    near = RECORD["regime"] == "near sleeping spin"
+    assert all(np.sum(near & (RECORD["level"] == level)) >= 50 for level in (1e-3, 1e-8, 1e-12))
 
 
 @pytest.mark.parametrize("regime", REGIMES)
@@ -86,7 +91,7 @@ def test_values_to_the_bar_against_30_digits(regime, compiled):
     error = np.max(np.abs(found - exact) / unit, axis=1)
     radians = rate[:, 0] * np.abs(time)
     bar = 1e-13 * (1 + radians)
-    if regime == "pendulum":  # near its separatrix the motion amplifies the inputs' last bits
+    if regime in UNSTABLE:  # near a separatrix the motion amplifies the inputs' last bits
         columns = compiled["jacobian"](parameters, attitude, omega, time)
         for column, x in zip(columns, (parameters, attitude, omega), strict=True):
             scaled = np.linalg.norm(np.asarray(column) / unit[:, :, None], axis=1)
@@ -139,6 +144,39 @@ def test_the_closed_form_at_50_digits_is_the_taylor_series(regime):
         with mp.workdps(40):
             high, low = ([*stored[i][k], *stored[i + 2][k]] for i in (0, 1))
             assert max(abs(a - b - c) for a, b, c in zip((*q, *w), high, low, strict=True)) < 1e-29
+
+
+@pytest.mark.parametrize("spin", [3.0, 4.0, 4.5])
+@pytest.mark.parametrize("t", [1e3, 1e6])
+def test_a_top_asleep_turns_about_the_vertical_for_ever(spin, t):
+    """Below, at and above the threshold, where a nutation lasts without end."""
+    found = state_at(jnp.array([1.0, 0.5, 1.0]), np.eye(4)[0], jnp.array([0, 0, spin]), t)
+    half = mp.mpf(spin) * mp.mpf(t) / 2
+    exact = [float(mp.cos(half)), 0, 0, float(mp.sin(half)), 0, 0, spin]
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-13 * (1 + spin * t))
+
+
+def test_rates_whose_squares_underflow_and_angles_that_overflow():
+    for rate in (1e-140, 1e-170, 1e-300):
+        found = state_at(
+            jnp.array([1.0, 0.5, 0.0]),
+            ATTITUDE / np.linalg.norm(ATTITUDE),
+            rate * OMEGA,
+            0.5 / rate,
+        )
+        slow = state_at(jnp.array([1.0, 0.5, 0.0]), ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 0.5)
+        np.testing.assert_allclose(found[:4], slow[:4], atol=1e-14)
+        np.testing.assert_allclose(found[4:] / rate, slow[4:], atol=1e-14)
+    single = jr.top_motion(
+        jr.SymmetricTop(np.float32(1), np.float32(0.5), np.float32(0)),
+        jr.State(np.eye(4, dtype=np.float32)[0], np.array([0, 0, 1e-19], np.float32)),
+        np.float32(1),
+    )
+    assert np.all(np.isfinite(single.omega))
+    top, state = jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(4)[0], 1e10 * OMEGA)
+    with pytest.raises(RuntimeError, match="out of the range"):
+        jr.top_motion(top, state, 1e300)
+    assert jr.top.motion_validity(top, state, 1e300) == jr.RESULTS.nonfinite_state
 
 
 def test_without_gravity_it_is_the_free_body():

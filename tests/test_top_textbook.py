@@ -24,7 +24,12 @@ STARTS = {
     "spherical pendulum": {"theta": 2.0, "phi_dot": 0.7, "theta_dot": 0.2},
     "plane pendulum": {"theta": 2.0, "theta_dot": 0.4},
     "through upright": {"theta": 0.0, "omega3": 1.5, "theta_dot": 0.8},
+    "through upside down": {"theta": np.pi, "omega3": 1.5, "theta_dot": 0.8},
+    "sleeping": {"theta": 0.0, "omega3": 4.5},
+    "hanging": {"theta": np.pi, "omega3": 1.5},
 }
+# Where Euler's angles stop: of their routes that of the cosine alone goes on.
+AT_THE_VERTICAL = {"through upright", "through upside down", "sleeping", "hanging"}
 KINDS = {
     "wave": "wave",
     "cusp": "cusp",
@@ -35,6 +40,9 @@ KINDS = {
     "spherical pendulum": "wave",
     "plane pendulum": "pendulum",
     "through upright": "through the vertical",
+    "through upside down": "through the vertical",
+    "sleeping": "sleeping",
+    "hanging": "sleeping",
 }
 
 
@@ -106,7 +114,7 @@ def test_four_ways_to_the_same_motion(name, routes):
     state0 = start(name)
     exact, by_quaternions, heights = routes[0](state0)
     others = {"Euler-Poisson": by_quaternions}
-    if name != "through upright":  # where Euler's angles stop at the vertical
+    if name not in AT_THE_VERTICAL:
         q0 = jnp.asarray(angles_of(state0))
         rates = rotation.omega_to_euler_rates(q0, state0.omega)
         others["Lagrangian"], others["reduced"] = routes[1](q0, rates)
@@ -119,11 +127,6 @@ def test_four_ways_to_the_same_motion(name, routes):
 
 
 def test_where_the_angles_fail_it_is_said():
-    asleep = top.initial_state(TOP, 0.0, omega3=5.0)
-    motion = jr.top_motion(TOP, asleep, 7.0)
-    other = jr.simulate(TOP.as_rigid_body(), asleep, np.array([7.0])).states
-    np.testing.assert_allclose(motion.omega, other.omega[0], atol=1e-12)
-    np.testing.assert_allclose(motion.attitude, other.attitude[0], atol=1e-6)
     q, q_dot = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
     with pytest.raises(RuntimeError, match="singular"):
         lagrangian.acceleration(top.lagrangian, q, q_dot, TOP)
@@ -173,18 +176,31 @@ def test_potential_at_the_vertical():
     assert v(0.0, 1.0, 2.0) == np.inf
     # p^2 tan^2(theta / 2) / (2 I1) + mgl cos theta: curvature p^2 / 4 - mgl
     assert jax.grad(jax.grad(v))(0.0, 3.0, 3.0) == pytest.approx(9 / 4 - 1, rel=1e-13)
-    slopes = jax.grad(v, argnums=(0, 1, 2))(0.0, 3.0, 3.0)
-    assert np.all(np.isfinite(slopes))
+    assert np.all(np.isfinite(jax.grad(v, argnums=(0, 1, 2))(0.0, 3.0, 3.0)))
+
+
+@pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
+def test_slopes_of_potential_and_rates_in_the_momenta(p_phi):
+    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
+
+    def both(p):
+        rates = top.angle_rates(TOP, 1.0, p, 3.0)
+        return jnp.stack([top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi])
+
+    found, h = jax.jacfwd(both)(p_phi), 1e-5
+    difference = (both(p_phi + h) - both(p_phi - h)) / (2 * h)
+    np.testing.assert_allclose(found, difference, atol=1e-9)
+    curvature = jax.jacfwd(jax.jacfwd(both))(p_phi)
+    np.testing.assert_allclose(curvature, [1 / np.sin(1.0) ** 2, 0, 0], atol=1e-13)
 
 
 # --- Nutation -----------------------------------------------------------------------------------
 
 
-def quadratures(name):
+def quadratures(one, state):
     """Bounds, period and advance of phi and psi by integrals over u = cos theta, 25 digits."""
-    keeps = [mp.mpf(float(x)) for x in top.conserved(TOP, start(name))]
-    p_phi, p_psi, energy = keeps
-    i1, i3, mgl = (mp.mpf(float(x)) for x in (TOP.I1, TOP.I3, TOP.mgl))
+    p_phi, p_psi, energy = (mp.mpf(float(x)) for x in top.conserved(one, state))
+    i1, i3, mgl = (mp.mpf(float(x)) for x in (one.I1, one.I3, one.mgl))
     alpha, beta, a, b = (2 * energy - p_psi**2 / i3) / i1, 2 * mgl / i1, p_psi / i1, p_phi / i1
     u1, u2, u3 = sorted(
         mp.re(x) for x in mp.polyroots(
@@ -209,7 +225,7 @@ def quadratures(name):
 @pytest.mark.parametrize("name", ["wave", "cusp", "loop", "below the horizontal"])
 def test_bounds_period_and_advance_are_the_textbook_s_integrals(name):
     with mp.workdps(25):
-        low, high, period, phi, psi = (float(x) for x in quadratures(name))
+        low, high, period, phi, psi = (float(x) for x in quadratures(TOP, start(name)))
     state = start(name)
     bounds = top.nutation_bounds(TOP, state)
     np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13)
@@ -246,10 +262,14 @@ def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
 @pytest.mark.parametrize("name", STARTS)
 def test_kinds_of_motion(name):
     assert top.CLASSES[int(top.motion_class(TOP, start(name)))] == KINDS[name]
-    # Any later state is of the same kind, and a top seen from below too.
-    if name != "cusp":
-        later = jr.top_motion(TOP, start(name), 1.7)
-        assert top.CLASSES[int(top.motion_class(TOP, later))] == KINDS[name]
+    # Any later state is of the same kind, and so is the same motion with the axis named backward.
+    later = jr.top_motion(TOP, start(name), 1.7)
+    assert top.CLASSES[int(top.motion_class(TOP, later))] == KINDS[name]
+    state = start(name)
+    back = rotation.multiply(state.attitude, np.array([0.0, 1, 0, 0]))
+    backward = jr.State(back, state.omega * np.array([1.0, -1, -1]))
+    reversed_ = jr.SymmetricTop(TOP.I1, TOP.I3, -TOP.mgl)
+    assert top.CLASSES[int(top.motion_class(reversed_, backward))] == KINDS[name]
 
 
 @pytest.mark.parametrize("theta", [0.0, np.pi])
@@ -279,8 +299,9 @@ def slopes():
 def test_derivatives_of_period_and_precession_are_differences(name, slopes):
     state = start(name)
     direction = np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])
-    if name in ("plane pendulum", "through upright"):  # stay in the plane, or pass the vertical
-        direction[3:] = [0.4, 0.0, 0.0]
+    if name == "plane pendulum" or name in AT_THE_VERTICAL:  # stay in the plane, or at the vertical
+        moves = not name.startswith("plane") and state.omega[0] == 0
+        direction[3:] = [0.0, 0.0, 0.4] if moves else [0.4, 0.0, 0.0]
     value, forward, reverse = slopes
 
     def both(s):
@@ -291,6 +312,32 @@ def test_derivatives_of_period_and_precession_are_differences(name, slopes):
     difference = (8 * (both(h) - both(-h)) - (both(2 * h) - both(-2 * h))) / (12 * h)
     np.testing.assert_allclose(found, difference, rtol=0, atol=1e-9)
     np.testing.assert_allclose(reverse(0.0, direction, state), found, rtol=1e-11)
+
+
+def test_small_swings_keep_their_relative_size():
+    """Of a pendulum about hanging, and of a cusp beside the vertical."""
+    for small in (1e-3, 1e-7, 1e-12):
+        attitude = np.array([np.sin(small / 2), np.cos(small / 2), 0, 0])
+        bounds = top.nutation_bounds(TOP, jr.State(attitude, np.zeros(3)))
+        assert np.pi - bounds.theta_min == pytest.approx(small, rel=1e-12 + 5e-16 / small)
+        bounds = top.nutation_bounds(TOP, top.initial_state(TOP, small, omega3=6.0))
+        # theta_max^2 / theta_min^2 = spin^2 / (spin^2 - 4 mgl I1 / I3^2)
+        assert bounds.theta_max / bounds.theta_min == pytest.approx((36 / 20) ** 0.5, rel=1e-6)
+
+
+def test_the_endless_motion_comes_to_the_vertical_at_its_rate():
+    for mgl, sign in ((1.0, 1.0), (-1.0, -1.0)):
+        attitude = np.array([1.0, 0, 0, 0]) if mgl > 0 else np.array([0.0, 1, 0, 0])
+        one, state = jr.SymmetricTop(1.0, 0.5, mgl), jr.State(attitude, np.array([0, 0, 2.0]))
+        assert top.nutation_period(one, state) == np.inf
+        assert top.mean_precession(one, state) == pytest.approx(sign * 0.5)
+
+
+@pytest.mark.parametrize("tilt", [1e-6, 1e-9, 1e-30])
+def test_precession_at_the_threshold_of_sleeping(tilt):
+    """The slower a nutation, the longer the axis stands upright and turns at I3 omega3 / (2 I1)."""
+    state = top.initial_state(TOP, tilt, omega3=4.0)
+    assert top.mean_precession(TOP, state) == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
 
 
 SPECIAL = {
@@ -360,6 +407,8 @@ def test_when_steady_precession_exists():
     # Where the two meet their difference is the root of a rounding error.
     np.testing.assert_allclose(at_least.slow, at_least.fast, rtol=1e-7)
     assert top.steady_precession(TOP, 2.0, 0.0).exists
+    for mgl in (1.0, -1.0):
+        assert not top.steady_precession(jr.SymmetricTop(1.0, 0.5, mgl), np.pi / 2, 0.0).exists
     level = top.steady_precession(TOP, np.pi / 2, 5.0)
     assert level.slow == pytest.approx(1 / (0.5 * 5.0))
     assert level.fast == np.inf
@@ -481,12 +530,22 @@ INTEGRABLE = {
 }
 
 
+@pytest.fixture(scope="module")
+def long_motion():
+    def run(moments, lever, state0, ts):
+        gravity = jr.torques.UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
+        body = jr.RigidBody(moments, gravity)
+        return jr.simulate(body, state0, ts, rtol=1e-13, max_step=0.05).states
+
+    return jax.jit(run)
+
+
 @pytest.mark.parametrize("case", INTEGRABLE)
-def test_extra_integrals_are_constant_to_1e_12_over_a_thousand_turns(case):
+def test_extra_integrals_are_constant_to_1e_12_over_a_thousand_turns(case, long_motion):
     body, omega = INTEGRABLE[case]
     state0 = jr.State(ATTITUDE, omega)
     ts = np.linspace(0.0, 2000 * np.pi / np.linalg.norm(omega), 101)
-    states = jr.simulate(body, state0, ts, rtol=1e-13, max_step=0.05).states
+    states = long_motion(body.inertia, body.torque.lever, state0, ts)
     first = top.integrals(body, state0, case)
     later = jax.vmap(lambda s: top.integrals(body, s, case))(states)
     for before, after in zip(first, later, strict=True):
@@ -581,17 +640,24 @@ def test_bruls_cardona_heavy_top_in_closed_form():
 def test_simo_wong_heavy_top_in_closed_form():
     """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
 
-    A fast top: it precesses at mgl / (I3 omega3) = 0.4 rad/s to 2 I1 mgl / (I3 omega3)^2.
+    Beside it the quaternions' equations, and the mean precession by quadrature.
     """
     simo = jr.SymmetricTop(5.0, 1.0, 20.0)
     state0 = jr.State(rotation.exp(np.array([0.05, 0, 0])), np.array([0.0, 0.0, 50.0]))
     keeps = top.conserved(simo, state0)
     assert keeps.energy == pytest.approx(1269.975, abs=5e-4)
-    states = jr.top_motion(simo, state0, np.linspace(0.0, 10.0, 101))
+    times = np.linspace(0.0, 10.0, 101)
+    states = jr.top_motion(simo, state0, times)
     energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states)
     np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
     assert np.cos(top.nutation_bounds(simo, state0).theta_min) == pytest.approx(0.99875, abs=5e-6)
-    assert top.mean_precession(simo, state0) == pytest.approx(0.4, rel=0.09)
+    body = heavy([5.0, 5.0, 1.0], [0.0, 0.0, 20.0])
+    other = jr.simulate(body, state0, times, rtol=1e-12).states
+    np.testing.assert_allclose(states.attitude, other.attitude, atol=1e-9)
+    with mp.workdps(25):
+        _, _, period, phi, _ = quadratures(simo, state0)
+    assert top.nutation_period(simo, state0) == pytest.approx(float(period), rel=1e-12)
+    assert top.mean_precession(simo, state0) == pytest.approx(float(phi / period), rel=1e-11)
 
 
 def test_curtis_example_11_15():

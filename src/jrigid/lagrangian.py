@@ -38,6 +38,8 @@ def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
     q, q_dot = float_arrays(q, q_dot)
     check_shape("q", q, (None,))
     check_shape("q_dot", q_dot, q.shape)
+    if q.size == 0:
+        raise ValueError("Argument `q` must have one coordinate at least, but it has none.")
     return q, q_dot
 
 

@@ -1,6 +1,6 @@
 """Write top_motion.npz and top_derivatives.npz: heavy symmetric tops of every kind at 30 digits.
 
-Run as `python tests/data/make_top_motion.py`; it takes about four minutes. The cases are drawn
+Run as `python tests/data/make_top_motion.py`; it takes about ten minutes. The cases are drawn
 with a fixed seed, and the motions come from tests/taylor_reference.py.
 
 Arrays, one row a case: `regime` (name), `level` (how far from the degenerate case the regime is
@@ -81,14 +81,17 @@ class Cases:
         sign = -1 if self.rng.uniform() < 0.3 else 1
         return sign * self.power(np.log10(shortest), np.log10(longest))
 
-    def add(self, regime, top, attitude, omega, level=0.0, unstable=False, span=None, shortest=0.1):
+    def add(
+        self, regime, top, attitude, omega, level=0.0, unstable=False, span=None, shortest=0.1,
+        bits=BITS,
+    ):  # fmt: skip
         """Add a case; `span` is the time times `fastest`, else drawn."""
         attitude, omega = attitude + 0.0, np.asarray(omega, float) + 0.0  # no -0.0
         if span is None:
             span = self.duration(shortest, UNSTABLE if unstable else STABLE)
         rate = fastest(*top, omega)
         time = span / rate if rate else span
-        bits = BITS + (int(2.2 * abs(span)) if unstable else 0)
+        bits = bits + (int(2.2 * abs(span)) if unstable else 0)
         self.rows.append((regime, level, top[:2], top[2], attitude, omega, time, bits))
 
     # Regimes
@@ -196,15 +199,22 @@ class Cases:
                     span = -time * fastest(*top, omega)
                 self.add(regime, top, attitude, omega, unstable=True, span=span)
 
-    def near_sleeping(self):
+    def near_sleeping(self, repeats, longer=0):
+        """Over times of 60 and, `longer` times more, 300 to 1500: a nutation lasts that long."""
         tilts, signs = (0.5, 1e-2, 1e-4, 1e-6), (-1, 1)
         levels = (1e-3, 1e-8, 1e-12)
-        for level, tilt, sign, k in itertools.product(levels, tilts, signs, range(3)):
+        for level, tilt, sign, k in itertools.product(
+            levels, tilts, signs, range(repeats + longer)
+        ):
             top = self.top()
             spin = self.sign() * threshold(*top) * (1 + sign * level)
             omega = self.omega(top) * min(k, 1) * tilt
             omega[2] = spin
-            self.add("near sleeping spin", top, self.tilt(tilt), omega, level, unstable=True)
+            if k < repeats:
+                self.add("near sleeping spin", top, self.tilt(tilt), omega, level, unstable=True)
+                continue
+            span = self.sign() * self.power(2.5, 3.2)
+            self.add("near sleeping spin", top, self.tilt(tilt), omega, level, span=span, bits=412)
 
     def pendulum(self):
         for k in range(60):
@@ -255,10 +265,11 @@ def draw():
     cases.steady()
     cases.vertical()
     cases.passing()
-    cases.near_sleeping()
+    cases.near_sleeping(3)
     cases.pendulum()
     cases.hanging()
     cases.rest()
+    cases.near_sleeping(2, longer=2)
     return cases.rows
 
 

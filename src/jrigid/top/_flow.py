@@ -41,6 +41,10 @@ _SHORT_PHASE_SQUARE = 2.0
 # Nearer to the separatrix than this the nutation is out of reach, and beyond this phase a top is
 # taken to stay upright: it would leave only then, from a tilt below exp(-phase).
 _ON_SEPARATRIX = {8: 1e-100, 4: 1e-15}
+# Nor are nutations counted of which one lasts longer than some 1e20 (1e6) radians.
+_SLOWEST = {8: 1e-80, 4: 1e-24}
+# Rates are in units that are not smaller, whose squares do not underflow [rad/s].
+_LEAST_UNIT = {8: 1e-140, 4: 1e-17}
 _LONGEST_PHASE = {8: 60.0, 4: 10.0}
 
 
@@ -57,6 +61,40 @@ def _short_time(a: Array, b: Array, g: Array, h: Array) -> tuple[Array, Array]:
     return s, h**3 * (1 / 3 + (d1 / 5 + (d2 / 7 + d3 / 9)))
 
 
+def _short_time_of_alpha(mu: Array, a: Array, b: Array, g: Array, s: Array) -> Array:
+    """The integral w of alpha, of z / (1 + mu z), where beta's s is short but mu s^2 need not be.
+
+    Near the threshold of sleeping a nutation lasts much longer than 1 / sqrt(mu). The inverse of
+    s' is a series in s^2; what is left are the moments of 1 / (1 + mu s^2).
+    """
+    x = s * s
+    a, b, c = a * x, b * x * x, (g * x) ** 2 * x
+    weights = (
+        jnp.ones_like(x),
+        -a / 2,
+        3 * a * a / 8 - b / 2,
+        -5 * a**3 / 16 + 3 * a * b / 4 + c / 2,
+        35 * a**4 / 128 - 15 * a * a * b / 16 + 3 * b * b / 8 - 3 * a * c / 4,
+    )
+    q = mu * x
+    small = q < 0.25
+    # Integrals of y^(2 k) / (1 + q y^2) from 0 to 1: backward from a series, or forward.
+    near = jnp.where(small, q, 0.0)
+    total = jnp.full_like(x, 1 / 49)
+    for k in range(18, -1, -1):
+        total = 1 / (2 * k + 11) - near * total
+    moments = [total]
+    for k in range(4, 0, -1):
+        moments.insert(0, 1 / (2 * k + 1) - near * moments[0])
+    far = jnp.where(small, 1.0, q)
+    moment = arctanc_sqrt(far)
+    sum_ = jnp.zeros_like(x)
+    for k, (weight, close) in enumerate(zip(weights, moments, strict=True)):
+        moment = (1 / (2 * k + 1) - moment) / far
+        sum_ = sum_ + weight * jnp.where(small, close, moment)
+    return s * x * sum_
+
+
 def _slope(a: Array, b: Array, g: Array, z: Array) -> Array:
     """The derivative s' from z = s^2, up to the half period."""
     return jnp.sqrt(1 + z * (a + z * b) - (g * z) ** 2 * z)
@@ -67,8 +105,7 @@ def _elapsed(mu: Array, a: Array, b: Array, g_alpha: Array, g_beta: Array, h: Ar
     """Functions s (of beta), w of alpha and w of beta, at most a quarter of a nutation."""
     h = h * 2.0**-_DOUBLINGS
     s, w_beta = _short_time(a, b, g_beta, h)
-    # The base of s^-2 of alpha is lower by mu.
-    _, w_alpha = _short_time(a - 3 * mu, b + mu * (3 * mu - 2 * a), g_alpha, h)
+    w_alpha = _short_time_of_alpha(mu, a, b, g_beta, s)
 
     def twice(_: Any, at_half: Components) -> Components:
         s, w_alpha, w_beta = at_half
@@ -166,7 +203,9 @@ def invariants(i1: Scalar, i3: Scalar, mgl: Scalar, attitude: Quaternion, omega:
     spin = i3 / i1 * w3
     mu = mgl / i1
     sizes = jnp.stack([w1, w2, spin, jnp.sqrt(jnp.abs(jax.lax.stop_gradient(mu)))])
-    unit = power_of_two(jax.lax.stop_gradient(jnp.max(jnp.abs(sizes))))
+    size = jnp.dtype(mu.dtype).itemsize
+    fastest = jnp.max(jnp.abs(jax.lax.stop_gradient(sizes)))
+    unit = power_of_two(jnp.maximum(fastest, _LEAST_UNIT[size]))
     slip = (w3 - spin) / unit
     hangs = mu < 0
     q, w = _reversed(hangs, tuple(attitude), (w1 / unit, w2 / unit, spin / unit))
@@ -187,8 +226,8 @@ def invariants(i1: Scalar, i3: Scalar, mgl: Scalar, attitude: Quaternion, omega:
 
     # Over the fourth power of the fastest rate the square of q is zero on the separatrix.
     root = jax.lax.stop_gradient(_largest_root(a, b, g_beta * g_beta))
-    tiny = _ON_SEPARATRIX[jnp.dtype(a.dtype).itemsize]
-    nutates = b + root * (2 * a + 3 * root) > tiny * (a + 3 * root) ** 2
+    stretch = b + root * (2 * a + 3 * root)
+    nutates = stretch > _ON_SEPARATRIX[size] * (a + 3 * root) ** 2 + _SLOWEST[size]
     example = (1.0, 1.0, 1.0, 1.0, 3**0.5, 3**0.5)
     mu_, x, a_, b_, g_alpha_, g_beta_ = (
         jnp.where(nutates, value, other)
@@ -291,11 +330,15 @@ def at(motion: Motion, t: Scalar) -> tuple[Quaternion, Vector]:
     s, slope, w_alpha, w_beta = materialize(s, slope, w_alpha, w_beta)
     turn_alpha, turn_beta = materialize(_turn(g_alpha * w_alpha), _turn(g_beta * w_beta))
     top = mu, a, b, g_alpha, g_beta
-    for _ in range(2):
-        alpha, d_alpha, beta, d_beta = materialize(
+
+    def half(_: Any, x: Components) -> Components:
+        alpha, d_alpha, beta, d_beta = x
+        return (
             *_alpha_after((alpha, beta, d_alpha, d_beta), top, s, slope, turn_alpha),
             *_beta_after(beta, d_beta, top, s, slope, turn_beta),
         )
+
+    alpha, d_alpha, beta, d_beta = jax.lax.fori_loop(0, 2, half, (alpha, d_alpha, beta, d_beta))
     across = jnp.conj(alpha) * d_beta - beta * jnp.conj(d_alpha)
     across = across + across
     advance_alpha = advance_alpha + jnp.pi

@@ -6,7 +6,7 @@ import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Real
 
-from jrigid._checks import check_shape, nan_where
+from jrigid._checks import RESULTS, Findings, all_finite, check_shape, nan_where
 from jrigid._types import ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import normalize
@@ -37,7 +37,7 @@ def motion_validity(
     >>> code == jr.RESULTS.invalid_inertia
     Array(True, dtype=bool)
     """
-    findings, *_ = checked_with(top, state0, ts, t0)
+    findings, _ = _motion(top, state0, ts, t0)
     return findings.result
 
 
@@ -68,7 +68,8 @@ def top_motion(
 
     Raises:
         ValueError: Wrong shape or dtype (trace time).
-        RuntimeError: Bad value, with `throw=True` (run time, any lane).
+        RuntimeError: Bad value, or angles turned that overflow, with `throw=True` (run time, any
+            lane).
 
     Gradients: of any order and in every mode those of the motion, also for a sleeping, steady,
     weightless or hanging top and through the vertical; reverse mode costs a few values.
@@ -81,10 +82,16 @@ def top_motion(
     >>> print(motion.omega.shape, motion.omega[1].round(4))
     (3, 3) [-0.3481  0.2425  5.    ]
     """
+    findings, state = _motion(top, state0, ts, t0)
+    return findings.apply(nan_where(~findings.ok, state), throw)
+
+
+def _motion(top: Any, state0: Any, ts: Any, t0: Any) -> tuple[Findings, State]:
     findings, top, state0, (times, t0) = checked_with(top, state0, ts, t0)
     check_shape("t0", t0, ())
-    attitude, omega = _states(top, normalize(state0.attitude), state0.omega, times - t0)
-    return findings.apply(nan_where(~findings.ok, State(attitude, omega)), throw)
+    state = State(*_states(top, normalize(state0.attitude), state0.omega, times - t0))
+    findings.require(all_finite(state), RESULTS.nonfinite_state)
+    return findings, state
 
 
 @jax.jit

@@ -48,45 +48,61 @@ def _motion(top: SymmetricTop, state: State, throw: bool) -> tuple[Findings, Sym
     return findings, top, invariants(top.I1, top.I3, top.mgl, attitude, state.omega)
 
 
-def _squares(motion: Motion) -> tuple[Array, Array, Array]:
-    """|beta|^2 = (1 - cos tilt) / 2: now, and at the bounds; where mgl < 0, of the tilt reversed.
+class _Bounds(NamedTuple):
+    """|beta|^2 = (1 - cos tilt) / 2 and |alpha|^2 at the bounds; mgl < 0: of the axis reversed."""
 
-    It obeys (d|beta|^2/dt)^2 / 4 = (mu x + X) (-x^2 + c1 x + c0), with the largest root X of the
-    exact flow.
+    beta_low: Array
+    beta_high: Array
+    alpha_low: Array
+    alpha_high: Array
+    spread: Array
+
+
+def _bounds(motion: Motion) -> _Bounds:
+    """From the smaller of the two squares, x, which keeps its relative accuracy.
+
+    (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of the exact flow.
     """
-    _, beta, _, d_beta = motion.start
-    mu, a = motion.mu, motion.a
-    now = square_of(beta)
-    slope = square_of(d_beta) + now * (a - 2 * mu * now)  # zero in steady motion
-    moving = beta.real * d_beta.real + beta.imag * d_beta.imag
-    root = jnp.where(motion.nutates, motion.root, 0.0)
-    front = mu * now + root
+    alpha, beta, d_alpha, d_beta = motion.start
+    hanging = square_of(alpha) < square_of(beta)
+    x, dx = jnp.where(hanging, alpha, beta), jnp.where(hanging, d_alpha, d_beta)
+    m = jnp.where(hanging, motion.mu, -motion.mu)
+    a = jnp.where(hanging, motion.a - 3 * motion.mu, motion.a)
+    now = square_of(x)
+    slope = square_of(dx) + now * (a + 2 * m * now)  # zero in steady motion
+    front = motion.mu * square_of(beta) + jnp.where(motion.nutates, motion.root, 0.0)
     # Upright at the separatrix: from there to -mu x^2 + a x = 0.
     plain = front > 0
     front = jnp.where(plain, front, 1.0)
-    mu_safe = jnp.where(mu > 0, mu, 1.0)
-    height = moving * moving / front
-    skew = (slope - mu * height) / front
-    skew = jnp.where(plain, skew, jnp.where(mu > 0, jnp.maximum(a, 0.0) / mu_safe, 0.0))
-    height = jnp.where(plain, height, 0.0)
-    square = skew * skew + 4 * height
-    # The square root of a double root: zero, without a derivative.
-    distinct = square > 0
-    root = jnp.where(distinct, jnp.sqrt(jnp.where(distinct, square, 1.0)), 0.0)
+    speed = (jnp.conj(x) * dx).real / jnp.sqrt(front)
+    skew = slope / front + m * (speed / jnp.sqrt(front)) * (speed / jnp.sqrt(front))
+    fall = jnp.maximum(a, 0.0) / jnp.where(motion.mu > 0, motion.mu, 1.0)
+    skew = jnp.where(plain, skew, jnp.where(motion.mu > 0, fall, 0.0))
+    speed = jnp.where(plain, speed, 0.0)
+    # A length without underflow, and at a double root zero without a derivative.
+    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(skew), jnp.abs(speed)))
+    distinct = size > 0
+    size = jnp.where(distinct, size, 1.0)
+    square = (skew / size) ** 2 + 4 * (speed / size) ** 2
+    spread = jnp.where(distinct, size * jnp.sqrt(jnp.where(distinct, square, 1.0)), 0.0)
     # Without cancellation at the near end.
-    far = 0.5 * (jnp.abs(skew) + root)
-    near = -height / jnp.where(far > 0, far, 1.0)
-    up = jnp.where(skew > 0, far, -near)
-    down = jnp.where(skew > 0, near, -far)
-    return now, now + down, now + up
+    far = 0.5 * (jnp.abs(skew) + spread)
+    near = speed * (speed / jnp.where(distinct, far, 1.0))
+    low = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
+    high = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
+    return _Bounds(
+        jnp.where(hanging, 1 - high, low),
+        jnp.where(hanging, 1 - low, high),
+        jnp.where(hanging, low, 1 - high),
+        jnp.where(hanging, high, 1 - low),
+        spread,
+    )
 
 
-def _tilt(square: Array) -> Array:
-    square = jnp.clip(square, 0.0, 1.0)
-    inside = (square > 0) & (square < 1)
-    safe = jnp.where(inside, square, 0.5)
-    angle = 2 * safe_arctan2(jnp.sqrt(safe), jnp.sqrt(1 - safe))
-    return jnp.where(inside, angle, jnp.where(square > 0, jnp.pi, 0.0))
+def _tilt(of_beta: Array, of_alpha: Array) -> Array:
+    inside = (of_beta > 0) & (of_alpha > 0)
+    roots = (jnp.sqrt(jnp.where(inside, x, 0.5)) for x in (of_beta, of_alpha))
+    return jnp.where(inside, 2 * safe_arctan2(*roots), jnp.where(of_beta > 0, jnp.pi, 0.0))
 
 
 def nutation_bounds(top: SymmetricTop, state: State, *, throw: bool = True) -> NutationBounds:
@@ -115,8 +131,8 @@ def nutation_bounds(top: SymmetricTop, state: State, *, throw: bool = True) -> N
     0.5 0.7576
     """
     findings, _, motion = _motion(top, state, throw)
-    _, low, high = _squares(motion)
-    low, high = _tilt(low), _tilt(high)
+    at = _bounds(motion)
+    low, high = _tilt(at.beta_low, at.alpha_high), _tilt(at.beta_high, at.alpha_low)
     found = NutationBounds(
         jnp.where(motion.hangs, jnp.pi - high, low), jnp.where(motion.hangs, jnp.pi - low, high)
     )
@@ -206,7 +222,7 @@ def mean_precession(top: SymmetricTop, state: State, *, throw: bool = True) -> S
 
     Returns:
         The rate [rad/s]; in steady precession the rate of that; where the period is infinite that
-        with which the axis comes upright, I3 omega3 / (2 I1).
+        with which the axis comes upright, I3 omega3 / (2 I1) (mgl < 0: upside down, the opposite).
 
     Raises:
         ValueError: Wrong shape (trace time).
@@ -222,7 +238,7 @@ def mean_precession(top: SymmetricTop, state: State, *, throw: bool = True) -> S
     """
     findings, top, motion = _motion(top, state, throw)
     phi, _ = _advance(motion)
-    endless = 0.5 * top.I3 * motion.omega3 / top.I1
+    endless = jnp.where(motion.hangs, -0.5, 0.5) * top.I3 * motion.omega3 / top.I1
     rate = jnp.where(motion.nutates, motion.unit * phi / motion.period, endless)
     return nan_where(~findings.ok, rate)
 
@@ -259,27 +275,32 @@ def motion_class(top: SymmetricTop, state: State, *, throw: bool = True) -> Int[
     findings, _, motion = _motion(top, state, throw)
     motion = jax.lax.stop_gradient(motion)
     alpha, beta, d_alpha, d_beta = motion.start
-    now, low, high = _squares(motion)
-    tolerance = 4096 * jnp.finfo(now.dtype).eps
+    at = _bounds(motion)
+    eps = jnp.finfo(at.spread.dtype).eps
+    tolerance = 4096 * eps
     # Momenta about the vertical and the axis, less and plus, over 4 I1
     plus, less = (jnp.conj(alpha) * d_alpha).imag, (jnp.conj(beta) * d_beta).imag
     size = jnp.maximum(jnp.abs(plus), jnp.abs(less))
     rate = jnp.sqrt(motion.mu + square_of(d_alpha) + square_of(d_beta))
     rate = jnp.where(rate > 0, rate, 1.0)
-    spinless = size <= tolerance * rate
+    spinless = size <= tolerance * rate * at.beta_high * at.alpha_high
     # phi' sin^2 / 4 = plus |beta|^2 + less |alpha|^2, at either bound
-    ends = jnp.stack([plus * x + less * (1 - x) for x in (low, high)])
-    scales = jnp.stack([jnp.abs(plus) * x + jnp.abs(less) * (1 - x) for x in (low, high)])
-    turns = jnp.where(jnp.abs(ends) <= tolerance * scales + 1e-3 * tolerance * size, 0.0, ends)
-    wide = (high - low) > jnp.sqrt(tolerance) * jnp.sqrt(high * (1 - low)) + tolerance
-    vertical = ((jnp.abs(less) <= tolerance * size) & (low <= tolerance)) | (
-        (jnp.abs(plus) <= tolerance * size) & (high >= 1 - tolerance)
+    turns = []
+    for of_beta, of_alpha in ((at.beta_low, at.alpha_high), (at.beta_high, at.alpha_low)):
+        parts = plus * of_beta, less * of_alpha
+        scale = jnp.abs(parts[0]) + jnp.abs(parts[1])
+        still = jnp.abs(parts[0] + parts[1]) <= tolerance * scale
+        turns.append(jnp.where(still, 0.0, jnp.sign(parts[0] + parts[1])))
+    sense = turns[0] * turns[1]
+    wide = at.spread > tolerance * at.beta_high * at.alpha_high
+    vertical = (at.beta_low <= tolerance * at.beta_high) | (
+        at.alpha_low <= tolerance * at.alpha_high
     )
-    stands = square_of(beta) + square_of(d_beta) / rate**2 <= tolerance**2
-    stands = stands | (square_of(alpha) + square_of(d_alpha) / rate**2 <= tolerance**2)
-    code = jnp.where(turns[0] * turns[1] < 0, 2, jnp.where(turns[0] * turns[1] == 0, 1, 0))
+    stands = square_of(beta) + square_of(d_beta) / rate**2 <= (4 * eps) ** 2
+    stands = stands | (square_of(alpha) + square_of(d_alpha) / rate**2 <= (4 * eps) ** 2)
+    code = jnp.where(sense < 0, 2, jnp.where(sense == 0, 1, 0))
     code = jnp.where(vertical, 6, code)
-    code = jnp.where(spinless & wide, 5, code)
+    code = jnp.where(spinless, 5, code)
     code = jnp.where(~wide, 3, code)
     code = jnp.where(stands, 4, code)
     return jnp.where(findings.ok, code, -1)

@@ -47,7 +47,7 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
         The Lagrangian [J].
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape (trace time). Values are not checked.
 
     Gradients: analytic; the mass matrix is singular at theta = 0 and pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -102,8 +102,8 @@ def conserved(top: SymmetricTop, state: State, *, throw: bool = True) -> Conserv
 
 
 def _over(momentum: Array, side: Array) -> Array:
-    """Half the quotient; 0 / 0, an axis that may stand at the vertical, is 0."""
-    zero = momentum == 0
+    """Half the quotient; 0 / 0, at the vertical and allowed to be there, is 0."""
+    zero = (momentum == 0) & (side == 0)
     return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
 
 
@@ -121,12 +121,14 @@ def angle_rates(
     Returns:
         phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi' cos theta
         [rad/s]. Infinite at the vertical, unless the momenta let the axis pass: then the mean of
-        the two sides.
+        the two sides. At theta = pi, which no floating point number is, large in place of
+        infinite.
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape (trace time). Values are not checked.
 
-    Gradients: finite inside 0 < theta < pi; at p_phi = +-p_psi without the singular part.
+    Gradients: right inside 0 < theta < pi; in the momenta at the vertical without the singular
+    part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -158,10 +160,9 @@ def effective_potential(
         vertical unless the momenta let the axis pass.
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape (trace time). Values are not checked.
 
-    Gradients: finite where V is; in the momenta at an upright p_phi = p_psi without the
-    singular part.
+    Gradients: right where V is finite; in the momenta at the vertical without the singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -188,7 +189,7 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
         u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2.
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape (trace time). Values are not checked.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -219,7 +220,7 @@ def reduced_vector_field(
         may pass there (p_phi = +-p_psi) does pass, theta changing its sign (or beyond pi).
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Wrong shape (trace time). Values are not checked.
 
     Gradients: analytic inside 0 < theta < pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.

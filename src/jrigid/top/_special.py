@@ -54,20 +54,22 @@ def _steady(
     momentum = i3 * spin
     # psi' = omega3 - p cos(theta) in place of omega3 takes I3 off I1.
     i1 = i1 - i3 if of_psi else i1
+    eps = jnp.finfo(theta.dtype).eps
     cos = jnp.cos(theta)
-    square = momentum * momentum - 4 * i1 * mgl * cos
-    # Level within rounding, there is one rate.
-    level = (jnp.abs(cos) <= 4 * jnp.finfo(cos.dtype).eps) | (i1 == 0)
+    # Level within rounding there is one rate.
+    level = (jnp.abs(cos) <= 4 * eps) | (i1 == 0)
+    slant = jnp.where(level, 0.0, i1 * cos)
+    square = momentum * momentum - 4 * slant * mgl
     positive = square > 0
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
     total = momentum + jnp.where(momentum < 0, -root, root)
     still = total == 0
     slow = jnp.where(still, 0.0, 2 * mgl / jnp.where(still, 1.0, total))
-    fast = 0.5 * total / jnp.where(level, 1.0, i1 * cos)
+    fast = 0.5 * total / jnp.where(level, 1.0, slant)
     fast = jnp.where(level, jnp.where(total < 0, -jnp.inf, jnp.inf), fast)
     # At the threshold itself the square is zero to rounding only.
-    eps = jnp.finfo(square.dtype).eps
-    return slow, fast, square >= -8 * eps * momentum * momentum
+    exists = (square >= -8 * eps * momentum * momentum) & (~still | (mgl == 0))
+    return slow, fast, exists
 
 
 def steady_precession(

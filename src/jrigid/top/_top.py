@@ -26,8 +26,8 @@ from jrigid.torques import UniformGravity
 
 _SYMMETRIC = (
     "Arguments `body` and `lever` must describe a top symmetric about body axis 3, with the centre "
-    "of mass on that axis, but they do not: for any other body use `RigidBody` with "
-    "`torques.UniformGravity`."
+    "of mass on that axis, under a finite gravity, but they do not: for any other body use "
+    "`RigidBody` with `torques.UniformGravity`."
 )
 _BAD_TOP = "Argument `top` must have I1 > 0, I3 > 0 and a finite mgl, but it does not."
 
@@ -45,6 +45,8 @@ class SymmetricTop(eqx.Module):
 
     Raises:
         ValueError: Not scalars (trace time). Values are checked where the top is used.
+
+    For many tops `jax.vmap` over the numbers, or over a top whose leaves have a leading axis.
 
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(I1=2e-3, I3=1e-3, mgl=0.2)
@@ -101,7 +103,8 @@ class SymmetricTop(eqx.Module):
         tolerance = jnp.sqrt(jnp.finfo(tensor.dtype).eps)
         findings = Findings()
         findings.require(
-            jnp.all(jnp.abs(off) <= tolerance * size)
+            jnp.isfinite(gravity)
+            & jnp.all(jnp.abs(off) <= tolerance * size)
             & jnp.all(jnp.abs(lever[:2]) <= tolerance * jnp.max(jnp.abs(lever))),
             RESULTS.invalid_inertia,
             _SYMMETRIC,
@@ -126,8 +129,7 @@ class SymmetricTop(eqx.Module):
 
 
 def _scalar(name: str, value: Any) -> Any:
-    # None and integers pass, for the `in_axes` of a top under vmap.
-    return value if value is None or type(value) is int else array_of_shape(name, value)
+    return None if value is None else array_of_shape(name, value)  # None: an axis of vmap
 
 
 def require_top(findings: Findings, top: SymmetricTop) -> None:
