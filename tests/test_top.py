@@ -157,7 +157,7 @@ def test_a_top_asleep_turns_about_the_vertical_for_ever(spin, t):
 
 
 def test_rates_whose_squares_underflow_and_angles_that_overflow():
-    for rate in (1e-140, 1e-170, 1e-300):
+    for rate in (1e-140, 1e-170, 1e-200):
         found = state_at(
             jnp.array([1.0, 0.5, 0.0]),
             ATTITUDE / np.linalg.norm(ATTITUDE),
@@ -231,12 +231,9 @@ def test_derivatives_equal_the_variational_equations():
     tangent[:, :4, :4] -= inputs[:, :4, None] * inputs[:, None, :4]
     exact = np.einsum("nij,njk->nik", exact, tangent)
     size = np.linalg.norm(exact, axis=(1, 2))
-    # A bit of the inputs changes an unstable motion's Jacobian too, by about its square.
-    bar = 1e-9 + 8 * EPS * size
     for one in found:
         relative = np.linalg.norm(np.asarray(one) - exact, axis=(1, 2)) / size
-        assert np.all(relative <= bar), dict(zip(regimes, relative / bar, strict=True))
-    assert np.sum(bar < 2e-9) > 0.8 * len(bar)
+        assert np.all(relative <= 1e-9), dict(zip(regimes, relative, strict=True))
     assert set(regimes) == set(REGIMES) - {"slow units", "fast units"}
     assert np.sum(SLOPES["duration"] == -200) >= 20
 
@@ -312,11 +309,9 @@ def test_derivative_in_time_is_euler_s_equation():
 # --- float32, shapes, modes ---------------------------------------------------------------------
 
 FLOAT32_MULTIPLE = 32
-# Where a motion amplifies its inputs' last bits.
-AMPLIFIED = {"pendulum", "sleeping", "near sleeping spin", "through upright"}
 
 
-@pytest.mark.parametrize("regime", [r for r in REGIMES if r not in AMPLIFIED and "units" not in r])
+@pytest.mark.parametrize("regime", [r for r in REGIMES if "units" not in r])
 def test_float32_within_a_multiple_of_its_eps(regime, compiled):
     parameters, attitude, omega, time = (x.astype(np.float32) for x in rows(regime))
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
@@ -330,8 +325,10 @@ def test_float32_within_a_multiple_of_its_eps(regime, compiled):
     scaled = sum(np.linalg.norm(c, axis=(1, 2)) for c in columns) / np.minimum(1, rate[:, 0])
     eps = float(np.finfo(np.float32).eps)
     bar = FLOAT32_MULTIPLE * eps * (1 + rate[:, 0] * np.abs(wide[3]))
+    # Where the motion does not amplify its inputs' last bits.
     calm = scaled < 30 * (1 + rate[:, 0] * np.abs(wide[3]))
-    assert np.mean(calm) > 0.5
+    assert np.mean(calm) > (0.2 if regime in UNSTABLE else 0.5)
+    assert np.all(np.isfinite(found))
     assert np.all(np.max(error, axis=1)[calm] <= bar[calm]), np.max((np.max(error, 1) / bar)[calm])
 
 

@@ -51,7 +51,7 @@ _LONGEST_PHASE = {8: 60.0, 4: 10.0}
 def _short_time(a: Array, b: Array, g: Array, h: Array) -> tuple[Array, Array]:
     """Functions s and w of a short time."""
     x = h * h
-    a, b, c = a * x, b * x * x, -(g * g) * x**3
+    a, b, c = a * x, b * x * x, -((g * x) ** 2) * x
     c1 = a / 6
     c2 = (a * a + 12 * b) / 120
     c3 = (a**3 + 132 * a * b + 360 * c) / 5040
@@ -205,7 +205,7 @@ def invariants(i1: Scalar, i3: Scalar, mgl: Scalar, attitude: Quaternion, omega:
     sizes = jnp.stack([w1, w2, spin, jnp.sqrt(jnp.abs(jax.lax.stop_gradient(mu)))])
     size = jnp.dtype(mu.dtype).itemsize
     fastest = jnp.max(jnp.abs(jax.lax.stop_gradient(sizes)))
-    unit = power_of_two(jnp.maximum(fastest, _LEAST_UNIT[size]))
+    unit = power_of_two(jnp.where(fastest > 0, jnp.maximum(fastest, _LEAST_UNIT[size]), 1.0))
     slip = (w3 - spin) / unit
     hangs = mu < 0
     q, w = _reversed(hangs, tuple(attitude), (w1 / unit, w2 / unit, spin / unit))
