@@ -17,7 +17,18 @@ from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 from jax.flatten_util import ravel_pytree
 
 import jrigid as jr
-from jrigid import dynamics, elliptic, free, lagrangian, rotation, solvers, systems, top, torques
+from jrigid import (
+    dynamics,
+    elliptic,
+    free,
+    identify,
+    lagrangian,
+    rotation,
+    solvers,
+    systems,
+    top,
+    torques,
+)
 from jrigid._checks import float_arrays
 from jrigid.mass import MassProperties
 
@@ -31,6 +42,7 @@ MODULES = {
     "lagrangian": lagrangian,
     "top": top,
     "solvers": solvers,
+    "identify": identify,
 }
 # Abstract classes and aliases: nothing to call.
 NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
@@ -414,6 +426,18 @@ CASES = {
     "top.sleeping_spin": of_tilt(lambda one, *_: top.sleeping_spin(one)),
     "top.initial_state": of_tilt(lambda one, x, y: top.initial_state(one, x, omega3=y)),
     "top.integrals": Case(extra_integrals, (1.0, 0.5, VECTOR, ATTITUDE, OMEGA), ("top.Integrals",)),
+    # identify
+    "identify.parameters_from_inertia": Case(
+        lambda i: identify.parameters_from_inertia(number(i) + 3), (MOMENTS,)
+    ),
+    "identify.inertia_from_parameters": Case(
+        lambda p: identify.inertia_from_parameters(number(p) / 9), (np.linspace(-5, 6, 6),)
+    ),
+    "identify.log_cholesky_from_body": Case(
+        lambda p: identify.log_cholesky_from_body(identify.body_from_log_cholesky(number(p) / 9)),
+        (np.linspace(-5, 6, 10),),
+        ("identify.body_from_log_cholesky",),
+    ),
     # solvers
     "solvers.FreeRotation": Case(
         free_state(exact_step).function,

@@ -6,6 +6,7 @@ from jrigid import datasets as datasets
 from jrigid import dynamics as dynamics
 from jrigid import elliptic as elliptic
 from jrigid import free as free
+from jrigid import identify as identify
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
 from jrigid import rotation as rotation
