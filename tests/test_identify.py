@@ -1,4 +1,4 @@
-"""Parametrisations of real bodies: both ways, physical by construction, smooth at the sphere."""
+"""Parametrisations of real bodies, and linear regressions on samples of known bodies."""
 
 import jax
 import jax.numpy as jnp
@@ -148,3 +148,123 @@ def test_bad_lanes_and_shapes(untyped):
         identify.inertia_from_parameters(np.zeros(5))
     with pytest.raises(ValueError, match="must be MassProperties"):
         identify.log_cholesky_from_body(np.eye(3))
+
+
+# --- Linear starts ------------------------------------------------------------------------------
+
+TENSOR = np.array([[2.0, -0.3, 0.2], [-0.3, 2.5, 0.4], [0.2, 0.4, 1.7]])
+RATIOS = TENSOR / np.trace(TENSOR)
+STATE = jr.State(np.array([0.5, -0.5, 0.5, 0.5]), np.array([0.4, 0.9, -0.6]))
+TS = np.linspace(0.0, 50.0, 1001)
+
+
+@pytest.fixture(scope="module")
+def free_samples():
+    motion = jr.free_rotation(TENSOR, STATE, TS)
+    return np.asarray(motion.attitude), np.asarray(motion.omega)
+
+
+@pytest.fixture(scope="module")
+def wheel_samples():
+    def h(t):
+        return jnp.stack([0.3 * jnp.sin(t), 0.2 + 0 * t, 0.05 * t])
+
+    body = jr.RigidBody(TENSOR, jr.torques.Rotor(h))
+    omegas = jr.simulate(body, STATE, TS, rtol=1e-10).states.omega
+    return np.asarray(omegas), np.asarray(jax.vmap(h)(jnp.asarray(TS)))
+
+
+def test_exact_samples_give_the_body(free_samples, wheel_samples):
+    attitudes, omegas = free_samples
+    weak = identify.weak_form(omegas, TS)
+    np.testing.assert_allclose(weak.inertia, RATIOS, atol=1e-6)
+    assert weak.singular_values[-1] < 1e-6 * weak.singular_values[-2]
+    by_momentum, total = identify.momentum(attitudes, omegas, TS)
+    np.testing.assert_allclose(by_momentum.inertia, RATIOS, atol=1e-13)
+    exact = Rotation.from_quat(attitudes[0], scalar_first=True).apply(RATIOS @ omegas[0])
+    np.testing.assert_allclose(total, exact, atol=1e-12)
+    wheel = identify.gyrostat(*wheel_samples, TS)
+    np.testing.assert_allclose(wheel.inertia, TENSOR, rtol=1e-5)
+
+
+def test_errors_fall_with_the_noise(free_samples, wheel_samples, rng):
+    attitudes, omegas = free_samples
+    for noise, bar in ((0.01, 0.02), (0.001, 0.002)):
+        errors = []
+        for _ in range(10):
+            dirty = omegas + noise * rng.normal(size=omegas.shape)
+            turned, wheel = wheel_samples
+            found = (
+                identify.weak_form(dirty, TS).inertia / RATIOS,
+                identify.momentum(attitudes, dirty, TS)[0].inertia / RATIOS,
+                identify.gyrostat(turned + noise * rng.normal(size=turned.shape), wheel, TS).inertia
+                / TENSOR,
+            )
+            errors.append([np.sqrt(np.mean((np.diagonal(x) - 1) ** 2)) for x in found])
+        assert np.all(np.median(errors, axis=0) < bar), np.median(errors, axis=0)
+
+
+def test_samples_that_are_missing_are_left_out(free_samples, wheel_samples, rng):
+    attitudes, omegas = (x.copy() for x in free_samples)
+    turned, wheel = (x.copy() for x in wheel_samples)
+    lost = rng.choice(len(TS), 10, replace=False)
+    for x in (attitudes, omegas, turned):
+        x[lost] = np.nan
+    np.testing.assert_allclose(identify.weak_form(omegas, TS).inertia, RATIOS, atol=1e-5)
+    found, _ = identify.momentum(attitudes, omegas, TS)
+    np.testing.assert_allclose(found.inertia, RATIOS, atol=1e-12)
+    found = identify.gyrostat(turned, wheel, TS).inertia
+    np.testing.assert_allclose(found, TENSOR, rtol=1e-4)
+
+
+def test_what_the_samples_do_not_tell_shows_in_the_singular_values():
+    """Pure spin: ratios are not told; the unit of time and of the rates changes nothing."""
+    spin = np.tile([0.0, 0.0, 1.3], (len(TS), 1))
+    values = np.asarray(identify.weak_form(spin, TS).singular_values)
+    assert np.sum(values > 1e-6 * values[0]) <= 3
+    omegas = np.asarray(jr.free_rotation(TENSOR, STATE, TS).omega)
+    for unit in (1e-7, 1e4):
+        found = identify.weak_form(omegas * unit, TS / unit)
+        np.testing.assert_allclose(found.inertia, RATIOS, atol=1e-6)
+
+
+def test_starts_under_jit_vmap_and_derivatives(free_samples, wheel_samples, rng):
+    attitudes, omegas = (x[::20] for x in free_samples)
+    turned, wheel = (x[::20] for x in wheel_samples)
+    ts, change = TS[::20], rng.normal(size=omegas.shape)
+
+    def all_three(s):
+        dirty, other = omegas + s * change, turned + s * change
+        return (
+            identify.weak_form(dirty, ts).inertia,
+            identify.momentum(attitudes, dirty, ts)[0].inertia,
+            identify.gyrostat(other, wheel, ts).inertia,
+        )
+
+    values, slopes = jax.jit(jax.vmap(lambda s: jax.jvp(all_three, (s,), (1.0,))))(
+        jnp.array([0.02, 0.03])
+    )
+    h = 1e-6
+    up, down, here = all_three(0.02 + h), all_three(0.02 - h), all_three(0.02)
+    for value, slope, a, b, c in zip(values, slopes, up, down, here, strict=True):
+        np.testing.assert_allclose(value[0], c, atol=1e-12)
+        np.testing.assert_allclose(slope[0], (a - b) / (2 * h), atol=1e-7 * np.max(np.abs(slope)))
+    single = identify.weak_form(omegas.astype(np.float32), ts.astype(np.float32)).inertia
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, identify.weak_form(omegas, ts).inertia, atol=1e-3)
+
+
+def test_bad_samples_are_errors(free_samples, wheel_samples, untyped):
+    _, omegas = free_samples
+    with pytest.raises(RuntimeError, match="`ts` must be finite and increasing"):
+        identify.weak_form(omegas, TS[::-1].copy())
+    with pytest.raises(RuntimeError, match="four samples that are finite"):
+        identify.weak_form(np.full_like(omegas, np.nan), TS)
+    with pytest.raises(ValueError, match="four times at least"):
+        identify.weak_form(omegas[:3], TS[:3])
+    with pytest.raises(ValueError, match="`omegas` must have shape"):
+        identify.weak_form(omegas[:-1], TS)
+    with pytest.raises(ValueError, match="`rotor` must have shape"):
+        identify.gyrostat(omegas, wheel_samples[1][:-1], TS)
+    found = identify.weak_form(omegas, TS[::-1].copy(), throw=False)
+    assert np.all(np.isnan(found.inertia))

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import (
     RESULTS,
@@ -48,7 +48,7 @@ def _checked(parameters: Any, count: int, throw: bool) -> tuple[Findings, Array]
     return findings, jnp.where(findings.ok, parameters, 0.0)
 
 
-def inertia_from_parameters(parameters: Real[Any, "6"], *, throw: bool = True) -> Matrix:
+def inertia_from_parameters(parameters: Real[ArrayLike, "6"], *, throw: bool = True) -> Matrix:
     """Inertia tensor of a real body from six numbers without bounds.
 
     The tensor of second moments of the mass, Sigma = (trace I / 2) 1 - I, is L L^T, L lower
@@ -134,7 +134,9 @@ def parameters_from_inertia(inertia: InertiaLike, *, throw: bool = True) -> Floa
     return nan_where(~findings.ok, numbers)
 
 
-def body_from_log_cholesky(parameters: Real[Any, "10"], *, throw: bool = True) -> MassProperties:
+def body_from_log_cholesky(
+    parameters: Real[ArrayLike, "10"], *, throw: bool = True
+) -> MassProperties:
     """Mass properties of a real body from the ten numbers of its log-Cholesky parametrisation.
 
     The pseudo-inertia [[Sigma, m c], [m c^T, m]], Sigma the second moments of the mass about the

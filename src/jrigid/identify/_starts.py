@@ -1,0 +1,280 @@
+"""Inertia by linear regression from rates, attitudes or a wheel: starts for a fit, not answers.
+
+Errors of the samples stand on both sides of these equations and bias what comes out.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Real
+
+from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where
+from jrigid._numerics import product, safe_norm
+from jrigid._types import Matrix, Vector
+from jrigid.rotation import to_matrix
+
+_LEAST_SAMPLES = 8  # to a window
+_TIMES = (
+    "Argument `ts` must be finite and increasing, with four samples that are finite at least, but "
+    "it is not."
+)
+
+
+class LinearStart(NamedTuple):
+    """Inertia from a linear regression.
+
+    Attributes:
+        inertia: Tensor; of trace 1 where only ratios can be known, [kg m^2] beside a known rotor.
+            It need not be positive definite where the samples say little.
+        singular_values: Of the regression's matrix, with columns of unit scale, descending. The
+            last is the misfit where ratios are sought; those nearly as small are directions that
+            the samples do not tell.
+    """
+
+    inertia: Matrix
+    singular_values: Float[Array, " n"]
+
+
+def _momentum_matrix(omega: Array) -> Array:
+    """I omega as a (3, 6) matrix times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz)."""
+    x, y, z = omega
+    o = jnp.zeros_like(x)
+    rows = [[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _tensor(six: Array) -> Matrix:
+    xx, yy, zz, xy, xz, yz = six
+    return jnp.stack([jnp.stack(row) for row in ([xx, xy, xz], [xy, yy, yz], [xz, yz, zz])])
+
+
+def _samples(omegas: Any, ts: Any, *others: Any) -> tuple[Findings, Bool[Array, " n"], list[Array]]:
+    omegas, ts, *rest = float_arrays(omegas, ts, *others)
+    check_shape("ts", ts, (None,))
+    count = ts.shape[0]
+    check_shape("omegas", omegas, (count, 3))
+    if count < 4:
+        raise ValueError(f"Argument `ts` must hold four times at least, but it holds {count}.")
+    known = jnp.all(jnp.isfinite(omegas), axis=1)
+    for other in rest:
+        known = known & jnp.all(jnp.isfinite(other), axis=1)
+    steps = jnp.diff(jax.lax.stop_gradient(ts))
+    findings = Findings()
+    findings.require(
+        jnp.all(jnp.isfinite(ts)) & jnp.all(steps > 0) & (jnp.sum(known) >= 4),
+        RESULTS.invalid_times,
+        _TIMES,
+    )
+    ok = findings.ok
+    ts = jnp.where(ok, ts, jnp.arange(count, dtype=ts.dtype))
+    good = (ok & known)[:, None]
+    return findings, known, [jnp.where(good, x, 0.0) for x in (omegas, *rest)] + [ts]
+
+
+def _windows(
+    omegas: Array, ts: Array, known: Array, windows: int, radians: float
+) -> tuple[Array, Array]:
+    """Weights (windows, n) of smooth bumps and of minus their slopes, for integrals over time."""
+    # Samples left out are zero.
+    count = jnp.maximum(jnp.sum(known), 1).astype(ts.dtype)
+    speed = safe_norm(omegas.reshape(-1)) / jnp.sqrt(count)
+    speed = jnp.where(speed > 0, speed, 1.0)
+    span = ts[-1] - ts[0]
+    typical = span / (ts.shape[0] - 1)
+    width = jnp.maximum(radians / speed, _LEAST_SAMPLES * typical)
+    width = jnp.minimum(width, span)
+    centers = jnp.linspace(ts[0] + 0.5 * width, ts[-1] - 0.5 * width, windows)
+    s = (ts[None, :] - centers[:, None]) / (0.5 * width)
+    inside = jnp.abs(s) < 1
+    s = jnp.where(inside, s, 1.0)
+    bump = (1 - s * s) ** 4
+    slope = -8 * s * (1 - s * s) ** 3 / (0.5 * width)
+    step = jnp.diff(ts)
+    trapezoid = 0.5 * (
+        jnp.concatenate([step, jnp.zeros(1, ts.dtype)])
+        + jnp.concatenate([jnp.zeros(1, ts.dtype), step])
+    )
+    # A window with a gap says nothing.
+    whole = ~jnp.any(inside & ~known[None, :], axis=1) & (
+        jnp.sum(inside, axis=1) >= _LEAST_SAMPLES // 2
+    )
+    weight = jnp.where(whole[:, None] & inside, trapezoid[None, :], 0.0)
+    return weight * bump, -weight * slope
+
+
+def _weak_rows(
+    omegas: Array, ts: Array, known: Array, windows: int, radians: float
+) -> tuple[Array, tuple[Array, Array]]:
+    bump, fall = _windows(omegas, ts, known, windows, radians)
+    matrices = jax.vmap(_momentum_matrix)(omegas)
+    turned = jnp.cross(omegas[:, :, None], matrices, axis=1)
+    rows = product("wn,nij->wij", fall, matrices) + product("wn,nij->wij", bump, turned)
+    return rows.reshape(-1, 6), (bump, fall)
+
+
+def _null_vector(rows: Array) -> tuple[Array, Array]:
+    size = jnp.max(jnp.abs(jax.lax.stop_gradient(rows)))
+    _, values, right = jnp.linalg.svd(rows / jnp.where(size > 0, size, 1.0), full_matrices=False)
+    return right[-1], values
+
+
+def _of_unit_trace(six: Array) -> Matrix:
+    tensor = _tensor(six)
+    trace = jnp.trace(tensor)
+    return tensor / jnp.where(trace == 0, 1.0, trace)
+
+
+def weak_form(
+    omegas: Real[ArrayLike, "n 3"],
+    ts: Real[ArrayLike, " n"],
+    *,
+    windows: int = 128,
+    radians: float = 3.0,
+    throw: bool = True,
+) -> LinearStart:
+    """Ratios of inertia from sampled rates of a free body, without derivatives of the samples.
+
+    Euler's equations I omega' + omega x I omega = 0 are multiplied by smooth bumps, (1 - s^2)^4 on
+    windows of some radians, and integrated by parts: linear equations for I.
+
+    Args:
+        omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out, with the
+            windows they are in.
+        ts: Their times, increasing [s].
+        windows: How many, spread over the record.
+        radians: Length of a window, in radians turned; at least eight samples.
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        The tensor of trace 1 in the sensor's axes, and singular values.
+
+    Raises:
+        ValueError: Wrong shape, fewer than four samples (trace time).
+        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+
+    Gradients: those of the singular vector, where the last two singular values differ.
+    Source: the weak form of system identification, D. A. Messenger, D. M. Bortz, Multiscale
+    Modeling & Simulation 19 (2021) 1474.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> ts = jnp.linspace(0.0, 40.0, 801)
+    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
+    >>> omegas = jr.free_rotation(jnp.array([1.0, 1.7, 2.3]), start, ts).omega
+    >>> tensor = jr.identify.weak_form(omegas, ts).inertia
+    >>> print((jnp.diagonal(tensor) / tensor[0, 0]).round(3))
+    [1.  1.7 2.3]
+    """
+    findings, known, (omegas, ts) = _samples(omegas, ts)
+    rows, _ = _weak_rows(omegas, ts, known, windows, radians)
+    six, values = _null_vector(rows)
+    found = nan_where(~findings.ok, LinearStart(_of_unit_trace(six), values))
+    return findings.apply(found, throw)
+
+
+def momentum(
+    attitudes: Real[ArrayLike, "n 4"],
+    omegas: Real[ArrayLike, "n 3"],
+    ts: Real[ArrayLike, " n"],
+    *,
+    throw: bool = True,
+) -> tuple[LinearStart, Vector]:
+    """Ratios of inertia from attitudes and rates of a free body: its momentum stays in space.
+
+    R I omega = L is linear in I and L.
+
+    Args:
+        attitudes: Unit quaternions, body to space.
+        omegas: Angular velocities, body components [rad/s].
+        ts: Their times, increasing [s]; only their order is used.
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        The tensor of trace 1 in the body's axes with singular values, and the momentum in space
+        that belongs to it.
+
+    Raises:
+        ValueError: Wrong shape, fewer than four samples (trace time).
+        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+
+    Gradients: those of the singular vector, where the last two singular values differ.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> ts = jnp.linspace(0.0, 40.0, 101)
+    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
+    >>> motion = jr.free_rotation(jnp.array([1.0, 1.7, 2.3]), start, ts)
+    >>> found, total = jr.identify.momentum(motion.attitude, motion.omega, ts)
+    >>> print((jnp.diagonal(found.inertia) / found.inertia[0, 0]).round(3))
+    [1.  1.7 2.3]
+    """
+    attitudes, omegas, ts = float_arrays(attitudes, omegas, ts)
+    check_shape("attitudes", attitudes, (*ts.shape, 4))
+    findings, known, (omegas, attitudes, ts) = _samples(omegas, ts, attitudes)
+    identity = jnp.zeros_like(attitudes).at[:, 0].set(1)
+    matrices = jax.vmap(to_matrix)(jnp.where(known[:, None], attitudes, identity))
+    turned = product("nij,njk->nik", matrices, jax.vmap(_momentum_matrix)(omegas))
+    size = safe_norm(omegas.reshape(-1))
+    size = jnp.where(size > 0, size, 1.0) / ts.shape[0] ** 0.5
+    total = jnp.broadcast_to(-jnp.eye(3, dtype=ts.dtype), (ts.shape[0], 3, 3))
+    rows = jnp.concatenate([turned / size, total], axis=2)
+    rows = jnp.where(known[:, None, None], rows, 0.0)
+    vector, values = _null_vector(rows.reshape(-1, 9))
+    trace = vector[0] + vector[1] + vector[2]
+    scale = 1 / jnp.where(trace == 0, 1.0, trace)
+    found = LinearStart(_of_unit_trace(vector[:6]), values), vector[6:] * size * scale
+    return findings.apply(nan_where(~findings.ok, found), throw)
+
+
+def gyrostat(
+    omegas: Real[ArrayLike, "n 3"],
+    rotor: Real[ArrayLike, "n 3"],
+    ts: Real[ArrayLike, " n"],
+    *,
+    windows: int = 128,
+    radians: float = 3.0,
+    throw: bool = True,
+) -> LinearStart:
+    """The whole inertia tensor, scale included, from rates beside a rotor of known momentum.
+
+    The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares.
+
+    Args:
+        omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out.
+        rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s].
+        ts: Their times, increasing [s].
+        windows: How many, spread over the record.
+        radians: Length of a window, in radians turned; at least eight samples.
+        throw: False: bad values give NaN instead of an error.
+
+    Returns:
+        The tensor [kg m^2] and singular values.
+
+    Raises:
+        ValueError: Wrong shape, fewer than four samples (trace time).
+        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+
+    Gradients: those of the least-squares solution, where it is unique.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> wheel = jr.torques.Rotor(lambda t: jnp.array([0.0, 0.0, 0.5 * t]))
+    >>> body, ts = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]), wheel), jnp.linspace(0.0, 20.0, 801)
+    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
+    >>> omegas = jr.simulate(body, start, ts).states.omega
+    >>> h = jnp.stack([0 * ts, 0 * ts, 0.5 * ts], axis=1)
+    >>> print(jnp.diagonal(jr.identify.gyrostat(omegas, h, ts).inertia).round(2))
+    [1.  1.7 2.3]
+    """
+    omegas, rotor, ts = float_arrays(omegas, rotor, ts)
+    check_shape("rotor", rotor, (*ts.shape, 3))
+    findings, known, (omegas, rotor, ts) = _samples(omegas, ts, rotor)
+    rows, (bump, fall) = _weak_rows(omegas, ts, known, windows, radians)
+    given = product("wn,ni->wi", fall, rotor)
+    given = given + product("wn,ni->wi", bump, jnp.cross(omegas, rotor))
+    size = jnp.max(jnp.abs(jax.lax.stop_gradient(rows)))
+    size = jnp.where(size > 0, size, 1.0)
+    left, values, right = jnp.linalg.svd(rows / size, full_matrices=False)
+    projected = product("ni,n->i", left, -given.reshape(-1) / size)
+    told = values > jnp.finfo(values.dtype).eps * 64 * values[0]
+    six = product("ij,i->j", right, jnp.where(told, projected / jnp.where(told, values, 1.0), 0.0))
+    found = nan_where(~findings.ok, LinearStart(_tensor(six), values))
+    return findings.apply(found, throw)
