@@ -163,7 +163,7 @@ def of_moments(moments: Vector, omega: Vector, t: Scalar) -> tuple[Quaternion, V
     return at(invariants(moments, omega), t)
 
 
-def _turned(axes: Array, attitude: Array, omega: Array) -> tuple[Array, Array]:
+def turned(axes: Array, attitude: Array, omega: Array) -> tuple[Array, Array]:
     vector = product("ij,j->i", axes, attitude[1:])
     return jnp.concatenate([attitude[:1], vector]), product("ij,j->i", axes, omega)
 
@@ -171,7 +171,7 @@ def _turned(axes: Array, attitude: Array, omega: Array) -> tuple[Array, Array]:
 @jax.custom_jvp
 def _of_tensor(tensor: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     moments, axes = eigh(tensor)
-    return _turned(axes, *of_moments(moments, product("ji,j->i", axes, omega), t))
+    return turned(axes, *of_moments(moments, product("ji,j->i", axes, omega), t))
 
 
 @_of_tensor.defjvp
@@ -192,7 +192,7 @@ def _of_tensor_jvp(primals: tuple, tangents: tuple) -> tuple:
         axis, 0.5 * (after - before)
     )
     tangent = jtu.tree_map(lambda x, y: x + product("k,kn->n", elements, y), tangent, slopes)
-    return _turned(axes, *value), _turned(axes, *tangent)
+    return turned(axes, *value), turned(axes, *tangent)
 
 
 def _slope_off_diagonal(

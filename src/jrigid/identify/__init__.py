@@ -1,9 +1,18 @@
-"""Inertia from what was observed: so far the numbers in which it is sought, and linear starts."""
+"""Inertia from what was observed: the fit, what it can tell, its numbers and its linear starts."""
 
+from jrigid.identify._fit import fit as fit
+from jrigid.identify._observations import AbstractObservation as AbstractObservation
+from jrigid.identify._observations import AngularMomenta as AngularMomenta
+from jrigid.identify._observations import Attitudes as Attitudes
+from jrigid.identify._observations import Directions as Directions
+from jrigid.identify._observations import Observed as Observed
+from jrigid.identify._observations import Rates as Rates
 from jrigid.identify._parameters import body_from_log_cholesky as body_from_log_cholesky
 from jrigid.identify._parameters import inertia_from_parameters as inertia_from_parameters
 from jrigid.identify._parameters import log_cholesky_from_body as log_cholesky_from_body
 from jrigid.identify._parameters import parameters_from_inertia as parameters_from_inertia
+from jrigid.identify._result import FitResult as FitResult
+from jrigid.identify._result import Status as Status
 from jrigid.identify._starts import LinearStart as LinearStart
 from jrigid.identify._starts import gyrostat as gyrostat
 from jrigid.identify._starts import momentum as momentum

@@ -278,3 +278,69 @@ def gyrostat(
     six = product("ij,i->j", right, jnp.where(told, projected / jnp.where(told, values, 1.0), 0.0))
     found = nan_where(~findings.ok, LinearStart(_tensor(six), values))
     return findings.apply(found, throw)
+
+
+def linear_start(
+    ts: Array,
+    known: Array,
+    omegas: Array,
+    attitudes: Array | None,
+    torques: Array | None,
+    trace: Array | None,
+    windows: int = 128,
+) -> Matrix:
+    """Tensor from throws of one body, samples (throws, n): of a given trace, or, None, of any.
+
+    By attitudes, if there are any, R I omega is constant in each throw of a free body; else the
+    weak form, torques as they are at the samples. Where the record says little the tensor leans to
+    a sphere.
+    """
+    shown = known[..., None]
+    omegas = jnp.where(shown, omegas, 0.0)
+    given = jnp.zeros_like(omegas) if torques is None else jnp.where(shown, torques, 0.0)
+    if attitudes is None:
+
+        def of_throw(t: Array, ok: Array, omega: Array, torque: Array) -> tuple[Array, Array]:
+            # Samples that are not there repeat a time; they weigh nothing.
+            t = jax.lax.cummax(jnp.where(ok, t, -jnp.inf))
+            t = jnp.where(jnp.isfinite(t), t, jnp.min(jnp.where(jnp.isfinite(t), t, jnp.inf)))
+            rows, (bump, _) = _weak_rows(omega, t, ok, windows, 3.0)
+            return rows, product("wn,ni->wi", bump, torque).reshape(-1)
+
+        rows, right = jax.vmap(of_throw)(ts, known, omegas, given)
+    else:
+        turned = product(
+            "tnij,tnjk->tnik",
+            jax.vmap(jax.vmap(to_matrix))(attitudes),
+            jax.vmap(jax.vmap(_momentum_matrix))(omegas),
+        )
+        weight = shown[..., None].astype(ts.dtype)
+        count = jnp.maximum(jnp.sum(weight, axis=1, keepdims=True), 1.0)
+        rows = weight * (turned - jnp.sum(weight * turned, axis=1, keepdims=True) / count)
+        right = jnp.zeros(rows.shape[:-1], ts.dtype)
+    rows, right = rows.reshape(-1, 6), right.reshape(-1)
+    finite = jnp.all(jnp.isfinite(rows), axis=1) & jnp.isfinite(right)
+    rows, right = jnp.where(finite[:, None], rows, 0.0), jnp.where(finite, right, 0.0)
+    size = jnp.max(jnp.abs(rows))
+    size = jnp.where(size > 0, size, 1.0)
+    rows, right = rows / size, right / size
+    sphere = jnp.asarray([1.0, 1, 1, 0, 0, 0], rows.dtype) / 3
+    basis = jnp.eye(6, dtype=rows.dtype)
+    start = jnp.zeros(6, rows.dtype)
+    if trace is not None:  # five directions without a trace
+        third, half = 1 / 6**0.5, 1 / 2**0.5
+        flat = [[third, third, -2 * third, 0, 0, 0], [half, -half, 0, 0, 0, 0]]
+        basis = jnp.concatenate([jnp.asarray(flat, rows.dtype), basis[3:]])
+        start = trace * sphere
+    wanted = right - product("ri,i->r", rows, start)
+    u, values, vt = jnp.linalg.svd(product("ri,ki->rk", rows, basis), full_matrices=False)
+    along = product("rk,r->k", u, wanted)
+    # The misfit of the best answer is how far rows can be trusted.
+    best = jnp.where(values > 64 * jnp.finfo(values.dtype).eps * values[0], 1.0, 0.0) * along
+    misfit = safe_norm(wanted - product("rk,k->r", u, best))
+    floor = misfit / jnp.maximum(safe_norm(wanted), 1e-300) * values[0] if trace is None else (
+        2 * misfit / trace
+    )
+    square = values * values + floor * floor
+    faded = values * along / jnp.where(square > 0, square, 1.0)
+    return _tensor(start + product("k,kj,ji->i", faded, vt, basis))

@@ -90,13 +90,30 @@ def _bounds(motion: Motion) -> _Bounds:
     near = speed * (speed / jnp.where(distinct, far, 1.0))
     low = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
     high = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
+    beta_low, beta_high = jnp.where(hanging, 1 - high, low), jnp.where(hanging, 1 - low, high)
+    alpha_low, alpha_high = jnp.where(hanging, low, 1 - high), jnp.where(hanging, high, 1 - low)
     return _Bounds(
-        jnp.where(hanging, 1 - high, low),
-        jnp.where(hanging, 1 - low, high),
-        jnp.where(hanging, low, 1 - high),
-        jnp.where(hanging, high, 1 - low),
+        _nearest(motion, beta, d_beta, 0.0, beta_low, beta_high),
+        beta_high,
+        _nearest(motion, alpha, d_alpha, 1.0, alpha_low, alpha_high),
+        alpha_high,
         spread,
     )
+
+
+def _nearest(
+    motion: Motion, x: Array, dx: Array, at_zero: float, low: Array, high: Array
+) -> Array:
+    """The lower bound of |x|^2 where it is far below the upper one, with its relative accuracy.
+
+    At x = 0 the slope's square is -J^2, of the constant momentum J = Im(x* dx/dt).
+    """
+    front = jnp.where(motion.nutates, motion.root, 0.0) + at_zero * motion.mu
+    # Roots of a smaller size carry rounding of the larger numbers they come from.
+    sound = motion.nutates & (front > 0.01 * motion.mu) & (front > 0) & (low < 0.25 * high)
+    momentum = (jnp.conj(x) * dx).imag
+    of_root = momentum * (momentum / jnp.where(sound, front, 1.0))
+    return jnp.where(sound, of_root / jnp.where(sound, high, 1.0), low)
 
 
 def _tilt(of_beta: Array, of_alpha: Array) -> Array:

@@ -1,0 +1,223 @@
+"""Where a record is cut into segments, and the states they start from."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jrigid._checks import is_concrete
+from jrigid._numerics import safe_norm
+from jrigid.identify._observations import AbstractObservation, Attitudes, Rates, known
+from jrigid.rotation import conjugate, exp, log, multiply, normalize
+
+_SEGMENT = 3.0  # radians, below half a turn
+
+
+class Layout(NamedTuple):
+    """Times of all samples, their nodes, and where links go: (throws, samples) and (throws, nodes).
+
+    An unused node has no samples and no links.
+    """
+
+    ts: Array
+    node: Array
+    start: Array
+    end: Array
+    linked: Array
+    since: Array  # fraction of the record at each sample
+
+
+class Samples(NamedTuple):
+    """Rates, and attitudes if there are any, that tell where the segments start: (throws, n)."""
+
+    ts: Array
+    there: Array
+    omega: Array
+    attitude: Array | None
+
+
+def times_of(observations: tuple[AbstractObservation, ...]) -> tuple[Array, Array]:
+    """Times of the samples of all kinds, side by side, and which are there."""
+    there = jnp.concatenate([jnp.any(known(x), axis=-1) for x in observations], axis=1)
+    ts = jnp.concatenate([x.ts for x in observations], axis=1)
+    return jnp.where(there, ts, 0.0), there
+
+
+def first_and_last(ts: Array, there: Array) -> tuple[Array, Array]:
+    """Times of the first and last samples of each throw; zero for one without samples."""
+    first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1)
+    last = jnp.max(jnp.where(there, ts, -jnp.inf), axis=1)
+    some = jnp.any(there, axis=1)
+    return jnp.where(some, first, 0.0), jnp.where(some, last, 0.0)
+
+
+def _nearest_before(ts: Array, there: Array, t: Array) -> Array:
+    """Index of the last sample not after t; of the first one if all are later."""
+    times = jnp.where(there, ts, jnp.inf)
+    before = jnp.where(there & (ts <= t), ts, -jnp.inf)
+    return jnp.where(jnp.any(there & (ts <= t)), jnp.argmax(before), jnp.argmin(times))
+
+
+def _slopes(ts: Array, there: Array, attitude: Array) -> Array:
+    """Rates from attitudes: the mean of the turns to the samples on either side."""
+    count = ts.shape[0]
+    index = jnp.arange(count)
+    last = jax.lax.associative_scan(jnp.maximum, jnp.where(there, index, -1))
+    before = jnp.concatenate([jnp.full(1, -1), last[:-1]])
+    following = jnp.where(there, index, count)[::-1]
+    next_ = jax.lax.associative_scan(jnp.minimum, following)[::-1]
+    after = jnp.concatenate([next_[1:], jnp.full(1, count)])
+
+    def turn(a: Array, b: Array) -> tuple[Array, Array]:
+        ok = (a >= 0) & (b < count)
+        a, b = jnp.clip(a, 0, count - 1), jnp.clip(b, 0, count - 1)
+        step = ts[b] - ts[a]
+        ok = ok & (step > 0)
+        vector = log(normalize(multiply(conjugate(attitude[a]), attitude[b])))
+        return jnp.where(ok, vector / jnp.where(ok, step, 1.0), 0.0), ok.astype(ts.dtype)
+
+    def at(i: Array) -> Array:
+        left, a = turn(before[i], i)
+        right, b = turn(i, after[i])
+        return (left + right) / jnp.maximum(a + b, 1.0)
+
+    return jax.vmap(at)(index)
+
+
+def samples_of(
+    observations: tuple[AbstractObservation, ...], attitude0: Array | None
+) -> Samples | None:
+    """What tells the state on the way: a gyro, or attitudes; None if there is neither."""
+    rates = next((x for x in observations if isinstance(x, Rates)), None)
+    attitudes = next((x for x in observations if isinstance(x, Attitudes)), None)
+    if attitudes is not None:
+        q_there = jnp.all(known(attitudes), axis=-1)
+        unit = jnp.zeros_like(attitudes.values).at[..., 0].set(1)
+        q = jnp.where(q_there[..., None], attitudes.values, unit)
+        q = jax.vmap(jax.vmap(normalize))(q)
+        q_ts = jnp.where(q_there, attitudes.ts, 0.0)
+        if rates is None:
+            return Samples(q_ts, q_there, jax.vmap(_slopes)(q_ts, q_there, q), q)
+    if rates is None:
+        return None
+    there = jnp.all(known(rates), axis=-1)
+    omega = jnp.where(there[..., None], rates.values, 0.0)
+    ts = jnp.where(there, rates.ts, 0.0)
+    if attitudes is not None:
+
+        def nearest(t: Array, w: Array, times: Array, known_: Array, qs: Array) -> Array:
+            i = _nearest_before(times, known_, t)
+            return multiply(qs[i], exp(w * (t - times[i])))
+
+        found = jax.vmap(
+            lambda t, w, a, b, c: jax.vmap(lambda t, w: nearest(t, w, a, b, c))(t, w)
+        )(ts, omega, q_ts, q_there, q)
+        return Samples(ts, there, omega, found)
+    if attitude0 is None:
+        return Samples(ts, there, omega, None)
+    return Samples(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0))
+
+
+def _reckoned(ts: Array, there: Array, omega: Array, attitude0: Array) -> Array:
+    """Attitudes by dead reckoning: turns by the mean of neighbouring rates."""
+
+    def turn(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
+        q, t, w, any_ = carry
+        time, rate, ok = sample
+        step = jnp.where(ok & any_, time - t, 0.0)
+        q = normalize(multiply(q, exp(0.5 * (w + rate) * step)))
+        carry = q, jnp.where(ok, time, t), jnp.where(ok, rate, w), any_ | ok
+        return carry, q
+
+    start = attitude0, ts[0], omega[0], jnp.asarray(False)
+    return jax.lax.scan(turn, start, (ts, omega, there))[1]
+
+
+def angle_turned(samples: Samples) -> Array:
+    """Radians turned up to each sample, from the rates there."""
+
+    def throw(ts: Array, there: Array, omega: Array) -> Array:
+        speed = jnp.where(there, jax.vmap(safe_norm)(omega), 0.0)
+
+        def add(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
+            total, t, w, any_ = carry
+            time, rate, ok = sample
+            step = jnp.where(ok & any_, jnp.maximum(time - t, 0.0), 0.0)
+            total = total + 0.5 * (rate + w) * step
+            carry = total, jnp.where(ok, time, t), jnp.where(ok, rate, w), any_ | ok
+            return carry, total
+
+        zero = jnp.zeros_like(ts[0])
+        return jax.lax.scan(add, (zero, zero, zero, jnp.asarray(False)), (ts, speed, there))[1]
+
+    return jax.vmap(throw)(samples.ts, samples.there, samples.omega)
+
+
+def whole(ts: Array, there: Array, nodes: int) -> Layout:
+    """One segment a throw, in the first of so many nodes."""
+    first, last = first_and_last(ts, there)
+    zero = jnp.zeros((ts.shape[0], nodes), ts.dtype)
+    start = zero.at[:, 0].set(first)
+    span = jnp.where(last > first, last - first, 1.0)
+    since = (ts - first[:, None]) / span[:, None]
+    return Layout(ts, jnp.zeros(ts.shape, int), start, start, zero > 0, since)
+
+
+def segments(ts: Array, there: Array, samples: Samples, nodes: int) -> tuple[Layout, Array]:
+    """Segments of about half a turn; and the sample at which each starts."""
+    angles = angle_turned(samples)
+    whole_ = whole(ts, there, nodes)
+
+    def throw(angle: Array, times: Array, ok: Array) -> tuple[Array, ...]:
+        length = jnp.maximum(_SEGMENT, angle[-1] / max(nodes - 1, 1))
+        part = jnp.floor(angle / length * (1 - 1e-12)).astype(int)
+        count = part.size
+
+        def rank(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
+            last, index = carry
+            now, here = sample
+            new = here & (now != last)
+            index = jnp.where(new, index + 1, index)
+            return (jnp.where(new, now, last), index), index
+
+        _, index = jax.lax.scan(rank, (jnp.asarray(-1), jnp.asarray(-1)), (part, ok))
+        index = jnp.clip(index, 0, nodes - 1)
+        opening = jax.ops.segment_min(jnp.where(ok, jnp.arange(count), count), index, nodes)
+        used = opening < count
+        opening = jnp.where(used, opening, 0)
+        return opening, used, times[opening]
+
+    opening, used, start = jax.vmap(throw)(angles, samples.ts, samples.there)
+    # The first node stands at the first sample of any kind.
+    start = start.at[:, 0].set(whole_.start[:, 0])
+    reach = jnp.where(used, start, jnp.inf)
+    node = jax.vmap(
+        lambda starts, t: jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0, nodes - 1)
+    )(reach, ts)
+    following = jnp.concatenate([used[:, 1:], jnp.zeros_like(used[:, :1])], axis=1)
+    linked = used & following
+    end = jnp.where(linked, jnp.roll(start, -1, axis=1), start)
+    return Layout(ts, node, start, end, linked, whole_.since), opening
+
+
+def node_states(samples: Samples, opening: Array, start: Array) -> tuple[Array, Array | None]:
+    """States at the nodes, as observed."""
+    omega = jax.vmap(lambda w, i: w[i])(samples.omega, opening)
+    if samples.attitude is None:
+        return omega, None
+    at = jax.vmap(lambda q, i: q[i])(samples.attitude, opening)
+    late = start - jax.vmap(lambda t, i: t[i])(samples.ts, opening)
+    turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
+    return omega, turn(at, omega, late)
+
+
+def segments_needed(angle: Array, n: int) -> int:
+    """How many nodes a throw needs; if the angle is not known yet, for the worst case."""
+    most = n // 2 + 2
+    if not is_concrete(angle) or not float(angle) >= 0:
+        return most
+    needed = 2
+    while needed < float(angle) / _SEGMENT + 2:
+        needed *= 2
+    return min(needed, most)

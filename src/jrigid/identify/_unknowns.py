@@ -1,0 +1,299 @@
+"""The numbers a fit seeks: shape and scale of the inertia, leaves of the system, the gyro's errors.
+
+They are one flat vector; `Unknowns.system_and_gyro` turns it into a body and a sensor.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._checks import check_option
+from jrigid._numerics import product
+from jrigid._spectral import eigh
+from jrigid.systems import AbstractSystem
+
+SHAPES = {"tensor": 5, "moments": 2, "symmetric": 3, "top": 1, "flat": 4, "fixed": 0}
+SCALES = ("trace", "known", "rotor")
+NUISANCES = {
+    "gyro_bias": 3,  # in units of the record's rms rate
+    "gyro_scale": 1,  # common to the three axes
+    "gyro_scales": 3,
+    "gyro_misalignment": 3,  # a small turn of the gyro from the axes of everything else
+    "gyro_matrix": 9,
+    "gyro_handedness": 0,  # a discrete one: see `FitResult.mirror`
+}
+# Second moments of a mass are kept this fraction of their trace from flat, at the start.
+_FLATTEST = 1e-3
+# ... and where the fit is said to have run into a boundary.
+BOUNDARY = 1e-7
+
+
+def second_moments(tensor: Array) -> Array:
+    """Sigma of unit trace: 1 - 2 I / trace I."""
+    return jnp.eye(3, dtype=tensor.dtype) - 2 * tensor / jnp.trace(tensor)
+
+
+def as_tensor(inertia: Array) -> Array:
+    """A tensor, of moments or itself."""
+    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+def real_body(tensor: Array) -> Array:
+    """The nearest shape of a body with extent in three directions: Sigma of unit trace."""
+    values, axes = eigh(second_moments(tensor))
+    values = jnp.maximum(values, _FLATTEST)
+    values = values / jnp.sum(values)
+    return product("ik,k,jk->ij", axes, values, axes)
+
+
+class Unknowns(eqx.Module):
+    """What is sought, in what numbers, around what system."""
+
+    system: Any  # arrays
+    functions: Any = eqx.field(static=True)
+    shape: str = eqx.field(static=True)
+    scaled: bool = eqx.field(static=True)
+    leaves: tuple[int, ...] = eqx.field(static=True)
+    nuisances: tuple[str, ...] = eqx.field(static=True)
+    priors: tuple[Array | None, ...]
+    chart: Array
+    trace: Array
+    rate: Array  # rms of the rates [rad/s]
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where each part is in the flat vector."""
+        sizes = {"shape": SHAPES[self.shape], "scale": int(self.scaled)}
+        flat = jtu.tree_leaves(self.system)
+        sizes["leaves"] = sum(flat[i].size for i in self.leaves)
+        sizes.update({name: NUISANCES[name] for name in self.nuisances})
+        found, at = {}, 0
+        for name, size in sizes.items():
+            found[name] = slice(at, at + size)
+            at += size
+        return found
+
+    @property
+    def size(self) -> int:
+        """Of the flat vector."""
+        return max(s.stop for s in self.slices.values())
+
+    @property
+    def original(self) -> Any:
+        """The system as it was given."""
+        return eqx.combine(self.system, self.functions)
+
+    def names(self) -> tuple[str, ...]:
+        """One for each number."""
+        found: list[str] = []
+        paths = jtu.tree_leaves_with_path(self.system)
+        for name, s in self.slices.items():
+            if name == "leaves":
+                for i in self.leaves:
+                    path, leaf = paths[i]
+                    text = jtu.keystr(path).lstrip(".")
+                    parts = [text] if leaf.ndim == 0 else [f"{text}[{j}]" for j in range(leaf.size)]
+                    found.extend(parts)
+            elif s.stop - s.start == 1:
+                found.append(name)
+            else:
+                found.extend(f"{name}[{j}]" for j in range(s.stop - s.start))
+        return tuple(found)
+
+    def leaf_units(self) -> Array:
+        """Sizes of the free leaves at the start, one for each number."""
+        flat = jtu.tree_leaves(self.system)
+        units = [jnp.zeros(0, self.rate.dtype)]
+        for i in self.leaves:
+            size = jnp.max(jnp.abs(flat[i])).astype(self.rate.dtype)
+            units.append(jnp.full(flat[i].size, jnp.where(size > 0, size, 1.0)))
+        return jax.lax.stop_gradient(jnp.concatenate(units))
+
+    def leaf_values(self, numbers: Array) -> Array:
+        """The free leaves, side by side."""
+        flat = jtu.tree_leaves(self.system)
+        start = [flat[i].reshape(-1).astype(numbers.dtype) for i in self.leaves]
+        start = jnp.concatenate([jnp.zeros(0, numbers.dtype), *start])
+        return start + self.leaf_units() * numbers[self.slices["leaves"]]
+
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor."""
+        s = self.slices
+        p = numbers[s["shape"]]
+        template = self.original.inertia.astype(numbers.dtype)
+        if self.shape == "fixed":
+            tensor = as_tensor(template)
+        else:
+            sigma = _shape(self.shape, p)
+            sigma = product("ik,kl,jl->ij", self.chart, sigma, self.chart)
+            sigma = sigma / jnp.trace(sigma)
+            tensor = 0.5 * self.trace * (jnp.eye(3, dtype=sigma.dtype) - sigma)
+        return jnp.exp(numbers[s["scale"]][0]) * tensor if self.scaled else tensor
+
+    def start(self, tensor: Array, chart: Array) -> tuple["Unknowns", Array]:
+        """Numbers for a tensor, of the shape that is sought; the frame is chosen for it."""
+        sigma = real_body(tensor)
+        p = jnp.zeros(SHAPES[self.shape], sigma.dtype)
+        if self.shape == "tensor":
+            lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
+            p = jnp.stack(
+                [
+                    jnp.log(lower[1, 1]),
+                    jnp.log(lower[2, 2]),
+                    lower[1, 0],
+                    lower[2, 0],
+                    lower[2, 1],
+                ]
+            )
+        elif self.shape in ("moments", "top"):
+            sigma = product("ki,kl,li->i", chart, sigma, chart)
+            if self.shape == "moments":
+                p = jnp.log(sigma[1:] / sigma[0])
+            else:
+                p = jnp.log(2 * sigma[2:] / (sigma[0] + sigma[1]))
+        elif self.shape in ("symmetric", "flat"):
+            values, chart = eigh(sigma)
+            if self.shape == "flat":  # the largest second moment first
+                chart, values = chart[:, ::-1], values[::-1]
+                p = jnp.stack([0.5 * jnp.log(values[1] / values[0]), *(0 * values)])
+            else:  # the odd one out last
+                last = values[2] - values[1] > values[1] - values[0]
+                chart = jnp.where(last, chart, chart[:, ::-1])
+                values = jnp.where(last, values, values[::-1])
+                p = jnp.stack([2 * values[2] / (values[0] + values[1]), values[0], values[0]])
+                p = jnp.stack([jnp.log(p[0]), 0 * p[0], 0 * p[0]])
+        numbers = jnp.zeros(self.size, sigma.dtype).at[self.slices["shape"]].set(p)
+        if self.scaled:
+            factor = jnp.trace(tensor) / self.trace
+            log_scale = jnp.log(jnp.where(factor > 0, factor, 1.0))
+            numbers = numbers.at[self.slices["scale"]].set(log_scale)
+        unknowns = eqx.tree_at(lambda u: u.chart, self, chart)
+        return unknowns, numbers
+
+    def system_and_gyro(self, numbers: Array) -> tuple[AbstractSystem, Callable[[Array], Array]]:
+        """The body, and what its gyro makes of an angular velocity."""
+        values, tree = jtu.tree_flatten(self.system)
+        found, at = self.leaf_values(numbers), 0
+        for i in self.leaves:
+            size = values[i].size
+            values[i] = found[at : at + size].reshape(values[i].shape)
+            at += size
+        system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
+        system = eqx.tree_at(lambda x: x.inertia, system, self.inertia(numbers))
+        return system, self.gyro(numbers)
+
+    def gyro(self, numbers: Array) -> Callable[[Array], Array]:
+        """What the gyro makes of an angular velocity."""
+        s = self.slices
+        matrix = jnp.eye(3, dtype=numbers.dtype)
+        bias = jnp.zeros(3, numbers.dtype)
+        if "gyro_scale" in s:
+            matrix = matrix * jnp.exp(numbers[s["gyro_scale"]])
+        if "gyro_scales" in s:
+            matrix = matrix * jnp.exp(numbers[s["gyro_scales"]])[:, None]
+        if "gyro_matrix" in s:
+            matrix = matrix + numbers[s["gyro_matrix"]].reshape(3, 3)
+        if "gyro_misalignment" in s:
+            x, y, z = numbers[s["gyro_misalignment"]]
+            o = jnp.zeros_like(x)
+            rows = ([o, -z, y], [z, o, -x], [-y, x, o])
+            hat = jnp.stack([jnp.stack(row) for row in rows])
+            matrix = product("ij,jk->ik", matrix, jnp.eye(3, dtype=x.dtype) - hat)
+        if "gyro_bias" in s:
+            bias = self.rate * numbers[s["gyro_bias"]]
+        return lambda omega: product("ij,j->i", matrix, omega) + bias
+
+    def prior_rows(self, numbers: Array) -> Array:
+        """What is known of the nuisances beforehand, as residuals."""
+        rows = [jnp.zeros(0, numbers.dtype)]
+        for name, prior in zip(self.nuisances, self.priors, strict=True):
+            if prior is not None and NUISANCES[name]:
+                unit = self.rate if name == "gyro_bias" else 1.0
+                rows.append(unit * numbers[self.slices[name]] / prior)
+        return jnp.concatenate(rows)
+
+
+def _shape(shape: str, p: Array) -> Array:
+    """Sigma, in the frame of the chart and of any trace."""
+    one, zero = jnp.ones((), p.dtype), jnp.zeros((), p.dtype)
+    if shape == "moments":
+        return jnp.diag(jnp.stack([one, jnp.exp(p[0]), jnp.exp(p[1])]))
+    if shape == "top":
+        return jnp.diag(jnp.stack([one, one, jnp.exp(p[0])]))
+    if shape == "symmetric":
+        axis = jnp.stack([p[1], p[2], one])
+        axis = axis / jnp.sqrt(1 + p[1] ** 2 + p[2] ** 2)
+        dyad = axis[:, None] * axis[None, :]
+        return jnp.eye(3, dtype=p.dtype) + (jnp.exp(p[0]) - 1) * dyad
+    if shape == "flat":
+        rows = [[one, zero, zero], [p[1], jnp.exp(p[0]), zero], [p[2], p[3], zero]]
+    else:
+        rows = [[one, zero, zero], [p[2], jnp.exp(p[0]), zero], [p[3], p[4], jnp.exp(p[1])]]
+    lower = jnp.stack([jnp.stack(row) for row in rows])
+    return product("ik,jk->ij", lower, lower)
+
+
+def _free_leaves(system: AbstractSystem, free: Any) -> tuple[int, ...]:
+    """Indices, among the arrays of the system, of the leaves that `free` chooses."""
+    arrays, _ = eqx.partition(system, eqx.is_inexact_array)
+    flat = jtu.tree_leaves(arrays)
+    if free is None:
+        return ()
+    if callable(free) and not isinstance(free, eqx.Module):
+        numbered = jtu.tree_unflatten(jtu.tree_structure(arrays), list(range(len(flat))))
+        chosen = jtu.tree_leaves(free(eqx.combine(numbered, system)))
+        if not chosen or not all(isinstance(i, int) for i in chosen):
+            raise ValueError(
+                "Argument `free` must choose floating point arrays of the system, but it does not."
+            )
+        found = tuple(sorted(set(chosen)))
+    else:
+        chosen_tree = eqx.filter(arrays, free)
+        kept = {id(x) for x in jtu.tree_leaves(chosen_tree)}
+        found = tuple(i for i, x in enumerate(flat) if id(x) in kept)
+    inertia = [i for i, x in enumerate(flat) if x is arrays.inertia]
+    return tuple(i for i in found if i not in inertia)
+
+
+def unknowns_of(
+    system: AbstractSystem,
+    free: Any,
+    nuisances: Sequence[str] | Mapping[str, Any],
+    shape: str,
+    scale: str,
+    rate: Array,
+) -> Unknowns:
+    """Check the options and set up the numbers."""
+    check_option("shape", shape, tuple(SHAPES))
+    check_option("scale", scale, SCALES)
+    if isinstance(nuisances, str):
+        nuisances = (nuisances,)
+    priors = dict(nuisances) if isinstance(nuisances, Mapping) else dict.fromkeys(nuisances)
+    for name in priors:
+        check_option("nuisances", name, tuple(NUISANCES))
+    dtype = rate.dtype
+    arrays, functions = eqx.partition(system, eqx.is_inexact_array)
+    inertia = as_tensor(system.inertia.astype(dtype))
+    return Unknowns(
+        arrays,
+        functions,
+        shape,
+        scale != "trace" and shape != "fixed",
+        _free_leaves(system, free),
+        tuple(priors),
+        tuple(None if p is None else jnp.asarray(p, dtype) for p in priors.values()),
+        jnp.eye(3, dtype=dtype) if system.inertia.ndim == 1 else eigh(inertia)[1],
+        jnp.trace(inertia),
+        rate,
+    )
+
+
+def is_near_flat(tensor: Array) -> Array:
+    """Whether a fit has run into the boundary of real bodies."""
+    return eigh(second_moments(tensor))[0][0] < BOUNDARY
+
