@@ -518,6 +518,12 @@ def weighted(case, dtype):
     return np.asarray(flat), outputs, total
 
 
+@pytest.fixture(scope="module", params=list(CASES))
+def name(request):
+    """A case; with the scope of the module its tests follow each other, and share what is computed."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def derivatives():
     """Values and derivatives of a case in a dtype, computed once."""
@@ -548,7 +554,6 @@ def derivatives():
     return compute
 
 
-@pytest.mark.parametrize("name", CASES)
 def test_jit_and_vmap_equal_a_plain_call_and_a_loop(name, derivatives):
     flat, outputs, _, found = derivatives(name, np.float64)
     eager = np.asarray(outputs(jnp.asarray(flat)))
@@ -560,7 +565,6 @@ def test_jit_and_vmap_equal_a_plain_call_and_a_loop(name, derivatives):
     np.testing.assert_allclose(lanes, loop, rtol=0, atol=ulps(float, 64) * scale)
 
 
-@pytest.mark.parametrize("name", CASES)
 def test_derivatives_agree_in_every_mode_and_with_differences(name, derivatives):
     flat, _, everything, found = derivatives(name, np.float64)
     direction = direction_of(flat)
@@ -584,7 +588,6 @@ def test_derivatives_agree_in_every_mode_and_with_differences(name, derivatives)
     np.testing.assert_allclose(curvature, second, rtol=0, atol=10 * bound)
 
 
-@pytest.mark.parametrize("name", CASES)
 def test_float32_in_float32_out_with_its_accuracy(name, derivatives):
     exact, single = derivatives(name, np.float64)[3], derivatives(name, np.float32)[3]
     for key, count in (("value", 64), ("forward", 256), ("reverse", 256), ("second", 2048)):
@@ -608,7 +611,6 @@ def whole_numbers(value):
     return counted.reshape(np.shape(value))
 
 
-@pytest.mark.parametrize("name", CASES)
 def test_integers_python_numbers_and_numpy_arrays_are_taken(name):
     case = CASES[name]
     whole = [whole_numbers(x) for x in case.inputs]

@@ -47,8 +47,10 @@ from jrigid.torques import Rotor, Sum
 from jrigid.torques._base import has_parts
 
 _LOSSES = ("squares", "robust")
-_WEIGHTS = (1.0, 10.0, 100.0, 1e3, 1e4)  # of the links, in units of the noise
-_IN_A_STAGE = 6
+# Weights of the links, in units of the noise; and a slower way for fits that went wrong.
+_WEIGHTS = (1.0, 10.0, 100.0, 1e3, 1e4)
+_SLOW_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
+_IN_A_STAGE = 15
 _GATE = 5.0  # standard deviations of chi-square
 _REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
 _SPOILT = 0.25  # fraction of samples rejected that gives a throw up
@@ -313,6 +315,15 @@ def _local_scales(
     return rates, angles, guess
 
 
+class _Phase(NamedTuple):
+    """One pass: segments, stages, whether only for fits that went wrong, and after a rejection."""
+
+    layout: Layout
+    stages: Stage
+    again: Array
+    reject: Array
+
+
 class _Args(NamedTuple):
     unknowns: Unknowns
     observations: tuple[AbstractObservation, ...]
@@ -469,7 +480,7 @@ def _evaluate(options: Options) -> Callable[[Point, _Args, Layout, Stage], tuple
         of_next = jnp.where(layout.linked[..., None, None], of_next, 0.0)
         return rows, Links(gap, d_gap[..., :size], d_gap[..., size:], of_next)
 
-    return evaluate
+    return jax.jit(evaluate)  # traced once
 
 
 def _horizons(doublings: int) -> list[float]:
@@ -533,21 +544,32 @@ def _fit(
         free = [(0.0, 2.0, options.max_steps)]
     else:
         free = [(0.0, h, _IN_A_STAGE) for h in _horizons(8)[:-1]] + [(0.0, 2.0, options.max_steps)]
-    length = max(len(links), len(free))
-    phases = [(cut, _schedule(links, robust, length, dtype), False)] if options.shooting else []
-    phases.append((single, _schedule(free, robust, length, dtype), False))
+    slow = [(w, 2.0, 2 * _IN_A_STAGE) for w in _SLOW_WEIGHTS]
+    length = max(len(slow), len(free))
+
+    def phase_of(layout: Layout, stages: list, soft: bool, again: bool, reject: bool) -> _Phase:
+        flags = (jnp.asarray(x) for x in (again, reject))
+        return _Phase(layout, _schedule(stages, soft, length, dtype), *flags)
+
+    phases = [phase_of(single, free, robust, False, False)]
+    if options.shooting:
+        phases = [phase_of(cut, links, robust, False, False), *phases]
+        if options.free_motion:
+            phases += [
+                phase_of(cut, slow, robust, True, False),
+                phase_of(single, free, robust, True, False),
+            ]
     if robust:
-        phases.append((single, _schedule(free[-1:], False, length, dtype), True))
+        phases.append(phase_of(single, free[-1:], False, False, True))
 
     def accuracy(rows: Rows) -> Array:
         if options.noise_known:
             return jnp.asarray(ACCURACY, dtype)
         return ACCURACY * rows.cost / jnp.maximum(jnp.sum(rows.residual != 0), 1)
 
-    def run(point: Point, kept: tuple[Array, ...], phase: tuple) -> tuple:
-        layout, stages = phase
+    def run(point: Point, kept: tuple[Array, ...], phase: _Phase) -> tuple:
         now = args._replace(weights=kept)
-        return levenberg_marquardt(evaluate, now, point, layout, stages, accuracy)
+        return levenberg_marquardt(evaluate, now, point, phase.layout, phase.stages, accuracy)
 
     counts = [x.ts.shape[1] for x in stacked]
     widths = [w.shape[-1] for w in weights]
@@ -569,35 +591,57 @@ def _fit(
         spoilt = jnp.any(had & ~alive, axis=0)
         return tuple(w * ~spoilt[:, None, None] for w in found)
 
-    if options.free_motion:
-        stack = jtu.tree_map(lambda *x: jnp.stack(x), *[(a, b) for a, b, _ in phases])
-        flags = jnp.asarray([c for *_, c in phases])
-        shapes = eqx.filter_eval_shape(lambda p: run(p, weights, phases[0][:2])[1], point)
+    total = sum(jnp.sum(w) for w in weights)
+
+    def went_wrong(rows: Rows, settled: Array) -> Array:
+        if not options.noise_known or robust:
+            return ~settled
+        freedom = jnp.maximum(total - numbers.size - 3 * throws, 1.0)
+        return ~settled | (rows.cost > freedom * (1 + _GATE * jnp.sqrt(2 / freedom)))
+
+    if options.free_motion:  # all phases through one loop, compiled once
+        stack = jtu.tree_map(lambda *x: jnp.stack(x), *phases)
+        shapes = eqx.filter_eval_shape(lambda p: run(p, weights, phases[0])[1], point)
         empty = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-        def phase(carry: tuple, now: tuple) -> tuple[tuple, None]:
-            point, kept, rows, _, steps = carry
-            these, reject = now
+        def step(carry: tuple, phase: _Phase) -> tuple[tuple, None]:
+            now, kept, rows, settled, steps, wrong = carry
             if robust:
                 new = rejecting(rows)
-                kept = tuple(jnp.where(reject, a, b) for a, b in zip(new, kept, strict=True))
-            point, rows, settled, more = run(point, kept, these)
-            return (point, kept, rows, settled, steps + more), None
+                kept = tuple(jnp.where(phase.reject, a, b) for a, b in zip(new, kept, strict=True))
+            # A second attempt, for those that need it, begins where the first did.
+            linked = phase.stages.weight[0] > 0
+            wrong = jnp.where(phase.again & linked, went_wrong(rows, settled), wrong)
+            skip = phase.again & ~wrong
+            begin = jtu.tree_map(
+                lambda x, y: jnp.where(phase.again & linked & wrong, x, y), point, now
+            )
+            stages = phase.stages._replace(steps=jnp.where(skip, 0, phase.stages.steps))
+            found = run(begin, kept, phase._replace(stages=stages))
+            now, rows, settled, more = jtu.tree_map(
+                lambda new, old: jnp.where(skip, old, new), found, (now, rows, settled, 0 * steps)
+            )
+            return (now, kept, rows, settled, steps + more, wrong), None
 
-        carry = (point, weights, empty, jnp.asarray(False), jnp.asarray(0))
-        (point, weights_kept, rows, settled, steps), _ = jax.lax.scan(phase, carry, (stack, flags))
+        no = jnp.asarray(False)
+        carry = (point, weights, empty, no, jnp.asarray(0), no)
+        (point, weights_kept, rows, settled, steps, _), _ = jax.lax.scan(step, carry, stack)
     else:
         weights_kept, steps = weights, jnp.asarray(0)
         rows, settled = None, jnp.asarray(False)
-        for layout, stages, reject in phases:
-            if reject:
-                weights_kept = rejecting(rows)
-            if layout is single:  # only the first node matters, and the whole motion is integrated
-                layout = jtu.tree_map(lambda x: x[:, :1], layout)._replace(
-                    ts=layout.ts, node=layout.node, since=layout.since
+        for phase in phases:
+            if rows is not None and robust:
+                new = rejecting(rows)
+                weights_kept = tuple(
+                    jnp.where(phase.reject, a, b) for a, b in zip(new, weights_kept, strict=True)
                 )
+            if phase.layout is single:  # the whole motion is integrated, from the first node
+                first = single._replace(
+                    start=single.start[:, :1], end=single.end[:, :1], linked=single.linked[:, :1]
+                )
+                phase = phase._replace(layout=first)
                 point = Point(point.numbers, point.attitude[:, :1], point.omega[:, :1])
-            point, rows, settled, more = run(point, weights_kept, (layout, stages))
+            point, rows, settled, more = run(point, weights_kept, phase)
             steps = steps + more
     assert rows is not None
     return _result(
