@@ -597,7 +597,7 @@ def _fit(
         if not options.noise_known or robust:
             return ~settled
         freedom = jnp.maximum(total - numbers.size - 3 * throws, 1.0)
-        return ~settled | (rows.cost > freedom * (1 + _GATE * jnp.sqrt(2 / freedom)))
+        return rows.cost > freedom * (1 + _GATE * jnp.sqrt(2 / freedom))
 
     if options.free_motion:  # all phases through one loop, compiled once
         stack = jtu.tree_map(lambda *x: jnp.stack(x), *phases)
@@ -723,12 +723,15 @@ def _result(
     variation = _variation(options, args, point, rows)
     largest = jnp.sqrt(inflate) / jnp.min(values) if size else jnp.zeros((), dtype)
     gate = 1 + _GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1).astype(dtype))
-    status = Status.where(largest > LARGEST_ERROR, Status.UNIDENTIFIABLE, Status.OK)
-    status = Status.where(is_near_flat(tensor) & (unknowns.shape not in ("flat", "fixed")),
-                          Status.AT_BOUNDARY, status)  # fmt: skip
+    # A fit that creeps along a direction which the record does not tell is as good as any.
+    untold = largest > LARGEST_ERROR
+    status = Status.where(settled, Status.OK, Status.NOT_CONVERGED)
+    status = Status.where(untold, Status.UNIDENTIFIABLE, status)
+    if unknowns.shape not in ("flat", "fixed"):
+        status = Status.where(is_near_flat(tensor), Status.AT_BOUNDARY, status)
     if options.noise_known:
-        status = Status.where(noise > gate, Status.WRONG_BASIN, status)
-    status = Status.where(~settled, Status.NOT_CONVERGED, status)
+        wrong = Status.where(settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
+        status = Status.where(noise > gate, wrong, status)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
     found = FitResult(
         status, tensor, moments, axes, spread(of_moments),

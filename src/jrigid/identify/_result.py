@@ -1,5 +1,6 @@
 """FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -264,14 +265,36 @@ def words(result: FitResult) -> tuple[str, ...]:
     return tuple(found)
 
 
+def remarks(result: FitResult) -> tuple[str, ...]:
+    """What to bear in mind of the ratios."""
+    found = []
+    ratios, errors = np.asarray(result.ratios), np.asarray(result.ratios_errors)
+    if result.unknowns.shape in ("symmetric", "top", "fixed"):
+        return ()
+    weak = errors > 0.03 * ratios
+    if weak.any():
+        found.append("the ratios are weakly constrained: errors of 3 % or more")
+    covariance = np.asarray(result.moments_covariance)
+    moments = np.asarray(result.moments)
+    for i, j in ((0, 1), (1, 2)):
+        gap = moments[j] - moments[i]
+        error = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2 * covariance[i, j], 0.0))
+        if gap < 2 * error:
+            found.append(
+                f"I{i + 1} and I{j + 1} are equal within their errors: which is the larger, and "
+                "the axes of each, are not determined"
+            )
+    return tuple(found)
+
+
 def _with_error(value: Any, error: Any) -> str:
     value, error = float(value), float(error)
-    if not np.isfinite(error) or error <= 0:
+    if not error > 1e-9 * abs(value):
         return f"{value:.6g}"
-    if error > 10 * max(abs(value), 1e-300):
+    if not error < 10 * max(abs(value), 1e-300):
         return f"{value:.3g} (not determined)"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
-    return f"{value:.{min(digits, 15)}f} +- {error:.{min(digits, 15)}f}"
+    digits = min(max(0, 1 - math.floor(math.log10(error))), 15)
+    return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
 def report(result: FitResult) -> str:
@@ -326,6 +349,7 @@ def report(result: FitResult) -> str:
     if result.state.omega.shape[0] == 1:
         omega = ", ".join(f"{x:.5g}" for x in np.asarray(result.state.omega)[0])
         lines.append(f"  rates at t = {float(result.t0[0]):.6g} s: ({omega}) rad/s")
+    lines.extend(f"  {note}" for note in remarks(result))
     untold = result.null_directions
     lines.append("  not told by the record: " + ("; ".join(untold) if untold else "nothing"))
     if "gyro_handedness" in result.unknowns.nuisances:
