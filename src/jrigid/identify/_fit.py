@@ -15,7 +15,7 @@ from jrigid._numerics import product, safe_norm
 from jrigid._simulate import simulate
 from jrigid._spectral import eigh
 from jrigid.dynamics import State
-from jrigid.identify._flow import forced_flow, free_flow
+from jrigid.identify._flow import depends_on_attitude, forced_flow, free_flow
 from jrigid.identify._layout import (
     Layout,
     Samples,
@@ -53,6 +53,7 @@ _SLOW_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _IN_A_STAGE = 15
 _GATE = 5.0  # standard deviations of chi-square
 _REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
+_HISTORY = 512
 _SPOILT = 0.25  # fraction of samples rejected that gives a throw up
 
 
@@ -68,6 +69,8 @@ class Options(NamedTuple):
     rtol: float
     noise_known: bool
     motion: Any
+    doublings: int
+    progress: bool
     throw: bool
 
 
@@ -81,8 +84,11 @@ def fit(
     shape: str = "tensor",
     start: tuple[Any, State | None] | State | None = None,
     loss: str = "squares",
+    absolute_sigma: bool = True,
     motion: Callable[..., State] | None = None,
+    doublings: int = 8,
     max_steps: int = 60,
+    progress: bool = False,
     throw: bool = True,
 ) -> FitResult:
     """TODO."""
@@ -97,7 +103,7 @@ def fit(
     torque_free = isinstance(system.torque, Sum) and not system.torque.terms
     _refuse(system, stacked, scale, torque_free)
     throws = stacked[0].ts.shape[0]
-    on_attitude = not torque_free or any(x.on_attitude for x in stacked)
+    on_attitude = any(x.on_attitude for x in stacked) or depends_on_attitude(system)
     if on_attitude and start_state is None and not any(isinstance(x, Attitudes) for x in stacked):
         raise ValueError(
             "Argument `start` must hold a State whose attitude the fit can start from, since the "
@@ -124,7 +130,8 @@ def fit(
     options = Options(
         torque_free and motion is None, on_attitude, shooting,
         segments_needed(angle, stacked[0].ts.shape[1]) if shooting else 1, loss, max_steps, 1e-9,
-        all(x.sigma is not None or x.covariance is not None for x in stacked), motion, throw,
+        absolute_sigma and all(x.sigma is not None or x.covariance is not None for x in stacked),
+        motion, doublings, progress, throw,
     )  # fmt: skip
     return _fit(options, unknowns, stacked, samples, start_tensor, start_state, input_result)
 
@@ -369,7 +376,7 @@ def _sample_states(
         omega = jnp.concatenate([pick(point.omega), point.omega], axis=1)
         attitude = jnp.concatenate([pick(point.attitude), point.attitude], axis=1)
         states = jax.vmap(
-            jax.vmap(lambda q, w, a, b: forced_flow(system, State(normalize(q), w), a, b))
+            jax.vmap(lambda q, w, a, b: forced_flow(system, State(q, w), a, b, options.on_attitude))
         )(attitude, omega, begin, end)
     return (
         jtu.tree_map(lambda x: x[:, :count], states),
@@ -435,7 +442,11 @@ def _evaluate(options: Options) -> Callable[[Point, _Args, Layout, Stage], tuple
                 side = jnp.where(turn[..., :1] < 0, -1.0, 1.0)
                 gap = jnp.concatenate([gap, 2 * side * turn[..., 1:]], axis=-1)
             gap = jnp.where(layout.linked[..., None], gap / args.local[:locals_], 0.0)
-            return tuple(blocks), gap, args.unknowns.prior_rows(numbers)
+            # While little of the record takes part, nuisances must not imitate the motion.
+            held = numbers[args.unknowns.slices["leaves"].start :]
+            held = jnp.where(stage.horizon < 1, held, 0.0)
+            prior = jnp.concatenate([args.unknowns.prior_rows(numbers), held])
+            return tuple(blocks), gap, prior
 
         still = jnp.zeros((throws, nodes, locals_), dtype)
         directions = jnp.eye(size + locals_, dtype=dtype)
@@ -543,7 +554,7 @@ def _fit(
     if options.shooting:
         free = [(0.0, 2.0, options.max_steps)]
     else:
-        free = [(0.0, h, _IN_A_STAGE) for h in _horizons(8)[:-1]] + [(0.0, 2.0, options.max_steps)]
+        free = [(0.0, h, _IN_A_STAGE) for h in _horizons(options.doublings)[:-1]] + [(0.0, 2.0, options.max_steps)]
     slow = [(w, 2.0, 2 * _IN_A_STAGE) for w in _SLOW_WEIGHTS]
     length = max(len(slow), len(free))
 
@@ -567,9 +578,14 @@ def _fit(
             return jnp.asarray(ACCURACY, dtype)
         return ACCURACY * rows.cost / jnp.maximum(jnp.sum(rows.residual != 0), 1)
 
-    def run(point: Point, kept: tuple[Array, ...], phase: _Phase) -> tuple:
+    def run(
+        point: Point, kept: tuple[Array, ...], phase: _Phase, steps: Array, history: Array
+    ) -> tuple:
         now = args._replace(weights=kept)
-        return levenberg_marquardt(evaluate, now, point, phase.layout, phase.stages, accuracy)
+        return levenberg_marquardt(
+            evaluate, now, point, phase.layout, phase.stages, accuracy, steps, history,
+            options.progress,
+        )  # fmt: skip
 
     counts = [x.ts.shape[1] for x in stacked]
     widths = [w.shape[-1] for w in weights]
@@ -599,13 +615,14 @@ def _fit(
         freedom = jnp.maximum(total - numbers.size - 3 * throws, 1.0)
         return rows.cost > freedom * (1 + _GATE * jnp.sqrt(2 / freedom))
 
+    none, blank = jnp.asarray(0), jnp.full(_HISTORY, jnp.nan, dtype)
     if options.free_motion:  # all phases through one loop, compiled once
         stack = jtu.tree_map(lambda *x: jnp.stack(x), *phases)
-        shapes = eqx.filter_eval_shape(lambda p: run(p, weights, phases[0])[1], point)
+        shapes = eqx.filter_eval_shape(lambda p: run(p, weights, phases[0], none, blank)[1], point)
         empty = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
         def step(carry: tuple, phase: _Phase) -> tuple[tuple, None]:
-            now, kept, rows, settled, steps, wrong = carry
+            now, kept, rows, settled, steps, history, wrong = carry
             if robust:
                 new = rejecting(rows)
                 kept = tuple(jnp.where(phase.reject, a, b) for a, b in zip(new, kept, strict=True))
@@ -617,17 +634,21 @@ def _fit(
                 lambda x, y: jnp.where(phase.again & linked & wrong, x, y), point, now
             )
             stages = phase.stages._replace(steps=jnp.where(skip, 0, phase.stages.steps))
-            found = run(begin, kept, phase._replace(stages=stages))
-            now, rows, settled, more = jtu.tree_map(
-                lambda new, old: jnp.where(skip, old, new), found, (now, rows, settled, 0 * steps)
+            found = run(begin, kept, phase._replace(stages=stages), steps, history)
+            now, rows, settled, steps, history = jtu.tree_map(
+                lambda new, old: jnp.where(skip, old, new),
+                found,
+                (now, rows, settled, steps, history),
             )
-            return (now, kept, rows, settled, steps + more, wrong), None
+            return (now, kept, rows, settled, steps, history, wrong), None
 
         no = jnp.asarray(False)
-        carry = (point, weights, empty, no, jnp.asarray(0), no)
-        (point, weights_kept, rows, settled, steps, _), _ = jax.lax.scan(step, carry, stack)
+        carry = (point, weights, empty, no, none, blank, no)
+        (point, weights_kept, rows, settled, steps, history, _), _ = jax.lax.scan(
+            step, carry, stack
+        )
     else:
-        weights_kept, steps = weights, jnp.asarray(0)
+        weights_kept, steps, history = weights, none, blank
         rows, settled = None, jnp.asarray(False)
         for phase in phases:
             if rows is not None and robust:
@@ -641,12 +662,13 @@ def _fit(
                 )
                 phase = phase._replace(layout=first)
                 point = Point(point.numbers, point.attitude[:, :1], point.omega[:, :1])
-            point, rows, settled, more = run(point, weights_kept, phase)
-            steps = steps + more
+            point, rows, settled, steps, history = run(
+                point, weights_kept, phase, steps, history
+            )
     assert rows is not None
+    final = args._replace(weights=weights_kept)
     return _result(
-        options, unknowns, stacked, point, rows, weights_kept, weights, settled, steps,
-        single.start[:, 0], args, input_result,
+        options, final, point, rows, weights, settled, history, single, input_result,
     )  # fmt: skip
 
 
@@ -673,18 +695,16 @@ def _linear_start(
 
 def _result(
     options: Options,
-    unknowns: Unknowns,
-    stacked: tuple[AbstractObservation, ...],
+    args: _Args,
     point: Point,
     rows: Rows,
-    kept: tuple[Array, ...],
     seen: tuple[Array, ...],
     settled: Array,
-    steps: Array,
-    t0: Array,
-    args: _Args,
+    history: Array,
+    single: Layout,
     input_result: Any,
 ) -> FitResult:
+    unknowns, kept, t0 = args.unknowns, args.weights, single.start[:, 0]
     numbers = point.numbers
     dtype = numbers.dtype
     size, locals_ = numbers.size, rows.of_state.shape[-1]
@@ -695,7 +715,7 @@ def _result(
     freedom = count - size - locals_ * jnp.sum(alive)
     noise = chi_square / jnp.maximum(freedom, 1)
     inflate = jnp.ones((), dtype) if options.noise_known else noise
-    values, directions, covariance = _told(rows, inflate)
+    values, directions, covariance, of_state = _told(rows, inflate)
 
     tensor = unknowns.inertia(numbers)
     moments, axes = eigh(tensor)
@@ -720,11 +740,11 @@ def _result(
     def spread(x: Array) -> Array:
         return product("in,nm,jm->ij", x, cov, x)
 
-    variation = _variation(options, args, point, rows)
+    pure = _is_pure(args, rows, inflate) & (unknowns.shape != "fixed")
     largest = jnp.sqrt(inflate) / jnp.min(values) if size else jnp.zeros((), dtype)
     gate = 1 + _GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1).astype(dtype))
     # A fit that creeps along a direction which the record does not tell is as good as any.
-    untold = largest > LARGEST_ERROR
+    untold = (largest > LARGEST_ERROR) | pure
     status = Status.where(settled, Status.OK, Status.NOT_CONVERGED)
     status = Status.where(untold, Status.UNIDENTIFIABLE, status)
     if unknowns.shape not in ("flat", "fixed"):
@@ -738,9 +758,9 @@ def _result(
         jnp.sqrt(jnp.maximum(jnp.diagonal(spread(turns)), 0.0)), ratios, spread(of_ratios),
         State(point.attitude[:, 0], point.omega[:, 0]), t0, numbers, covariance,
         rows.residual, jnp.concatenate([rows.of_numbers, rows.of_state], axis=-1), chi_square,
-        freedom, values, directions, tuple(jnp.any(w > 0, axis=-1) for w in kept),
+        freedom, values, directions, of_state, tuple(jnp.any(w > 0, axis=-1) for w in kept),
         ~alive & jnp.any(jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in seen]), axis=0),
-        steps, variation, input_result, unknowns, options.noise_known, options.free_motion,
+        history, pure, input_result, unknowns, options.noise_known, options.free_motion,
     )  # fmt: skip
     found = nan_where(input_result != RESULTS.successful, found)
     if not options.throw:
@@ -751,25 +771,41 @@ def _result(
     return eqx.branched_error_if(found, failed, code, messages)
 
 
-def _variation(options: Options, args: _Args, point: Point, rows: Rows) -> Array:
-    """How much the rates vary over the record, from their share of the derivatives' cause."""
-    del rows
-    ends = args.unknowns.inertia(point.numbers)
-    momentum = product("ij,tj->ti", ends, point.omega[:, 0])
-    acceleration = jnp.cross(momentum, point.omega[:, 0])
-    size = jnp.sqrt(jnp.sum(acceleration**2)) / (
-        jnp.sqrt(jnp.sum(momentum**2)) * jnp.sqrt(jnp.sum(point.omega[:, 0] ** 2)) + 1e-300
-    )
-    return jnp.where(options.free_motion, size, 1.0)
+def _is_pure(args: _Args, rows: Rows, noise: Array) -> Array:
+    """Whether a constant rate in each throw describes a gyro's record as well.
+
+    Where the rates do not vary the Fisher information at the estimate is no guide: a motion fitted
+    to the noise seems to tell what the true one does not.
+    """
+    at = 0
+    for x, weight in zip(args.observations, args.weights, strict=True):
+        width = weight.shape[-1] * weight.shape[1]
+        if not isinstance(x, Rates):
+            at += width
+            continue
+        fitted = jnp.sum(rows.residual[:, at : at + width] ** 2)
+        if x.covariance is not None:
+            inverse = 1 / jnp.diagonal(x.covariance, axis1=-2, axis2=-1)
+        elif x.sigma is not None:
+            inverse = 1 / x.sigma**2
+        else:
+            inverse = jnp.full(weight.shape, 1.0, weight.dtype) / args.unit**2
+        inverse = jnp.where(weight > 0, inverse, 0.0)
+        values = jnp.where(weight > 0, x.values, 0.0)
+        total = jnp.sum(inverse, axis=1, keepdims=True)
+        mean = jnp.sum(inverse * values, axis=1, keepdims=True) / jnp.where(total > 0, total, 1.0)
+        constant = jnp.sum(inverse * (values - mean) ** 2)
+        return constant - fitted < noise * (5 + _GATE * 10**0.5)  # of the shape's five numbers
+    return jnp.asarray(False)
 
 
-def _told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array]:
+def _told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array, Array]:
     """Singular values and directions of the numbers, states removed, and the whole covariance."""
     jg, jl = rows.of_numbers, rows.of_state
     throws, size, locals_ = jg.shape[0], jg.shape[-1], jl.shape[-1]
     eps = jnp.finfo(jg.dtype).eps
 
-    def throw(jg: Array, jl: Array) -> tuple[Array, Array, Array]:
+    def throw(jg: Array, jl: Array) -> tuple[Array, Array, Array, Array]:
         scale = jnp.sqrt(jnp.sum(jl * jl, axis=0))
         scale = jnp.where(scale > 0, scale, 1.0)
         u, s, vt = jnp.linalg.svd(jl / scale, full_matrices=False)
@@ -779,9 +815,9 @@ def _told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array]:
         half = vt.T * inverse / scale[:, None]
         cause = product("lk,rk,rg->lg", vt.T / scale[:, None] * jnp.where(told, inverse, 0.0), u, jg)
         rest = jg - product("rk,sk,sg->rg", u, u, jg)
-        return jnp.linalg.qr(rest, mode="r") if size else rest[:0], half, cause
+        return jnp.linalg.qr(rest, mode="r") if size else rest[:0], half, cause, s
 
-    r, half, cause = jax.vmap(throw)(jg, jl)
+    r, half, cause, of_state = jax.vmap(throw)(jg, jl)
     own = product("tik,tjk->tij", half, half)
     if size:
         _, values, vt = jnp.linalg.svd(r.reshape(-1, size), full_matrices=False)
@@ -798,4 +834,4 @@ def _told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array]:
     whole_ = jnp.concatenate(
         [jnp.concatenate([cov, across.T], axis=1), jnp.concatenate([across, blocks], axis=1)]
     )
-    return values, directions, inflate * whole_
+    return values, directions, inflate * whole_, of_state

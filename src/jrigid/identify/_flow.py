@@ -8,6 +8,7 @@ nearer than a ten-millionth are taken that far apart, in the derivatives alone.
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -20,7 +21,7 @@ from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import AbstractSystem
 
 _APART = {8: 1e-7, 4: 1e-3}
-_STEPS = 8  # Dopri8's in a segment of half a turn, to 1e-8 of the state
+_STEPS = 4  # Dopri8's in a segment of half a turn, to 1e-7 of the state
 
 
 @jax.custom_jvp
@@ -61,25 +62,47 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
     return turned(axes, p, w), turned(axes, p_change, w_change)
 
 
-def forced_flow(system: AbstractSystem, state: State, t0: Array, t1: Array) -> State:
-    """State at t1, by a few fixed steps: for times of half a turn, forward or back."""
+def forced_flow(
+    system: AbstractSystem, state: State, t0: Array, t1: Array, on_attitude: bool
+) -> State:
+    """State at t1, by a few fixed steps: for times of half a turn, forward or back.
+
+    Where nothing depends on the attitude it stays as it is.
+    """
     span = t1 - t0
 
-    def rate(s: Array, y: State, args: Any) -> State:
-        slope = system.vector_field(t0 + s * span, y, args)
-        return jax.tree.map(lambda x: span * x, slope)
+    def rate(s: Array, y: Any, args: Any) -> Any:
+        now = State(y[0] if on_attitude else state.attitude, y[-1])
+        slope = system.vector_field(t0 + s * span, now, args)
+        return tuple(span * x for x in (slope.attitude, slope.omega)[-len(y) :])
 
+    start = (state.attitude, state.omega) if on_attitude else (state.omega,)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
         diffrax.Dopri8(),
         jnp.zeros_like(span),
         jnp.ones_like(span),
         1 / _STEPS,
-        state,
+        start,
         stepsize_controller=diffrax.ConstantStepSize(),
         adjoint=diffrax.ForwardMode(),
         max_steps=_STEPS,
         throw=False,
     )
-    end = jax.tree.map(lambda x: x[0], solution.ys)
-    return State(normalize(end.attitude), end.omega)
+    end = tuple(x[0] for x in solution.ys)
+    return State(normalize(end[0]) if on_attitude else state.attitude, end[-1])
+
+
+def depends_on_attitude(system: AbstractSystem) -> bool:
+    """Whether the torque looks at the attitude, as far as its program shows."""
+    arrays, rest = eqx.partition(system, eqx.is_inexact_array)
+
+    def torque(q: Array, w: Array, arrays: Any) -> Array:
+        return eqx.combine(arrays, rest).torque(jnp.zeros(()), State(q, w), None)
+
+    program = jax.make_jaxpr(torque)(jnp.array([1.0, 0, 0, 0]), jnp.zeros(3), arrays).jaxpr
+    reached = {program.invars[0]}
+    for equation in program.eqns:
+        if any(x in reached for x in equation.invars if not hasattr(x, "val")):
+            reached.update(equation.outvars)
+    return any(x in reached for x in program.outvars if not hasattr(x, "val"))

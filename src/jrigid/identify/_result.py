@@ -41,8 +41,6 @@ class Status(eqx.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
 STATUSES = ("OK", "UNIDENTIFIABLE", "WRONG_BASIN", "AT_BOUNDARY", "NOT_CONVERGED", "BAD_INPUT")
 # An error above this, in natural units, and a direction is not told.
 LARGEST_ERROR = 0.3
-# Rates that vary by less than this are a pure spin.
-_PURE = 0.02
 
 
 class FitResult(eqx.Module):
@@ -72,10 +70,12 @@ class FitResult(eqx.Module):
         degrees_of_freedom: Residuals less what was sought.
         singular_values: Of the derivatives in the numbers, the states' part removed, descending.
         directions: In the numbers, columns for the singular values.
+        state_singular_values: Of the derivatives in each throw's state, of unit columns; a zero is
+            a change of the state that the record does not show.
         kept: For each kind of observation, which samples were (throws, n).
         spoilt: Throws that a robust fit gave up.
-        history: Steps of the last stages.
-        variation: How much the rates vary, in units of their size; zero for a pure spin.
+        history: Sum of squares of the record after each step, NaN beyond the last.
+        pure_spin: Whether constant rates describe a gyro's record as well.
         input_result: `jrigid.RESULTS` of the input.
     """
 
@@ -97,10 +97,11 @@ class FitResult(eqx.Module):
     degrees_of_freedom: Int[Array, ""]
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
+    state_singular_values: Float[Array, "throws state"]
     kept: tuple[Bool[Array, "throws n"], ...]
     spoilt: Bool[Array, " throws"]
-    history: Int[Array, ""]
-    variation: Scalar
+    history: Float[Array, " steps"]
+    pure_spin: Bool[Array, ""]
     input_result: Any
     unknowns: Unknowns
     noise_known: bool = eqx.field(static=True)
@@ -228,7 +229,9 @@ def words(result: FitResult) -> tuple[str, ...]:
     noise = 1.0 if result.noise_known else float(np.sqrt(result.reduced_chi_square))
     values = np.asarray(result.singular_values)
     slices = result.unknowns.slices
-    pure = float(result.variation) < _PURE
+    pure = bool(result.pure_spin)
+    if pure:
+        found.append("spin is pure: ratios not determined")
     for value, direction in zip(values, np.asarray(result.directions).T, strict=True):
         if noise <= LARGEST_ERROR * value:
             continue
@@ -254,12 +257,14 @@ def words(result: FitResult) -> tuple[str, ...]:
                 parts.append((size, text))
         parts.sort(reverse=True)
         names = [name for _, name in parts]
-        if pure and names == ["ratios"]:
-            text = "spin is pure: ratios not determined"
-        else:
-            text = " against ".join(names)
-        if text not in found:
+        names = [name for name in names if name != "ratios"]
+        text = " against ".join(names)
+        if text and text not in found:
             found.append(text)
+    of_state = np.asarray(result.state_singular_values)
+    if of_state.shape[-1] == 6 and (of_state[..., -1] < 1e-6 * of_state[..., 0]).any():
+        count = int((of_state < 1e-6 * of_state[..., :1]).sum(axis=-1).max())
+        found.append("heading about the vertical" if count == 1 else "attitude in space")
     if "gyro_handedness" in result.unknowns.nuisances:
         found.append("mirror body fits equally: handedness of the gyro")
     return tuple(found)
@@ -319,7 +324,7 @@ def report(result: FitResult) -> str:
     if result.state.omega.shape[0] > 1:
         seen += f" of {result.state.omega.shape[0]} throws"
     lines.append(
-        f"  {seen}, {int(result.history)} steps; chi-square {float(result.chi_square):.1f} for "
+        f"  {seen}, {int(np.sum(np.isfinite(result.history)))} steps; chi-square {float(result.chi_square):.1f} for "
         f"{int(result.degrees_of_freedom)} degrees of freedom"
         + ("" if result.noise_known else " (noise taken from the residuals)")
     )

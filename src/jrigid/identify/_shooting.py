@@ -179,6 +179,7 @@ class _Carry(NamedTuple):
     fresh: Array
     settled: Array
     steps: Array
+    history: Array
 
 
 def levenberg_marquardt(
@@ -188,11 +189,15 @@ def levenberg_marquardt(
     layout: Any,
     stages: Stage,
     accuracy: Callable[[Rows], Array],
-) -> tuple[Point, Rows, Array, Array]:
+    steps: Array,
+    history: Array,
+    progress: bool = False,
+) -> tuple[Point, Rows, Array, Array, Array]:
     """The minimum of the sums of squares of one stage after the other, each from the last's.
 
     Returns:
-        Point, rows there, whether the last stage settled, and steps taken.
+        Point, rows there, whether the last stage settled, steps taken so far, and the sum of
+        squares of the record after each.
     """
     throws, nodes = start.omega.shape[:2]
     count = jnp.sum(stages.steps > 0)
@@ -206,7 +211,7 @@ def levenberg_marquardt(
     carry = _Carry(
         start, rows, links, jnp.asarray(jnp.inf, dtype), still, jnp.zeros((), dtype),
         jnp.asarray(_FIRST_DAMPING, dtype), jnp.asarray(0), jnp.asarray(0), jnp.asarray(True),
-        jnp.asarray(False), jnp.asarray(0),
+        jnp.asarray(False), steps, history,
     )  # fmt: skip
 
     def body(carry: _Carry) -> _Carry:
@@ -237,12 +242,22 @@ def levenberg_marquardt(
         settled = small | (damping > _STUCK) | (gain <= 1e-6 * enough)
         over = settled | (since >= now.steps)
         stage = carry.stage + over
+        if progress:
+            jax.lax.cond(
+                over,
+                lambda: jax.debug.print(
+                    "fit: {} steps, links {}, record {}: chi-square {}",
+                    carry.steps + 1, now.weight, jnp.minimum(now.horizon, 1.0), rows.cost,
+                ),
+                lambda: None,
+            )  # fmt: skip
         # A new stage has other weights: its first evaluation is where this one ended.
         move = jtu.tree_map(lambda x: jnp.where(over, 0.0, x), tuple(move))
         return _Carry(
             point, rows, links, cost, move, gain, damping, stage, jnp.where(over, 0, since), over,
-            settled, carry.steps + 1,
+            settled, carry.steps + 1, carry.history.at[carry.steps].set(rows.cost, mode="drop"),
         )  # fmt: skip
 
     carry = jax.lax.while_loop(lambda c: c.stage < count, body, carry)
-    return carry.point, carry.rows, carry.settled & jnp.isfinite(carry.cost), carry.steps
+    settled = carry.settled & jnp.isfinite(carry.cost)
+    return carry.point, carry.rows, settled, carry.steps, carry.history
