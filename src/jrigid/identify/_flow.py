@@ -52,8 +52,9 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
     a, b, c = moments
     turn = jnp.stack([inside[1, 2] / (b - c), inside[2, 0] / (c - a), inside[0, 1] / (a - b)])
     columns = jnp.concatenate([jnp.diagonal(inside), omega_change - jnp.cross(turn, omega)])
-    p_change, w_change = product("ij,j->i", p_columns, columns), product(
-        "ij,j->i", w_columns, columns
+    p_change, w_change = (
+        product("ij,j->i", p_columns, columns),
+        product("ij,j->i", w_columns, columns),
     )
     vector = p_change[1:] + jnp.cross(turn, p[1:])
     p_change = jnp.concatenate([p_change[:1], vector]) + t_change * attitude_rate(p, w)

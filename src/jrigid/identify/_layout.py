@@ -110,9 +110,9 @@ def samples_of(
             i = _nearest_before(times, known_, t)
             return multiply(qs[i], exp(w * (t - times[i])))
 
-        found = jax.vmap(
-            lambda t, w, a, b, c: jax.vmap(lambda t, w: nearest(t, w, a, b, c))(t, w)
-        )(ts, omega, q_ts, q_there, q)
+        found = jax.vmap(lambda t, w, a, b, c: jax.vmap(lambda t, w: nearest(t, w, a, b, c))(t, w))(
+            ts, omega, q_ts, q_there, q
+        )
         return Samples(ts, there, omega, found)
     if attitude0 is None:
         return Samples(ts, there, omega, None)

@@ -47,11 +47,14 @@ class AbstractObservation(eqx.Module):
         return predicted - value
 
 
-def _fields(
-    self: Any, ts: Any, values: Any, sigma: Any = None, covariance: Any = None, angle: bool = False
-) -> None:
+def _fields(self: Any, ts: Any, values: Any, sigma: Any = None, covariance: Any = None) -> None:
     """Convert, check shapes, and bring the noise into the shape of the values."""
     name = type(self).__name__
+    if values is None:  # a plan
+        if self.width is None:
+            raise ValueError(f"Argument `values` of `{name}` must be given, but it is None.")
+        (ts,) = float_arrays(ts)
+        values = jnp.ones((*ts.shape, self.width), ts.dtype) / self.width**0.5
     ts, values = float_arrays(ts, values)
     if ts.ndim not in (1, 2) or values.shape[:-1] != ts.shape or values.ndim != ts.ndim + 1:
         raise ValueError(
@@ -108,7 +111,7 @@ class Rates(AbstractObservation):
     def __init__(
         self,
         ts: Real[_ArrayLike, "*throws n"],
-        values: Real[_ArrayLike, "*throws n 3"],
+        values: Real[_ArrayLike, "*throws n 3"] | None,
         sigma: Real[_ArrayLike, "..."] | None = None,
         *,
         covariance: Real[_ArrayLike, "..."] | None = None,
@@ -137,7 +140,7 @@ class Attitudes(AbstractObservation):
     def __init__(
         self,
         ts: Real[_ArrayLike, "*throws n"],
-        values: Real[_ArrayLike, "*throws n 4"],
+        values: Real[_ArrayLike, "*throws n 4"] | None,
         sigma: Real[_ArrayLike, "..."] | None = None,
         *,
         covariance: Real[_ArrayLike, "..."] | None = None,
@@ -177,7 +180,7 @@ class Directions(AbstractObservation):
     def __init__(
         self,
         ts: Real[_ArrayLike, "*throws n"],
-        values: Real[_ArrayLike, "*throws n 3"],
+        values: Real[_ArrayLike, "*throws n 3"] | None,
         sigma: Real[_ArrayLike, "..."] | None = None,
         *,
         of: VectorLike,
@@ -223,7 +226,7 @@ class AngularMomenta(AbstractObservation):
     def __init__(
         self,
         ts: Real[_ArrayLike, "*throws n"],
-        values: Real[_ArrayLike, "*throws n 3"],
+        values: Real[_ArrayLike, "*throws n 3"] | None,
         sigma: Real[_ArrayLike, "..."] | None = None,
         *,
         axes: str = "space",

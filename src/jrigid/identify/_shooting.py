@@ -128,10 +128,9 @@ def _step(blocks: tuple[Array, ...], damping: Array) -> tuple[Array, Array, Arra
 
     solved, schur = jax.vmap(throw)(h, u, hg, b)
     schur = jnp.sum(schur, axis=0)
+    numbers = -bg
     if globals_:
         numbers = -_solve(gg - schur[:, :-1], (bg - schur[:, -1])[:, None])[:, 0]
-    else:
-        numbers = -bg
 
     def back(later: Array, node: Array) -> tuple[Array, Array]:
         move = -node[:, -1] - product("ij,j->i", node[:, :local], later)

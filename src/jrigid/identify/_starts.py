@@ -338,8 +338,10 @@ def linear_start(
     # The misfit of the best answer is how far rows can be trusted.
     best = jnp.where(values > 64 * jnp.finfo(values.dtype).eps * values[0], 1.0, 0.0) * along
     misfit = safe_norm(wanted - product("rk,k->r", u, best))
-    floor = misfit / jnp.maximum(safe_norm(wanted), 1e-300) * values[0] if trace is None else (
-        2 * misfit / trace
+    floor = (
+        misfit / jnp.maximum(safe_norm(wanted), 1e-300) * values[0]
+        if trace is None
+        else (2 * misfit / trace)
     )
     square = values * values + floor * floor
     faded = values * along / jnp.where(square > 0, square, 1.0)

@@ -3,6 +3,7 @@
 They are one flat vector; `Unknowns.system_and_gyro` turns it into a body and a sensor.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -64,6 +65,8 @@ class Unknowns(eqx.Module):
     chart: Array
     trace: Array
     rate: Array  # rms of the rates [rad/s]
+    held: Any = eqx.field(static=True, default=None)  # a function of the tensor that is held
+    constraint: tuple[Array, Array] | None = None  # at a value, to within a unit
 
     @property
     def slices(self) -> dict[str, slice]:
@@ -215,7 +218,15 @@ class Unknowns(eqx.Module):
             if prior is not None and NUISANCES[name]:
                 unit = self.rate if name == "gyro_bias" else 1.0
                 rows.append(unit * numbers[self.slices[name]] / prior)
+        if self.held is not None and self.constraint is not None:
+            value, unit = self.constraint
+            rows.append(((self.held(self.inertia(numbers)) - value) / unit)[None])
         return jnp.concatenate(rows)
+
+    def holding(self, function: Any, value: Array, unit: Array) -> "Unknowns":
+        """The same, with a function of the tensor held at a value, to within a unit."""
+        fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}
+        return Unknowns(**{**fields, "held": function, "constraint": (value, unit)})
 
 
 def _shape(shape: str, p: Array) -> Array:
@@ -296,4 +307,3 @@ def unknowns_of(
 def is_near_flat(tensor: Array) -> Array:
     """Whether a fit has run into the boundary of real bodies."""
     return eigh(second_moments(tensor))[0][0] < BOUNDARY
-

@@ -101,9 +101,7 @@ def _bounds(motion: Motion) -> _Bounds:
     )
 
 
-def _nearest(
-    motion: Motion, x: Array, dx: Array, at_zero: float, low: Array, high: Array
-) -> Array:
+def _nearest(motion: Motion, x: Array, dx: Array, at_zero: float, low: Array, high: Array) -> Array:
     """The lower bound of |x|^2 where it is far below the upper one, with its relative accuracy.
 
     At x = 0 the slope's square is -J^2, of the constant momentum J = Im(x* dx/dt).
