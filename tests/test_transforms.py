@@ -520,7 +520,7 @@ def weighted(case, dtype):
 
 @pytest.fixture(scope="module", params=list(CASES))
 def name(request):
-    """A case; with the scope of the module its tests follow each other, and share what is computed."""
+    """A case; by the scope of the module its tests follow each other and share what is computed."""
     return request.param
 
 

@@ -336,13 +336,7 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     evaluate = evaluation(options._replace(shooting=False, nodes=1))
 
     def at(value: Array) -> Array:
-        held = eqx.tree_at(
-            lambda u: u.constraint,
-            args.unknowns,
-            (value, 1e-3 * error),
-            is_leaf=lambda x: x is None,
-        )
-        held = held.holding(function)
+        held = args.unknowns.holding(function, value, 1e-3 * error)
         _, rows, settled, *_ = levenberg_marquardt(
             evaluate, args._replace(unknowns=held), point, layout, stages,
             lambda _: jnp.asarray(ACCURACY, ts.dtype), jnp.asarray(0), jnp.zeros(1, ts.dtype),

@@ -40,7 +40,7 @@ def conclude(
     alive = jnp.any(jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in kept]), axis=0)
     chi_square = rows.cost
     freedom = count - size - locals_ * jnp.sum(alive)
-    noise = chi_square / jnp.maximum(freedom, 1)
+    noise = chi_square / jnp.maximum(freedom, 1).astype(dtype)
     inflate = jnp.ones((), dtype) if options.noise_known else noise
     values, directions, covariance, of_state = told(rows, inflate)
 
@@ -133,14 +133,13 @@ def told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array, Array]:
     def throw(jg: Array, jl: Array) -> tuple[Array, Array, Array, Array]:
         scale = jnp.sqrt(jnp.sum(jl * jl, axis=0))
         scale = jnp.where(scale > 0, scale, 1.0)
-        u, s, vt = jnp.linalg.svd(jl / scale, full_matrices=False)
+        u, s, vt = jnp.linalg.svd(jl / scale[None, :], full_matrices=False)
         told = s > 1e-9 * s[0]
-        u = jnp.where(told, u, 0.0)
+        u = jnp.where(told[None, :], u, 0.0)
         inverse = jnp.where(told, 1 / jnp.where(told, s, 1.0), 1 / (eps * jnp.maximum(s[0], 1.0)))
-        half = vt.T * inverse / scale[:, None]
-        cause = product(
-            "lk,rk,rg->lg", vt.T / scale[:, None] * jnp.where(told, inverse, 0.0), u, jg
-        )
+        half = vt.T * inverse[None, :] / scale[:, None]
+        of_told = jnp.where(told[None, :], half, 0.0)
+        cause = product("lk,rk,rg->lg", of_told, u, jg)
         rest = jg - product("rk,sk,sg->rg", u, u, jg)
         return jnp.linalg.qr(rest, mode="r") if size else rest[:0], half, cause, s
 

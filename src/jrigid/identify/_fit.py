@@ -229,7 +229,8 @@ def _fit(
     if tensor is None:
         tensor = as_tensor(unknowns.original.inertia.astype(dtype))
         if samples is not None and unknowns.shape != "fixed" and options.motion is None:
-            trace = None if unknowns.scaled else jnp.trace(tensor)
+            by_torque = unknowns.scaled and not options.free_motion
+            trace = None if by_torque else jnp.trace(tensor)
             tensor = _linear_start(options, unknowns, samples, trace)
     unknowns, numbers = unknowns.start(tensor.astype(dtype), unknowns.chart)
 
@@ -281,7 +282,7 @@ def _fit(
     def accuracy(rows: Rows) -> Array:
         if options.noise_known:
             return jnp.asarray(ACCURACY, dtype)
-        return ACCURACY * rows.cost / jnp.maximum(jnp.sum(rows.residual != 0), 1)
+        return ACCURACY * rows.cost / jnp.maximum(jnp.sum(rows.residual != 0), 1).astype(dtype)
 
     def run(
         point: Point, kept: tuple[Array, ...], phase: _Phase, steps: Array, history: Array
@@ -304,13 +305,16 @@ def _fit(
             square = soft / jnp.maximum(1 - soft / (4.0 * width), 1e-6)
             good = square < width + _REJECTED
             seen = jnp.any(weight > 0, axis=-1)
-            bad = jnp.sum(seen & ~good, axis=1) > _SPOILT * jnp.sum(seen, axis=1)
-            found.append(weight * (good & ~bad[:, None])[..., None])
+            rejected = jnp.sum(seen & ~good, axis=1).astype(dtype)
+            bad = rejected > _SPOILT * jnp.sum(seen, axis=1).astype(dtype)
+            good = (good & ~bad[:, None]).astype(dtype)
+            found.append(weight * good[..., None])
         # A throw given up by one kind of observation is given up by all.
-        alive = jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in found])
+        left = jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in found])
         had = jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in weights])
-        spoilt = jnp.any(had & ~alive, axis=0)
-        return tuple(w * ~spoilt[:, None, None] for w in found)
+        spoilt = jnp.any(had & ~left, axis=0)
+        alive = (~spoilt).astype(dtype)[:, None, None]
+        return tuple(w * alive for w in found)
 
     total = sum(jnp.sum(w) for w in weights)
 

@@ -119,7 +119,7 @@ def findings_of(
             good = jnp.all(~known(x) | ((noise > 0) & jnp.isfinite(noise)))
         elif x.covariance is not None:
             swapped = jnp.swapaxes(noise, -1, -2)
-            eye = jnp.eye(noise.shape[-1], dtype=noise.dtype)
+            eye = jnp.broadcast_to(jnp.eye(noise.shape[-1], dtype=noise.dtype), noise.shape)
             filled = jnp.where(seen[..., None, None], noise, eye)
             positive = jnp.all(jnp.isfinite(jnp.linalg.cholesky(filled)))
             good = positive & jnp.all(

@@ -193,7 +193,9 @@ def segments(ts: Array, there: Array, samples: Samples, nodes: int) -> tuple[Lay
     start = start.at[:, 0].set(whole_.start[:, 0])
     reach = jnp.where(used, start, jnp.inf)
     node = jax.vmap(
-        lambda starts, t: jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0, nodes - 1)
+        lambda starts, t: jnp.clip(
+            jnp.searchsorted(starts, t, side="right").astype(int) - 1, 0, nodes - 1
+        )
     )(reach, ts)
     following = jnp.concatenate([used[:, 1:], jnp.zeros_like(used[:, :1])], axis=1)
     linked = used & following

@@ -399,11 +399,10 @@ def whitened(
     rows = jax.vmap(jax.vmap(one))(ts, harmless, states.attitude, states.omega)
     if observation.covariance is not None:
         eye = jnp.eye(rows.shape[-1], dtype=rows.dtype)
+        eye = jnp.broadcast_to(eye, observation.covariance.shape)
         noise = jnp.where(seen[..., None, None], observation.covariance, eye)
         lower = jnp.linalg.cholesky(noise)
-        inverse = jax.scipy.linalg.solve_triangular(
-            lower, jnp.broadcast_to(eye, lower.shape), lower=True
-        )
+        inverse = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
         rows = product("tnij,tnj->tni", inverse, rows)
     elif observation.sigma is not None:
         rows = rows / jnp.where(there, observation.sigma, 1.0)

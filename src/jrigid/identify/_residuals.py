@@ -145,7 +145,8 @@ def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple
                 )
                 side = jnp.where(turn[..., :1] < 0, -1.0, 1.0)
                 gap = jnp.concatenate([gap, 2 * side * turn[..., 1:]], axis=-1)
-            gap = jnp.where(layout.linked[..., None], gap / args.local[:locals_], 0.0)
+            noise = args.local[None, None, :locals_]
+            gap = jnp.where(layout.linked[..., None], gap / noise, 0.0)
             # While little of the record takes part, nuisances must not imitate the motion.
             held = numbers[args.unknowns.slices["leaves"].start :]
             held = jnp.where(stage.horizon < 1, held, 0.0)
@@ -166,6 +167,7 @@ def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple
         for x, slope in zip(blocks, d_blocks, strict=True):
             count, width = x.shape[1:]
             within = layout.since[:, at : at + count] <= stage.horizon
+            within = within.astype(dtype)
             at += count
             square = jnp.sum(x * x, axis=-1)
             soft = 4.0 * width
@@ -192,7 +194,7 @@ def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple
             cost,
         )
         of_next = -jnp.eye(locals_, dtype=dtype) / args.local[:locals_, None]
-        of_next = jnp.where(layout.linked[..., None, None], of_next, 0.0)
+        of_next = jnp.where(layout.linked[..., None, None], of_next[None, None], 0.0)
         return rows, Links(gap, d_gap[..., :size], d_gap[..., size:], of_next)
 
     return jax.jit(evaluate)  # traced once

@@ -40,6 +40,10 @@ STATUSES = ("OK", "UNIDENTIFIABLE", "WRONG_BASIN", "AT_BOUNDARY", "NOT_CONVERGED
 LARGEST_ERROR = 0.3
 
 
+def _errors(covariance: Array) -> Array:
+    return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+
+
 class FitResult(eqx.Module):
     """Inertia, state and nuisances with errors; what is a number in one fit is a lane's under vmap.
 
@@ -95,7 +99,7 @@ class FitResult(eqx.Module):
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
     state_singular_values: Float[Array, "throws state"]
-    kept: tuple[Bool[Array, "throws n"], ...]
+    kept: tuple[Array, ...]
     spoilt: Bool[Array, " throws"]
     history: Float[Array, " steps"]
     pure_spin: Bool[Array, ""]
@@ -117,25 +121,26 @@ class FitResult(eqx.Module):
         return self.unknowns.system_and_gyro(self.numbers)[0]  # pyright: ignore
 
     @property
-    def errors(self) -> Float[Array, " numbers"]:
+    def errors(self) -> Float[Array, "*fits numbers"]:
         """Standard errors of `numbers`."""
-        return jnp.sqrt(jnp.diagonal(self.covariance)[: self.numbers.size])
+        return _errors(self.covariance)[..., : self.numbers.shape[-1]]
 
     @property
-    def correlation(self) -> Float[Array, "all all"]:
+    def correlation(self) -> Float[Array, "*fits all all"]:
         """The covariance with ones on its diagonal."""
-        error = jnp.sqrt(jnp.diagonal(self.covariance))
-        return self.covariance / error[:, None] / error[None, :]
+        error = _errors(self.covariance)
+        return self.covariance / error[..., :, None] / error[..., None, :]
 
     @property
-    def ratios_errors(self) -> Float[Array, " 2"]:
+    def ratios_errors(self) -> Float[Array, "*fits 2"]:
         """Standard errors of `ratios`."""
-        return jnp.sqrt(jnp.diagonal(self.ratios_covariance))
+        return _errors(self.ratios_covariance)
 
     @property
-    def reduced_chi_square(self) -> Scalar:
+    def reduced_chi_square(self) -> Float[Array, "*fits"]:
         """Chi-square for each degree of freedom."""
-        return self.chi_square / jnp.maximum(self.degrees_of_freedom, 1)
+        freedom = jnp.maximum(self.degrees_of_freedom, 1).astype(self.chi_square.dtype)
+        return self.chi_square / freedom
 
     @property
     def nuisances(self) -> dict[str, tuple[Array, Array]]:

@@ -102,7 +102,8 @@ def _linked(sums: tuple[Array, ...], links: Links, weight: Array) -> tuple[Array
 def _damped(matrix: Array, damping: Array) -> Array:
     diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
     more = jnp.where(diagonal > 0, damping * diagonal, 1.0)
-    return matrix + more[..., None] * jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
+    eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
+    return matrix + more[..., None] * eye
 
 
 def _step(blocks: tuple[Array, ...], damping: Array) -> tuple[Array, Array, Array]:
@@ -240,7 +241,7 @@ def levenberg_marquardt(
         small = (gain <= enough) & (damping <= 1e-2)
         settled = small | (damping > _STUCK) | (gain <= 1e-6 * enough)
         over = settled | (since >= now.steps)
-        stage = carry.stage + over
+        stage = carry.stage + over.astype(int)
         if progress:
             jax.lax.cond(
                 over,

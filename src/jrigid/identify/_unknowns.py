@@ -143,6 +143,7 @@ class Unknowns(eqx.Module):
         sigma = real_body(tensor)
         p = jnp.zeros(SHAPES[self.shape], sigma.dtype)
         if self.shape == "tensor":
+            chart = jnp.eye(3, dtype=sigma.dtype)
             lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
             p = jnp.stack(
                 [
@@ -196,7 +197,7 @@ class Unknowns(eqx.Module):
         matrix = jnp.eye(3, dtype=numbers.dtype)
         bias = jnp.zeros(3, numbers.dtype)
         if "gyro_scale" in s:
-            matrix = matrix * jnp.exp(numbers[s["gyro_scale"]])
+            matrix = matrix * jnp.exp(numbers[s["gyro_scale"]][0])
         if "gyro_scales" in s:
             matrix = matrix * jnp.exp(numbers[s["gyro_scales"]])[:, None]
         if "gyro_matrix" in s:

@@ -1,0 +1,632 @@
+"""fit(): bodies found again from noisy records, honest errors, and what no record tells."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import jrigid as jr
+from jrigid import identify
+from jrigid.identify import Status
+
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+TURN = Rotation.from_rotvec([0.6, -0.4, 0.9]).as_matrix()
+# Moments and the direction of the spin along the principal axes.
+BODIES = {
+    "asymmetric": ((1.0, 1.7, 2.3), (0.5, 1.0, 0.4)),
+    "symmetric": ((1.0, 1.0, 1.6), (0.6, 0.0, 0.8)),
+    "nearly symmetric": ((1.0, 1.02, 1.5), (0.6, 0.3, 0.8)),
+    "slender rod": ((0.05, 1.0, 1.02), (1.0, 0.3, 0.3)),
+    "near separatrix": ((1.0, 1.7, 2.3), (0.02, 1.0, 0.01)),
+}
+ASYMMETRIC, SYMMETRIC = BODIES["asymmetric"], BODIES["symmetric"]
+BLIND = jr.RigidBody(np.ones(3))
+TS = np.arange(200) * 0.3  # ten turns, twenty samples each
+
+
+def turned(moments):
+    tensor = TURN @ np.diag(moments) @ TURN.T
+    return (tensor + tensor.T) / 2
+
+
+def rates(body, ts=TS, axes=TURN):
+    """Tensor and true rates in the axes of the sensor, one radian a second."""
+    moments, direction = body
+    omega = axes @ np.array(direction) / np.linalg.norm(direction)
+    tensor = axes @ np.diag(moments) @ axes.T
+    tensor = (tensor + tensor.T) / 2
+    motion = jr.free_rotation(tensor, jr.State(UNTURNED, omega), ts)
+    return tensor, np.asarray(motion.omega), np.asarray(motion.attitude)
+
+
+def elements(tensor):
+    """Five independent numbers of a tensor of trace 3."""
+    return np.stack([tensor[..., i, j] for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))], -1)
+
+
+def spread_of_elements(result):
+    """Covariance of `elements`, of one fit or of many."""
+
+    def one(result):
+        slopes = jax.jacfwd(result.unknowns.inertia)(result.numbers)
+        slopes = jnp.stack([slopes[i, j] for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))])
+        size = result.numbers.size
+        return slopes @ result.covariance[:size, :size] @ slopes.T
+
+    return np.asarray(one(result) if result.numbers.ndim == 1 else jax.vmap(one)(result))
+
+
+@pytest.fixture(scope="module")
+def blind_fit():
+    """One body after the other, from rates alone, in one compiled and vmapped call."""
+    return jax.jit(
+        jax.vmap(
+            lambda y, sigma: identify.fit(BLIND, identify.Rates(TS, y, sigma), throw=False),
+            in_axes=(0, None),
+        )
+    )
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.05])
+def test_every_body_is_found_blind_at_the_bound(blind_fit, noise, rng):
+    trials = 12
+    tensors, records = [], []
+    for body in BODIES.values():
+        tensor, omegas, _ = rates(body)
+        tensors += [3 * tensor / np.trace(tensor)] * trials
+        records.append(omegas + noise * rng.normal(size=(trials, *omegas.shape)))
+    found = blind_fit(np.concatenate(records), noise)
+    assert bool(jnp.all(found.status == Status.OK)), str(found)
+    errors = elements(np.asarray(found.inertia)) - elements(np.stack(tensors))
+    spread = spread_of_elements(found)
+    normalised = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors) / 5
+    # Chi-square of 5 degrees of freedom each, 60 fits: 1 +- 0.08
+    assert 0.7 < normalised.mean() < 1.3
+    per_body = normalised.reshape(len(BODIES), trials).mean(axis=1)
+    assert np.all(per_body < 1 + 4 * np.sqrt(2 / 5 / trials)), per_body
+    chi_square = np.asarray(found.reduced_chi_square)
+    assert np.all(np.abs(chi_square - 1) < 5 * np.sqrt(2 / 592))
+
+
+def test_a_bad_lane_is_marked_and_leaves_the_others_alone(blind_fit, rng):
+    _, omegas, _ = rates(ASYMMETRIC)
+    records = np.tile(omegas + 0.01 * rng.normal(size=omegas.shape), (60, 1, 1))
+    alone = blind_fit(records, 0.01)
+    records[1] = np.nan
+    found = blind_fit(records, 0.01)
+    assert bool((found.status == Status.BAD_INPUT)[1])
+    assert np.all(np.isnan(found.inertia[1]))
+    assert "60 fits: 59 OK, 1 BAD_INPUT" in str(found)
+    np.testing.assert_array_equal(found.inertia[2:], alone.inertia[2:])
+
+
+@pytest.fixture(scope="module")
+def one_fit():
+    rng = np.random.default_rng(4)
+    tensor, omegas, _ = rates(ASYMMETRIC)
+    readings = identify.Rates(TS, omegas + 0.02 * rng.normal(size=omegas.shape), 0.02)
+    return tensor, readings, identify.fit(BLIND, readings)
+
+
+def test_minimum_and_covariance_are_those_of_scipy_in_other_parameters(one_fit):
+    """Moments and a rotation vector, Euler's equations integrated, finite differences."""
+    _, readings, found = one_fit
+    moments, axes = np.linalg.eigh(np.asarray(found.inertia))
+    axes = axes * np.sign(np.linalg.det(axes))
+
+    def tensor(x):
+        turn = axes @ Rotation.from_rotvec(x[2:5]).as_matrix()
+        diagonal = np.append(x[:2], 3 - x[0] - x[1])
+        return turn @ np.diag(diagonal) @ turn.T
+
+    @jax.jit
+    def motion(inertia, omega):
+        body = jr.RigidBody(inertia)
+        return jr.simulate(body, jr.State(UNTURNED, omega), TS, rtol=1e-11).states.omega
+
+    def residuals(x):
+        seen = np.asarray(readings.values[0] if readings.values.ndim == 3 else readings.values)
+        inertia = tensor(x)
+        return (np.asarray(motion((inertia + inertia.T) / 2, x[5:])) - seen).ravel() / 0.02
+
+    start = np.concatenate([moments[:2], np.zeros(3), np.asarray(found.state.omega[0])])
+    peer = least_squares(residuals, start, x_scale="jac", jac="3-point")
+    errors = np.sqrt(np.diagonal(np.linalg.inv(peer.jac.T @ peer.jac)))
+    assert abs(2 * peer.cost - float(found.chi_square)) < 1e-4
+    assert np.all(np.abs(peer.x - start) < 0.01 * errors)
+    np.testing.assert_allclose(errors[:2], np.sqrt(np.diagonal(found.moments_covariance))[:2],
+                               rtol=1e-3)  # fmt: skip
+    np.testing.assert_allclose(errors[2:5], found.axes_errors, rtol=1e-3)
+    np.testing.assert_allclose(errors[5:], np.sqrt(np.diagonal(found.covariance))[5:], rtol=1e-3)
+
+
+def test_what_is_printed(one_fit):
+    _, _, found = one_fit
+    text = str(found)
+    assert text.startswith("OK: The fit describes the record")
+    for line in ("200 samples", "I3/I1 = ", "trace as declared", "not told by the record: overall"):
+        assert line in text
+    assert found.names == tuple(f"shape[{i}]" for i in range(5))
+    np.testing.assert_allclose(jnp.diagonal(found.correlation), 1, rtol=1e-12)
+    assert float(jnp.trace(found.inertia)) == pytest.approx(3)
+    steps = np.asarray(found.history)[np.isfinite(found.history)]
+    assert steps[-1] == pytest.approx(float(found.chi_square))
+    assert found.system.inertia.shape == (3, 3)
+
+
+def test_residuals_are_those_of_the_motion_and_have_its_derivatives(one_fit):
+    _, readings, found = one_fit
+    state = jr.State(UNTURNED, found.state.omega[0])
+    rows = identify.residuals(found.system, state, readings)
+    np.testing.assert_allclose(rows, found.residuals, atol=1e-9)
+
+    def loss(omega):
+        return jnp.sum(identify.residuals(found.system, jr.State(UNTURNED, omega), readings) ** 2)
+
+    # at the minimum the slope vanishes
+    slope = jax.grad(loss)(found.state.omega[0])
+    scale = np.linalg.norm(np.asarray(found.jacobian)[0], axis=0)[5:]
+    assert np.all(np.abs(slope) < 0.01 * scale)
+
+
+def test_profile_is_the_parabola_of_the_errors_near_the_minimum(one_fit):
+    _, _, found = one_fit
+    best, error = float(found.moments[0]), float(found.moments_covariance[0, 0] ** 0.5)
+    moves = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    growth = identify.profile(found, lambda i: jnp.linalg.eigvalsh(i)[0], best + error * moves)
+    np.testing.assert_allclose(growth, moves**2, rtol=0.05, atol=1e-3)
+
+
+def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit):
+    tensor, _, found = one_fit
+    plan = identify.Rates(TS, None, 0.02)
+    body = jr.RigidBody(3 * tensor / np.trace(tensor))
+    omega = TURN @ np.array(ASYMMETRIC[1]) / np.linalg.norm(ASYMMETRIC[1])
+
+    def bound(omega, ts):
+        plan = identify.Rates(ts, None, 0.02)
+        return identify.cramer_rao(body, plan, jr.State(UNTURNED, omega)).ratios_covariance[1, 1]
+
+    bound = jax.jit(bound)
+    assert float(bound(omega, TS)) == pytest.approx(float(found.ratios_covariance[1, 1]), rel=0.1)
+    told = identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+    assert bool(told.status == Status.OK)
+    np.testing.assert_allclose(told.ratios_covariance[1, 1], bound(omega, TS), rtol=1e-9)
+    information = identify.fisher_information(body, plan, jr.State(UNTURNED, omega))
+    inverse = np.linalg.inv(np.asarray(information))
+    np.testing.assert_allclose(inverse, told.covariance, rtol=1e-6, atol=1e-12)
+    slope_omega, slope_ts = jax.jit(jax.grad(bound, argnums=(0, 1)))(omega, TS)
+    for k in range(3):
+        h = 1e-5 * np.eye(3)[k]
+        difference = (bound(omega + h, TS) - bound(omega - h, TS)) / 2e-5
+        np.testing.assert_allclose(slope_omega[k], difference, rtol=1e-4)
+    later = 1e-5 * (np.arange(200) == 150)
+    difference = (bound(omega, TS + later) - bound(omega, TS - later)) / 2e-5
+    np.testing.assert_allclose(slope_ts[150], difference, rtol=1e-4, atol=1e-12)
+
+
+# What data can tell: the list of what is and is not determined
+
+
+def told(body, nuisances=(), axes=TURN, **options):
+    moments, direction = body
+    tensor = axes @ np.diag(moments) @ axes.T
+    omega = axes @ np.array(direction) / np.linalg.norm(direction)
+    return identify.identifiability(
+        jr.RigidBody((tensor + tensor.T) / 2),
+        identify.Rates(TS, None, 0.01),
+        jr.State(UNTURNED, omega),
+        nuisances=nuisances,
+        **options,
+    )
+
+
+def test_free_motion_tells_everything_but_the_scale():
+    found = told(ASYMMETRIC)
+    assert found.null_directions == ("overall scale",)
+    assert bool(found.status == Status.OK)
+    plan = identify.Attitudes(TS, None, 0.01)
+    omega = TURN @ np.array([0.5, 1.0, 0.4])
+    body = jr.RigidBody(turned(ASYMMETRIC[0]))
+    found = identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+    assert found.null_directions == ("overall scale",)
+
+
+@pytest.mark.parametrize("scale", ["known", "rotor"])
+def test_the_scale_of_a_free_body_is_refused(scale):
+    with pytest.raises(ValueError, match="scale"):
+        identify.fit(BLIND, identify.Rates(TS, np.ones((200, 3)), 0.01), scale=scale)
+
+
+@pytest.mark.parametrize("body", [((1, 1.7, 2.3), (0, 0, 1)), ((1, 1, 1), (0.5, 1, 0.4))])
+def test_pure_spin_and_a_sphere_do_not_tell_ratios(blind_fit, body, rng):
+    words = told(body).null_directions
+    assert "spin is pure: ratios not determined" in words
+    _, omegas, _ = rates(body)
+    records = omegas + 0.01 * rng.normal(size=(60, *omegas.shape))
+    found = blind_fit(records, 0.01)
+    assert bool(jnp.all(found.status == Status.UNIDENTIFIABLE)), str(found)
+    one = jax.tree.map(lambda x: x[0], found)
+    assert "spin is pure: ratios not determined" in one.null_directions
+    assert "ratios   not determined" in str(one)
+
+
+def test_bias_of_the_gyro():
+    found = told(ASYMMETRIC, "gyro_bias")
+    assert found.null_directions == ("overall scale",)
+    found = told(SYMMETRIC, "gyro_bias")
+    assert bool(found.status == Status.UNIDENTIFIABLE)
+    (text,) = found.null_directions[1:]
+    assert "I3/I1" in text
+    assert "gyro bias along the axis of I3" in text
+
+
+def test_one_scale_factor_of_the_gyro():
+    assert told(ASYMMETRIC, "gyro_scale").null_directions == ("overall scale",)
+    (text,) = told(SYMMETRIC, "gyro_scale").null_directions[1:]
+    assert "gyro scale" in text
+    assert "I3/I1" in text
+
+
+def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
+    """Three factors along the principal axes change (I2 - I3)/I1 and cyclic ones at will."""
+    words = told(ASYMMETRIC, "gyro_scales", axes=np.eye(3)).null_directions
+    assert len(words) > 1
+    assert all("gyro scale factors" in text for text in words[1:])
+    words = told(ASYMMETRIC, "gyro_matrix").null_directions
+    assert len(words) > 1
+    assert all("gyro matrix" in text for text in words[1:])
+
+
+def test_bias_and_scale_inflate_the_bound_as_measured_before():
+    """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5), by order."""
+    for body, least in ((ASYMMETRIC, 1.2), (BODIES["nearly symmetric"], 10.0)):
+        plain, bias, factor = (
+            float(told(body, n).ratios_errors[1]) for n in ((), "gyro_bias", "gyro_scale")
+        )
+        assert bias > least * plain
+        assert factor > least * plain
+    # What is known beforehand of the bias helps
+    known = told(BODIES["nearly symmetric"], {"gyro_bias": 1e-4})
+    assert float(known.ratios_errors[1]) < 3 * plain
+
+
+def test_a_gyro_of_unknown_handedness_fits_two_bodies():
+    _, omegas, _ = rates(ASYMMETRIC)
+    found = told(ASYMMETRIC, "gyro_handedness")
+    assert "mirror body fits equally: handedness of the gyro" in found.null_directions
+    # One axis reversed: the mirror body, physical, moves so.
+    axes = np.asarray(found.axes)
+    mirror = axes @ np.diag(np.asarray(found.mirror)) @ axes.T
+    reversed_ = omegas @ axes * np.array([-1, 1, 1]) @ axes.T
+    motion = jr.free_rotation((mirror + mirror.T) / 2, jr.State(UNTURNED, reversed_[0]), TS)
+    np.testing.assert_allclose(motion.omega, reversed_, atol=1e-10)
+    moments = np.sort(np.asarray(found.mirror))
+    assert moments[2] < moments[0] + moments[1]
+
+
+def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
+    top = jr.SymmetricTop(1.0, 0.6, 2.0).as_rigid_body()
+    plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
+    options = {"shape": "top", "free": lambda body: body.torque.mass}
+
+    def words(tilt):
+        state = jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0)
+        return identify.identifiability(top, plan, state, **options)
+
+    assert words(0.5).null_directions == ("heading about the vertical",)
+    sleeping = words(0.0)
+    assert bool(sleeping.status == Status.UNIDENTIFIABLE)
+    assert "spin is pure: ratios not determined" in sleeping.null_directions
+
+
+# Records of other kinds
+
+
+def test_gaps_missing_samples_and_single_components(rng):
+    tensor, omegas, _ = rates(ASYMMETRIC, np.arange(400) * 0.15)
+    values = omegas + 0.01 * rng.normal(size=omegas.shape)
+    ts = np.arange(400) * 0.15
+    keep = np.ones(400, bool)
+    keep[100:180] = False  # a gap of two turns
+    values, ts = values[keep], ts[keep]
+    values[rng.random(len(ts)) < 0.05] = np.nan
+    values[50:60, 1] = np.nan  # one axis out
+    found = identify.fit(BLIND, identify.Rates(ts, values, 0.01))
+    error = elements(np.asarray(found.inertia)) - elements(3 * tensor / np.trace(tensor))
+    spread = spread_of_elements(found)
+    assert error @ np.linalg.solve(spread, error) < 21  # chi-square of 5, 0.1 %
+    assert int(found.degrees_of_freedom) == int(np.isfinite(values).sum()) - 8
+
+
+def test_attitudes_rates_directions_and_momenta_together(rng):
+    """All kinds at once, times of their own, one with a covariance; the momentum sets the scale."""
+    ts = np.arange(120) * 0.3
+    later = ts[:60] + 0.11
+    tensor, omegas, attitudes = rates(ASYMMETRIC, ts)
+    _, _, attitudes_later = rates(ASYMMETRIC, later)
+    star = np.array([0.6, 0.0, 0.8])
+    seen = Rotation.from_quat(np.roll(attitudes_later, -1, axis=1)).inv().apply(star)
+    tilt = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.5]]) * 1e-4
+    noise = rng.multivariate_normal(np.zeros(3), tilt, size=120)
+    turned_ = Rotation.from_quat(np.roll(attitudes, -1, axis=1)) * Rotation.from_rotvec(noise)
+    across = seen + 0.01 * rng.normal(size=seen.shape)
+    momentum = tensor @ omegas[0]
+    observations = (
+        identify.Rates(ts, omegas + 0.02 * rng.normal(size=omegas.shape), np.full(3, 0.02)),
+        identify.Attitudes(ts, np.roll(turned_.as_quat(), 1, axis=1), covariance=tilt),
+        identify.Directions(
+            later, across / np.linalg.norm(across, axis=1, keepdims=True), 0.01, of=star
+        ),
+        identify.AngularMomenta(ts[:3], momentum + 0.01 * rng.normal(size=(3, 3)), 0.01),
+    )
+    found = identify.fit(BLIND, observations, scale="known")
+    assert bool(found.status == Status.OK)
+    assert found.null_directions == ()
+    np.testing.assert_allclose(found.inertia, tensor, rtol=0, atol=0.05)
+    spread = np.sqrt(np.diagonal(found.moments_covariance))
+    assert np.all(np.abs(np.asarray(found.moments) - np.array(ASYMMETRIC[0])) < 4 * spread)
+    assert abs(float(found.reduced_chi_square) - 1) < 5 * np.sqrt(2 / 800)
+
+
+def test_attitudes_alone_with_noise_that_is_not_known(rng):
+    ts = np.arange(100) * 0.4
+    tensor, _, attitudes = rates(ASYMMETRIC, ts)
+    noisy = Rotation.from_quat(np.roll(attitudes, -1, axis=1)) * Rotation.from_rotvec(
+        0.03 * rng.normal(size=(100, 3))
+    )
+    sign = rng.choice([-1.0, 1.0], size=(100, 1))  # either sign of a quaternion
+    values = sign * np.roll(noisy.as_quat(), 1, axis=1)
+    found = identify.fit(BLIND, identify.Attitudes(ts, values, 1.0), absolute_sigma=False)
+    error = elements(np.asarray(found.inertia)) - elements(3 * tensor / np.trace(tensor))
+    assert error @ np.linalg.solve(spread_of_elements(found), error) < 21
+    assert float(found.reduced_chi_square) ** 0.5 == pytest.approx(0.03, rel=0.15)
+    assert "noise taken from the residuals" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("shape", "body", "size"),
+    [
+        ("symmetric", SYMMETRIC, 3),
+        ("flat", ((1.0, 1.7, 2.7), (0.5, 1.0, 0.4)), 4),
+        ("moments", ASYMMETRIC, 2),
+    ],
+)
+def test_what_is_known_of_the_tensor_holds(shape, body, size, rng):
+    axes = np.eye(3) if shape == "moments" else TURN
+    tensor, omegas, _ = rates(body, axes=axes)
+    readings = identify.Rates(TS, omegas + 0.01 * rng.normal(size=omegas.shape), 0.01)
+    found = identify.fit(BLIND, readings, shape=shape)
+    assert found.numbers.size == size
+    np.testing.assert_allclose(found.inertia, 3 * tensor / np.trace(tensor), atol=0.02)
+    moments = np.asarray(found.moments)
+    if shape == "symmetric":
+        assert moments[1] == pytest.approx(moments[0], rel=1e-12)
+    if shape == "flat":
+        assert moments[2] == pytest.approx(moments[0] + moments[1], rel=1e-12)
+    if shape == "moments":
+        off = np.asarray(found.inertia) - np.diag(np.diagonal(found.inertia))
+        assert np.abs(off).max() < 1e-14
+    true = np.sort(body[0]) / np.min(body[0])
+    errors = np.maximum(np.asarray(found.ratios_errors), 1e-9)
+    assert np.all(np.abs(np.asarray(found.ratios) - true[1:]) < 4 * errors)
+
+
+def test_toutatis():
+    record = jr.datasets.toutatis_1992()
+    apparition = slice(0, 17)  # free motion
+    times = record.times[apparition]
+    degree = np.pi / 180
+    found = identify.fit(
+        BLIND,
+        (
+            identify.Attitudes(times, record.attitudes[apparition], 6 * degree),
+            identify.Rates(times, record.omegas[apparition], 6 * degree / 86400),
+        ),
+        shape="moments",
+        loss="robust",
+    )
+    # An independent refit of the same record: 3.19 +- 0.19 and 3.15 +- 0.17
+    moments = np.diagonal(found.inertia) / found.inertia[2, 2]
+    assert abs(moments[0] - 3.19) < 0.19
+    assert abs(moments[1] - 3.15) < 0.17
+    assert np.all(np.asarray(found.ratios_errors) > 0.03)
+    assert np.all(np.asarray(found.ratios_errors) < 0.25)
+    text = str(found)
+    assert "weakly constrained" in text
+    assert "I2 and I3 are equal within their errors" in text
+    # The two spins that are off by 45 degrees a day
+    assert list(np.flatnonzero(~np.asarray(found.kept[1])[0])) == [5, 12]
+
+
+# Torques
+
+
+def test_absolute_tensor_beside_a_rotor_of_known_momentum(rng):
+    wheel = jr.torques.Rotor(
+        lambda t: jnp.stack([0.1 + 0 * t, 0.2 * jnp.sin(0.7 * t), 0.3 + 0 * t])
+    )
+    ts = np.arange(200) * 0.15
+    sphere = 1.3 * np.eye(3)
+    for tensor in (turned(ASYMMETRIC[0]), sphere):
+        body = jr.RigidBody(tensor, wheel)
+        motion = jr.simulate(body, jr.State(UNTURNED, np.array([0.5, 1.0, 0.4])), ts)
+        values = np.asarray(motion.states.omega) + 0.01 * rng.normal(size=(200, 3))
+        found = identify.fit(
+            jr.RigidBody(np.ones(3), wheel), identify.Rates(ts, values, 0.01), scale="rotor"
+        )
+        assert bool(found.status == Status.OK)
+        assert found.null_directions == ()
+        error = elements(np.asarray(found.inertia)) - elements(tensor)
+        assert error @ np.linalg.solve(spread_of_elements(found), error) < 21
+        np.testing.assert_allclose(found.moments, np.linalg.eigvalsh(tensor), rtol=0.03)
+
+
+def test_heavy_top_from_its_gyro_alone(rng):
+    """I3/I1 and mgl/I1, from a start that is wrong by half in both."""
+    top = jr.SymmetricTop(1.0, 0.6, 2.0)
+    ts = np.arange(300) * 0.05
+    motion = jr.top_motion(top, jr.top.initial_state(top, 0.6, omega3=5.0), ts)
+    values = np.asarray(motion.omega) + 0.02 * rng.normal(size=(300, 3))
+    guess = jr.SymmetricTop(1.0, 1.0, 1.0).as_rigid_body()
+    found = identify.fit(
+        guess,
+        identify.Rates(ts, values, 0.02),
+        shape="top",
+        free=lambda body: body.torque.mass,
+        start=jr.State(jr.rotation.exp(jnp.array([0.4, 0.0, 0.0])), np.zeros(3)),
+    )
+    assert bool(found.status == Status.OK)
+    assert found.null_directions == ("heading about the vertical",)
+    transverse, _, axial = np.diagonal(found.inertia)
+    assert axial / transverse == pytest.approx(0.6, abs=4 * 0.0005)
+    ((value, error),) = found.leaves.values()
+    one = float(guess.torque.mass)
+    assert float(value) / one / transverse == pytest.approx(2.0, abs=4 * float(error) / one)
+
+
+def throws_of_a_phone(rng, count):
+    """Rates at 100 Hz of throws of 0.5 to 1.5 s; spoilt samples, spoilt throws."""
+    box = jr.solids.box(0.17, np.array([0.0715, 0.147, 0.0078]))
+    moments = np.asarray(jnp.diagonal(box.inertia))
+    turn = Rotation.from_rotvec(np.radians([1.5, -1.0, 0.8])).as_matrix()
+    tensor = turn @ np.diag(moments) @ turn.T
+    drag = np.array([0.010, 0.012, 0.015]) * moments
+    phone = jr.RigidBody((tensor + tensor.T) / 2, jr.torques.QuadraticDrag(drag))
+    ts = np.arange(151) * 0.01
+    spin = rng.normal(size=(count, 3))
+    spin *= rng.uniform(8, 16, (count, 1)) / np.linalg.norm(spin, axis=1, keepdims=True)
+    motion = jax.jit(jax.vmap(lambda w: jr.simulate(phone, jr.State(UNTURNED, w), ts).states.omega))
+    values = np.asarray(motion(spin)) + 0.02 * rng.normal(size=(count, 151, 3))
+    touched = rng.random((count, 151)) < 0.02
+    values[touched] += 2 * rng.normal(size=(touched.sum(), 3))
+    spoilt = np.sort(rng.choice(count, max(1, count // 20), replace=False))
+    values[spoilt] += np.cumsum(0.15 * rng.normal(size=(spoilt.size, 151, 3)), axis=1)
+    lengths = rng.integers(50, 152, count)
+    throws = [identify.Rates(ts[:n], y[:n], 0.02) for n, y in zip(lengths, values, strict=True)]
+    start = jr.RigidBody(np.full(3, moments.mean()), jr.torques.QuadraticDrag(0.005 * moments))
+    return moments, drag, spoilt, throws, start
+
+
+def check_phone(rng, count):
+    moments, drag, spoilt, throws, start = throws_of_a_phone(rng, count)
+    found = identify.fit(start, throws, loss="robust", free=lambda body: body.torque.coefficient)
+    assert bool(found.status == Status.OK)
+    assert list(np.flatnonzero(np.asarray(found.spoilt))) == list(spoilt)
+    assert "throws left out: " + ", ".join(str(i) for i in spoilt) in str(found)
+    true = np.sort(moments)[1:] / moments.min()
+    errors = np.asarray(found.ratios_errors)
+    assert np.all(np.abs(np.asarray(found.ratios) - true) < 4 * errors)
+    assert np.all(errors < 0.01)
+    for (value, error), c in zip(found.leaves.values(), drag, strict=True):
+        assert abs(value - c) < 4 * error
+
+
+def test_a_few_throws_of_a_phone(rng):
+    check_phone(rng, 8)
+
+
+@pytest.mark.slow
+def test_117_throws_of_a_phone(rng):
+    check_phone(rng, 117)
+
+
+def test_motion_of_one_s_own_and_a_function_of_the_state(rng):
+    """A damped pointer seen through one angle: doubling horizons from a start that is off."""
+    ts = np.linspace(0.0, 12.0, 120)
+    body = jr.RigidBody(np.array([1.0, 1.0, 1.5]), jr.torques.LinearDrag(0.1))
+    start = jr.State(UNTURNED, np.array([0.3, 0.0, 2.0]))
+    motion = jr.simulate(body, start, ts)
+    values = np.asarray(motion.states.omega)[:, :1] + 0.003 * rng.normal(size=(120, 1))
+
+    def across(t, state, system):
+        return state.omega[:1]
+
+    guess = jr.RigidBody(np.array([1.0, 1.0, 1.3]), jr.torques.LinearDrag(0.05))
+    observations = (
+        identify.Observed(across, ts, values, 0.003, on_attitude=False),
+        identify.Observed(spin_of, ts[:1], np.array([[2.0]]), 1e-3, on_attitude=False),
+    )
+    found = identify.fit(
+        guess, observations, shape="top", free=lambda b: b.torque.coefficient,
+        start=jr.State(UNTURNED, np.array([0.25, 0.05, 2.0])), doublings=3,
+    )  # fmt: skip
+    ratio, error = float(found.ratios[1]), float(found.ratios_errors[1])
+    assert abs(ratio - 1.5) < 4 * error < 0.1
+
+
+def spin_of(t, state, system):
+    return state.omega[2:]
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"values": np.full((200, 3), np.nan)}, "all are NaN"),
+        ({"ts": TS[::-1]}, "increasing"),
+        ({"ts": np.where(np.arange(200) == 7, TS[6], TS)}, "increasing"),
+        ({"ts": np.where(np.arange(200) == 7, np.nan, TS)}, "finite where there are values"),
+        ({"sigma": 0.0}, "positive"),
+        ({"scale": 180 / np.pi * 3}, "degrees"),
+    ],
+)
+def test_bad_values_are_errors(change, message):
+    _, omegas, _ = rates(ASYMMETRIC)
+    values = change.get("values", omegas * change.get("scale", 1.0))
+    readings = identify.Rates(change.get("ts", TS), values, change.get("sigma", 0.01))
+    with pytest.raises(RuntimeError, match=message):
+        identify.fit(BLIND, readings)
+
+
+def test_too_few_samples_and_wrong_options(untyped):
+    ts, values = np.arange(3.0), np.ones((3, 3))
+    with pytest.raises(RuntimeError, match="too few"):
+        identify.fit(BLIND, identify.Rates(ts, values, 0.01))
+    readings = identify.Rates(TS, np.ones((200, 3)), 0.01)
+    for options, message in (
+        ({"shape": "cube"}, "shape"),
+        ({"scale": "mass"}, "scale"),
+        ({"nuisances": "gyro_drift"}, "nuisances"),
+        ({"loss": "huber"}, "loss"),
+        ({"start": 3.0}, "start"),
+        ({"free": lambda body: body.torque}, "free"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            identify.fit(BLIND, readings, **options)
+    with pytest.raises(ValueError, match="system"):
+        identify.fit(jr.SymmetricTop(1.0, 1.0, 1.0), readings)
+    with pytest.raises(ValueError, match="observations"):
+        identify.fit(BLIND, np.ones((200, 3)))
+    with pytest.raises(ValueError, match="observations"):
+        identify.fit(BLIND, [])
+    with pytest.raises(ValueError, match="shapes"):
+        identify.Rates(TS, np.ones((199, 3)), 0.01)
+    with pytest.raises(ValueError, match="sigma"):
+        identify.Rates(TS, np.ones((200, 3)), np.ones(7))
+    star = identify.Directions(TS, np.ones((200, 3)), 0.01, of=np.ones(3))
+    with pytest.raises(ValueError, match="attitude"):
+        identify.fit(BLIND, (readings, star))
+    with pytest.raises(ValueError, match="start"):
+        identify.fit(BLIND, star)
+
+
+def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, rng):
+    _, omegas, _ = rates(ASYMMETRIC)
+    records = omegas + 0.05 * rng.normal(size=(60, *omegas.shape))
+    found = blind_fit(records, 0.01)  # five times the noise that is stated
+    assert bool(jnp.all(found.status == Status.WRONG_BASIN))
+    with pytest.raises(RuntimeError, match="chi-square is too large"):
+        identify.fit(BLIND, identify.Rates(TS, records[0], 0.01))
+
+
+def test_progress_is_printed(capfd, rng):
+    _, omegas, _ = rates(ASYMMETRIC)
+    readings = identify.Rates(TS, omegas + 0.01 * rng.normal(size=omegas.shape), 0.01)
+    identify.fit(BLIND, readings, progress=True)
+    jax.effects_barrier()
+    assert "chi-square" in capfd.readouterr().out
