@@ -221,7 +221,9 @@ def cramer_rao(
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
     scaled = information / size[:, None] / size[None, :]
     eye = jnp.eye(size.size, dtype=size.dtype)
-    inverse = jnp.linalg.inv(scaled + 4 * jnp.finfo(size.dtype).eps * eye)
+    # Where nothing is told this is what keeps the bound finite, and very large.
+    inverse = jnp.linalg.inv(scaled + 512 * jnp.finfo(size.dtype).eps * eye)
+    inverse = 0.5 * (inverse + inverse.T)
     covariance = inverse / size[:, None] / size[None, :]
     numbers, unknowns = plan.point.numbers, plan.args.unknowns
 

@@ -153,7 +153,7 @@ def told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array, Array]:
     else:
         values, cov = jnp.zeros(0, jg.dtype), jnp.zeros((0, 0), jg.dtype)
         directions = cov
-    across = -product("tlg,gh->tlh", cause, cov).reshape(-1, size)
+    across = -product("tlg,gh->tlh", cause, cov).reshape(throws * locals_, size)
     everywhere = product("tlg,gh,smh->tlsm", cause, cov, cause)
     blocks = everywhere + jnp.eye(throws, dtype=jg.dtype)[:, None, :, None] * own[:, :, None, :]
     blocks = blocks.reshape(throws * locals_, throws * locals_)

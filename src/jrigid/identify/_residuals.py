@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -197,4 +198,4 @@ def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple
         of_next = jnp.where(layout.linked[..., None, None], of_next[None, None], 0.0)
         return rows, Links(gap, d_gap[..., :size], d_gap[..., size:], of_next)
 
-    return jax.jit(evaluate)  # traced once
+    return eqx.filter_jit(evaluate)  # traced once

@@ -78,6 +78,12 @@ class FitResult(eqx.Module):
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         input_result: `jrigid.RESULTS` of the input.
+        unknowns: What the numbers mean: `unknowns.inertia(numbers)` is the tensor, to carry
+            `covariance` over to anything that follows from it.
+        problem: The record as it was fitted.
+        options: How it was fitted.
+        noise_known: Whether errors follow from the noise stated, not from the residuals.
+        free_motion: Whether the motion is that of a body without torque.
     """
 
     status: Any
