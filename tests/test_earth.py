@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import jrigid as jr
-from jrigid import _fit
 
 pytest.importorskip("astropy_iers_data")
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "examples"))
@@ -123,8 +122,7 @@ def linearised_fit(pole, observed, ellipticity):
     wobble = earth_wobble.Wobble(
         jnp.asarray(ellipticity / unit), jnp.zeros(2), jnp.zeros((4, 2)), jnp.zeros((4, 2))
     )
-    done = (jnp.asarray(0), jnp.asarray(True))
-    return _fit.LeastSquaresFit(wobble, jnp.asarray(rows), jnp.asarray(jacobian), *done)
+    return earth_wobble.WobbleFit(wobble, jnp.asarray(rows), jnp.asarray(jacobian), 0, True)
 
 
 def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
@@ -139,7 +137,9 @@ def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
     @jax.jit
     def bootstrap(jacobian, residuals):
         jacobian, residuals = jacobian.reshape(-1, 2, 19), residuals.reshape(-1, 2)
-        shifts = _fit.block_bootstrap(jacobian, residuals, 37, jax.random.key(0), samples=100)
+        shifts = jr.identify.block_bootstrap(
+            jacobian, residuals, 37, jax.random.key(0), samples=100
+        )
         return jnp.std(shifts[:, 0])
 
     honest, naive = [], []

@@ -7,6 +7,8 @@ from jrigid.identify._design import identifiability as identifiability
 from jrigid.identify._design import profile as profile
 from jrigid.identify._design import residuals as residuals
 from jrigid.identify._fit import fit as fit
+from jrigid.identify._noise import block_bootstrap as block_bootstrap
+from jrigid.identify._noise import coloured_covariance as coloured_covariance
 from jrigid.identify._observations import AbstractObservation as AbstractObservation
 from jrigid.identify._observations import AngularMomenta as AngularMomenta
 from jrigid.identify._observations import Attitudes as Attitudes

@@ -77,11 +77,13 @@ def conclude(
         wrong = Status.where(settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
         status = Status.where(noise > gate, wrong, status)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
+    seen_rows = sum(w.shape[1] * w.shape[2] for w in kept)  # then what was known beforehand
+    jacobian = jnp.concatenate([rows.of_numbers, rows.of_state], axis=-1)
     found = FitResult(
         status, tensor, moments, axes, spread(of_moments),
         jnp.sqrt(jnp.maximum(jnp.diagonal(spread(turns)), 0.0)), ratios, spread(of_ratios),
         State(point.attitude[:, 0], point.omega[:, 0]), t0, numbers, covariance,
-        rows.residual, jnp.concatenate([rows.of_numbers, rows.of_state], axis=-1), chi_square,
+        rows.residual[:, :seen_rows], jacobian[:, :seen_rows], chi_square,
         freedom, values, directions, of_state, tuple(jnp.any(w > 0, axis=-1) for w in kept),
         ~alive & jnp.any(jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in seen]), axis=0),
         history, pure, input_result, unknowns, args, options, options.noise_known,
