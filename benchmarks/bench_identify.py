@@ -173,7 +173,7 @@ def peers(turns, count):
                                              method="lm", max_nfev=2000)  # fmt: skip
         return found.x
 
-    optimiser = optax.adam(optax.cosine_decay_schedule(0.02, 3000))
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.02, 1500))
 
     @jax.jit
     def by_adam(y):
@@ -186,7 +186,7 @@ def peers(turns, count):
             return (optax.apply_updates(x, updates), state), None
 
         x = jnp.concatenate([jnp.zeros(5), y[0]])
-        return jax.lax.scan(step, (x, optimiser.init(x)), None, length=3000)[0][0]
+        return jax.lax.scan(step, (x, optimiser.init(x)), None, length=1500)[0][0]
 
     def by_fit(y):
         found = fit(SPHERE, Rates(ts, y, 0.01), throw=False)
@@ -195,7 +195,7 @@ def peers(turns, count):
     rows = []
     true = np.asarray(of_elements(tensor))
     for name, method in (("jrigid fit", by_fit), ("scipy least_squares", by_scipy),
-                         ("Adam, 3000 steps", by_adam)):  # fmt: skip
+                         ("Adam, 1500 steps", by_adam)):  # fmt: skip
         jax.block_until_ready(method(records[0]))
         start = time.perf_counter()
         answers = [np.asarray(jax.block_until_ready(method(y))) for y in records]
@@ -214,7 +214,7 @@ def peers(turns, count):
 
 
 def main(write: bool, short: bool) -> None:
-    compared = peers(10, 20) + peers(100, 4)
+    compared = peers(10, 20) + peers(100, 3)
     parts = [
         common.table(["one call", "compile ms", "min ms", "median ms"], speed()),
         common.table(

@@ -215,7 +215,7 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     """
     span = float(pole.tau[-1])
     spin = np.where(pole.tau == 0, 1.0, np.nan)
-    values = np.stack([pole.m.real, pole.m.imag, spin], axis=1)
+    values = np.stack([np.real(pole.m), np.imag(pole.m), spin], axis=1)
     guess = Wobble(
         ellipticity=jnp.asarray(RIGID_PERIOD / period),
         start=jnp.asarray(values[0, :2]),

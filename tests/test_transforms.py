@@ -44,16 +44,23 @@ MODULES = {
     "solvers": solvers,
     "identify": identify,
 }
-# Abstract classes and aliases: nothing to call.
-NOTHING_TO_CALL = {"torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem"}
+# Abstract classes, aliases and records: nothing to call.
+NOTHING_TO_CALL = {
+    "torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem",
+    "identify.AbstractObservation", "identify.AngularMomenta", "identify.Attitudes",
+    "identify.Directions", "identify.Observed", "identify.Rates", "identify.FitResult",
+}  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
     "rotation.rate_record_validity", "free.motion_validity", "free.regime", "top.motion_validity",
     "top.motion_class", "lagrangian.cyclic_coordinates",
 }  # fmt: skip
-# Regressions on records of some length: tests/test_identify.py.
+# Regressions and fits of records of some length: tests/test_identify*.py.
 OF_RECORDS = {
     "identify.LinearStart", "identify.weak_form", "identify.momentum", "identify.gyrostat",
+    "identify.fit", "identify.Status", "identify.Bound", "identify.cramer_rao",
+    "identify.fisher_information", "identify.identifiability", "identify.profile",
+    "identify.residuals", "identify.block_bootstrap", "identify.coloured_covariance",
 }  # fmt: skip
 CODE_METHOD = "check"
 

@@ -72,7 +72,7 @@ def forced_flow(
     """
     span = t1 - t0
 
-    def rate(s: Array, y: Any, args: Any) -> Any:
+    def rate(s: Any, y: Any, args: Any) -> Any:
         now = State(y[0] if on_attitude else state.attitude, y[-1])
         slope = system.vector_field(t0 + s * span, now, args)
         return tuple(span * x for x in (slope.attitude, slope.omega)[-len(y) :])
@@ -90,7 +90,8 @@ def forced_flow(
         max_steps=_STEPS,
         throw=False,
     )
-    end = tuple(x[0] for x in solution.ys)
+    ys: Any = solution.ys
+    end = tuple(x[0] for x in ys)
     return State(normalize(end[0]) if on_attitude else state.attitude, end[-1])
 
 

@@ -60,12 +60,14 @@ def refuse(system: Any, stacked: tuple[AbstractObservation, ...], scale: str, fr
 
 
 def typical_rate(samples: Samples | None, state: State | None, dtype: Any) -> Array:
-    if samples is None:
-        size = safe_norm(state.omega.astype(dtype))  # pyright: ignore
-    else:
-        count = jnp.maximum(jnp.sum(samples.there), 1).astype(dtype)
+    if samples is not None:
         shown = jnp.where(samples.there[..., None], samples.omega, 0.0)
-        size = safe_norm(shown.reshape(-1)) / jnp.sqrt(count)
+        count = jnp.sum(samples.there)
+    else:
+        assert state is not None
+        shown = state.omega.astype(dtype)
+        count = jnp.asarray(shown.shape[0])
+    size = safe_norm(shown.reshape(-1)) / jnp.sqrt(jnp.maximum(count, 1).astype(dtype))
     size = jax.lax.stop_gradient(size)
     return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
 
@@ -91,7 +93,7 @@ def findings_of(
         RESULTS.invalid_state,
         "Argument `observations` must hold values, but all are NaN.",
     )
-    numbers = sum(jnp.sum(known(x)) for x in stacked)
+    numbers = jnp.sum(jnp.stack([jnp.sum(known(x)) for x in stacked]))
     findings.require(
         numbers >= 12,
         RESULTS.invalid_state,
@@ -114,10 +116,10 @@ def findings_of(
             f"Argument `ts` of `{type(x).__name__}` must be finite where there are values, but it "
             "is not.",
         )
-        noise = x.sigma if x.sigma is not None else x.covariance
         if x.sigma is not None:
-            good = jnp.all(~known(x) | ((noise > 0) & jnp.isfinite(noise)))
+            good = jnp.all(~known(x) | ((x.sigma > 0) & jnp.isfinite(x.sigma)))
         elif x.covariance is not None:
+            noise = x.covariance
             swapped = jnp.swapaxes(noise, -1, -2)
             eye = jnp.broadcast_to(jnp.eye(noise.shape[-1], dtype=noise.dtype), noise.shape)
             filled = jnp.where(seen[..., None, None], noise, eye)
