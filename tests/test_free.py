@@ -176,7 +176,9 @@ def derivatives():
     return quick_jit(jax.vmap(along, (0, 0, None)))
 
 
-@pytest.mark.parametrize(("duration", "per_regime"), [(20.0, 5), (-200.0, 2)])
+@pytest.mark.parametrize(
+    ("duration", "per_regime"), [(20.0, 5), pytest.param(-200.0, 2, marks=pytest.mark.slow)]
+)
 def test_derivatives_equal_the_variational_equations(duration, per_regime, derivatives):
     inputs, regimes = of_unit_rate(per_regime)
     if duration < -20:  # exp(lambda t) of an unstable motion is beyond 80 bits then

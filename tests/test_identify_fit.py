@@ -1,9 +1,12 @@
 """fit(): bodies found again from noisy records, honest errors, and what no record tells."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import quick_jit
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -189,15 +192,21 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
         plan = identify.Rates(ts, None, 0.02)
         return identify.cramer_rao(body, plan, jr.State(UNTURNED, omega)).ratios_covariance[1, 1]
 
-    bound = jax.jit(bound)
+    slopes = quick_jit(jax.grad(bound, argnums=(0, 1)))
+    bound = quick_jit(bound)
     assert float(bound(omega, TS)) == pytest.approx(float(found.ratios_covariance[1, 1]), rel=0.1)
-    told = identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+    start = jr.State(UNTURNED, omega)
+    told, information = quick_jit(
+        lambda start: (
+            identify.identifiability(body, plan, start),
+            identify.fisher_information(body, plan, start),
+        )
+    )(start)
     assert bool(told.status == Status.OK)
     np.testing.assert_allclose(told.ratios_covariance[1, 1], bound(omega, TS), rtol=1e-9)
-    information = identify.fisher_information(body, plan, jr.State(UNTURNED, omega))
     inverse = np.linalg.inv(np.asarray(information))
     np.testing.assert_allclose(inverse, told.covariance, rtol=1e-6, atol=1e-12)
-    slope_omega, slope_ts = jax.jit(jax.grad(bound, argnums=(0, 1)))(omega, TS)
+    slope_omega, slope_ts = slopes(omega, TS)
     for k in range(3):
         h = 1e-5 * np.eye(3)[k]
         difference = (bound(omega + h, TS) - bound(omega - h, TS)) / 2e-5
@@ -210,17 +219,25 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
 # What data can tell: the list of what is and is not determined
 
 
-def told(body, nuisances=(), axes=TURN, **options):
+@functools.cache
+def program(nuisances, prior):
+    """Compiled once for each set of nuisances."""
+    sought = {nuisances: prior} if nuisances else ()
+    return quick_jit(
+        lambda tensor, omega: identify.identifiability(
+            jr.RigidBody(tensor),
+            identify.Rates(TS, None, 0.01),
+            jr.State(UNTURNED, omega),
+            nuisances=sought,
+        )
+    )
+
+
+def told(body, nuisances=None, prior=None, axes=TURN):
     moments, direction = body
     tensor = axes @ np.diag(moments) @ axes.T
     omega = axes @ np.array(direction) / np.linalg.norm(direction)
-    return identify.identifiability(
-        jr.RigidBody((tensor + tensor.T) / 2),
-        identify.Rates(TS, None, 0.01),
-        jr.State(UNTURNED, omega),
-        nuisances=nuisances,
-        **options,
-    )
+    return program(nuisances, prior)((tensor + tensor.T) / 2, omega)
 
 
 def test_free_motion_tells_everything_but_the_scale():
@@ -230,7 +247,9 @@ def test_free_motion_tells_everything_but_the_scale():
     plan = identify.Attitudes(TS, None, 0.01)
     omega = TURN @ np.array([0.5, 1.0, 0.4])
     body = jr.RigidBody(turned(ASYMMETRIC[0]))
-    found = identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+    found = quick_jit(
+        lambda omega: identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+    )(omega)
     assert found.null_directions == ("overall scale",)
 
 
@@ -284,12 +303,12 @@ def test_bias_and_scale_inflate_the_bound_as_measured_before():
     """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5), by order."""
     for body, least in ((ASYMMETRIC, 1.2), (BODIES["nearly symmetric"], 10.0)):
         plain, bias, factor = (
-            float(told(body, n).ratios_errors[1]) for n in ((), "gyro_bias", "gyro_scale")
+            float(told(body, n).ratios_errors[1]) for n in (None, "gyro_bias", "gyro_scale")
         )
         assert bias > least * plain
         assert factor > least * plain
     # What is known beforehand of the bias helps
-    known = told(BODIES["nearly symmetric"], {"gyro_bias": 1e-4})
+    known = told(BODIES["nearly symmetric"], "gyro_bias", 1e-4)
     assert float(known.ratios_errors[1]) < 3 * plain
 
 
@@ -312,9 +331,10 @@ def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
     options = {"shape": "top", "free": lambda body: body.torque.mass}
 
+    told_of = quick_jit(lambda state: identify.identifiability(top, plan, state, **options))
+
     def words(tilt):
-        state = jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0)
-        return identify.identifiability(top, plan, state, **options)
+        return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
 
     assert words(0.5).null_directions == ("heading about the vertical",)
     sleeping = words(0.0)

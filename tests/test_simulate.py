@@ -9,7 +9,7 @@ import optimistix as optx
 import pytest
 import scipy.linalg
 from free_reference import free_motion
-from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit
 from reference import heavy_body
 
 import jrigid as jr
@@ -243,12 +243,12 @@ def _observable(omega, adjoint=None):
 
 def test_reverse_forward_and_direct_agree():
     omega = jnp.asarray(OMEGA)
-    reverse = jax.jit(jax.grad(_observable))(omega)
-    forward = jax.jit(jax.jacfwd(lambda w: _observable(w, FORWARD)))(omega)
+    reverse = quick_jit(jax.grad(_observable))(omega)
+    forward = quick_jit(jax.jacfwd(lambda w: _observable(w, FORWARD)))(omega)
     np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
-    twice = jax.jit(jax.jacfwd(jax.jacfwd(lambda w: _observable(w, FORWARD))))(omega)
+    twice = quick_jit(jax.jacfwd(jax.jacfwd(lambda w: _observable(w, FORWARD))))(omega)
     direct = diffrax.DirectAdjoint()
-    hessian = jax.jit(jax.hessian(lambda w: _observable(w, direct)))(omega)
+    hessian = quick_jit(jax.hessian(lambda w: _observable(w, direct)))(omega)
     np.testing.assert_allclose(twice, hessian, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(twice, twice.T, rtol=1e-7, atol=1e-9)
     step = 1e-5
@@ -509,7 +509,7 @@ def test_gradients_of_good_lanes_are_untouched_by_a_bad_one():
 
         return jnp.sum(jax.vmap(lane)(omegas))
 
-    gradient = jax.jit(jax.grad(total))(omegas)
+    gradient = quick_jit(jax.grad(total))(omegas)
     assert np.all(np.isfinite(gradient))
     assert np.all(gradient[1] == 0)
     np.testing.assert_array_equal(gradient[0], gradient[2])
@@ -528,7 +528,7 @@ def test_gradients_in_what_lanes_share_are_untouched_by_a_bad_one():
 
         return jnp.sum(jax.vmap(lane)(attitudes))
 
-    gradient = jax.jit(jax.grad(total))
+    gradient = quick_jit(jax.grad(total))
     alone = gradient(jnp.array(0.1), attitudes[:1])
     np.testing.assert_allclose(gradient(jnp.array(0.1), attitudes), alone, rtol=1e-12)
 
