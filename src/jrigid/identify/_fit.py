@@ -48,7 +48,7 @@ _SLOW_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _IN_A_STAGE = 15
 _REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
 _SPOILT = 0.25  # fraction of samples rejected that gives a throw up
-_HISTORY = 512
+_HISTORY = 1024
 
 
 def fit(
@@ -64,7 +64,7 @@ def fit(
     absolute_sigma: bool = True,
     motion: Callable[..., State] | None = None,
     doublings: int = 8,
-    max_steps: int = 60,
+    max_steps: int = 400,
     progress: bool = False,
     throw: bool = True,
 ) -> FitResult:

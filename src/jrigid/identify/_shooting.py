@@ -174,6 +174,7 @@ class _Carry(NamedTuple):
     move: tuple[Array, Array]
     gain: Array
     damping: Array
+    growth: Array
     stage: Array
     since: Array
     fresh: Array
@@ -210,7 +211,8 @@ def levenberg_marquardt(
     still = jnp.zeros_like(start.numbers), jnp.zeros((throws, nodes, local), dtype)
     carry = _Carry(
         start, rows, links, jnp.asarray(jnp.inf, dtype), still, jnp.zeros((), dtype),
-        jnp.asarray(_FIRST_DAMPING, dtype), jnp.asarray(0), jnp.asarray(0), jnp.asarray(True),
+        jnp.asarray(_FIRST_DAMPING, dtype), jnp.asarray(2.0, dtype), jnp.asarray(0),
+        jnp.asarray(0), jnp.asarray(True),
         jnp.asarray(False), steps, history,
     )  # fmt: skip
 
@@ -222,16 +224,18 @@ def levenberg_marquardt(
         finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(rows.of_numbers))
         better = finite & (cost <= carry.cost)
         taken = carry.fresh | better
+        trial_cost = cost
         point, rows, links, cost = jtu.tree_map(
             lambda new, old: jnp.where(taken, new, old),
             (trial, rows, links, cost),
             (carry.point, carry.rows, carry.links, carry.cost),
         )
-        damping = jnp.where(
-            carry.fresh,
-            _FIRST_DAMPING,
-            jnp.where(better, carry.damping / 5, carry.damping * 4),
-        )
+        # Nielsen's rule: by how well the gain was foretold, and ever faster while it is not.
+        told = (carry.cost - trial_cost) / jnp.where(carry.gain > 0, carry.gain, 1.0)
+        ease = jnp.clip(1 - (2 * jnp.where(better, told, 0.0) - 1) ** 3, 0.1, 2.0)
+        damping = carry.damping * jnp.where(better, ease, carry.growth)
+        damping = jnp.where(carry.fresh, _FIRST_DAMPING, damping)
+        growth = jnp.where(carry.fresh | better, 2.0, 2 * carry.growth)
         damping = jnp.maximum(damping, _LEAST_DAMPING)
         blocks = _linked(_sums(rows, nodes), links, now.weight)
         *move, gain = _step(blocks, damping)
@@ -254,7 +258,8 @@ def levenberg_marquardt(
         # A new stage has other weights: its first evaluation is where this one ended.
         move = jtu.tree_map(lambda x: jnp.where(over, 0.0, x), tuple(move))
         return _Carry(
-            point, rows, links, cost, move, gain, damping, stage, jnp.where(over, 0, since), over,
+            point, rows, links, cost, move, gain, damping, growth, stage,
+            jnp.where(over, 0, since), over,
             settled, carry.steps + 1, carry.history.at[carry.steps].set(rows.cost, mode="drop"),
         )  # fmt: skip
 
