@@ -644,6 +644,57 @@ def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, rng):
         identify.fit(BLIND, identify.Rates(TS, records[0], 0.01))
 
 
+def test_what_cannot_be_weighed_is_refused():
+    _, omegas, _ = rates(ASYMMETRIC)
+    relative = {"absolute_sigma": False}
+    readings = identify.Rates(TS, omegas, 0.01)
+    with pytest.raises(ValueError, match="known beforehand"):
+        identify.fit(BLIND, readings, nuisances={"gyro_scale": 0.02}, **relative)
+    with pytest.raises(ValueError, match="loss"):
+        identify.fit(BLIND, readings, loss="robust", **relative)
+    with pytest.raises(ValueError, match="noise"):
+        identify.cramer_rao(BLIND, identify.Rates(TS, None), jr.State(UNTURNED, np.ones(3)))
+    with pytest.raises(ValueError, match="free"):
+        identify.fit(BLIND, readings, free=lambda body: body.inertia)
+    stars = [identify.Directions(TS, omegas, 0.01, of=of) for of in np.eye(3)[:2]]
+    with pytest.raises(ValueError, match="of"):
+        identify.fit(BLIND, stars)
+
+
+def test_a_gyro_and_a_star_tracker_that_looks_seldom(rng):
+    """25 turns, four attitudes: dead reckoning carries them over the gaps."""
+    ts = np.arange(400) * 0.4
+    tensor, omegas, attitudes = rates(ASYMMETRIC, ts)
+    noise = Rotation.from_rotvec(0.01 * rng.normal(size=(4, 3)))
+    seen = Rotation.from_quat(np.roll(attitudes[::100], -1, axis=1)) * noise
+    observations = (
+        identify.Attitudes(ts[::100], np.roll(seen.as_quat(), 1, axis=1), 0.01),
+        identify.Rates(ts, omegas + 0.05 * rng.normal(size=omegas.shape), 0.05),
+    )
+    found = identify.fit(BLIND, observations)
+    assert bool(found.status == Status.OK)
+    error = elements(np.asarray(found.inertia)) - elements(3 * tensor / np.trace(tensor))
+    assert error @ np.linalg.solve(spread_of_elements(found), error) < 21
+
+
+@pytest.mark.slow
+def test_the_torque_of_a_gravity_gradient_follows_the_body(rng):
+    """The same tensor stands in the torque: both are sought together."""
+
+    def orbit(t):
+        return jnp.stack([jnp.cos(0.3 * t), jnp.sin(0.3 * t), 0 * t])
+
+    moments, ts = np.array([1.0, 1.7, 2.3]), np.linspace(0.0, 20.0, 60)
+    body = jr.RigidBody(moments, jr.torques.GravityGradient(moments, 0.09, orbit))
+    start = jr.State(UNTURNED, np.array([0.5, 1.0, 0.3]))
+    values = np.asarray(jr.simulate(body, start, ts).states.omega) + 0.01 * rng.normal(size=(60, 3))
+    near = np.array([1.0, 1.4, 1.9])
+    guess = jr.RigidBody(near, jr.torques.GravityGradient(near, 0.09, orbit))
+    found = identify.fit(guess, identify.Rates(ts, values, 0.01), start=start, shape="moments")
+    errors = np.asarray(found.ratios_errors)
+    assert np.all(np.abs(np.asarray(found.ratios) - [1.7, 2.3]) < 4 * errors)
+
+
 def test_progress_is_printed(capfd, rng):
     _, omegas, _ = rates(ASYMMETRIC)
     readings = identify.Rates(TS, omegas + 0.01 * rng.normal(size=omegas.shape), 0.01)

@@ -19,7 +19,7 @@ from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse
 from jrigid.identify._layout import Layout, first_and_last, times_of, whole
-from jrigid.identify._observations import AbstractObservation, of_throws, whitened
+from jrigid.identify._observations import AbstractObservation, known, of_throws, whitened
 from jrigid.identify._residuals import Args, Options, evaluation, whole_motion
 from jrigid.identify._result import FitResult
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
@@ -82,6 +82,11 @@ def _planned(
         )
         for x, ok in zip(stacked, times, strict=True)
     )
+    if any(x.sigma is None and x.covariance is None for x in stacked):
+        raise ValueError(
+            "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
+            "not."
+        )
     ts, there = times_of(stacked)
     throws = ts.shape[0]
     attitude = jnp.broadcast_to(state.attitude.astype(ts.dtype), (throws, 4))[:, None]
@@ -90,11 +95,10 @@ def _planned(
     rate = jnp.where(rate > 0, rate, 1.0)
     unknowns = unknowns_of(system, free, nuisances, shape, scale, rate)
     tensor = as_tensor(system.inertia.astype(ts.dtype))
-    unknowns, numbers = unknowns.start(tensor, unknowns.chart)
+    unknowns, numbers = unknowns.start(tensor, 1e-9)
     options = Options(
         torque_free, any(x.on_attitude for x in stacked) or depends_on_attitude(system), False, 1,
-        "squares", 0, all(x.sigma is not None or x.covariance is not None for x in stacked), None,
-        0, False, False,
+        "squares", 0, True, None, 0, False, False,
     )  # fmt: skip
     layout = whole(ts, there, 1)
     point = Point(numbers, attitude, omega)
@@ -133,6 +137,22 @@ def _information(rows: Rows) -> Array:
     return jnp.concatenate(
         [jnp.concatenate([gg, gl], axis=1), jnp.concatenate([gl.T, blocks], axis=1)]
     )
+
+
+def _inverse(rows: Rows) -> Array:
+    """Of the information, from the derivatives themselves: their squares lose digits."""
+    jg, jl = rows.of_numbers, rows.of_state
+    throws, count, locals_ = jl.shape
+    eye = jnp.eye(throws, dtype=jl.dtype)
+    apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
+    jacobian = jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
+    size = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0))
+    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
+    # Where nothing is told the last rows keep the bound finite, and very large.
+    floor = 64 * jnp.finfo(jl.dtype).eps * jnp.eye(size.size, dtype=jl.dtype)
+    _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
+    half = jax.scipy.linalg.solve_triangular(r, jnp.eye(size.size, dtype=jl.dtype))
+    return (half @ half.T) / size[:, None] / size[None, :]
 
 
 def fisher_information(
@@ -216,15 +236,7 @@ def cramer_rao(
     0.00378
     """
     plan = _planned(system, observations, state, free, nuisances, scale, shape)
-    information = _information(plan.rows)
-    size = jnp.sqrt(jnp.diagonal(information))
-    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
-    scaled = information / size[:, None] / size[None, :]
-    eye = jnp.eye(size.size, dtype=size.dtype)
-    # Where nothing is told this is what keeps the bound finite, and very large.
-    inverse = jnp.linalg.inv(scaled + 512 * jnp.finfo(size.dtype).eps * eye)
-    inverse = 0.5 * (inverse + inverse.T)
-    covariance = inverse / size[:, None] / size[None, :]
+    covariance = _inverse(plan.rows)
     numbers, unknowns = plan.point.numbers, plan.args.unknowns
 
     def ratios(numbers: Array) -> Array:
@@ -277,9 +289,7 @@ def identifiability(
     ('overall scale', 'I3/I1 against gyro scale')
     """
     plan = _planned(system, observations, state, free, nuisances, scale, shape)
-    seen = tuple(
-        jnp.isfinite(x.values).astype(plan.rows.residual.dtype) for x in plan.args.observations
-    )
+    seen = tuple(known(x).astype(plan.rows.residual.dtype) for x in plan.args.observations)
     return conclude(
         plan.options, plan.args._replace(weights=seen), plan.point, plan.rows, seen,
         jnp.asarray(True), jnp.full(1, jnp.nan), plan.layout, RESULTS.successful,
@@ -337,13 +347,14 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     stages = Stage(0 * one, 2 * one, jnp.asarray([False]), jnp.asarray([100]))
     evaluate = evaluation(options._replace(shooting=False, nodes=1))
 
+    noise = jnp.ones((), ts.dtype) if options.noise_known else result.reduced_chi_square
+
     def at(value: Array) -> Array:
-        held = args.unknowns.holding(function, value, 1e-3 * error)
+        held = args.unknowns.holding(function, value, 1e-3 * error / jnp.sqrt(noise))
         _, rows, settled, *_ = levenberg_marquardt(
             evaluate, args._replace(unknowns=held), point, layout, stages,
-            lambda _: jnp.asarray(ACCURACY, ts.dtype), jnp.asarray(0), jnp.zeros(1, ts.dtype),
+            lambda _: ACCURACY * noise, jnp.asarray(0), jnp.zeros(1, ts.dtype),
         )  # fmt: skip
-        noise = 1.0 if options.noise_known else result.reduced_chi_square
         return jnp.where(settled, (rows.cost - result.chi_square) / noise, jnp.nan)
 
     return jax.lax.map(at, values)
@@ -393,6 +404,14 @@ def residuals(
     attitude = jnp.broadcast_to(state.attitude, (throws, 4))
     omega = jnp.broadcast_to(state.omega, (throws, 3))
     torque_free = isinstance(system.torque, Sum) and not system.torque.terms
+
+    if not torque_free:
+        begin = eqx.error_if(
+            begin,
+            begin > first,
+            "Argument `t0` must not be later than the first sample where there is a torque, but it "
+            "is.",
+        )
 
     def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
         if torque_free:

@@ -42,7 +42,7 @@ def conclude(
     freedom = count - size - locals_ * jnp.sum(alive)
     noise = chi_square / jnp.maximum(freedom, 1).astype(dtype)
     inflate = jnp.ones((), dtype) if options.noise_known else noise
-    values, directions, covariance, of_state = told(rows, inflate)
+    values, directions, covariance, of_state = told(rows, inflate, unknowns.natural_units(numbers))
 
     tensor = unknowns.inertia(numbers)
     moments, axes = eigh(tensor)
@@ -70,12 +70,15 @@ def conclude(
     # A fit that creeps along a direction which the record does not tell is as good as any.
     untold = (largest > LARGEST_ERROR) | pure
     status = Status.where(settled, Status.OK, Status.NOT_CONVERGED)
+    sound = jnp.all(jnp.isfinite(covariance)) & (freedom > 0)
     status = Status.where(untold, Status.UNIDENTIFIABLE, status)
     if unknowns.shape not in ("flat", "fixed"):
         status = Status.where(is_near_flat(tensor), Status.AT_BOUNDARY, status)
+    status = Status.where(pure, Status.UNIDENTIFIABLE, status)
     if options.noise_known:
         wrong = Status.where(settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
         status = Status.where(noise > gate, wrong, status)
+    status = Status.where(sound, status, Status.NOT_CONVERGED)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
     seen_rows = sum(w.shape[1] * w.shape[2] for w in kept)  # then what was known beforehand
     jacobian = jnp.concatenate([rows.of_numbers, rows.of_state], axis=-1)
@@ -104,16 +107,13 @@ def _is_pure(args: Args, rows: Rows, noise: Array) -> Array:
     Where the rates do not vary the Fisher information at the estimate is no guide: a motion fitted
     to the noise seems to tell what the true one does not.
     """
+    if not all(isinstance(x, Rates) and x.covariance is None for x in args.observations):
+        return jnp.asarray(False)
     at = 0
     for x, weight in zip(args.observations, args.weights, strict=True):
         width = weight.shape[-1] * weight.shape[1]
-        if not isinstance(x, Rates):
-            at += width
-            continue
         fitted = jnp.sum(rows.residual[:, at : at + width] ** 2)
-        if x.covariance is not None:
-            inverse = 1 / jnp.diagonal(x.covariance, axis1=-2, axis2=-1)
-        elif x.sigma is not None:
+        if x.sigma is not None:
             inverse = 1 / x.sigma**2
         else:
             inverse = jnp.full(weight.shape, 1.0, weight.dtype) / args.unit**2
@@ -126,9 +126,9 @@ def _is_pure(args: Args, rows: Rows, noise: Array) -> Array:
     return jnp.asarray(False)
 
 
-def told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array, Array]:
+def told(rows: Rows, inflate: Array, units: Array) -> tuple[Array, Array, Array, Array]:
     """Singular values and directions of the numbers, states removed, and the whole covariance."""
-    jg, jl = rows.of_numbers, rows.of_state
+    jg, jl = rows.of_numbers * units[None, None, :], rows.of_state
     throws, size, locals_ = jg.shape[0], jg.shape[-1], jl.shape[-1]
     eps = jnp.finfo(jg.dtype).eps
 
@@ -162,4 +162,5 @@ def told(rows: Rows, inflate: Array) -> tuple[Array, Array, Array, Array]:
     whole_ = jnp.concatenate(
         [jnp.concatenate([cov, across.T], axis=1), jnp.concatenate([across, blocks], axis=1)]
     )
-    return values, directions, inflate * whole_, of_state
+    scale = jnp.concatenate([units, jnp.ones(throws * locals_, jg.dtype)])
+    return values, directions, inflate * whole_ * scale[:, None] * scale[None, :], of_state

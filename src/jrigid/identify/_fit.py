@@ -164,12 +164,25 @@ def fit(
     stacked, samples, rate, angle, input_result = _prepare(
         system, stacked, start_tensor, start_state, on_attitude, throw
     )
+    stated = all(x.sigma is not None or x.covariance is not None for x in stacked)
+    noise_known = absolute_sigma and stated
+    if not noise_known and loss == "robust":
+        raise ValueError(
+            "Argument `loss` must be 'squares' where the noise is not stated or only relative, but "
+            "it is 'robust': nothing says what is too far off."
+        )
     unknowns = unknowns_of(system, free, nuisances, shape, scale, rate)
+    if not noise_known and any(prior is not None for prior in unknowns.priors):
+        raise ValueError(
+            "Argument `nuisances` must not state what is known beforehand where the noise of the "
+            "record is not stated or only relative, but it does: the two cannot be weighed."
+        )
+    nodes = 1
+    if shooting and samples is not None:
+        nodes = segments_needed(angle, samples.ts.shape[1])
     options = Options(
         torque_free and motion is None, on_attitude, shooting,
-        segments_needed(angle, stacked[0].ts.shape[1]) if shooting else 1, loss, max_steps,
-        absolute_sigma and all(x.sigma is not None or x.covariance is not None for x in stacked),
-        motion, doublings, progress, throw,
+        nodes, loss, max_steps, noise_known, motion, doublings, progress, throw,
     )  # fmt: skip
     return _fit(options, unknowns, stacked, samples, start_tensor, start_state, input_result)
 
@@ -232,7 +245,7 @@ def _fit(
             by_torque = unknowns.scaled and not options.free_motion
             trace = None if by_torque else jnp.trace(tensor)
             tensor = _linear_start(options, unknowns, samples, trace)
-    unknowns, numbers = unknowns.start(tensor.astype(dtype), unknowns.chart)
+    unknowns, numbers = unknowns.start(tensor.astype(dtype))
 
     single = whole(ts, there, nodes)
     if options.shooting and samples is not None:

@@ -152,16 +152,18 @@ def findings_of(
     if samples is not None and any(isinstance(x, Rates) for x in stacked):
         turned = _between(samples)
         findings.require(
-            turned < 2 * jnp.pi,
+            turned < jnp.pi,
             RESULTS.invalid_state,
-            "Argument `values` of `Rates` must be in radians a second and sampled more than once a "
-            "turn, but the body turns more between samples: are the rates in degrees a second?",
+            "Argument `values` of `Rates` must be in radians a second and sampled more than twice "
+            "a turn, but the body turns more between samples: are the rates in degrees a second?",
         )
     return findings
 
 
 def _between(samples: Samples) -> Array:
     """Angle turned between neighbouring samples, as a median."""
+    if samples.ts.shape[1] < 2:
+        return jnp.zeros((), samples.ts.dtype)
     ok = samples.there[:, 1:] & samples.there[:, :-1]
     step = jnp.where(ok, jnp.diff(samples.ts, axis=1), jnp.nan)
     speed = jnp.sqrt(jnp.sum(samples.omega[:, 1:] ** 2, axis=-1))
@@ -181,7 +183,9 @@ def local_scales(
             noise = jnp.sqrt(jnp.diagonal(x.covariance, axis1=-2, axis2=-1))
         else:
             return jnp.full((), 0.02, rate.dtype) * (rate if isinstance(x, Rates) else 1.0)
-        return jnp.nanmedian(jnp.where(known(x), noise, jnp.nan))
+        found = jnp.nanmedian(jnp.where(known(x), noise, jnp.nan))
+        fallback = 0.02 * rate if isinstance(x, Rates) else jnp.full((), 0.02, rate.dtype)
+        return jnp.where(jnp.isnan(found), fallback, found)
 
     of_rates = [median(x) for x in stacked if isinstance(x, Rates)]
     of_angles = [median(x) for x in stacked if isinstance(x, Attitudes | Directions)]

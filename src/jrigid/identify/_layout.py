@@ -41,7 +41,8 @@ def times_of(observations: tuple[AbstractObservation, ...]) -> tuple[Array, Arra
     """Times of the samples of all kinds, side by side, and which are there."""
     there = jnp.concatenate([jnp.any(known(x), axis=-1) for x in observations], axis=1)
     ts = jnp.concatenate([x.ts for x in observations], axis=1)
-    return jnp.where(there, ts, 0.0), there
+    first, _ = first_and_last(ts, there)
+    return jnp.where(there, ts, first[:, None]), there
 
 
 def first_and_last(ts: Array, there: Array) -> tuple[Array, Array]:
@@ -105,33 +106,39 @@ def samples_of(
     omega = jnp.where(there[..., None], rates.values, 0.0)
     ts = jnp.where(there, rates.ts, 0.0)
     if attitudes is not None:
-
-        def nearest(t: Array, w: Array, times: Array, known_: Array, qs: Array) -> Array:
-            i = _nearest_before(times, known_, t)
-            return multiply(qs[i], exp(w * (t - times[i])))
-
-        found = jax.vmap(lambda t, w, a, b, c: jax.vmap(lambda t, w: nearest(t, w, a, b, c))(t, w))(
-            ts, omega, q_ts, q_there, q
+        latest = jax.vmap(lambda t, a, b: jax.vmap(lambda t: _nearest_before(a, b, t))(t))(
+            ts, q_ts, q_there
         )
+        at = jax.vmap(lambda x, i: x[i])
+        seen, late = at(q, latest), ts - at(q_ts, latest)
+        turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
+        fresh = jnp.concatenate(
+            [jnp.ones_like(there[:, :1]), latest[:, 1:] != latest[:, :-1]], axis=1
+        )
+        found = jax.vmap(_reckoned)(ts, there, omega, q[:, 0], turn(seen, omega, late), fresh)
         return Samples(ts, there, omega, found)
     if attitude0 is None:
         return Samples(ts, there, omega, None)
-    return Samples(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0))
+    none = jnp.zeros((*ts.shape, 4), ts.dtype).at[..., 0].set(1), jnp.zeros(ts.shape, bool)
+    return Samples(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0, *none))
 
 
-def _reckoned(ts: Array, there: Array, omega: Array, attitude0: Array) -> Array:
-    """Attitudes by dead reckoning: turns by the mean of neighbouring rates."""
+def _reckoned(
+    ts: Array, there: Array, omega: Array, attitude0: Array, seen: Array, fresh: Array
+) -> Array:
+    """Attitudes by dead reckoning from those that are fresh: by the mean of neighbouring rates."""
 
     def turn(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
         q, t, w, any_ = carry
-        time, rate, ok = sample
+        time, rate, ok, now, anew = sample
         step = jnp.where(ok & any_, time - t, 0.0)
         q = normalize(multiply(q, exp(0.5 * (w + rate) * step)))
+        q = jnp.where(anew, now, q)
         carry = q, jnp.where(ok, time, t), jnp.where(ok, rate, w), any_ | ok
         return carry, q
 
     start = attitude0, ts[0], omega[0], jnp.asarray(False)
-    return jax.lax.scan(turn, start, (ts, omega, there))[1]
+    return jax.lax.scan(turn, start, (ts, omega, there, seen, fresh))[1]
 
 
 def angle_turned(samples: Samples) -> Array:

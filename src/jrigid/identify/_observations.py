@@ -1,6 +1,7 @@
 """What was observed of a rotating body: times, values and their noise."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import check_option, float_arrays
+from jrigid._checks import check_option, float_arrays, is_concrete
 from jrigid._numerics import product, safe_norm
 from jrigid._types import VectorLike
 from jrigid.dynamics import State, angular_momentum
@@ -352,6 +353,12 @@ def _stacked(parts: Sequence[AbstractObservation]) -> AbstractObservation:
                 "Argument `observations` must hold times of shape (n,) for each throw of a list, "
                 f"but it holds {x.ts.shape}."
             )
+        for field in dataclasses.fields(x):
+            if field.name not in names and not _same(x, first, field.name):
+                raise ValueError(
+                    f"Argument `observations` must have the same `{field.name}` in every throw of "
+                    "a list, but it has not."
+                )
         if any((getattr(x, n) is None) != (getattr(first, n) is None) for n in names):
             raise ValueError(
                 "Argument `observations` must state the noise for all throws or for none, but it "
@@ -365,6 +372,14 @@ def _stacked(parts: Sequence[AbstractObservation]) -> AbstractObservation:
         new,
         is_leaf=lambda x: x is None,
     )
+
+
+def _same(a: Any, b: Any, name: str) -> bool:
+    """Whether two observations agree in a field, as far as that is known now."""
+    a, b = getattr(a, name), getattr(b, name)
+    if a is b or not eqx.is_array(a):
+        return a is b or a == b
+    return not (is_concrete(a) and is_concrete(b)) or bool(jnp.array_equal(a, b))
 
 
 def known(observation: AbstractObservation) -> Array:

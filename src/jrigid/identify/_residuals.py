@@ -19,7 +19,7 @@ from jrigid.identify._shooting import Links, Point, Rows, Stage
 from jrigid.identify._unknowns import Unknowns
 from jrigid.rotation import conjugate, exp, multiply, normalize
 
-RTOL = 1e-9  # of the integration of a whole record
+RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
 
 
 class Options(NamedTuple):
@@ -97,7 +97,7 @@ def _integrated(options: Options, system: Any, layout: Layout, point: Point) -> 
             states = options.motion(system, state, times, t0)
         else:
             states = simulate(
-                system, state, times, t0=t0, rtol=RTOL, throw=False,
+                system, state, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
                 adjoint=diffrax.ForwardMode(), max_steps=100_000,
             ).states  # fmt: skip
         back = jnp.argsort(order)

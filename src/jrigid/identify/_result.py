@@ -155,13 +155,13 @@ class FitResult(eqx.Module):
         for name in self.unknowns.nuisances:
             s = self.unknowns.slices[name]
             if s.stop > s.start:
-                unit = self.unknowns.rate if name == "gyro_bias" else 1.0
-                found[name] = unit * self.numbers[s], unit * self.errors[s]
+                unit = self.unknowns.rate[..., None] if name == "gyro_bias" else 1.0
+                found[name] = unit * self.numbers[..., s], unit * self.errors[..., s]
         return found
 
     @property
     def leaves(self) -> dict[str, tuple[Array, Array]]:
-        """Value and error of each leaf of the system that was free."""
+        """Value and error of each leaf of the system that was free, of a single fit."""
         found = {}
         s = self.unknowns.slices["leaves"]
         values = self.unknowns.leaf_values(self.numbers)
@@ -171,18 +171,19 @@ class FitResult(eqx.Module):
         return found
 
     @property
-    def mirror(self) -> Vector:
+    def mirror(self) -> Float[Array, "*fits 3"]:
         """Moments, about the same axes, of the body that fits the mirrored readings of a gyro.
 
-        With one axis of the gyro reversed the rates obey Euler's equations of another body, whose
-        (I2 - I3)/I1 and cyclic ones have the opposite sign: a gyro of unknown handedness cannot
-        tell the two apart.
+        With all axes of the gyro reversed, or one that is a principal axis, the rates obey Euler's
+        equations of another body, whose (I2 - I3)/I1 and cyclic ones have the opposite sign: a gyro
+        of unknown handedness cannot tell the two apart.
         """
-        a = (self.moments[1] - self.moments[2]) / self.moments[0]
-        b = (self.moments[2] - self.moments[0]) / self.moments[1]
-        second = (1 - a) / (1 + b)
-        found = jnp.stack([jnp.ones_like(a), second, second + a])
-        return found * jnp.sum(self.moments) / jnp.sum(found)
+        first, second, third = jnp.moveaxis(self.moments, -1, 0)
+        a, b = (second - third) / first, (third - first) / second
+        other = (1 - a) / (1 + b)
+        found = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
+        total = jnp.sum(found, axis=-1, keepdims=True)
+        return found * jnp.sum(self.moments, axis=-1, keepdims=True) / total
 
     @property
     def null_directions(self) -> tuple[str, ...]:

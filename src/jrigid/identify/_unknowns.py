@@ -17,6 +17,7 @@ from jrigid._checks import check_option
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid.systems import AbstractSystem
+from jrigid.torques import GravityGradient, Sum
 
 SHAPES = {"tensor": 5, "moments": 2, "symmetric": 3, "top": 1, "flat": 4, "fixed": 0}
 SCALES = ("trace", "known", "rotor")
@@ -44,10 +45,10 @@ def as_tensor(inertia: Array) -> Array:
     return jnp.diag(inertia) if inertia.ndim == 1 else inertia
 
 
-def real_body(tensor: Array) -> Array:
+def real_body(tensor: Array, flattest: float) -> Array:
     """The nearest shape of a body with extent in three directions: Sigma of unit trace."""
     values, axes = eigh(second_moments(tensor))
-    values = jnp.maximum(values, _FLATTEST)
+    values = jnp.maximum(values, flattest)
     values = values / jnp.sum(values)
     return product("ik,k,jk->ij", axes, values, axes)
 
@@ -117,6 +118,13 @@ class Unknowns(eqx.Module):
             units.append(jnp.full(flat[i].size, jnp.where(size > 0, size, 1.0)))
         return jax.lax.stop_gradient(jnp.concatenate(units))
 
+    def natural_units(self, numbers: Array) -> Array:
+        """Units in which an error is large or small: of a leaf its size, at the start or found."""
+        s = self.slices["leaves"]
+        units = self.leaf_units()
+        sizes = jnp.abs(self.leaf_values(numbers)) / units
+        return jnp.ones_like(numbers).at[s].set(jnp.maximum(sizes, 1.0))
+
     def leaf_values(self, numbers: Array) -> Array:
         """The free leaves, side by side."""
         flat = jtu.tree_leaves(self.system)
@@ -138,9 +146,9 @@ class Unknowns(eqx.Module):
             tensor = 0.5 * self.trace * (jnp.eye(3, dtype=sigma.dtype) - sigma)
         return jnp.exp(numbers[s["scale"]][0]) * tensor if self.scaled else tensor
 
-    def start(self, tensor: Array, chart: Array) -> tuple["Unknowns", Array]:
+    def start(self, tensor: Array, flattest: float = _FLATTEST) -> tuple["Unknowns", Array]:
         """Numbers for a tensor, of the shape that is sought; the frame is chosen for it."""
-        sigma = real_body(tensor)
+        chart, sigma = self.chart, real_body(tensor, flattest)
         p = jnp.zeros(SHAPES[self.shape], sigma.dtype)
         if self.shape == "tensor":
             chart = jnp.eye(3, dtype=sigma.dtype)
@@ -188,7 +196,9 @@ class Unknowns(eqx.Module):
             values[i] = found[at : at + size].reshape(values[i].shape)
             at += size
         system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
-        system = eqx.tree_at(lambda x: x.inertia, system, self.inertia(numbers))
+        inertia = self.inertia(numbers)
+        torque = _with_inertia(system.torque, inertia)
+        system = eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque))
         return system, self.gyro(numbers)
 
     def gyro(self, numbers: Array) -> Callable[[Array], Array]:
@@ -230,6 +240,15 @@ class Unknowns(eqx.Module):
         return Unknowns(**{**fields, "held": function, "constraint": (value, unit)})
 
 
+def _with_inertia(torque: Any, inertia: Array) -> Any:
+    """The torque, with the body's inertia where it has one of its own."""
+    if isinstance(torque, Sum):
+        return Sum(tuple(_with_inertia(term, inertia) for term in torque.terms))
+    if isinstance(torque, GravityGradient):
+        return eqx.tree_at(lambda x: x.inertia, torque, inertia)
+    return torque
+
+
 def _shape(shape: str, p: Array) -> Array:
     """Sigma, in the frame of the chart and of any trace."""
     one, zero = jnp.ones((), p.dtype), jnp.zeros((), p.dtype)
@@ -268,8 +287,14 @@ def _free_leaves(system: AbstractSystem, free: Any) -> tuple[int, ...]:
         chosen_tree = eqx.filter(arrays, free)
         kept = {id(x) for x in jtu.tree_leaves(chosen_tree)}
         found = tuple(i for i, x in enumerate(flat) if id(x) in kept)
-    inertia = [i for i, x in enumerate(flat) if x is arrays.inertia]
-    return tuple(i for i in found if i not in inertia)
+    paths = [jtu.keystr(path) for path, _ in jtu.tree_leaves_with_path(arrays)]
+    found = tuple(i for i in found if not paths[i].endswith(".inertia"))
+    if not found:
+        raise ValueError(
+            "Argument `free` must choose floating point arrays of the system beside the inertia, "
+            "which is always sought, but it does not."
+        )
+    return found
 
 
 def unknowns_of(
@@ -290,7 +315,7 @@ def unknowns_of(
         check_option("nuisances", name, tuple(NUISANCES))
     dtype = rate.dtype
     arrays, functions = eqx.partition(system, eqx.is_inexact_array)
-    inertia = as_tensor(system.inertia.astype(dtype))
+    inertia, eye = as_tensor(system.inertia.astype(dtype)), jnp.eye(3, dtype=dtype)
     return Unknowns(
         arrays,
         functions,
@@ -299,7 +324,7 @@ def unknowns_of(
         _free_leaves(system, free),
         tuple(priors),
         tuple(None if p is None else jnp.asarray(p, dtype) for p in priors.values()),
-        jnp.eye(3, dtype=dtype) if system.inertia.ndim == 1 else eigh(inertia)[1],
+        eigh(inertia)[1] if shape == "moments" and system.inertia.ndim == 2 else eye,
         jnp.trace(inertia),
         rate,
     )
