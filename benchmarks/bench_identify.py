@@ -216,7 +216,7 @@ def peers(turns, count):
 
 
 def main(write: bool, short: bool) -> None:
-    compared = peers(10, 20) + peers(100, 3)
+    compared = peers(10, 10) + peers(100, 3)
     parts = [
         common.table(["one call", "compile ms", "min ms", "median ms"], speed()),
         common.table(

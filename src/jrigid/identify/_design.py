@@ -232,7 +232,7 @@ def cramer_rao(
     ...     plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
     ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
     ...     return jr.identify.cramer_rao(body, plan, start).ratios_covariance[1, 1] ** 0.5
-    >>> print(jax.jit(error)(jnp.array([0.5, 1.0, 0.3])).round(5))
+    >>> print(f"{jax.jit(error)(jnp.array([0.5, 1.0, 0.3])):.5f}")
     0.00378
     """
     plan = _planned(system, observations, state, free, nuisances, scale, shape)
