@@ -104,6 +104,8 @@ def grid():
                         apart.append((cell, float(relative), converged))
                         continue
                     worst_cell = min(worst_cell, converged)
+                    if not good.any():  # each fit says that it is not told
+                        continue
                     scaled = error[good] / np.sqrt(np.diagonal(true_spread))
                     inverse = np.linalg.inv(np.asarray(spread)[good])
                     squared = np.einsum("ni,nij,nj->n", error[good], inverse, error[good]) / 5
