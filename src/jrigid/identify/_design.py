@@ -7,11 +7,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, check_inertia_shape
+from jrigid._numerics import product
 from jrigid._simulate import simulate
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
@@ -20,7 +20,14 @@ from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse
 from jrigid.identify._layout import Layout, first_and_last, times_of, whole
 from jrigid.identify._observations import AbstractObservation, known, of_throws, whitened
-from jrigid.identify._residuals import Args, Options, evaluation, whole_motion
+from jrigid.identify._residuals import (
+    Args,
+    Options,
+    by_kind,
+    evaluation,
+    in_any_order,
+    whole_motion,
+)
 from jrigid.identify._result import FitResult
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
 from jrigid.identify._unknowns import as_tensor, unknowns_of
@@ -75,13 +82,7 @@ def _planned(
     stacked = of_throws(observations)
     torque_free = isinstance(system.torque, Sum) and not system.torque.terms
     refuse(system, stacked, scale, torque_free)
-    times = [jnp.isfinite(x.ts) for x in stacked]
-    stacked = tuple(
-        eqx.tree_at(
-            lambda x: x.values, x, jnp.where(ok[..., None], jnp.ones_like(x.values), jnp.nan)
-        )
-        for x, ok in zip(stacked, times, strict=True)
-    )
+    stacked = tuple(_with_values(x, jnp.ones_like(x.values)) for x in stacked)
     if any(x.sigma is None and x.covariance is None for x in stacked):
         raise ValueError(
             "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
@@ -109,11 +110,8 @@ def _planned(
     local = jnp.ones(6, ts.dtype)
     args = Args(unknowns, stacked, weights, local, jnp.ones((), ts.dtype))
     states = whole_motion(plain, args, layout, point)
-    seen, at = [], 0
-    for x in stacked:
-        count = x.ts.shape[1]
-        part = jtu.tree_map(lambda s, a=at, n=count: s[:, a : a + n], states)
-        at += count
+    seen = []
+    for x, part in by_kind(stacked, states):
         values = jax.vmap(jax.vmap(lambda t, q, w, x=x: x.predict(t, State(q, w), found)))(
             x.ts, part.attitude, part.omega
         )
@@ -129,9 +127,9 @@ def _information(rows: Rows) -> Array:
     """Of the numbers and of each throw's state."""
     jg, jl = rows.of_numbers, rows.of_state
     throws, locals_ = jl.shape[0], jl.shape[-1]
-    gg = jnp.einsum("tri,trj->ij", jg, jg)
-    gl = jnp.einsum("tri,trl->itl", jg, jl).reshape(gg.shape[0], throws * locals_)
-    ll = jnp.einsum("trk,trl->tkl", jl, jl)
+    gg = product("tri,trj->ij", jg, jg)
+    gl = product("tri,trl->itl", jg, jl).reshape(gg.shape[0], throws * locals_)
+    ll = product("trk,trl->tkl", jl, jl)
     eye = jnp.eye(throws, dtype=jl.dtype)
     blocks = (eye[:, None, :, None] * ll[:, :, None, :]).reshape(2 * (throws * locals_,))
     return jnp.concatenate(
@@ -152,7 +150,7 @@ def _inverse(rows: Rows) -> Array:
     floor = 64 * jnp.finfo(jl.dtype).eps * jnp.eye(size.size, dtype=jl.dtype)
     _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
     half = jax.scipy.linalg.solve_triangular(r, jnp.eye(size.size, dtype=jl.dtype))
-    return (half @ half.T) / size[:, None] / size[None, :]
+    return product("ij,kj->ik", half, half) / size[:, None] / size[None, :]
 
 
 def fisher_information(
@@ -416,19 +414,14 @@ def residuals(
     def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
         if torque_free:
             return free_rotation(system.inertia, State(q, w), times, t0=begin)
-        order = jnp.argsort(times)
-        states = simulate(
-            system, State(q, w), jnp.maximum(times[order], begin), t0=begin, adjoint=adjoint
-        ).states
-        back = jnp.argsort(order)
-        return State(states.attitude[back], states.omega[back])
+        return in_any_order(
+            lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
+            times,
+            begin,
+        )
 
-    times = jnp.where(there, ts, first[:, None])
-    states = jax.vmap(motion)(attitude, omega, times, begin)
-    blocks, at = [], 0
-    for x in stacked:
-        count = x.ts.shape[1]
-        part = jtu.tree_map(lambda s, a=at, n=count: s[:, a : a + n], states)
-        at += count
+    states = jax.vmap(motion)(attitude, omega, ts, begin)
+    blocks = []
+    for x, part in by_kind(stacked, states):
         blocks.append(whitened(x, part, lambda w: w, system).reshape(throws, -1))
     return jnp.concatenate(blocks, axis=1)

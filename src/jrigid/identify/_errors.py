@@ -109,21 +109,18 @@ def _is_pure(args: Args, rows: Rows, noise: Array) -> Array:
     """
     if not all(isinstance(x, Rates) and x.covariance is None for x in args.observations):
         return jnp.asarray(False)
-    at = 0
-    for x, weight in zip(args.observations, args.weights, strict=True):
-        width = weight.shape[-1] * weight.shape[1]
-        fitted = jnp.sum(rows.residual[:, at : at + width] ** 2)
-        if x.sigma is not None:
-            inverse = 1 / x.sigma**2
-        else:
-            inverse = jnp.full(weight.shape, 1.0, weight.dtype) / args.unit**2
-        inverse = jnp.where(weight > 0, inverse, 0.0)
-        values = jnp.where(weight > 0, x.values, 0.0)
-        total = jnp.sum(inverse, axis=1, keepdims=True)
-        mean = jnp.sum(inverse * values, axis=1, keepdims=True) / jnp.where(total > 0, total, 1.0)
-        constant = jnp.sum(inverse * (values - mean) ** 2)
-        return constant - fitted < noise * (5 + GATE * 10**0.5)  # of the shape's five numbers
-    return jnp.asarray(False)
+    x, weight = args.observations[0], args.weights[0]
+    fitted = jnp.sum(rows.residual[:, : weight.shape[1] * weight.shape[2]] ** 2)
+    if x.sigma is not None:
+        inverse = 1 / x.sigma**2
+    else:
+        inverse = jnp.full(weight.shape, 1.0, weight.dtype) / args.unit**2
+    inverse = jnp.where(weight > 0, inverse, 0.0)
+    values = jnp.where(weight > 0, x.values, 0.0)
+    total = jnp.sum(inverse, axis=1, keepdims=True)
+    mean = jnp.sum(inverse * values, axis=1, keepdims=True) / jnp.where(total > 0, total, 1.0)
+    constant = jnp.sum(inverse * (values - mean) ** 2)
+    return constant - fitted < noise * (5 + GATE * 10**0.5)  # of the shape's five numbers
 
 
 def told(rows: Rows, inflate: Array, units: Array) -> tuple[Array, Array, Array, Array]:

@@ -86,6 +86,12 @@ def _slopes(ts: Array, there: Array, attitude: Array) -> Array:
     return jax.vmap(at)(index)
 
 
+def _carried(attitude: Array, omega: Array, late: Array) -> Array:
+    """Attitudes a time later, at the rates there: (throws, n)."""
+    turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
+    return turn(attitude, omega, late)
+
+
 def samples_of(
     observations: tuple[AbstractObservation, ...], attitude0: Array | None
 ) -> Samples | None:
@@ -111,11 +117,10 @@ def samples_of(
         )
         at = jax.vmap(lambda x, i: x[i])
         seen, late = at(q, latest), ts - at(q_ts, latest)
-        turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
         fresh = jnp.concatenate(
             [jnp.ones_like(there[:, :1]), latest[:, 1:] != latest[:, :-1]], axis=1
         )
-        found = jax.vmap(_reckoned)(ts, there, omega, q[:, 0], turn(seen, omega, late), fresh)
+        found = jax.vmap(_reckoned)(ts, there, omega, q[:, 0], _carried(seen, omega, late), fresh)
         return Samples(ts, there, omega, found)
     if attitude0 is None:
         return Samples(ts, there, omega, None)
@@ -217,8 +222,7 @@ def node_states(samples: Samples, opening: Array, start: Array) -> tuple[Array, 
         return omega, None
     at = jax.vmap(lambda q, i: q[i])(samples.attitude, opening)
     late = start - jax.vmap(lambda t, i: t[i])(samples.ts, opening)
-    turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
-    return omega, turn(at, omega, late)
+    return omega, _carried(at, omega, late)
 
 
 def segments_needed(angle: Array, n: int) -> int:

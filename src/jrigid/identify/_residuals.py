@@ -46,6 +46,26 @@ class Args(NamedTuple):
     unit: Array  # of residuals whose noise is not known
 
 
+def in_any_order(motion: Callable[[Array], State], ts: Array, t0: Array) -> State:
+    """States of a motion that wants its times in order, none before t0."""
+    order = jnp.argsort(ts)
+    states = motion(jnp.maximum(ts[order], t0))
+    back = jnp.argsort(order)
+    return State(states.attitude[back], states.omega[back])
+
+
+def by_kind(
+    observations: tuple[AbstractObservation, ...], states: State
+) -> list[tuple[AbstractObservation, State]]:
+    """Each kind of observation with its states, which stand side by side."""
+    found, at = [], 0
+    for x in observations:
+        end = at + x.ts.shape[1]
+        found.append((x, State(states.attitude[:, at:end], states.omega[:, at:end])))
+        at = end
+    return found
+
+
 def _sample_states(
     options: Options, args: Args, layout: Layout, point: Point
 ) -> tuple[State, State]:
@@ -90,18 +110,17 @@ def _integrated(options: Options, system: Any, layout: Layout, point: Point) -> 
     """Every throw from its first state, by `simulate`, or by the motion that was given."""
 
     def throw(q: Array, w: Array, ts: Array, t0: Array) -> State:
-        order = jnp.argsort(ts)
         state = State(normalize(q), w)
-        times = jnp.maximum(ts[order], t0)
-        if options.motion is not None:
-            states = options.motion(system, state, times, t0)
-        else:
-            states = simulate(
+
+        def motion(times: Array) -> State:
+            if options.motion is not None:
+                return options.motion(system, state, times, t0)
+            return simulate(
                 system, state, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
                 adjoint=diffrax.ForwardMode(), max_steps=100_000,
             ).states  # fmt: skip
-        back = jnp.argsort(order)
-        return State(states.attitude[back], states.omega[back])
+
+        return in_any_order(motion, ts, t0)
 
     return jax.vmap(throw)(point.attitude[:, 0], point.omega[:, 0], layout.ts, layout.start[:, 0])
 
@@ -129,14 +148,12 @@ def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple
             moved = Point(numbers, attitude, point.omega + move[..., :3])
             states, ends = _sample_states(options, args, layout, moved)
             system, gyro = args.unknowns.system_and_gyro(numbers)
-            blocks, at = [], 0
-            for x, weight in zip(args.observations, args.weights, strict=True):
-                count = x.ts.shape[1]
-                part = jtu.tree_map(lambda s, a=at, n=count: s[:, a : a + n], states)
+            blocks = []
+            kinds = by_kind(args.observations, states)
+            for (x, part), weight in zip(kinds, args.weights, strict=True):
                 rows = whitened(x, part, gyro, system)
                 unit = args.unit if x.sigma is None and x.covariance is None else 1.0
                 blocks.append(rows * weight / unit)
-                at += count
             now = State(point.attitude, point.omega)
             following = jtu.tree_map(lambda s: jnp.roll(s, -1, axis=1), now)
             gap = ends.omega - following.omega

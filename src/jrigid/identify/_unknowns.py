@@ -16,6 +16,7 @@ from jaxtyping import Array
 from jrigid._checks import check_option
 from jrigid._numerics import product
 from jrigid._spectral import eigh
+from jrigid.rotation import hat
 from jrigid.systems import AbstractSystem
 from jrigid.torques import GravityGradient, Sum
 
@@ -172,13 +173,12 @@ class Unknowns(eqx.Module):
             values, chart = eigh(sigma)
             if self.shape == "flat":  # the largest second moment first
                 chart, values = chart[:, ::-1], values[::-1]
-                p = jnp.stack([0.5 * jnp.log(values[1] / values[0]), *(0 * values)])
+                p = p.at[0].set(0.5 * jnp.log(values[1] / values[0]))
             else:  # the odd one out last
                 last = values[2] - values[1] > values[1] - values[0]
                 chart = jnp.where(last, chart, chart[:, ::-1])
                 values = jnp.where(last, values, values[::-1])
-                p = jnp.stack([2 * values[2] / (values[0] + values[1]), values[0], values[0]])
-                p = jnp.stack([jnp.log(p[0]), 0 * p[0], 0 * p[0]])
+                p = p.at[0].set(jnp.log(2 * values[2] / (values[0] + values[1])))
         numbers = jnp.zeros(self.size, sigma.dtype).at[self.slices["shape"]].set(p)
         if self.scaled:
             factor = jnp.trace(tensor) / self.trace
@@ -213,11 +213,8 @@ class Unknowns(eqx.Module):
         if "gyro_matrix" in s:
             matrix = matrix + numbers[s["gyro_matrix"]].reshape(3, 3)
         if "gyro_misalignment" in s:
-            x, y, z = numbers[s["gyro_misalignment"]]
-            o = jnp.zeros_like(x)
-            rows = ([o, -z, y], [z, o, -x], [-y, x, o])
-            hat = jnp.stack([jnp.stack(row) for row in rows])
-            matrix = product("ij,jk->ik", matrix, jnp.eye(3, dtype=x.dtype) - hat)
+            turn = jnp.eye(3, dtype=numbers.dtype) - hat(numbers[s["gyro_misalignment"]])
+            matrix = product("ij,jk->ik", matrix, turn)
         if "gyro_bias" in s:
             bias = self.rate * numbers[s["gyro_bias"]]
         return lambda omega: product("ij,j->i", matrix, omega) + bias
