@@ -1,6 +1,15 @@
 """Set-up of the test suite: x64, strict promotion, run-time type checks, warnings as errors."""
 
+import gc
 import os
+from pathlib import Path
+
+import jaxlib
+
+# XLA's other way to generate code on CPUs takes two thirds of the time. What is slower to compile
+# is what users have: run `XLA_FLAGS= make test` before a release.
+if jaxlib.version.__version_info__ < (0, 11):
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
 from jaxtyping import config as jaxtyping_config
@@ -33,3 +42,16 @@ def rng(request):
     seed = sum(ord(c) * (i + 1) for i, c in enumerate(request.node.name)) % 2**32
     print(f"seed {seed}")
     return np.random.default_rng(seed)
+
+
+# Each compiled function keeps memory maps of its own, and Linux allows a process 65530: beyond
+# them XLA's compiler dies. The suite compiles more than that, so now and then all are let go.
+_MAPS = Path("/proc/self/maps")
+_MOST_MAPS = 24_000
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown():
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
