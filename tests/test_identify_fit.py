@@ -93,6 +93,17 @@ def test_every_body_is_found_blind_at_the_bound(blind_fit, noise, rng):
     assert np.all(np.abs(chi_square - 1) < 5 * np.sqrt(2 / 592))
 
 
+def test_a_short_record_whose_linear_start_is_flat(rng):
+    """A radian and a half at 1e-4: the first attempt ends at a flat body, the second does not."""
+    ts = TS / 40
+    tensor, omegas, _ = rates(ASYMMETRIC, ts)
+    values = omegas + 1e-4 * np.random.default_rng(5).normal(size=omegas.shape)
+    found = identify.fit(BLIND, identify.Rates(ts, values, 1e-4), throw=False)
+    assert bool(found.status == Status.OK)
+    error = elements(np.asarray(found.inertia)) - elements(3 * tensor / np.trace(tensor))
+    assert error @ np.linalg.solve(spread_of_elements(found), error) < 21
+
+
 def test_a_bad_lane_is_marked_and_leaves_the_others_alone(blind_fit, rng):
     _, omegas, _ = rates(ASYMMETRIC)
     records = np.tile(omegas + 0.01 * rng.normal(size=omegas.shape), (60, 1, 1))
@@ -507,6 +518,60 @@ def test_heavy_top_from_its_gyro_alone(rng):
     assert float(value) / one / transverse == pytest.approx(2.0, abs=4 * float(error) / one)
 
 
+def test_ten_numbers_of_a_body_about_its_pivot_of_which_two_are_known(rng):
+    """A gyro on a swinging body tells inertia over weight; mass and one length must be known."""
+    turn = jr.rotation.exp(np.array([0.3, -0.2, 0.5]))
+    box = jr.solids.box(2.0, np.array([0.2, 0.3, 0.5])).rotated(turn)
+    arm = box.translated(np.array([0.05, -0.02, 0.4]))
+    gravity = np.array([0.0, 0.0, -9.8])
+    weight = jr.torques.UniformGravity(arm.mass, arm.center_of_mass, gravity)
+    body = jr.RigidBody(arm.about(np.zeros(3)), weight)
+    ts = np.arange(200) * 0.05
+    state = jr.State(jr.rotation.exp(jnp.array([2.5, 0.2, 0.0])), np.array([0.5, -1.0, 4.0]))
+    values = jr.simulate(body, state, ts).states.omega + 0.005 * rng.normal(size=(200, 3))
+    true = np.asarray(identify.log_cholesky_from_body(arm))
+    wrong = true + np.array([0, 0.1, -0.1, 0.1, 0.02, -0.02, 0.02, 0.02, 0.01, 0])
+    start = identify.body_from_log_cholesky(wrong)
+    ten = identify.LogCholesky(start, frozen=("alpha", "t3"))
+    readings, known = identify.Rates(ts, values, 0.005), {"scale": "known", "start": state}
+    found = identify.fit(body, readings, shape=ten, **known)
+    assert bool(found.status == Status.OK)
+    assert found.names == ("d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2")
+    error = np.asarray(found.numbers) - true[1:9]
+    assert error @ np.linalg.solve(found.covariance[:8, :8], error) < 26
+    assert np.asarray(found.errors).max() < 0.05
+    np.testing.assert_allclose(found.body.mass, arm.mass, rtol=1e-12)
+    np.testing.assert_allclose(found.body.center_of_mass, arm.center_of_mass, atol=0.01)
+    np.testing.assert_allclose(found.inertia, found.body.about(np.zeros(3)), rtol=1e-12)
+    weighed = found.system.torque
+    np.testing.assert_allclose(weighed.lever, found.body.center_of_mass, rtol=1e-12)
+    # Ten are two too many: the mass, and the scale of the inertia and the weight's moment.
+    every = identify.LogCholesky(arm)
+    plan = identify.identifiability(body, readings, state, shape=every, scale="known")
+    nulls = [text for text in plan.null_directions if "heading" not in text]
+    assert len(nulls) == 2
+    assert "alpha" in " ".join(nulls)
+    with pytest.raises(ValueError, match="scale"):
+        identify.fit(body, readings, shape=ten, start=state)
+    with pytest.raises(ValueError, match="frozen"):
+        identify.LogCholesky(arm, frozen="mass")
+    with pytest.raises(ValueError, match="LogCholesky"):
+        _ = identify.identifiability(body, readings, state).body
+
+
+def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
+    """Where it is seen so often that it seems to turn little between samples all the same."""
+    ts, degrees = TS / 20, 180 / np.pi
+    _, omegas, _ = rates(ASYMMETRIC, ts)
+    values = omegas + 1e-4 * rng.normal(size=omegas.shape)
+    found = identify.fit(BLIND, identify.Rates(ts, values * degrees, 1e-4 * degrees), throw=False)
+    assert bool(found.status == Status.WRONG_BASIN)
+    assert "degrees a second" in str(found)
+    found = identify.fit(BLIND, identify.Rates(ts, values, 1e-4))
+    assert bool(found.status == Status.OK)
+    assert "degrees a second" not in str(found)
+
+
 def throws_of_a_phone(rng, count):
     """Rates at 100 Hz of throws of 0.5 to 1.5 s; spoilt samples, spoilt throws."""
     box = jr.solids.box(0.17, np.array([0.0715, 0.147, 0.0078]))
@@ -615,6 +680,7 @@ def test_too_few_samples_and_wrong_options(untyped):
         ({"loss": "huber"}, "loss"),
         ({"start": 3.0}, "start"),
         ({"free": lambda body: body.torque}, "free"),
+        ({"free": lambda _: 0}, "free"),
     ):
         with pytest.raises(ValueError, match=message):
             identify.fit(BLIND, readings, **options)
@@ -652,6 +718,9 @@ def test_what_cannot_be_weighed_is_refused():
         identify.fit(BLIND, readings, nuisances={"gyro_scale": 0.02}, **relative)
     with pytest.raises(ValueError, match="loss"):
         identify.fit(BLIND, readings, loss="robust", **relative)
+    turns = np.broadcast_to(UNTURNED, (200, 4))
+    with pytest.raises(ValueError, match="each kind"):
+        identify.fit(BLIND, (readings, identify.Attitudes(TS, turns)))
     with pytest.raises(ValueError, match="noise"):
         identify.cramer_rao(BLIND, identify.Rates(TS, None), jr.State(UNTURNED, np.ones(3)))
     with pytest.raises(ValueError, match="free"):

@@ -63,6 +63,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "a torque, force or parameter is NaN or infinite there."
     )
     nonfinite_state = "The motion ran out of the range of floating point numbers."
+    no_equilibrium = (
+        "Argument `state` must be an equilibrium in a frame in which the system does not change, "
+        "but it is not."
+    )
+    inaccurate = (
+        "Argument `steps` must be large enough for the accuracy of the motion, but it is not."
+    )
     invalid_tolerance = (
         "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in float32), but "
         "one is not."

@@ -15,6 +15,7 @@ from jrigid.identify._observations import Attitudes as Attitudes
 from jrigid.identify._observations import Directions as Directions
 from jrigid.identify._observations import Observed as Observed
 from jrigid.identify._observations import Rates as Rates
+from jrigid.identify._parameters import LogCholesky as LogCholesky
 from jrigid.identify._parameters import body_from_log_cholesky as body_from_log_cholesky
 from jrigid.identify._parameters import inertia_from_parameters as inertia_from_parameters
 from jrigid.identify._parameters import log_cholesky_from_body as log_cholesky_from_body

@@ -20,6 +20,7 @@ from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse
 from jrigid.identify._layout import Layout, first_and_last, times_of, whole
 from jrigid.identify._observations import AbstractObservation, known, of_throws, whitened
+from jrigid.identify._parameters import LogCholesky
 from jrigid.identify._residuals import (
     Args,
     Options,
@@ -69,7 +70,7 @@ def _planned(
     free: Any,
     nuisances: Sequence[str] | Mapping[str, Any],
     scale: str,
-    shape: str,
+    shape: str | LogCholesky,
 ) -> _Plan:
     """Derivatives of a record that is what the body and the state say."""
     if not isinstance(system, RigidBody):
@@ -161,7 +162,7 @@ def fisher_information(
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
-    shape: str = "tensor",
+    shape: str | LogCholesky = "tensor",
 ) -> Float[Array, "all all"]:
     """Fisher information of a planned record, about what `fit` would seek in it.
 
@@ -202,7 +203,7 @@ def cramer_rao(
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
-    shape: str = "tensor",
+    shape: str | LogCholesky = "tensor",
 ) -> Bound:
     """The least errors that a planned record allows: the inverse of `fisher_information`.
 
@@ -254,7 +255,7 @@ def identifiability(
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
-    shape: str = "tensor",
+    shape: str | LogCholesky = "tensor",
 ) -> FitResult:
     """What a planned record would tell: a `FitResult` before there is a record.
 

@@ -19,6 +19,7 @@ from jrigid.identify._shooting import Point, Rows
 from jrigid.identify._unknowns import is_near_flat
 
 GATE = 5.0  # standard deviations of chi-square
+_TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
 
 
 def conclude(
@@ -35,14 +36,16 @@ def conclude(
     unknowns, kept, t0 = args.unknowns, args.weights, single.start[:, 0]
     numbers = point.numbers
     dtype = numbers.dtype
-    size, locals_ = numbers.size, rows.of_state.shape[-1]
+    size = numbers.size
     count = sum(jnp.sum(w > 0) for w in kept)
     alive = jnp.any(jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in kept]), axis=0)
     chi_square = rows.cost
-    freedom = count - size - locals_ * jnp.sum(alive)
+    values, directions, covariance, of_state = told(rows, unknowns.natural_units(numbers))
+    shown = (of_state > _TOLD * of_state[:, :1]) & alive[:, None]
+    freedom = count - size - jnp.sum(shown)
     noise = chi_square / jnp.maximum(freedom, 1).astype(dtype)
     inflate = jnp.ones((), dtype) if options.noise_known else noise
-    values, directions, covariance, of_state = told(rows, inflate, unknowns.natural_units(numbers))
+    covariance = inflate * covariance
 
     tensor = unknowns.inertia(numbers)
     moments, axes = eigh(tensor)
@@ -123,8 +126,11 @@ def _is_pure(args: Args, rows: Rows, noise: Array) -> Array:
     return constant - fitted < noise * (5 + GATE * 10**0.5)  # of the shape's five numbers
 
 
-def told(rows: Rows, inflate: Array, units: Array) -> tuple[Array, Array, Array, Array]:
-    """Singular values and directions of the numbers, states removed, and the whole covariance."""
+def told(rows: Rows, units: Array) -> tuple[Array, Array, Array, Array]:
+    """Singular values and directions of the numbers, states removed, and the whole covariance.
+
+    Last the singular values of each throw's state, descending.
+    """
     jg, jl = rows.of_numbers * units[None, None, :], rows.of_state
     throws, size, locals_ = jg.shape[0], jg.shape[-1], jl.shape[-1]
     eps = jnp.finfo(jg.dtype).eps
@@ -133,7 +139,7 @@ def told(rows: Rows, inflate: Array, units: Array) -> tuple[Array, Array, Array,
         scale = jnp.sqrt(jnp.sum(jl * jl, axis=0))
         scale = jnp.where(scale > 0, scale, 1.0)
         u, s, vt = jnp.linalg.svd(jl / scale[None, :], full_matrices=False)
-        told = s > 1e-9 * s[0]
+        told = s > _TOLD * s[0]
         u = jnp.where(told[None, :], u, 0.0)
         inverse = jnp.where(told, 1 / jnp.where(told, s, 1.0), 1 / (eps * jnp.maximum(s[0], 1.0)))
         half = vt.T * inverse[None, :] / scale[:, None]
@@ -160,4 +166,4 @@ def told(rows: Rows, inflate: Array, units: Array) -> tuple[Array, Array, Array,
         [jnp.concatenate([cov, across.T], axis=1), jnp.concatenate([across, blocks], axis=1)]
     )
     scale = jnp.concatenate([units, jnp.ones(throws * locals_, jg.dtype)])
-    return values, directions, inflate * whole_ * scale[:, None] * scale[None, :], of_state
+    return values, directions, whole_ * scale[:, None] * scale[None, :], of_state

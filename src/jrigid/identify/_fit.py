@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jrigid._checks import check_option
 from jrigid.dynamics import State
+from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import GATE, conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import findings_of, local_scales, refuse, start_of, typical_rate
@@ -32,6 +33,7 @@ from jrigid.identify._observations import (
     known,
     of_throws,
 )
+from jrigid.identify._parameters import LogCholesky
 from jrigid.identify._residuals import Args, Options, evaluation
 from jrigid.identify._result import FitResult
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
@@ -58,7 +60,7 @@ def fit(
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
-    shape: str = "tensor",
+    shape: str | LogCholesky = "tensor",
     start: tuple[Any, State | None] | State | None = None,
     loss: str = "squares",
     absolute_sigma: bool = True,
@@ -93,7 +95,8 @@ def fit(
             momentum of a `torques.Rotor`.
         shape: What is known of the tensor. "tensor": nothing, any real body; "moments": the
             principal axes, those of the system's; "symmetric": two moments are equal; "top": they
-            are, and the axis is body axis 3; "flat": all mass in a plane; "fixed": all of it.
+            are, and the axis is body axis 3; "flat": all mass in a plane; "fixed": all of it. Or a
+            `LogCholesky`: ten numbers of the body about a fixed point, of which any are frozen.
         start: Where to start: a `State` at the first time, of one throw or with an axis of throws
             in front; or (inertia or None, State or None). Needed where the attitude matters and was
             not observed: an attitude nearer than about half a turn will do.
@@ -166,6 +169,11 @@ def fit(
     )
     stated = all(x.sigma is not None or x.covariance is not None for x in stacked)
     noise_known = absolute_sigma and stated
+    if not stated and len(stacked) > 1:
+        raise ValueError(
+            "Argument `observations` must state the noise of each kind where there are several, "
+            "but one has neither `sigma` nor `covariance`: they cannot be weighed."
+        )
     if not noise_known and loss == "robust":
         raise ValueError(
             "Argument `loss` must be 'squares' where the noise is not stated or only relative, but "
@@ -197,11 +205,11 @@ def _prepare(
     throw: bool,
 ) -> tuple[Any, Samples | None, Array, Array, Any]:
     """Checked observations, what tells the state on the way, and the angle it turns."""
-    ts, there = times_of(stacked)
+    ts, _ = times_of(stacked)
     attitude0 = None if state is None or not on_attitude else state.attitude.astype(ts.dtype)
     samples = samples_of(stacked, attitude0)
     rate = typical_rate(samples, state, ts.dtype)
-    findings = findings_of(system, stacked, there, samples, tensor, state)
+    findings = findings_of(system, stacked, samples, tensor, state)
     stacked = findings.apply(stacked, throw)
     angle = jnp.zeros(()) if samples is None else jnp.max(angle_turned(samples)[:, -1])
     return stacked, samples, rate, angle, findings.result
@@ -225,7 +233,7 @@ def _schedule(stages: list[tuple[float, float, int]], robust: bool, length: int,
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _fit(
     options: Options,
     unknowns: Unknowns,
@@ -241,11 +249,13 @@ def _fit(
     tensor = start_tensor
     if tensor is None:
         tensor = as_tensor(unknowns.original.inertia.astype(dtype))
-        if samples is not None and unknowns.shape != "fixed" and options.motion is None:
+        sought = unknowns.shape != "fixed" and unknowns.ten is None
+        if samples is not None and sought and options.motion is None:
             by_torque = unknowns.scaled and not options.free_motion
             trace = None if by_torque else jnp.trace(tensor)
             tensor = _linear_start(options, unknowns, samples, trace)
     unknowns, numbers = unknowns.start(tensor.astype(dtype))
+    rounder = unknowns.rounder(tensor.astype(dtype), numbers)
 
     single = whole(ts, there, nodes)
     if options.shooting and samples is not None:
@@ -348,12 +358,14 @@ def _fit(
             if robust:
                 new = rejecting(rows)
                 kept = tuple(jnp.where(phase.reject, a, b) for a, b in zip(new, kept, strict=True))
-            # A second attempt, for those that need it, begins where the first did.
+            # A second attempt, for those that need it, begins at a body further from flat.
             linked = phase.stages.weight[0] > 0
             wrong = jnp.where(phase.again & linked, went_wrong(rows, settled), wrong)
             skip = phase.again & ~wrong
             begin = jtu.tree_map(
-                lambda x, y: jnp.where(phase.again & linked & wrong, x, y), point, now
+                lambda x, y: jnp.where(phase.again & linked & wrong, x, y),
+                point._replace(numbers=rounder),
+                now,
             )
             stages = phase.stages._replace(steps=jnp.where(skip, 0, phase.stages.steps))
             found = run(begin, kept, phase._replace(stages=stages), steps, history)

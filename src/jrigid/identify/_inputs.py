@@ -75,7 +75,6 @@ def typical_rate(samples: Samples | None, state: State | None, dtype: Any) -> Ar
 def findings_of(
     system: Any,
     stacked: tuple[AbstractObservation, ...],
-    there: Array,
     samples: Samples | None,
     tensor: Any,
     state: State | None,
@@ -88,11 +87,12 @@ def findings_of(
     if state is not None:
         findings.require(all_finite(state), RESULTS.invalid_state)
         findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
-    findings.require(
-        jnp.any(there),
-        RESULTS.invalid_state,
-        "Argument `observations` must hold values, but all are NaN.",
-    )
+    for x in stacked:
+        findings.require(
+            jnp.any(known(x)),
+            RESULTS.invalid_state,
+            f"Argument `values` of `{type(x).__name__}` must hold values, but all are NaN.",
+        )
     numbers = jnp.sum(jnp.stack([jnp.sum(known(x)) for x in stacked]))
     findings.require(
         numbers >= 12,

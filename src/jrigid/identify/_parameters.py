@@ -1,9 +1,12 @@
 """Numbers without bounds for the inertia of a real body: physical by construction."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import (
@@ -12,6 +15,7 @@ from jrigid._checks import (
     all_finite,
     array_of_shape,
     check_inertia_shape,
+    check_option,
     float_arrays,
     is_positive_definite,
     is_symmetric,
@@ -26,6 +30,9 @@ _NOT_SOLID = (
     "I3 < I1 + I2, but it is not."
 )
 _NOT_FINITE = "Argument `parameters` must be finite, but it is not."
+
+
+LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 
 
 def _second_moments(tensor: Matrix) -> Matrix:
@@ -220,3 +227,68 @@ def log_cholesky_from_body(body: MassProperties, *, throw: bool = True) -> Float
         ]
     )
     return findings.apply(nan_where(~ok, numbers), throw)
+
+
+class LogCholesky(eqx.Module):
+    """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
+
+    The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
+    the lever of any `torques.UniformGravity` of the system, all follow from the ten numbers. Motion
+    under gravity tells the inertia about the point over the mass times the lever, eight numbers:
+    freeze two at least, such as "alpha", half the logarithm of the mass, and a length. A rotor or
+    a torque of known size tells one more.
+
+    Attributes:
+        parameters: (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) to start from.
+        frozen: Names of those that are known.
+
+    Raises:
+        ValueError: Not mass properties, or a name that is none of the ten (trace time).
+        RuntimeError: A flat body (run time, any lane).
+
+    Gradients: as `body_from_log_cholesky`.
+    Source: as `body_from_log_cholesky`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> arm = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0])).translated(jnp.array([0.0, 0.0, 1.5]))
+    >>> print(jr.identify.LogCholesky(arm, frozen=("alpha", "t1", "t2")).sought)
+    ('d1', 'd2', 'd3', 's12', 's23', 's13', 't3')
+    """
+
+    parameters: Float[Array, "10"]
+    frozen: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, body: MassProperties, frozen: Sequence[str] = ()):
+        self.frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
+        for name in self.frozen:
+            check_option("frozen", name, LOG_CHOLESKY)
+        if not self.sought:
+            raise ValueError("Argument `frozen` must leave a number to seek, but it does not.")
+        self.parameters = log_cholesky_from_body(body)
+
+    @property
+    def sought(self) -> tuple[str, ...]:
+        """Names of the numbers that are not frozen."""
+        return tuple(name for name in LOG_CHOLESKY if name not in self.frozen)
+
+    @property
+    def units(self) -> Array:
+        """Sizes of the numbers sought: 1, or for those in metres that of the body."""
+        body = body_from_log_cholesky(self.parameters, throw=False)
+        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
+        lengths = {"s12", "s23", "s13", "t1", "t2", "t3"}
+        one = jnp.ones_like(square)
+        return jnp.stack([jnp.sqrt(square) if name in lengths else one for name in self.sought])
+
+    @property
+    def start(self) -> Array:
+        """The numbers sought, as they were given."""
+        return self.parameters[self._indices()]
+
+    def body(self, numbers: Array) -> MassProperties:
+        """The body, of other numbers for those that are sought."""
+        whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
+        return body_from_log_cholesky(whole, throw=False)
+
+    def _indices(self) -> Any:
+        return np.array([LOG_CHOLESKY.index(name) for name in self.sought])

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jrigid._types import Matrix, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._unknowns import Unknowns
+from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 
 
@@ -125,6 +126,20 @@ class FitResult(eqx.Module):
     def system(self) -> RigidBody:
         """The body that was found."""
         return self.unknowns.system_and_gyro(self.numbers)[0]  # pyright: ignore
+
+    @property
+    def body(self) -> MassProperties:
+        """The body that was found, about its fixed point, by a `LogCholesky`.
+
+        Raises:
+            ValueError: The shape that was sought was another one.
+        """
+        if self.unknowns.ten is None:
+            raise ValueError(
+                "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
+                "to follow, but it was not."
+            )
+        return self.unknowns.ten.body(self.numbers[self.unknowns.slices["shape"]])
 
     @property
     def errors(self) -> Float[Array, "*fits numbers"]:

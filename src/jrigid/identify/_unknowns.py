@@ -16,9 +16,11 @@ from jaxtyping import Array
 from jrigid._checks import check_option
 from jrigid._numerics import product
 from jrigid._spectral import eigh
+from jrigid.identify._parameters import LogCholesky
+from jrigid.mass import MassProperties
 from jrigid.rotation import hat
 from jrigid.systems import AbstractSystem
-from jrigid.torques import GravityGradient, Sum
+from jrigid.torques import GravityGradient, Sum, UniformGravity
 
 SHAPES = {"tensor": 5, "moments": 2, "symmetric": 3, "top": 1, "flat": 4, "fixed": 0}
 SCALES = ("trace", "known", "rotor")
@@ -69,11 +71,13 @@ class Unknowns(eqx.Module):
     rate: Array  # rms of the rates [rad/s]
     held: Any = eqx.field(static=True, default=None)  # a function of the tensor that is held
     constraint: tuple[Array, Array] | None = None  # at a value, to within a unit
+    ten: LogCholesky | None = None  # in place of a shape
 
     @property
     def slices(self) -> dict[str, slice]:
         """Where each part is in the flat vector."""
-        sizes = {"shape": SHAPES[self.shape], "scale": int(self.scaled)}
+        of_shape = SHAPES[self.shape] if self.ten is None else len(self.ten.sought)
+        sizes = {"shape": of_shape, "scale": int(self.scaled)}
         flat = jtu.tree_leaves(self.system)
         sizes["leaves"] = sum(flat[i].size for i in self.leaves)
         sizes.update({name: NUISANCES[name] for name in self.nuisances})
@@ -104,6 +108,8 @@ class Unknowns(eqx.Module):
                     text = jtu.keystr(path).lstrip(".")
                     parts = [text] if leaf.ndim == 0 else [f"{text}[{j}]" for j in range(leaf.size)]
                     found.extend(parts)
+            elif name == "shape" and self.ten is not None:
+                found.extend(self.ten.sought)
             elif s.stop - s.start == 1:
                 found.append(name)
             else:
@@ -124,7 +130,10 @@ class Unknowns(eqx.Module):
         s = self.slices["leaves"]
         units = self.leaf_units()
         sizes = jnp.abs(self.leaf_values(numbers)) / units
-        return jnp.ones_like(numbers).at[s].set(jnp.maximum(sizes, 1.0))
+        found = jnp.ones_like(numbers).at[s].set(jnp.maximum(sizes, 1.0))
+        if self.ten is not None:
+            found = found.at[self.slices["shape"]].set(self.ten.units.astype(found.dtype))
+        return found
 
     def leaf_values(self, numbers: Array) -> Array:
         """The free leaves, side by side."""
@@ -138,7 +147,9 @@ class Unknowns(eqx.Module):
         s = self.slices
         p = numbers[s["shape"]]
         template = self.original.inertia.astype(numbers.dtype)
-        if self.shape == "fixed":
+        if self.ten is not None:
+            tensor = self.ten.body(p).about(jnp.zeros(3, p.dtype))
+        elif self.shape == "fixed":
             tensor = as_tensor(template)
         else:
             sigma = _shape(self.shape, p)
@@ -149,6 +160,9 @@ class Unknowns(eqx.Module):
 
     def start(self, tensor: Array, flattest: float = _FLATTEST) -> tuple["Unknowns", Array]:
         """Numbers for a tensor, of the shape that is sought; the frame is chosen for it."""
+        if self.ten is not None:
+            start = self.ten.start.astype(tensor.dtype)
+            return self, jnp.zeros(self.size, start.dtype).at[self.slices["shape"]].set(start)
         chart, sigma = self.chart, real_body(tensor, flattest)
         p = jnp.zeros(SHAPES[self.shape], sigma.dtype)
         if self.shape == "tensor":
@@ -187,6 +201,13 @@ class Unknowns(eqx.Module):
         unknowns = eqx.tree_at(lambda u: u.chart, self, chart)
         return unknowns, numbers
 
+    def rounder(self, tensor: Array, numbers: Array) -> Array:
+        """Numbers for a body half way to a sphere: another place to start from."""
+        if self.ten is not None or self.shape not in ("tensor", "moments", "top"):
+            return numbers
+        sphere = jnp.eye(3, dtype=tensor.dtype) * jnp.trace(tensor) / 3
+        return self.start(0.5 * (tensor + sphere), 0.1)[1]
+
     def system_and_gyro(self, numbers: Array) -> tuple[AbstractSystem, Callable[[Array], Array]]:
         """The body, and what its gyro makes of an angular velocity."""
         values, tree = jtu.tree_flatten(self.system)
@@ -198,6 +219,8 @@ class Unknowns(eqx.Module):
         system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
         inertia = self.inertia(numbers)
         torque = _with_inertia(system.torque, inertia)
+        if self.ten is not None:
+            torque = _with_body(torque, self.ten.body(numbers[self.slices["shape"]]))
         system = eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque))
         return system, self.gyro(numbers)
 
@@ -246,6 +269,15 @@ def _with_inertia(torque: Any, inertia: Array) -> Any:
     return torque
 
 
+def _with_body(torque: Any, body: MassProperties) -> Any:
+    """The torque, with the body's mass and lever where it is that of its weight."""
+    if isinstance(torque, Sum):
+        return Sum(tuple(_with_body(term, body) for term in torque.terms))
+    if isinstance(torque, UniformGravity):
+        return UniformGravity(body.mass, body.center_of_mass, torque.gravity)
+    return torque
+
+
 def _shape(shape: str, p: Array) -> Array:
     """Sigma, in the frame of the chart and of any trace."""
     one, zero = jnp.ones((), p.dtype), jnp.zeros((), p.dtype)
@@ -266,6 +298,13 @@ def _shape(shape: str, p: Array) -> Array:
     return product("ik,jk->ij", lower, lower)
 
 
+class _Mark:
+    """In the place of an array, to see which a function picks."""
+
+    def __init__(self, index: int):
+        self.index = index
+
+
 def _free_leaves(system: AbstractSystem, free: Any) -> tuple[int, ...]:
     """Indices, among the arrays of the system, of the leaves that `free` chooses."""
     arrays, _ = eqx.partition(system, eqx.is_inexact_array)
@@ -273,13 +312,14 @@ def _free_leaves(system: AbstractSystem, free: Any) -> tuple[int, ...]:
     if free is None:
         return ()
     if callable(free) and not isinstance(free, eqx.Module):
-        numbered = jtu.tree_unflatten(jtu.tree_structure(arrays), list(range(len(flat))))
-        chosen = jtu.tree_leaves(free(eqx.combine(numbered, system)))
-        if not chosen or not all(isinstance(i, int) for i in chosen):
+        marks = [_Mark(i) for i in range(len(flat))]
+        marked = jtu.tree_unflatten(jtu.tree_structure(arrays), marks)
+        chosen = jtu.tree_leaves(free(eqx.combine(marked, system)))
+        if not chosen or not all(isinstance(x, _Mark) for x in chosen):
             raise ValueError(
                 "Argument `free` must choose floating point arrays of the system, but it does not."
             )
-        found = tuple(sorted(set(chosen)))
+        found = tuple(sorted({x.index for x in chosen}))
     else:
         chosen_tree = eqx.filter(arrays, free)
         kept = {id(x) for x in jtu.tree_leaves(chosen_tree)}
@@ -298,12 +338,19 @@ def unknowns_of(
     system: AbstractSystem,
     free: Any,
     nuisances: Sequence[str] | Mapping[str, Any],
-    shape: str,
+    shape: str | LogCholesky,
     scale: str,
     rate: Array,
 ) -> Unknowns:
     """Check the options and set up the numbers."""
-    check_option("shape", shape, tuple(SHAPES))
+    ten = shape if isinstance(shape, LogCholesky) else None
+    if ten is None:
+        check_option("shape", shape, tuple(SHAPES))
+    elif scale == "trace":
+        raise ValueError(
+            "Argument `scale` must be 'known' or 'rotor' where `shape` is a LogCholesky, whose "
+            "numbers hold the scale, but it is 'trace'."
+        )
     check_option("scale", scale, SCALES)
     if isinstance(nuisances, str):
         nuisances = (nuisances,)
@@ -316,14 +363,15 @@ def unknowns_of(
     return Unknowns(
         arrays,
         functions,
-        shape,
-        scale != "trace" and shape != "fixed",
+        "tensor" if ten is not None else shape,
+        ten is None and scale != "trace" and shape != "fixed",
         _free_leaves(system, free),
         tuple(priors),
         tuple(None if p is None else jnp.asarray(p, dtype) for p in priors.values()),
         eigh(inertia)[1] if shape == "moments" and system.inertia.ndim == 2 else eye,
         jnp.trace(inertia),
         rate,
+        ten=ten,
     )
 
 

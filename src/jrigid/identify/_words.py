@@ -8,8 +8,10 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jrigid.identify._observations import Rates
 from jrigid.identify._result import LARGEST_ERROR, STATUSES, FitResult, Status
 
+_NEARLY_A_SPHERE = 1.03  # degrees for radians shrink the gaps of the moments by 57
 _SPEAKING = {
     "scale": "overall scale",
     "gyro_bias": "gyro bias",
@@ -66,14 +68,14 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
             size = float(np.sqrt(np.sum(direction[s] ** 2)))
             if s.stop == s.start or size < 0.2:
                 continue
-            if name == "shape":
+            if name == "leaves" or (name == "shape" and result.unknowns.ten is not None):
+                names = np.array(result.names[s])[np.abs(direction[s]) > 0.2]
+                parts.append((size, ", ".join(names)))
+            elif name == "shape":
                 only = np.zeros_like(direction)
                 only[s] = direction[s]
                 told = "ratios" if pure else _of_shape(result, only)
                 parts.append((size, told))
-            elif name == "leaves":
-                names = np.array(result.names[s])[np.abs(direction[s]) > 0.2]
-                parts.append((size, ", ".join(names)))
             else:
                 text = _SPEAKING[name]
                 if name == "gyro_bias":
@@ -115,6 +117,12 @@ def remarks(result: FitResult) -> tuple[str, ...]:
                 f"I{i + 1} and I{j + 1} are equal within their errors: which is the larger, and "
                 "the axes of each, are not determined"
             )
+    observed = any(isinstance(x, Rates) for x in result.problem.observations)
+    if observed and ratios[1] < _NEARLY_A_SPHERE:
+        found.append(
+            "nearly a sphere: so would any body look whose rates are in degrees a second, or whose "
+            "times are not in seconds"
+        )
     return tuple(found)
 
 
@@ -131,7 +139,8 @@ def _with_error(value: Any, error: Any) -> str:
 def _of_tensor(result: FitResult, moments: np.ndarray, errors: np.ndarray) -> list[str]:
     pairs = zip(np.asarray(result.ratios), np.asarray(result.ratios_errors), strict=True)
     lines = ["  ratios   I2/I1 = " + "   I3/I1 = ".join(_with_error(*pair) for pair in pairs)]
-    unit = " kg m^2" if result.unknowns.scaled else " (trace as declared)"
+    scaled = result.unknowns.scaled or result.unknowns.ten is not None
+    unit = " kg m^2" if scaled else " (trace as declared)"
     listed = [_with_error(v, e) for v, e in zip(moments, errors, strict=True)]
     lines.append("  moments  " + ", ".join(listed) + unit)
     for i in range(3):
