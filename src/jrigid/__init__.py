@@ -12,6 +12,7 @@ from jrigid import mass as mass
 from jrigid import rotation as rotation
 from jrigid import solids as solids
 from jrigid import solvers as solvers
+from jrigid import stability as stability
 from jrigid import systems as systems
 from jrigid import top as top
 from jrigid import torques as torques

@@ -14,13 +14,16 @@ from jrigid._numerics import cosh_sqrt, sinhc_sqrt
 from jrigid._types import Scalar, ScalarLike, VectorLike
 
 
-def growth_rate_squared(moments: VectorLike, axis: int, spin: ScalarLike) -> Scalar:
+def growth_rate_squared(
+    moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
+) -> Scalar:
     """Square of the rate at which a small wobble grows about a principal axis.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
         spin: Rate of the rotation about it [rad/s].
+        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
 
     Returns:
         Square of the growth rate [1/s^2]; where negative, minus the square of the frequency.
@@ -29,25 +32,31 @@ def growth_rate_squared(moments: VectorLike, axis: int, spin: ScalarLike) -> Sca
         ValueError: Wrong shape or axis (trace time). Values are not checked.
 
     Gradients: polynomial over moments, finite everywhere.
-    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; with a rotor, Hughes, Spacecraft
+    Attitude Dynamics (1986), section 6.3.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> moments = jnp.array([1.0, 2.0, 3.0])
     >>> print([jr.free.growth_rate_squared(moments, n, 1.0).item() for n in range(3)])
     [-0.3333333333333333, 0.3333333333333333, -1.0]
     """
-    towards, back, _, _ = _linear_rates(moments, axis, spin)
+    towards, back, _, _ = linear_rates(moments, axis, spin, rotor)
     return towards * back
 
 
-def _linear_rates(moments: Any, axis: int, spin: Any) -> tuple[Array, Array, int, int]:
-    moments, spin = float_arrays(moments, spin)
+def linear_rates(
+    moments: Any, axis: int, spin: Any, rotor: Any = 0.0
+) -> tuple[Array, Array, int, int]:
+    """What couples the two small components j and k: w_j' = first w_k, w_k' = second w_j."""
+    moments, spin, rotor = float_arrays(moments, spin, rotor)
     check_shape("moments", moments, (3,))
     check_shape("spin", spin, ())
+    check_shape("rotor", rotor, ())
     check_option("axis", axis, (0, 1, 2))
     j, k = (axis + 1) % 3, (axis + 2) % 3
     own, first, second = moments[axis], moments[j], moments[k]
-    return (second - own) / first * spin, (own - first) / second * spin, j, k
+    towards = ((second - own) * spin - rotor) / first
+    return towards, ((own - first) * spin + rotor) / second, j, k
 
 
 def linearized(
@@ -77,7 +86,7 @@ def linearized(
     """
     moments, omega0, ts = float_arrays(moments, omega0, ts)
     check_shape("omega0", omega0, (3,))
-    towards, back, j, k = _linear_rates(moments, axis, omega0[axis])
+    towards, back, j, k = linear_rates(moments, axis, omega0[axis])
     square = towards * back * ts * ts
     even, odd = cosh_sqrt(square), ts * sinhc_sqrt(square)
     wave = [jnp.full(ts.shape, omega0[n]) for n in range(3)]

@@ -18,3 +18,4 @@ from jrigid.torques._external import UniformGravity as UniformGravity
 from jrigid.torques._internal import InternalDamper as InternalDamper
 from jrigid.torques._internal import Rotor as Rotor
 from jrigid.torques._internal import SpinningMass as SpinningMass
+from jrigid.torques._orbit import KeplerOrbit as KeplerOrbit

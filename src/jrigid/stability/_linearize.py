@@ -1,0 +1,251 @@
+"""Linearisation about an equilibrium, or a motion that is one in a turning frame."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Complex, Float, Int
+
+from jrigid._checks import RESULTS, Findings, all_finite, float_arrays, is_unit, nan_where
+from jrigid._checks import check_shape as _check_shape
+from jrigid._numerics import product, safe_norm
+from jrigid._scales import ravel, unravel
+from jrigid._types import ScalarLike, VectorLike
+from jrigid.dynamics import State
+from jrigid.rotation import exp, multiply, normalize, rotate, rotate_inverse
+from jrigid.stability._eigen import eigenvalues
+from jrigid.systems import RigidBody
+from jrigid.torques._base import has_parts
+
+STABILITY = ("unstable", "marginal", "stable")
+_NO_EQUILIBRIUM = (
+    "Argument `state` must be an equilibrium, at rest or in the frame that turns with `body_rate` "
+    "and with the motion, but it is not: the state changes there."
+)
+_NOT_STATIONARY = (
+    "The system must look the same at all times in the frame that turns with the motion, but it "
+    "does not: what is linear about `state` has no constant matrix."
+)
+
+
+class Linearization(eqx.Module):
+    """Small motions about an equilibrium: x' = matrix x.
+
+    The components of x are a small turn of the attitude about the body axes (q = q0 exp(x)) [rad],
+    the change of the angular velocity, body components [rad/s], and that of the internal state, all
+    as seen in a frame that turns with the motion.
+
+    Attributes:
+        matrix: Its matrix.
+        eigenvalues: Rates [1/s], the one of largest real part first.
+        eigenvectors: Columns, in the order of the eigenvalues; without derivatives.
+        stability: Index into `STABILITY`: "unstable" where a part grows exponentially; "stable"
+            where none does and none drifts; "marginal" between: an eigenvalue 0, or two that share
+            an eigenvector, beside those that come with every motion of a symmetric system (it may
+            turn a little further, or a little faster). Rates below 1e-6 of the largest (in float64)
+            count as 0.
+        result: `jrigid.RESULTS` of the input.
+    """
+
+    matrix: Float[Array, "n n"]
+    eigenvalues: Complex[Array, " n"]
+    eigenvectors: Complex[Array, "n n"]
+    stability: Int[Array, ""]
+    result: Any
+
+    @property
+    def growth_rate(self) -> Float[Array, "*batch"]:
+        """Largest real part of an eigenvalue [1/s]."""
+        return jnp.max(self.eigenvalues.real, axis=-1)
+
+
+def linearize(
+    system: RigidBody,
+    state: State,
+    args: Any = None,
+    *,
+    t: ScalarLike = 0.0,
+    body_rate: VectorLike | None = None,
+    space_axis: VectorLike | None = None,
+    throw: bool = True,
+) -> Linearization:
+    """Linearise a system about an equilibrium, or about a motion that is one in a turning frame.
+
+    Without `body_rate` the frame turns with the body: right for rest, for the spin of a free body
+    or of a gyrostat, for a sleeping or hanging top, for a satellite that keeps its face to the
+    Earth on a circular orbit. A top in steady precession also turns about its own axis, as seen by
+    one who precesses with it: `body_rate` is that turning.
+
+    Args:
+        system: The body and its torque.
+        state: Its state, an equilibrium in the frame.
+        args: Passed to the torque.
+        t: Time of the state [s].
+        body_rate: Turning of the body seen from the frame, body components [rad/s]; about an axis
+            of symmetry of the body and its torque.
+        space_axis: A direction in space about which the system is symmetric, where it is at rest:
+            up, for what hangs still. A motion that turns has its own.
+        throw: False: bad input is a result code and NaN.
+
+    Returns:
+        Matrix, eigenvalues, eigenvectors, and what they mean.
+
+    Raises:
+        ValueError: Wrong shape; `body_rate` with internal parts (trace time).
+        RuntimeError: Bad value; a state that is no equilibrium; a system that changes in the frame,
+            such as a body on an eccentric orbit (run time, any lane).
+
+    Gradients: of matrix and eigenvalues, in all parameters of the system and in the state; where
+    eigenvalues meet see `eigenvalues`. None of the eigenvectors.
+    Source: J. E. Marsden, T. S. Ratiu, Introduction to Mechanics and Symmetry, 2nd ed. (1999), for
+    relative equilibria; docs/stability.md. Eigenvalues on a GPU need a jaxlib that has them there.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    >>> spin = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 2.0, 0.0]))
+    >>> about = jr.stability.linearize(body, spin)
+    >>> print(about.growth_rate.round(6), jr.stability.STABILITY[about.stability])
+    1.154701 unstable
+    """
+    if not isinstance(system, RigidBody):
+        raise ValueError(
+            f"Argument `system` must be a RigidBody, but it is {type(system).__name__}."
+        )
+    if not isinstance(state, State):
+        raise ValueError(f"Argument `state` must be a State, but it is {type(state).__name__}.")
+    attitude, omega = float_arrays(state.attitude, state.omega)
+    none = jnp.zeros(3, omega.dtype)
+    own, up = (none if x is None else x for x in (body_rate, space_axis))
+    time, own, up = (float_arrays(x)[0].astype(omega.dtype) for x in (t, own, up))
+    shapes = {"t": (), "body_rate": (3,), "space_axis": (3,), "attitude": (4,), "omega": (3,)}
+    for (name, shape), value in zip(shapes.items(), (time, own, up, attitude, omega), strict=True):
+        _check_shape(name, value, shape)
+    if not has_parts(state.internal):
+        internal = system.torque.internal_at_rest(State(attitude, omega))
+    else:
+        internal = state.internal
+    state = State(attitude, omega, internal)
+    if body_rate is not None and has_parts(state.internal):
+        raise ValueError(
+            "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
+            "but it is not."
+        )
+    return _linearize(system, state, args, time, own, up, throw)
+
+
+@eqx.filter_jit
+def _linearize(
+    system: RigidBody,
+    state: State,
+    args: Any,
+    time: Array,
+    own: Array,
+    up: Array,
+    throw: bool,
+) -> Linearization:
+    dtype = state.omega.dtype
+    findings = Findings()
+    system.check(findings)
+    findings.require(all_finite((state, time, own, up)), RESULTS.invalid_state)
+    findings.require(is_unit(jax.lax.stop_gradient(state.attitude)), RESULTS.invalid_attitude)
+    state = dataclasses.replace(state, attitude=normalize(state.attitude))
+    across = rotate(state.attitude, state.omega - own)  # turning of the frame in space
+
+    def rates(x: Array, later: Array) -> Array:
+        """Rates of the components, at a state x away, as seen in the frame some time later."""
+        turn, change, parts = x[:3], x[3:6], x[6:]
+        seen = multiply(state.attitude, exp(turn))
+        spin = state.omega + change
+        on = exp(later * own)
+        attitude = multiply(exp(later * across), multiply(seen, on))
+        inside = unravel(ravel(state.internal) + parts, state.internal) if parts.size else None
+        actual = State(attitude, rotate_inverse(on, spin), inside)
+        found = system.vector_field(time + later, actual, args)
+        turning = spin - own - rotate_inverse(seen, across)
+        change = rotate(on, found.omega) + jnp.cross(own, spin)
+        inner = ravel(found.internal) if parts.size else parts
+        return jnp.concatenate([turning, change, inner])
+
+    extra = sum(x.size for x in jtu.tree_leaves(state.internal))
+    still, now = jnp.zeros(6 + extra, dtype), jnp.zeros((), dtype)
+    matrix = jax.jacfwd(rates)(still, now)
+    # A rate to measure by: of the frame, of the body, of what the torque does to a turn.
+    fixed = jax.lax.stop_gradient(matrix)
+    stiff = jnp.sqrt(jnp.max(jnp.abs(fixed[3:6, :3])))
+    moving = [safe_norm(v) for v in (state.omega, own, across)]
+    rate = jnp.max(jnp.stack([*moving, jnp.max(jnp.abs(fixed[3:6, 3:6])), stiff]))
+    rate = jax.lax.stop_gradient(jnp.where(jnp.isfinite(rate) & (rate > 0), rate, 1.0))
+    units = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, rate)])
+    if extra:
+        scale = system.torque.internal_scale(rate)
+        full = jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), scale, state.internal)
+        units = jnp.concatenate([units, ravel(full).astype(dtype)])
+
+    def measured(x: Array) -> Array:
+        return x * units[None, :] / units[:, None] / rate
+
+    known = jax.lax.stop_gradient
+    accuracy = 64 * jnp.sqrt(jnp.finfo(dtype).eps)
+    moved = jnp.max(jnp.abs(known(rates(still, now)) / units / rate))
+    findings.require(all_finite(fixed), RESULTS.invalid_vector_field)
+    findings.require(moved <= accuracy, RESULTS.no_equilibrium, _NO_EQUILIBRIUM)
+    later = known(jax.jacfwd(rates)(still, 0.7 / rate))
+    differs = jnp.max(jnp.abs(measured(later - fixed)))
+    size = jnp.maximum(jnp.max(jnp.abs(measured(fixed))), 1.0)
+    findings.require(differs <= accuracy * size, RESULTS.no_equilibrium, _NOT_STATIONARY)
+    ok = findings.ok
+    plain = jnp.where(ok, measured(matrix), jnp.eye(6 + extra, dtype=dtype))
+    values = eigenvalues(plain)
+    vectors = _vectors(known(plain), known(values))
+    along = jnp.where(safe_norm(up) > 0, up, across)
+    neutral = [
+        jnp.concatenate([rotate_inverse(state.attitude, along), jnp.zeros_like(still[3:])]),
+        jnp.concatenate([own, jnp.cross(state.omega, own) / rate, jnp.zeros_like(still[6:])]),
+    ]
+    stability = _classify(known(plain), known(values), vectors, known(jnp.stack(neutral)), accuracy)
+    of_units = units.astype(vectors.dtype)[:, None] * vectors
+    length = jnp.sqrt(jnp.sum(jnp.abs(of_units) ** 2, axis=0))
+    of_units = of_units / length.astype(values.dtype)[None, :]
+    found = (matrix, rate.astype(values.dtype) * values, of_units)
+    found = findings.apply(nan_where(~ok, found), throw)
+    return Linearization(*found, jnp.where(ok, stability, -1), findings.result)
+
+
+def _vectors(matrix: Array, values: Array) -> Array:
+    """Eigenvectors in the order of the eigenvalues."""
+    found, columns = jnp.linalg.eig(matrix)
+    gaps = jnp.abs(found[None, :] - values[:, None])
+    # Each eigenvalue takes the nearest that is left.
+    order = []
+    for i in range(values.size):
+        nearest = jnp.argmin(gaps[i])
+        order.append(nearest)
+        gaps = jnp.where(jnp.arange(values.size)[None, :] == nearest, jnp.inf, gaps)
+    return columns[:, jnp.stack(order)]
+
+
+def _classify(
+    matrix: Array, values: Array, vectors: Array, neutral: Array, accuracy: Array
+) -> Int[Array, ""]:
+    largest = jnp.maximum(jnp.max(jnp.abs(values)), 1.0)
+    tiny = accuracy * largest
+    grows = jnp.max(values.real) > tiny
+    # Directions along which the motion only turns further: each explains a pair of zeros.
+    length = jnp.sqrt(jnp.sum(neutral**2, axis=1))
+    there = length > 0
+    neutral = neutral / jnp.where(there, length, 1.0)[:, None]
+    kept = jnp.sqrt(jnp.sum(product("ij,kj->ki", matrix, neutral) ** 2, axis=1)) <= tiny
+    there = there & kept
+    twins = jnp.abs(jnp.sum(neutral[0] * neutral[1])) > 1 - 1e-6
+    explained = jnp.where(there[0] & there[1] & twins, 1, jnp.sum(there))
+    zeros = jnp.sum(jnp.abs(values) <= tiny)
+    gaps = jnp.abs(values[:, None] - values[None, :])
+    overlap = jnp.abs(product("ki,kj->ij", jnp.conj(vectors), vectors))
+    others = ~jnp.eye(values.size, dtype=bool)
+    on_axis = (jnp.abs(values.real) <= tiny) & (jnp.abs(values) > tiny)
+    pairs = others & on_axis[:, None] & on_axis[None, :] & (gaps <= tiny) & (overlap > 0.999)
+    drifts = (zeros > 2 * explained) | jnp.any(pairs)
+    return jnp.where(grows, 0, jnp.where(drifts, 1, 2))

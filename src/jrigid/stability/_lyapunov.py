@@ -1,0 +1,312 @@
+"""Order and chaos: the spectrum of Lyapunov exponents, and an indicator that tells early."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int, Real
+
+from jrigid._checks import check_shape, float_arrays, nan_where
+from jrigid._types import Scalar, ScalarLike
+from jrigid.dynamics import State
+from jrigid.stability._steps import (
+    Walk,
+    checked_body,
+    orthonormal,
+    solver_of,
+    verdict,
+    walk,
+    whole_number,
+)
+from jrigid.systems import RigidBody
+
+ORDER = ("regular", "undecided", "chaotic")
+_REGULAR, _CHAOTIC = 3.0, 5.0
+
+
+class LyapunovSpectrum(NamedTuple):
+    """Lyapunov exponents, and how they settled.
+
+    Attributes:
+        exponents: Mean rates of growth over the whole time, the largest first [1/s].
+        ts: Times since the start [s].
+        history: Exponents up to each of these times [1/s].
+        final_state: Where the motion ended.
+        error: Largest local error of a step, in the scales of the variables.
+        result: `jrigid.RESULTS`.
+    """
+
+    exponents: Float[Array, " count"]
+    ts: Float[Array, " samples"]
+    history: Float[Array, "samples count"]
+    final_state: State
+    error: Scalar
+    result: Any
+
+
+class Megno(NamedTuple):
+    """Mean exponential growth of nearby orbits.
+
+    Attributes:
+        megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one near a
+            periodic orbit), and to half the exponent times the time for a chaotic one.
+        exponent: 2 / time of it: an estimate of the largest exponent [1/s].
+        order: Index into `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided".
+        ts: Times since the start [s].
+        history: `megno` up to each of these times.
+        final_state: Where the motion ended.
+        error: Largest local error of a step, in the scales of the variables.
+        result: `jrigid.RESULTS`.
+    """
+
+    megno: Scalar
+    exponent: Scalar
+    order: Int[Array, ""]
+    ts: Float[Array, " samples"]
+    history: Float[Array, " samples"]
+    final_state: State
+    error: Scalar
+    result: Any
+
+
+def _starting_vectors(vectors: Any, count: int, dimension: int, dtype: Any) -> Array:
+    """Rows to start from: those given, or some that lie along no axis."""
+    if vectors is None:
+        i = jnp.arange(dimension, dtype=dtype)
+        rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype)[:, None]) * (i + 0.5) * 0.9)
+        return orthonormal(rows + 0.3 * jnp.eye(count, dimension, dtype=dtype))[0]
+    rows = float_arrays(vectors)[0].astype(dtype)
+    check_shape("vectors", rows, (None, dimension))
+    return rows
+
+
+def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
+    """Samples, renormalisations of each, steps of each: all of one length, at least `steps`."""
+    steps, every = whole_number("steps", steps), whole_number("every", every)
+    samples = min(whole_number("samples", samples), steps)
+    every = min(every, -(-steps // samples))
+    each = -(-steps // (samples * every))
+    return samples, each, every
+
+
+def _rows_of(path: Walk, every: int, first: Array, rows: Array, y: Array) -> tuple[Array, ...]:
+    """Some steps, then rows made orthonormal: rows, state, logarithms of growth, local error."""
+
+    def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
+        y, rows, error = carry
+        t = path.t0 + path.step * (first + i).astype(y.dtype)
+        y, rows, local = path.advance(t, y, rows)
+        return (y, rows, jnp.maximum(error, local)), None
+
+    begin = (y, rows, jnp.zeros((), y.dtype))
+    (y, rows, error), _ = jax.lax.scan(step, begin, jnp.arange(every))
+    rows, lengths = orthonormal(rows)
+    return rows, y, jnp.log(jnp.where(lengths > 0, lengths, 1.0)), error
+
+
+def lyapunov_spectrum(
+    system: RigidBody,
+    state0: State,
+    duration: ScalarLike,
+    steps: int,
+    args: Any = None,
+    *,
+    t0: ScalarLike = 0.0,
+    count: int | None = None,
+    vectors: Real[ArrayLike, "count n"] | None = None,
+    every: int = 10,
+    samples: int = 50,
+    solver: Any = None,
+    throw: bool = True,
+) -> LyapunovSpectrum:
+    """Lyapunov exponents of a motion, by small motions beside it that are kept orthogonal.
+
+    The small motions live where they belong, a turn of the attitude and a change of the angular
+    velocity (and of internal parts): six exponents for a plain body, none of the quaternion's norm.
+    The steps are equal and their number is given, so that every lane of a map costs the same.
+
+    Args:
+        system: The body and its torque.
+        state0: Where the motion starts.
+        duration: How long it is followed [s]: an exponent is uncertain by a few over the duration.
+        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step too coarse
+            is an error, not a wrong number.
+        args: Passed to the torque.
+        t0: Time at the start [s].
+        count: How many exponents, from the largest; all by default.
+        vectors: Small motions to start from, rows of (turn about the body axes, change of the rate
+            over the initial one, ...); they stay in any set that the motion keeps invariant, such
+            as that of a planar motion. Gives `count`.
+        every: Steps between two orthogonalisations.
+        samples: How many times of `history`.
+        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
+        throw: False: a bad or an inaccurate lane is a result code and NaN.
+
+    Returns:
+        The exponents, and their means up to each of the times. (`steps` is rounded up to fill
+        all intervals.)
+
+    Raises:
+        ValueError: Wrong shape or option (trace time).
+        RuntimeError: Bad value, steps too coarse (run time, any lane).
+
+    Gradients: none to be relied on: those of a chaotic motion grow as fast as it does.
+    Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980) 9.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))  # integrable: none grows
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
+    >>> found = jr.stability.lyapunov_spectrum(body, state0, 1000.0, 5000)
+    >>> print(bool(jnp.all(jnp.abs(found.exponents) < 0.02)), found.history.shape)
+    True (50, 6)
+    """
+    state0, duration, t0 = checked_body(system, state0, duration, t0)
+    plan, solver = _plan(steps, every, samples), solver_of(solver)
+    if count is not None:
+        count = whole_number("count", count)
+    return _spectrum(system, state0, duration, plan, args, t0, count, vectors, solver, throw)
+
+
+@eqx.filter_jit
+def _spectrum(
+    system: RigidBody,
+    state0: State,
+    duration: Array,
+    plan: tuple[int, int, int],
+    args: Any,
+    t0: Array,
+    count: int | None,
+    vectors: Any,
+    solver: Any,
+    throw: bool,
+) -> LyapunovSpectrum:
+    samples, each, every = plan
+    path = walk(system, state0, duration, samples * each * every, args, t0, solver)
+    if count is not None and count > path.dimension:
+        raise ValueError(f"Argument `count` must be at most {path.dimension}, but it is {count}.")
+    dtype = path.start.dtype
+    rows = _starting_vectors(vectors, count or path.dimension, path.dimension, dtype)
+    rows, _ = orthonormal(rows)
+
+    def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
+        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
+            y, rows, total, error = carry
+            first = (k * each + j) * every
+            rows, y, logs, local = _rows_of(path, every, first, rows, y)
+            return (y, rows, total + logs, jnp.maximum(error, local)), None
+
+        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
+        return carry, carry[2]
+
+    begin = (path.start, rows, jnp.zeros(rows.shape[0], dtype), jnp.zeros((), dtype))
+    (y, _, _, error), totals = jax.lax.scan(sample, begin, jnp.arange(samples))
+    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
+    history = totals / ts[:, None]
+    result, ok, found = verdict(path.findings, error, (ts, history, path.to_state(y)))
+    ts, history, state = path.findings.apply(nan_where(~ok, found), throw)
+    return LyapunovSpectrum(history[-1], ts, history, state, error, result)
+
+
+def megno(
+    system: RigidBody,
+    state0: State,
+    duration: ScalarLike,
+    steps: int,
+    args: Any = None,
+    *,
+    t0: ScalarLike = 0.0,
+    vector: Real[ArrayLike, " n"] | None = None,
+    every: int = 10,
+    samples: int = 50,
+    solver: Any = None,
+    throw: bool = True,
+) -> Megno:
+    """Mean exponential growth of nearby orbits: tells order from chaos long before an exponent.
+
+    One small motion beside the motion is enough, and 2 is what it tends to for order of any kind,
+    without a constant of the system's own: that is why this one of the fast indicators is here. It
+    also gives the exponent of what is chaotic, in the same pass.
+
+    Args:
+        system: The body and its torque.
+        state0: Where the motion starts.
+        duration: How long it is followed [s].
+        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step too coarse
+            is an error, not a wrong number.
+        args: Passed to the torque.
+        t0: Time at the start [s].
+        vector: The small motion to start from, as for `lyapunov_spectrum`.
+        every: Steps between two looks at its growth.
+        samples: How many times of `history`.
+        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
+        throw: False: a bad or an inaccurate lane is a result code and NaN.
+
+    Returns:
+        The mean, the exponent it stands for, and the verdict. (`steps` is rounded up to fill all
+        intervals.)
+
+    Raises:
+        ValueError: Wrong shape or option (trace time).
+        RuntimeError: Bad value, steps too coarse (run time, any lane).
+
+    Gradients: none to be relied on.
+    Source: P. M. Cincotta, C. Simo, Astronomy & Astrophysics Supplement 147 (2000) 205; in steps,
+    P. M. Cincotta, C. M. Giordano, C. Simo, Physica D 182 (2003) 151.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
+    >>> found = jr.stability.megno(body, state0, 1000.0, 5000)
+    >>> print(found.megno.round(1), jr.stability.ORDER[found.order])
+    2.0 regular
+    """
+    state0, duration, t0 = checked_body(system, state0, duration, t0)
+    plan, solver = _plan(steps, every, samples), solver_of(solver)
+    return _megno(system, state0, duration, plan, args, t0, vector, solver, throw)
+
+
+@eqx.filter_jit
+def _megno(
+    system: RigidBody,
+    state0: State,
+    duration: Array,
+    plan: tuple[int, int, int],
+    args: Any,
+    t0: Array,
+    vector: Any,
+    solver: Any,
+    throw: bool,
+) -> Megno:
+    samples, each, every = plan
+    path = walk(system, state0, duration, samples * each * every, args, t0, solver)
+    dtype = path.start.dtype
+    if vector is not None:
+        vector = float_arrays(vector)[0]
+        check_shape("vector", vector, (path.dimension,))
+        vector = vector[None]
+    rows, _ = orthonormal(_starting_vectors(vector, 1, path.dimension, dtype))
+
+    def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
+        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
+            y, rows, weighted, total, error = carry
+            index = k * each + j
+            number = (1 + index).astype(dtype)
+            rows, y, (log,), local = _rows_of(path, every, index * every, rows, y)
+            weighted = weighted + number * log
+            total = total + 2 * weighted / number
+            return (y, rows, weighted, total, jnp.maximum(error, local)), None
+
+        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
+        return carry, carry[3] / (each * (1 + k)).astype(dtype)
+
+    none = jnp.zeros((), dtype)
+    begin = (path.start, rows, none, none, none)
+    (y, _, _, _, error), history = jax.lax.scan(sample, begin, jnp.arange(samples))
+    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
+    result, ok, found = verdict(path.findings, error, (ts, history, path.to_state(y)))
+    ts, history, state = path.findings.apply(nan_where(~ok, found), throw)
+    mean = history[-1]
+    order = jnp.where(mean > _CHAOTIC, 2, jnp.where(mean > _REGULAR, 1, 0))
+    order = jnp.where(ok, order, -1)
+    return Megno(mean, 2 * mean / ts[-1], order, ts, history, state, error, result)

@@ -1,0 +1,246 @@
+"""Maps of stability over any parameters, in blocks, and the boundaries between their regions."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool
+
+from jrigid._checks import check_shape, float_arrays
+from jrigid._types import Scalar, ScalarLike
+
+
+class Marked(NamedTuple):
+    """What a function of a map returns to say itself whether its values are defined.
+
+    Attributes:
+        values: Arrays, the same at every point.
+        valid: Whether they mean anything.
+    """
+
+    values: Any
+    valid: Bool[Array, ""]
+
+
+class StabilityMap(NamedTuple):
+    """Values of a function on a grid.
+
+    Attributes:
+        values: As the function returned them, with the axes of the grid in front; numpy arrays.
+        valid: Where the function was defined and finite: a mask of the shape of the grid.
+        axes: Names and points of the axes, in their order.
+    """
+
+    values: Any
+    valid: np.ndarray
+    axes: dict[str, np.ndarray]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return tuple(self.axes)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Of a map over two axes, for matplotlib's `imshow(values.T, origin="lower", extent=...)`.
+
+        Raises:
+            ValueError: The map is over more or fewer axes.
+        """
+        if len(self.axes) != 2:
+            raise ValueError(f"Property `extent` is for two axes, but there are {len(self.axes)}.")
+        ends: list[float] = []
+        for x in self.axes.values():
+            half = 0.5 * (x[-1] - x[0]) / max(x.size - 1, 1)
+            ends += [float(x[0] - half), float(x[-1] + half)]
+        return ends[0], ends[1], ends[2], ends[3]
+
+
+def stability_map(
+    function: Callable[..., Any],
+    axes: Mapping[str, ArrayLike],
+    *,
+    block_size: int = 2**16,
+    progress: bool = False,
+) -> StabilityMap:
+    """Evaluate a function of some parameters on the grid they span.
+
+    The grid is cut into blocks of one size, which are evaluated one after the other by one compiled
+    and vmapped call, so that memory is that of a block and of the result.
+
+    Args:
+        function: A function of one number for each axis, given by name, for a single point: a
+            growth rate, an indicator of chaos, a tree of several. With `throw=False` inside, so
+            that points that fail are NaN.
+        axes: Name and points of each axis, two or more as a rule; the last one runs fastest.
+        block_size: Points of a block. Large for what is cheap; for long integrations some hundreds,
+            since a block takes as long as its slowest lane.
+        progress: Print how many points are done, every few seconds.
+
+    Returns:
+        Values on the grid, and where they are valid.
+
+    Raises:
+        ValueError: An axis that is not one array of numbers, or a function that returns integers or
+            booleans only, which cannot say that they are undefined: return floats (NaN where
+            undefined), or a `Marked`.
+
+    Gradients: none; differentiate the function, or a `boundary`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> def square(second, third):
+    ...     return jr.stability.growth_rate_squared(jnp.stack([1.0, second, third]), 2, 1.0)
+    >>> ratios = jnp.linspace(0.5, 2.0, 4)
+    >>> found = jr.stability.stability_map(square, {"second": ratios, "third": ratios})
+    >>> print(found.values.shape, found.labels, (found.values > 0).sum())
+    (4, 4) ('second', 'third') 3
+    """
+    points = {name: np.asarray(x) for name, x in axes.items()}
+    for name, x in points.items():
+        if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
+            raise ValueError(
+                f"Argument `axes` must hold arrays of numbers of shape (n,), but {name!r} has "
+                f"shape {x.shape} and type {x.dtype}."
+            )
+    if not points:
+        raise ValueError("Argument `axes` must name at least one axis, but it is empty.")
+    if block_size < 1:
+        raise ValueError(f"Argument `block_size` must be at least 1, but it is {block_size}.")
+    shape = tuple(x.size for x in points.values())
+    total = math.prod(shape)
+    size = min(block_size, total)
+    # One dtype, that of all axes taken together.
+    arrays = float_arrays(*points.values())
+    block = _block(function, tuple(points), size)
+    values: list[np.ndarray] = []
+    structure: Any = None
+    valid = np.empty(total, bool)
+    told = time.monotonic()
+    for start in range(0, total, size):
+        first = tuple(np.int32(i) for i in np.unravel_index(start, shape))
+        found, good = block(arrays, first)
+        flat, structure = jtu.tree_flatten(found)
+        if not values:
+            values = [np.empty((total, *x.shape[1:]), x.dtype) for x in flat]
+        stop = min(start + size, total)
+        for whole, part in zip(values, flat, strict=True):
+            whole[start:stop] = np.asarray(part)[: stop - start]
+        valid[start:stop] = np.asarray(good)[: stop - start]
+        if progress and time.monotonic() - told > 5:
+            told = time.monotonic()
+            print(f"{stop} of {total} points", flush=True)
+    values = [x.reshape(*shape, *x.shape[1:]) for x in values]
+    axes_of_it = {name: np.asarray(x) for name, x in zip(points, arrays, strict=True)}
+    return StabilityMap(structure.unflatten(values), valid.reshape(shape), axes_of_it)
+
+
+def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> Callable:
+    """One block of the grid: values at `size` points that follow a first one."""
+
+    def at(point: dict[str, Array]) -> tuple[Any, Array]:
+        found = function(**point)
+        if isinstance(found, Marked):
+            values, valid = jtu.tree_map(jnp.asarray, tuple(found))
+        else:
+            values = jtu.tree_map(jnp.asarray, found)
+            valid = jnp.asarray(True)
+            if not any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(values)):
+                raise ValueError(
+                    "Argument `function` must return floats, NaN where it is undefined, or a "
+                    "`jrigid.stability.Marked`, but it returns nothing that could say so."
+                )
+        finite = [
+            jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(values) if eqx.is_inexact_array(x)
+        ]
+        return values, jnp.all(jnp.stack([valid, *finite]))
+
+    @jax.jit
+    def block(axes: tuple[Array, ...], first: tuple[Array, ...]) -> tuple[Any, Array]:
+        # Digits of the index in the grid's own bases: no number beyond 32 bits is needed.
+        carry = jnp.arange(size, dtype=jnp.int32)
+        point = {}
+        for name, x, digit in zip(names[::-1], axes[::-1], first[::-1], strict=True):
+            index = carry + digit
+            carry = index // x.size
+            point[name] = x[index % x.size]
+        return jax.vmap(at)(point)
+
+    return block
+
+
+def boundary(
+    function: Callable[..., Any],
+    lower: ScalarLike,
+    upper: ScalarLike,
+    *args: Any,
+    rtol: float | None = None,
+    throw: bool = True,
+) -> Scalar:
+    """Where a function of one parameter changes its sign: the edge of a region of stability.
+
+    Args:
+        function: `function(parameter, *args)`, a number that is positive on one side and negative
+            on the other, smooth between: a `growth_rate_squared`, one of the margins.
+        lower: An end of the interval to look in, where the function has one sign.
+        upper: The other end, where it has the other.
+        *args: Passed to the function: what the boundary depends on.
+        rtol: Accuracy, as a part of the interval; by default 64 eps.
+        throw: False: NaN where there is no change of sign.
+
+    Returns:
+        The parameter at the boundary.
+
+    Raises:
+        ValueError: Wrong shape (trace time).
+        RuntimeError: The function has the same sign, or is not finite, at both ends (run time).
+
+    Gradients: by the implicit function theorem in `args`, not in what the function closes over.
+    Infinite where the slope of the function is 0.
+    Source: bisection, `optimistix.Bisection`.
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr
+    >>> def upright(omega3, mgl):
+    ...     top = jr.SymmetricTop(1.0, 0.5, mgl)
+    ...     return jr.stability.top_stability(top, omega3).growth_rate_squared
+    >>> print(jr.stability.boundary(upright, 1.0, 9.0, 1.0).round(9))
+    4.0
+    >>> print(jax.grad(lambda mgl: jr.stability.boundary(upright, 1.0, 9.0, mgl))(1.0).round(9))
+    2.0
+    """
+    lower, upper = float_arrays(lower, upper)
+    check_shape("lower", lower, ())
+    check_shape("upper", upper, ())
+    eps = float(jnp.finfo(lower.dtype).eps)
+    ends = [jnp.asarray(function(x, *args), lower.dtype) for x in (lower, upper)]
+    for end in ends:
+        check_shape("function", end, ())
+    ok = jnp.isfinite(ends[0]) & jnp.isfinite(ends[1]) & (ends[0] * ends[1] <= 0)
+    width = upper - lower
+
+    def inside(x: Array, args: tuple) -> Array:
+        found = jnp.asarray(function(lower + width * x, *args), lower.dtype)
+        return jnp.where(ok, found, x - 0.5)
+
+    # The slope at the end is that of the function alone, so that it does not matter how it ended.
+    tolerance = 64 * eps if rtol is None else rtol
+    solver = optx.Bisection(rtol=0.0, atol=tolerance, expand_if_necessary=False)
+    solution = optx.root_find(
+        inside, solver, jnp.asarray(0.5, lower.dtype), args,
+        options={"lower": jnp.zeros_like(lower), "upper": jnp.ones_like(lower)},
+        max_steps=200, throw=False,
+    )  # fmt: skip
+    found = jnp.where(ok, lower + width * solution.value, jnp.nan)
+    if not throw:
+        return found
+    message = (
+        "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
+        "but they are not."
+    )
+    return eqx.error_if(found, ~ok, message)

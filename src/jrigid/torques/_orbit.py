@@ -1,0 +1,66 @@
+"""The orbit on which a torque depends: Kepler's ellipse."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jrigid._checks import array_of_shape
+from jrigid._types import ScalarLike, Vector
+
+
+class KeplerOrbit(eqx.Module):
+    """Position on an ellipse, as a function of time, for `GravityGradient`.
+
+    At time 0 the body is at the pericentre, on the x axis of space; it moves towards y, and z is
+    the normal of the orbit.
+
+    Attributes:
+        mu: Gravitational parameter of the attractor [m^3/s^2].
+        semi_major_axis: Semi-major axis [m].
+        eccentricity: Eccentricity, from 0 to below 1.
+
+    Raises:
+        ValueError: Wrong shape (trace time). Values are not checked; those of no ellipse give NaN.
+
+    Gradients: finite for eccentricities below 1.
+    Source: J. M. A. Danby, Fundamentals of Celestial Mechanics, 2nd ed. (1988), section 6.6.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> orbit = jr.torques.KeplerOrbit(1.0, 1.0, 0.1)
+    >>> print(orbit(0.0).round(6), orbit(jnp.pi).round(6))
+    [0.9 0.  0. ] [-1.1  0.   0. ]
+    """
+
+    mu: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("mu", x))
+    semi_major_axis: Float[Array, ""] = eqx.field(
+        converter=lambda x: array_of_shape("semi_major_axis", x)
+    )
+    eccentricity: Float[Array, ""] = eqx.field(
+        converter=lambda x: array_of_shape("eccentricity", x)
+    )
+
+    @property
+    def mean_motion(self) -> Float[Array, ""]:
+        """Mean motion n = sqrt(mu / a^3) [rad/s]."""
+        return jnp.sqrt(self.mu / self.semi_major_axis) / self.semi_major_axis
+
+    def __call__(self, t: ScalarLike) -> Vector:
+        """Position at a time, space components [m]."""
+        a, e = self.semi_major_axis, self.eccentricity
+        mean = self.mean_motion * jnp.asarray(t, a.dtype)
+        turn = jnp.asarray(2 * jnp.pi, a.dtype)
+        mean = mean - turn * jax.lax.stop_gradient(jnp.round(mean / turn))
+        known, fixed = jax.lax.stop_gradient((mean, e))
+        anomaly = known + 0.85 * fixed * jnp.sign(known)
+        for _ in range(3):  # of fourth order
+            sine, cosine = fixed * jnp.sin(anomaly), fixed * jnp.cos(anomaly)
+            f, slope = anomaly - sine - known, 1 - cosine
+            first = -f / slope
+            second = -f / (slope + 0.5 * first * sine)
+            anomaly = anomaly - f / (slope + 0.5 * second * sine + second**2 * cosine / 6)
+        for _ in range(2):  # Newton's steps, which carry the derivatives
+            anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (1 - e * jnp.cos(anomaly))
+        x = a * (jnp.cos(anomaly) - e)
+        y = a * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
+        return jnp.stack([x, y, jnp.zeros_like(x)])

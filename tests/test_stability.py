@@ -1,0 +1,502 @@
+"""Linear stability: growth rates, linearisation in a turning frame, maps, boundaries."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.spatial
+from helpers import central_difference, quick_jit
+
+import jrigid as jr
+from jrigid import stability as st
+
+UP = np.array([1.0, 0.0, 0.0, 0.0])
+GRAVITY = np.array([0.0, 0.0, -9.8])
+
+
+def spin(axis, rate=1.0):
+    return jr.State(UP, rate * np.eye(3)[axis])
+
+
+def satellite(moments, eccentricity=0.0):
+    """A body whose axes point along the radius, the flight and the normal of its orbit; n = 1."""
+    moments = jnp.asarray(moments)
+    orbit = jr.torques.KeplerOrbit(1.0, 1.0, eccentricity)
+    return jr.RigidBody(moments, jr.torques.GravityGradient(moments, 1.0, orbit))
+
+
+# Spin about a principal axis
+
+
+def test_theorem_of_the_tennis_racket_over_a_million_bodies():
+    """Unstable about the axis between the other two, stable about those, with no exception."""
+    rng = np.random.default_rng(0)
+    moments = rng.uniform(0.1, 10.0, (1_000_000, 3))
+    # A third of them with gaps down to 1e-12 of the moments.
+    near = rng.integers(0, 3, 333_333)
+    gap = 10 ** rng.uniform(-11.9, 0, 333_333) * rng.choice([-1, 1], 333_333)
+    rows = np.arange(333_333)
+    moments[rows, near] = moments[rows, (near + 1) % 3] * (1 + gap)
+    for axis in range(3):
+        square = jax.jit(jax.vmap(lambda m, axis=axis: st.growth_rate_squared(m, axis, 1.0)))
+        found = np.asarray(square(moments))
+        own, others = moments[:, axis], np.delete(moments, axis, axis=1)
+        between = (own - others[:, 0]) * (own - others[:, 1]) < 0
+        apart = np.abs(own[:, None] / others - 1).min(axis=1) > 1e-12
+        assert apart.sum() > 900_000
+        assert np.all((found > 0)[apart] == between[apart])
+        assert np.all((found < 0)[apart] == ~between[apart])
+
+
+@pytest.mark.parametrize("rotor", [0.0, 1.5, -0.4])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_growth_rates_and_frequencies_are_those_of_the_monodromy_matrix(axis, rotor):
+    """The integrated motion's Jacobian over one turn has the eigenvalues exp(rate x period)."""
+    moments, rate = jnp.array([1.0, 1.7, 2.3]), 1.3
+    momentum = rotor * np.eye(3)[axis]
+    body = jr.RigidBody(moments, jr.torques.Rotor(momentum))
+    period = 2 * np.pi / rate
+
+    def after(change):
+        state = jr.State(UP, rate * jnp.eye(3)[axis] + change)
+        adjoint = diffrax.ForwardMode()
+        return jr.simulate(body, state, period, rtol=1e-13, adjoint=adjoint).states.omega
+
+    monodromy = np.asarray(jax.jacfwd(after)(jnp.zeros(3)))
+    square = st.growth_rate_squared(moments, axis, rate, rotor)
+    exponent = np.sqrt(complex(square)) * period
+    others = [i for i in range(3) if i != axis]
+    block = monodromy[np.ix_(others, others)]
+    np.testing.assert_allclose(np.trace(block), 2 * np.cosh(exponent).real, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(np.linalg.det(block), 1.0, rtol=1e-8)
+    growth = st.growth_rate(moments, axis, rate, rotor)
+    turning = st.frequency(moments, axis, rate, rotor)
+    assert float(growth * turning) == 0
+    np.testing.assert_allclose(growth**2 - turning**2, square, rtol=1e-14)
+    # The modes are eigenvectors of the same block.
+    order = [(axis + 1) % 3, (axis + 2) % 3]
+    found = st.modes(moments, axis, rate, rotor)
+    cyclic = monodromy[np.ix_(order, order)]
+    for value, shape in zip(found.rates, found.shapes, strict=True):
+        multiplier = np.exp(complex(value) * period)
+        np.testing.assert_allclose(cyclic @ np.asarray(shape), multiplier * shape, atol=1e-8)
+        assert np.linalg.norm(shape) == pytest.approx(1.0, rel=1e-12)
+    ratio = np.abs(found.shapes[0, 1] / found.shapes[0, 0])
+    np.testing.assert_allclose(found.amplitude_ratio, ratio, rtol=1e-12)
+
+
+def test_a_rotor_steadies_the_intermediate_axis_at_its_threshold():
+    """(l2 - l3) spin < h or (l3 - l1) spin + h < 0: both ends located to 1e-10."""
+    moments = jnp.array([1.0, 2.0, 2.7])
+
+    def square(rotor, rate):
+        return st.growth_rate_squared(moments, 1, rate, rotor)
+
+    # About axis 2 the couplings vanish at h = (l3 - l2) spin and h = (l1 - l2) spin.
+    for rate in (1.0, 3.0):
+        for end, low, high in ((0.7 * rate, 0.0, 2.0 * rate), (-1.0 * rate, -2.0 * rate, 0.0)):
+            found = st.boundary(square, low, high, rate)
+            assert float(found) == pytest.approx(end, abs=1e-10 * rate)
+            slope = jax.grad(lambda w, a=low, b=high: st.boundary(square, a, b, w))(rate)
+            assert float(slope) == pytest.approx(end / rate, rel=1e-9)
+    # ... as a linearisation of the gyrostat finds it.
+    for rotor, name in ((0.6, "unstable"), (0.8, "stable"), (-0.9, "unstable"), (-1.1, "stable")):
+        body = jr.RigidBody(moments, jr.torques.Rotor(np.array([0.0, rotor, 0.0])))
+        about = st.linearize(body, spin(1))
+        assert st.STABILITY[about.stability] == name
+        np.testing.assert_allclose(
+            about.growth_rate, st.growth_rate(moments, 1, 1.0, rotor), atol=1e-12
+        )
+
+
+def test_slope_of_the_growth_rate_is_finite_at_the_threshold():
+    def rate(m):
+        return st.growth_rate(jnp.stack([1.0, m, 2.0]), 1, 1.0)
+
+    for m, expected in ((1.0, 0.0), (2.0, 0.0), (0.5, 0.0), (1.5, None)):
+        slope = jax.grad(rate)(m)
+        assert np.isfinite(slope)
+        if expected is None:
+            np.testing.assert_allclose(slope, central_difference(rate, m, 1.0), atol=1e-8)
+        else:
+            assert float(slope) == expected
+    assert np.isfinite(jax.grad(jax.grad(rate))(1.0))
+
+
+# Tops and satellites
+
+
+def test_sleeping_top_map_against_the_formula():
+    """Sign of the square on a grid of spin and mgl; the boundary to 1e-10, with its slope."""
+
+    def square(omega3, mgl):
+        top = jr.SymmetricTop(1.3, 0.6, mgl)
+        return st.top_stability(top, omega3, throw=False).growth_rate_squared
+
+    spins, weights = np.linspace(0.1, 9.0, 60), np.linspace(-0.5, 4.0, 50)
+    found = st.stability_map(square, {"omega3": spins, "mgl": weights}, block_size=700)
+    assert found.values.shape == found.valid.shape == (60, 50)
+    assert found.valid.all()
+    threshold = 2 * np.sqrt(1.3 * np.maximum(weights, 0)) / 0.6
+    assert np.all((found.values > 0) == (spins[:, None] < threshold[None, :]))
+    for mgl in (0.3, 1.0, 3.7):
+        exact = 2 * np.sqrt(1.3 * mgl) / 0.6
+        edge = st.boundary(square, 0.0, 20.0, mgl)
+        assert float(edge) == pytest.approx(exact, abs=1e-10)
+        assert float(jr.top.sleeping_spin(jr.SymmetricTop(1.3, 0.6, mgl))) == pytest.approx(exact)
+
+
+@pytest.mark.parametrize(
+    ("omega3", "name"), [(3.9, "unstable"), (4.0, "marginal"), (4.1, "stable")]
+)
+def test_sleeping_top_linearised(omega3, name):
+    top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    about = st.linearize(top.as_rigid_body(), jr.top.initial_state(top, 0.0, omega3=omega3))
+    closed = st.top_stability(top, omega3)
+    assert st.STABILITY[about.stability] == name
+    np.testing.assert_allclose(about.growth_rate, closed.growth_rate, atol=1e-7)
+    if name == "stable":  # the frame turns with the body: the tilt goes round at omega3 less
+        seen = np.sort(np.abs(omega3 - np.asarray(closed.frequencies)))
+        positive = np.sort(about.eigenvalues.imag[about.eigenvalues.imag > 1e-6])
+        np.testing.assert_allclose(positive, seen, rtol=1e-12)
+
+
+@pytest.mark.parametrize("theta", [0.4, 1.2, 2.0])
+@pytest.mark.parametrize("which", ["slow", "fast"])
+def test_steady_precession_linearised_and_in_closed_form(theta, which):
+    top = jr.SymmetricTop(1.2, 0.7, 1.5)
+    closed = st.precession_stability(top, theta, 6.0)
+    i = ("slow", "fast").index(which)
+    state = jr.top.initial_state(top, theta, omega3=6.0, phi_dot=which)
+    own = jnp.array([0.0, 0.0, 6.0]) - closed.precession[i] * jnp.cos(theta) * jnp.eye(3)[2]
+    about = st.linearize(top.as_rigid_body(), state, body_rate=own)
+    assert st.STABILITY[about.stability] == "stable"
+    nutation = np.max(about.eigenvalues.imag)
+    np.testing.assert_allclose(-(nutation**2), closed.growth_rate_squared[i], rtol=1e-10)
+    # A nutation of 1e-5 has that frequency.
+    period = 2 * np.pi / nutation
+    tilted = jr.top.initial_state(
+        top, theta + 1e-5, omega3=6.0, phi_dot=float(closed.precession[i])
+    )
+    np.testing.assert_allclose(jr.top.nutation_period(top, tilted), period, rtol=1e-4)
+    # In a frame that does not turn with the body's own turning there is no equilibrium.
+    with pytest.raises(RuntimeError, match="equilibrium"):
+        st.linearize(top.as_rigid_body(), state)
+
+
+def test_no_steady_precession_is_marked():
+    found = st.precession_stability(jr.SymmetricTop(1.0, 0.5, 1.0), 0.3, 1.0)
+    assert not bool(found.exists)
+    assert np.isnan(found.growth_rate_squared).all()
+
+
+def test_satellites_against_linearisation_and_the_sign_of_the_energy(rng):
+    """200 bodies; Lagrange's region is where the energy has a minimum."""
+    moments = rng.uniform(0.5, 2.0, (200, 3))
+
+    @jax.jit
+    @jax.vmap
+    def both(m):
+        about = st.linearize(satellite(m), spin(2), throw=False)
+        return about.growth_rate, about.stability, st.satellite_stability(m, throw=False)
+
+    growth, stability, closed = both(moments)
+    np.testing.assert_allclose(growth, closed.growth_rate, atol=1e-7)
+    regions = np.array(st.REGIONS)[closed.region]
+    assert np.all((regions == "unstable") == (np.asarray(stability) == 0))
+    a, b, c = moments.T
+    assert np.all((regions == "Lagrange") == ((c > b) & (b > a)))
+    assert set(regions) == set(st.REGIONS)
+
+
+def test_regions_of_debra_and_delp_located_to_1e_10():
+    """Each margin along a line; the boundaries in closed form, and by eigenvalues."""
+
+    def moments(yaw, roll):
+        """Moments with k_R = (C - A)/B and k_Y = (C - B)/A, A = 1."""
+        b = (1 - yaw) / (1 - roll)
+        return jnp.stack([jnp.ones_like(b), b, b + yaw])
+
+    def margin(yaw, roll, index):
+        return st.satellite_stability(moments(yaw, roll), throw=False).margins[index]
+
+    # 1 + 3 R + R Y = 4 sqrt(R Y): a quadratic in sqrt(-Y), for R < 0.
+    for roll in (-0.1, -0.2, -0.3):
+        edge = st.boundary(functools.partial(margin, index=3), -0.999, -1e-3, roll)
+        x = np.roots([-roll, -4 * np.sqrt(-roll), 1 + 3 * roll]).real
+        exact = -(x[(x > 0) & (x < 1)] ** 2)
+        assert exact.size == 1
+        assert float(edge) == pytest.approx(exact[0], abs=1e-10)
+        for side, stable in ((1e-3, roll > edge + 1e-3), (-1e-3, False)):
+            found = st.satellite_stability(moments(edge + side, roll))
+            about = st.linearize(satellite(moments(edge + side, roll)), spin(2))
+            assert (st.REGIONS[found.region] == "DeBra-Delp") == bool(stable)
+            assert (st.STABILITY[about.stability] == "stable") == bool(stable)
+    # Pitch: A = B. Roll and yaw: C = B.
+    edge = st.boundary(
+        lambda b: st.satellite_stability(jnp.stack([1.0, b, 3.0])).margins[0], 0.5, 2.0
+    )
+    assert float(edge) == pytest.approx(1.0, abs=1e-10)
+    edge = st.boundary(
+        lambda c: st.satellite_stability(jnp.stack([1.0, 2.0, c])).margins[1], 1.5, 2.9
+    )
+    assert float(edge) == pytest.approx(2.0, abs=1e-10)
+
+
+def test_satellite_growth_is_that_of_the_integrated_motion():
+    """Jacobian over one orbit against the exponential of the matrix, in the frame of the orbit."""
+    body = satellite([1.6, 1.8, 1.0])
+    about = st.linearize(body, spin(2))
+
+    def after(x):
+        state = jr.State(jr.rotation.exp(x[:3]), jnp.array([0.0, 0.0, 1.0]) + x[3:])
+        adjoint = diffrax.ForwardMode()
+        end = jr.simulate(body, state, 2 * np.pi, rtol=1e-13, adjoint=adjoint).states
+        turn = jr.rotation.log(jr.rotation.multiply(jr.rotation.conjugate(-UP), end.attitude))
+        return jnp.concatenate([turn, end.omega])
+
+    found = jax.jacfwd(after)(jnp.zeros(6))
+    expected = scipy.linalg.expm(2 * np.pi * np.asarray(about.matrix))
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+# linearize
+
+
+def test_what_is_at_rest():
+    top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    hanging = jr.top.initial_state(top, jnp.pi)
+    body = top.as_rigid_body()
+    assert st.STABILITY[st.linearize(body, hanging).stability] == "marginal"  # it may turn slowly
+    up = np.array([0.0, 0.0, 1.0])
+    about = st.linearize(body, hanging, space_axis=up)
+    assert st.STABILITY[about.stability] == "stable"
+    np.testing.assert_allclose(np.max(about.eigenvalues.imag), 1.0, rtol=1e-12)
+    upright = st.linearize(body, jr.top.initial_state(top, 0.0), space_axis=up)
+    np.testing.assert_allclose(upright.growth_rate, 1.0, rtol=1e-12)
+    sphere = st.linearize(jr.RigidBody(jnp.ones(3)), spin(0))
+    assert st.STABILITY[sphere.stability] == "marginal"
+
+
+def test_a_damper_makes_the_largest_axis_attract_and_the_others_repel():
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.3, 0.2))
+    found = [st.linearize(body, spin(axis)) for axis in range(3)]
+    assert [st.STABILITY[x.stability] for x in found] == ["unstable", "unstable", "stable"]
+    # Beside the zeros of its own turning and the turning of L in space all decay.
+    falling = np.sort(np.asarray(found[2].eigenvalues.real))[:5]
+    assert np.all(falling < -1e-3)
+
+
+def test_any_torque_and_any_leaf_with_derivatives():
+    """A torque of a user's; slopes of the growth rate in a parameter, against differences."""
+
+    def pull(t, state, args, k):
+        """Turns body axis 3 away from up."""
+        up = jr.rotation.rotate_inverse(state.attitude, jnp.array([0.0, 0.0, 1.0]))
+        return k * jnp.cross(up, jnp.array([0.0, 0.0, 1.0])) * 1.0
+
+    def growth(k):
+        torque = jr.torques.Torque(functools.partial(pull, k=k))
+        return st.linearize(jr.RigidBody(jnp.array([1.0, 1.4, 0.6]), torque), spin(2, 0.5))
+
+    slope = jax.grad(lambda k: growth(k).growth_rate)(1.0)
+    difference = central_difference(lambda k: growth(k).growth_rate, 1.0, 1.0)
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+    assert float(growth(1.0).growth_rate) > 0.3
+
+
+def test_bad_requests(untyped):
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    with pytest.raises(RuntimeError, match="equilibrium"):
+        st.linearize(body, jr.State(UP, np.array([1.0, 0.1, 0.0])))
+    with pytest.raises(RuntimeError, match="same at all times"):
+        st.linearize(
+            satellite([1.0, 2.0, 2.5], 0.1), jr.State(UP, 0.9**-1.5 * 1.1**0.5 * np.eye(3)[2])
+        )
+    with pytest.raises(RuntimeError, match="finite"):
+        st.linearize(body, spin(0, np.nan))
+    with pytest.raises(ValueError, match="system"):
+        st.linearize(jr.SymmetricTop(1.0, 1.0, 1.0), spin(0))
+    with pytest.raises(ValueError, match="body_rate"):
+        damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
+        st.linearize(damped, spin(0), body_rate=np.ones(3))
+    with pytest.raises(RuntimeError, match="change of sign"):
+        st.boundary(lambda x: x**2 + 1, 0.0, 1.0)
+    lanes = jax.vmap(lambda w: st.linearize(body, jr.State(UP, w), throw=False))
+    found = lanes(jnp.array([[1.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.0, np.nan, 0.0]]))
+    assert list(found.stability) == [2, -1, -1]
+    assert np.isfinite(found.matrix[0]).all()
+    assert np.isnan(found.growth_rate[1:]).all()
+    assert bool((found.result == jr.RESULTS.no_equilibrium)[1])
+    assert bool((found.result == jr.RESULTS.invalid_state)[2])
+
+
+# Eigenvalues where they meet
+
+
+def test_slopes_of_eigenvalues_are_those_of_the_simple_ones(rng):
+    matrix, change = rng.normal(size=(2, 6, 6))
+    values, slopes = jax.jvp(st.eigenvalues, (matrix,), (change,))
+    exact, left, right = scipy.linalg.eig(matrix, left=True)
+    for value, slope in zip(np.asarray(values), np.asarray(slopes), strict=True):
+        i = np.argmin(abs(exact - value))
+        y, x = left[:, i].conj(), right[:, i]
+        np.testing.assert_allclose(slope, y @ change @ x / (y @ x), rtol=1e-11)
+    second = jax.jvp(lambda m: jax.jvp(st.eigenvalues, (m,), (change,))[1], (matrix,), (change,))[1]
+    ahead, behind = (
+        jax.jvp(st.eigenvalues, (matrix + h * change,), (change,))[1] for h in (1e-5, -1e-5)
+    )
+    np.testing.assert_allclose(second, (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_slopes_at_a_collision_are_finite_in_every_order(order):
+    """Roots of mu meet at 0: each gets the slope of their mean, which is smooth."""
+
+    def values(mu):
+        companion = jnp.eye(order, k=1).at[-1, 0].set(mu).at[-1, -1].set(mu)
+        return st.eigenvalues(companion)
+
+    for mu in (0.0, 1e-30):
+        first = jax.jacfwd(values)(mu)
+        np.testing.assert_allclose(first, np.full(order, 1 / order), atol=1e-6)
+        assert np.isfinite(jax.jacfwd(jax.jacfwd(values))(mu)).all()
+        assert np.isfinite(jax.grad(lambda m: jnp.sum(values(m).real))(mu))
+    away = jax.jacfwd(values)(0.3)
+    np.testing.assert_allclose(away, (values(0.3 + 1e-6) - values(0.3 - 1e-6)) / 2e-6, rtol=1e-6)
+
+
+def test_slopes_of_a_top_where_its_eigenvalues_collide():
+    top = jr.SymmetricTop(1.0, 0.5, 1.0)
+
+    def growth(omega3):
+        state = jr.top.initial_state(top, 0.0, omega3=omega3)
+        return st.linearize(top.as_rigid_body(), state).growth_rate
+
+    assert np.isfinite(jax.grad(growth)(4.0))
+    np.testing.assert_allclose(
+        jax.grad(growth)(3.0), central_difference(growth, 3.0, 1.0), rtol=1e-7
+    )
+
+
+# Maps
+
+
+def test_a_map_is_the_function_at_each_point_whatever_the_blocks():
+    def function(a, b, c):
+        return {"product": a * b + c, "vector": jnp.stack([a, b, c])}
+
+    axes = {"a": np.linspace(0, 1, 5), "b": np.arange(7), "c": np.linspace(-1, 2, 3)}
+    grid = np.meshgrid(*axes.values(), indexing="ij")
+    for size in (1, 4, 105, 1000):
+        found = st.stability_map(function, axes, block_size=size)
+        np.testing.assert_array_equal(found.values["vector"], np.stack(grid, axis=-1))
+        np.testing.assert_allclose(found.values["product"], grid[0] * grid[1] + grid[2])
+        assert found.labels == ("a", "b", "c")
+        assert found.valid.all()
+
+
+def test_points_that_are_undefined_are_marked():
+    def root(x, y):
+        return jnp.sqrt(x - y)
+
+    axes = {"x": np.linspace(0, 1, 11), "y": np.linspace(0, 1, 11)}
+    found = st.stability_map(root, axes)
+    assert np.all(found.valid == (axes["x"][:, None] >= axes["y"][None, :]))
+    np.testing.assert_allclose(found.extent, (-0.05, 1.05, -0.05, 1.05))
+
+    def truth(x, y):
+        return st.Marked(x > 0.5, x > y)
+
+    found = st.stability_map(truth, axes)
+    assert found.values.dtype == bool
+    assert np.all(found.valid == (axes["x"][:, None] > axes["y"][None, :]))
+    with pytest.raises(ValueError, match="Marked"):
+        st.stability_map(lambda x, y: x > y, axes)
+    with pytest.raises(ValueError, match="shape"):
+        st.stability_map(root, {"x": np.ones((2, 2)), "y": np.ones(3)})
+    with pytest.raises(ValueError, match="block_size"):
+        st.stability_map(root, axes, block_size=0)
+    with pytest.raises(ValueError, match="extent"):
+        _ = st.stability_map(lambda x: x, {"x": axes["x"]}).extent
+
+
+def test_progress_of_a_map_is_printed(monkeypatch, capsys):
+    from jrigid.stability import _maps
+
+    clock = iter(np.arange(0, 1000, 10.0))
+    monkeypatch.setattr(_maps.time, "monotonic", lambda: next(clock))
+    st.stability_map(lambda x: x, {"x": np.arange(4.0)}, block_size=2, progress=True)
+    assert "4 of 4 points" in capsys.readouterr().out
+
+
+def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
+    """Shape -> moments -> growth rate -> rotor that steadies it -> slope, against differences."""
+
+    def of_box(length):
+        body = jr.solids.box(2.0, jnp.stack([1.0, length, 2.5]))
+        return jnp.diagonal(body.inertia)
+
+    cube = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], float)
+    hull = scipy.spatial.ConvexHull(cube)
+    faces = np.array(
+        [
+            s
+            if np.dot(np.cross(cube[s[1]] - cube[s[0]], cube[s[2]] - cube[s[0]]), e[:3]) > 0
+            else s[::-1]
+            for s, e in zip(hull.simplices, hull.equations, strict=True)
+        ]
+    )
+
+    def of_mesh(length):
+        stretched = jnp.asarray(cube) * jnp.stack([1.0, length, 2.5])[None]
+        return jr.from_mesh(stretched, faces, 2.0).principal_axes().moments
+
+    for shape in (of_box, of_mesh):
+
+        def rotor(length, shape=shape):
+            def square(h, length):
+                moments = shape(length)
+                order = jnp.argsort(moments)
+                return st.growth_rate_squared(moments[order], 1, 1.0, h)
+
+            return st.boundary(square, 0.0, 10.0, length)
+
+        slope = jax.grad(rotor)(1.6)
+        np.testing.assert_allclose(slope, central_difference(rotor, 1.6, 1.0), rtol=1e-6)
+        assert abs(float(slope)) > 0.1
+
+
+def test_orbits_obey_kepler_and_have_his_slopes():
+    for e in (0.0, 0.1, 0.6, 0.97):
+        orbit = jr.torques.KeplerOrbit(2.0, 1.5, e)
+        ts = np.linspace(-30.0, 30.0, 301)
+        position = np.asarray(jax.vmap(orbit)(ts))
+        x, y = position[:, 0] / 1.5 + e, position[:, 1] / 1.5 / np.sqrt(1 - e * e)
+        anomaly = np.unwrap(np.arctan2(y, x))
+        n = np.sqrt(2.0 / 1.5**3)
+        anomaly = anomaly - 2 * np.pi * np.round((anomaly - n * ts)[0] / 2 / np.pi)
+        np.testing.assert_allclose(anomaly - e * np.sin(anomaly), n * ts, atol=1e-12)
+        pull = jax.vmap(jax.jacfwd(jax.jacfwd(orbit)))(ts)
+        r = np.linalg.norm(position, axis=1, keepdims=True)
+        np.testing.assert_allclose(pull, -2.0 * position / r**3, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(orbit.mean_motion, n, rtol=1e-15)
+
+
+def test_float32_is_as_good_as_float32():
+    top = jr.SymmetricTop(np.float32(1.0), np.float32(0.5), np.float32(1.0))
+    found = st.top_stability(top, np.float32(3.0))
+    assert found.growth_rate.dtype == np.float32
+    np.testing.assert_allclose(found.growth_rate, np.sqrt(0.4375), rtol=1e-6)
+    moments = np.array([1.0, 2.0, 3.0], np.float32)
+    state = jr.State(UP.astype(np.float32), np.array([0, 1, 0], np.float32))
+    about = st.linearize(jr.RigidBody(moments), state)
+    assert about.eigenvalues.dtype == np.complex64
+    np.testing.assert_allclose(about.growth_rate, 3**-0.5, rtol=1e-5)
+    slopes = jax.jit(jax.jacfwd(lambda m: st.satellite_stability(m).margins))(moments)
+    assert np.isfinite(slopes).all()
+    assert quick_jit(lambda m: st.satellite_stability(m).growth_rate)(moments).dtype == np.float32
