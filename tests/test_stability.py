@@ -321,8 +321,8 @@ def test_bad_requests(untyped):
         st.linearize(body, spin(0, np.nan))
     with pytest.raises(ValueError, match="system"):
         st.linearize(jr.SymmetricTop(1.0, 1.0, 1.0), spin(0))
+    damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
     with pytest.raises(ValueError, match="body_rate"):
-        damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
         st.linearize(damped, spin(0), body_rate=np.ones(3))
     with pytest.raises(RuntimeError, match="change of sign"):
         st.boundary(lambda x: x**2 + 1, 0.0, 1.0)

@@ -19,7 +19,8 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     Within another jit, vmap or derivative it is the plain one: options are for whole programs.
     """
     plain = eqx.filter_jit(function)
-    quick = eqx.filter_jit(function, compiler_options=_OPTIONS)
+    options: dict[str, Any] = {"compiler_options": _OPTIONS}
+    quick = eqx.filter_jit(function, **options)
     known = True
 
     @wraps(function)

@@ -363,7 +363,7 @@ def unknowns_of(
     return Unknowns(
         arrays,
         functions,
-        "tensor" if ten is not None else shape,
+        shape if isinstance(shape, str) else "tensor",
         ten is None and scale != "trace" and shape != "fixed",
         _free_leaves(system, free),
         tuple(priors),

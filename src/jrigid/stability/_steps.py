@@ -32,6 +32,7 @@ class Walk(NamedTuple):
 
     advance: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
     to_state: Callable[[Array], State]
+    on_sphere: Callable[[Array], Array]
     field: Callable[[Array, Array], Array]
     start: Array
     t0: Array
@@ -115,15 +116,18 @@ def walk(
     def to_state(y: Array) -> State:
         return unravel(y * scales, state0)
 
+    def on_sphere(y: Array) -> Array:
+        return jnp.concatenate([normalize(y[:4] * scales[:4]) / scales[:4], y[4:]])
+
     def rates(t: Array, y: Array) -> Array:
         return ravel(system.vector_field(t, to_state(y), args)) / scales
 
     def beside(y: Array, tangent: Array) -> Array:
         """A tangent as a change of the state's components."""
         turned = attitude_rate(to_state(y).attitude, tangent[:3])
-        return jnp.concatenate([turned, tangent[3:]])
+        return jnp.concatenate([turned / scales[:4], tangent[3:]])
 
-    def together(t: Array, both: Array, _: Any) -> Array:
+    def together(t: Any, both: Any, _: Any) -> Array:
         y = both[:size]
         tangents = both[size:].reshape(-1, dimension)
         spin, unit = to_state(y).omega, scales[4]
@@ -145,25 +149,24 @@ def walk(
         after, error, _, _, _ = solver.step(
             term, t, t + step, both, None, solver_state, made_jump=False
         )
-        y = after[:size]
-        y = jnp.concatenate([normalize(y[:4]), y[4:]])
+        y = on_sphere(after[:size])
         return y, after[size:].reshape(tangents.shape), jnp.max(jnp.abs(error[:size]))
 
     start = ravel(state0) / scales
-    return Walk(advance, to_state, rates, start, t0, step, dimension, findings)
+    return Walk(advance, to_state, on_sphere, rates, start, t0, step, dimension, findings)
 
 
 def verdict(findings: Findings, error: Array, found: Any) -> tuple[Any, Array, Any]:
     """The result code: of the input, then of a motion that left the numbers or its accuracy."""
     worst = _LARGEST_ERROR[error.dtype.itemsize]
-    finite = all_finite(found)
-    findings.require(finite | ~findings.ok, RESULTS.nonfinite_state)
+    ok = findings.ok
     findings.require(
-        (error <= worst) | ~findings.ok,
+        (error <= worst) | ~ok,
         RESULTS.inaccurate,
         f"Argument `steps` must be large enough for a local error below {worst:g} a step, but it "
         "is not.",
     )
+    findings.require(all_finite(found) | ~ok, RESULTS.nonfinite_state)
     return findings.result, findings.ok, found
 
 

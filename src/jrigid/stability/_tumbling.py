@@ -16,7 +16,6 @@ from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
-from jrigid.rotation import normalize
 from jrigid.stability._steps import checked_body, solver_of, verdict, walk, whole_number
 from jrigid.systems import RigidBody
 
@@ -115,8 +114,9 @@ def _section(
     path = walk(system, state0, step, 1, args, t0, solver)
     dtype = path.start.dtype
     step, ok = path.step, path.findings.ok
-    term = diffrax.ODETerm(lambda t, y, _: path.field(t, y))
-    eps = jnp.finfo(dtype).eps
+    field: Any = path.field
+    term = diffrax.ODETerm(lambda t, y, _: field(t, y))
+    eps = float(jnp.finfo(dtype).eps)
 
     def of(t: Array, y: Array) -> Array:
         found = jnp.asarray(condition(t, path.to_state(y)), dtype)
@@ -146,7 +146,7 @@ def _section(
         assert solution.ts is not None
         assert solution.ys is not None
         at, there = solution.ts[-1], solution.ys[-1]
-        there = jnp.where(alive, jnp.concatenate([normalize(there[:4]), there[4:]]), path.start)
+        there = jnp.where(alive, path.on_sphere(there), path.start)
         at = jnp.where(alive, at, begun)
         rises = of(at + 1e-3 * step, there + 1e-3 * step * path.field(at, there)) > of(at, there)
         side = jnp.where(rises, 1.0, -1.0).astype(dtype)
@@ -178,11 +178,11 @@ def flip_time(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) ->
 
     Gradients: those of `jrigid.free.polhode_period`.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; near the separatrix it grows like
-    the logarithm of 4 over the offset, over `growth_rate`.
+    twice the logarithm of one over the offset, over `growth_rate`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.stability.flip_time([1.0, 2.0, 3.0], [1e-3, 1.0, 0.0]).round(4))
-    27.6637
+    28.7314
     """
     return 0.5 * polhode_period(inertia, omega, throw=throw)
 

@@ -1,0 +1,391 @@
+"""Order and chaos: exponents, the indicator, sections, flips, and where a damped body ends."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import MOMENTS, quick_jit
+from scipy.integrate import solve_ivp
+
+import jrigid as jr
+from jrigid import stability as st
+
+UP = np.array([1.0, 0.0, 0.0, 0.0])
+DOWN = np.array([0.0, 0.0, -1.0])
+TURN = 2 * np.pi
+# A heavy top without symmetry, and a state from which it is chaotic.
+HEAVY = (np.array([1.0, 1.5, 0.7]), np.array([0.3, 0.1, 0.5]))
+TILTED, SPINNING = np.array([1.2, 0.0, 0.0]), np.array([0.3, 0.2, 0.8])
+
+
+def heavy(moments, lever):
+    return jr.RigidBody(moments, jr.torques.UniformGravity(1.0, lever, DOWN))
+
+
+def kovalevskaya():
+    return heavy(np.array([2.0, 2.0, 1.0]), np.array([0.5, 0.0, 0.0]))
+
+
+def state(turn, omega):
+    return jr.State(jr.rotation.exp(jnp.asarray(turn)), jnp.asarray(omega))
+
+
+def hyperion(eccentricity=0.1):
+    """Moments of (B - A)/C = 0.26, axis 3 along the normal of the orbit, n = 1."""
+    moments = jnp.array([0.7, 0.96, 1.0])
+    orbit = jr.torques.KeplerOrbit(1.0, 1.0, eccentricity)
+    return jr.RigidBody(moments, jr.torques.GravityGradient(moments, 1.0, orbit))
+
+
+@pytest.fixture(scope="module")
+def spectrum_of_heavy():
+    """Mean exponents of 64 motions of one energy and one momentum about the vertical, to T."""
+    rng = np.random.default_rng(3)
+    turns = 1e-6 * rng.normal(size=(64, 3))
+    body = heavy(*HEAVY)
+
+    @jax.jit
+    @jax.vmap
+    def lane(turn):
+        q = jr.rotation.multiply(jr.rotation.exp(turn), jr.rotation.exp(jnp.asarray(TILTED)))
+        start = jr.State(q, jnp.asarray(SPINNING))
+        return st.lyapunov_spectrum(body, start, 1200.0, 9600, throw=False)
+
+    return turns, lane(turns)
+
+
+# Tangents
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
+    """Over a short time a small motion's growth is the difference of two motions, to first order.
+
+    The rate is between 1/2 and 1, where its scale is 1.
+    """
+    torque = jr.torques.UniformGravity(1.0, HEAVY[1], 0.3 * DOWN)
+    if damped:
+        torque = torque + jr.torques.InternalDamper(0.3, 0.2)
+    body = jr.RigidBody(HEAVY[0], torque)
+    start = state(TILTED, [0.3, 0.2, 0.6])
+    size = 9 if damped else 6
+    vectors = rng.normal(size=(3, size)) + 2 * np.eye(3, size)
+    found = st.lyapunov_spectrum(body, start, 4.0, 60, vectors=vectors, every=60, samples=1)
+
+    def after(x):
+        q = jr.rotation.multiply(start.attitude, jr.rotation.exp(x[:3]))
+        internal = start.omega + x[6:] if damped else ()
+        moved = jr.State(q, start.omega + x[3:6], internal)
+        return jr.simulate(body, moved, 4.0, rtol=1e-12).states
+
+    reference, h = after(jnp.zeros(size)), 1e-5
+    rows = np.linalg.qr(vectors.T)[0].T
+    columns = []
+    for row in rows:
+        ends = []
+        for sign in (1, -1):
+            end = after(sign * h * jnp.asarray(row))
+            turn = jr.rotation.multiply(jr.rotation.conjugate(reference.attitude), end.attitude)
+            parts = [jr.rotation.log(turn), end.omega - reference.omega]
+            if damped:
+                parts.append(end.internal - reference.internal)
+            ends.append(np.concatenate(parts))
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    lengths = np.abs(np.diagonal(np.linalg.qr(np.array(columns).T)[1]))
+    np.testing.assert_allclose(np.exp(4.0 * np.asarray(found.exponents)), lengths, rtol=1e-7)
+    np.testing.assert_allclose(found.final_state.omega, reference.omega, atol=1e-9)
+
+
+# Order
+
+
+@pytest.mark.parametrize(
+    ("body", "start"),
+    [
+        (jr.RigidBody(MOMENTS), state([0.3, 0.2, 0.1], [0.5, 0.3, 0.8])),
+        (jr.RigidBody(MOMENTS), state([0.3, 0.2, 0.1], [0.02, 1.0, 0.01])),
+        (jr.SymmetricTop(1.0, 0.6, 1.0).as_rigid_body(), state([0.9, 0.0, 0.0], [0.1, 0.4, 3.0])),
+        (kovalevskaya(), state([0.9, 0.4, 0.0], [0.3, 0.5, 0.9])),
+    ],
+    ids=["free", "near the separatrix", "Lagrange", "Kovalevskaya"],
+)
+def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_over_t(body, start):
+    times = np.array([250.0, 1000.0, 4000.0])
+    found = st.lyapunov_spectrum(body, start, times[-1], 32_000, samples=16)
+    largest = np.asarray(found.history)[:, 0][[0, 3, 15]]
+    # A small motion grows in proportion to the time: its logarithm over the time.
+    np.testing.assert_array_less(np.abs(largest), 2.5 * np.log(times) / times)
+    assert largest[2] < 0.6 * largest[0]
+    assert np.abs(np.sum(found.exponents)) < 1e-6
+    np.testing.assert_allclose(found.exponents, -found.exponents[::-1], atol=5 / times[-1])
+    indicator = st.megno(body, start, times[-1], 32_000)
+    assert st.ORDER[indicator.order] == "regular"
+    assert 1.5 < float(indicator.megno) < 2.2
+
+
+def test_exponents_without_damping_pair_to_zero(spectrum_of_heavy):
+    _, found = spectrum_of_heavy
+    mean = np.asarray(found.exponents).mean(axis=0)
+    assert mean[0] > 0.15
+    np.testing.assert_allclose(mean, -mean[::-1], atol=0.003)
+    # Energy and the momentum about the vertical are constant: four exponents are zero.
+    np.testing.assert_array_less(np.abs(mean[1:5]), 2.5 * np.log(1200.0) / 1200.0)
+    np.testing.assert_allclose(np.asarray(found.exponents).sum(axis=1), 0, atol=1e-6)
+
+
+def euler_poisson(y, moments, lever):
+    """Rates of (omega, up in the body), many lanes: another way to write the heavy top."""
+    w, up = y[:, :3], y[:, 3:]
+    momentum = w * moments
+    pull = np.cross(lever[None], -up)
+    return np.concatenate([(np.cross(momentum, w) + pull) / moments, np.cross(up, w)], axis=1)
+
+
+def test_exponent_of_an_asymmetric_top_by_two_trajectories(spectrum_of_heavy):
+    """Neighbours 1e-8 apart, drawn together again and again, by Runge-Kutta in numpy: to 2 %."""
+    turns, found = spectrum_of_heavy
+    moments, lever = HEAVY
+    q = jax.vmap(
+        lambda t: jr.rotation.multiply(jr.rotation.exp(t), jr.rotation.exp(jnp.asarray(TILTED)))
+    )(turns)
+    up = np.asarray(jax.vmap(lambda q: jr.rotation.rotate_inverse(q, jnp.array([0.0, 0, 1])))(q))
+    y = np.concatenate([np.broadcast_to(SPINNING, up.shape), up], axis=1)
+    near = y + 1e-8 * np.random.default_rng(0).normal(size=y.shape)
+    y, step, total = np.concatenate([y, near]), 0.03, np.zeros(64)
+    steps = int(1200 / step)
+    for i in range(steps):
+        a = euler_poisson(y, moments, lever)
+        b = euler_poisson(y + 0.5 * step * a, moments, lever)
+        c = euler_poisson(y + 0.5 * step * b, moments, lever)
+        d = euler_poisson(y + step * c, moments, lever)
+        y = y + step / 6 * (a + 2 * b + 2 * c + d)
+        if i % 50 == 49:
+            apart = y[64:] - y[:64]
+            distance = np.linalg.norm(apart, axis=1)
+            if i > 500:  # once they lie along the fastest direction
+                total += np.log(distance / 1e-8)
+            y[64:] = y[:64] + 1e-8 * apart / distance[:, None]
+    theirs = total / (step * (steps - 500))
+    ours = np.asarray(found.exponents)[:, 0]
+    assert theirs.mean() == pytest.approx(ours.mean(), rel=0.02)
+
+
+# Hyperion
+
+
+@pytest.fixture(scope="module")
+def planar():
+    """Exponents and indicator of the motion in the plane of the orbit, from the pericentre."""
+    body = hyperion()
+    plane = np.array([[0, 0, 1.0, 0, 0, 0], [0, 0, 0, 0, 0, 1.0]])
+    orbits, steps = 1000, 50_000
+
+    @jax.jit
+    @jax.vmap
+    def lane(angle, rate):
+        axis = jnp.array([0.0, 0.0, 1.0])
+        start = jr.State(jr.rotation.exp(axis * angle), axis * rate)
+        spectrum = st.lyapunov_spectrum(body, start, TURN * orbits, steps, vectors=plane)
+        indicator = st.megno(body, start, TURN * orbits, steps, vector=plane[0] + plane[1])
+        return spectrum, indicator
+
+    return lane
+
+
+def test_hyperion_is_chaotic_where_it_is_said_to_be(planar):
+    """Wisdom, Peale & Mignard (1984): a large chaotic zone, e-folding in one to two orbits."""
+    angles = np.array([0.0, np.pi / 2, 0.0, np.pi / 2])
+    rates = np.array([1.3, 1.5, 1.8, 1.0])
+    spectrum, indicator = planar(angles, rates)
+    exponents = np.asarray(spectrum.exponents)
+    assert np.all((exponents[:, 0] > 0.09) & (exponents[:, 0] < 0.14))
+    folding = 1 / exponents[:, 0] / TURN
+    assert np.all((folding > 1) & (folding < 2))
+    assert 0.105 < exponents[:, 0].mean() < 0.13
+    np.testing.assert_allclose(exponents.sum(axis=1), 0, atol=1e-7)
+    assert {st.ORDER[i] for i in indicator.order} == {"chaotic"}
+    np.testing.assert_allclose(indicator.exponent, exponents[:, 0], rtol=0.15)
+    # It stays in the plane to the last bit, as the planar equation does.
+    assert np.all(np.asarray(spectrum.final_state.omega)[:, :2] == 0)
+
+
+def test_regular_islands_of_hyperion_are_regular(planar):
+    angles, rates = np.array([np.pi / 2, 0.0, np.pi / 2, 0.3]), np.array([0.5, 0.5, 2.3, 2.9])
+    spectrum, indicator = planar(angles, rates)
+    assert np.all(np.asarray(spectrum.exponents)[:, 0] < 0.003)
+    assert {st.ORDER[i] for i in indicator.order} == {"regular"}
+
+
+def test_planar_hyperion_is_the_pendulum_on_an_ellipse():
+    """theta'' = -(3/2) (B - A)/C (a/r)^3 sin 2(theta - f), by scipy."""
+
+    def field(t, y):
+        mean = np.remainder(t + np.pi, TURN) - np.pi
+        anomaly = mean
+        for _ in range(50):
+            anomaly -= (anomaly - 0.1 * np.sin(anomaly) - mean) / (1 - 0.1 * np.cos(anomaly))
+        r = 1 - 0.1 * np.cos(anomaly)
+        f = np.arctan2(np.sqrt(0.99) * np.sin(anomaly), np.cos(anomaly) - 0.1)
+        return [y[1], -1.5 * 0.26 / r**3 * np.sin(2 * (y[0] - f))]
+
+    theirs = solve_ivp(field, (0, 30.0), [0.4, 1.2], rtol=1e-11, atol=1e-12).y[:, -1]
+    ours = st.megno(hyperion(), state([0, 0, 0.4], [0, 0, 1.2]), 30.0, 600).final_state
+    assert float(ours.omega[2]) == pytest.approx(theirs[1], abs=1e-8)
+    turned = 2 * np.arctan2(ours.attitude[3], ours.attitude[0])
+    assert np.abs(np.exp(1j * (float(turned) - theirs[0])) - 1) < 1e-8
+
+
+def test_hyperion_out_of_its_plane_tumbles_in_three_dimensions():
+    """Two exponents of about 0.1 n and a spectrum that pairs (Wisdom, Peale & Mignard, fig. 8)."""
+    start = state([0.01, 0.02, 0.3], [0.02, 0.01, 1.3])
+    found = quick_jit(
+        lambda s: st.lyapunov_spectrum(hyperion(), s, TURN * 600, 36_000, throw=False)
+    )(start)
+    exponents = np.asarray(found.exponents)
+    assert 0.06 < exponents[0] < 0.16
+    np.testing.assert_allclose(exponents, -exponents[::-1], atol=0.006)
+
+
+# Sections, flips, final states
+
+
+def test_crossings_are_those_of_scipy_and_keep_the_energy():
+    body, start = heavy(*HEAVY), state(TILTED, SPINNING)
+    found = st.poincare_section(body, start, lambda _, s: s.omega[0], 12, 0.1)
+    assert found.valid.all()
+    energy = jax.vmap(lambda s: body.energy(0.0, s, None))(found.states)
+    np.testing.assert_allclose(energy, body.energy(0.0, start, None), rtol=1e-8)
+    assert np.abs(found.states.omega[:, 0]).max() < 1e-8
+    up = np.asarray(jr.rotation.rotate_inverse(start.attitude, jnp.array([0.0, 0.0, 1.0])))
+
+    def rises(_, y):
+        return y[0]
+
+    rises.direction = 1
+    y0 = np.concatenate([SPINNING, up])
+    theirs = solve_ivp(
+        lambda _, y: euler_poisson(y[None], *HEAVY)[0], (0, float(found.ts[-1]) + 0.1), y0,
+        method="DOP853", rtol=1e-12, atol=1e-13, events=rises,
+    ).t_events[0]  # fmt: skip
+    np.testing.assert_allclose(found.ts[:7], theirs[:7], atol=1e-6)  # later they part: chaos
+
+
+def test_crossings_in_either_direction_and_those_there_are_not():
+    body, start = jr.RigidBody(MOMENTS), state([0.0, 0.0, 0.0], [0.5, 0.3, 0.8])
+    period = float(jr.free.polhode_period(MOMENTS, start.omega))
+    first = lambda _, s: s.omega[0]  # noqa: E731
+    up = st.poincare_section(body, start, first, 4, 0.1)
+    down = st.poincare_section(body, start, first, 4, 0.1, direction=False)
+    both = st.poincare_section(body, start, first, 8, 0.1, direction=None)
+    np.testing.assert_allclose(np.diff(up.ts), period, rtol=1e-8)
+    np.testing.assert_allclose(np.sort(np.concatenate([up.ts, down.ts])), both.ts, atol=1e-8)
+    none = st.poincare_section(body, start, lambda _, s: s.omega[0] - 9, 3, 0.1, steps=50)
+    assert not none.valid.any()
+    assert np.isnan(none.ts).all()
+
+
+@pytest.mark.parametrize("offset", [1e-1, 1e-4])
+def test_flip_time_is_that_between_events(offset):
+    omega = np.array([offset, 1.0, 0.0])
+    closed = float(st.flip_time(MOMENTS, omega))
+    body = jr.RigidBody(MOMENTS)
+    found = st.poincare_section(
+        body, jr.State(UP, omega), lambda _, s: s.omega[1], 3, 0.1, direction=None
+    )
+    np.testing.assert_allclose(np.diff(found.ts), closed, rtol=1e-7)
+    # Near the separatrix: log(4 over the offset in its own measure), twice over the growth rate.
+    rate = float(st.growth_rate(MOMENTS, 1, 1.0))
+    slow = st.flip_time(MOMENTS, np.array([offset**2, 1.0, 0.0])) - closed
+    assert float(slow) == pytest.approx(-2 * np.log(offset) / rate, rel=0.02)
+
+
+def test_damped_bodies_end_about_the_largest_axis_on_either_side():
+    damper = jr.torques.InternalDamper(0.3, 0.2)
+    body = jr.RigidBody(MOMENTS, damper)
+    angles = np.linspace(0.05, 0.6, 48)
+
+    @jax.jit
+    @jax.vmap
+    def lane(angle):
+        omega = jnp.stack([jnp.cos(angle), 0.3 * jnp.sin(angle), jnp.sin(angle)])
+        start = jr.State(jnp.asarray(UP), omega)
+        return start, st.final_spin(body, start, 600.0, 3000, throw=False)
+
+    starts, found = lane(angles)
+    sides = np.array(st.SIDES)[found.side]
+    assert set(sides) == {"along", "against"}
+    assert np.count_nonzero(sides[1:] != sides[:-1]) >= 4
+    np.testing.assert_allclose(np.abs(found.alignment), 1, atol=1e-6)
+    start = jax.tree.map(lambda x: x[7], starts)
+    motion = jr.simulate(body, start, np.linspace(0, 600, 61), rtol=1e-10)
+    assert np.all(np.diff(motion.energy) < 1e-12)
+    assert np.all(np.diff(motion.energy)[:8] < -1e-3)
+    momentum = np.asarray(motion.angular_momentum)
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (61, 3)), atol=1e-7)
+    assert np.sign(motion.states.omega[-1, 2]) == np.sign(found.alignment[7])
+    undamped = st.final_spin(jr.RigidBody(MOMENTS), start, 100.0, 600)
+    assert st.SIDES[undamped.side] == "not settled"
+
+
+# What is asked
+
+
+def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
+    body, start = jr.RigidBody(MOMENTS), state([0.0, 0.0, 0.0], [0.5, 0.3, 0.8])
+    with pytest.raises(RuntimeError, match="steps"):
+        st.megno(body, start, 1000.0, 300)
+    with pytest.raises(RuntimeError, match="duration"):
+        st.megno(body, start, -1.0, 300)
+    with pytest.raises(RuntimeError, match="finite"):
+        st.lyapunov_spectrum(body, state([0.0, 0, 0], [np.nan, 0, 0]), 10.0, 300)
+    for options, message in (
+        ({"steps": 0}, "steps"),
+        ({"steps": 2.5}, "steps"),
+        ({"steps": 100, "every": 0}, "every"),
+        ({"steps": 100, "samples": 0}, "samples"),
+        ({"steps": 100, "count": 7}, "count"),
+        ({"steps": 100, "vectors": np.ones((2, 5))}, "vectors"),
+        ({"steps": 100, "solver": "rk4"}, "solver"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            st.lyapunov_spectrum(body, start, 10.0, **options)
+    with pytest.raises(ValueError, match="system"):
+        st.megno(jr.SymmetricTop(1.0, 1.0, 1.0), start, 10.0, 100)
+    with pytest.raises(ValueError, match="state0"):
+        st.final_spin(body, UP, 10.0, 100)
+    with pytest.raises(ValueError, match="direction"):
+        st.poincare_section(body, start, lambda _, s: s.omega[0], 3, 0.1, direction="up")
+
+    def lane(omega):
+        return st.megno(body, jr.State(jnp.asarray(UP), omega), 100.0, 200, throw=False)
+
+    found = jax.vmap(lane)(jnp.array([[0.5, 0.3, 0.8], [np.nan, 0, 0], [50.0, 30.0, 80.0]]))
+    assert list(found.order) == [0, -1, -1]
+    assert bool((found.result == jr.RESULTS.invalid_state)[1])
+    assert bool((found.result == jr.RESULTS.inaccurate)[2])
+    assert np.isnan(found.history[1:]).all()
+    assert np.isfinite(found.history[0]).all()
+
+
+def test_a_map_of_order_and_chaos_marks_what_fails():
+    """A 4 x 4 map of the heavy top: indicator where it could be followed, marked where not."""
+
+    def point(tilt, spin):
+        start = jr.State(
+            jr.rotation.exp(tilt * jnp.array([1.0, 0, 0])), spin * jnp.array([0, 0, 1.0])
+        )
+        return st.megno(heavy(*HEAVY), start, 200.0, 1000, throw=False).megno
+
+    axes = {"tilt": np.linspace(0.2, 2.8, 4), "spin": np.array([0.5, 1.0, 2.0, 200.0])}
+    found = st.stability_map(point, axes, block_size=8)
+    assert found.valid[:, :3].all()
+    assert not found.valid[:, 3].any()
+    assert (found.values[:, :3] > 5).any()
+
+
+def test_float32_follows_the_motion_as_far_as_it_can():
+    body = jr.RigidBody(MOMENTS.astype(np.float32))
+    start = jr.State(UP.astype(np.float32), np.array([0.5, 0.3, 0.8], np.float32))
+    found = st.megno(body, start, 300.0, 1500)
+    assert found.megno.dtype == np.float32
+    assert st.ORDER[found.order] == "regular"
