@@ -15,6 +15,8 @@ directions, which is what it offers); scipy's DOP853. From them only the growth 
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from typing import Any
 
 import common
 import jax
@@ -68,7 +70,9 @@ def linear():
         start = time.perf_counter()
         case()
         first[name] = (time.perf_counter() - start) * 1e3
-    cases = {name: lambda c=c: c().valid.size for name, c in maps.items()}
+    cases: dict[str, Callable[[], Any]] = {
+        name: lambda c=c: c().valid.size for name, c in maps.items()
+    }
     cases["numpy, growth rate squared"] = lambda: by_numpy(*axes.values()).size
     for name, (least, median, _) in common.timed(cases, repeats=5).items():
         compile_ms = first[name] - median if name in first else None
@@ -81,15 +85,15 @@ def linear():
 def peak_memory(side, block):
     """Peak of the resident memory of a process that makes one map [MiB]."""
     code = (
-        "import resource, sys; sys.path.insert(0, 'benchmarks');"
+        "import sys; sys.path.insert(0, 'benchmarks');"
         "import numpy as np, bench_stability as b, jrigid as jr;"
         f"x = np.linspace(0.3, 3.0, {side});"
         "jr.stability.stability_map(b.satellite, {'roll': x / 4, 'yaw': -x / 4},"
         f" block_size={block});"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+        "print([x for x in open('/proc/self/status') if 'VmHWM' in x][0].split()[1])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return float(done.stdout)
+    return float(done.stdout) / 1024
 
 
 def point(tilt, spin):
@@ -127,7 +131,7 @@ def starts():
 
 
 def by_var_ode_sys(some):
-    """heyoka's own variational equations, all six directions, on some of the motions."""
+    """With the variational equations of heyoka itself, all six directions, on some motions."""
     import heyoka as hy  # pyright: ignore[reportMissingImports]
 
     variables = hy.make_vars(*(f"x{i}" for i in range(6)))

@@ -25,6 +25,7 @@ from jrigid import (
     lagrangian,
     rotation,
     solvers,
+    stability,
     systems,
     top,
     torques,
@@ -43,12 +44,17 @@ MODULES = {
     "top": top,
     "solvers": solvers,
     "identify": identify,
+    "stability": stability,
 }
 # Abstract classes, aliases and records: nothing to call.
 NOTHING_TO_CALL = {
     "torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem",
     "identify.AbstractObservation", "identify.AngularMomenta", "identify.Attitudes",
     "identify.Directions", "identify.Observed", "identify.Rates", "identify.FitResult",
+    "identify.LogCholesky", "stability.Linearization", "stability.Modes",
+    "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
+    "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
+    "stability.Marked", "stability.StabilityMap",
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
@@ -61,6 +67,9 @@ OF_RECORDS = {
     "identify.fit", "identify.Status", "identify.Bound", "identify.cramer_rao",
     "identify.fisher_information", "identify.identifiability", "identify.profile",
     "identify.residuals", "identify.block_bootstrap", "identify.coloured_covariance",
+    # Long motions and grids: tests/test_stability*.py.
+    "stability.lyapunov_spectrum", "stability.megno", "stability.poincare_section",
+    "stability.final_spin", "stability.stability_map",
 }  # fmt: skip
 CODE_METHOD = "check"
 
@@ -97,6 +106,11 @@ TORQUE_METHODS = (
 def number(x):
     """What the functions written here, not the package's, do with integers."""
     return float_arrays(x)[0]
+
+
+def parts(tree):
+    """Real and imaginary parts, as numbers of the real dtype."""
+    return jax.tree.map(lambda x: [x.real, x.imag] if jnp.iscomplexobj(x) else x, tree)
 
 
 def symmetric(tensor):
@@ -339,6 +353,14 @@ CASES = {
         (TENSOR, 4.0, VECTOR, 0.5, ATTITUDE, OMEGA),
         methods("torques.GravityGradient", "__call__", "potential"),
     ),
+    "torques.KeplerOrbit": Case(
+        lambda mu, a, e, t: [
+            torques.KeplerOrbit(mu, a, number(e) / 8)(t),
+            torques.KeplerOrbit(mu, a, e).mean_motion,
+        ],
+        (2.0, 1.5, 1.0, 0.7),
+        methods("torques.KeplerOrbit", "__call__", "mean_motion"),
+    ),
     "torques.LinearDrag": Case(
         of_external(torques.LinearDrag),
         (TENSOR, 0.5, ATTITUDE, OMEGA),
@@ -476,6 +498,49 @@ CASES = {
             *methods("systems.FloatingBody", "momentum", "inertia"),
             *("systems.Force", "systems.Force.__call__"),
         ),
+    ),
+    # stability
+    "stability.growth_rate": Case(
+        lambda i, w, h: stability.growth_rate(i, 1, w, h), (MOMENTS, 1.3, 0.2)
+    ),
+    "stability.frequency": Case(
+        lambda i, w, h: stability.frequency(i, 0, w, h), (MOMENTS, 1.3, 0.2)
+    ),
+    "stability.modes": Case(
+        lambda i, w: parts(stability.modes(i, 2, w)), (MOMENTS * np.array([1.0, 1.3, 1.0]), 1.3)
+    ),
+    "stability.flip_time": Case(stability.flip_time, (MOMENTS, OMEGA)),
+    "stability.eigenvalues": Case(
+        lambda m: parts(stability.eigenvalues(number(m))), (MATRIX + np.diag([1.0, 3.0, -2.0]),)
+    ),
+    "stability.linearize": Case(
+        lambda i, w: parts(
+            stability.linearize(
+                jr.RigidBody(i),
+                jr.State(
+                    jnp.array([1, 0, 0, 0], number(w).dtype),
+                    number(w) * jnp.array([0, 1, 0], number(w).dtype),
+                ),
+            ).matrix
+        ),
+        (MOMENTS, 1.3),
+    ),
+    "stability.boundary": Case(
+        lambda a, b: stability.boundary(lambda x, c: x**3 - number(c), 0.0, b, a), (2.0, 3.0)
+    ),
+    "stability.top_stability": Case(
+        lambda a, c, m, w: list(stability.top_stability(jr.SymmetricTop(a, c, m), w)[:3]),
+        (1.2, 0.7, 1.5, 3.0),
+    ),
+    "stability.precession_stability": Case(
+        lambda a, c, m, tilt, w: list(
+            stability.precession_stability(jr.SymmetricTop(a, c, m), tilt, w)[:2]
+        ),
+        (1.2, 0.7, 1.5, 1.0, 6.0),
+    ),
+    "stability.satellite_stability": Case(
+        lambda i, n: parts(stability.satellite_stability(i, n)[:4]),
+        (np.array([1.0, 2.0, 2.5]), 1.1),
     ),
 }
 

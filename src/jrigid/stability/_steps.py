@@ -132,12 +132,18 @@ def walk(
         tangents = both[size:].reshape(-1, dimension)
         spin, unit = to_state(y).omega, scales[4]
 
-        def of(tangent: Array) -> Array:
-            _, change = jax.jvp(lambda y: rates(t, y), (y,), (beside(y, tangent),))
-            turn = unit * tangent[3:6] - jnp.cross(spin, tangent[:3])
-            return jnp.concatenate([turn, change[4:]])
+        if not tangents.size:
+            return rates(t, y)
 
-        return jnp.concatenate([rates(t, y), jax.vmap(of)(tangents).reshape(-1)])
+        def of(tangent: Array) -> tuple[Array, Array]:
+            now, change = jax.jvp(lambda y: rates(t, y), (y,), (beside(y, tangent),))
+            turn = unit * tangent[3:6] - jnp.cross(spin, tangent[:3])
+            return now, jnp.concatenate([turn, change[4:]])
+
+        if len(tangents) == 1:
+            return jnp.concatenate(of(tangents[0]))
+        now, changes = jax.vmap(of, out_axes=(None, 0))(tangents)
+        return jnp.concatenate([now, changes.reshape(-1)])
 
     term = diffrax.ODETerm(together)
     step = duration / steps
