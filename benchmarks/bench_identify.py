@@ -2,7 +2,7 @@
 
 Each record is rates along the axes of a sensor turned at random from the principal axes, one radian
 a second, the noise a fraction of that; a turn is 2 pi seconds. The grid: five bodies, 1, 10 and
-100 turns, 5, 20 and 50 samples a turn, noise of 0.1, 1 and 5 %, 60 records in each cell, fitted
+100 turns, 5, 20 and 50 samples a turn, noise of 0.1, 1 and 5 %, 100 records in each cell, fitted
 blind (`fit` is given a sphere and no state). The bound is Cramer and Rao's at the truth; errors are
 of the tensor's five numbers at unit mean moment; cells whose bound exceeds 0.3 of a ratio are
 counted apart. Normalised error squared is chi-square over 5, by the covariance each fit reports.
@@ -30,7 +30,7 @@ BODIES = {
     "slender rod": ((0.05, 1.0, 1.02), (1.0, 0.3, 0.3)),
     "near separatrix": ((1.0, 1.7, 2.3), (0.02, 1.0, 0.01)),
 }
-TURNS, A_TURN, NOISE, TRIALS = (1, 10, 100), (5, 20, 50), (0.001, 0.01, 0.05), 60
+TURNS, A_TURN, NOISE, TRIALS = (1, 10, 100), (5, 20, 50), (0.001, 0.01, 0.05), 100
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 SPHERE = jr.RigidBody(np.ones(3))
 FIVE = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
