@@ -284,6 +284,20 @@ def test_crossings_in_either_direction_and_those_there_are_not():
     assert np.isnan(none.ts).all()
 
 
+@pytest.mark.parametrize("unit", [1e-7, 1e4])
+def test_nothing_depends_on_the_unit_of_time(unit):
+    body, omega = jr.RigidBody(MOMENTS), unit * np.array([0.5, 0.3, 0.8])
+    start = jr.State(UP, omega)
+    found = st.poincare_section(body, start, lambda _, s: s.omega[0] / unit, 4, 0.1 / unit)
+    period = float(jr.free.polhode_period(MOMENTS, omega))
+    np.testing.assert_allclose(np.diff(found.ts), period, rtol=1e-10)
+    indicator = st.megno(body, start, 1000.0 / unit, 5000)
+    assert st.ORDER[indicator.order] == "regular"
+    about = st.linearize(body, jr.State(UP, unit * np.eye(3)[1]))
+    assert st.STABILITY[about.stability] == "unstable"
+    np.testing.assert_allclose(about.growth_rate, unit / 3**0.5, rtol=1e-12)
+
+
 @pytest.mark.parametrize("offset", [1e-1, 1e-4])
 def test_flip_time_is_that_between_events(offset):
     omega = np.array([offset, 1.0, 0.0])

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool
 
 from jrigid._checks import check_shape, float_arrays
 from jrigid._types import Scalar, ScalarLike
+from jrigid.stability._roots import PlaceOfRoot
 
 
 class Marked(NamedTuple):
@@ -231,9 +232,8 @@ def boundary(
         found = jnp.asarray(function(lower + width * x, *args), lower.dtype)
         return jnp.where(ok, found, x - 0.5)
 
-    # The slope at the end is that of the function alone, so that it does not matter how it ended.
     tolerance = 64 * eps if rtol is None else rtol
-    solver = optx.Bisection(rtol=0.0, atol=tolerance, expand_if_necessary=False)
+    solver = PlaceOfRoot(rtol=0.0, atol=tolerance, expand_if_necessary=False)
     solution = optx.root_find(
         inside, solver, jnp.asarray(0.5, lower.dtype), args,
         options={"lower": jnp.zeros_like(lower), "upper": jnp.ones_like(lower)},

@@ -7,7 +7,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._checks import check_option, check_shape, nan_where
@@ -16,6 +15,7 @@ from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
+from jrigid.stability._roots import PlaceOfRoot
 from jrigid.stability._steps import checked_body, solver_of, verdict, walk, whole_number
 from jrigid.systems import RigidBody
 
@@ -117,6 +117,7 @@ def _section(
     field: Any = path.field
     term = diffrax.ODETerm(lambda t, y, _: field(t, y))
     eps = float(jnp.finfo(dtype).eps)
+    tolerance: Any = step * (1e-11 if eps < 1e-10 else 1e-5)
 
     def of(t: Array, y: Array) -> Array:
         found = jnp.asarray(condition(t, path.to_state(y)), dtype)
@@ -134,9 +135,8 @@ def _section(
             opening = (t <= begun + 1e-6 * step) & (side != 0)
             return jnp.where(opening, side, value)
 
-        event = diffrax.Event(
-            watched, optx.Bisection(rtol=4 * eps, atol=1e-10 if eps < 1e-10 else 1e-5), direction
-        )
+        finder = PlaceOfRoot(rtol=4 * eps, atol=tolerance)
+        event = diffrax.Event(watched, finder, direction)
         end = begun + jnp.where(alive, step * steps, step)
         solution = diffrax.diffeqsolve(
             term, solver, begun, end, step, y, None,
