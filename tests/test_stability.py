@@ -3,6 +3,7 @@
 import functools
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -210,7 +211,8 @@ def test_satellites_against_linearisation_and_the_sign_of_the_energy(rng):
     assert np.all((regions == "unstable") == (np.asarray(stability) == 0))
     a, b, c = moments.T
     assert np.all((regions == "Lagrange") == ((c > b) & (b > a)))
-    assert set(regions) == set(st.REGIONS)
+    assert set(regions) == set(st.REGIONS) - {"marginal"}
+    assert st.REGIONS[st.satellite_stability(jnp.ones(3)).region] == "marginal"
 
 
 def test_regions_of_debra_and_delp_located_to_1e_10():
@@ -279,7 +281,50 @@ def test_what_is_at_rest():
     upright = st.linearize(body, jr.top.initial_state(top, 0.0), space_axis=up)
     np.testing.assert_allclose(upright.growth_rate, 1.0, rtol=1e-12)
     sphere = st.linearize(jr.RigidBody(jnp.ones(3)), spin(0))
-    assert st.STABILITY[sphere.stability] == "marginal"
+    assert st.STABILITY[sphere.stability] == "stable"  # another spin turns about another axis
+    across = st.linearize(jr.RigidBody(jnp.array([1.0, 1.0, 2.0])), spin(0))
+    assert st.STABILITY[across.stability] == "marginal"  # it drifts along the equator
+
+
+def test_zeros_that_drift_nowhere_are_stable():
+    """A free wheel's own spin; a tilt that goes round as fast as the frame."""
+    wheel = jr.torques.Rotor(jr.torques.SpinningMass(0.2, np.array([0.0, 0.0, 1.0])))
+    for moments, name in (([1.0, 2.0, 1.5], "stable"), ([1.0, 4.0, 2.5], "unstable")):
+        body = jr.RigidBody(jnp.array(moments), wheel)
+        about = st.linearize(body, jr.State(UP, np.array([0.0, 0, 1]), np.array(5.0)))
+        held = jr.RigidBody(body.inertia, jr.torques.Rotor(np.array([0.0, 0.0, 1.0])))
+        assert st.STABILITY[about.stability] == name
+        assert st.STABILITY[st.linearize(held, spin(2)).stability] == name
+    top = jr.SymmetricTop(1.0, 1.5, 1.0)
+    asleep, own = jr.top.initial_state(top, 0.0, omega3=2**0.5), np.array([0.0, 0.0, 2**0.5])
+    for rate in (None, own):
+        about = st.linearize(top.as_rigid_body(), asleep, body_rate=rate)
+        assert st.STABILITY[about.stability] == "stable"
+
+
+def test_a_stiff_part_hides_nothing():
+    """Damped fast, a satellite off its equilibrium or orbit is one all the same; so is growth."""
+    n, moments = 1.08e-3, jnp.array([1.0, 2.0, 2.5])
+    for damping in (0.1, 1.0):
+        damper = jr.torques.InternalDamper(0.1, damping)
+        for e, turn, name in ((0.0, 0.0, None), (0.0, 0.5, "equilibrium"), (0.3, 0.0, "same at")):
+            orbit = jr.torques.KeplerOrbit(n**2, 1.0, e)
+            gradient = jr.torques.GravityGradient(moments, n**2, orbit)
+            rate = n * ((1 + e) / (1 - e) ** 3) ** 0.5
+            q = jr.rotation.exp(jnp.array([0.0, 0.0, turn]))
+            state = jr.State(q, jnp.array([0.0, 0.0, rate]))
+            body = jr.RigidBody(moments, gradient + damper)
+            if name is None:
+                assert st.STABILITY[st.linearize(body, state).stability] == "stable"
+            else:
+                with pytest.raises(RuntimeError, match=name):
+                    st.linearize(body, state)
+    stiff = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.3, 1e6))
+    about = st.linearize(stiff, spin(1))
+    assert st.STABILITY[about.stability] == "unstable"
+    # As good as one rigid body with the sphere in it.
+    rigid = st.growth_rate(jnp.array([1.3, 2.3, 3.3]), 1, 1.0)
+    np.testing.assert_allclose(about.growth_rate, rigid, rtol=1e-4)
 
 
 def test_a_damper_makes_the_largest_axis_attract_and_the_others_repel():
@@ -324,8 +369,18 @@ def test_bad_requests(untyped):
     damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
     with pytest.raises(ValueError, match="body_rate"):
         st.linearize(damped, spin(0), body_rate=np.ones(3))
-    with pytest.raises(RuntimeError, match="change of sign"):
-        st.boundary(lambda x: x**2 + 1, 0.0, 1.0)
+    for function in (lambda x: x**2 + 1, lambda x: 1e-200 * (1 + x), lambda x: 1 / (x - 0.3)):
+        with pytest.raises(RuntimeError, match="change of sign"):
+            st.boundary(function, 0.0, 1.0)
+
+    def switched_on(t, state, args):
+        return jnp.sin(t) * jnp.array([0.0, 0.0, 1.0])
+
+    with pytest.raises(RuntimeError, match="same at all times"):
+        st.linearize(jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), switched_on), spin(2))
+    pushed = jr.RigidBody(1e7 * jnp.array([1.0, 2.0, 3.0]), jr.torques.Constant(np.ones(3)))
+    with pytest.raises(RuntimeError, match="equilibrium"):
+        st.linearize(pushed, spin(2, 0.0))
     lanes = jax.vmap(lambda w: st.linearize(body, jr.State(UP, w), throw=False))
     found = lanes(jnp.array([[1.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.0, np.nan, 0.0]]))
     assert list(found.stability) == [2, -1, -1]
@@ -400,6 +455,18 @@ def test_a_map_is_the_function_at_each_point_whatever_the_blocks():
         assert found.valid.all()
 
 
+def test_a_function_may_be_a_module_of_arrays():
+    class Line(eqx.Module):
+        slope: jax.Array
+
+        def __call__(self, x, y):
+            return self.slope * x + y
+
+    axes = {"x": np.arange(3.0), "y": np.arange(4)}
+    found = st.stability_map(Line(jnp.array(2.0)), axes)
+    np.testing.assert_array_equal(found.values, 2 * axes["x"][:, None] + axes["y"][None, :])
+
+
 def test_points_that_are_undefined_are_marked():
     def root(x, y):
         return jnp.sqrt(x - y)
@@ -432,6 +499,15 @@ def test_progress_of_a_map_is_printed(monkeypatch, capsys):
     monkeypatch.setattr(_maps.time, "monotonic", lambda: next(clock))
     st.stability_map(lambda x: x, {"x": np.arange(4.0)}, block_size=2, progress=True)
     assert "4 of 4 points" in capsys.readouterr().out
+
+
+def test_a_boundary_at_an_end_and_lanes_without_one():
+    edges = jax.vmap(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p, throw=False))
+    found = edges(jnp.array([1.0, 1.5, 2.0, 3.0]))
+    np.testing.assert_allclose(found, [1.0, 1.5, 2.0, np.nan], atol=1e-13)
+    falling = jax.vmap(lambda p: st.boundary(lambda x, p: p - x, 1.0, 2.0, p, throw=False))
+    np.testing.assert_allclose(falling(jnp.array([1.0, 1.5, 2.0])), [1.0, 1.5, 2.0], atol=1e-13)
+    assert float(jax.grad(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p))(1.0)) == 1.0
 
 
 def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
@@ -472,7 +548,7 @@ def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
 
 
 def test_orbits_obey_kepler_and_have_his_slopes():
-    for e in (0.0, 0.1, 0.6, 0.97):
+    for e in (0.0, 0.1, 0.6, 0.99):
         orbit = jr.torques.KeplerOrbit(2.0, 1.5, e)
         ts = np.linspace(-30.0, 30.0, 301)
         position = np.asarray(jax.vmap(orbit)(ts))
@@ -485,6 +561,13 @@ def test_orbits_obey_kepler_and_have_his_slopes():
         r = np.linalg.norm(position, axis=1, keepdims=True)
         np.testing.assert_allclose(pull, -2.0 * position / r**3, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(orbit.mean_motion, n, rtol=1e-15)
+    for e in (0.999, 0.99999):  # near the pericentre, by the radius at the anomaly
+        anomaly = 10 ** np.linspace(-5, 0, 30)
+        ts = (anomaly - e * np.sin(anomaly)) / n
+        radius = np.linalg.norm(jax.vmap(jr.torques.KeplerOrbit(2.0, 1.5, e))(ts), axis=1)
+        np.testing.assert_allclose(radius, 1.5 * (1 - e * np.cos(anomaly)), rtol=1e-6)
+    for e in (-0.1, 1.0, np.nan):
+        assert np.isnan(jr.torques.KeplerOrbit(2.0, 1.5, e)(1.0)).all()
 
 
 def test_float32_is_as_good_as_float32():

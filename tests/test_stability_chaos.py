@@ -37,11 +37,10 @@ def hyperion(eccentricity=0.1):
     return jr.RigidBody(moments, jr.torques.GravityGradient(moments, 1.0, orbit))
 
 
-@pytest.fixture(scope="module")
-def spectrum_of_heavy():
-    """Mean exponents of 64 motions of one energy and one momentum about the vertical, to T."""
+def spectrum_of_heavy(lanes, count):
+    """Exponents of motions of one energy and one momentum about the vertical, to T = 1200."""
     rng = np.random.default_rng(3)
-    turns = 1e-6 * rng.normal(size=(64, 3))
+    turns = 1e-6 * rng.normal(size=(lanes, 3))
     body = heavy(*HEAVY)
 
     @jax.jit
@@ -49,7 +48,7 @@ def spectrum_of_heavy():
     def lane(turn):
         q = jr.rotation.multiply(jr.rotation.exp(turn), jr.rotation.exp(jnp.asarray(TILTED)))
         start = jr.State(q, jnp.asarray(SPINNING))
-        return st.lyapunov_spectrum(body, start, 1200.0, 9600, throw=False)
+        return st.lyapunov_spectrum(body, start, 1200.0, 9600, count=count, throw=False)
 
     return turns, lane(turns)
 
@@ -123,8 +122,8 @@ def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_ove
     assert 1.5 < float(indicator.megno) < 2.2
 
 
-def test_exponents_without_damping_pair_to_zero(spectrum_of_heavy):
-    _, found = spectrum_of_heavy
+def test_exponents_without_damping_pair_to_zero():
+    _, found = spectrum_of_heavy(32, 6)
     mean = np.asarray(found.exponents).mean(axis=0)
     assert mean[0] > 0.15
     np.testing.assert_allclose(mean, -mean[::-1], atol=0.003)
@@ -141,9 +140,12 @@ def euler_poisson(y, moments, lever):
     return np.concatenate([(np.cross(momentum, w) + pull) / moments, np.cross(up, w)], axis=1)
 
 
-def test_exponent_of_an_asymmetric_top_by_two_trajectories(spectrum_of_heavy):
-    """Neighbours 1e-8 apart, drawn together again and again, by Runge-Kutta in numpy: to 2 %."""
-    turns, found = spectrum_of_heavy
+def test_exponent_of_an_asymmetric_top_by_two_trajectories():
+    """Neighbours 1e-8 apart, drawn together again and again, by Runge-Kutta in numpy: to 2 %.
+
+    The means of 256 motions: each is uncertain by 0.4 %.
+    """
+    turns, found = spectrum_of_heavy(256, 1)
     moments, lever = HEAVY
     q = jax.vmap(
         lambda t: jr.rotation.multiply(jr.rotation.exp(t), jr.rotation.exp(jnp.asarray(TILTED)))
@@ -151,7 +153,7 @@ def test_exponent_of_an_asymmetric_top_by_two_trajectories(spectrum_of_heavy):
     up = np.asarray(jax.vmap(lambda q: jr.rotation.rotate_inverse(q, jnp.array([0.0, 0, 1])))(q))
     y = np.concatenate([np.broadcast_to(SPINNING, up.shape), up], axis=1)
     near = y + 1e-8 * np.random.default_rng(0).normal(size=y.shape)
-    y, step, total = np.concatenate([y, near]), 0.03, np.zeros(64)
+    y, step, total = np.concatenate([y, near]), 0.03, np.zeros(256)
     steps = int(1200 / step)
     for i in range(steps):
         a = euler_poisson(y, moments, lever)
@@ -160,11 +162,11 @@ def test_exponent_of_an_asymmetric_top_by_two_trajectories(spectrum_of_heavy):
         d = euler_poisson(y + step * c, moments, lever)
         y = y + step / 6 * (a + 2 * b + 2 * c + d)
         if i % 50 == 49:
-            apart = y[64:] - y[:64]
+            apart = y[256:] - y[:256]
             distance = np.linalg.norm(apart, axis=1)
             if i > 500:  # once they lie along the fastest direction
                 total += np.log(distance / 1e-8)
-            y[64:] = y[:64] + 1e-8 * apart / distance[:, None]
+            y[256:] = y[:256] + 1e-8 * apart / distance[:, None]
     theirs = total / (step * (steps - 500))
     ours = np.asarray(found.exponents)[:, 0]
     assert theirs.mean() == pytest.approx(ours.mean(), rel=0.02)
@@ -193,25 +195,28 @@ def planar():
 
 
 def test_hyperion_is_chaotic_where_it_is_said_to_be(planar):
-    """Wisdom, Peale & Mignard (1984): a large chaotic zone, e-folding in one to two orbits."""
-    angles = np.array([0.0, np.pi / 2, 0.0, np.pi / 2])
-    rates = np.array([1.3, 1.5, 1.8, 1.0])
-    spectrum, indicator = planar(angles, rates)
+    """Wisdom, Peale & Mignard (1984): a large chaotic zone, e-folding in one to two orbits.
+
+    Motions stick to islands now and then, so that the median of 16 is what is compared.
+    """
+    starts = np.tile([[0.0, 1.3], [np.pi / 2, 1.5], [0.0, 1.8], [np.pi / 2, 1.0]], (4, 1))
+    angles = starts[:, 0] + 1e-6 * np.arange(16)
+    spectrum, indicator = planar(angles, starts[:, 1])
     exponents = np.asarray(spectrum.exponents)
-    assert np.all((exponents[:, 0] > 0.09) & (exponents[:, 0] < 0.14))
-    folding = 1 / exponents[:, 0] / TURN
-    assert np.all((folding > 1) & (folding < 2))
-    assert 0.105 < exponents[:, 0].mean() < 0.13
+    assert np.all((exponents[:, 0] > 0.02) & (exponents[:, 0] < 0.16))
+    median = np.median(exponents[:, 0])
+    assert 0.11 < median < 0.132  # 0.12 to 0.13 in another's computation
+    assert 1 < 1 / median / TURN < 2
     np.testing.assert_allclose(exponents.sum(axis=1), 0, atol=1e-7)
     assert {st.ORDER[i] for i in indicator.order} == {"chaotic"}
-    np.testing.assert_allclose(indicator.exponent, exponents[:, 0], rtol=0.15)
+    assert np.median(indicator.exponent) == pytest.approx(median, rel=0.1)
     # It stays in the plane to the last bit, as the planar equation does.
     assert np.all(np.asarray(spectrum.final_state.omega)[:, :2] == 0)
 
 
 def test_regular_islands_of_hyperion_are_regular(planar):
-    angles, rates = np.array([np.pi / 2, 0.0, np.pi / 2, 0.3]), np.array([0.5, 0.5, 2.3, 2.9])
-    spectrum, indicator = planar(angles, rates)
+    starts = np.tile([[np.pi / 2, 0.5], [0.0, 0.5], [np.pi / 2, 2.3], [0.3, 2.9]], (4, 1))
+    spectrum, indicator = planar(starts[:, 0] + 1e-3 * np.arange(16), starts[:, 1])
     assert np.all(np.asarray(spectrum.exponents)[:, 0] < 0.003)
     assert {st.ORDER[i] for i in indicator.order} == {"regular"}
 
@@ -282,6 +287,31 @@ def test_crossings_in_either_direction_and_those_there_are_not():
     none = st.poincare_section(body, start, lambda _, s: s.omega[0] - 9, 3, 0.1, steps=50)
     assert not none.valid.any()
     assert np.isnan(none.ts).all()
+
+
+def test_sections_of_many_lanes_and_of_starts_on_the_surface():
+    body = jr.RigidBody(MOMENTS)
+
+    def lane(omega):
+        start = jr.State(jnp.asarray(UP), omega)
+        return st.poincare_section(
+            body, start, lambda _, s: s.omega[0], 2, 0.1, steps=300, throw=False
+        )
+
+    omegas = np.array([[0.5, 0.3, 0.8], [1, 0.1, 0.1], [np.nan, 0, 0], [0, -0.583, 0.746]])
+    found = jax.jit(jax.vmap(lane))(omegas)
+    assert found.valid.tolist() == [[True, True], [False, False], [False, False], [True, True]]
+    assert bool((found.result == jr.RESULTS.invalid_state)[2])
+    assert np.isnan(found.ts[1:3]).all()
+    for i in (0, 3):
+        period = float(jr.free.polhode_period(MOMENTS, omegas[i]))
+        np.testing.assert_allclose(np.diff(found.ts[i]), period, rtol=1e-8)
+    np.testing.assert_allclose(found.ts[3, 0], period, rtol=1e-8)  # not the start itself
+    single = jr.State(UP.astype(np.float32), omegas[0].astype(np.float32))
+    small = jr.RigidBody(MOMENTS.astype(np.float32))
+    found = st.poincare_section(small, single, lambda _, s: s.omega[0], 2, 0.1)
+    assert found.states.omega.dtype == np.float32
+    assert found.valid.all()
 
 
 @pytest.mark.parametrize("unit", [1e-7, 1e4])
@@ -359,10 +389,21 @@ def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
         ({"steps": 100, "samples": 0}, "samples"),
         ({"steps": 100, "count": 7}, "count"),
         ({"steps": 100, "vectors": np.ones((2, 5))}, "vectors"),
+        ({"steps": 100, "vectors": np.ones((7, 6))}, "vectors"),
+        ({"steps": 100, "vectors": np.eye(6), "count": 2}, "vectors"),
         ({"steps": 100, "solver": "rk4"}, "solver"),
     ):
         with pytest.raises(ValueError, match=message):
             st.lyapunov_spectrum(body, start, 10.0, **options)
+    for vector in (np.zeros(6), np.full(6, np.nan)):
+        with pytest.raises(RuntimeError, match="independent"):
+            st.megno(body, start, 10.0, 100, vector=vector)
+    with pytest.raises(RuntimeError, match="independent"):
+        st.lyapunov_spectrum(body, start, 10.0, 100, vectors=np.ones((2, 6)))
+    with pytest.raises(RuntimeError, match="step"):
+        st.poincare_section(heavy(*HEAVY), start, lambda _, s: s.omega[0], 3, 3.0)
+    with pytest.raises(RuntimeError, match="condition"):
+        st.poincare_section(body, start, lambda _, s: s.omega[0] * np.nan, 3, 0.1)
     with pytest.raises(ValueError, match="system"):
         st.megno(jr.SymmetricTop(1.0, 1.0, 1.0), start, 10.0, 100)
     with pytest.raises(ValueError, match="state0"):

@@ -68,7 +68,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "but it is not."
     )
     inaccurate = (
-        "Argument `steps` must be large enough for the accuracy of the motion, but it is not."
+        "Arguments `steps` or `step` must be fine enough for the accuracy of the motion, but they "
+        "are not."
     )
     invalid_tolerance = (
         "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in float32), but "

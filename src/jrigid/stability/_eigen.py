@@ -11,13 +11,14 @@ _TOGETHER = 8.0  # sqrt(eps) of the matrix: eigenvalues nearer than that count a
 
 
 def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
-    """Eigenvalues of a square matrix, those of largest real part first.
+    """Eigenvalues of a square matrix, in the order of their real parts, the largest first.
 
     Args:
         matrix: Any square matrix, whose entries are of comparable size.
 
     Returns:
-        Its eigenvalues.
+        Its eigenvalues; real parts closer than 1e-5 of the matrix's norm count as equal, and there
+        the larger imaginary part comes first.
 
     Gradients: exact where an eigenvalue is by itself. Eigenvalues that are nearer than 8 sqrt(eps)
     of the matrix's norm (1e-7 in float64) count as one, and each gets the derivative of their mean,

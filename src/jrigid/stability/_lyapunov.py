@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Real
 
-from jrigid._checks import check_shape, float_arrays, nan_where
+from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
@@ -52,7 +52,8 @@ class Megno(NamedTuple):
         megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one near a
             periodic orbit), and to half the exponent times the time for a chaotic one.
         exponent: 2 / time of it: an estimate of the largest exponent [1/s].
-        order: Index into `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided".
+        order: Index into `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided". It
+            starts at "regular" and needs some ten e-folding times to leave it.
         ts: Times since the start [s].
         history: `megno` up to each of these times.
         final_state: Where the motion ended.
@@ -70,14 +71,33 @@ class Megno(NamedTuple):
     result: Any
 
 
-def _starting_vectors(vectors: Any, count: int, dimension: int, dtype: Any) -> Array:
+def _starting_vectors(vectors: Any, count: int | None, dimension: int, dtype: Any) -> Array:
     """Rows to start from: those given, or some that lie along no axis."""
     if vectors is None:
+        assert count is not None
         i = jnp.arange(dimension, dtype=dtype)
         rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype))[:, None] * (0.9 * i + 0.45)[None, :])
         return orthonormal(rows + 0.3 * jnp.eye(count, dimension, dtype=dtype))[0]
     rows = float_arrays(vectors)[0].astype(dtype)
     check_shape("vectors", rows, (None, dimension))
+    if len(rows) > dimension or len(rows) != (count or len(rows)):
+        raise ValueError(
+            f"Argument `vectors` must have as many rows as `count` and at most {dimension}, but it "
+            f"has {len(rows)}."
+        )
+    return rows
+
+
+def _independent(findings: Findings, rows: Array) -> Array:
+    """Orthonormal rows; those that depend on each other, or are not finite, are noted."""
+    rows = rows / jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True))
+    rows, lengths = orthonormal(rows)
+    findings.require(
+        jnp.all(lengths > 1e3 * jnp.finfo(rows.dtype).eps),
+        RESULTS.invalid_state,
+        "Arguments `vector` and `vectors` must be finite and linearly independent, but they are "
+        "not.",
+    )
     return rows
 
 
@@ -102,7 +122,7 @@ def _rows_of(path: Walk, every: int, first: Array, rows: Array, y: Array) -> tup
     begin = (y, rows, jnp.zeros((), y.dtype))
     (y, rows, error), _ = jax.lax.scan(step, begin, jnp.arange(every))
     rows, lengths = orthonormal(rows)
-    return rows, y, jnp.log(jnp.where(lengths > 0, lengths, 1.0)), error
+    return rows, y, jnp.log(lengths), error  # of NaN or of nothing it is not finite
 
 
 def lyapunov_spectrum(
@@ -186,8 +206,10 @@ def _spectrum(
     if count is not None and count > path.dimension:
         raise ValueError(f"Argument `count` must be at most {path.dimension}, but it is {count}.")
     dtype = path.start.dtype
-    rows = _starting_vectors(vectors, count or path.dimension, path.dimension, dtype)
-    rows, _ = orthonormal(rows)
+    if vectors is None and count is None:
+        count = path.dimension
+    rows = _starting_vectors(vectors, count, path.dimension, dtype)
+    rows = _independent(path.findings, rows)
 
     def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
         def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
@@ -285,7 +307,7 @@ def _megno(
         vector = float_arrays(vector)[0]
         check_shape("vector", vector, (path.dimension,))
         vector = vector[None]
-    rows, _ = orthonormal(_starting_vectors(vector, 1, path.dimension, dtype))
+    rows = _independent(path.findings, _starting_vectors(vector, 1, path.dimension, dtype))
 
     def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
         def interval(carry: tuple, j: Array) -> tuple[tuple, None]:

@@ -79,9 +79,10 @@ def stability_map(
     next map of the same function with blocks of the same size.
 
     Args:
-        function: A function of one number for each axis, given by name, for a single point: a
-            growth rate, an indicator of chaos, a tree of several. With `throw=False` inside, so
-            that points that fail are NaN.
+        function: A pure function (as for `jax.jit`: what it closes over must not change) of one
+            number for each axis, given by name, for a single point: a growth rate, an indicator of
+            chaos, a tree of several. With `throw=False` inside, so that points that fail are NaN.
+            Codes of a result are -1 there: return `Marked(code, code >= 0)`.
         axes: Name and points of each axis, two or more as a rule; the last one runs fastest.
         block_size: Points of a block. Large for what is cheap; for long integrations some hundreds,
             since a block takes as long as its slowest lane.
@@ -121,7 +122,10 @@ def stability_map(
     size = min(block_size, total)
     # One dtype, that of all axes taken together.
     arrays = float_arrays(*points.values())
-    block = _block(function, tuple(points), size)
+    try:
+        block = _block(function, tuple(points), size)
+    except TypeError:  # a module of arrays cannot be hashed
+        block = _block.__wrapped__(function, tuple(points), size)
     values: list[np.ndarray] = []
     structure: Any = None
     valid = np.empty(total, bool)
@@ -152,6 +156,7 @@ def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> C
         found = function(**point)
         if isinstance(found, Marked):
             values, valid = jtu.tree_map(jnp.asarray, tuple(found))
+            check_shape("valid", valid, ())
         else:
             values = jtu.tree_map(jnp.asarray, found)
             valid = jnp.asarray(True)
@@ -203,7 +208,8 @@ def boundary(
 
     Raises:
         ValueError: Wrong shape (trace time).
-        RuntimeError: The function has the same sign, or is not finite, at both ends (run time).
+        RuntimeError: The function has the same sign at both ends, is not finite there, or jumps
+            where its sign changes, as at a pole (run time, any lane).
 
     Gradients: by the implicit function theorem in `args`, not in what the function closes over.
     Infinite where the slope of the function is 0.
@@ -225,7 +231,8 @@ def boundary(
     ends = [jnp.asarray(function(x, *args), lower.dtype) for x in (lower, upper)]
     for end in ends:
         check_shape("function", end, ())
-    ok = jnp.isfinite(ends[0]) & jnp.isfinite(ends[1]) & (ends[0] * ends[1] <= 0)
+    known = jax.lax.stop_gradient(jnp.stack(ends))
+    ok = jnp.all(jnp.isfinite(known)) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     width = upper - lower
 
     def inside(x: Array, args: tuple) -> Array:
@@ -233,17 +240,20 @@ def boundary(
         return jnp.where(ok, found, x - 0.5)
 
     tolerance = 64 * eps if rtol is None else rtol
-    solver = PlaceOfRoot(rtol=0.0, atol=tolerance, expand_if_necessary=False)
+    solver = PlaceOfRoot(rtol=0.0, atol=tolerance)
     solution = optx.root_find(
         inside, solver, jnp.asarray(0.5, lower.dtype), args,
         options={"lower": jnp.zeros_like(lower), "upper": jnp.ones_like(lower)},
         max_steps=200, throw=False,
     )  # fmt: skip
+    # At a pole, or a jump, or where it is NaN between the ends, there is no root.
+    left = jnp.abs(jax.lax.stop_gradient(inside(solution.value, args)))
+    ok = ok & (left <= 1e-3 * jnp.max(jnp.abs(known)))
     found = jnp.where(ok, lower + width * solution.value, jnp.nan)
     if not throw:
         return found
     message = (
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
-        "but they are not."
+        "which must be continuous there, but they are not."
     )
     return eqx.error_if(found, ~ok, message)

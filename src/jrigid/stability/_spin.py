@@ -12,7 +12,7 @@ from jrigid.free._linear import linear_rates
 from jrigid.top import SymmetricTop, steady_precession
 from jrigid.top._top import as_arrays, require_top
 
-REGIONS = ("unstable", "Lagrange", "DeBra-Delp")
+REGIONS = ("unstable", "Lagrange", "DeBra-Delp", "marginal")
 
 
 def root_of_positive(square: Array) -> Array:
@@ -28,8 +28,9 @@ class Modes(NamedTuple):
         rates: Growing or turning, and its opposite [1/s].
         shapes: For each the two small components of the angular velocity, those of the axes that
             follow the spin axis in cyclic order; of unit length. Both the same, at rates of 0,
-            where the motion drifts.
-        amplitude_ratio: |second component / first|; infinite or NaN for a symmetric body.
+            where the motion drifts; zero where nothing couples the two.
+        amplitude_ratio: |second component / first|; infinite or NaN, and its slopes, where a
+            coupling is zero.
     """
 
     rates: Complex[Array, "2"]
@@ -247,7 +248,7 @@ class SatelliteStability(NamedTuple):
         margins: Four numbers that are all positive where it is stable, each smooth through 0, of
             the moments (A, B, C) with k_R = (C - A)/B, k_Y = (C - B)/A: (B - A)/C (pitch), k_R k_Y,
             1 + 3 k_R + k_R k_Y, and its square less 16 k_R k_Y.
-        region: Index into `REGIONS`.
+        region: Index into `REGIONS`; "marginal" where nothing grows but a margin is not positive.
         result: `jrigid.RESULTS` of the input.
     """
 
@@ -315,7 +316,7 @@ def satellite_stability(
     growth = jnp.maximum(root_of_positive(pitch), jnp.where(apart, of_spiral, of_real))
     margins = jnp.stack([(b - a) / c, both, sum_, inside])
     stable = jnp.all(margins > 0)
-    region = jnp.where(stable, jnp.where(yaw > 0, 1, 2), 0)
+    region = jnp.where(stable, jnp.where(yaw > 0, 1, 2), jnp.where(growth > 0, 0, 3))
     found = (n * n * pitch, (n * n).astype(squares.dtype) * squares, jnp.abs(n) * growth, margins)
     pitch, squares, growth, margins = findings.apply(nan_where(~ok, found), throw)
     region = jnp.where(ok, region, -1)

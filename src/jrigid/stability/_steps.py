@@ -169,8 +169,8 @@ def verdict(findings: Findings, error: Array, found: Any) -> tuple[Any, Array, A
     findings.require(
         (error <= worst) | ~ok,
         RESULTS.inaccurate,
-        f"Argument `steps` must be large enough for a local error below {worst:g} a step, but it "
-        "is not.",
+        "Arguments `steps` or `step` must be fine enough for a local error below "
+        f"{worst:g} a step, but they are not.",
     )
     findings.require(all_finite(found) | ~ok, RESULTS.nonfinite_state)
     return findings.result, findings.ok, found

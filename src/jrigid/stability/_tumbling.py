@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jrigid._checks import check_option, check_shape, nan_where
+from jrigid._checks import RESULTS, check_option, check_shape, nan_where
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
@@ -71,11 +71,12 @@ def poincare_section(
         throw: False: bad input is a result code and NaN.
 
     Returns:
-        States and times of the crossings.
+        States and times of the crossings; a start on the surface itself is none.
 
     Raises:
         ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value (run time, any lane). Fewer crossings are none: see `valid`.
+        RuntimeError: Bad value, a step too coarse (run time, any lane). Fewer crossings than asked
+            for are none: see `valid`.
 
     Gradients: none to be relied on.
     Source: M. Henon, Physica D 5 (1982) 412; crossings are located as events of diffrax.
@@ -127,13 +128,13 @@ def _section(
     # Just after a crossing rounding may leave the motion before it: the first instant is taken to
     # lie on the side to which it crossed.
     def crossing(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        begun, y, side, alive = carry
+        begun, y, side, alive, error = carry
 
         def watched(t: Array, y: Array, args: Any, **_: Any) -> Array:
             del args
             value = of(t, y)
             opening = (t <= begun + 1e-6 * step) & (side != 0)
-            return jnp.where(opening, side, value)
+            return jnp.where(opening, side, value).astype(jnp.result_type(float))
 
         finder = PlaceOfRoot(rtol=4 * eps, atol=tolerance)
         event = diffrax.Event(watched, finder, direction)
@@ -148,15 +149,34 @@ def _section(
         at, there = solution.ts[-1], solution.ys[-1]
         there = jnp.where(alive, path.on_sphere(there), path.start)
         at = jnp.where(alive, at, begun)
-        rises = of(at + 1e-3 * step, there + 1e-3 * step * path.field(at, there)) > of(at, there)
-        side = jnp.where(rises, 1.0, -1.0).astype(dtype)
-        return (at, there, side, alive), (at, path.to_state(there), alive, jnp.abs(of(at, there)))
+        left = jnp.abs(of(at, there))
+        error = jnp.maximum(error, jnp.where(alive, path.advance(at, there, none)[2], 0.0))
+        found = (at, path.to_state(there), alive, left)
+        return (at, there, side_of(at, there), alive, error), found
 
-    begin = (path.t0, path.start, jnp.zeros((), dtype), ok)
-    _, (ts, states, valid, left) = jax.lax.scan(crossing, begin, None, length=crossings)
+    def side_of(t: Array, y: Array) -> Array:
+        """To which side of the surface the motion goes from here."""
+        ahead = of(t + 1e-3 * step, y + 1e-3 * step * path.field(t, y))
+        return jnp.where(ahead > of(t, y), 1.0, -1.0).astype(dtype)
+
+    none = jnp.zeros((0, path.dimension), dtype)
+    value = of(path.t0, path.start)
+    path.findings.require(
+        jnp.isfinite(jax.lax.stop_gradient(value)) | ~ok,
+        RESULTS.invalid_vector_field,
+        "Argument `condition` must be finite at the start, but it is not.",
+    )
+    # A start on the surface itself is no crossing.
+    side = jnp.where(value == 0, side_of(path.t0, path.start), 0.0).astype(dtype)
+    error = path.advance(path.t0, path.start, none)[2]
+    begin = (path.t0, path.start, side, path.findings.ok, error)
+    (_, end, _, _, error), found = jax.lax.scan(crossing, begin, None, length=crossings)
+    ts, states, valid, left = found
+    result, ok, _ = verdict(path.findings, error, end)
+    valid = valid & ok
     ts, states = jax.vmap(lambda good, x: nan_where(~good, x))(valid, (ts, states))
     ts, states = path.findings.apply((ts, states), throw)
-    return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), path.findings.result)
+    return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), result)
 
 
 def flip_time(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
@@ -221,7 +241,9 @@ def final_spin(
 
     What is lost inside, such as by a `torques.InternalDamper`, takes energy but no angular momentum
     from a body, until it spins about the axis of largest moment. Whether along it or against it is
-    decided where the motion crosses the separatrix, and looks like chance.
+    decided where the motion crosses the separatrix, and looks like chance. The axis and its sign
+    are those of `principal_axes` (of moments, the body axis itself): two equal largest moments
+    leave no axis to settle about.
 
     Args:
         system: The body and what damps it.

@@ -23,8 +23,12 @@ class KeplerOrbit(eqx.Module):
     Raises:
         ValueError: Wrong shape (trace time). Values are not checked; those of no ellipse give NaN.
 
+    Digits: all up to an eccentricity of 0.99; of more extreme ones some are lost near the
+    pericentre.
+
     Gradients: finite for eccentricities below 1.
-    Source: J. M. A. Danby, Fundamentals of Celestial Mechanics, 2nd ed. (1988), section 6.6.
+    Source: S. Mikkola, Celestial Mechanics 40 (1987) 329, for the start; J. M. A. Danby,
+    Fundamentals of Celestial Mechanics, 2nd ed. (1988), section 6.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> orbit = jr.torques.KeplerOrbit(1.0, 1.0, 0.1)
@@ -52,7 +56,13 @@ class KeplerOrbit(eqx.Module):
         turn = jnp.asarray(2 * jnp.pi, a.dtype)
         mean = mean - turn * jax.lax.stop_gradient(jnp.round(mean / turn))
         known, fixed = jax.lax.stop_gradient((mean, e))
-        anomaly = known + 0.85 * fixed * jnp.sign(known)
+        # The root of a cubic is near enough at any eccentricity.
+        scale = 4 * fixed + 0.5
+        alpha, beta = (1 - fixed) / scale, 0.5 * jnp.abs(known) / scale
+        z = jnp.cbrt(beta + jnp.sqrt(alpha**3 + beta * beta))
+        sine = 2 * beta / (z * z + alpha + (alpha / z) ** 2)
+        sine = sine - 0.078 * sine**5 / (1 + fixed)
+        anomaly = known + jnp.sign(known) * fixed * (3 * sine - 4 * sine**3)
         for _ in range(3):  # of fourth order
             sine, cosine = fixed * jnp.sin(anomaly), fixed * jnp.cos(anomaly)
             f, slope = anomaly - sine - known, 1 - cosine
@@ -63,4 +73,5 @@ class KeplerOrbit(eqx.Module):
             anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (1 - e * jnp.cos(anomaly))
         x = a * (jnp.cos(anomaly) - e)
         y = a * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
-        return jnp.stack([x, y, jnp.zeros_like(x)])
+        ellipse = (fixed >= 0) & (fixed < 1)
+        return jnp.where(ellipse, jnp.stack([x, y, jnp.zeros_like(x)]), jnp.nan)
