@@ -28,6 +28,12 @@ def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.where(zero, jnp.zeros_like(square), scale * jnp.sqrt(jnp.where(zero, 1.0, square)))
 
 
+def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The square root where there is one, else 0; the slope at 0, infinite in truth, is 0."""
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
 def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """`arctan2` without overflow; at the origin the value is 0 and the gradient 0."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))

@@ -218,9 +218,8 @@ class Unknowns(eqx.Module):
             at += size
         system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
         inertia = self.inertia(numbers)
-        torque = _with_inertia(system.torque, inertia)
-        if self.ten is not None:
-            torque = _with_body(torque, self.ten.body(numbers[self.slices["shape"]]))
+        body = None if self.ten is None else self.ten.body(numbers[self.slices["shape"]])
+        torque = _of_body(system.torque, inertia, body)
         system = eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque))
         return system, self.gyro(numbers)
 
@@ -260,20 +259,13 @@ class Unknowns(eqx.Module):
         return Unknowns(**{**fields, "held": function, "constraint": (value, unit)})
 
 
-def _with_inertia(torque: Any, inertia: Array) -> Any:
-    """The torque, with the body's inertia where it has one of its own."""
+def _of_body(torque: Any, inertia: Array, body: MassProperties | None) -> Any:
+    """The torque, with the body's inertia, mass and lever where it has some of its own."""
     if isinstance(torque, Sum):
-        return Sum(tuple(_with_inertia(term, inertia) for term in torque.terms))
+        return Sum(tuple(_of_body(term, inertia, body) for term in torque.terms))
     if isinstance(torque, GravityGradient):
         return eqx.tree_at(lambda x: x.inertia, torque, inertia)
-    return torque
-
-
-def _with_body(torque: Any, body: MassProperties) -> Any:
-    """The torque, with the body's mass and lever where it is that of its weight."""
-    if isinstance(torque, Sum):
-        return Sum(tuple(_with_body(term, body) for term in torque.terms))
-    if isinstance(torque, UniformGravity):
+    if isinstance(torque, UniformGravity) and body is not None:
         return UniformGravity(body.mass, body.center_of_mass, torque.gravity)
     return torque
 

@@ -9,14 +9,22 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Complex, Float, Int
 
-from jrigid._checks import RESULTS, Findings, all_finite, float_arrays, is_unit, nan_where
-from jrigid._checks import check_shape as _check_shape
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    float_arrays,
+    is_unit,
+    nan_where,
+)
 from jrigid._numerics import product, safe_norm
 from jrigid._scales import ravel, unravel
 from jrigid._types import ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.rotation import exp, multiply, normalize, rotate, rotate_inverse
 from jrigid.stability._eigen import eigenvalues
+from jrigid.stability._steps import checked_state
 from jrigid.systems import RigidBody
 from jrigid.torques._base import has_parts
 
@@ -110,24 +118,14 @@ def linearize(
     >>> print(about.growth_rate.round(6), jr.stability.STABILITY[about.stability])
     1.154701 unstable
     """
-    if not isinstance(system, RigidBody):
-        raise ValueError(
-            f"Argument `system` must be a RigidBody, but it is {type(system).__name__}."
-        )
-    if not isinstance(state, State):
-        raise ValueError(f"Argument `state` must be a State, but it is {type(state).__name__}.")
-    attitude, omega = float_arrays(state.attitude, state.omega)
-    none = jnp.zeros(3, omega.dtype)
+    state = checked_state(system, state, "state")
+    dtype = state.omega.dtype
+    none = jnp.zeros(3, dtype)
     own, up = (none if x is None else x for x in (body_rate, space_axis))
-    time, own, up = (float_arrays(x)[0].astype(omega.dtype) for x in (t, own, up))
-    shapes = {"t": (), "body_rate": (3,), "space_axis": (3,), "attitude": (4,), "omega": (3,)}
-    for (name, shape), value in zip(shapes.items(), (time, own, up, attitude, omega), strict=True):
-        _check_shape(name, value, shape)
-    if not has_parts(state.internal):
-        internal = system.torque.internal_at_rest(State(attitude, omega))
-    else:
-        internal = state.internal
-    state = State(attitude, omega, internal)
+    time, own, up = (float_arrays(x)[0].astype(dtype) for x in (t, own, up))
+    check_shape("t", time, ())
+    check_shape("body_rate", own, (3,))
+    check_shape("space_axis", up, (3,))
     if body_rate is not None and has_parts(state.internal):
         raise ValueError(
             "Argument `body_rate` must be None for a body with internal parts, which turn with it, "

@@ -1,5 +1,6 @@
 """Order and chaos: the spectrum of Lyapunov exponents, and an indicator that tells early."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -7,17 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Real
 
-from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where
+from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, whole_number
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
     Walk,
     checked_body,
+    follow,
     orthonormal,
     solver_of,
     verdict,
     walk,
-    whole_number,
 )
 from jrigid.systems import RigidBody
 
@@ -77,7 +78,7 @@ def _starting_vectors(vectors: Any, count: int | None, dimension: int, dtype: An
         assert count is not None
         i = jnp.arange(dimension, dtype=dtype)
         rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype))[:, None] * (0.9 * i + 0.45)[None, :])
-        return orthonormal(rows + 0.3 * jnp.eye(count, dimension, dtype=dtype))[0]
+        return rows + 0.3 * jnp.eye(count, dimension, dtype=dtype)
     rows = float_arrays(vectors)[0].astype(dtype)
     check_shape("vectors", rows, (None, dimension))
     if len(rows) > dimension or len(rows) != (count or len(rows)):
@@ -110,19 +111,33 @@ def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
     return samples, each, every
 
 
-def _rows_of(path: Walk, every: int, first: Array, rows: Array, y: Array) -> tuple[Array, ...]:
-    """Some steps, then rows made orthonormal: rows, state, logarithms of growth, local error."""
+def _followed(
+    path: Walk, plan: tuple[int, int, int], rows: Array, tally: Any, add: Callable[..., Any]
+) -> tuple[Array, Any, State, Array]:
+    """Times and tallies of each sample, the state at the end, the largest local error.
 
-    def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
-        y, rows, error = carry
-        t = path.t0 + path.step * (first + i).astype(y.dtype)
-        y, rows, local = path.advance(t, y, rows)
-        return (y, rows, jnp.maximum(error, local)), None
+    After some steps the rows are made orthonormal, and `add(tally, logs, number)` takes in the
+    logarithms of their growth, of NaN or of nothing not finite, and the number of the interval.
+    """
+    samples, each, every = plan
+    dtype = path.start.dtype
 
-    begin = (y, rows, jnp.zeros((), y.dtype))
-    (y, rows, error), _ = jax.lax.scan(step, begin, jnp.arange(every))
-    rows, lengths = orthonormal(rows)
-    return rows, y, jnp.log(lengths), error  # of NaN or of nothing it is not finite
+    def sample(carry: tuple, k: Array) -> tuple[tuple, Any]:
+        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
+            y, rows, tally, error = carry
+            index = k * each + j
+            y, rows, local = follow(path, index * every, every, y, rows)
+            rows, lengths = orthonormal(rows)
+            tally = add(tally, jnp.log(lengths), (1 + index).astype(dtype))
+            return (y, rows, tally, jnp.maximum(error, local)), None
+
+        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
+        return carry, carry[2]
+
+    begin = (path.start, rows, tally, jnp.zeros((), dtype))
+    (y, _, _, error), tallies = jax.lax.scan(sample, begin, jnp.arange(samples))
+    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
+    return ts, tallies, path.to_state(y), error
 
 
 def lyapunov_spectrum(
@@ -211,22 +226,12 @@ def _spectrum(
     rows = _starting_vectors(vectors, count, path.dimension, dtype)
     rows = _independent(path.findings, rows)
 
-    def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
-        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
-            y, rows, total, error = carry
-            first = (k * each + j) * every
-            rows, y, logs, local = _rows_of(path, every, first, rows, y)
-            return (y, rows, total + logs, jnp.maximum(error, local)), None
-
-        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
-        return carry, carry[2]
-
-    begin = (path.start, rows, jnp.zeros(rows.shape[0], dtype), jnp.zeros((), dtype))
-    (y, _, _, error), totals = jax.lax.scan(sample, begin, jnp.arange(samples))
-    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
-    history = totals / ts[:, None]
-    result, ok, found = verdict(path.findings, error, (ts, history, path.to_state(y)))
-    ts, history, state = path.findings.apply(nan_where(~ok, found), throw)
+    none = jnp.zeros(rows.shape[0], dtype)
+    ts, totals, state, error = _followed(
+        path, plan, rows, none, lambda total, logs, _: total + logs
+    )
+    found = (ts, totals / ts[:, None], state)
+    result, _, (ts, history, state) = verdict(path.findings, error, found, throw)
     return LyapunovSpectrum(history[-1], ts, history, state, error, result)
 
 
@@ -309,25 +314,16 @@ def _megno(
         vector = vector[None]
     rows = _independent(path.findings, _starting_vectors(vector, 1, path.dimension, dtype))
 
-    def sample(carry: tuple, k: Array) -> tuple[tuple, Array]:
-        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
-            y, rows, weighted, total, error = carry
-            index = k * each + j
-            number = (1 + index).astype(dtype)
-            rows, y, (log,), local = _rows_of(path, every, index * every, rows, y)
-            weighted = weighted + number * log
-            total = total + 2 * weighted / number
-            return (y, rows, weighted, total, jnp.maximum(error, local)), None
-
-        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
-        return carry, carry[3] / (each * (1 + k)).astype(dtype)
+    def add(tally: tuple[Array, Array], logs: Array, number: Array) -> tuple[Array, Array]:
+        weighted, total = tally
+        weighted = weighted + number * logs[0]
+        return weighted, total + 2 * weighted / number
 
     none = jnp.zeros((), dtype)
-    begin = (path.start, rows, none, none, none)
-    (y, _, _, _, error), history = jax.lax.scan(sample, begin, jnp.arange(samples))
-    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
-    result, ok, found = verdict(path.findings, error, (ts, history, path.to_state(y)))
-    ts, history, state = path.findings.apply(nan_where(~ok, found), throw)
+    ts, (_, totals), state, error = _followed(path, plan, rows, (none, none), add)
+    history = totals / (each * (1 + jnp.arange(samples))).astype(dtype)
+    found = (ts, history, state)
+    result, ok, (ts, history, state) = verdict(path.findings, error, found, throw)
     mean = history[-1]
     order = jnp.where(mean > _CHAOTIC, 2, jnp.where(mean > _REGULAR, 1, 0))
     order = jnp.where(ok, order, -1)

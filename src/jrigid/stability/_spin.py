@@ -7,18 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays, nan_where
+from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.free._linear import linear_rates
 from jrigid.top import SymmetricTop, steady_precession
 from jrigid.top._top import as_arrays, require_top
 
 REGIONS = ("unstable", "Lagrange", "DeBra-Delp", "marginal")
-
-
-def root_of_positive(square: Array) -> Array:
-    """The square root where there is one, else 0; the slope at 0, infinite in truth, is 0."""
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 class Modes(NamedTuple):

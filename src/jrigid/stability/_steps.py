@@ -8,11 +8,18 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays, is_unit
-from jrigid._inputs import harmless
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    float_arrays,
+    harmless,
+    is_unit,
+    nan_where,
+)
 from jrigid._scales import ravel, units, unravel
 from jrigid.dynamics import State
 from jrigid.rotation import attitude_rate, normalize
@@ -41,15 +48,6 @@ class Walk(NamedTuple):
     findings: Findings
 
 
-def whole_number(name: str, value: Any, least: int = 1) -> int:
-    """A Python integer of some size, which fixes the cost at trace time."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(
-            f"Argument `{name}` must be an integer and at least {least}, but it is {value!r}."
-        )
-    return int(value)
-
-
 def solver_of(solver: Any) -> Any:
     """The solver, or the one that is the default."""
     if solver is None:
@@ -62,22 +60,31 @@ def solver_of(solver: Any) -> Any:
     return solver
 
 
-def checked_body(system: Any, state0: Any, duration: Any, t0: Any) -> tuple[State, Array, Array]:
-    """Shapes and types, at trace time: the state with its internal parts, and the times."""
+def checked_state(system: Any, state: Any, name: str = "state0") -> State:
+    """Shapes and types, at trace time: the state, with its internal parts."""
     if not isinstance(system, RigidBody):
         raise ValueError(
             f"Argument `system` must be a RigidBody, but it is {type(system).__name__}."
         )
-    if not isinstance(state0, State):
-        raise ValueError(f"Argument `state0` must be a State, but it is {type(state0).__name__}.")
-    duration, t0, attitude, omega = float_arrays(duration, t0, state0.attitude, state0.omega)
-    shapes = {"duration": (), "t0": (), "attitude": (4,), "omega": (3,)}
-    for (name, shape), value in zip(shapes.items(), (duration, t0, attitude, omega), strict=True):
-        check_shape(name, value, shape)
-    internal = state0.internal
+    if not isinstance(state, State):
+        raise ValueError(f"Argument `{name}` must be a State, but it is {type(state).__name__}.")
+    attitude, omega = float_arrays(state.attitude, state.omega)
+    check_shape("attitude", attitude, (4,))
+    check_shape("omega", omega, (3,))
+    internal = state.internal
     if not has_parts(internal):
         internal = system.torque.internal_at_rest(State(attitude, omega))
     internal = jtu.tree_map(lambda x: jnp.asarray(x, omega.dtype), internal)
+    return State(attitude, omega, internal)
+
+
+def checked_body(system: Any, state0: Any, duration: Any, t0: Any) -> tuple[State, Array, Array]:
+    """The state, and the times in a dtype that serves all."""
+    state0 = checked_state(system, state0)
+    duration, t0, attitude, omega = float_arrays(duration, t0, state0.attitude, state0.omega)
+    check_shape("duration", duration, ())
+    check_shape("t0", t0, ())
+    internal = jtu.tree_map(lambda x: x.astype(omega.dtype), state0.internal)
     return State(attitude, omega, internal), duration, t0
 
 
@@ -162,8 +169,24 @@ def walk(
     return Walk(advance, to_state, on_sphere, rates, start, t0, step, dimension, findings)
 
 
-def verdict(findings: Findings, error: Array, found: Any) -> tuple[Any, Array, Any]:
-    """The result code: of the input, then of a motion that left the numbers or its accuracy."""
+def follow(path: Walk, first: Any, count: int, y: Array, rows: Array) -> tuple[Array, Array, Array]:
+    """Some steps from the one of a number on: state, tangents, largest local error."""
+
+    def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
+        y, rows, error = carry
+        t = path.t0 + path.step * (first + i).astype(y.dtype)
+        y, rows, local = path.advance(t, y, rows)
+        return (y, rows, jnp.maximum(error, local)), None
+
+    begin = (y, rows, jnp.zeros((), y.dtype))
+    return jax.lax.scan(step, begin, jnp.arange(count))[0]
+
+
+def verdict(findings: Findings, error: Array, found: Any, throw: bool) -> tuple[Any, Array, Any]:
+    """What became of it: the code, whether it is good, and what was found, an error or NaN if not.
+
+    Beside a bad input that is a motion that left its accuracy, or the numbers.
+    """
     worst = _LARGEST_ERROR[error.dtype.itemsize]
     ok = findings.ok
     findings.require(
@@ -173,7 +196,8 @@ def verdict(findings: Findings, error: Array, found: Any) -> tuple[Any, Array, A
         f"{worst:g} a step, but they are not.",
     )
     findings.require(all_finite(found) | ~ok, RESULTS.nonfinite_state)
-    return findings.result, findings.ok, found
+    ok = findings.ok
+    return findings.result, ok, findings.apply(nan_where(~ok, found), throw)
 
 
 def orthonormal(rows: Array) -> tuple[Array, Array]:

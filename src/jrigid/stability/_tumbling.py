@@ -9,14 +9,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jrigid._checks import RESULTS, check_option, check_shape, nan_where
+from jrigid._checks import RESULTS, check_option, check_shape, nan_where, whole_number
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
 from jrigid.stability._roots import PlaceOfRoot
-from jrigid.stability._steps import checked_body, solver_of, verdict, walk, whole_number
+from jrigid.stability._steps import (
+    checked_body,
+    follow,
+    solver_of,
+    verdict,
+    walk,
+)
 from jrigid.systems import RigidBody
 
 SIDES = ("along", "not settled", "against")
@@ -170,12 +176,11 @@ def _section(
     side = jnp.where(value == 0, side_of(path.t0, path.start), 0.0).astype(dtype)
     error = path.advance(path.t0, path.start, none)[2]
     begin = (path.t0, path.start, side, path.findings.ok, error)
-    (_, end, _, _, error), found = jax.lax.scan(crossing, begin, None, length=crossings)
+    (*_, error), found = jax.lax.scan(crossing, begin, None, length=crossings)
     ts, states, valid, left = found
-    result, ok, _ = verdict(path.findings, error, end)
+    result, ok, (ts, states) = verdict(path.findings, error, (ts, states), throw)
     valid = valid & ok
     ts, states = jax.vmap(lambda good, x: nan_where(~good, x))(valid, (ts, states))
-    ts, states = path.findings.apply((ts, states), throw)
     return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), result)
 
 
@@ -291,14 +296,7 @@ def _final_spin(
 ) -> FinalSpin:
     path = walk(system, state0, duration, steps, args, t0, solver)
     none = jnp.zeros((0, path.dimension), path.start.dtype)
-
-    def step(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
-        y, error = carry
-        y, _, local = path.advance(path.t0 + path.step * i.astype(y.dtype), y, none)
-        return (y, jnp.maximum(error, local)), None
-
-    begin = (path.start, jnp.zeros((), path.start.dtype))
-    (y, error), _ = jax.lax.scan(step, begin, jnp.arange(steps))
+    y, _, error = follow(path, 0, steps, path.start, none)
     state = path.to_state(y)
     inertia = jnp.where(path.findings.ok, system.inertia, jnp.ones_like(system.inertia))
     if inertia.ndim == 1:
@@ -307,8 +305,8 @@ def _final_spin(
         axis = principal_axes(system.inertia, throw=False).axes[:, 2].astype(y.dtype)
     rate = safe_norm(state.omega)
     alignment = jnp.sum(state.omega * axis) / jnp.where(rate > 0, rate, 1.0)
-    result, ok, found = verdict(path.findings, error, (alignment, state))
-    alignment, state = path.findings.apply(nan_where(~ok, found), throw)
+    result, ok, found = verdict(path.findings, error, (alignment, state), throw)
+    alignment, state = found
     settled = jnp.abs(alignment) > jnp.cos(jnp.radians(jnp.asarray(5.0, y.dtype)))
     side = jnp.where(settled, jnp.where(alignment > 0, 0, 2), 1)
     return FinalSpin(jnp.where(ok, side, -1), alignment, state, error, result)

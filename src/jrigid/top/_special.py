@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, check_shape, nan_where
+from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import euler_rates_to_omega, from_euler
@@ -60,8 +61,7 @@ def _steady(
     level = (jnp.abs(cos) <= 4 * eps) | (i1 == 0)
     slant = jnp.where(level, 0.0, i1 * cos)
     square = momentum * momentum - 4 * slant * mgl
-    positive = square > 0
-    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    root = root_of_positive(square)
     total = momentum + jnp.where(momentum < 0, -root, root)
     still = total == 0
     slow = jnp.where(still, 0.0, 2 * mgl / jnp.where(still, 1.0, total))
