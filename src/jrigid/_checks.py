@@ -1,10 +1,18 @@
-"""Argument checks: shapes at trace time, values at run time, and the result codes they set."""
+"""The door: arguments become arrays, shapes are checked, values judged, and what is wrong raised.
 
-from collections.abc import Sequence
-from typing import Any
+Shapes, dtypes and options are checked when a call is traced (ValueError). Values are judged by
+`Findings`, in three ways that `docs/design.md` tells apart: a formula is NaN outside its domain
+(`where_defined`), a builder raises or is NaN (`Findings.guard`), a working call raises or returns
+its result code (`settle`). An error is raised in Python where the values are known, which leaves
+the compiled function without callbacks, and by `equinox.error_if` inside of someone's jit.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -12,8 +20,29 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+Tree = TypeVar("Tree")
 
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+
+class _Listed(type(eqx.Enumeration)):
+    """Lists the names of an enumeration, each with a text."""
+
+    def __dir__(cls) -> list[str]:
+        return [*super().__dir__(), *cls._name_to_item]
+
+    def __getitem__(cls, item: Any) -> str:
+        return super().__getitem__(item) or "All went well."
+
+    @property
+    def texts(cls) -> list[str]:
+        """The texts in the order of the codes."""
+        return [x or "All went well." for x in cls._index_to_message]
+
+
+class Enumeration(eqx.Enumeration, metaclass=_Listed):
+    """Codes with a text each, as `equinox.Enumeration`; `dir` lists them."""
+
+
+class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGeneralTypeIssues]
     """What became of a computation: `diffrax.RESULTS` and the ways an input can be wrong."""
 
     invalid_inertia = (
@@ -145,6 +174,37 @@ def check_option(name: str, value: Any, options: Sequence[Any]) -> None:
         raise ValueError(f"Argument `{name}` must be one of {listed}, but it is {value!r}.")
 
 
+def check_type(name: str, value: Any, *types: type) -> None:
+    """Raise ValueError unless `value` is of one of the types."""
+    if not isinstance(value, types):
+        wanted = " or a ".join(x.__name__ for x in types)
+        raise ValueError(
+            f"Argument `{name}` must be a {wanted}, but it is a {type(value).__name__}."
+        )
+
+
+def check_precision(dtype: Any) -> None:
+    """Raise ValueError unless a motion can be followed in this dtype."""
+    if jnp.dtype(dtype) not in (jnp.float32, jnp.float64):
+        raise ValueError(f"Arguments must be float32 or float64, but they are {jnp.dtype(dtype)}.")
+
+
+def whole_number(name: str, value: Any, least: int = 1) -> int:
+    """A Python integer of some size, which fixes a cost at trace time, or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(
+            f"Argument `{name}` must be an integer and at least {least}, but it is {value!r}."
+        )
+    return int(value)
+
+
+def is_concrete(value: Any) -> bool:
+    """True for a value known now, not a tracer."""
+    return isinstance(value, int | float | np.ndarray | np.generic) or (
+        eqx.is_array(value) and not isinstance(value, jax.core.Tracer)
+    )
+
+
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """True where every inexact leaf of a pytree is finite."""
     leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
@@ -154,12 +214,21 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
     return ok
 
 
+def all_positive(tree: Any) -> Bool[Array, ""]:
+    """True where every inexact leaf of a pytree is positive and finite."""
+    leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
+    ok = jnp.array(True)
+    for leaf in leaves:
+        ok = ok & jnp.all((leaf > 0) & jnp.isfinite(leaf))
+    return ok
+
+
 def is_unit(quaternion: Float[Array, "4"]) -> Bool[Array, ""]:
     """True where a quaternion is of norm 1 to rounding, be it float32's in float64.
 
     Four digits typed by hand are not in float64.
     """
-    excess = jnp.abs(jnp.sum(quaternion**2) - 1)
+    excess = jnp.abs(jnp.sum(jax.lax.stop_gradient(quaternion) ** 2) - 1)
     return excess < max(300 * float(jnp.finfo(quaternion.dtype).eps), 4.5e-7)
 
 
@@ -194,43 +263,27 @@ def is_inertia(inertia: Array) -> Bool[Array, ""]:
     """True where moments or a tensor can drive the dynamics: finite, symmetric, positive."""
     inertia = jax.lax.stop_gradient(inertia)
     if inertia.ndim == 1:
-        return all_finite(inertia) & jnp.all(inertia > 0)
+        return all_positive(inertia)
     return all_finite(inertia) & is_symmetric(inertia) & is_positive_definite(inertia)
 
 
-class Findings:
-    """Collects what is wrong with the inputs of one call; the first finding wins.
+def harmless(ok: Array, tree: Tree) -> Tree:
+    """Ones, and unit tensors, in place of the arrays of a bad lane.
 
-    `apply` either raises (throw=True, in eager code and under jit) or gives back the result code,
-    so that the caller can answer a bad lane with NaN and leave the others alone.
+    Derivatives of NaN are NaN, even those that a mask multiplies by zero: a bad lane that went on
+    with its values would spoil the derivatives of what it shares with the others.
     """
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
 
-    def __init__(self) -> None:
-        """Start with nothing found."""
-        self.result: Any = RESULTS.successful
-        self._failed: list[Array] = []
-        self._messages: list[str] = []
+    def replace(x: Any) -> Array:  # a constant of a jaxpr may be numpy's
+        x = jnp.asarray(x)
+        unit = jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else jnp.ones_like(x)
+        return jnp.where(ok, x, unit)
 
-    @property
-    def ok(self) -> Bool[Array, ""]:
-        """True where nothing has been found."""
-        return self.result == RESULTS.successful
-
-    def require(self, ok: Bool[Array, ""], code: Any, message: str | None = None) -> None:
-        """Note that `code` is what is wrong where `ok` is False."""
-        self.result = RESULTS.where(self.ok & ~ok, code, self.result)
-        self._failed.append(~ok)
-        self._messages.append(RESULTS[code] if message is None else message)
-
-    def apply(self, value: Any, throw: bool) -> Any:
-        """Return `value`, guarded by the error if `throw`."""
-        if not throw or not self._failed:
-            return value
-        failed = jnp.stack(self._failed)
-        return eqx.branched_error_if(value, jnp.any(failed), jnp.argmax(failed), self._messages)
+    return eqx.combine(jtu.tree_map(replace, arrays), rest)
 
 
-def nan_where(bad: Bool[Array, ""], tree: Any) -> Any:
+def nan_where(bad: Bool[Array, ""], tree: Tree) -> Tree:
     """Replace the inexact leaves of a pytree by NaN where `bad`."""
     return jtu.tree_map(
         lambda x: (
@@ -240,8 +293,111 @@ def nan_where(bad: Bool[Array, ""], tree: Any) -> Any:
     )
 
 
-def is_concrete(value: Any) -> bool:
-    """True for a value known now, not a tracer."""
-    return isinstance(value, int | float | np.ndarray | np.generic) or (
-        eqx.is_array(value) and not isinstance(value, jax.core.Tracer)
-    )
+def where_defined(ok: Bool[Array, ""], formula: Callable[..., Tree], *arguments: Any) -> Tree:
+    """A formula's values where `ok`, NaN elsewhere; its derivatives stay clean everywhere."""
+    return nan_where(~ok, formula(*harmless(ok, arguments)))
+
+
+class _Finding(NamedTuple):
+    failed: Array
+    message: str
+    value: Any
+
+
+class Findings:
+    """Collects what is wrong with the inputs of one call; the first finding wins."""
+
+    def __init__(self) -> None:
+        """Start with nothing found."""
+        self.result: Any = RESULTS.successful
+        self.all: list[_Finding] = []
+
+    @property
+    def ok(self) -> Bool[Array, ""]:
+        """True where nothing has been found."""
+        return self.result == RESULTS.successful
+
+    def require(
+        self, ok: Bool[Array, ""], code: Any, message: str | None = None, value: Any = None
+    ) -> None:
+        """Note what is wrong where `ok` is False: a code, a sentence, and the value to show."""
+        self.result = RESULTS.where(self.ok & ~ok, code, self.result)
+        message = RESULTS[code] if message is None else message
+        self.all.append(_Finding(~ok, message, value))
+
+    def guard(self, tree: Tree, throw: bool) -> Tree:
+        """What a builder made: an error where something was found, or NaN without `throw`."""
+        if not throw:
+            return nan_where(~self.ok, tree)
+        return _refuse(tree, ~self.ok, lambda: self)
+
+    # What `identify` still calls.
+    def apply(self, value: Any, throw: bool) -> Any:
+        """Return `value`, guarded by the error if `throw`."""
+        return _refuse(value, ~self.ok, lambda: self) if throw and self.all else value
+
+
+def settle(answer: Tree, throw: bool, findings: Callable[[], Findings]) -> Tree:
+    """What a working call found: an error where its `result` is none to go on with, if `throw`.
+
+    Args:
+        answer: With a `result` of `RESULTS`.
+        throw: Whether to raise.
+        findings: Looks at the arguments again, to say which of them is wrong.
+    """
+    if not throw:
+        return answer
+    result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]
+    good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+    return _refuse(answer, ~good, findings, result)
+
+
+def _refuse(tree: Tree, bad: Array, findings: Callable[[], Findings], result: Any = None) -> Tree:
+    """The tree; an error where `bad`, in Python if that is known now, as under vmap and grad."""
+    some = eqxi.unvmap_any(bad)
+    traced = isinstance(some, jax.core.Tracer)
+    if not traced and not some:
+        return tree
+    found = list(findings().all)
+    if result is not None:  # what became of the work itself
+        found += [
+            _Finding(bad & (result._value == i), x, None) for i, x in enumerate(RESULTS.texts)
+        ]
+    failed = jnp.stack([jax.lax.stop_gradient(x.failed) for x in found])
+    if traced:  # of several bad lanes the last message wins
+        return eqx.branched_error_if(tree, bad, jnp.argmax(failed), [x.message for x in found])
+    known, each = _all_lanes(bad, failed)
+    lane = tuple(np.argwhere(known)[0].tolist())
+    first = found[int(np.argmax(each[lane]))]
+    details = []
+    if first.value is not None:
+        value = _all_lanes(bad, jax.lax.stop_gradient(jnp.asarray(first.value)))[1][lane]
+        details.append(str(value.item()) if value.ndim == 0 else np.array2string(value))
+    if lane:
+        others = f" and {known.sum() - 1} more" if known.sum() > 1 else ""
+        details.append(f"in lane {lane[0] if len(lane) == 1 else lane}{others}")
+    told, stop, hint = first.message.partition(". (")
+    told = f"{told.rstrip('.')}: {' '.join(details)}" if details else told.rstrip(".")
+    raise RuntimeError(told + (stop + hint if hint else "."))
+
+
+def _all_lanes(*values: Array) -> list[np.ndarray]:
+    """Values known now, of all lanes of whatever vmap is around; the lanes in front."""
+    if not any(isinstance(x, jax.core.Tracer) for x in values):
+        return [np.asarray(x) for x in values]
+    found: list[np.ndarray] = []
+
+    @jax.custom_batching.custom_vmap
+    def look(*values: Array) -> Array:
+        return values[0]
+
+    @look.def_vmap
+    def _(size: int, batched: list[bool], *values: Array) -> tuple[Array, bool]:
+        pairs = zip(values, batched, strict=True)
+        found.extend(
+            _all_lanes(*(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in pairs))
+        )
+        return values[0], batched[0]
+
+    look(*values)
+    return found

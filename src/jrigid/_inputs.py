@@ -3,9 +3,7 @@
 import warnings
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._checks import (
@@ -80,15 +78,3 @@ def check_values(
     findings.require(longest > 0, RESULTS.invalid_max_step)
     field = system.vector_field(t0.astype(rtol.dtype), state0, args)
     findings.require(all_finite(field), RESULTS.invalid_vector_field)
-
-
-def harmless(ok: Array, tree: Any) -> Any:
-    """Ones, and unit tensors, in place of the arrays of a bad lane."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-
-    def replace(x: Any) -> Array:  # a constant of a jaxpr may be numpy's
-        x = jnp.asarray(x)
-        unit = jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else jnp.ones_like(x)
-        return jnp.where(ok, x, unit)
-
-    return eqx.combine(jtu.tree_map(replace, arrays), rest)

@@ -20,6 +20,7 @@ from jrigid._checks import (
     all_finite,
     check_shape,
     float_arrays,
+    harmless,
     nan_where,
 )
 from jrigid._controller import (
@@ -30,7 +31,7 @@ from jrigid._controller import (
     guarded,
     standing_still,
 )
-from jrigid._inputs import DEFAULT_RTOL, check_values, harmless, numbers, tolerances
+from jrigid._inputs import DEFAULT_RTOL, check_values, numbers, tolerances
 from jrigid._numerics import power_of_two
 from jrigid._scales import ravel, units, unravel
 from jrigid._trajectory import Trajectory

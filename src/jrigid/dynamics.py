@@ -5,19 +5,22 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
     check_inertia_shape,
+    check_precision,
     check_shape,
+    check_type,
     float_arrays,
     internal_parts,
     state_array,
 )
-from jrigid._types import InertiaLike, Scalar, Vector, VectorLike
+from jrigid._types import InertiaLike, Readable, Scalar, Vector, VectorLike
 
 
-class State(eqx.Module):
+class State(Readable):
     """State of a body that turns about a fixed point or its centre of mass.
 
     Attributes:
@@ -35,6 +38,44 @@ class State(eqx.Module):
     attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
     omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
     internal: Any = eqx.field(default=(), converter=internal_parts)
+
+
+class ExactStates(Readable):
+    """States of a motion in closed form, and what became of the call.
+
+    Attributes:
+        states: State at each time; the leading axes of its leaves are those of the times.
+        result: `jrigid.RESULTS.successful`, or what is wrong with the arguments; one for each lane
+            under vmap. `jrigid.RESULTS[motion.result]` is its text.
+    """
+
+    states: State
+    result: Any
+
+    @property
+    def attitude(self) -> Float[Array, "... 4"]:
+        """Unit quaternions, scalar first, body to space."""
+        return self.states.attitude
+
+    @property
+    def omega(self) -> Float[Array, "... 3"]:
+        """Angular velocities, body components [rad/s]."""
+        return self.states.omega
+
+
+def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array, ...]]:
+    """A state without internal parts and other arrays in one dtype, or ValueError."""
+    check_type(name, state, State)
+    if jtu.tree_leaves(state.internal):
+        raise ValueError(
+            f"Argument `{name}.internal` must be empty, but it is not: a body with moving parts "
+            "has no motion in closed form; use `jrigid.simulate`."
+        )
+    attitude, omega, *others = float_arrays(state.attitude, state.omega, *others)
+    check_shape(f"{name}.attitude", attitude, (4,))
+    check_shape(f"{name}.omega", omega, (3,))
+    check_precision(omega.dtype)
+    return State(attitude, omega), tuple(others)
 
 
 def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:
