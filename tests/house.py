@@ -1,10 +1,13 @@
 """The size and the order of the house, counted: `python tests/house.py` prints them."""
 
 import ast
+import inspect
 import io
 import tokenize
 from collections import Counter
 from pathlib import Path
+
+import jrigid
 
 ROOT = Path(__file__).parents[1] / "src" / "jrigid"
 LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE}
@@ -58,20 +61,25 @@ def functions():
 
 
 def with_throw():
-    """Public functions, and constructors of public classes, that take `throw`."""
-    found = []
-    for name, path, tree in modules():
-        del path
-        owners = [(None, tree), *((x.name, x) for x in tree.body if isinstance(x, ast.ClassDef))]
-        for owner, body in owners:
-            for node in body.body:
-                if not isinstance(node, ast.FunctionDef):
-                    continue
-                arguments = [x.arg for x in node.args.args + node.args.kwonlyargs]
-                private = (owner or node.name).startswith("_")
-                if "throw" in arguments and not private:
-                    found.append(f"{name}.{owner}.{node.name}" if owner else f"{name}.{node.name}")
-    return found
+    """Public functions, constructors and methods that take `throw`."""
+    parts = inspect.getmembers(jrigid, inspect.ismodule)
+    modules = [jrigid, *(x for name, x in parts if not name.startswith("_"))]
+    found = set()
+    for module in modules:
+        for name, value in inspect.getmembers(module):
+            if name.startswith("_") or not getattr(value, "__module__", "").startswith("jrigid"):
+                continue
+            own = {name: value} if inspect.isfunction(value) else {}
+            if inspect.isclass(value):
+                own = {
+                    f"{name}.{x}": getattr(value, x)
+                    for x in vars(value)
+                    if x == "__init__" or not x.startswith("_")
+                }
+            for label, function in own.items():
+                if callable(function) and "throw" in inspect.signature(function).parameters:
+                    found.add(label)
+    return sorted(found)
 
 
 def imports():
