@@ -363,18 +363,18 @@ def _refuse(tree: Tree, bad: Array, findings: Callable[[], Findings], result: An
     raise RuntimeError(told + (stop + hint if hint else "."))
 
 
-def _all_lanes(*values: Array) -> list[np.ndarray]:
+def _all_lanes(*values: Any) -> list[np.ndarray]:
     """Values known now, of all lanes of whatever vmap is around; the lanes in front."""
     if not any(isinstance(x, jax.core.Tracer) for x in values):
         return [np.asarray(x) for x in values]
     found: list[np.ndarray] = []
 
     @jax.custom_batching.custom_vmap
-    def look(*values: Array) -> Array:
+    def look(*values: Any) -> Any:
         return values[0]
 
     @look.def_vmap
-    def _(size: int, batched: list[bool], *values: Array) -> tuple[Array, bool]:
+    def _(size: int, batched: list[bool], *values: Any) -> tuple[Any, bool]:
         pairs = zip(values, batched, strict=True)
         found.extend(
             _all_lanes(*(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in pairs))
