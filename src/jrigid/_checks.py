@@ -55,28 +55,9 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "I3 <= I1 + I2, but they do not."
     )
     invalid_mass = "Argument `mass` must be positive and finite, but it is not."
-    invalid_masses = (
-        "Argument `masses` must be finite and non-negative, with a positive sum, but it is not."
-    )
-    invalid_position = "Argument `positions` must be finite, but it is not."
-    invalid_density = (
-        "Argument `density` must be finite and non-negative, with a positive integral over a box "
-        "with `lower` < `upper`, but it is not."
-    )
-    open_mesh = (
-        "Argument `faces` must describe a closed surface in which every edge is shared by two "
-        "faces that run through it in opposite directions, but an edge is not."
-    )
-    inside_out_mesh = (
-        "Argument `faces` must be ordered counter-clockwise seen from outside, enclosing a "
-        "positive volume, but the enclosed volume is not positive: the mesh is inside out or flat."
-    )
     invalid_torque = (
         "A parameter of a torque must be finite, and masses, moments, couplings and drag "
         "coefficients must not be negative, but one is."
-    )
-    invalid_length = (
-        "The lengths of a solid must be positive and finite, and fit together, but they do not."
     )
     invalid_attitude = (
         "Argument `attitude` must be a unit quaternion, but its norm is not 1: "
@@ -238,7 +219,7 @@ def is_symmetric(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
     return jnp.all(jnp.abs(tensor - tensor.T) <= tolerance)
 
 
-def of_unit_size(
+def scaled_together(
     tensor: Float[Array, "3 3"], *others: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "3 3"], ...]:
     """Divide tensors by the largest magnitude of the first one's entries, unless 0 or infinite."""
@@ -252,7 +233,7 @@ def of_unit_size(
 
 def is_positive_definite(tensor: Float[Array, "3 3"]) -> Bool[Array, ""]:
     """True where the pivots of a symmetric tensor, of whatever scale, are positive."""
-    (a, d, e), (_, b, f), (_, _, c) = of_unit_size(tensor)[0]
+    (a, d, e), (_, b, f), (_, _, c) = scaled_together(tensor)[0]
     first = jnp.where(a > 0, a, 1.0)
     b, c, f = b - d * (d / first), c - e * (e / first), f - d * (e / first)
     second = jnp.where(b > 0, b, 1.0)
@@ -309,19 +290,20 @@ class Findings:
 
     def __init__(self) -> None:
         """Start with nothing found."""
+        self.ok: Bool[Array, ""] = jnp.array(True)
         self.result: Any = RESULTS.successful
         self.all: list[_Finding] = []
-
-    @property
-    def ok(self) -> Bool[Array, ""]:
-        """True where nothing has been found."""
-        return self.result == RESULTS.successful
 
     def require(
         self, ok: Bool[Array, ""], code: Any, message: str | None = None, value: Any = None
     ) -> None:
-        """Note what is wrong where `ok` is False: a code, a sentence, and the value to show."""
-        self.result = RESULTS.where(self.ok & ~ok, code, self.result)
+        """Note what is wrong where `ok` is False: a code, a sentence, and the value to show.
+
+        A builder, which keeps no code, has None and a sentence.
+        """
+        if code is not None:
+            self.result = RESULTS.where(self.ok & ~ok, code, self.result)
+        self.ok = self.ok & ok
         message = RESULTS[code] if message is None else message
         self.all.append(_Finding(~ok, message, value))
 
@@ -381,18 +363,18 @@ def _refuse(tree: Tree, bad: Array, findings: Callable[[], Findings], result: An
     raise RuntimeError(told + (stop + hint if hint else "."))
 
 
-def _all_lanes(*values: Array) -> list[np.ndarray]:
+def _all_lanes(*values: Any) -> list[np.ndarray]:
     """Values known now, of all lanes of whatever vmap is around; the lanes in front."""
     if not any(isinstance(x, jax.core.Tracer) for x in values):
         return [np.asarray(x) for x in values]
     found: list[np.ndarray] = []
 
     @jax.custom_batching.custom_vmap
-    def look(*values: Array) -> Array:
+    def look(*values: Any) -> Any:
         return values[0]
 
     @look.def_vmap
-    def _(size: int, batched: list[bool], *values: Array) -> tuple[Array, bool]:
+    def _(size: int, batched: list[bool], *values: Any) -> tuple[Any, bool]:
         pairs = zip(values, batched, strict=True)
         found.extend(
             _all_lanes(*(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in pairs))

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from jrigid._checks import (
     RESULTS,
     Findings,
-    all_finite,
     check_inertia_shape,
     check_shape,
     float_arrays,
@@ -208,15 +207,6 @@ class Force(eqx.Module):
         return self.fn(t, state, args)
 
 
-# What `MassProperties` made with `throw=False` remembers of a bad input.
-_MARKS: tuple[Any, ...] = (
-    RESULTS.invalid_position,
-    RESULTS.unphysical_inertia,
-    RESULTS.invalid_length,
-    RESULTS.invalid_attitude,
-)
-
-
 class FloatingBody(AbstractSystem):
     """A body in flight: its centre of mass moves under forces while it turns.
 
@@ -274,10 +264,6 @@ class FloatingBody(AbstractSystem):
             findings: What has been found so far; `require` adds to it.
         """
         mass = jax.lax.stop_gradient(self.mass_properties.mass)
-        marked = ~all_finite(jax.lax.stop_gradient(self.inertia))
-        result: Any = self.mass_properties.result
-        for code in _MARKS:
-            findings.require(~marked | (result != code), code)
         findings.require(jnp.isfinite(mass) & (mass > 0), RESULTS.invalid_mass)
         findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia)
         self.torque.check(findings)

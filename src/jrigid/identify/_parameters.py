@@ -180,7 +180,7 @@ def body_from_log_cholesky(
     # About the centre of mass the column t drops out.
     inertia = mass * _tensor(product("ik,jk->ij", upper, upper))
     body = nan_where(~findings.ok, (mass, jnp.stack(t), inertia))
-    return MassProperties(*body, throw=None)
+    return MassProperties.unchecked(*body)
 
 
 def log_cholesky_from_body(body: MassProperties, *, throw: bool = True) -> Float[Array, "10"]:

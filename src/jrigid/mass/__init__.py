@@ -13,7 +13,6 @@ from jrigid.mass._axes import to_center_of_mass as to_center_of_mass
 from jrigid.mass._body import MassProperties as MassProperties
 from jrigid.mass._body import PrincipalAxes as PrincipalAxes
 from jrigid.mass._mesh import from_mesh as from_mesh
-from jrigid.mass._mesh import mesh_validity as mesh_validity
 from jrigid.mass._points import from_density as from_density
 from jrigid.mass._points import from_points as from_points
 from jrigid.mass._points import inertia_tensor as inertia_tensor

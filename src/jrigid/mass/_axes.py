@@ -1,95 +1,98 @@
-"""Tensors: parallel axis, principal axes, functions of a tensor."""
+"""Tensors: what is one, parallel axis, principal axes, functions of a tensor."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import (
-    RESULTS,
-    Findings,
     all_finite,
     check_inertia_shape,
     check_shape,
     float_arrays,
-    nan_where,
-    of_unit_size,
+    is_symmetric,
+    scaled_together,
+    where_defined,
 )
 from jrigid._spectral import eigh, spectral_function
-from jrigid._types import (
-    InertiaLike,
-    Matrix,
-    Scalar,
-    ScalarLike,
-    Vector,
-    VectorLike,
-)
-from jrigid.mass._body import (
-    PrincipalAxes,
-    as_tensor,
-    unit_steiner,
-)
-from jrigid.mass._validity import NOT_SYMMETRIC, is_finite_symmetric, is_semidefinite
+from jrigid._types import InertiaLike, Matrix, Readable, Scalar, ScalarLike, Vector, VectorLike
+
+ULPS = 64  # rounding allowed in "not negative" and "I3 <= I1 + I2"
 
 
-def _tensor(inertia: ArrayLike, *others: ArrayLike) -> tuple[Findings, Matrix, list[Array]]:
-    inertia, *rest = float_arrays(inertia, *others)
+def as_tensor(inertia: Array) -> Matrix:
+    """A tensor of moments or of a tensor, or ValueError."""
     check_inertia_shape(inertia)
-    tensor = as_tensor(inertia)
-    findings = Findings()
-    findings.require(is_finite_symmetric(tensor), RESULTS.invalid_inertia, NOT_SYMMETRIC)
-    return findings, tensor, rest
+    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
 
 
-def _steiner_arguments(
+def inertia_of_second_moment(second: Matrix) -> Matrix:
+    """tr(S) 1 - S; sums of two moments, as differences of three would leave none to a needle."""
+    x, y, z = jnp.diagonal(second)
+    outside = jnp.where(np.eye(3, dtype=bool), 0.0, second)
+    return jnp.diag(jnp.stack([y + z, x + z, x + y])) - outside
+
+
+def steiner(displacement: Vector) -> Matrix:
+    """Tensor of a unit mass at a place, |d|^2 1 - d d^T."""
+    return inertia_of_second_moment(displacement[:, None] * displacement[None, :])
+
+
+def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
+    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
+
+    Entries and scale are about 1: products of much larger or smaller ones leave the range.
+    """
+    # A few ulps off at any moments, where the roots of the cubic lose half the digits.
+    shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
+    remainder = tensor + shift * jnp.eye(3, dtype=tensor.dtype)
+    left, fine = jnp.ones(3, bool), jnp.asarray(True)
+    for _ in range(3):
+        k = jnp.argmax(jnp.where(left, jnp.diagonal(remainder), -jnp.inf))
+        row, pivot = remainder[k], remainder[k, k]
+        fine = fine & (pivot >= 0)
+        remainder = remainder - row[:, None] * row[None, :] / jnp.where(pivot > 0, pivot, 1.0)
+        left = left & (jnp.arange(3) != k)
+    return fine
+
+
+@jax.jit
+def is_physical(tensor: Matrix) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether a tensor is symmetric, finite and semi-definite, and whether I3 <= I1 + I2."""
+    tensor = jax.lax.stop_gradient(tensor)
+    (unit,) = scaled_together(tensor)
+    trace = jnp.trace(unit)
+    second = 0.5 * trace * jnp.eye(3, dtype=unit.dtype) - unit
+    return is_symmetric(tensor) & is_semidefinite(unit, trace), is_semidefinite(second, trace)
+
+
+def _displaced(
     inertia: ArrayLike, mass: ArrayLike, displacement: ArrayLike
-) -> tuple[Findings, tuple[Matrix, Scalar, Vector]]:
-    """What is wrong, and the arguments; zeros, whose derivatives are finite, where it is."""
-    findings, tensor, (mass, displacement) = _tensor(inertia, mass, displacement)
+) -> tuple[Bool[Array, ""], tuple[Matrix, Scalar, Vector]]:
+    """Whether the parallel axis theorem applies, and its arguments."""
+    inertia, mass, displacement = float_arrays(inertia, mass, displacement)
+    tensor = as_tensor(inertia)
     check_shape("mass", mass, ())
     check_shape("displacement", displacement, (3,))
-    findings.require(
-        (mass >= 0) & jnp.isfinite(mass),
-        RESULTS.invalid_mass,
-        "Argument `mass` must be finite and non-negative, but it is not.",
-    )
-    findings.require(
-        all_finite(displacement),
-        RESULTS.invalid_position,
-        "Argument `displacement` must be finite, but it is not.",
-    )
-    tensor, mass, displacement = (
-        jnp.where(findings.ok, x, 0.0) for x in (tensor, mass, displacement)
-    )
-    return findings, (tensor, mass, displacement)
+    ok = is_symmetric(tensor) & (mass >= 0) & all_finite((mass, displacement))
+    return ok, (tensor, mass, displacement)
 
 
-def _answer(findings: Findings, tensor: Matrix, throw: bool) -> Matrix:
-    return findings.apply(tensor, True) if throw else nan_where(~findings.ok, tensor)
-
-
-def parallel_axis(
-    inertia_com: InertiaLike, mass: ScalarLike, displacement: VectorLike, *, throw: bool = True
-) -> Matrix:
+def parallel_axis(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
     r"""Inertia tensor about a point displaced from the centre of mass.
 
-    $I = I_{com} + m (|d|^2 1 - d d^T)$.
+    $I = I_{com} + m (|d|^2 1 - d d^T)$. NaN where the tensor is not symmetric or the mass negative.
 
     Args:
-        inertia_com: Moments or tensor about the centre of mass [kg m^2].
-        mass: Mass [kg], not negative.
+        inertia: Moments or tensor about the centre of mass [kg m^2].
+        mass: Mass [kg].
         displacement: Between centre of mass and point, either way round [m].
-        throw: False: a bad value makes the tensor of its lane NaN instead of an error.
 
     Returns:
         Tensor about the point, same axes [kg m^2].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: The tensor is not finite or not symmetric, the mass is negative, or mass or
-            displacement is not finite (run time, any lane).
 
     Gradients: polynomial, finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
@@ -99,31 +102,24 @@ def parallel_axis(
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    findings, (tensor, mass, displacement) = _steiner_arguments(inertia_com, mass, displacement)
-    return _answer(findings, tensor + mass * unit_steiner(displacement), throw)
+    ok, arguments = _displaced(inertia, mass, displacement)
+    return where_defined(ok, lambda tensor, mass, d: tensor + mass * steiner(d), *arguments)
 
 
-def to_center_of_mass(
-    inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike, *, throw: bool = True
-) -> Matrix:
+def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
     r"""Inertia tensor about the centre of mass, from that about a displaced point.
 
-    The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$.
+    The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$. NaN where the tensor is not
+    symmetric or the mass negative, and where a moment about the centre of mass comes out negative:
+    no body with `mass` at `displacement` has so small a tensor.
 
     Args:
         inertia: Moments or tensor about the point [kg m^2].
-        mass: Mass [kg], not negative.
+        mass: Mass [kg].
         displacement: Between centre of mass and point, either way round [m].
-        throw: False: a bad value makes the tensor of its lane NaN instead of an error.
 
     Returns:
         Tensor about the centre of mass, same axes [kg m^2].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: The tensor is not finite or not symmetric, the mass is negative, mass or
-            displacement is not finite, or the tensor is less than `mass` at `displacement` has,
-            so that a moment comes out negative (run time, any lane).
 
     Gradients: polynomial, finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
@@ -133,35 +129,41 @@ def to_center_of_mass(
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    findings, (tensor, mass, displacement) = _steiner_arguments(inertia, mass, displacement)
-    reduced = tensor - mass * unit_steiner(displacement)
-    whole, fixed = of_unit_size(*jax.lax.stop_gradient((tensor, reduced)))
-    findings.require(
-        is_semidefinite(fixed, jnp.trace(whole)),
-        RESULTS.invalid_inertia,
-        "Argument `inertia` must be at least that of `mass` at `displacement`, but a moment about "
-        "the centre of mass comes out negative.",
-    )
-    return _answer(findings, reduced, throw)
+    ok, arguments = _displaced(inertia, mass, displacement)
+
+    def reduced(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
+        return tensor - mass * steiner(displacement)
+
+    tensor = jax.lax.stop_gradient(arguments[0])
+    whole, own = scaled_together(tensor, jax.lax.stop_gradient(reduced(*arguments)))
+    return where_defined(ok & is_semidefinite(own, jnp.trace(whole)), reduced, *arguments)
 
 
-def principal_axes(inertia: InertiaLike, *, throw: bool = True) -> PrincipalAxes:
+@final
+class PrincipalAxes(Readable):
     """Principal moments and axes of an inertia tensor.
+
+    Attributes:
+        moments: Principal moments, ascending [kg m^2].
+        axes: Rotation whose columns are the principal axes: v_body = axes @ v_principal.
+    """
+
+    moments: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+
+
+def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
+    """Principal moments and axes of an inertia tensor; NaN where it is not symmetric.
 
     Moments ascend; axes are the columns of a right-handed rotation. In axes 1 and 3 the first
     component that has at least 0.9 of the largest magnitude is positive, so that the signs do not
     hang on the last bit where two components tie; axis 2 completes the rotation.
 
     Args:
-        inertia: Moments or tensor [kg m^2]; any finite symmetric tensor will do.
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
+        inertia: Moments or tensor [kg m^2]; any symmetric tensor will do.
 
     Returns:
         Moments and axes, tensor = axes diag(moments) axes^T to a few ulps of the largest.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
 
     Gradients: d moments = diag(axes^T dI axes). First derivatives of symmetric functions of
     the moments (`sum(1 / moments)`) are right everywhere, repeated moments included. The moments
@@ -174,29 +176,27 @@ def principal_axes(inertia: InertiaLike, *, throw: bool = True) -> PrincipalAxes
     >>> print(jr.principal_axes(jnp.array([3.0, 1.0, 2.0])).moments)
     [1. 2. 3.]
     """
-    findings, tensor, _ = _tensor(inertia)
-    tensor = findings.apply(tensor, throw)
-    return PrincipalAxes(*eigh(jnp.where(findings.ok, tensor, jnp.nan)))
+    tensor = as_tensor(float_arrays(inertia)[0])
+    return where_defined(is_symmetric(tensor), lambda x: PrincipalAxes(*eigh(x)), tensor)
 
 
-def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike, *, throw: bool = True) -> Matrix:
+def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
     """Function of a tensor, axes diag(f(moments)) axes^T, with derivatives right everywhere.
+
+    NaN where the tensor is not symmetric, and where f is.
 
     Args:
         f: Maps a scalar to a scalar, smooth on the range of the moments, by jax operations;
             forward-differentiable. It may close over parameters that are differentiated. Across
             gaps below a tenth of a moment its derivatives are integrated with eight nodes.
-        inertia: Moments or tensor [kg m^2]; any finite symmetric tensor in the domain of f.
-        throw: False: a bad tensor makes the answer of its lane NaN instead of an error;
-            `principal_axes` gives the code.
+        inertia: Moments or tensor [kg m^2]; any symmetric tensor in the domain of f.
 
     Returns:
         Symmetric tensor in the units of f.
 
     Raises:
-        ValueError: Wrong shape, or f does not map scalars to scalars (trace time).
-        RuntimeError: The tensor is not finite or not symmetric (run time, any lane).
-        NotImplementedError: A third derivative in the tensor (trace time).
+        ValueError: f does not map scalars to scalars.
+        NotImplementedError: A third derivative in the tensor.
 
     Gradients: first and second, in every mode, in the tensor and in what f closes over, right at
     repeated and nearly repeated moments (divided differences), where moments and axes composed by
@@ -210,12 +210,13 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike, *, throw: boo
      [0.   0.25 0.  ]
      [0.   0.   0.25]]
     """
-    findings, tensor, _ = _tensor(inertia)
+    tensor = as_tensor(float_arrays(inertia)[0])
     moment = jax.ShapeDtypeStruct((), tensor.dtype)
     shape = jax.eval_shape(f, moment)
     if getattr(shape, "shape", None) != () or shape.dtype != tensor.dtype:
         raise ValueError(f"Argument `f` must map {moment} to the same, but it gives {shape}.")
     hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
-    # NaN would reach the derivatives in the parameters; 1 is in the domain of most functions.
-    good = jnp.where(findings.ok, tensor, jnp.eye(3, dtype=tensor.dtype))
-    return _answer(findings, spectral_function(hoisted, good, *parameters), throw)
+    # Of a bad lane f is asked at 1, which is in the domain of most functions.
+    return where_defined(
+        is_symmetric(tensor), lambda x: spectral_function(hoisted, x, *parameters), tensor
+    )

@@ -1,68 +1,53 @@
 """The mass properties of a body: checks, composition, motion."""
 
-from typing import final
+from typing import Any, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    check_inertia_shape,
-    check_shape,
-    float_arrays,
-    nan_where,
-)
+from jrigid._checks import Findings, all_finite, check_shape, float_arrays, where_defined
 from jrigid._numerics import product
-from jrigid._spectral import eigh
 from jrigid._types import (
     InertiaLike,
     Matrix,
     Quaternion,
     QuaternionLike,
+    Readable,
+    Scalar,
     ScalarLike,
     Vector,
     VectorLike,
 )
-from jrigid.mass._validity import Body, find, judge, raise_or_mark
+from jrigid.mass._axes import (
+    PrincipalAxes,
+    as_tensor,
+    is_physical,
+    parallel_axis,
+    principal_axes,
+    steiner,
+)
 from jrigid.rotation import to_matrix
 
-
-@final
-class PrincipalAxes(eqx.Module):
-    """Principal moments and axes of an inertia tensor.
-
-    Attributes:
-        moments: Principal moments, ascending [kg m^2].
-        axes: Rotation whose columns are the principal axes: v_body = axes @ v_principal.
-    """
-
-    moments: Float[Array, "3"]
-    axes: Float[Array, "3 3"]
-
-    @property
-    def result(self) -> RESULTS:
-        """Code of what became of the call: `successful` or `invalid_inertia`."""
-
-        def judge(moments: Array) -> RESULTS:
-            findings = Findings()
-            findings.require(all_finite(moments), RESULTS.invalid_inertia)
-            return findings.result  # pyright: ignore[reportReturnType]
-
-        for _ in range(self.moments.ndim - 1):
-            judge = jax.vmap(judge)
-        return judge(self.moments)
+_NOT_A_BODY = (
+    "Argument `inertia` must hold three finite, non-negative principal moments or be a finite, "
+    "symmetric, positive semi-definite (3, 3) tensor, but it is not. (Three bodies are three "
+    "lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
+)
+_NOT_PHYSICAL = (
+    "Argument `inertia` must be the tensor of a real body, whose principal moments satisfy "
+    "I3 <= I1 + I2, but they do not."
+)
 
 
 @final
-class MassProperties(eqx.Module):
+class MassProperties(Readable):
     """Mass, centre of mass, and inertia tensor about the centre of mass, of a real body.
 
     Thin bodies are bodies too: a plate may have I3 = I1 + I2, a rod one zero moment, a point
-    three. `a + b` is the two bodies rigidly joined (coordinates in common), and `sum` works.
+    three. `a + b` is the two bodies rigidly joined (coordinates in common), and `sum` works. What
+    is done with a body of NaN gives NaN.
 
     Attributes:
         mass: Mass [kg].
@@ -88,7 +73,7 @@ class MassProperties(eqx.Module):
         center_of_mass: VectorLike,
         inertia: InertiaLike,
         *,
-        throw: bool | None = True,
+        throw: bool = True,
     ) -> None:
         """Check and store; principal moments become a diagonal tensor.
 
@@ -97,43 +82,53 @@ class MassProperties(eqx.Module):
             center_of_mass: Coordinates of the centre of mass [m].
             inertia: Moments or tensor about the centre of mass [kg m^2], positive semi-definite,
                 with I3 <= I1 + I2, to rounding. It is stored symmetrised.
-            throw: True: a bad value is an error. False: it turns into NaN and `result` says what
-                was wrong. None: values known to be good are not looked at.
+            throw: False: a bad value makes the body of its lane NaN instead of an error.
 
         Raises:
-            ValueError: Wrong shape (trace time).
             RuntimeError: Mass not positive, a value not finite, a tensor that is not symmetric or
-                has a negative moment or violates I3 <= I1 + I2 (run time, any lane).
+                has a negative moment or violates I3 <= I1 + I2.
 
         Gradients: the identity, on symmetric tensors.
         """
-        mass, center_of_mass, inertia = float_arrays(mass, center_of_mass, inertia)
-        check_shape("mass", mass, ())
-        check_shape("center_of_mass", center_of_mass, (3,))
-        check_inertia_shape(inertia)
-        tensor = as_tensor(inertia)
-        if throw is not None:
-            findings = judge(mass, center_of_mass, tensor)
-            mass, center_of_mass, tensor = raise_or_mark(
-                findings, (mass, center_of_mass, tensor), throw
-            )
-        self.mass = mass
-        self.center_of_mass = center_of_mass
-        self.inertia = 0.5 * tensor + 0.5 * tensor.T
+        values = _arrays(mass, center_of_mass, inertia)
+        mass, center_of_mass, tensor = jax.lax.stop_gradient(values)
+        findings = Findings()
+        message = "Argument `mass` must be positive and finite, but it is not."
+        findings.require((mass > 0) & jnp.isfinite(mass), None, message, mass)
+        message = "Argument `center_of_mass` must be finite, but it is not."
+        findings.require(all_finite(center_of_mass), None, message, center_of_mass)
+        positive, triangle = is_physical(tensor)
+        findings.require(positive, None, _NOT_A_BODY, inertia)
+        findings.require(triangle, None, _NOT_PHYSICAL, inertia)
+        self.mass, self.center_of_mass, tensor = findings.guard(values, throw)
+        self.inertia = _symmetrised(tensor)
 
-    @property
-    def result(self) -> RESULTS:
-        """Code of what these values are, computed when asked.
+    @classmethod
+    def unchecked(
+        cls, mass: ScalarLike, center_of_mass: VectorLike, inertia: InertiaLike
+    ) -> "MassProperties":
+        """The body of values at which nobody looks, for formulas that give those of real bodies.
 
-        `successful`, `invalid_mass`, `invalid_position`, `invalid_inertia`,
-        `unphysical_inertia`, `invalid_length` (of a solid), `invalid_attitude` (of `rotated`),
-        `invalid_masses` (of points), `invalid_density`, `open_mesh` or `inside_out_mesh`; one code
-        a lane where the leaves carry batch axes.
+        Args:
+            mass: Mass [kg].
+            center_of_mass: Coordinates of the centre of mass [m].
+            inertia: Moments or tensor about the centre of mass [kg m^2], stored symmetrised.
+
+        Returns:
+            The body; NaN stays NaN.
+
+        Gradients: the identity, on symmetric tensors.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> print(jr.MassProperties.unchecked(1.0, jnp.zeros(3), jnp.ones(3)).mass)
+        1.0
         """
-        code = lambda *body: judge(*body).result  # noqa: E731
-        for _ in range(self.mass.ndim):
-            code = jax.vmap(code)
-        return code(self.mass, self.center_of_mass, self.inertia)  # pyright: ignore[reportReturnType]
+        body = object.__new__(cls)
+        mass, center_of_mass, tensor = _arrays(mass, center_of_mass, inertia)
+        object.__setattr__(body, "mass", mass)
+        object.__setattr__(body, "center_of_mass", center_of_mass)
+        object.__setattr__(body, "inertia", _symmetrised(tensor))
+        return body
 
     def about(self, point: VectorLike) -> Matrix:
         """Inertia tensor about any point.
@@ -144,9 +139,6 @@ class MassProperties(eqx.Module):
         Returns:
             Tensor about the point, same axes [kg m^2].
 
-        Raises:
-            ValueError: Wrong shape (trace time).
-
         Gradients: polynomial, finite everywhere.
         Source: Goldstein, Classical Mechanics, 3rd ed., 5.3 (Steiner).
 
@@ -155,10 +147,9 @@ class MassProperties(eqx.Module):
         >>> print(ball.about(jnp.zeros(3))[2, 2])
         3.0
         """
-        (point,) = float_arrays(point)
+        point, center = float_arrays(point, self.center_of_mass)
         check_shape("point", point, (3,))
-        *body, point = float_arrays(self.mass, self.center_of_mass, self.inertia, point)
-        return _about(body, point)
+        return parallel_axis(self.inertia, self.mass, point - center)
 
     def translated(self, displacement: VectorLike) -> "MassProperties":
         """The body moved by a displacement, without turning it.
@@ -169,9 +160,6 @@ class MassProperties(eqx.Module):
         Returns:
             The moved body.
 
-        Raises:
-            ValueError: Wrong shape (trace time).
-
         Gradients: linear, finite everywhere.
 
         >>> import jax.numpy as jnp, jrigid as jr
@@ -179,25 +167,18 @@ class MassProperties(eqx.Module):
         >>> print(ball.translated(jnp.array([0.0, 2.0, 0.0])).center_of_mass)
         [0. 2. 0.]
         """
-        (displacement,) = float_arrays(displacement)
+        body, displacement = _in_one_dtype(self, displacement)
         check_shape("displacement", displacement, (3,))
-        *body, displacement = float_arrays(
-            self.mass, self.center_of_mass, self.inertia, displacement
-        )
-        return MassProperties(*_translated(body, displacement), throw=None)
+        return MassProperties.unchecked(body.mass, body.center_of_mass + displacement, body.inertia)
 
     def rotated(self, attitude: QuaternionLike) -> "MassProperties":
         """The body turned about the origin of the coordinates.
 
         Args:
-            attitude: Quaternion of the turn, any but zero; its norm drops out.
+            attitude: Quaternion of the turn; its norm drops out. Of a zero quaternion: NaN.
 
         Returns:
-            The turned body: centre of mass R c, tensor R I R^T. After a zero quaternion the
-            centre and moments are NaN and `result` is `invalid_attitude`.
-
-        Raises:
-            ValueError: Wrong shape (trace time).
+            The turned body: centre of mass R c, tensor R I R^T.
 
         Gradients: finite for any non-zero quaternion.
 
@@ -207,15 +188,15 @@ class MassProperties(eqx.Module):
         >>> print(turned.center_of_mass.round(6)[2])
         -1.0
         """
-        *body, attitude = float_arrays(self.mass, self.center_of_mass, self.inertia, attitude)
+        body, attitude = _in_one_dtype(self, attitude)
         check_shape("attitude", attitude, (4,))
-        return MassProperties(*_rotated(body, attitude), throw=None)
+        return _rotated(body, attitude)
 
     def principal_axes(self) -> PrincipalAxes:
         """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`.
 
         Returns:
-            Moments and axes; NaN where the tensor is.
+            Moments and axes.
 
         Gradients: as those of `jrigid.principal_axes`.
 
@@ -224,17 +205,13 @@ class MassProperties(eqx.Module):
         >>> print(box.principal_axes().moments)
         [ 5. 10. 13.]
         """
-        return PrincipalAxes(*eigh(self.inertia))
+        return principal_axes(self.inertia)
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
         """The two bodies rigidly joined."""
         if not isinstance(other, MassProperties):
             return NotImplemented
-        leaves = float_arrays(
-            self.mass, self.center_of_mass, self.inertia,
-            other.mass, other.center_of_mass, other.inertia,
-        )  # fmt: skip
-        return MassProperties(*_joined(list(leaves[:3]), list(leaves[3:])), throw=None)
+        return _joined(*_in_one_dtype(self, other))
 
     def __radd__(self, other: int) -> "MassProperties":
         """Start of `sum`: 0 is no body."""
@@ -243,76 +220,43 @@ class MassProperties(eqx.Module):
         return NotImplemented
 
 
-def as_tensor(inertia: Array) -> Matrix:
-    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+def _arrays(
+    mass: ArrayLike, center_of_mass: ArrayLike, inertia: ArrayLike
+) -> tuple[Scalar, Vector, Matrix]:
+    mass, center_of_mass, inertia = float_arrays(mass, center_of_mass, inertia)
+    check_shape("mass", mass, ())
+    check_shape("center_of_mass", center_of_mass, (3,))
+    return mass, center_of_mass, as_tensor(inertia)
 
 
-def unit_steiner(displacement: Float[Array, "3"]) -> Matrix:
-    x, y, z = displacement
-    return jnp.stack(
-        [
-            jnp.stack([y * y + z * z, -x * y, -x * z]),
-            jnp.stack([-x * y, x * x + z * z, -y * z]),
-            jnp.stack([-x * z, -y * z, x * x + y * y]),
-        ]
-    )
+def _symmetrised(tensor: Matrix) -> Matrix:
+    return 0.5 * tensor + 0.5 * tensor.T
 
 
-# Derivatives of NaN are NaN, even those that a mask multiplies by zero: what shares a lane with
-# bad values would lose its gradient in all lanes. So bad values do not enter the arithmetic.
-def _harmless(ok: Bool[Array, ""], body: list[Array]) -> Body:
-    mass, center_of_mass, tensor = body
-    eye = jnp.eye(3, dtype=tensor.dtype)
-    return (
-        jnp.where(ok, mass, 1.0),
-        jnp.where(ok, center_of_mass, 0.0),
-        jnp.where(ok, tensor, eye),
-    )
-
-
-def _examined(
-    *bodies: list[Array], also: tuple[Bool[Array, ""], RESULTS] | None = None
-) -> tuple[Findings, list[Body]]:
-    """What is wrong with bodies, or else with `also`, and the bodies made harmless."""
-    findings = Findings()
-    for body in bodies:
-        find(findings, *body)
-    if also is not None:
-        findings.require(*also)
-    return findings, [_harmless(findings.ok, body) for body in bodies]
+def _in_one_dtype(*trees: Any) -> Any:
+    leaves, structure = jtu.tree_flatten(trees)
+    return jtu.tree_unflatten(structure, float_arrays(*leaves))
 
 
 @jax.jit
-def _about(body: list[Array], point: Vector) -> Matrix:
-    also = all_finite(point), RESULTS.invalid_position
-    findings, [(mass, center, tensor)] = _examined(body, also=also)
-    point = jnp.where(findings.ok, point, 0.0)
-    return nan_where(~findings.ok, tensor + mass * unit_steiner(point - center))
+def _rotated(body: MassProperties, attitude: Quaternion) -> MassProperties:
+    def turned(body: MassProperties, attitude: Quaternion) -> MassProperties:
+        turn = to_matrix(attitude)
+        center = product("ij,j->i", turn, body.center_of_mass)
+        tensor = product("ij,jk,lk->il", turn, body.inertia, turn)
+        return MassProperties.unchecked(body.mass, center, tensor)
+
+    ok = all_finite((body, attitude)) & jnp.any(attitude != 0)
+    return where_defined(ok, turned, body, attitude)
 
 
 @jax.jit
-def _translated(body: list[Array], displacement: Vector) -> Body:
-    also = all_finite(displacement), RESULTS.invalid_position
-    findings, [(mass, center, tensor)] = _examined(body, also=also)
-    return raise_or_mark(findings, (mass, center + displacement, tensor), False)
+def _joined(body: MassProperties, other: MassProperties) -> MassProperties:
+    def joined(a: MassProperties, b: MassProperties) -> MassProperties:
+        mass = a.mass + b.mass
+        share = b.mass / mass
+        apart = b.center_of_mass - a.center_of_mass
+        tensor = a.inertia + b.inertia + a.mass * share * steiner(apart)
+        return MassProperties.unchecked(mass, a.center_of_mass + share * apart, tensor)
 
-
-@jax.jit
-def _rotated(body: list[Array], attitude: Quaternion) -> Body:
-    turnable = all_finite(attitude) & jnp.any(attitude != 0)
-    also = turnable, RESULTS.invalid_attitude
-    findings, [(mass, center, tensor)] = _examined(body, also=also)
-    turn = to_matrix(jnp.where(turnable, attitude, 1.0))
-    turned = product("ij,jk,lk->il", turn, tensor, turn)
-    return raise_or_mark(findings, (mass, product("ij,j->i", turn, center), turned), False)
-
-
-@jax.jit
-def _joined(body_a: list[Array], body_b: list[Array]) -> Body:
-    findings, bodies = _examined(body_a, body_b)
-    (mass_a, center_a, tensor_a), (mass_b, center_b, tensor_b) = bodies
-    mass = mass_a + mass_b
-    share = mass_b / mass
-    apart = center_b - center_a
-    tensor = tensor_a + tensor_b + mass_a * share * unit_steiner(apart)
-    return raise_or_mark(findings, (mass, center_a + share * apart, tensor), False)
+    return where_defined(all_finite((body, other)), joined, body, other)

@@ -9,31 +9,61 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int, Real
 
 from jrigid._checks import (
-    RESULTS,
     Findings,
-    all_finite,
     check_shape,
     float_arrays,
+    harmless,
     is_concrete,
 )
-from jrigid._types import (
-    Matrix,
-    Scalar,
-    ScalarLike,
-    Vector,
-)
+from jrigid._types import Matrix, Scalar, ScalarLike, Vector
+from jrigid.mass._axes import ULPS, inertia_of_second_moment, is_physical
 from jrigid.mass._body import MassProperties
-from jrigid.mass._points import inertia_of_second_moment, lane_sum
-from jrigid.mass._surface import closed_parts, closed_traced, winds_once
-from jrigid.mass._validity import ULPS, is_physical, raise_or_mark
+from jrigid.mass._points import lane_sum
+
+_OPEN = (
+    "Argument `faces` must describe a closed surface in which every edge is shared by two "
+    "faces that run through it in opposite directions, but an edge is not."
+)
+_INSIDE_OUT = (
+    "Argument `faces` must be ordered counter-clockwise seen from outside, enclosing a "
+    "positive volume, but the enclosed volume is not positive: the mesh is inside out or flat."
+)
+_CUTS_ITSELF = (
+    "Argument `faces` must describe a surface that does not cut itself and no part of which is "
+    "inside out, but the tensor is not that of a real body."
+)
 
 
-def _mesh(vertices: Array, faces: Any) -> tuple[Any, Bool[Array, ""], np.ndarray | None]:
-    """Faces, whether they are closed, and where to ask how often they wind (`closed_parts`)."""
-    check_shape("vertices", vertices, (None, 3))
-    if not eqx.is_array_like(faces):
-        faces = np.asarray(faces)
-    if is_concrete(faces):
+def is_closed(faces: Int[np.ndarray, "faces 3"], vertices: int) -> bool:
+    """Whether known faces run through each edge once forth and once back."""
+    faces = faces.astype(np.int64)
+    if faces.min() < 0 or faces.max() >= vertices:
+        return False
+    start, end = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    edges = np.sort(2 * (low * vertices + high) + (start > end))
+    forth, back = edges[::2], edges[1::2]
+    # Sorted, every edge once forth and once back leaves no room for a third run or a point.
+    return not (edges.size % 2 or np.any(forth % 2) or np.any(back != forth + 1))
+
+
+def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array, ""]:
+    """As `is_closed`, at run time."""
+    if faces.shape[0] % 2:
+        return jnp.asarray(False)
+    start, end = faces.T.ravel(), jnp.roll(faces, -1, axis=1).T.ravel()
+    # Keys stay apart: their product overflows int32.
+    keys = (jnp.minimum(start, end), jnp.maximum(start, end), (start > end).astype(start.dtype))
+    low, high, back = jax.lax.sort(keys, num_keys=3)
+    same = (low[::2] == low[1::2]) & (high[::2] == high[1::2])
+    alternate = (back[::2] == 0) & (back[1::2] == 1)
+    inside = jnp.all((faces >= 0) & (faces < vertices))
+    return inside & jnp.all(same & alternate)
+
+
+def _index_array(faces: Any) -> Any:
+    """Faces as numpy's array if they are known, or ValueError."""
+    if is_concrete(faces) or not eqx.is_array_like(faces):
         faces = np.asarray(faces)
     check_shape("faces", faces, (None, 3))
     if not jnp.issubdtype(faces.dtype, jnp.integer):
@@ -42,22 +72,17 @@ def _mesh(vertices: Array, faces: Any) -> tuple[Any, Bool[Array, ""], np.ndarray
         )
     if faces.shape[0] == 0:
         raise ValueError("Argument `faces` must hold at least one face, but it is empty.")
-    if isinstance(faces, np.ndarray):
-        closed, samples = closed_parts(faces, vertices.shape[0])
-        return faces.astype(np.int32), jnp.asarray(closed), samples
-    return faces, closed_traced(faces, vertices.shape[0]), None
+    return faces.astype(np.int32) if isinstance(faces, np.ndarray) else faces
 
 
 @jax.jit
 def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vector, Matrix]:
-    """Volume, sum of the absolute volumes of its tetrahedra, centre, second moment about it.
+    """Volume, sum of the absolute volumes of its tetrahedra, centre, tensor about it.
 
     The divergence theorem, as tetrahedra between the faces and an origin amid the vertices: the
     sums do not depend on it, so no derivative runs through it, and far bodies lose no digits.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
     """
-    # NaN in the sums would reach the gradients of the other lanes.
-    vertices = jnp.where(all_finite(vertices), vertices, 0.0)
     sums = jnp.stack([lane_sum(vertices[:, i]) for i in range(3)])
     origin = jax.lax.stop_gradient(sums / vertices.shape[0])
     local = [vertices[:, i] - origin[i] for i in range(3)]
@@ -82,38 +107,7 @@ def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vect
         [jnp.stack([second[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)]
     )
     about_center = matrix - volume * center[:, None] * center[None, :]
-    return volume, magnitude, origin + center, about_center
-
-
-def _judged(vertices: Array, faces: Any) -> tuple[Findings, tuple[Scalar, Vector, Matrix]]:
-    """What is wrong with a mesh, and volume, centre, and tensor about it, of unit density."""
-    faces, closed, samples = _mesh(vertices, faces)
-    volume, magnitude, center, second = _mesh_integrals(vertices, faces)
-    tensor = inertia_of_second_moment(second)
-    findings = Findings()
-    findings.require(
-        all_finite(vertices),
-        RESULTS.invalid_position,
-        "Argument `vertices` must be finite, but it is not.",
-    )
-    findings.require(closed, RESULTS.open_mesh)
-    rounding = ULPS * jnp.finfo(vertices.dtype).eps * jax.lax.stop_gradient(magnitude)
-    findings.require(jax.lax.stop_gradient(volume) > rounding, RESULTS.inside_out_mesh)
-    if samples is not None:
-        findings.require(
-            winds_once(vertices, faces, samples),
-            RESULTS.inside_out_mesh,
-            "Argument `faces` must describe surfaces that bound one body together, but a part is "
-            "inside out or lies within another or at the same place.",
-        )
-    positive, triangle = is_physical(tensor)
-    findings.require(
-        positive & triangle,
-        RESULTS.inside_out_mesh,
-        "Argument `faces` must describe a surface that does not cut itself and no part of which is "
-        "inside out, but the tensor is not that of a real body.",
-    )
-    return findings, (volume, center, tensor)
+    return volume, magnitude, origin + center, inertia_of_second_moment(about_center)
 
 
 def from_mesh(
@@ -125,34 +119,28 @@ def from_mesh(
 ) -> MassProperties:
     """Mass properties of a homogeneous body bounded by a closed triangle mesh; exact.
 
+    Surfaces that close each for itself are taken at their word: a cavity is a surface turned
+    inward, and where surfaces overlap or one is inside out outside of the others (a part mirrored
+    by its program) their masses add or subtract. Programs that repair meshes join them.
+
     Args:
         vertices: Coordinates of the corners [m]. Corners at one place must be one vertex.
-        faces: Indices of the corners of each triangle, counter-clockwise seen from outside. A
-            cavity is a surface of its own, counter-clockwise seen from inside the cavity. Known
-            values are checked once, at trace time; traced ones by a sort at run time, which does
-            not tell surfaces apart.
+        faces: Indices of the corners of each triangle, counter-clockwise seen from outside, in a
+            cavity seen from inside the cavity. Known values are checked once, at trace time;
+            traced ones by a sort at run time.
         density: Density [kg/m^3], positive.
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
+        throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:
         The body, its tensor about the centre of mass. Accurate far from the origin too.
 
-    Where known faces make several surfaces that share no vertex, points on both sides of each
-    are asked how often all of them wind around: more than once or less than never is an error.
-    This finds a surface inside out where there is no body, one within another that is no cavity,
-    and one at the place of another; each point costs a solid angle a face. Of surfaces that cut
-    through each other or through themselves it finds those that have one of up to 16 corners,
-    spread over all of them, on the wrong side: not all. Nor are parts that share a vertex told
-    apart.
-
     Raises:
-        ValueError: Wrong shape, no faces, or indices that are no integers (trace time).
+        ValueError: No faces, or indices that are no integers.
         RuntimeError: A vertex is not finite; an edge is not shared by exactly two faces that run
             through it in opposite directions (an open mesh, a flipped, repeated or degenerate
             face, an index out of range, three faces at an edge); the volume is not positive (inside
-            out or flat); surfaces contradict each other, as said above; the tensor is not that of a
-            real body (the surface cuts itself); the density is not positive and finite (run time,
-            any lane).
+            out or flat); the tensor is not that of a real body (the surface cuts itself); the
+            density is not positive and finite.
 
     Gradients: exact in the vertices and the density.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
@@ -165,42 +153,22 @@ def from_mesh(
     1.0 [1.5  0.25 0.25]
     """
     vertices, density = float_arrays(vertices, density)
+    check_shape("vertices", vertices, (None, 3))
     check_shape("density", density, ())
-    findings, (volume, center, tensor) = _judged(vertices, faces)
-    dense = (density > 0) & jnp.isfinite(density)
-    density = jnp.where(dense, density, 1.0)
-    findings.require(
-        dense,
-        RESULTS.invalid_density,
-        "Argument `density` must be positive and finite, but it is not.",
-    )
-    volume = jnp.where(findings.ok, volume, 1.0)  # a code may stand on a mass that is good
-    values = raise_or_mark(findings, (density * volume, center, density * tensor), throw)
-    return MassProperties(*values, throw=None)
-
-
-def mesh_validity(
-    vertices: Real[ArrayLike, "vertices 3"], faces: Int[ArrayLike, "faces 3"]
-) -> RESULTS:
-    """What `from_mesh` would find wrong with a mesh, as a code.
-
-    Args:
-        vertices: Coordinates of the corners [m].
-        faces: Indices of the corners of each triangle.
-
-    Returns:
-        `successful`, `invalid_position`, `open_mesh` or `inside_out_mesh`, a code a lane.
-
-    Raises:
-        ValueError: Wrong shape, no faces, or indices that are no integers (trace time).
-
-    Gradients: none, a code is no number.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> corners = jnp.array([[0.0, 0, 0], [6.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    >>> inward = jnp.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-    >>> jr.mass.mesh_validity(corners, inward) == jr.RESULTS.inside_out_mesh
-    Array(True, dtype=bool)
-    """
-    (vertices,) = float_arrays(vertices)
-    return _judged(vertices, faces)[0].result  # pyright: ignore[reportReturnType]
+    faces = _index_array(faces)
+    closed_of = is_closed if isinstance(faces, np.ndarray) else is_closed_traced
+    findings = Findings()
+    finite = jnp.all(jnp.isfinite(vertices), axis=1)
+    message = "Argument `vertices` must be finite, but it is not."
+    findings.require(jnp.all(finite), None, message, vertices[jnp.argmin(finite)])
+    message = "Argument `density` must be positive and finite, but it is not."
+    findings.require((density > 0) & jnp.isfinite(density), None, message, density)
+    findings.require(jnp.asarray(closed_of(faces, vertices.shape[0])), None, _OPEN)
+    vertices, density = harmless(findings.ok, (vertices, density))
+    volume, magnitude, center, tensor = _mesh_integrals(vertices, faces)
+    rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude
+    findings.require(jax.lax.stop_gradient(volume) > rounding, None, _INSIDE_OUT)
+    positive, triangle = is_physical(tensor)
+    findings.require(positive & triangle, None, _CUTS_ITSELF)
+    body = MassProperties.unchecked(density * volume, center, density * tensor)
+    return findings.guard(body, throw)

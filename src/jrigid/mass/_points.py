@@ -9,22 +9,19 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Real
 
 from jrigid._checks import (
-    RESULTS,
     Findings,
     all_finite,
     check_shape,
     float_arrays,
+    harmless,
     nan_where,
+    pair_of_shapes,
+    whole_number,
 )
 from jrigid._numerics import product
-from jrigid._types import (
-    Matrix,
-    Scalar,
-    Vector,
-    VectorLike,
-)
+from jrigid._types import Matrix, Scalar, Vector, VectorLike
+from jrigid.mass._axes import inertia_of_second_moment
 from jrigid.mass._body import MassProperties
-from jrigid.mass._validity import raise_or_mark
 
 # Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU reductions
 # and products of tall thin matrices run below numpy's speed; lanes of partial sums mend both.
@@ -64,7 +61,10 @@ def _outer_sum_in_lanes(weights: Array, positions: Array) -> Matrix:
 
 @jax.custom_jvp
 def _second_moment(weights: Float[Array, " points"], positions: Float[Array, "points 3"]) -> Matrix:
-    """Sum of m r r^T; the rule spares reverse mode the memory of a scan."""
+    """Sum of m r r^T; the rule spares reverse mode the memory of a scan, and NaN from bad values.
+
+    To keep them from the sum itself would cost as much as the sum.
+    """
     if weights.shape[0] < 16 * _LANES:
         return _outer_sum(weights, positions)
     return jax.lax.platform_dependent(
@@ -74,50 +74,46 @@ def _second_moment(weights: Float[Array, " points"], positions: Float[Array, "po
 
 @_second_moment.defjvp
 def _second_moment_jvp(primals: tuple, tangents: tuple) -> tuple[Matrix, Matrix]:
-    (m, r), (dm, dr) = primals, tangents
+    dm, dr = tangents
+    m, r = (jnp.where(jnp.isfinite(x), x, 0.0) for x in primals)
     half = product("na,nb->ab", 0.5 * dm[:, None] * r + m[:, None] * dr, r)
-    return _second_moment(m, r), half + half.T
+    return _second_moment(*primals), half + half.T
 
 
-def inertia_of_second_moment(second: Matrix) -> Matrix:
-    return jnp.trace(second) * jnp.eye(3, dtype=second.dtype) - second
+def _first_moment(weights: Array, positions: Array) -> Vector:
+    return jnp.stack([lane_sum(weights * positions[:, i]) for i in range(3)])
 
 
 @jax.jit
-def _cloud(masses: Array, positions: Array) -> tuple[Scalar, Vector, Matrix]:
-    """Mass, centre, and tensor about the centre, by differences to a local origin."""
+def _cloud(masses: Array, positions: Array) -> MassProperties:
+    """The body, its centre found in two passes: the first is off by the rounding of far places."""
     mass = lane_sum(masses)
-    origin = jax.lax.stop_gradient(positions[0])
-    local = positions - origin[None, :]
     divisor = jnp.where(mass == 0, 1.0, mass)
-    center = jnp.stack([lane_sum(masses * local[:, i]) for i in range(3)]) / divisor
-    return (
-        mass,
-        origin + center,
-        inertia_of_second_moment(_second_moment(masses, local - center[None, :])),
-    )
+    origin = jax.lax.stop_gradient(_first_moment(masses, positions) / divisor)
+    local = positions - origin[None, :]
+    center = _first_moment(masses, local) / divisor
+    second = _second_moment(masses, local - center[None, :])
+    return MassProperties.unchecked(mass, origin + center, inertia_of_second_moment(second))
 
 
 @jax.jit
-def _cloud_checks(masses: Array, positions: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    fine = jnp.all(jnp.isfinite(masses) & (masses >= 0)) & jnp.any(masses > 0)
-    return fine, all_finite(positions)
+def _examined(masses: Array, positions: Array) -> list[tuple[Bool[Array, ""], Array]]:
+    """Whether all masses are finite and not negative, and positions finite; the first that is not.
+
+    Asked of the whole, not of each one, a good answer is quick.
+    """
+    fine = jnp.isfinite(masses) & (masses >= 0)
+    finite = jnp.all(jnp.isfinite(positions), axis=1)
+    return [(jnp.all(ok), x[jnp.argmin(ok)]) for ok, x in ((fine, masses), (finite, positions))]
 
 
-def _points(masses: ArrayLike, positions: ArrayLike, throw: bool) -> tuple[Array, Array, Findings]:
+def _cloud_arrays(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array]:
     masses, positions = float_arrays(masses, positions)
     check_shape("masses", masses, (None,))
     check_shape("positions", positions, (masses.shape[0], 3))
     if masses.shape[0] == 0:
         raise ValueError("Argument `masses` must hold at least one point, but it is empty.")
-    findings = Findings()
-    fine_masses, fine_positions = _cloud_checks(*jax.lax.stop_gradient((masses, positions)))
-    findings.require(fine_masses, RESULTS.invalid_masses)
-    findings.require(fine_positions, RESULTS.invalid_position)
-    if not throw:  # NaN in the sums would reach the gradients of the other lanes
-        masses = jnp.where(findings.ok, masses, 1.0)
-        positions = jnp.where(findings.ok, positions, 0.0)
-    return masses, positions, findings
+    return masses, positions
 
 
 def from_points(
@@ -131,15 +127,15 @@ def from_points(
     Args:
         masses: Point masses [kg], non-negative, not all zero.
         positions: Their coordinates [m].
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
+        throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:
-        The body, its tensor about the centre of mass. Accurate far from the origin too.
+        The body, its tensor about the centre of mass. Accurate far from the origin too, and
+        where a light point is far from the others.
 
     Raises:
-        ValueError: Wrong shapes or no points (trace time).
         RuntimeError: A mass is negative or not finite or all are zero, or a position is not
-            finite (run time, any lane).
+            finite.
 
     Gradients: finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.7-5.8.
@@ -150,34 +146,33 @@ def from_points(
     >>> print(dumbbell.center_of_mass, jnp.diag(dumbbell.inertia))
     [0. 0. 1.] [2. 2. 0.]
     """
-    masses, positions, findings = _points(masses, positions, throw)
-    values = raise_or_mark(findings, _cloud(masses, positions), throw)
-    return MassProperties(*values, throw=None)
+    arrays = _cloud_arrays(masses, positions)
+    (fine, mass), (finite, position) = _examined(*jax.lax.stop_gradient(arrays))
+    findings = Findings()
+    message = "Argument `masses` must be finite and non-negative, but it is not."
+    findings.require(fine, None, message, mass)
+    message = "Argument `positions` must be finite, but it is not."
+    findings.require(finite, None, message, position)
+    if not throw:  # NaN in the sums would reach the gradients of the other lanes
+        arrays = harmless(findings.ok, arrays)
+    body = _cloud(*arrays)
+    findings.require(body.mass > 0, None, "Argument `masses` must not be all zero, but it is.")
+    return findings.guard(body, throw)
 
 
 def inertia_tensor(
-    masses: Real[ArrayLike, " points"],
-    positions: Real[ArrayLike, "points 3"],
-    *,
-    throw: bool = True,
+    masses: Real[ArrayLike, " points"], positions: Real[ArrayLike, "points 3"]
 ) -> Matrix:
     r"""Inertia tensor of point masses about the origin of their coordinates.
 
-    $I_{ab} = \sum_i m_i (|r_i|^2 \delta_{ab} - r_{ia} r_{ib})$.
+    $I_{ab} = \sum_i m_i (|r_i|^2 \delta_{ab} - r_{ia} r_{ib})$. NaN where a mass is negative.
 
     Args:
-        masses: Point masses [kg], non-negative, not all zero.
+        masses: Point masses [kg].
         positions: Coordinates [m].
-        throw: False: a bad value makes the tensor of its lane NaN instead of an error;
-            `from_points` gives the code.
 
     Returns:
         Symmetric positive semi-definite tensor [kg m^2].
-
-    Raises:
-        ValueError: Wrong shapes or no points (trace time).
-        RuntimeError: A mass is negative or not finite or all are zero, or a position is not
-            finite (run time, any lane).
 
     Gradients: finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.7-5.8.
@@ -188,14 +183,13 @@ def inertia_tensor(
      [ 0. 18.  0.]
      [ 0.  0.  0.]]
     """
-    masses, positions, findings = _points(masses, positions, throw)
-    tensor = _inertia_about_origin(masses, positions)
-    return findings.apply(tensor, True) if throw else nan_where(~findings.ok, tensor)
+    return _inertia_about_origin(*_cloud_arrays(masses, positions))
 
 
 @jax.jit
 def _inertia_about_origin(masses: Array, positions: Array) -> Matrix:
-    return inertia_of_second_moment(_second_moment(masses, positions))
+    ok = jnp.all(masses >= 0) & all_finite((masses, positions))
+    return nan_where(~ok, inertia_of_second_moment(_second_moment(masses, positions)))
 
 
 def from_density(
@@ -216,15 +210,15 @@ def from_density(
         order: Nodes along each axis. Exact for densities that are polynomials of degree up to
             2 order - 3 in each coordinate; a density that jumps inside the box, such as that of a
             ball, converges slowly: split the box, or use `from_mesh` or `jrigid.solids`.
-        throw: False: bad values give NaN and a code in `.result` instead of an error.
+        throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:
         The body, its tensor about the centre of mass.
 
     Raises:
-        ValueError: Wrong shape, order below 2, or a density that is no scalar (trace time).
+        ValueError: A density that is no scalar.
         RuntimeError: The density is negative or not finite at a node, its integral is zero, or
-            the box is empty (run time, any lane).
+            the box is empty.
 
     Gradients: finite wherever those of the density are.
 
@@ -233,11 +227,8 @@ def from_density(
     >>> print(wedge.mass.round(6), wedge.center_of_mass.round(6))
     1.0 [0.666667 0.5      0.5     ]
     """
-    lower, upper = float_arrays(lower, upper)
-    check_shape("lower", lower, (3,))
-    check_shape("upper", upper, (3,))
-    if not isinstance(order, int) or order < 2:
-        raise ValueError(f"Argument `order` must be an integer of at least 2, but it is {order!r}.")
+    lower, upper = pair_of_shapes("lower", lower, (3,), "upper", upper, (3,))
+    order = whole_number("order", order, 2)
     shape = jax.eval_shape(density, jax.ShapeDtypeStruct((3,), lower.dtype))
     if getattr(shape, "shape", None) != ():
         raise ValueError(
@@ -246,14 +237,21 @@ def from_density(
     nodes, node_weights = np.polynomial.legendre.leggauss(order)
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
-    box = all_finite((lower, upper)) & jnp.all(lower < upper)
-    # A bad box gives way to a unit box: its NaN would reach the gradients of the other lanes.
-    lower, upper = jnp.where(box, lower, 0.0), jnp.where(box, upper, 1.0)
+    findings = Findings()
+    findings.require(
+        all_finite((lower, upper)) & jnp.all(lower < upper),
+        None,
+        "Arguments `lower` and `upper` must be finite with `lower` < `upper`, but they are not.",
+        jnp.stack([lower, upper]),
+    )
+    lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)
     positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(grid, half.dtype)
     values = jax.vmap(density)(positions).astype(half.dtype)
-    findings = Findings()
-    fine = jnp.all(jnp.isfinite(values) & (values >= 0)) & jnp.any(values > 0)
-    findings.require(fine & box, RESULTS.invalid_density)
-    masses = jnp.where(fine, values, 1.0) * jnp.prod(half) * jnp.asarray(weights, half.dtype)
-    return MassProperties(*raise_or_mark(findings, _cloud(masses, positions), throw), throw=None)
+    [(fine, value), _] = _examined(*jax.lax.stop_gradient((values, positions)))
+    message = "Argument `density` must be finite and non-negative, but it is not."
+    findings.require(fine, None, message, value)
+    masses = harmless(fine, values) * jnp.prod(half) * jnp.asarray(weights, half.dtype)
+    body = _cloud(masses, positions)
+    findings.require(body.mass > 0, None, "Argument `density` must not be zero, but it is.")
+    return findings.guard(body, throw)

@@ -302,7 +302,7 @@ def _final_spin(
     if inertia.ndim == 1:
         axis = jnp.eye(3, dtype=y.dtype)[jnp.argmax(inertia)]
     else:
-        axis = principal_axes(system.inertia, throw=False).axes[:, 2].astype(y.dtype)
+        axis = principal_axes(system.inertia).axes[:, 2].astype(y.dtype)
     rate = safe_norm(state.omega)
     alignment = jnp.sum(state.omega * axis) / jnp.where(rate > 0, rate, 1.0)
     result, ok, found = verdict(path.findings, error, (alignment, state), throw)
