@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike as NumpyArrayLike
 
 from jrigid._numerics import product
 
@@ -149,7 +148,7 @@ def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Ar
     def g(moment: Array) -> Array:
         return f(moment, *parameters)
 
-    def differences(of: Callable[..., Array], indices: NumpyArrayLike) -> Array:
+    def differences(of: Callable[..., Array], indices: np.ndarray) -> Array:
         """Of the moments of each set of indices, once, in ascending order."""
         wanted = np.sort(indices, axis=-1)
         sets, which = np.unique(wanted.reshape(-1, wanted.shape[-1]), axis=0, return_inverse=True)
