@@ -137,3 +137,8 @@ def test_gyro_example_is_free_rotation_plus_its_noise():
 def test_gyro_example_is_the_same_at_every_call():
     first, second = jr.datasets.gyro_example(), jr.datasets.gyro_example()
     np.testing.assert_array_equal(first.omegas, second.omegas)
+
+
+def test_records_print_their_numbers():
+    assert "moments=[3.0836, 3.235 , 1. " in repr(jr.datasets.toutatis_1992())
+    assert "sigma=0.06" in repr(jr.datasets.gyro_example())

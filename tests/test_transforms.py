@@ -58,7 +58,7 @@ NOTHING_TO_CALL = {
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
-    "rotation.rate_record_validity", "free.motion_validity", "free.regime", "top.motion_validity",
+    "free.motion_validity", "free.regime", "top.motion_validity",
     "top.motion_class", "lagrangian.cyclic_coordinates",
 }  # fmt: skip
 # Regressions and fits of records of some length: tests/test_identify*.py.
@@ -311,9 +311,19 @@ CASES = {
     "rotation.euler_rates_to_omega": Case(rotation.euler_rates_to_omega, (ANGLES, VECTOR)),
     "rotation.omega_to_euler_rates": Case(rotation.omega_to_euler_rates, (ANGLES, OMEGA)),
     "rotation.integrate_rate": Case(
-        lambda omegas, ts, q: rotation.integrate_rate(omegas, ts, rotation.normalize(q)),
-        (SAMPLES, TIMES, ATTITUDE),
+        lambda ts, omegas, q: rotation.integrate_rate(ts, omegas, rotation.normalize(q)),
+        (TIMES, SAMPLES, ATTITUDE),
     ),
+    "rotation.identity": Case(lambda x: number(x) * rotation.identity(number(x).dtype), (1.3,)),
+    "rotation.random": Case(
+        # the bits of another precision are others, the norm is not
+        lambda x: number(x) * jnp.sum(rotation.random(jax.random.key(0), number(x).dtype) ** 2),
+        (1.3,),
+    ),
+    "rotation.inverse": Case(rotation.inverse, (2 * ATTITUDE,)),
+    "rotation.slerp": Case(rotation.slerp, (ATTITUDE, OTHER_ATTITUDE, 0.3)),
+    "rotation.from_roll_pitch_yaw": Case(rotation.from_roll_pitch_yaw, (ANGLES,)),
+    "rotation.to_roll_pitch_yaw": Case(rotation.to_roll_pitch_yaw, (OTHER_ATTITUDE,)),
     # dynamics
     "dynamics.State": Case(lambda q, w, x: jr.State(q, w, x), (ATTITUDE, OMEGA, INNER)),
     "dynamics.angular_momentum": Case(jr.angular_momentum, (TENSOR, OMEGA)),
@@ -687,7 +697,7 @@ def test_integers_python_numbers_and_numpy_arrays_are_taken(name):
     case = CASES[name]
     whole = [whole_numbers(x) for x in case.inputs]
     if name == "rotation.integrate_rate":
-        whole[1] = np.arange(whole[1].size)
+        whole[0] = np.arange(whole[0].size)
     exact = case.function(*(jnp.asarray(x, float) for x in whole))
     as_integers = case.function(*(int(x) if x.ndim == 0 else x for x in whole))
     as_floats = case.function(*(float(x) if x.ndim == 0 else x.astype(float) for x in whole))

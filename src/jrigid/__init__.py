@@ -17,6 +17,7 @@ from jrigid import systems as systems
 from jrigid import top as top
 from jrigid import torques as torques
 from jrigid._checks import RESULTS as RESULTS
+from jrigid._public import list_public_names as _list_public_names
 from jrigid._simulate import simulate as simulate
 from jrigid._trajectory import Trajectory as Trajectory
 from jrigid.dynamics import State as State
@@ -42,3 +43,8 @@ from jrigid.top import SymmetricTop as SymmetricTop
 from jrigid.top import top_motion as top_motion
 
 __version__ = _version("jrigid")
+
+_list_public_names(
+    *(datasets, dynamics, elliptic, free, identify, lagrangian, mass, rotation, solids, solvers),
+    *(stability, systems, top, torques),
+)

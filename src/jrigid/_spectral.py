@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike as NumpyArrayLike
 
 from jrigid._numerics import product
 
@@ -149,29 +148,20 @@ def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Ar
     def g(moment: Array) -> Array:
         return f(moment, *parameters)
 
-    def at(indices: NumpyArrayLike) -> list[Array]:
-        return list(moments[np.asarray(indices).T])
+    def differences(of: Callable[..., Array], indices: np.ndarray) -> Array:
+        """Of the moments of each set of indices, once, in ascending order."""
+        wanted = np.sort(indices, axis=-1)
+        sets, which = np.unique(wanted.reshape(-1, wanted.shape[-1]), axis=0, return_inverse=True)
+        values = jax.vmap(functools.partial(of, g))(*(moments[k] for k in sets.T))
+        return values[which.reshape(wanted.shape[:-1])]
 
-    pairs = [(0, 1), (0, 2), (1, 2), (0, 0), (1, 1), (2, 2)]
-    triples = [(i, j, k) for i in range(3) for j in range(i, 3) for k in range(j, 3)]
-    first = jax.vmap(functools.partial(_first_difference, g))(*at(pairs))
-    second = jax.vmap(functools.partial(_second_difference, g))(*at(triples))
-    all_pairs = [[pairs.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
-    all_triples = [
-        [
-            [
-                triples.index((min(i, k, j), i + j + k - min(i, k, j) - max(i, k, j), max(i, k, j)))
-                for j in range(3)
-            ]
-            for k in range(3)
-        ]
-        for i in range(3)
-    ]
+    first = differences(_first_difference, np.moveaxis(np.indices((3, 3)), 0, -1))
+    second = differences(_second_difference, np.moveaxis(np.indices((3, 3, 3)), 0, -1))
     matrix = (
         jnp.diag(jax.vmap(g)(moments))
-        + first[np.asarray(all_pairs)] * inside
-        + product("ikj,ik,kj->ij", second[np.asarray(all_triples)], inside, inside)
-        + _no_third_derivative(inside)
+        + first * inside
+        + product("ikj,ik,kj->ij", second, inside, inside)
+        + _zero_with_derivatives(2)(inside)
     )
     return product("ik,kl,jl->ij", axes, matrix, axes)
 
@@ -209,36 +199,21 @@ def _second_difference(f: Callable[[Array], Array], a: Array, b: Array, c: Array
     return jnp.where(near, integral, quotient / jnp.where(near, 1.0, gap))
 
 
-# Zeros that count derivatives: the second-order series has no third, and must not answer 0.
-@jax.custom_jvp
-def _no_third_derivative(x: Array) -> Array:
-    return jnp.zeros((), x.dtype)
+@functools.cache
+def _zero_with_derivatives(orders: int) -> Callable[[Array], Array]:
+    """A zero that counts derivatives: the series has no third, and must not answer 0."""
 
+    @jax.custom_jvp
+    def zero(x: Array) -> Array:
+        return jnp.zeros((), x.dtype)
 
-@jax.custom_jvp
-def _no_second_derivative(x: Array) -> Array:
-    return jnp.zeros((), x.dtype)
+    @zero.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple:
+        if orders == 0:
+            raise NotImplementedError(
+                "Third derivatives of `jrigid.tensor_function` in its tensor are not available."
+            )
+        (x,), (change,) = primals, tangents
+        return zero(x), _zero_with_derivatives(orders - 1)(x) * jnp.sum(change)
 
-
-@jax.custom_jvp
-def _no_derivative(x: Array) -> Array:
-    return jnp.zeros((), x.dtype)
-
-
-@_no_third_derivative.defjvp
-def _no_third_derivative_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (x,), (change,) = primals, tangents
-    return _no_third_derivative(x), _no_second_derivative(x) * jnp.sum(change)
-
-
-@_no_second_derivative.defjvp
-def _no_second_derivative_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (x,), (change,) = primals, tangents
-    return _no_second_derivative(x), _no_derivative(x) * jnp.sum(change)
-
-
-@_no_derivative.defjvp
-def _no_derivative_jvp(primals: tuple, tangents: tuple) -> tuple:
-    raise NotImplementedError(
-        "Third derivatives of `jrigid.tensor_function` in its tensor are not available."
-    )
+    return zero

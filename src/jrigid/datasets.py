@@ -7,15 +7,16 @@ where they are used.
 import importlib.resources
 import math
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Shaped
+
+from jrigid._types import Readable
 
 _ARCSECOND = math.pi / 648000.0
 _DAY = 86400.0
 
 
-class EarthPole(eqx.Module):
+class EarthPole(Readable):
     """Daily polar motion of the Earth, as published.
 
     The coordinates are those of the celestial intermediate pole in the terrestrial frame. `x` is
@@ -39,7 +40,7 @@ class EarthPole(eqx.Module):
     y_sigma: Float[np.ndarray, " days"]
 
 
-class ToutatisRecord(eqx.Module):
+class ToutatisRecord(Readable):
     """Attitude and spin of the asteroid 4179 Toutatis, observed by radar, with a published fit.
 
     Body axes: x the principal axis of the intermediate moment, y of the short body axis (largest
@@ -63,7 +64,7 @@ class ToutatisRecord(eqx.Module):
     epoch_omega: Float[np.ndarray, " 3"]
 
 
-class GyroRecord(eqx.Module):
+class GyroRecord(Readable):
     """SYNTHETIC readings of a three-axis gyro on a freely tumbling body, with the truth behind.
 
     Attributes:

@@ -1,8 +1,8 @@
 """Mechanics from any Lagrangian: accelerations, canonical momenta, energy, cyclic coordinates.
 
 A Lagrangian is a pure function `L(q, q_dot, *params) -> scalar` of n generalised coordinates,
-their rates and whatever parameters it needs (numbers, arrays, any pytree). Time is no argument:
-along a motion the parameters are constants.
+their rates and whatever parameters it needs (numbers, arrays, any pytree); one that is not a real
+scalar is a ValueError. Time is no argument: along a motion the parameters are constants.
 """
 
 from collections.abc import Callable
@@ -10,18 +10,10 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Real
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    check_shape,
-    float_arrays,
-    nan_where,
-)
+from jrigid._checks import all_finite, check_shape, float_arrays, nan_where, where_defined
 from jrigid._numerics import power_of_two, product
 from jrigid._types import Scalar
 
@@ -90,44 +82,19 @@ def _scales(mass: Array) -> Array:
     return power_of_two(scales)
 
 
-def _norm(matrix: Array) -> Array:
-    return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
-
-
 @jax.jit  # for eager callers: one compilation for each n, not fifty
-def _solve(mass: Array, force: Array) -> tuple[Array, Bool[Array, ""]]:
-    """M^-1 f and whether M is regular; NaN, and derivatives zero, where it is not.
+def _accelerations(mass: Array, force: Array) -> Array:
+    """M^-1 f; NaN, and derivatives zero, where M is singular or the answer is not finite.
 
-    LU, since a mass matrix is symmetric but need not be definite. `custom_linear_solve` takes the
-    derivatives, because those of `lineax.linear_solve` bring run-time errors of their own: one
-    bad lane would stop all, and every step of an integration would call the host.
+    By LU: a mass matrix is symmetric but need not be definite.
     """
-    size, solver = force.size, lx.LU()
     scales = jax.lax.stop_gradient(_scales(mass))
     mass, force = scales[:, None] * mass * scales[None, :], scales * force
-    identity = jnp.eye(size, dtype=mass.dtype)
-
-    def operator(matrix: Array) -> lx.MatrixLinearOperator:
-        return lx.MatrixLinearOperator(jax.lax.stop_gradient(matrix), lx.symmetric_tag)
-
-    factors = solver.init(operator(mass), {})
-
-    def solution(vector: Array) -> Array:
-        return lx.linear_solve(operator(mass), vector, solver, state=factors, throw=False).value
-
-    inverse = jax.vmap(solution)(identity)
-    threshold = 16 * size * float(jnp.finfo(mass.dtype).eps)
-    # 1 >= threshold * condition number, false for inf and NaN
-    regular = threshold * _norm(jax.lax.stop_gradient(mass)) * _norm(inverse) <= 1
-    regular = regular & all_finite(force)
-    mass, force = jnp.where(regular, mass, identity), jnp.where(regular, force, 0.0)
-    result = jax.lax.custom_linear_solve(
-        lambda vector: product("ij,j->i", mass, vector),
-        force,
-        lambda _, vector: solution(vector),
-        symmetric=True,
-    )
-    return nan_where(~regular, scales * result), regular
+    threshold = 16 * force.size * float(jnp.finfo(force.dtype).eps)
+    condition = jnp.linalg.cond(jax.lax.stop_gradient(mass), jnp.inf)
+    regular = (threshold * condition <= 1) & all_finite(force)  # false for inf and NaN
+    result = scales * where_defined(regular, jnp.linalg.solve, mass, force)
+    return nan_where(~all_finite(result), result)
 
 
 def acceleration(
@@ -135,7 +102,6 @@ def acceleration(
     q: CoordinatesLike,
     q_dot: CoordinatesLike,
     *params: Any,
-    throw: bool = True,
 ) -> Coordinates:
     r"""Accelerations q'' of the motion that a Lagrangian makes stationary.
 
@@ -151,17 +117,15 @@ def acceleration(
         params: Further arguments of the Lagrangian, constants of the motion. A time among them is
             right where the momenta do not depend on it, as in a driven potential; with a moving
             support write L without the total time derivative, as a force of inertia.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        q'' [coordinate units/s^2], in the dtype of `q` and `q_dot`.
+        q'' [coordinate units/s^2], in the dtype of `q` and `q_dot`. NaN where M is singular, as
+        that of Euler angles is at theta = 0 (`jrigid.RigidBody` turns without any), and where
+        coordinates, derivatives of L or q'' itself are not finite.
 
-    Raises:
-        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time).
-        RuntimeError: Coordinates or derivatives of L that are not finite, or a mass matrix that
-            is singular, as that of Euler angles is at theta = 0 (run time, any lane).
-
-    Gradients: those of the solution, of any order that L has; zero where `throw=False` gives NaN.
+    Gradients: those of the solution, of any order that L has. Zero where M is singular or a
+        coordinate is not finite, so that such a lane spoils none of what it shares with others;
+        where derivatives of L are not finite those of what it shares are NaN.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 1.57.
 
     >>> import jax.numpy as jnp
@@ -173,42 +137,19 @@ def acceleration(
     [-2.4525]
     """
     q, q_dot = _coordinates(q, q_dot)
-    mass, force = _equations(_bind(lagrangian, params, q.dtype), q, q_dot)
-    result, regular = _solve(mass, force)
-    findings = Findings()
-    findings.require(
-        all_finite((q, q_dot)),
-        RESULTS.invalid_state,
-        "Arguments `q` and `q_dot` must be finite, but a component is not.",
-    )
-    findings.require(
-        all_finite((mass, force)),
-        RESULTS.invalid_state,
-        "Argument `lagrangian` must have finite first and second derivatives at this `q` and "
-        "`q_dot`, but one is NaN or infinite there.",
-    )
-    findings.require(
-        regular,
-        RESULTS.invalid_state,
-        "Argument `lagrangian` must determine the accelerations, but its mass matrix "
-        "d2L/dq_dot2 is singular at this `q`, as that of Euler angles is at theta = 0: use other "
-        "coordinates there (`jrigid.RigidBody` turns without any).",
-    )
-    findings.require(
-        all_finite(result),
-        RESULTS.nonfinite_state,
-        "The accelerations are out of the range of floating point numbers at this `q`.",
-    )
-    return findings.apply(nan_where(~findings.ok, result), throw)
+
+    def formula(q: Array, q_dot: Array, params: tuple[Any, ...]) -> Array:
+        return _accelerations(*_equations(_bind(lagrangian, params, q.dtype), q, q_dot))
+
+    return where_defined(all_finite((q, q_dot)), formula, q, q_dot, params)
 
 
 def vector_field(lagrangian: Lagrangian) -> Callable[..., tuple[Coordinates, Coordinates]]:
     """Vector field of the motion for diffrax: `(t, (q, q_dot), args) -> (q_dot, q'')`.
 
-    Nothing is checked at run time. Where the mass matrix is singular, judged as in
-    `acceleration`, q'' is NaN, never infinite or a large wrong number: an adaptive solve that
-    meets it rejects its steps and ends with an error at `max_steps`, one of constant steps goes on
-    with NaN. Steps may jump over an isolated point such as theta = 0 and not see it.
+    Where `acceleration` is NaN so is q'' here, never infinite or a large wrong number: an adaptive
+    solve that meets it rejects its steps and ends with an error at `max_steps`, one of constant
+    steps goes on with NaN. Steps may jump over an isolated point such as theta = 0 and not see it.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
@@ -217,10 +158,6 @@ def vector_field(lagrangian: Lagrangian) -> Callable[..., tuple[Coordinates, Coo
         A function of the time, which is not passed on; the pair (q, q_dot) [coordinate units,
         coordinate units/s]; and `args`, the tuple of the Lagrangian's parameters, None for none.
         It gives the pair of rates.
-
-    Raises:
-        ValueError: By that function: wrong shape, `args` is not a tuple, or the Lagrangian is not
-            a real scalar (trace time).
 
     Gradients: as of `acceleration`.
 
@@ -250,8 +187,7 @@ def vector_field(lagrangian: Lagrangian) -> Callable[..., tuple[Coordinates, Coo
                 f"is a {type(args).__name__}: write `(args,)`."
             )
         q, q_dot = _coordinates(*y)
-        result, _ = _solve(*_equations(_bind(lagrangian, tuple(args or ()), q.dtype), q, q_dot))
-        return q_dot, nan_where(~all_finite(result), result)
+        return q_dot, acceleration(lagrangian, q, q_dot, *(args or ()))
 
     return field
 
@@ -271,10 +207,6 @@ def momenta(
 
     Returns:
         p [J s/coordinate unit].
-
-    Raises:
-        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
-            not checked.
 
     Gradients: those of L.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 2.44.
@@ -306,10 +238,6 @@ def energy(
 
     Returns:
         Energy, in the unit of L [J].
-
-    Raises:
-        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
-            not checked.
 
     Gradients: those of L.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 2.53.
@@ -354,11 +282,7 @@ def cyclic_coordinates(
 
     Returns:
         True for a cyclic coordinate. `jnp.where(cyclic, p, 0)` with p of `momenta` are then
-        constants of the motion.
-
-    Raises:
-        ValueError: Wrong shape, or the Lagrangian is not a real scalar (trace time). Values are
-            not checked: with NaN no coordinate is cyclic.
+        constants of the motion. False where something is NaN.
 
     Gradients: none, the answer is boolean.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 2.6.

@@ -20,8 +20,7 @@ Values: TypeAlias = Float[Array, "..."]
 ValuesLike: TypeAlias = Real[ArrayLike, "..."]
 
 # A square root quotient of 1e-300 (float64) or 1e-38 (float32) is down to 1e-3 after so many steps.
-_STEPS = {"float64": 15}
-_STEPS_OTHERS = 11
+_STEPS, _STEPS_OTHERS = {"float64": 15}, 11
 
 
 def elementwise(*values: Any) -> list[Array]:
@@ -79,8 +78,8 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     dz = -(dx + dy) / 3
     xy, zz = dx * dy, dz * dz
     e2, e3, e4 = xy - 6 * zz, (3 * xy - 8 * zz) * dz, 3 * (xy - zz) * zz
-    rest = _rj_series(mean, e2, e3, e4, xy * zz * dz)
-    return _rf_series(a, b, c), total + weight * rest / 3
+    last = _rj_series(mean, e2, e3, e4, xy * zz * dz)
+    return _rf_series(a, b, c), total + weight * last / 3
 
 
 def _rc_of_one(root: Array) -> Array:
@@ -239,26 +238,20 @@ def rc_of(a: Array, b: Array) -> Array:
     return jnp.where(safe | jnp.isnan(a + b), value, edge)
 
 
-def _rf_rule(primals: Any, tangents: Any) -> Any:
-    a, b, c = primals
-    slopes = (lambda: g_of(b, c, a), lambda: g_of(a, c, b), lambda: g_of(a, b, c))
-    total = jnp.zeros_like(a)
-    for i in _varied(tangents):
-        total = total - slopes[i]() * tangents[i]
-    return rf_of(a, b, c), total
+def _by_slopes(function: jax.custom_jvp[Array], *slopes: Callable[..., Array]) -> None:
+    """A rule of the partial derivatives, of which those that are not varied are not computed."""
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        total = jnp.zeros_like(primals[0])
+        for i in _varied(tangents):
+            total = total - slopes[i](*primals) * tangents[i]
+        return function(*primals), total
+
+    function.defjvp(rule, symbolic_zeros=True)
 
 
-def _rc_rule(primals: Any, tangents: Any) -> Any:
-    a, b = primals
-    slopes = (lambda: g_of(b, b, a), lambda: 2 * g_of(a, b, b))
-    total = jnp.zeros_like(a)
-    for i in _varied(tangents):
-        total = total - slopes[i]() * tangents[i]
-    return rc_of(a, b), total
-
-
-rf_of.defjvp(_rf_rule, symbolic_zeros=True)
-rc_of.defjvp(_rc_rule, symbolic_zeros=True)
+_by_slopes(rf_of, lambda a, b, c: g_of(b, c, a), lambda a, b, c: g_of(a, c, b), g_of)
+_by_slopes(rc_of, lambda a, b: g_of(b, b, a), lambda a, b: 2 * g_of(a, b, b))
 
 
 # --- principal values --------------------------------------------------------------------------
@@ -301,8 +294,8 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     xi = jnp.where(other, low * second / base, 1.0)
     eta = jnp.where(other, (p / base) * (q / base), 1.0)
     # R_J can be out of range where its factor is nothing.
-    rest = gap * jnp.where(jnp.isfinite(rj), rj, 0.0)
-    moved = (3 * (rf - rc_signed(xi, eta)) - rest) / distance
+    of_rj = gap * jnp.where(jnp.isfinite(rj), rj, 0.0)
+    moved = (3 * (rf - rc_signed(xi, eta)) - of_rj) / distance
     moved = jnp.where(_two_zero(a, b, c), jnp.copysign(jnp.inf, p), moved)
     return rf * per, jnp.where(other, moved, rj) * per * per * per
 

@@ -1,5 +1,6 @@
 """Jacobi's elliptic functions and the amplitude."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -10,8 +11,7 @@ from jrigid.elliptic._carlson import Values, ValuesLike, g_of
 from jrigid.elliptic._legendre import root_where_turned, with_parameters
 
 # Landen steps that take mc = 1e-300 (float64) or 1e-37 (float32) to 1 within rounding.
-_LANDEN_STEPS = {"float64": 13}
-_LANDEN_STEPS_OTHERS = 9
+_LANDEN_STEPS, _LANDEN_STEPS_OTHERS = {"float64": 13}, 9
 # pi in two parts, the first of 33 (float64) or 12 bits: its multiples are exact.
 _PI_PARTS = {"float64": (3.1415926534682512, 1.2154201013012384e-10)}
 
@@ -88,10 +88,7 @@ def _reduced(u: Array, m: Array, mc: Array) -> tuple[Array, Array, Array, Array]
     values = _landen(jnp.where(end, 0.0, u), jnp.where(end, 1.0, mc))
     sine, cosine = _hyperbolic(u)
     limits = (sine, cosine, cosine, jnp.zeros_like(u))
-    sine, cosine, dn, turns = (
-        jnp.where(end, limit, value) for limit, value in zip(limits, values, strict=True)
-    )
-    return sine, cosine, dn, turns
+    return jax.tree.map(functools.partial(jnp.where, end), limits, values)
 
 
 @_reduced.defjvp
@@ -137,7 +134,7 @@ def ellipj(u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None)
         u: Argument, any.
         m: Parameter, the square of the modulus, any: for m > 1 the amplitude oscillates between
             +-arcsin(1 / sqrt(m)) and dn changes sign.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         sn, cn, dn and am, with an error of 4e-15 (1 + |u|) in float64 and 2e-6 (1 + |u|) in
@@ -163,7 +160,7 @@ def am(u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> 
     Args:
         u: Argument, any.
         m: Parameter, the square of the modulus, any.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         Amplitude [rad], as by `ellipj`. For m < 1 it is continuous and grows by pi with 2 K; at

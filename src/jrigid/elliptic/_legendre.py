@@ -27,10 +27,10 @@ def with_parameters(m: Any, mc: Any, *others: Any) -> tuple[Array, ...]:
     if mc is None:
         if m is None:
             raise ValueError("Argument `m` must be given, or else `mc`, but neither is.")
-        *rest, m = elementwise(*others, m)
-        return *rest, m, 1 - m
-    *rest, mc = elementwise(*others, mc)
-    return *rest, 1 - mc, mc
+        *arrays, m = elementwise(*others, m)
+        return *arrays, m, 1 - m
+    *arrays, mc = elementwise(*others, mc)
+    return *arrays, 1 - mc, mc
 
 
 def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
@@ -96,7 +96,7 @@ def ellipk(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
 
     Args:
         m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments broadcast.
@@ -120,7 +120,7 @@ def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
 
     Args:
         m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
@@ -144,7 +144,7 @@ def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
         n: Characteristic. For n > 1 the value is Cauchy's principal value, the real part of
             mpmath's.
         m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n, m) for
@@ -229,24 +229,24 @@ def _pi_of(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     c, d = jnp.where(above, delta, cosine), jnp.where(above, cosine, delta)
     n, mc = n / (k * k), jnp.where(above, -mc / (k * k), mc)
     # DLMF 19.25.14; for n far below 0, where its terms cancel, (t + 1) / (t + p) is split into
-    # 1 / (1 - n) and the rest, to which 19.21.12 is applied: q - c^2 = s^2 mc / (1 - n)
+    # 1 / (1 - n) and a part to which 19.21.12 is applied: q - c^2 = s^2 mc / (1 - n)
     negative = n * s * s < -0.5
     share = jnp.where(negative, 1 / (1 - n), 1.0)
     p = c * c + (1 - n) * s * s
     step = s * s * mc * share
-    # Complete and mc out of range or 0: what tends to a limit is at it, and at 0 the rest diverges.
+    # Complete and mc out of range or 0: what tends to a limit has reached it, what else there is
+    # diverges at 0.
     limit = (c == 0) & (step < 64 * jnp.finfo(s.dtype).tiny)
     split = negative & ~limit
     q = jnp.where(split, c * c + step, 1.0)
     # In units in which d is 1, where R_J itself can be out of range below.
     unit = jax.lax.stop_gradient(jnp.where(split, 1 / jnp.maximum(d, 1.0), 1.0))
-    at = jnp.where(negative, (q * unit) * unit, p)
-    rf, rj = rf_rj_signed(c * unit, d * unit, unit, at)
+    rf, rj = rf_rj_signed(c * unit, d * unit, unit, jnp.where(negative, (q * unit) * unit, p))
     rf = rf * unit
     of_n = jnp.where(limit, jnp.where(negative, p, 1.0), p * q)
     rc = rc_of(jnp.where(limit, 1.0, d), jnp.sqrt(jnp.where(negative, of_n, 1.0)))
-    rest = jnp.where(limit, rc, c * rc + ((step / 3 * unit) * unit) * (rj * unit))
-    value = jnp.where(negative, share * (rf - n * rest), rf + n * s * s / 3 * rj)
+    split_off = jnp.where(limit, rc, c * rc + ((step / 3 * unit) * unit) * (rj * unit))
+    value = jnp.where(negative, share * (rf - n * split_off), rf + n * s * s / 3 * rj)
     infinite = jnp.where(n > 1, 0.5, -0.5) * jnp.log(jnp.where(end, mc, 1.0))
     return jnp.where(end, infinite, s / k * value)
 
@@ -288,7 +288,7 @@ def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
         phi: Amplitude [rad], any.
         m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
             |phi| <= pi/2 and m sin^2 phi <= 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         F to 8 ulps (8 ulps of the amplitude where F itself is steep); +-inf at m = 1 beyond
@@ -315,7 +315,7 @@ def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
         phi: Amplitude [rad], any.
         m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
             |phi| <= pi/2 and m sin^2 phi <= 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         E to 8 ulps, NaN outside the domain. Arguments broadcast.
@@ -343,7 +343,7 @@ def ellippiinc(
         phi: Amplitude [rad], any.
         m: Parameter, the square of the modulus. For m > 1 the amplitude must satisfy
             |phi| <= pi/2 and m sin^2 phi <= 1.
-        mc: 1 - m, for m near 1; where it is given m is not looked at, and may be None.
+        mc: 1 - m; where it is given m may be None.
 
     Returns:
         The integral to 10 ulps (of its terms for a principal value); infinite where

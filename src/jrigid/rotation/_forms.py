@@ -1,7 +1,10 @@
-"""Other forms of an attitude: matrices, z-x-z Euler angles, scipy's scalar-last order."""
+"""Other forms of an attitude: matrices, Euler angles, roll, pitch and yaw, scipy's rotations."""
+
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import array_of_shape
@@ -14,7 +17,7 @@ from jrigid._types import (
     Vector,
     VectorLike,
 )
-from jrigid.rotation._quaternion import normalize, of_unit_size, rotate
+from jrigid.rotation._quaternion import multiply, normalize, rescaled, rotate
 
 
 def hat(vector: VectorLike) -> Matrix:
@@ -25,9 +28,6 @@ def hat(vector: VectorLike) -> Matrix:
 
     Returns:
         Skew-symmetric matrix, same unit.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: linear, finite everywhere.
 
@@ -50,9 +50,6 @@ def vee(matrix: MatrixLike) -> Vector:
     Returns:
         The vector, same unit.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: linear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -71,9 +68,6 @@ def to_matrix(attitude: QuaternionLike) -> Matrix:
 
     Returns:
         Rotation matrix; its columns are the body axes in space.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: finite for any non-zero quaternion.
 
@@ -95,9 +89,6 @@ def from_matrix(matrix: MatrixLike) -> Quaternion:
 
     Returns:
         Unit quaternion. Where w = 0 (half turns) the sign makes the largest component positive.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: those of a smooth extension off the rotation group; exact along it, everywhere.
     Source: S. W. Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978) 223.
@@ -132,9 +123,6 @@ def to_scipy(attitude: QuaternionLike) -> Quaternion:
     Returns:
         The same quaternion, scalar last.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: linear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -144,25 +132,43 @@ def to_scipy(attitude: QuaternionLike) -> Quaternion:
     return jnp.roll(array_of_shape("attitude", attitude, 4), -1)
 
 
-def from_scipy(quaternion: QuaternionLike) -> Quaternion:
-    """Scalar-first order (w, x, y, z) from scipy's scalar-last one.
+@runtime_checkable
+class _ScipyRotation(Protocol):
+    def as_quat(self) -> Any: ...
+
+
+def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
+    """Attitude of one of scipy's rotations, or scalar-first order from scipy's scalar-last one.
 
     Args:
-        quaternion: Quaternion, scalar last.
+        rotation: A single `scipy.spatial.transform.Rotation`, or a quaternion (x, y, z, w).
 
     Returns:
         The same quaternion, scalar first.
 
     Raises:
-        ValueError: Wrong shape (trace time).
+        ValueError: Of what is neither.
 
-    Gradients: linear, finite everywhere.
+    Gradients: linear in a quaternion, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
+    >>> from scipy.spatial.transform import Rotation
+    >>> print(jr.rotation.from_scipy(Rotation.from_rotvec([0.0, 0.0, jnp.pi])).round(6))
+    [0. 0. 0. 1.]
     >>> print(jr.rotation.from_scipy(jnp.array([2.0, 3.0, 4.0, 1.0])))
     [1. 2. 3. 4.]
     """
-    return jnp.roll(array_of_shape("quaternion", quaternion, 4), 1)
+    value = rotation.as_quat() if isinstance(rotation, _ScipyRotation) else rotation
+    try:
+        quaternion = array_of_shape("rotation", value, 4)
+    except (TypeError, ValueError) as error:
+        shape = getattr(value, "shape", None)
+        kind = type(rotation).__name__ if shape is None else f"of shape {shape}"
+        raise ValueError(
+            "Argument `rotation` must be a single scipy.spatial.transform.Rotation or a quaternion "
+            f"(x, y, z, w) of shape (4,), but it is {kind}."
+        ) from error
+    return jnp.roll(quaternion, 1)
 
 
 def from_euler(angles: VectorLike) -> Quaternion:
@@ -173,9 +179,6 @@ def from_euler(angles: VectorLike) -> Quaternion:
 
     Returns:
         Unit quaternion, body to space.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: analytic everywhere.
 
@@ -207,9 +210,6 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     Returns:
         (phi, theta, psi) [rad], theta in [0, pi], phi and psi in [-pi, pi].
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: exact for 0 < theta < pi. At the two poles theta has a cone (gradient 0) and phi
     and psi the derivatives along the choice psi = 0: finite always.
 
@@ -218,7 +218,7 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     >>> print(jr.rotation.to_euler(jr.rotation.from_euler(angles)).round(6))
     [ 0.3  0.8 -1.2]
     """
-    w, x, y, z = of_unit_size(array_of_shape("attitude", attitude, 4))
+    w, x, y, z = rescaled(array_of_shape("attitude", attitude, 4))
     upper, lower = (w == 0) & (z == 0), (x == 0) & (y == 0)
     half_sum = safe_arctan2(z, w)
     half_difference = safe_arctan2(y, x)
@@ -231,3 +231,70 @@ def to_euler(attitude: QuaternionLike) -> Vector:
 
 def _wrap(angle: Array) -> Array:
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
+    """Attitude of roll, pitch and yaw: `R = Rz(yaw) Ry(pitch) Rx(roll)`, body to space.
+
+    The aerospace sequence z-y'-x'': from the space axes the body is turned by yaw about z, then by
+    pitch about its new y axis, then by roll about its newest x axis, each right-handed. It is
+    scipy's `Rotation.from_euler("ZYX", (yaw, pitch, roll))`.
+
+    Args:
+        angles: (roll, pitch, yaw) [rad].
+
+    Returns:
+        Unit quaternion, body to space.
+
+    Gradients: analytic everywhere.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> nose_up = jr.rotation.from_roll_pitch_yaw(jnp.array([0.0, -jnp.pi / 2, 0.0]))
+    >>> print(jr.rotation.rotate(nose_up, jnp.array([1.0, 0.0, 0.0])).round(6))
+    [0. 0. 1.]
+    """
+    half = 0.5 * array_of_shape("angles", angles, 3)
+    (a, b, c), (p, q, r) = jnp.cos(half), jnp.sin(half)
+    return jnp.stack(
+        [
+            a * b * c + p * q * r,
+            p * b * c - a * q * r,
+            a * q * c + p * b * r,
+            a * b * r - p * q * c,
+        ]
+    )
+
+
+# Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; this is C^-1.
+_TO_ZXZ = np.array([0.5, 0.5, 0.5, 0.5])
+
+
+def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
+    """Roll, pitch and yaw of an attitude, as `from_roll_pitch_yaw` takes them.
+
+    At pitch = +-pi/2, to rounding, only roll -+ yaw is defined: there roll = 0 is chosen and yaw
+    carries the whole rotation about the vertical.
+
+    Args:
+        attitude: Unit quaternion, body to space; its norm drops out.
+
+    Returns:
+        (roll, pitch, yaw) [rad], to rounding of the attitude; pitch in [-pi/2, pi/2], roll and yaw
+        in [-pi, pi].
+
+    Gradients: exact for |pitch| < pi/2. At the two poles pitch has a cone (gradient 0) and yaw and
+        roll the derivatives along the choice roll = 0: finite always.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> angles = jnp.array([0.3, -0.8, 1.2])
+    >>> attitude = jr.rotation.from_roll_pitch_yaw(angles)
+    >>> print(jr.rotation.to_roll_pitch_yaw(attitude).round(6))
+    [ 0.3 -0.8  1.2]
+    """
+    q = rescaled(array_of_shape("attitude", attitude, 4))
+    q = multiply(q, _TO_ZXZ.astype(q.dtype))
+    # No float is a pole exactly: a pair of components is zero where it is so to rounding.
+    w, x, y, z = jnp.abs(q) / (4 * jnp.finfo(q.dtype).eps)
+    upper, lower = w + z < 1, x + y < 1
+    yaw, pitch, roll = to_euler(jnp.where(jnp.stack([upper, lower, lower, upper]), 0.0, q))
+    return jnp.stack([roll, pitch - jnp.pi / 2, _wrap(yaw - jnp.pi / 2)])

@@ -4,19 +4,15 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, DTypeLike, PRNGKeyArray
 
-from jrigid._checks import array_of_shape, pair_of_shapes
+from jrigid._checks import array_of_shape, check_shape, float_arrays, pair_of_shapes, where_defined
 from jrigid._numerics import arctanc_sqrt, cos_sqrt, safe_norm, sinc_sqrt
 from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
 
 
-def of_unit_size(vector: Array) -> Array:
-    """Vector times the power of two that brings the sum of its magnitudes to [1, 2).
-
-    No rounding, and no squares that leave the range of numbers, in values or in derivatives; zero
-    stays zero.
-    """
+def _scale(vector: Array) -> Array:
+    """The power of two that brings the sum of a vector's magnitudes to [1, 2)."""
     info = jnp.finfo(vector.dtype)
     least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
     greatest = ((1 << info.nexp) - 2) * least
@@ -24,7 +20,60 @@ def of_unit_size(vector: Array) -> Array:
     # In the bits of the exponent: `frexp` and `ldexp` take twice as long as a rotation.
     exponent = jax.lax.bitcast_convert_type(size, jnp.dtype(f"int{info.bits}")) & -least
     reciprocal = jnp.maximum(greatest - exponent, least)
-    return vector * jax.lax.bitcast_convert_type(reciprocal, vector.dtype)
+    return jax.lax.bitcast_convert_type(reciprocal, vector.dtype)
+
+
+def rescaled(vector: Array) -> Array:
+    """Vector times the power of two that brings the sum of its magnitudes to [1, 2).
+
+    No rounding, and no squares that leave the range of numbers, in values or in derivatives; zero
+    stays zero.
+    """
+    return vector * _scale(vector)
+
+
+def _dtype(dtype: DTypeLike | None) -> jnp.dtype:
+    dtype = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(
+            f"Argument `dtype` must be of floating point numbers, but it is {dtype.name}."
+        )
+    return dtype
+
+
+def identity(dtype: DTypeLike | None = None) -> Quaternion:
+    """The unit quaternion (1, 0, 0, 0): body and space axes coincide.
+
+    Args:
+        dtype: Of floating point numbers; JAX's default by default (float32 unless x64 is on).
+            Beside arrays of another precision pass theirs.
+
+    Returns:
+        The quaternion of no rotation.
+
+    >>> import jrigid as jr
+    >>> print(jr.rotation.identity())
+    [1. 0. 0. 0.]
+    """
+    return jnp.array([1, 0, 0, 0], _dtype(dtype))
+
+
+def random(key: PRNGKeyArray, dtype: DTypeLike | None = None) -> Quaternion:
+    """A random attitude: uniform on the sphere of unit quaternions, so in every turned frame.
+
+    Args:
+        key: Of `jax.random`; for many attitudes `jax.vmap` over `jax.random.split(key, count)`.
+        dtype: Of floating point numbers; JAX's default by default.
+
+    Returns:
+        Unit quaternion, of either sign.
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr
+    >>> attitudes = jax.vmap(jr.rotation.random)(jax.random.split(jax.random.key(0), 5))
+    >>> print(attitudes.shape, jnp.linalg.norm(attitudes, axis=1))
+    (5, 4) [1. 1. 1. 1. 1.]
+    """
+    return normalize(jax.random.normal(key, (4,), _dtype(dtype)))
 
 
 def normalize(quaternion: QuaternionLike) -> Quaternion:
@@ -35,9 +84,6 @@ def normalize(quaternion: QuaternionLike) -> Quaternion:
 
     Returns:
         The unit quaternion.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: projected on the tangent of the unit sphere, over the norm, whatever that is; zero
     at the zero quaternion.
@@ -52,7 +98,7 @@ def normalize(quaternion: QuaternionLike) -> Quaternion:
 
 def _direction(vector: Array) -> Array:
     """Vector over its norm; at zero the value is zero and the gradient zero."""
-    vector = of_unit_size(vector)
+    vector = rescaled(vector)
     square = jnp.sum(vector * vector)
     zero = square == 0
     return jnp.where(zero, jnp.zeros_like(vector), vector / jnp.sqrt(jnp.where(zero, 1.0, square)))
@@ -67,9 +113,6 @@ def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
 
     Returns:
         The product.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: bilinear, finite everywhere.
 
@@ -98,9 +141,6 @@ def conjugate(quaternion: QuaternionLike) -> Quaternion:
     Returns:
         (w, -x, -y, -z).
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: linear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -109,6 +149,35 @@ def conjugate(quaternion: QuaternionLike) -> Quaternion:
     """
     w, x, y, z = array_of_shape("quaternion", quaternion, 4)
     return jnp.stack([w, -x, -y, -z])
+
+
+def inverse(quaternion: QuaternionLike) -> Quaternion:
+    """The quaternion that, multiplied with the one given, makes the identity.
+
+    Args:
+        quaternion: Scalar first, of any norm; NaN where it is zero or not finite.
+
+    Returns:
+        The conjugate over the square of the norm: the inverse rotation.
+
+    Gradients: finite for any non-zero quaternion, of order 1 / norm squared.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.rotation.inverse(jnp.array([0.0, 0.0, 2.0, 0.0])))
+    [ 0.  -0.  -0.5 -0. ]
+    """
+    q = array_of_shape("quaternion", quaternion, 4)
+
+    def formula(q: Array) -> Array:
+        unit = rescaled(q)
+        return conjugate(unit) / jnp.sum(unit * unit) * _scale(q)
+
+    return where_defined(_spans(q), formula, q)
+
+
+def _spans(quaternion: Array) -> Array:
+    """True where a quaternion stands for an attitude: not zero, finite."""
+    return jnp.any(quaternion != 0) & jnp.all(jnp.isfinite(quaternion))
 
 
 def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
@@ -121,9 +190,6 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     Returns:
         Space components, same unit. Exact for any non-zero quaternion: its norm drops out.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: finite for any non-zero quaternion, of order 1 / norm in the attitude.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -132,7 +198,7 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     [0. 1. 0.]
     """
     quaternion, (a, b, c) = pair_of_shapes("attitude", attitude, (4,), "vector", vector, (3,))
-    w, x, y, z = of_unit_size(quaternion)
+    w, x, y, z = rescaled(quaternion)
     # v + 2 (w u x v + u x (u x v)) / |q|^2
     scale = 2 / (w * w + x * x + y * y + z * z)
     p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
@@ -155,9 +221,6 @@ def rotate_inverse(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     Returns:
         Body components, same unit.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: finite for any non-zero quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -176,9 +239,6 @@ def exp(rotation_vector: VectorLike) -> Quaternion:
 
     Returns:
         Unit quaternion (cos(a/2), axis sin(a/2)).
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: analytic everywhere, also at the zero vector, to any order.
 
@@ -200,9 +260,6 @@ def log(attitude: QuaternionLike) -> Vector:
     Returns:
         Axis times angle [rad]; zero for the zero quaternion.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion; across a
     half turn the value itself jumps from +pi to -pi along the axis.
 
@@ -211,7 +268,7 @@ def log(attitude: QuaternionLike) -> Vector:
     >>> bool(jnp.allclose(jr.rotation.log(-jr.rotation.exp(v)), v))
     True
     """
-    q = of_unit_size(array_of_shape("attitude", attitude, 4))
+    q = rescaled(array_of_shape("attitude", attitude, 4))
     q = jnp.where(q[0] < 0, -q, q)
     w, v = q[0], q[1:]
     square = jnp.sum(v * v)
@@ -234,9 +291,6 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     Returns:
         Angle in [0, pi] [rad], accurate also for tiny angles; 0 if p or q is zero.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: at p = q the angle has a cone; the gradient there is 0, as at a zero quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -245,7 +299,41 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     0.001
     """
     p, q = pair_of_shapes("p", p, (4,), "q", q, (4,))
-    return safe_norm(log(multiply(of_unit_size(conjugate(p)), of_unit_size(q))))
+    return safe_norm(log(multiply(rescaled(conjugate(p)), rescaled(q))))
+
+
+def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
+    """Spherical linear interpolation: from p to q at a constant rate, along the shortest arc.
+
+    Args:
+        p: Attitude at s = 0: unit quaternion; its norm drops out.
+        q: Attitude at s = 1: unit quaternion; its norm drops out, and -q gives the same.
+        s: Fraction of the way; outside of [0, 1] the rotation goes on. NaN where p or q is zero or
+            not finite.
+
+    Returns:
+        Unit quaternion p exp(s log(p^-1 q)), of the sign of p at s = 0.
+
+    Gradients: analytic also at p = q, to any order. Attitudes half a turn apart have two shortest
+        arcs: where conj(p) q has no scalar part the one about its vector part is taken, and
+        the value jumps from one to the other across; derivatives are those on the side taken.
+    Source: K. Shoemake, Animating rotation with quaternion curves, SIGGRAPH (1985) 245.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> half = jr.rotation.exp(jnp.array([0.0, 0.0, 1.0]))
+    >>> print(jr.rotation.log(jr.rotation.slerp(jr.rotation.identity(), half, 0.25)).round(6))
+    [0.   0.   0.25]
+    """
+    p, q, s = float_arrays(p, q, s)
+    check_shape("p", p, (4,))
+    check_shape("q", q, (4,))
+    check_shape("s", s, ())
+
+    def formula(p: Array, q: Array, s: Array) -> Array:
+        p = normalize(p)
+        return multiply(p, exp(s * log(multiply(conjugate(p), rescaled(q)))))
+
+    return where_defined(_spans(p) & _spans(q), formula, p, q, s)
 
 
 def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
@@ -257,9 +345,6 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
 
     Returns:
         Unit quaternion; the identity, with gradient zero in `axis`, if the axis is zero.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: finite everywhere.
 

@@ -1,32 +1,21 @@
 """Rates: between attitude and angular velocity, and from gyro samples back to an attitude."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Float, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import (
-    RESULTS,
-    Findings,
     all_finite,
-    array_of_shape,
     check_shape,
     float_arrays,
     is_unit,
-    nan_where,
     pair_of_shapes,
+    where_defined,
 )
-from jrigid._types import (
-    MatrixLike,
-    Quaternion,
-    QuaternionLike,
-    Vector,
-    VectorLike,
-)
+from jrigid._types import MatrixLike, Quaternion, QuaternionLike, Vector, VectorLike
 from jrigid.rotation._forms import vee
-from jrigid.rotation._quaternion import exp, multiply, normalize
+from jrigid.rotation._quaternion import exp, identity, multiply, normalize
 
 
 def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
@@ -38,9 +27,6 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
 
     Returns:
         q' [1/s].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: bilinear, finite everywhere.
 
@@ -72,9 +58,6 @@ def angular_velocity(rotation: MatrixLike, rotation_rate: MatrixLike) -> Vector:
     Returns:
         omega [rad/s], body components.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: bilinear, finite everywhere.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
@@ -98,9 +81,6 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     Returns:
         omega [rad/s]: (phi' sin theta sin psi + theta' cos psi,
         phi' sin theta cos psi - theta' sin psi, psi' + phi' cos theta).
-
-    Raises:
-        ValueError: Wrong shape (trace time).
 
     Gradients: analytic everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 4.87.
@@ -136,9 +116,6 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     Returns:
         (phi', theta', psi') [rad/s].
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: exact for sin theta != 0; at the poles those of the choice, finite.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -159,11 +136,9 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
 
 
 def integrate_rate(
-    omegas: Real[_ArrayLike, "samples 3"],
     ts: Real[_ArrayLike, " samples"],
+    omegas: Real[_ArrayLike, "samples 3"],
     attitude0: QuaternionLike | None = None,
-    *,
-    throw: bool = True,
 ) -> Float[Array, "samples 4"]:
     r"""Dead-reckon an attitude from sampled gyro rates, coning-corrected, to fourth order.
 
@@ -173,107 +148,44 @@ def integrate_rate(
     $q \to q \exp(h (a + b) / 2 + \sqrt{3} h^2 (a \times b) / 12)$.
 
     Args:
-        omegas: Angular velocity at the times `ts`, body components [rad/s]; two or more samples.
-        ts: Times of the samples [s], increasing, not necessarily uniform.
+        ts: Times of two or more samples [s], increasing, not necessarily uniform.
+        omegas: Angular velocity at these times, body components [rad/s].
         attitude0: Unit quaternion at the first sample; the identity by default.
-        throw: False: a bad value makes all attitudes of its lane NaN instead of an error;
-            `rate_record_validity` says what is wrong.
 
     Returns:
-        Attitude at each sample. With samples h apart the error over a fixed span is O(h^4).
+        Attitude at each sample, with samples h apart to an error of O(h^4) over a fixed span; all
+        NaN unless `ts` is finite and increasing, `omegas` finite and `attitude0` of norm 1.
 
-    Raises:
-        ValueError: Wrong shape or fewer than two samples (trace time).
-        RuntimeError: `ts` is not finite and increasing, a rate is not finite, or `attitude0` is
-            not a unit quaternion, with `throw=True` (run time, any lane).
-
-    Gradients: finite everywhere; zero in a lane of NaN.
+    Gradients: finite everywhere; zero in a record of NaN.
     Source: A. Iserles et al., Lie-group methods, Acta Numerica 9 (2000) 215, section 5 (for
     R' = hat(omega) R; the sign of the commutator is the opposite for body rates).
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts = jnp.linspace(0.0, 1.0, 11)
     >>> omegas = jnp.stack([jnp.zeros(11), jnp.zeros(11), 2 * ts], axis=1)
-    >>> attitudes = jr.rotation.integrate_rate(omegas, ts)
+    >>> attitudes = jr.rotation.integrate_rate(ts, omegas)
     >>> print(jr.rotation.log(attitudes[-1]).round(5))
     [0. 0. 1.]
     """
-    omegas, ts, start = _record(omegas, ts, attitude0)
-    findings = _record_findings(omegas, ts, start)
-    attitudes = nan_where(~findings.ok, _dead_reckon(omegas, ts, start, findings.ok))
-    return findings.apply(attitudes, throw)
-
-
-def rate_record_validity(
-    omegas: Real[_ArrayLike, "samples 3"],
-    ts: Real[_ArrayLike, " samples"],
-    attitude0: QuaternionLike | None = None,
-) -> RESULTS:
-    """What `integrate_rate` would find wrong with a record of rates, as a code.
-
-    Args:
-        omegas: Angular velocity at the times `ts`, body components [rad/s].
-        ts: Times of the samples [s].
-        attitude0: Attitude at the first sample; the identity by default.
-
-    Returns:
-        `successful`, `invalid_times` (`ts`), `invalid_state` (`omegas`) or `invalid_attitude`
-        (`attitude0`), a code a lane.
-
-    Raises:
-        ValueError: Wrong shape or fewer than two samples (trace time).
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> repeated = jnp.array([0.0, 0.1, 0.1])
-    >>> jr.rotation.rate_record_validity(jnp.ones((3, 3)), repeated) == jr.RESULTS.invalid_times
-    Array(True, dtype=bool)
-    """
-    return _record_findings(*_record(omegas, ts, attitude0)).result
-
-
-def _record(omegas: Any, ts: Any, attitude0: Any) -> tuple[Array, Array, Array]:
-    omegas, ts = float_arrays(omegas, ts)
-    check_shape("omegas", omegas, (None, 3))
-    check_shape("ts", ts, (omegas.shape[0],))
+    ts, omegas = float_arrays(ts, omegas)
+    start = identity(ts.dtype) if attitude0 is None else attitude0
+    ts, omegas, start = float_arrays(ts, omegas, start)
+    check_shape("ts", ts, (None,))
+    check_shape("omegas", omegas, (ts.shape[0], 3))
+    check_shape("attitude0", start, (4,))
     if ts.shape[0] < 2:
         raise ValueError(
             f"Argument `ts` must hold at least two samples, but it has shape {ts.shape}."
         )
-    if attitude0 is None:
-        return omegas, ts, jnp.array([1.0, 0.0, 0.0, 0.0], ts.dtype)
-    return omegas, ts, array_of_shape("attitude0", attitude0, 4).astype(ts.dtype)
-
-
-def _record_findings(omegas: Array, ts: Array, start: Quaternion) -> Findings:
-    omegas, ts, start = jax.lax.stop_gradient((omegas, ts, start))
     step = ts[1:] - ts[:-1]
-    findings = Findings()
-    findings.require(
-        jnp.all((step > 0) & jnp.isfinite(step)),  # no time is infinite or NaN then
-        RESULTS.invalid_times,
-        "Argument `ts` must be finite and increasing, but it is not.",
-    )
-    findings.require(
-        all_finite(omegas),
-        RESULTS.invalid_state,
-        "Argument `omegas` must be finite, but it is not.",
-    )
-    findings.require(
-        is_unit(start),
-        RESULTS.invalid_attitude,
-        "Argument `attitude0` must be a unit quaternion, but its norm is not 1: "
-        "use `jrigid.rotation.normalize`.",
-    )
-    return findings
+    increasing = jnp.all((step > 0) & jnp.isfinite(step))  # no time is infinite or NaN then
+    ok = increasing & all_finite(omegas) & is_unit(start)
+    return where_defined(ok, _dead_reckon, ts, omegas, start)
 
 
 @jax.jit  # run eagerly, each level of the scan would be compiled by itself
-def _dead_reckon(omegas: Array, ts: Array, start: Quaternion, ok: Bool[Array, ""]) -> Array:
+def _dead_reckon(ts: Array, omegas: Array, start: Quaternion) -> Array:
     count = ts.shape[0]
-    # A bad lane reckons a body at rest instead, so that no NaN reaches a derivative.
-    omegas = jnp.where(ok, omegas, 0.0)
-    ts = jnp.where(ok, ts, jnp.arange(count, dtype=ts.dtype))
-    start = jnp.where(ok, start, jnp.zeros_like(start).at[0].set(1))
     width = min(4, count)
     first = jnp.clip(jnp.arange(count - 1) - (width - 2) // 2, 0, count - width)
     window = first[:, None] + jnp.arange(width)[None, :]
@@ -282,8 +194,8 @@ def _dead_reckon(omegas: Array, ts: Array, start: Quaternion, ok: Bool[Array, ""
     # far from zero costs nothing.
     nodes = (ts[window] - ts[:-1, None]) / step[:, None] - 0.5
 
-    def interpolate(at: float) -> Array:
-        weights = jax.vmap(_lagrange_weights, in_axes=(0, None))(nodes, at)
+    def interpolate(place: float) -> Array:
+        weights = jax.vmap(_lagrange_weights, in_axes=(0, None))(nodes, place)
         # A sum, not a dot, which a GPU may round to ten bits in float32.
         return jnp.sum(weights[:, :, None] * omegas[window], axis=1)
 
@@ -296,9 +208,9 @@ def _dead_reckon(omegas: Array, ts: Array, start: Quaternion, ok: Bool[Array, ""
     return jax.vmap(normalize)(product)
 
 
-def _lagrange_weights(nodes: Float[Array, " nodes"], at: float) -> Float[Array, " nodes"]:
+def _lagrange_weights(nodes: Float[Array, " nodes"], place: float) -> Float[Array, " nodes"]:
     count = nodes.shape[0]
     others = ~jnp.eye(count, dtype=bool)
-    numerator = jnp.where(others, at - nodes[None, :], 1.0)
+    numerator = jnp.where(others, place - nodes[None, :], 1.0)
     denominator = jnp.where(others, nodes[:, None] - nodes[None, :], 1.0)
     return jnp.prod(numerator / denominator, axis=1)
