@@ -50,7 +50,7 @@ def along_the_motion(system, t, state, args=None):
 CONSERVATIVE = {
     "free": None,
     "heavy": tq.UniformGravity(MASS, LEVER, GRAVITY),
-    "attracted": tq.GravityGradient(TENSOR, 4.0, orbit),
+    "attracted": tq.GravityGradient(4.0, orbit),
     "with a free wheel": tq.Rotor(tq.SpinningMass(0.3, LEVER)),
     "heavy with a wheel": tq.UniformGravity(MASS, LEVER, GRAVITY)
     + tq.Rotor(tq.SpinningMass(0.3, LEVER)),
@@ -67,7 +67,7 @@ def test_energy_is_constant_where_nothing_takes_any(name, inertia):
     torque = CONSERVATIVE[name]
     state = jr.State(ATTITUDE, OMEGA, tq.as_torque(torque).internal_at_rest(STATE))
     if "wheel" in name:
-        state = jr.State(ATTITUDE, OMEGA, jnp.asarray(4.0))
+        state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(4.0),))
     energy, _, power, _ = along_the_motion(jr.RigidBody(inertia, torque), 0.4, state, 1.7)
     assert np.isfinite(energy)
     assert abs(power) <= ulps(float, 128)
@@ -238,7 +238,7 @@ def test_a_force_at_an_offset_turns_the_body_as_the_lagrangian_says():
 def test_internal_parts_fly_along():
     body = jr.FloatingBody(BODY, WEIGHT, tq.InternalDamper(0.2, 0.05))
     inner = np.array([1.0, 2.0, 3.0])
-    state = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA, jnp.asarray(inner))
+    state = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA, (jnp.asarray(inner),))
     energy, momentum, power, rate = along_the_motion(body, 0.0, state)
     np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 512))
     np.testing.assert_allclose(rate, MASS * np.cross(POSITION, GRAVITY), atol=ulps(float, 256))
@@ -271,7 +271,7 @@ def test_systems_and_states_are_pytrees_whose_data_are_leaves():
     flying = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA)
     assert [x.shape for x in jax.tree.leaves(flying)] == [(3,), (3,), (4,), (3,)]
     doubled = jax.tree.map(lambda x: 2 * x, system)
-    state = jr.State(ATTITUDE, OMEGA, jnp.zeros(3))
+    state = jr.State(ATTITUDE, OMEGA, (jnp.zeros(3),))
     np.testing.assert_allclose(
         doubled.angular_momentum(0.0, state, None),
         2 * system.angular_momentum(0.0, state, None),
@@ -337,7 +337,7 @@ def test_a_vector_field_is_diffrax_s_with_states_saved():
         (jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)),
         (
             jr.RigidBody(MOMENTS, jr.torques.InternalDamper(0.3, 0.1)),
-            jr.State(ATTITUDE, OMEGA, jnp.array([0.1, 0.2, 0.3])),
+            jr.State(ATTITUDE, OMEGA, (jnp.array([0.1, 0.2, 0.3]),)),
         ),
     ):
         solution = diffrax.diffeqsolve(

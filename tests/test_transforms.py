@@ -141,7 +141,9 @@ def of_external(make):
 
 
 def of_internal(make):
-    return lambda *x: all_of_a_torque(make(*x[:-4]), x[-4], jr.State(x[-3], x[-2], number(x[-1])))
+    return lambda *x: all_of_a_torque(
+        make(*x[:-4]), x[-4], jr.State(x[-3], x[-2], (number(x[-1]),))
+    )
 
 
 def orbit_along(axis):
@@ -180,7 +182,7 @@ def floating_body(mass, inertia, stiffness, t, position, velocity, q, w, inner):
         mass, jnp.zeros_like(number(position)), symmetric(inertia), throw=None
     )
     body = jr.FloatingBody(properties, force, torques.InternalDamper(mass, stiffness))
-    state = jr.FloatingState(position, velocity, q, w, number(inner))
+    state = jr.FloatingState(position, velocity, q, w, (number(inner),))
     return [
         *(f(t, state, None) for f in (body.vector_field, body.energy, body.angular_momentum)),
         *(f(state) for f in (body.translational_energy, body.rotational_energy, body.momentum)),
@@ -348,7 +350,7 @@ CASES = {
     ),
     "torques.GravityGradient": Case(
         of_external(
-            lambda i, mu, axis: torques.GravityGradient(symmetric(i), mu, orbit_along(axis))
+            lambda i, mu, axis: torques.GravityGradient(mu, orbit_along(axis)).of_body(symmetric(i))
         ),
         (TENSOR, 4.0, VECTOR, 0.5, ATTITUDE, OMEGA),
         methods("torques.GravityGradient", "__call__", "potential"),

@@ -26,8 +26,9 @@ class State(Readable):
     Attributes:
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
-        internal: What an internal damper or a spinning rotor carries, in the order of the torques
-            that carry something (see `jrigid.torques`); empty by default, and then None.
+        internal: A tuple with an entry for each torque that carries parts, in the order of the
+            torques (see `jrigid.torques`): one wheel's spin is `(spin,)`. None if there are none,
+            and before `system.with_parts(state)`, or `simulate`, adds parts at rest in the body.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 0.0, 5.0]))
