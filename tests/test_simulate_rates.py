@@ -89,7 +89,7 @@ def _spun_up(omega, adjoint=None, scale=1.0):
     """A wheel spun up to h = 50 while a counter-torque holds the body: |d omega| is conserved."""
     wheel = jr.torques.SpinningMass(1e-2, np.array([0, 0, 1.0]), lambda _t, _s, _a: 0.5 * scale)
     held = jr.torques.Constant(jnp.array([0, 0, 0.5]) * scale)
-    body = jr.RigidBody(SYMMETRIC, jr.torques.Rotor(wheel) + held)
+    body = jr.RigidBody(SYMMETRIC, wheel + held)
     state0 = jr.State(UPRIGHT, omega, (jnp.zeros(()),))
     return jr.simulate(body, state0, 100.0, adjoint=adjoint, throw=False)
 

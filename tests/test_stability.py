@@ -288,7 +288,7 @@ def test_what_is_at_rest():
 
 def test_zeros_that_drift_nowhere_are_stable():
     """A free wheel's own spin; a tilt that goes round as fast as the frame."""
-    wheel = jr.torques.Rotor(jr.torques.SpinningMass(0.2, np.array([0.0, 0.0, 1.0])))
+    wheel = jr.torques.SpinningMass(0.2, np.array([0.0, 0.0, 1.0]))
     for moments, name in (([1.0, 2.0, 1.5], "stable"), ([1.0, 4.0, 2.5], "unstable")):
         body = jr.RigidBody(jnp.array(moments), wheel)
         about = st.linearize(body, jr.State(UP, np.array([0.0, 0, 1]), (np.array(5.0),)))

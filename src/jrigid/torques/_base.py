@@ -1,5 +1,8 @@
 """What a torque is, and how torques add."""
 
+# A torque takes t, state and args, whatever it looks at.
+# ruff: noqa: ARG002
+
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -119,37 +122,30 @@ class AbstractTorque(Readable):
 
         `RigidBody` and `FloatingBody` ask for it at every use, with their own inertia.
         """
-        del inertia
         return self
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if the torque has none."""
-        del t, args
         return zero_like(state)
 
     def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal state of parts that move with the body; `()` if there are none."""
-        del state
         return ()
 
     def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
-        del t, state, args
         return ()
 
     def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
         """Size of the internal state when the body turns at `rate` [rad/s], for error control."""
-        del rate
         return ()
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the internal parts [kg m^2/s], body components."""
-        del t, args
         return jnp.zeros_like(state.omega)
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of the internal parts [J]."""
-        del t, args
         return zero_like(state)
 
     def check(self, findings: Findings) -> None:
@@ -231,21 +227,20 @@ class Sum(AbstractTorque):
         """
         self.terms = tuple(x for term in terms for x in _terms(term))
 
-    def _each(self, state: Any, method: Callable[[AbstractTorque, Any], Any]) -> list[Any]:
-        """A method's value for each term, called with the state as that term sees it."""
-        values, start = [], 0
+    def _total(self, start: Any, state: Any, method: Callable[[AbstractTorque, Any], Any]) -> Any:
+        """The sum of a method's values, each term given the state as it sees it."""
+        first = 0
         for term in self.terms:
             view, count = state, len(term.internal_at_rest(state))
             if count:
-                own = state.internal[start : start + count]
-                view, start = dataclasses.replace(state, internal=own), start + count
-            values.append(method(term, view))
-        return values
+                own = state.internal[first : first + count]
+                view, first = dataclasses.replace(state, internal=own), first + count
+            start = start + method(term, view)
+        return start
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Sum of the torques [N m], body components."""
-        torques = self._each(state, lambda term, view: term(t, view, args))
-        return sum(torques, jnp.zeros_like(state.omega))
+        return self._total(jnp.zeros_like(state.omega), state, lambda x, own: x(t, own, args))
 
     def of_body(self, inertia: InertiaLike) -> "Sum":
         """The torques on a body of this inertia."""
@@ -253,8 +248,7 @@ class Sum(AbstractTorque):
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Sum of the potential energies [J]."""
-        energies = self._each(state, lambda term, view: term.potential(t, view, args))
-        return sum(energies, zero_like(state))
+        return self._total(zero_like(state), state, lambda x, own: x.potential(t, own, args))
 
     def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal states of the terms that have one."""
@@ -262,7 +256,7 @@ class Sum(AbstractTorque):
 
     def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
-        return sum(self._each(state, lambda term, view: term.internal_rate(t, view, args)), ())
+        return self._total((), state, lambda x, own: x.internal_rate(t, own, args))
 
     def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
         """Size of the internal state when the body turns at `rate` [rad/s]."""
@@ -270,13 +264,12 @@ class Sum(AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of all internal parts [kg m^2/s], body components."""
-        momenta = self._each(state, lambda term, view: term.internal_momentum(t, view, args))
-        return sum(momenta, jnp.zeros_like(state.omega))
+        zero = jnp.zeros_like(state.omega)
+        return self._total(zero, state, lambda x, own: x.internal_momentum(t, own, args))
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of all internal parts [J]."""
-        energies = self._each(state, lambda term, view: term.internal_energy(t, view, args))
-        return sum(energies, zero_like(state))
+        return self._total(zero_like(state), state, lambda x, own: x.internal_energy(t, own, args))
 
     def check(self, findings: Findings) -> None:
         """Note bad parameters of the terms."""
@@ -342,5 +335,4 @@ class Constant(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         return self.torque.astype(state.omega.dtype)

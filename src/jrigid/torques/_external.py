@@ -1,5 +1,8 @@
 """Torques from outside: gravity and its gradient, magnetism, sunlight, drag and friction."""
 
+# A torque takes t, state and args, whatever it looks at.
+# ruff: noqa: ARG002
+
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +17,7 @@ from jrigid._checks import (
     check_inertia_shape,
     check_shape,
     float_arrays,
+    is_positive_definite,
     is_symmetric,
     of_unit_size,
 )
@@ -63,13 +67,11 @@ class UniformGravity(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         mass, lever, gravity = in_dtype_of(state, self.mass, self.lever, self.gravity)
         return jnp.cross(lever, rotate_inverse(state.attitude, mass * gravity))
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J], zero with the centre of mass level with the pivot."""
-        del t, args
         mass, lever, gravity = in_dtype_of(state, self.mass, self.lever, self.gravity)
         return -mass * jnp.sum(gravity * rotate(state.attitude, lever))
 
@@ -127,13 +129,11 @@ class GravityGradient(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del args
         inertia, n, strength = self._seen(t, state)
         return 3 * strength * jnp.cross(n, angular_momentum(inertia, n))
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Attitude-dependent potential energy [J]: -mu / (2 r^3) (tr I - 3 n . I n)."""
-        del args
         inertia, n, strength = self._seen(t, state)
         trace = jnp.sum(inertia) if inertia.ndim == 1 else jnp.trace(inertia)
         return -0.5 * strength * (trace - 3 * jnp.sum(n * angular_momentum(inertia, n)))
@@ -165,7 +165,6 @@ class MagneticDipole(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del args
         return jnp.cross(*self._moment_and_field(t, state))
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
@@ -173,7 +172,6 @@ class MagneticDipole(AbstractTorque):
 
         A body in flight keeps its energy only under the force grad (m . B) as well.
         """
-        del args
         moment, field = self._moment_and_field(t, state)
         return -jnp.sum(moment * field)
 
@@ -247,12 +245,10 @@ class SolarPressure(AbstractTorque):
 
     def force(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Force on the body [N], space components: what a `FloatingBody` takes as its force."""
-        del args
         return rotate(state.attitude, jnp.sum(self._forces(t, state), axis=0))
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del args
         (centers,) = in_dtype_of(state, self.centers)
         return jnp.sum(jnp.cross(centers, self._forces(t, state)), axis=0)
 
@@ -283,13 +279,9 @@ def _takes_energy(coefficient: Array) -> Array:
     """True where a drag takes energy or nothing: no negative number, axis or eigenvalue."""
     if coefficient.ndim < 2:
         return all_finite(coefficient) & jnp.all(coefficient >= 0)
-    (m,) = of_unit_size(coefficient)
-    (a, d, e), (_, b, f), (_, _, g) = m
-    # Positive semi-definite: no principal minor is negative, to rounding.
-    determinant = a * (b * g - f * f) - d * (d * g - f * e) + e * (d * f - b * e)
-    minors = jnp.stack([a, b, g, a * b - d * d, a * g - e * e, b * g - f * f, determinant])
-    floor = -64 * jnp.finfo(m.dtype).eps
-    return all_finite(coefficient) & is_symmetric(m) & jnp.all(minors >= floor)
+    (unit,) = of_unit_size(coefficient)
+    rounding = 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype)
+    return is_symmetric(coefficient) & is_positive_definite(unit + rounding)
 
 
 _DISSIPATIVE = rule(
@@ -317,7 +309,6 @@ class LinearDrag(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         (c,) = in_dtype_of(state, self.coefficient)
         return -(angular_momentum(c, state.omega) if c.ndim else c * state.omega)
 
@@ -379,7 +370,6 @@ class CoulombFriction(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         magnitude, width = in_dtype_of(state, self.magnitude, self.width)
         omega = state.omega
         if self.axis is not None:

@@ -1,5 +1,8 @@
 """Torques of internal parts with a momentum of their own: a damper, a rotor."""
 
+# A torque takes t, state and args, whatever it looks at.
+# ruff: noqa: ARG002
+
 from typing import Any
 
 import equinox as eqx
@@ -54,7 +57,6 @@ class InternalDamper(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         (sphere,) = state.internal
         return self.coupling.astype(state.omega.dtype) * (sphere - state.omega)
 
@@ -73,63 +75,23 @@ class InternalDamper(AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the sphere [kg m^2/s]."""
-        del t, args
         (sphere,) = state.internal
         return self.inertia.astype(state.omega.dtype) * sphere
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of the sphere [J]."""
-        del t, args
         (sphere,) = state.internal
         return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(sphere**2)
 
 
-class SpinningMass(eqx.Module):
-    """A wheel with a spin of its own, for `Rotor`.
-
-    Attributes:
-        inertia: Moment of inertia about its axis [kg m^2], positive.
-        axis: Direction of the axis, body components, of any length but zero.
-        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
-            wheel turns freely on its axis.
-
-    Gradients: finite for any axis but zero.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), (jnp.array(10.0),))
-    >>> print(jr.torques.Rotor(wheel).internal_momentum(0.0, state, None).round(6))
-    [0.  1.2 1.6]
-    """
-
-    inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
-    axis: Float[Array, "3"] = eqx.field(converter=directions("axis", 3), metadata=DIRECTION)
-    motor_torque: TorqueFunction | None = None
-
-    def _motor(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
-        """Torque of the motor on the wheel [N m]."""
-        if self.motor_torque is None:
-            return zero_like(state)
-        motor = jnp.asarray(self.motor_torque(t, state, args), state.omega.dtype)
-        check_shape("motor_torque", motor, ())
-        return motor
-
-
-def _wheel_or_momentum(value: Any) -> Any:
-    return value if isinstance(value, SpinningMass) else vector_or_function("momentum")(value)
-
-
 class Rotor(AbstractTorque):
-    """A rotor inside the body (a gyrostat): prescribed momentum, or a wheel with its own spin.
+    """A rotor inside the body with a prescribed momentum h (a gyrostat): -h' - omega x h.
 
-    With a prescribed momentum h (an array, or a function of time, in body components, relative to
-    the body) the torque on the body is -h' - omega x h and the body's inertia includes the locked
-    rotor. With a `SpinningMass` of axial moment J the wheel's absolute spin s about its axis a is
-    its entry in `State.internal` [rad/s], J s' = motor torque, and the body's inertia includes the
-    wheel except for J about a; by default the wheel starts at rest relative to the body.
+    The body's inertia includes the locked rotor. For a wheel that turns as its motor makes it see
+    `SpinningMass`.
 
     Attributes:
-        momentum: h [kg m^2/s] as an array or `h(t) -> (3,)`, or a `SpinningMass`.
+        momentum: h, relative to the body, body components [kg m^2/s]: an array, or `h(t) -> (3,)`.
 
     Gradients: finite everywhere; a function of time must be differentiable.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
@@ -141,52 +103,81 @@ class Rotor(AbstractTorque):
     [-0.  -0.  -0.5]
     """
 
-    momentum: Any = eqx.field(converter=_wheel_or_momentum, metadata=FINITE)
-
-    @property
-    def _wheel(self) -> SpinningMass | None:
-        return self.momentum if isinstance(self.momentum, SpinningMass) else None
-
-    def _momentum_and_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Array, Array]:
-        if self._wheel is None:
-            time = jnp.asarray(t, state.omega.dtype)
-            momentum = lambda t: vector_at("momentum", self.momentum, time.dtype, t)  # noqa: E731
-            return jax.jvp(momentum, (time,), (jnp.ones_like(time),))
-        inertia, axis = in_dtype_of(state, self._wheel.inertia, self._wheel.axis)
-        (spin,) = state.internal
-        return inertia * spin * axis, self._wheel._motor(t, state, args) * axis
+    momentum: Any = eqx.field(converter=vector_or_function("momentum"), metadata=FINITE)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        momentum, rate = self._momentum_and_rate(t, state, args)
+        time = jnp.asarray(t, state.omega.dtype)
+        momentum_at = lambda t: self.internal_momentum(t, state, args)  # noqa: E731
+        momentum, rate = jax.jvp(momentum_at, (time,), (jnp.ones_like(time),))
         return -rate - jnp.cross(state.omega, momentum)
-
-    def internal_at_rest(self, state: Any) -> tuple[Scalar, ...]:
-        """The wheel turning with the body."""
-        if self._wheel is None:
-            return ()
-        (axis,) = in_dtype_of(state, self._wheel.axis)
-        return (jnp.sum(axis * state.omega),)
-
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Scalar, ...]:
-        """Rate of the wheel's spin [rad/s^2]."""
-        if self._wheel is None:
-            return ()
-        (inertia,) = in_dtype_of(state, self._wheel.inertia)
-        return (self._wheel._motor(t, state, args) / inertia,)
-
-    def internal_scale(self, rate: Scalar) -> tuple[Scalar, ...]:
-        """The wheel's spin is judged against the body's."""
-        return () if self._wheel is None else (rate,)
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the rotor [kg m^2/s], body components."""
-        return self._momentum_and_rate(t, state, args)[0]
+        return vector_at("momentum", self.momentum, state.omega.dtype, t)
+
+
+class SpinningMass(AbstractTorque):
+    """A wheel with a spin of its own: -(motor torque) a - omega x (J s a).
+
+    The wheel's absolute spin s about its axis a is its entry in `State.internal` [rad/s]; by
+    default it starts at rest relative to the body. J s' = motor torque. The body's inertia includes
+    the wheel except for its axial moment J about a.
+
+    Attributes:
+        inertia: J [kg m^2], positive.
+        axis: a, body components, of any length but zero.
+        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
+            wheel turns freely on its axis.
+
+    Gradients: finite for any axis but zero.
+    Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), (jnp.array(10.0),))
+    >>> print(wheel.internal_momentum(0.0, state, None).round(6))
+    [0.  1.2 1.6]
+    """
+
+    inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
+    axis: Float[Array, "3"] = eqx.field(converter=directions("axis", 3), metadata=DIRECTION)
+    motor_torque: TorqueFunction | None = None
+
+    def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
+        if self.motor_torque is None:
+            return zero_like(state)
+        motor = jnp.asarray(self.motor_torque(t, state, args), state.omega.dtype)
+        check_shape("motor_torque", motor, ())
+        return motor
+
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        (axis,) = in_dtype_of(state, self.axis)
+        push = -self._motor(t, state, args) * axis
+        return push - jnp.cross(state.omega, self.internal_momentum(t, state, args))
+
+    def internal_at_rest(self, state: Any) -> tuple[Scalar]:
+        """The wheel turning with the body."""
+        (axis,) = in_dtype_of(state, self.axis)
+        return (jnp.sum(axis * state.omega),)
+
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Scalar]:
+        """Rate of the wheel's spin [rad/s^2]."""
+        (inertia,) = in_dtype_of(state, self.inertia)
+        return (self._motor(t, state, args) / inertia,)
+
+    def internal_scale(self, rate: Scalar) -> tuple[Scalar]:
+        """The wheel's spin is judged against the body's."""
+        return (rate,)
+
+    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Angular momentum of the wheel about its axis [kg m^2/s], body components."""
+        inertia, axis = in_dtype_of(state, self.inertia, self.axis)
+        (spin,) = state.internal
+        return inertia * spin * axis
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
-        """Kinetic energy of a wheel [J]; zero for a prescribed momentum, whose motor does work."""
-        del t, args
-        if self._wheel is None:
-            return zero_like(state)
-        (inertia,), (spin,) = in_dtype_of(state, self._wheel.inertia), state.internal
+        """Kinetic energy of the wheel about its axis [J]."""
+        (inertia,), (spin,) = in_dtype_of(state, self.inertia), state.internal
         return 0.5 * inertia * spin**2
