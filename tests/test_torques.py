@@ -179,7 +179,7 @@ def test_sunlight_pushes_by_the_momentum_it_loses(name):
         **PLATES, sun=lambda t: t * jnp.asarray(SUN), specular=specular, diffuse=diffuse
     )
     lit = set()
-    for q in (ATTITUDE, np.eye(4)[0], np.array([0.0, 0.6, 0.0, -0.8]), np.array([0.6, 0, 0.8, 0])):
+    for q in (ATTITUDE, np.eye(4)[0], np.array([0.0, 0.6, 0.0, -0.8]), np.array([0.6, 0, -0.8, 0])):
         r, state = np.asarray(ro.to_matrix(q)), jr.State(q, OMEGA)
         lit.add(tuple(NORMALS @ r.T @ SUN > 0))
         force, moment = momentum_of_light(r.T @ SUN / 3, specular, diffuse)
@@ -293,7 +293,7 @@ def test_friction_is_of_one_size_and_linear_below_its_width(dtype):
 def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps():
     """I w' = -c w / sqrt(w^2 + e^2): sqrt(w^2 + e^2) - e arsinh(e / w) falls as c t / I.
 
-    A callable -c sign(omega) took a quarter of a million steps and did not arrive.
+    A callable -c sign(omega) took 43 s and ended at `max_steps`.
     """
     moment, c, width, start = 2.0, 0.3, 1e-3, 1.5
     axis = np.array([0.0, 0.6, 0.8])
@@ -301,7 +301,7 @@ def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps():
     stop = moment * start / c  # 10 s
     ts = np.array([0.3, 0.7, 0.95, 0.999, 2.0, 3.0]) * stop
     run = jr.simulate(body, jr.State(np.eye(4)[0], start * axis), ts, rtol=1e-9)
-    assert int(run.stats["num_steps"]) < 3000
+    assert int(run.stats["num_steps"]) < 10_000  # most of them at rest: 2.5 for I e / c
     fall = lambda w: np.hypot(w, width) - width * np.arcsinh(width / w)  # noqa: E731
     for t, omega in zip(ts[:4], np.asarray(run.states.omega), strict=False):
         exact = scipy.optimize.brentq(
@@ -312,8 +312,8 @@ def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps():
     # the energy went into heat, and the angle is that of a constant torque, to the width
     assert np.all(np.diff(run.energy[:5]) < 0)
     angle = start**2 * moment / (2 * c)
-    turned = 2 * np.arctan2(*np.asarray(run.states.attitude)[-1][[3, 0]] / np.array([0.8, 1.0]))
-    np.testing.assert_allclose(np.cos(turned), np.cos(angle), atol=5e-3)
+    turned = ro.angle_between(run.states.attitude[-1], ro.from_axis_angle(axis, angle))
+    assert turned < 1e-4
 
 
 # --- sums and states of internal parts --------------------------------------------------------

@@ -49,6 +49,7 @@ MODULES = {
 # Abstract classes, aliases and records: nothing to call.
 NOTHING_TO_CALL = {
     "torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem",
+    "dynamics.ExactStates", "dynamics.plain_state",
     "identify.AbstractObservation", "identify.AngularMomenta", "identify.Attitudes",
     "identify.Directions", "identify.Observed", "identify.Rates", "identify.FitResult",
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",

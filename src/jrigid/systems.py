@@ -62,15 +62,15 @@ class AbstractSystem(Readable):
         """
         if state.internal is None:
             state = dataclasses.replace(state, internal=self.torque.internal_at_rest(state))
-        self._acting_torque(state)
+        self._inertia_and_torque(state)  # which looks at the parts
         return state
 
     def torque_on(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """The torque on this body [N m], body components, of torques that know its inertia."""
-        return self._acting_torque(state)(t, state, args)
+        return self._inertia_and_torque(state)[1](t, state, args)
 
-    def _acting_torque(self, state: Any) -> AbstractTorque:
-        """The torque with this body's inertia, for a state with this body's parts."""
+    def _inertia_and_torque(self, state: Any) -> tuple[Array, AbstractTorque]:
+        """The inertia, in the dtype of a state with this body's parts, and the torque on it."""
         have, want = (
             [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
             for tree in (state.internal, self.torque.internal_at_rest(state))
@@ -81,7 +81,8 @@ class AbstractSystem(Readable):
                 f"that carries parts, here of the shapes {want}, but it holds {have}: "
                 "`system.with_parts(state)` adds parts at rest to a state that has none."
             )
-        return self.torque.of_body(self.inertia)
+        inertia = self.inertia.astype(state.omega.dtype)
+        return inertia, self.torque.of_body(inertia)
 
     def check(self, findings: Findings) -> None:
         """Note parameters with bad values, for `simulate`.
@@ -170,8 +171,7 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        torque = self._acting_torque(state)
-        inertia = self.inertia.astype(state.omega.dtype)
+        inertia, torque = self._inertia_and_torque(state)
         return State(
             attitude_rate(state.attitude, state.omega),
             euler_equations(inertia, state.omega, torque(t, state, args)),
@@ -191,8 +191,8 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        torque = self._acting_torque(state)
-        own = kinetic_energy(self.inertia.astype(state.omega.dtype), state.omega)
+        inertia, torque = self._inertia_and_torque(state)
+        own = kinetic_energy(inertia, state.omega)
         return own + torque.internal_energy(t, state, args) + torque.potential(t, state, args)
 
     def angular_momentum(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Vector:
@@ -208,8 +208,8 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        torque = self._acting_torque(state)
-        own = angular_momentum(self.inertia.astype(state.omega.dtype), state.omega)
+        inertia, torque = self._inertia_and_torque(state)
+        own = angular_momentum(inertia, state.omega)
         return rotate(state.attitude, own + torque.internal_momentum(t, state, args))
 
 

@@ -27,28 +27,24 @@ from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 TorqueFunction = Callable[[Any, Any, Any], Any]
 
 
-def rule(words: str, holds: Callable[[Array], Array]) -> dict[str, Any]:
-    """What a parameter must be, in words and as a test, for the metadata of its field."""
-    return {"rule": (words, holds)}
+# What a parameter must be, in words and as a test: the metadata of its field.
+FINITE = {"rule": ("finite", all_finite)}
+POSITIVE = {"rule": ("positive and finite", all_positive)}
+NOT_NEGATIVE = {"rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0))}
+DIRECTION = {
+    "rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x != 0, axis=-1)))
+}
 
 
-FINITE = rule("finite", all_finite)
-POSITIVE = rule("positive and finite", all_positive)
-NOT_NEGATIVE = rule("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0))
-DIRECTION = rule("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x != 0, axis=-1)))
-
-
-def check_parameters(findings: Findings, owner: eqx.Module) -> None:
-    """Note each parameter, of parts too, that breaks the rule of its field."""
-    for field in dataclasses.fields(owner):
-        value, rule = getattr(owner, field.name), field.metadata.get("rule")
-        if isinstance(value, eqx.Module):
-            check_parameters(findings, value)
-        elif rule and eqx.is_array(value):  # not a function of time, nor None
-            words, holds = rule
-            name = f"Argument `{field.name}` of `{type(owner).__name__}`"
-            value = jax.lax.stop_gradient(value)
+def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
+    """Note each parameter that breaks the rule of its field."""
+    for field in dataclasses.fields(torque):
+        value = getattr(torque, field.name)
+        if "rule" in field.metadata and eqx.is_array(value):  # not a function of time, nor None
+            words, holds = field.metadata["rule"]
+            name = f"Argument `{field.name}` of `{type(torque).__name__}`"
             message = f"{name} must be {words}, but it is not."
+            value = jax.lax.stop_gradient(value)
             findings.require(holds(value), RESULTS.invalid_torque, message, value)
 
 
@@ -160,7 +156,7 @@ class AbstractTorque(Readable):
         """Both torques together."""
         return Sum((self, other))
 
-    def __radd__(self, other: TorqueFunction | int) -> "AbstractTorque":
+    def __radd__(self, other: Any) -> "AbstractTorque":
         """Both torques together; `0 + torque` is the torque, so that `sum()` works.
 
         A plain function may not come first in `sum`, since Python adds it to 0 without asking any

@@ -35,7 +35,6 @@ from jrigid.torques._base import (
     check_parameters,
     directions,
     in_dtype_of,
-    rule,
     vector_at,
     vector_or_function,
 )
@@ -147,7 +146,7 @@ class MagneticDipole(AbstractTorque):
         field: Flux density B, space components [T]: an array, or `field(t, state) -> (3,)`.
 
     Gradients: analytic in the attitude, linear in m and B.
-    Source: Wertz, Spacecraft Attitude Determination and Control (1978), section 17.2.
+    Source: Wertz, Spacecraft Attitude Determination and Control (1978), section 17.2.4.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> rod = jr.torques.MagneticDipole(jnp.array([0.0, 0.0, 2.0]), jnp.array([3e-5, 0.0, 0.0]))
@@ -255,9 +254,9 @@ class SolarPressure(AbstractTorque):
     def check(self, findings: Findings) -> None:
         """Note bad parameters, and plates that reflect more light than they get."""
         check_parameters(findings, self)
-        reflected = self.specular + self.diffuse
+        reflected = sum(float_arrays(self.specular, self.diffuse))
         findings.require(
-            jnp.all(reflected <= 1),
+            jnp.all(reflected <= 1 + 1e-6),  # to rounding, of float32 too
             RESULTS.invalid_torque,
             "Arguments `specular` and `diffuse` of `SolarPressure` must add up to at most 1, but "
             "they do not.",
@@ -284,9 +283,12 @@ def _takes_energy(coefficient: Array) -> Array:
     return is_symmetric(coefficient) & is_positive_definite(unit + rounding)
 
 
-_DISSIPATIVE = rule(
-    "finite and not negative (a tensor symmetric and positive semi-definite)", _takes_energy
-)
+_DISSIPATIVE = {
+    "rule": (
+        "finite and not negative (a tensor symmetric and positive semi-definite)",
+        _takes_energy,
+    )
+}
 
 
 class LinearDrag(AbstractTorque):
@@ -341,9 +343,10 @@ class CoulombFriction(AbstractTorque):
 
     Coulomb's law jumps where the motion turns round, and no integrator steps over that. Here the
     jump is spread over a width: far above it the torque is c, at it 0.71 c, below it that of a
-    linear drag c / width, in which a body comes to rest with the time constant I width / c; a load
-    below c does not hold still but creeps at less than width. Take a width as small as the speeds
-    that matter allow: a body at rest costs some c t / (3 I width) steps.
+    linear drag c / width, in which a body comes to rest with the time constant I width / c. A body
+    that c could hold under a load does not stand still but creeps at about the width. At rest
+    `simulate` takes some three steps in each such time constant: with a width of a thousandth of
+    the speed 3000 in the time it took to stop. An event at |omega| = width saves them.
 
     Attributes:
         magnitude: c [N m], not negative.
