@@ -162,7 +162,7 @@ class AbstractTorque(Readable):
         A plain function may not come first in `sum`, since Python adds it to 0 without asking any
         torque: `Sum([function, torque])` takes them in any order.
         """
-        return self if isinstance(other, int) and other == 0 else Sum((other, self))
+        return self if other == 0 else Sum((other, self))
 
 
 def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
