@@ -763,11 +763,11 @@ def test_the_torque_of_a_gravity_gradient_follows_the_body(rng):
         return jnp.stack([jnp.cos(0.3 * t), jnp.sin(0.3 * t), 0 * t])
 
     moments, ts = np.array([1.0, 1.7, 2.3]), np.linspace(0.0, 20.0, 60)
-    body = jr.RigidBody(moments, jr.torques.GravityGradient(moments, 0.09, orbit))
+    body = jr.RigidBody(moments, jr.torques.GravityGradient(0.09, orbit))
     start = jr.State(UNTURNED, np.array([0.5, 1.0, 0.3]))
     values = np.asarray(jr.simulate(body, start, ts).states.omega) + 0.01 * rng.normal(size=(60, 3))
     near = np.array([1.0, 1.4, 1.9])
-    guess = jr.RigidBody(near, jr.torques.GravityGradient(near, 0.09, orbit))
+    guess = jr.RigidBody(near, jr.torques.GravityGradient(0.09, orbit))
     found = identify.fit(guess, identify.Rates(ts, values, 0.01), start=start, shape="moments")
     errors = np.asarray(found.ratios_errors)
     assert np.all(np.abs(np.asarray(found.ratios) - [1.7, 2.3]) < 4 * errors)

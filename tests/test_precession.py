@@ -79,8 +79,8 @@ def precess(ts, sun=SUN, moon=MOON, mu_sun=MU_SUN, mu_moon=MU_MOON, flattening=F
     """
     moments = POLAR_MOMENT * np.array([1 - flattening, 1 - flattening, 1.0])
     gradients = [
-        jr.torques.GravityGradient(moments, mu_sun, sun),
-        jr.torques.GravityGradient(moments, mu_moon, moon),
+        jr.torques.GravityGradient(mu_sun, sun),
+        jr.torques.GravityGradient(mu_moon, moon),
     ]
     attitude = jr.rotation.from_euler(jnp.array([np.pi, OBLIQUITY, 0.0]))
     state0 = jr.State(attitude, np.array([0.0, 0.0, EARTH_RATE]))

@@ -262,8 +262,8 @@ def flying_cylinder():
         return -MU_EARTH * body.mass * r / jnp.sum(r**2) ** 1.5
 
     def gradient(t, state, args):
-        torque = jr.torques.GravityGradient(CYLINDER, MU_EARTH, lambda _: state.position)
-        return torque(t, state, args)
+        torque = jr.torques.GravityGradient(MU_EARTH, lambda _: state.position)
+        return torque.of_body(CYLINDER)(t, state, args)
 
     omega, rotation = jeod_state(RUN_10A_START)
     attitude = quaternion_of(rotation)
@@ -274,7 +274,7 @@ def flying_cylinder():
 def guided_cylinder():
     """The orbit given as a function of time."""
     orbit = KeplerOrbit(jnp.asarray(RUN_10A_POSITION), jnp.asarray(RUN_10A_VELOCITY))
-    torque = jr.torques.GravityGradient(CYLINDER, MU_EARTH, orbit)
+    torque = jr.torques.GravityGradient(MU_EARTH, orbit)
     omega, rotation = jeod_state(RUN_10A_START)
     return jr.RigidBody(CYLINDER, torque), jr.State(quaternion_of(rotation), omega)
 
@@ -314,7 +314,7 @@ def test_hughes_libration_periods():
     n = np.pi / (2821.46 * np.sqrt(k))
     radius = (MU_EARTH / n**2) ** (1 / 3)
     orbit = KeplerOrbit(jnp.array([radius, 0.0, 0.0]), jnp.array([0.0, n * radius, 0.0]))
-    body = jr.RigidBody(CYLINDER, jr.torques.GravityGradient(CYLINDER, MU_EARTH, orbit))
+    body = jr.RigidBody(CYLINDER, jr.torques.GravityGradient(MU_EARTH, orbit))
     # 6e-6 rad: small enough for linear theory, large enough to stand above the tolerance
     push = 1e-5 * n
     state0 = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.0, -push, n + push]))

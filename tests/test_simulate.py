@@ -570,7 +570,7 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
         ),
         (
             lambda b, s: jr.simulate(b, jr.State(s.attitude, s.omega, jnp.ones(3)), 1.0),
-            "`state0.internal` must hold arrays of the shapes",
+            "`internal` of the state must be a tuple with an entry",
         ),
         (
             lambda b, s: jr.simulate(b, (s.attitude, s.omega), 1.0),

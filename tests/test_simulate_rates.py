@@ -89,8 +89,8 @@ def _spun_up(omega, adjoint=None, scale=1.0):
     """A wheel spun up to h = 50 while a counter-torque holds the body: |d omega| is conserved."""
     wheel = jr.torques.SpinningMass(1e-2, np.array([0, 0, 1.0]), lambda _t, _s, _a: 0.5 * scale)
     held = jr.torques.Constant(jnp.array([0, 0, 0.5]) * scale)
-    body = jr.RigidBody(SYMMETRIC, jr.torques.Rotor(wheel) + held)
-    state0 = jr.State(UPRIGHT, omega, jnp.zeros(()))
+    body = jr.RigidBody(SYMMETRIC, wheel + held)
+    state0 = jr.State(UPRIGHT, omega, (jnp.zeros(()),))
     return jr.simulate(body, state0, 100.0, adjoint=adjoint, throw=False)
 
 
@@ -364,7 +364,8 @@ def test_bad_mass_properties_in_a_lane_are_found():
     result, position = jax.jit(jax.vmap(lane))(
         np.array(masses), spread(centers), np.stack(moments), spread(positions)
     )
-    assert [int(c) for c in result._value] == [int(c._value) for c in expected]
+    for code, allowed in zip(result._value, expected, strict=True):
+        assert int(code) in [int(x._value) for x in allowed]
     assert np.all(np.isfinite(position[0]))
     assert np.all(np.isnan(position[1:]))
 

@@ -1,4 +1,5 @@
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
 import jrigid as jr
 from jrigid import rotation as ro
 from jrigid import torques as tq
+from jrigid._checks import Findings
 from jrigid.mass import MassProperties
 from jrigid.systems import Force
 
@@ -50,10 +52,9 @@ def along_the_motion(system, t, state, args=None):
 CONSERVATIVE = {
     "free": None,
     "heavy": tq.UniformGravity(MASS, LEVER, GRAVITY),
-    "attracted": tq.GravityGradient(TENSOR, 4.0, orbit),
-    "with a free wheel": tq.Rotor(tq.SpinningMass(0.3, LEVER)),
-    "heavy with a wheel": tq.UniformGravity(MASS, LEVER, GRAVITY)
-    + tq.Rotor(tq.SpinningMass(0.3, LEVER)),
+    "attracted": tq.GravityGradient(4.0, orbit),
+    "with a free wheel": tq.SpinningMass(0.3, LEVER),
+    "heavy with a wheel": tq.UniformGravity(MASS, LEVER, GRAVITY) + tq.SpinningMass(0.3, LEVER),
     "sprung": tq.Torque(
         lambda _t, s, k: -k * s.attitude[0] * s.attitude[1:],
         lambda _t, s, k: -k * s.attitude[0] ** 2,
@@ -67,7 +68,7 @@ def test_energy_is_constant_where_nothing_takes_any(name, inertia):
     torque = CONSERVATIVE[name]
     state = jr.State(ATTITUDE, OMEGA, tq.as_torque(torque).internal_at_rest(STATE))
     if "wheel" in name:
-        state = jr.State(ATTITUDE, OMEGA, jnp.asarray(4.0))
+        state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(4.0),))
     energy, _, power, _ = along_the_motion(jr.RigidBody(inertia, torque), 0.4, state, 1.7)
     assert np.isfinite(energy)
     assert abs(power) <= ulps(float, 128)
@@ -138,6 +139,86 @@ def test_a_custom_function_gets_time_state_and_arguments():
     torque = 6.0 * ATTITUDE[1:]
     np.testing.assert_allclose(found, jr.euler_equations(MOMENTS, OMEGA, torque), atol=0)
     assert system.energy(0.0, STATE, {"k": 3.0}) == jr.kinetic_energy(MOMENTS, OMEGA)
+
+
+def swinging(inertia):
+    return jr.RigidBody(inertia, tq.LinearDrag(0.1) + tq.GravityGradient(4.0, orbit))
+
+
+@pytest.mark.parametrize("inertia", [TENSOR, MOMENTS], ids=["tensor", "moments"])
+def test_the_gradient_of_gravity_acts_on_the_bodys_own_inertia(inertia):
+    """Built with it, replaced, in lanes, in flight; derivatives flow through the torque too."""
+    gradient = tq.GravityGradient(4.0, orbit)
+    by_hand = lambda i: jr.euler_equations(  # noqa: E731
+        i, OMEGA, gradient.of_body(i)(0.7, STATE, None) - 0.1 * OMEGA
+    )
+    rate = lambda i: swinging(i).vector_field(0.7, STATE, None).omega  # noqa: E731
+    other = inertia + 0.2 * (np.eye(3) if inertia.ndim == 2 else 1)
+    bodies = jnp.stack([inertia, other])
+    expected = np.stack([by_hand(x) for x in bodies])
+    np.testing.assert_allclose(jax.vmap(rate)(bodies), expected, atol=ulps(float, 8))
+    replaced = eqx.tree_at(lambda body: body.inertia, swinging(inertia), jnp.asarray(other))
+    found = replaced.vector_field(0.7, STATE, None).omega
+    np.testing.assert_allclose(found, expected[1], atol=ulps(float, 8))
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(
+            derivative(rate)(inertia), derivative(by_hand)(inertia), atol=ulps(float, 32)
+        )
+    on_body = swinging(inertia).torque_on(0.7, STATE, None)
+    expected = gradient.of_body(inertia)(0.7, STATE, None) - 0.1 * OMEGA
+    np.testing.assert_allclose(on_body, expected, atol=ulps(float, 4))
+    if inertia.ndim == 2:
+        flying = jr.FloatingState(orbit(0.7), VELOCITY, ATTITUDE, OMEGA)
+        in_flight = jr.FloatingBody(BODY, None, tq.GravityGradient(4.0))
+        own = in_flight.torque_on(0.0, flying, None)
+        np.testing.assert_allclose(own, on_body + 0.1 * OMEGA, atol=ulps(float, 4))
+
+
+def test_a_body_without_torque_is_free():
+    assert jr.RigidBody(MOMENTS).is_free
+    assert jr.RigidBody(MOMENTS, tq.Sum([])).is_free
+    assert not swinging(MOMENTS).is_free
+    assert isinstance(jr.RigidBody(MOMENTS), jr.AbstractSystem)
+
+
+def test_a_state_without_its_parts_is_an_error_that_says_how_to_add_them():
+    """In `diffeqsolve` of one's own this was "DynamicJaxprTracer * NoneType"."""
+    wheel, damper = tq.SpinningMass(0.3, LEVER), tq.InternalDamper(0.2, 0.05)
+    body = jr.RigidBody(TENSOR, wheel + damper)
+    flying = jr.FloatingBody(BODY, WEIGHT, wheel + damper)
+
+    def solve(state):
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(body.vector_field), diffrax.Tsit5(), 0.0, 0.1, 0.01, state
+        ).ys
+
+    message = (
+        r"`internal` of the state must be a tuple .*\[\('\[0\]', \(\)\), \('\[1\]', \(3,\)\)\]"
+    )
+    for call in (
+        lambda: solve(STATE),
+        lambda: body.energy(0.0, STATE, None),
+        lambda: body.angular_momentum(0.0, STATE, None),
+        lambda: body.torque_on(0.0, STATE, None),
+        lambda: flying.vector_field(0.0, FLYING, None),
+        lambda: flying.energy(0.0, FLYING, None),
+        lambda: body.with_parts(jr.State(ATTITUDE, OMEGA, (jnp.ones(()),))),
+        lambda: body.vector_field(0.0, jr.State(ATTITUDE, OMEGA, jnp.ones(3)), None),
+    ):
+        with pytest.raises(ValueError, match=message + r".*`system.with_parts\(state\)`"):
+            call()
+    with pytest.raises(ValueError, match="carries parts, here of the shapes \\[\\]"):
+        jr.RigidBody(TENSOR).vector_field(0.0, jr.State(ATTITUDE, OMEGA, (jnp.ones(()),)), None)
+
+    state = body.with_parts(STATE)
+    spin, sphere = state.internal
+    axis = LEVER / np.linalg.norm(LEVER)
+    np.testing.assert_allclose(spin, axis @ OMEGA, rtol=ulps(float, 4))
+    np.testing.assert_array_equal(sphere, OMEGA)
+    assert body.with_parts(state) is state
+    assert jax.tree.structure(solve(state)) == jax.tree.structure(state)
+    assert jr.RigidBody(TENSOR).with_parts(STATE).internal is None
+    assert len(flying.with_parts(FLYING).internal) == 2
 
 
 # --- a body in flight -------------------------------------------------------------------------
@@ -238,7 +319,7 @@ def test_a_force_at_an_offset_turns_the_body_as_the_lagrangian_says():
 def test_internal_parts_fly_along():
     body = jr.FloatingBody(BODY, WEIGHT, tq.InternalDamper(0.2, 0.05))
     inner = np.array([1.0, 2.0, 3.0])
-    state = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA, jnp.asarray(inner))
+    state = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA, (jnp.asarray(inner),))
     energy, momentum, power, rate = along_the_motion(body, 0.0, state)
     np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 512))
     np.testing.assert_allclose(rate, MASS * np.cross(POSITION, GRAVITY), atol=ulps(float, 256))
@@ -271,7 +352,7 @@ def test_systems_and_states_are_pytrees_whose_data_are_leaves():
     flying = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA)
     assert [x.shape for x in jax.tree.leaves(flying)] == [(3,), (3,), (4,), (3,)]
     doubled = jax.tree.map(lambda x: 2 * x, system)
-    state = jr.State(ATTITUDE, OMEGA, jnp.zeros(3))
+    state = jr.State(ATTITUDE, OMEGA, (jnp.zeros(3),))
     np.testing.assert_allclose(
         doubled.angular_momentum(0.0, state, None),
         2 * system.angular_momentum(0.0, state, None),
@@ -281,6 +362,52 @@ def test_systems_and_states_are_pytrees_whose_data_are_leaves():
     lanes = np.stack([MOMENTS, 2 * MOMENTS])
     single = jr.kinetic_energy(MOMENTS, OMEGA)
     np.testing.assert_allclose(energies(lanes), [single, 2 * single], rtol=ulps(float, 4))
+
+
+def findings_of(system):
+    findings = Findings()
+    system.check(findings)
+    return findings
+
+
+INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("inertia", [-MOMENTS, INDEFINITE], ids=["moments", "tensor"])
+def test_a_bad_inertia_is_found_whatever_the_torque(inertia):
+    for torque in (None, tq.GravityGradient(4.0, orbit)):
+        findings = findings_of(jr.RigidBody(inertia, torque))
+        assert findings.result == jr.RESULTS.invalid_inertia
+        shown = str(inertia.ravel()[0])[:2]
+        with pytest.raises(RuntimeError, match=rf"`inertia` .*, but it is not: \[+{shown}"):
+            findings.guard(jnp.zeros(()), throw=True)
+
+
+def test_a_bad_body_in_flight_is_found_by_its_mass_or_inertia():
+    spoilt = lambda leaf, value: eqx.tree_at(leaf, jr.FloatingBody(BODY), value)  # noqa: E731
+    for system, code, message in (
+        (
+            spoilt(lambda s: s.mass_properties.mass, jnp.array(-1.0)),
+            jr.RESULTS.invalid_mass,
+            r"`mass` must be positive and finite, but it is not: -1\.0",
+        ),
+        (
+            spoilt(lambda s: s.mass_properties.inertia, jnp.full((3, 3), jnp.nan)),
+            jr.RESULTS.invalid_inertia,
+            r"`inertia` must hold .*, but it is not: \[\[nan",
+        ),
+    ):
+        findings = findings_of(system)
+        assert findings.result == code
+        with pytest.raises(RuntimeError, match=message):
+            findings.guard(jnp.zeros(()), throw=True)
+    assert findings_of(jr.FloatingBody(BODY, WEIGHT, tq.LinearDrag(0.1))).ok
+
+
+def test_systems_and_states_show_their_numbers():
+    assert "velocity=[ 0.4, 3. , -1.2]" in repr(FLYING)
+    assert repr(jr.RigidBody(MOMENTS)).startswith("RigidBody(inertia=[1., 2., 3.], torque=")
+    assert repr(tq.LinearDrag(0.1)) == "LinearDrag(coefficient=0.1)"
 
 
 FOUR = np.ones(4)
@@ -337,7 +464,7 @@ def test_a_vector_field_is_diffrax_s_with_states_saved():
         (jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)),
         (
             jr.RigidBody(MOMENTS, jr.torques.InternalDamper(0.3, 0.1)),
-            jr.State(ATTITUDE, OMEGA, jnp.array([0.1, 0.2, 0.3])),
+            jr.State(ATTITUDE, OMEGA, (jnp.array([0.1, 0.2, 0.3]),)),
         ),
     ):
         solution = diffrax.diffeqsolve(

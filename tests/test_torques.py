@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.optimize
 from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
 
 import jrigid as jr
@@ -27,9 +28,12 @@ def momentum_of_time(t):
 STATE = jr.State(ATTITUDE, OMEGA)
 POTENTIALS = {
     "gravity": tq.UniformGravity(2.0, LEVER, GRAVITY),
-    "gradient, tensor": tq.GravityGradient(TENSOR, MU, orbit),
-    "gradient, moments": tq.GravityGradient(MOMENTS, MU, orbit),
+    "gradient, tensor": tq.GravityGradient(MU, orbit).of_body(TENSOR),
+    "gradient, moments": tq.GravityGradient(MU, orbit).of_body(MOMENTS),
 }
+FIELD = np.array([0.3, 0.8, -0.5])
+POTENTIALS["dipole"] = tq.MagneticDipole(LEVER, FIELD)
+POTENTIALS["dipole, field of time"] = tq.MagneticDipole(LEVER, lambda t, _: orbit(t))
 POTENTIALS["both and a drag"] = POTENTIALS["gravity"] + POTENTIALS["gradient, tensor"]
 
 
@@ -79,14 +83,15 @@ def test_gravity_gradient_is_that_of_a_body_of_points(inertia):
         distance = np.linalg.norm(where)
         torque += np.cross(point, r.T @ (-0.5 * MU * where / distance**3))
         energy += -0.5 * MU * (1 / distance - 1 / np.linalg.norm(center))
-    body = tq.GravityGradient(size**2 * inertia, MU, orbit)
+    body = tq.GravityGradient(MU, orbit).of_body(size**2 * inertia)
     np.testing.assert_allclose(body(0.7, STATE, None), torque, atol=1e-5 * size**2)
     np.testing.assert_allclose(body.potential(0.7, STATE, None), energy, atol=1e-5 * size**2)
 
 
 def test_gravity_gradient_of_the_earth_seen_in_float32():
     """mu / r^3 of the Sun in SI units: r^3 alone is out of the range of float32."""
-    sun = tq.GravityGradient(MOMENTS, 1.327e20, lambda _: jnp.array([1.2e11, 9e10, 0.0]))
+    sun = tq.GravityGradient(1.327e20, lambda _: jnp.array([1.2e11, 9e10, 0.0]))
+    sun = sun.of_body(MOMENTS)
     state = jr.State(np.float32(ATTITUDE), np.float32(OMEGA))
     found = sun(0.0, state, None)
     assert found.dtype == np.float32
@@ -96,9 +101,124 @@ def test_gravity_gradient_of_the_earth_seen_in_float32():
 def test_gravity_gradient_at_the_bodys_own_position():
     position = np.asarray(orbit(0.7))
     flying = jr.FloatingState(position, OMEGA, ATTITUDE, OMEGA)
-    own, told = tq.GravityGradient(TENSOR, MU), POTENTIALS["gradient, tensor"]
+    own, told = tq.GravityGradient(MU).of_body(TENSOR), POTENTIALS["gradient, tensor"]
     np.testing.assert_array_equal(own(0.0, flying, None), told(0.7, STATE, None))
     assert own.potential(0.0, flying, None) == told.potential(0.7, STATE, None)
+
+
+def test_a_dipole_against_numpy_in_a_field_of_time_and_place():
+    r = np.asarray(ro.to_matrix(ATTITUDE))
+    torque = tq.MagneticDipole(LEVER, FIELD)
+    in_body = r.T @ FIELD
+    np.testing.assert_allclose(
+        torque(0.0, STATE, None), np.cross(LEVER, in_body), atol=ulps(float, 4)
+    )
+    np.testing.assert_allclose(
+        torque.potential(0.0, STATE, None), -LEVER @ in_body, rtol=ulps(float, 8)
+    )
+    place = np.array([2.0, -1.0, 0.5])
+    flying = jr.FloatingState(place, OMEGA, ATTITUDE, OMEGA)
+    of_place = tq.MagneticDipole(LEVER, lambda t, s: t * s.position)(0.7, flying, None)
+    np.testing.assert_allclose(of_place, np.cross(LEVER, r.T @ (0.7 * place)), atol=ulps(float, 4))
+
+
+def test_a_compass_needle_swings_at_its_frequency():
+    """About the field at sqrt(m B / I), for small swings."""
+    moment, field, inertia = 2.0, 3e-5, 0.01
+    needle = tq.MagneticDipole(np.array([moment, 0, 0]), np.array([field, 0, 0]))
+    body = jr.RigidBody(np.full(3, inertia), needle)
+    rate = lambda e: body.vector_field(0.0, jr.State(ro.exp(e), np.zeros(3)), None).omega  # noqa: E731
+    stiffness = jax.jit(jax.jacfwd(rate))(jnp.zeros(3))
+    expected = -moment * field / inertia * np.diag([0.0, 1.0, 1.0])
+    np.testing.assert_allclose(stiffness, expected, atol=ulps(float, 4) * 6e-3)
+
+
+# --- sunlight -------------------------------------------------------------------------------------
+
+NORMALS = np.array([[0.0, 0.0, 2.0], [0.6, 0.0, -0.8], [0.0, 3.0, 0.0]])
+PLATES = {
+    "areas": np.array([1.5, 2.0, 0.7]),
+    "normals": NORMALS,
+    "centers": np.array([[0.4, 0.1, -0.2], [0.3, -0.5, 0.6], [0.2, 0.7, -0.1]]),
+}
+SUN = np.array([1.0, 2.0, 2.0])
+COATINGS = {
+    "black": (0.0, 0.0),
+    "mirrors": (1.0, 0.0),
+    "paper": (0.0, 1.0),
+    "each its own": (np.array([0.1, 0.5, 0.0]), np.array([0.2, 0.3, 0.9])),
+}
+
+
+def momentum_of_light(sun, specular, diffuse):
+    """Force and moment in body axes from what each photon brings and takes away."""
+    force, moment = np.zeros(3), np.zeros(3)
+    for k in range(3):
+        area, arm = PLATES["areas"][k], PLATES["centers"][k]
+        n = NORMALS[k] / np.linalg.norm(NORMALS[k])
+        cosine = n @ sun
+        if cosine <= 0:
+            continue
+        mirrored = 2 * cosine * n - sun
+        # Lambert's law: the mean direction of what leaves is 2/3 of the normal
+        scattered = 2 / 3 * n
+        leaving = np.broadcast_to(specular, 3)[k] * mirrored
+        leaving = leaving + np.broadcast_to(diffuse, 3)[k] * scattered
+        push = -1361 / 299792458 * area * cosine * (sun + leaving)
+        force, moment = force + push, moment + np.cross(arm, push)
+    return force, moment
+
+
+@pytest.mark.parametrize("name", COATINGS)
+def test_sunlight_pushes_by_the_momentum_it_loses(name):
+    specular, diffuse = COATINGS[name]
+    light = tq.SolarPressure(**PLATES, sun=SUN, specular=specular, diffuse=diffuse)
+    of_time = tq.SolarPressure(
+        **PLATES, sun=lambda t: t * jnp.asarray(SUN), specular=specular, diffuse=diffuse
+    )
+    lit = set()
+    for q in (ATTITUDE, np.eye(4)[0], np.array([0.0, 0.6, 0.0, -0.8]), np.array([0.6, 0, -0.8, 0])):
+        r, state = np.asarray(ro.to_matrix(q)), jr.State(q, OMEGA)
+        lit.add(tuple(NORMALS @ r.T @ SUN > 0))
+        force, moment = momentum_of_light(r.T @ SUN / 3, specular, diffuse)
+        for one in (light, of_time):
+            np.testing.assert_allclose(one(0.4, state, None), moment, rtol=0, atol=1e-20)
+            np.testing.assert_allclose(one.force(0.4, state, None), r @ force, rtol=0, atol=1e-20)
+    assert len(lit) >= 3  # plates in the light and in the dark
+
+
+def test_a_sail_in_flight_feels_force_and_torque():
+    light = tq.SolarPressure(**PLATES, sun=SUN, specular=0.3)
+    body = jr.FloatingBody(jr.MassProperties(2.0, np.zeros(3), TENSOR), light.force, light)
+    place = np.array([2.0, -1.0, 0.5])
+    flying = jr.FloatingState(place, OMEGA, ATTITUDE, OMEGA)
+    rates = body.vector_field(0.0, flying, None)
+    force = light.force(0.0, flying, None)
+    np.testing.assert_allclose(rates.velocity, force / 2.0, rtol=ulps(float, 2))
+    momentum = lambda s: body.angular_momentum(0.0, s, None)  # noqa: E731
+    _, rate = jax.jvp(momentum, (flying,), (rates,))
+    expected = np.cross(place, force) + ro.rotate(ATTITUDE, light(0.0, flying, None))
+    np.testing.assert_allclose(rate, expected, atol=ulps(float, 64))
+
+
+def test_no_light_no_torque_and_clean_derivatives_edge_on():
+    """In an eclipse, from behind, and seen edge on, where value and derivatives are zero."""
+    one = {"areas": np.ones(1), "normals": np.eye(3)[:1], "centers": np.eye(3)[1:2]}
+    upright = jr.State(np.eye(4)[0], OMEGA)
+
+    @jax.jit
+    @jax.vmap
+    def torque_and_derivatives(sun):
+        light = tq.SolarPressure(**one, sun=sun, diffuse=0.4)
+        torque = lambda e: light(0.0, jr.State(ro.exp(e), OMEGA), None)  # noqa: E731
+        return [f(jnp.zeros(3)) for f in (torque, jax.jacfwd(torque), jax.jacrev(torque))]
+
+    for found in torque_and_derivatives(np.array([[0.0, 0, 0], [-1, 0.5, 0], [0, 1, 0]])):
+        assert np.all(np.asarray(found) == 0)
+    eclipse = lambda t: jnp.where(t > 1, 0.0, 1.0) * jnp.asarray(SUN)  # noqa: E731
+    dark = tq.SolarPressure(**PLATES, sun=eclipse)
+    assert np.all(np.asarray(dark(2.0, upright, None)) == 0)
+    assert np.any(np.asarray(dark(0.0, upright, None)) != 0)
 
 
 # --- drag -------------------------------------------------------------------------------------
@@ -147,6 +267,56 @@ def test_quadratic_drag_at_rest_has_value_and_gradient_zero():
             assert np.all(np.asarray(jacobian) == 0)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_friction_is_of_one_size_and_linear_below_its_width(dtype):
+    axis = np.array([2.0, -3.0, 6.0], dtype)
+    joint = tq.CoulombFriction(0.3, 1e-3)
+    bearing = tq.CoulombFriction(0.3, 1e-3, axis)
+    state = lambda w: jr.State(ATTITUDE.astype(dtype), w.astype(dtype))  # noqa: E731
+    omega, unit = OMEGA.astype(dtype), axis / 7
+    fast = omega / np.linalg.norm(omega)
+    close = {"rtol": 2e-6}  # the width over the speed, squared
+    np.testing.assert_allclose(joint(0.0, state(omega), None), -0.3 * fast, **close)
+    turning = np.sign(unit @ omega)
+    np.testing.assert_allclose(bearing(0.0, state(omega), None), -0.3 * turning * unit, **close)
+    at_width = np.linalg.norm(joint(0.0, state(1e-3 * fast), None))
+    np.testing.assert_allclose(at_width, 0.3 / np.sqrt(2), rtol=ulps(dtype, 8))
+    across = np.cross(unit, omega)  # turning about another axis is free
+    np.testing.assert_allclose(bearing(0.0, state(across), None), np.zeros(3), atol=2e-5)
+    for friction, slope in ((joint, np.eye(3)), (bearing, np.outer(unit, unit))):
+        torque = lambda w, f=friction: f(0.0, jr.State(ATTITUDE.astype(dtype), w), None)  # noqa: E731
+        for derivative in (jax.jacfwd, jax.jacrev):
+            found = jax.jit(derivative(torque))(np.zeros(3, dtype))
+            np.testing.assert_allclose(found, -300.0 * slope, rtol=1e-6, atol=1e-4)
+        assert np.all(np.asarray(torque(np.zeros(3, dtype))) == 0)
+
+
+def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps():
+    """I w' = -c w / sqrt(w^2 + e^2): sqrt(w^2 + e^2) - e arsinh(e / w) falls as c t / I.
+
+    A callable -c sign(omega) took 43 s and ended at `max_steps`.
+    """
+    moment, c, width, start = 2.0, 0.3, 1e-3, 1.5
+    axis = np.array([0.0, 0.6, 0.8])
+    body = jr.RigidBody(np.full(3, moment), tq.CoulombFriction(c, width, axis))
+    stop = moment * start / c  # 10 s
+    ts = np.array([0.3, 0.7, 0.95, 0.999, 2.0, 3.0]) * stop
+    run = jr.simulate(body, jr.State(np.eye(4)[0], start * axis), ts, rtol=1e-9)
+    assert int(run.stats["num_steps"]) < 10_000  # most of them at rest: 2.5 for I e / c
+    fall = lambda w: np.hypot(w, width) - width * np.arcsinh(width / w)  # noqa: E731
+    for t, omega in zip(ts[:4], np.asarray(run.states.omega), strict=False):
+        exact = scipy.optimize.brentq(
+            lambda w, t=t: fall(w) - fall(start) + c * t / moment, 1e-12, start, xtol=1e-14
+        )
+        np.testing.assert_allclose(omega, exact * axis, atol=1e-8)
+    assert np.linalg.norm(run.states.omega[4:]) < 1e-9
+    # the energy went into heat, and the angle is that of a constant torque, to the width
+    assert np.all(np.diff(run.energy[:5]) < 0)
+    angle = start**2 * moment / (2 * c)
+    turned = ro.angle_between(run.states.attitude[-1], ro.from_axis_angle(axis, angle))
+    assert turned < 1e-4
+
+
 # --- sums and states of internal parts --------------------------------------------------------
 
 WHEEL = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]))
@@ -164,6 +334,11 @@ def test_torques_add_with_plus_and_sum_and_with_plain_functions():
         np.testing.assert_allclose(total(0.5, STATE, 2.0), expected, atol=ulps(float, 4))
         assert total.potential(0.5, STATE, 2.0) == 0
     assert sum([drag]) is drag
+    in_any_order = tq.Sum([spring, constant, tq.Sum((drag,))])
+    assert len(in_any_order.terms) == 3
+    np.testing.assert_allclose(in_any_order(0.5, STATE, 2.0), expected, atol=ulps(float, 4))
+    with pytest.raises(TypeError, match="unsupported operand"):  # Python's own: 0 + function
+        sum([spring, constant])
     nothing = tq.as_torque(None)
     assert np.all(np.asarray(nothing(0.0, STATE, None)) == 0)
     assert nothing.internal_at_rest(STATE) == ()
@@ -177,7 +352,7 @@ def test_potentials_add():
 
 
 def test_internal_states_of_a_sum_are_a_tuple_in_the_order_of_the_terms():
-    total = tq.Constant(H) + DAMPER + tq.Rotor(WHEEL) + tq.LinearDrag(0.1) + SLOSH + tq.Rotor(H)
+    total = tq.Constant(H) + DAMPER + WHEEL + tq.LinearDrag(0.1) + SLOSH + tq.Rotor(H)
     rest = total.internal_at_rest(STATE)
     axis = np.array([1.0, 2.0, -2.0]) / 3
     assert len(rest) == 3
@@ -206,10 +381,12 @@ def test_internal_states_of_a_sum_are_a_tuple_in_the_order_of_the_terms():
         np.testing.assert_allclose(a, b, atol=ulps(float, 8))
 
 
-def test_the_internal_state_of_one_carrier_is_not_wrapped():
+def test_the_internal_state_of_one_carrier_is_a_tuple_of_one():
     total = tq.LinearDrag(0.1) + DAMPER
     state = jr.State(ATTITUDE, OMEGA, total.internal_at_rest(STATE))
-    assert state.internal.shape == (3,)
+    assert [x.shape for x in state.internal] == [(3,)]
+    (spin,) = WHEEL.internal_at_rest(STATE)
+    assert spin.shape == ()
     alone = jr.State(ATTITUDE, OMEGA, DAMPER.internal_at_rest(STATE))
     np.testing.assert_array_equal(
         total.internal_rate(0.0, state, None), DAMPER.internal_rate(0.0, alone, None)
@@ -223,7 +400,7 @@ def test_a_plain_torque_sees_the_whole_internal_state_alone_and_in_a_sum():
     first = lambda s: jax.tree.leaves(s.internal)[0]  # noqa: E731
     plain = tq.Torque(lambda _t, s, _a: 1.0 * first(s), lambda _t, s, _a: first(s)[0])
     inner, outer = jnp.array([1.0, 2, 3]), jnp.array([-0.5, 0.2, 0.1])
-    alone = jr.State(ATTITUDE, OMEGA, inner)
+    alone = jr.State(ATTITUDE, OMEGA, (inner,))
     one, two = DAMPER + plain, DAMPER + plain + SLOSH
     np.testing.assert_allclose(
         one(0.0, alone, None),
@@ -244,7 +421,7 @@ class Sprung(tq.InternalDamper):
 
     def potential(self, t, state, args):
         del t, args
-        return 2 * jnp.sum(state.internal)
+        return 2 * jnp.sum(*state.internal)
 
 
 def test_the_potential_of_a_part_in_a_sum_is_that_of_its_own_state():
@@ -258,8 +435,8 @@ def test_internal_parts_exert_what_they_lose():
     """The space rate of their own momentum is minus their torque, whatever they do."""
     wheel = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]), lambda t, s, _a: 0.7 * t + s.omega[0])
     parts = {
-        "damper": (DAMPER, jnp.array([1.0, 2, 3])),
-        "wheel": (tq.Rotor(wheel), jnp.array(5.0)),
+        "damper": (DAMPER, (jnp.array([1.0, 2, 3]),)),
+        "wheel": (wheel, (jnp.array(5.0),)),
         "prescribed": (tq.Rotor(momentum_of_time), ()),
     }
     t = jnp.asarray(0.4)
@@ -279,7 +456,7 @@ def test_internal_parts_exert_what_they_lose():
 def test_a_damper_loses_energy_as_its_coupling_says():
     inner = jnp.array([1.0, 2.0, 3.0])
     body = jr.RigidBody(TENSOR, DAMPER)
-    state = jr.State(ATTITUDE, OMEGA, inner)
+    state = jr.State(ATTITUDE, OMEGA, (inner,))
     rates = body.vector_field(0.0, state, None)
     _, power = jax.jvp(lambda s: body.energy(0.0, s, None), (state,), (rates,))
     np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 32))
@@ -351,12 +528,12 @@ def test_prescribed_momentum_equals_a_wheel_driven_by_the_motor_that_keeps_it():
 
     motor = slope + moment * axis @ np.asarray(free.omega)
     spin = value / moment + axis @ OMEGA
-    wheel = tq.Rotor(tq.SpinningMass(moment, axis, lambda *_: motor))
+    wheel = tq.SpinningMass(moment, axis, lambda *_: motor)
     body = jr.RigidBody(TENSOR - moment * np.outer(axis, axis), wheel)
-    state = jr.State(ATTITUDE, OMEGA, jnp.asarray(spin))
+    state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(spin),))
     found = body.vector_field(t, state, None)
     np.testing.assert_allclose(found.omega, free.omega, atol=ulps(float, 16))
-    np.testing.assert_allclose(found.internal, motor / moment, rtol=ulps(float, 4))
+    np.testing.assert_allclose(found.internal[0], motor / moment, rtol=ulps(float, 4))
     np.testing.assert_allclose(
         body.angular_momentum(t, state, None),
         jr.RigidBody(TENSOR, prescribed).angular_momentum(t, STATE, None),
@@ -365,8 +542,8 @@ def test_prescribed_momentum_equals_a_wheel_driven_by_the_motor_that_keeps_it():
 
 
 def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
-    body = jr.RigidBody(TENSOR, tq.Rotor(WHEEL))
-    state = jr.State(ATTITUDE, OMEGA, jnp.asarray(4.0))
+    body = jr.RigidBody(TENSOR, WHEEL)
+    state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(4.0),))
 
     @jax.jit
     def rates(state):
@@ -375,7 +552,7 @@ def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
         return rate, *jax.jvp(invariants, (state,), (rate,))[1]
 
     rate, power, momentum_rate = rates(state)
-    assert rate.internal == 0
+    assert rate.internal == (0,)
     assert np.linalg.norm(rate.omega) > 0.1
     assert abs(power) <= ulps(float, 16)
     np.testing.assert_allclose(momentum_rate, np.zeros(3), atol=ulps(float, 16))
@@ -384,7 +561,7 @@ def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
 def test_a_wheel_started_without_a_state_turns_with_the_body():
     """Then, and only at that instant, body and wheel move as one rigid body with a brake."""
     axis = np.array([1.0, 2.0, -2.0]) / 3
-    body = jr.RigidBody(TENSOR, tq.Rotor(WHEEL))
+    body = jr.RigidBody(TENSOR, WHEEL)
     state = jr.State(ATTITUDE, OMEGA, body.torque.internal_at_rest(STATE))
     whole = TENSOR + 0.3 * np.outer(axis, axis)
     expected = ro.rotate(ATTITUDE, whole @ OMEGA)
@@ -399,6 +576,10 @@ def test_a_wheel_started_without_a_state_turns_with_the_body():
 # --- values of parameters ---------------------------------------------------------------------
 
 
+def sunlit(**changes):
+    return tq.SolarPressure(**{**PLATES, "sun": SUN, **changes})
+
+
 def findings_of(torque):
     findings = Findings()
     torque.check(findings)
@@ -410,18 +591,16 @@ ROW = np.array([1.0, -2.0, 0.5])
 SKEW = np.array([[1.0, 0.2, 0.0], [-0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])
 NAN3 = np.array([0.0, np.nan, 0.0])
 BAD_VALUES = {
-    "gradient, moments": (tq.GravityGradient(-MOMENTS, MU, orbit), "invalid_inertia", "inertia"),
-    "gradient, tensor": (tq.GravityGradient(INDEFINITE, MU, orbit), "invalid_inertia", "inertia"),
-    "mu": (tq.GravityGradient(MOMENTS, np.inf, orbit), "invalid_torque", "mu"),
-    "mass": (tq.UniformGravity(-1.0, LEVER, GRAVITY), "invalid_mass", "mass"),
-    "nan mass": (tq.UniformGravity(np.nan, LEVER, GRAVITY), "invalid_mass", "mass"),
+    "mu": (tq.GravityGradient(np.inf, orbit), "invalid_torque", "mu"),
+    "mass": (tq.UniformGravity(-1.0, LEVER, GRAVITY), "invalid_torque", "mass"),
+    "nan mass": (tq.UniformGravity(np.nan, LEVER, GRAVITY), "invalid_torque", "mass"),
     "lever": (tq.UniformGravity(1.0, NAN3, GRAVITY), "invalid_torque", "lever"),
     "gravity": (tq.UniformGravity(1.0, LEVER, NAN3), "invalid_torque", "gravity"),
     "damper": (tq.InternalDamper(0.0, 0.1), "invalid_torque", "inertia"),
     "coupling": (tq.InternalDamper(0.1, -0.1), "invalid_torque", "coupling"),
     "nan coupling": (tq.InternalDamper(0.1, np.nan), "invalid_torque", "coupling"),
-    "wheel": (tq.Rotor(tq.SpinningMass(-1.0, LEVER)), "invalid_torque", "inertia"),
-    "axis": (tq.Rotor(tq.SpinningMass(1.0, np.zeros(3))), "invalid_torque", "axis"),
+    "wheel": (tq.SpinningMass(-1.0, LEVER), "invalid_torque", "inertia"),
+    "axis": (tq.SpinningMass(1.0, np.zeros(3)), "invalid_torque", "axis"),
     "linear": (tq.LinearDrag(-0.1), "invalid_torque", "coefficient"),
     "linear, axes": (tq.LinearDrag(np.array([1.0, -1.0, 0.0])), "invalid_torque", "coefficient"),
     "linear, tensor": (tq.LinearDrag(INDEFINITE), "invalid_torque", "coefficient"),
@@ -429,6 +608,18 @@ BAD_VALUES = {
     "quadratic, tensor": (tq.QuadraticDrag(SKEW), "invalid_torque", "coefficient"),
     "constant": (tq.Constant(NAN3), "invalid_torque", "torque"),
     "rotor": (tq.Rotor(NAN3), "invalid_torque", "momentum"),
+    "dipole": (tq.MagneticDipole(NAN3, FIELD), "invalid_torque", "moment"),
+    "field": (tq.MagneticDipole(LEVER, NAN3), "invalid_torque", "field"),
+    "friction": (tq.CoulombFriction(-0.1, 1.0), "invalid_torque", "magnitude"),
+    "width": (tq.CoulombFriction(0.1, 0.0), "invalid_torque", "width"),
+    "bearing": (tq.CoulombFriction(0.1, 1.0, np.zeros(3)), "invalid_torque", "axis"),
+    "area": (sunlit(areas=-PLATES["areas"]), "invalid_torque", "areas"),
+    "normal": (sunlit(normals=NORMALS * [[1], [0], [1]]), "invalid_torque", "normals"),
+    "center": (sunlit(centers=np.full((3, 3), np.nan)), "invalid_torque", "centers"),
+    "sun": (sunlit(sun=NAN3), "invalid_torque", "sun"),
+    "specular": (sunlit(specular=-0.1), "invalid_torque", "specular"),
+    "diffuse": (sunlit(diffuse=np.array([0.1, np.nan, 0.2])), "invalid_torque", "diffuse"),
+    "pressure": (sunlit(pressure=-1.0), "invalid_torque", "pressure"),
 }
 
 
@@ -439,12 +630,14 @@ def test_a_bad_parameter_is_found_alone_and_in_a_sum(name):
         findings = findings_of(bad)
         assert findings.result == getattr(jr.RESULTS, code)
         with pytest.raises(RuntimeError, match=f"Argument `{argument}` of `"):
-            findings.apply(jnp.zeros(()), throw=True)
+            findings.guard(jnp.zeros(()), throw=True)
 
 
 def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
-    good = [tq.UniformGravity(0.0, LEVER, GRAVITY), tq.GravityGradient(TENSOR, 0.0), DAMPER]
-    good += [tq.InternalDamper(0.1, 0.0), tq.Rotor(WHEEL), tq.Rotor(H), tq.Rotor(momentum_of_time)]
+    good = [tq.UniformGravity(0.0, LEVER, GRAVITY), tq.GravityGradient(0.0), DAMPER]
+    good += [tq.InternalDamper(0.1, 0.0), WHEEL, tq.Rotor(H), tq.Rotor(momentum_of_time)]
+    good += [POTENTIALS["dipole"], tq.CoulombFriction(0.0, 1.0), tq.CoulombFriction(1.0, 1.0, H)]
+    good += [sunlit(specular=0.4, diffuse=0.6), sunlit(sun=np.zeros(3)), sunlit(sun=lambda _: SUN)]
     good += [tq.LinearDrag(c) for c in (0.0, TENSOR, np.zeros((3, 3)), MOMENTS)]
     good += [tq.QuadraticDrag(1e-30 * np.outer(ROW, ROW)), tq.Constant(H), tq.as_torque(None)]
     good += [tq.LinearDrag(np.float32(1e20 * np.outer(ROW, ROW))), tq.Torque(lambda *_: NAN3)]
@@ -455,6 +648,19 @@ def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
     codes = lanes(np.array([0.1, -0.1, np.nan]))
     for k, code in enumerate(("successful", "invalid_torque", "invalid_torque")):
         assert (codes == getattr(jr.RESULTS, code))[k]
+
+
+def test_what_a_torque_says_of_a_bad_value_shows_it():
+    for torque, message in (
+        (tq.LinearDrag(-0.25), r"`coefficient` of `LinearDrag` must be .*, but it is not: -0\.25"),
+        (tq.SpinningMass(1.0, np.zeros(3)), r"`axis` of `SpinningMass` .* not: \[0\. 0\. 0\.\]"),
+        (
+            sunlit(specular=0.7, diffuse=np.array([0.1, 0.4, 0.0])),
+            r"`specular` and `diffuse` .* at most 1, but .* not: \[0\.8 1\.1 0\.7\]",
+        ),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            findings_of(torque).guard(jnp.zeros(()), throw=True)
 
 
 # --- arguments --------------------------------------------------------------------------------
@@ -480,12 +686,33 @@ WRONG = {
         r"`mass` must have shape \(\), but it has shape \(2,\)",
     ),
     "gradient": (
-        lambda: tq.GravityGradient(FOUR, MU, orbit),
+        lambda: tq.GravityGradient(MU, orbit).of_body(FOUR),
         r"`inertia` must have shape \(3,\) or \(3, 3\), but it has shape \(4,\)",
     ),
     "mu": (
-        lambda: tq.GravityGradient(MOMENTS, np.ones(2), orbit),
+        lambda: tq.GravityGradient(np.ones(2), orbit),
         r"`mu` must have shape \(\), but it has shape \(2,\)",
+    ),
+    "unbound": (
+        lambda: tq.GravityGradient(MU, orbit)(0.0, STATE, None),
+        r"`torque` must know the inertia of its body, but this `GravityGradient` does not",
+    ),
+    "dipole": (lambda: tq.MagneticDipole(FOUR, FIELD), r"`moment` must have shape \(3,\), but"),
+    "field of time": (
+        lambda: tq.MagneticDipole(LEVER, lambda *_: jnp.ones(4))(0.0, STATE, None),
+        r"`field` must have shape \(3,\), but it has shape \(4,\)",
+    ),
+    "normals": (
+        lambda: sunlit(normals=NORMALS[:2]),
+        r"`normals` must have shape \(3, 3\), but it has shape \(2, 3\)",
+    ),
+    "specular": (
+        lambda: sunlit(specular=np.ones(2)),
+        r"`specular` must have shape \(3,\), but it has shape \(2,\)",
+    ),
+    "friction": (
+        lambda: tq.CoulombFriction(MOMENTS, 1.0),
+        r"`magnitude` must have shape \(\), but it has shape \(3,\)",
     ),
     "linear": (
         lambda: tq.LinearDrag(FOUR),
@@ -511,7 +738,7 @@ WRONG = {
         r"`momentum` must have shape \(3,\), but it has shape \(4,\)",
     ),
     "orbit": (
-        lambda: tq.GravityGradient(MOMENTS, MU, lambda _: jnp.ones(2))(0.0, STATE, None),
+        lambda: tq.GravityGradient(MU, lambda _: jnp.ones(2)).of_body(MOMENTS)(0.0, STATE, None),
         r"`position` must have shape \(3,\), but it has shape \(2,\)",
     ),
     "function": (
@@ -519,8 +746,8 @@ WRONG = {
         r"`torque` must have shape \(3,\), but it has shape \(\)",
     ),
     "motor": (
-        lambda: tq.Rotor(tq.SpinningMass(0.3, LEVER, lambda *_: jnp.ones(3)))(
-            0.0, jr.State(ATTITUDE, OMEGA, jnp.ones(())), None
+        lambda: tq.SpinningMass(0.3, LEVER, lambda *_: jnp.ones(3))(
+            0.0, jr.State(ATTITUDE, OMEGA, (jnp.ones(()),)), None
         ),
         r"`motor_torque` must have shape \(\), but it has shape \(3,\)",
     ),

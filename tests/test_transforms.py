@@ -49,6 +49,7 @@ MODULES = {
 # Abstract classes, aliases and records: nothing to call.
 NOTHING_TO_CALL = {
     "torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem",
+    "dynamics.ExactStates", "dynamics.plain_state",
     "identify.AbstractObservation", "identify.AngularMomenta", "identify.Attitudes",
     "identify.Directions", "identify.Observed", "identify.Rates", "identify.FitResult",
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",
@@ -90,6 +91,8 @@ ANGLES = np.array([0.4, 1.1, -0.7])
 MATRIX = np.asarray(rotation.to_matrix(ATTITUDE))
 POSITION, VELOCITY = np.array([1.0, -2.0, 0.5]), np.array([0.4, 3.0, -1.2])
 INNER = np.array([1.0, 0.2, -0.6])
+PLATES = np.array([[0.1, 1.0, 0.2], [0.5, -0.9, 0.3], [-0.2, 0.1, 1.2]])
+SHAPE = np.array([[0.4, 0.1, -0.2], [0.3, -0.5, 0.6], [0.2, 0.7, -0.1]])
 SAMPLES = np.random.default_rng(0).normal(size=(5, 3))
 TIMES = np.array([0.0, 0.2, 0.35, 0.6, 0.7])
 TORQUE_METHODS = (
@@ -141,7 +144,9 @@ def of_external(make):
 
 
 def of_internal(make):
-    return lambda *x: all_of_a_torque(make(*x[:-4]), x[-4], jr.State(x[-3], x[-2], number(x[-1])))
+    return lambda *x: all_of_a_torque(
+        make(*x[:-4]), x[-4], jr.State(x[-3], x[-2], (number(x[-1]),))
+    )
 
 
 def orbit_along(axis):
@@ -153,7 +158,7 @@ def motor(t, state, args):
 
 
 def two_parts(inertia, coupling, spinning, axis):
-    wheel = torques.Rotor(torques.SpinningMass(spinning, axis, motor))
+    wheel = torques.SpinningMass(spinning, axis, motor)
     drag = torques.LinearDrag(coupling)
     return drag + torques.InternalDamper(inertia, coupling) + wheel
 
@@ -165,9 +170,17 @@ def custom(scale):
     )
 
 
+def sunlit(areas, normals, centers, sun, specular, diffuse, pressure, t, q, w):
+    towards = lambda t: number(sun) + number(t)  # noqa: E731
+    torque = torques.SolarPressure(areas, normals, centers, towards, specular, diffuse, pressure)
+    state = jr.State(q, w)
+    return [all_of_a_torque(torque, t, state), torque.force(t, state, None)]
+
+
 def rigid_body(inertia, mass, lever, gravity, t, q, w):
     body = jr.RigidBody(symmetric(inertia), torques.UniformGravity(mass, lever, gravity))
     state = jr.State(q, w)
+    assert not body.is_free
     return [f(t, state, None) for f in (body.vector_field, body.energy, body.angular_momentum)]
 
 
@@ -180,11 +193,12 @@ def floating_body(mass, inertia, stiffness, t, position, velocity, q, w, inner):
         mass, jnp.zeros_like(number(position)), symmetric(inertia)
     )
     body = jr.FloatingBody(properties, force, torques.InternalDamper(mass, stiffness))
-    state = jr.FloatingState(position, velocity, q, w, number(inner))
+    state = jr.FloatingState(position, velocity, q, w, (number(inner),))
     return [
         *(f(t, state, None) for f in (body.vector_field, body.energy, body.angular_momentum)),
         *(f(state) for f in (body.translational_energy, body.rotational_energy, body.momentum)),
         body.inertia,
+        body.rotation.energy(t, state, None),
     ]
 
 
@@ -358,10 +372,10 @@ CASES = {
     ),
     "torques.GravityGradient": Case(
         of_external(
-            lambda i, mu, axis: torques.GravityGradient(symmetric(i), mu, orbit_along(axis))
+            lambda i, mu, axis: torques.GravityGradient(mu, orbit_along(axis)).of_body(symmetric(i))
         ),
         (TENSOR, 4.0, VECTOR, 0.5, ATTITUDE, OMEGA),
-        methods("torques.GravityGradient", "__call__", "potential"),
+        methods("torques.GravityGradient", "__call__", "potential", "of_body"),
     ),
     "torques.KeplerOrbit": Case(
         lambda mu, a, e, t: [
@@ -381,30 +395,51 @@ CASES = {
         (0.3, 0.5, ATTITUDE, OMEGA),
         methods("torques.QuadraticDrag", "__call__"),
     ),
+    "torques.CoulombFriction": Case(
+        of_external(torques.CoulombFriction),
+        (0.3, 0.8, AXIS, 0.5, ATTITUDE, OMEGA),
+        methods("torques.CoulombFriction", "__call__"),
+    ),
+    "torques.CoulombFriction, a ball joint": Case(
+        of_external(torques.CoulombFriction), (0.3, 0.8, 0.5, ATTITUDE, OMEGA)
+    ),
+    "torques.MagneticDipole": Case(
+        of_external(
+            lambda m, b: torques.MagneticDipole(
+                m, lambda t, s: number(b) * number(t) + s.attitude[1:]
+            )
+        ),
+        (VECTOR, AXIS, 0.5, ATTITUDE, OMEGA),
+        methods("torques.MagneticDipole", "__call__", "potential"),
+    ),
+    "torques.SolarPressure": Case(
+        sunlit,
+        (np.array([1.5, 2.0, 0.7]), PLATES, SHAPE, AXIS, 0.3, 0.2, 1.4, 0.5, ATTITUDE, OMEGA),
+        methods("torques.SolarPressure", "__call__", "force"),
+    ),
     "torques.InternalDamper": Case(
         of_internal(torques.InternalDamper),
         (0.2, 0.05, 0.5, ATTITUDE, OMEGA, INNER),
         methods("torques.InternalDamper", *(set(TORQUE_METHODS) - {"potential"})),
     ),
-    "torques.Rotor, a wheel": Case(
-        of_internal(lambda i, axis: torques.Rotor(torques.SpinningMass(i, axis, motor))),
+    "torques.SpinningMass": Case(
+        of_internal(lambda i, axis: torques.SpinningMass(i, axis, motor)),
         (0.3, AXIS, 0.5, ATTITUDE, OMEGA, 4.0),
-        (
-            *methods("torques.Rotor", *(set(TORQUE_METHODS) - {"potential"})),
-            "torques.SpinningMass",
-            "torques.Rotor",
-        ),
+        methods("torques.SpinningMass", *(set(TORQUE_METHODS) - {"potential"})),
     ),
-    "torques.Rotor, prescribed": Case(
+    "torques.Rotor": Case(
         of_external(lambda axis: torques.Rotor(lambda t: number(axis) * jnp.sin(t))),
         (AXIS, 0.5, ATTITUDE, OMEGA),
+        methods("torques.Rotor", "__call__", "internal_momentum"),
     ),
     "torques.Sum": Case(
         lambda *x: all_of_a_torque(
-            two_parts(*x[:4]), x[4], jr.State(x[5], x[6], (number(x[7]), number(x[8])))
+            two_parts(*x[:4]).of_body(MOMENTS),
+            x[4],
+            jr.State(x[5], x[6], (number(x[7]), number(x[8]))),
         ),
         (0.2, 0.05, 0.3, AXIS, 0.5, ATTITUDE, OMEGA, INNER, 4.0),
-        methods("torques.Sum", *TORQUE_METHODS),
+        methods("torques.Sum", *TORQUE_METHODS, "of_body"),
     ),
     # systems
     # free
@@ -497,7 +532,7 @@ CASES = {
     "systems.RigidBody": Case(
         rigid_body,
         (TENSOR, 2.0, VECTOR, AXIS, 0.5, ATTITUDE, OMEGA),
-        methods("systems.RigidBody", "vector_field", "energy", "angular_momentum"),
+        methods("systems.RigidBody", "vector_field", "energy", "angular_momentum", "is_free"),
     ),
     "systems.FloatingBody": Case(
         floating_body,
@@ -505,7 +540,7 @@ CASES = {
         (
             *methods("systems.FloatingBody", "vector_field", "energy", "angular_momentum"),
             *methods("systems.FloatingBody", "translational_energy", "rotational_energy"),
-            *methods("systems.FloatingBody", "momentum", "inertia"),
+            *methods("systems.FloatingBody", "momentum", "inertia", "rotation"),
             *("systems.Force", "systems.Force.__call__"),
         ),
     ),

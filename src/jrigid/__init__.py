@@ -36,6 +36,7 @@ from jrigid.mass import parallel_axis as parallel_axis
 from jrigid.mass import principal_axes as principal_axes
 from jrigid.mass import tensor_function as tensor_function
 from jrigid.mass import to_center_of_mass as to_center_of_mass
+from jrigid.systems import AbstractSystem as AbstractSystem
 from jrigid.systems import FloatingBody as FloatingBody
 from jrigid.systems import FloatingState as FloatingState
 from jrigid.systems import RigidBody as RigidBody

@@ -39,8 +39,6 @@ from jrigid._types import ScalarLike
 from jrigid.rotation import normalize
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem, RigidBody
-from jrigid.torques import Sum
-from jrigid.torques._base import has_parts
 
 # One step commits this fraction of rtol. The error of the energy adds up over the turns and that
 # of the phase over the energy's: what is promised of the state after thousands of turns, and of
@@ -177,9 +175,7 @@ def simulate(
     if solver is None:
         solver = diffrax.Dopri8()
     if isinstance(solver, ExactFree):
-        torque = system.torque
-        free = isinstance(system, RigidBody) and isinstance(torque, Sum) and not torque.terms
-        if not free:
+        if not (isinstance(system, RigidBody) and system.is_free):
             raise ValueError(
                 "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
                 "torque, but it is."
@@ -244,18 +240,7 @@ def _simulate(
     throw: bool,
     meter: Any,
 ) -> Trajectory:
-    if not has_parts(state0.internal):
-        state0 = dataclasses.replace(state0, internal=system.torque.internal_at_rest(state0))
-    have, want = (
-        [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
-        for tree in (state0.internal, system.torque.internal_at_rest(state0))
-    )
-    if have != want:
-        raise ValueError(
-            f"Argument `state0.internal` must hold arrays of the shapes {want}, "
-            f"but it holds {have}."
-        )
-
+    state0 = system.with_parts(state0)
     flat = ts.reshape(-1)
     findings = Findings()
     check_values(findings, system, state0, flat, t0, longest, rtol, atol, args)

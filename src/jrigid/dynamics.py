@@ -26,8 +26,9 @@ class State(Readable):
     Attributes:
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
-        internal: What an internal damper or a spinning rotor carries, in the order of the torques
-            that carry something (see `jrigid.torques`); empty by default, and then None.
+        internal: A tuple with an entry for each torque that carries parts, in the order of the
+            torques (see `jrigid.torques`): one wheel's spin is `(spin,)`. None if there are none,
+            and before `system.with_parts(state)`, or `simulate`, adds parts at rest in the body.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 0.0, 5.0]))
@@ -71,11 +72,11 @@ def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array
             f"Argument `{name}.internal` must be empty, but it is not: a body with moving parts "
             "has no motion in closed form; use `jrigid.simulate`."
         )
-    attitude, omega, *others = float_arrays(state.attitude, state.omega, *others)
+    attitude, omega, *converted = float_arrays(state.attitude, state.omega, *others)
     check_shape(f"{name}.attitude", attitude, (4,))
     check_shape(f"{name}.omega", omega, (3,))
     check_precision(omega.dtype)
-    return State(attitude, omega), tuple(others)
+    return State(attitude, omega), tuple(converted)
 
 
 def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:
@@ -85,7 +86,7 @@ def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array
     return inertia, vector
 
 
-def _apply(inertia: Array, vector: Array) -> tuple[Array, Array, Array]:
+def _inertia_times(inertia: Array, vector: Array) -> tuple[Array, Array, Array]:
     """Components of I v; written out, so that XLA can fuse it and no dot is involved."""
     a, b, c = vector
     if inertia.ndim == 1:
@@ -94,7 +95,7 @@ def _apply(inertia: Array, vector: Array) -> tuple[Array, Array, Array]:
     return rows[0], rows[1], rows[2]
 
 
-def _solve(inertia: Array, vector: Array) -> Array:
+def _inverse_times(inertia: Array, vector: Array) -> Array:
     """I^-1 v for a symmetric tensor, through the cofactors."""
     if inertia.ndim == 1:
         return vector / inertia
@@ -121,9 +122,6 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     Returns:
         Angular momentum [kg m^2/s], body components; `rotation.rotate` takes it to space.
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked: this runs at every step.
-
     Gradients: bilinear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -131,7 +129,7 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     [1. 2. 3.]
     """
     tensor, w = _inertia_and_vector(inertia, omega)
-    return jnp.stack(_apply(tensor, w))
+    return jnp.stack(_inertia_times(tensor, w))
 
 
 def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
@@ -144,9 +142,6 @@ def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     Returns:
         Energy [J].
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked: this runs at every step.
-
     Gradients: finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -154,7 +149,7 @@ def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     3.0
     """
     tensor, w = _inertia_and_vector(inertia, omega)
-    a, b, c = _apply(tensor, w)
+    a, b, c = _inertia_times(tensor, w)
     return 0.5 * (w[0] * a + w[1] * b + w[2] * c)
 
 
@@ -174,9 +169,6 @@ def euler_equations(
     Returns:
         omega' [rad/s^2], body components.
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked: this runs at every step.
-
     Gradients: finite everywhere.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 36.5.
 
@@ -190,7 +182,7 @@ def euler_equations(
         tensor, gyroscopic, torque = float_arrays(tensor, gyroscopic, torque)
         check_shape("torque", torque, (3,))
         gyroscopic = gyroscopic + torque
-    return _solve(tensor, gyroscopic)
+    return _inverse_times(tensor, gyroscopic)
 
 
 def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
@@ -217,9 +209,6 @@ def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
 
     Returns:
         Torque on the body [N m], body components; zero about a principal axis.
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
 
     Gradients: finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.39 with omega' = 0.

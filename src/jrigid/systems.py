@@ -1,32 +1,36 @@
 """Systems for diffrax: vector fields and invariants of bodies that turn, and that fly."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
     RESULTS,
     Findings,
+    all_positive,
     check_inertia_shape,
     check_shape,
+    check_type,
     float_arrays,
     internal_parts,
     is_inertia,
     state_array,
 )
-from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
+from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
 from jrigid.mass import MassProperties
 from jrigid.rotation import attitude_rate, rotate
-from jrigid.torques import AbstractTorque, TorqueFunction, as_torque
+from jrigid.torques import AbstractTorque, Sum, TorqueFunction, as_torque
 
 
-class AbstractSystem(eqx.Module):
+class AbstractSystem(Readable):
     """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants."""
 
     state_type: eqx.AbstractClassVar[type]
@@ -45,17 +49,52 @@ class AbstractSystem(eqx.Module):
     def angular_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Total angular momentum [kg m^2/s], space components, internal parts included."""
 
+    def with_parts(self, state: Any) -> Any:
+        """A state with all that the body carries: its own parts, or parts at rest in the body.
+
+        `simulate` takes a state without them; a vector field in one's own `diffeqsolve` does not.
+
+        Args:
+            state: State, with an entry in `internal` for each torque that carries parts, or none.
+
+        Returns:
+            The state itself, if it has its parts.
+        """
+        if state.internal is None:
+            state = dataclasses.replace(state, internal=self.torque.internal_at_rest(state))
+        self._inertia_and_torque(state)  # which looks at the parts
+        return state
+
+    def torque_on(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """The torque on this body [N m], body components, of torques that know its inertia."""
+        return self._inertia_and_torque(state)[1](t, state, args)
+
+    def _inertia_and_torque(self, state: Any) -> tuple[Array, AbstractTorque]:
+        """The inertia, in the dtype of a state with this body's parts, and the torque on it."""
+        have, want = (
+            [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
+            for tree in (state.internal, self.torque.internal_at_rest(state))
+        )
+        if have != want:
+            raise ValueError(
+                "Argument `internal` of the state must be a tuple with an entry for each torque "
+                f"that carries parts, here of the shapes {want}, but it holds {have}: "
+                "`system.with_parts(state)` adds parts at rest to a state that has none."
+            )
+        inertia = self.inertia.astype(state.omega.dtype)
+        return inertia, self.torque.of_body(inertia)
+
     def check(self, findings: Findings) -> None:
         """Note parameters with bad values, for `simulate`.
 
         Args:
             findings: What has been found so far; `require` adds to it.
         """
-        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia)
+        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia, value=self.inertia)
         self.torque.check(findings)
 
 
-class FloatingState(eqx.Module):
+class FloatingState(Readable):
     """State of a body in flight.
 
     Attributes:
@@ -63,7 +102,7 @@ class FloatingState(eqx.Module):
         velocity: Velocity of the centre of mass, space components [m/s].
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
-        internal: What internal dampers and rotors carry, as in `State`.
+        internal: A tuple with an entry for each torque that carries parts, as in `State`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.FloatingState(
@@ -76,23 +115,6 @@ class FloatingState(eqx.Module):
     attitude: Float[Array, "*batch 4"] = eqx.field(converter=state_array)
     omega: Float[Array, "*batch 3"] = eqx.field(converter=state_array)
     internal: Any = eqx.field(default=(), converter=internal_parts)
-
-
-def _rotational_momentum(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
-    inertia = system.inertia.astype(state.omega.dtype)
-    own = angular_momentum(inertia, state.omega)
-    return rotate(state.attitude, own + system.torque.internal_momentum(t, state, args))
-
-
-def _rotational_energy(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
-    inertia = system.inertia.astype(state.omega.dtype)
-    own = kinetic_energy(inertia, state.omega)
-    return own + system.torque.internal_energy(t, state, args)
-
-
-def _omega_rate(system: AbstractSystem, t: Any, state: Any, args: Any) -> Array:
-    inertia = system.inertia.astype(state.omega.dtype)
-    return euler_equations(inertia, state.omega, system.torque(t, state, args))
 
 
 class RigidBody(AbstractSystem):
@@ -120,9 +142,6 @@ class RigidBody(AbstractSystem):
             inertia: Principal moments or symmetric tensor [kg m^2].
             torque: `(t, state, args) -> (3,)` body components [N m], a torque of
                 `jrigid.torques`, or None.
-
-        Raises:
-            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
         """
         if isinstance(inertia, MassProperties):
             raise ValueError(
@@ -134,7 +153,12 @@ class RigidBody(AbstractSystem):
         check_inertia_shape(self.inertia)
         self.torque = as_torque(torque)
 
-    def vector_field(self, t: ScalarLike, state: State, args: Any) -> State:
+    @property
+    def is_free(self) -> bool:
+        """True of a body without torque."""
+        return isinstance(self.torque, Sum) and not self.torque.terms
+
+    def vector_field(self, t: ScalarLike, state: State | FloatingState, args: Any) -> State:
         """Time derivative of the state.
 
         Args:
@@ -147,13 +171,14 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
+        inertia, torque = self._inertia_and_torque(state)
         return State(
             attitude_rate(state.attitude, state.omega),
-            _omega_rate(self, t, state, args),
-            self.torque.internal_rate(t, state, args),
+            euler_equations(inertia, state.omega, torque(t, state, args)),
+            torque.internal_rate(t, state, args),
         )
 
-    def energy(self, t: ScalarLike, state: State, args: Any) -> Scalar:
+    def energy(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Scalar:
         """Total energy [J]: kinetic, potential, and that of internal parts.
 
         Args:
@@ -166,10 +191,11 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        potential = self.torque.potential(t, state, args)
-        return _rotational_energy(self, t, state, args) + potential
+        inertia, torque = self._inertia_and_torque(state)
+        own = kinetic_energy(inertia, state.omega)
+        return own + torque.internal_energy(t, state, args) + torque.potential(t, state, args)
 
-    def angular_momentum(self, t: ScalarLike, state: State, args: Any) -> Vector:
+    def angular_momentum(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Vector:
         """Total angular momentum about the fixed point, internal parts included.
 
         Args:
@@ -182,7 +208,9 @@ class RigidBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        return _rotational_momentum(self, t, state, args)
+        inertia, torque = self._inertia_and_torque(state)
+        own = angular_momentum(inertia, state.omega)
+        return rotate(state.attitude, own + torque.internal_momentum(t, state, args))
 
 
 class Force(eqx.Module):
@@ -238,18 +266,13 @@ class FloatingBody(AbstractSystem):
             force: `(t, state, args) -> (3,)` space components [N]; a `Force` adds a potential.
             torque: About the centre of mass, as for `RigidBody`.
         """
-        if not isinstance(mass_properties, MassProperties):
-            raise ValueError(
-                "Argument `mass_properties` must be a MassProperties, "
-                f"but it is {type(mass_properties).__name__}."
-            )
+        check_type("mass_properties", mass_properties, MassProperties)
         if force is not None and not callable(force):
             raise ValueError(
                 "Argument `force` must be a callable (t, state, args) -> (3,), "
                 f"but it is {force!r}."
             )
-        self.mass_properties = mass_properties
-        self.force = force
+        self.mass_properties, self.force = mass_properties, force
         self.torque = as_torque(torque)
 
     @property
@@ -257,16 +280,20 @@ class FloatingBody(AbstractSystem):
         """Inertia tensor about the centre of mass [kg m^2]."""
         return self.mass_properties.inertia
 
+    @property
+    def rotation(self) -> RigidBody:
+        """The body that turns about the centre of mass as this one does."""
+        return RigidBody(self.inertia, self.torque)
+
     def check(self, findings: Findings) -> None:
-        """Note what was found wrong with the mass properties, then as any system.
+        """Note a mass that is not positive, then as any system.
 
         Args:
             findings: What has been found so far; `require` adds to it.
         """
         mass = jax.lax.stop_gradient(self.mass_properties.mass)
-        findings.require(jnp.isfinite(mass) & (mass > 0), RESULTS.invalid_mass)
-        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia)
-        self.torque.check(findings)
+        findings.require(all_positive(mass), RESULTS.invalid_mass, value=mass)
+        self.rotation.check(findings)
 
     def _force(self, t: ScalarLike, state: Any, args: Any) -> Array:
         if self.force is None:
@@ -291,12 +318,10 @@ class FloatingBody(AbstractSystem):
         check_shape("position", state.position, (3,))
         check_shape("velocity", state.velocity, (3,))
         mass = self.mass_properties.mass.astype(state.velocity.dtype)
+        acceleration = self._force(t, state, args) / mass
+        turning = self.rotation.vector_field(t, state, args)
         return FloatingState(
-            state.velocity,
-            self._force(t, state, args) / mass,
-            attitude_rate(state.attitude, state.omega),
-            _omega_rate(self, t, state, args),
-            self.torque.internal_rate(t, state, args),
+            state.velocity, acceleration, turning.attitude, turning.omega, turning.internal
         )
 
     def translational_energy(self, state: FloatingState) -> Scalar:
@@ -335,8 +360,7 @@ class FloatingBody(AbstractSystem):
 
         Gradients: finite for any non-zero attitude quaternion.
         """
-        total = self.translational_energy(state) + _rotational_energy(self, t, state, args)
-        total = total + self.torque.potential(t, state, args)
+        total = self.translational_energy(state) + self.rotation.energy(t, state, args)
         if isinstance(self.force, Force):
             total = total + jnp.asarray(self.force.potential(t, state, args), total.dtype)
         return total
@@ -366,4 +390,4 @@ class FloatingBody(AbstractSystem):
         Gradients: finite for any non-zero attitude quaternion.
         """
         orbital = jnp.cross(state.position, self.momentum(state))
-        return orbital + _rotational_momentum(self, t, state, args)
+        return orbital + self.rotation.angular_momentum(t, state, args)

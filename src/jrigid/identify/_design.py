@@ -33,7 +33,6 @@ from jrigid.identify._result import FitResult
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
 from jrigid.identify._unknowns import as_tensor, unknowns_of
 from jrigid.systems import RigidBody
-from jrigid.torques import Sum
 
 
 class Bound(NamedTuple):
@@ -81,7 +80,7 @@ def _planned(
         raise ValueError(f"Argument `state` must be a State, but it is {type(state).__name__}.")
     check_inertia_shape(system.inertia)
     stacked = of_throws(observations)
-    torque_free = isinstance(system.torque, Sum) and not system.torque.terms
+    torque_free = system.is_free
     refuse(system, stacked, scale, torque_free)
     stacked = tuple(_with_values(x, jnp.ones_like(x.values)) for x in stacked)
     if any(x.sigma is None and x.covariance is None for x in stacked):
@@ -402,7 +401,7 @@ def residuals(
     begin = first if t0 is None else jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
     attitude = jnp.broadcast_to(state.attitude, (throws, 4))
     omega = jnp.broadcast_to(state.omega, (throws, 3))
-    torque_free = isinstance(system.torque, Sum) and not system.torque.terms
+    torque_free = system.is_free
 
     if not torque_free:
         begin = eqx.error_if(

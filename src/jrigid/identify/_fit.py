@@ -40,8 +40,6 @@ from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_ma
 from jrigid.identify._starts import linear_start
 from jrigid.identify._unknowns import Unknowns, as_tensor, unknowns_of
 from jrigid.systems import RigidBody
-from jrigid.torques import Sum
-from jrigid.torques._base import has_parts
 
 _LOSSES = ("squares", "robust")
 # Weights of the links, in units of the noise; and a slower way for fits that went wrong.
@@ -141,7 +139,7 @@ def fit(
         )
     stacked = of_throws(observations)
     start_tensor, start_state = start_of(start)
-    torque_free = isinstance(system.torque, Sum) and not system.torque.terms
+    torque_free = system.is_free
     refuse(system, stacked, scale, torque_free)
     throws = stacked[0].ts.shape[0]
     on_attitude = any(x.on_attitude for x in stacked) or depends_on_attitude(system)
@@ -152,7 +150,7 @@ def fit(
             "not."
         )
     observed = any(isinstance(x, Rates | Attitudes) for x in stacked)
-    internal = has_parts(system.torque.internal_at_rest(State(jnp.zeros(4), jnp.zeros(3))))
+    internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     shooting = observed and motion is None and not internal
     if not shooting and start_state is None:
         raise ValueError(
@@ -411,7 +409,7 @@ def _linear_start(
     by_attitude = options.free_motion and samples.attitude is not None and samples.ts.shape[1] < 40
     torque = None
     if not options.free_motion:
-        torque_of = unknowns.original.torque
+        torque_of = unknowns.original.torque_on
 
         def at(t: Array, q: Array, w: Array) -> Array:
             return jnp.asarray(torque_of(t, State(q, w), None), w.dtype)

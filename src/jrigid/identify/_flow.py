@@ -100,7 +100,8 @@ def depends_on_attitude(system: AbstractSystem) -> bool:
     arrays, rest = eqx.partition(system, eqx.is_inexact_array)
 
     def torque(q: Array, w: Array, arrays: Any) -> Array:
-        return eqx.combine(arrays, rest).torque(jnp.zeros(()), State(q, w), None)
+        system = eqx.combine(arrays, rest)
+        return system.torque_on(jnp.zeros(()), system.with_parts(State(q, w)), None)
 
     program = jax.make_jaxpr(torque)(jnp.array([1.0, 0, 0, 0]), jnp.zeros(3), arrays).jaxpr
     reached = {program.invars[0]}

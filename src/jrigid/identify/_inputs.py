@@ -20,7 +20,7 @@ from jrigid.identify._observations import (
 )
 from jrigid.identify._unknowns import as_tensor
 from jrigid.systems import RigidBody
-from jrigid.torques import Rotor, Sum
+from jrigid.torques import Rotor, SpinningMass, Sum
 
 
 def start_of(start: Any) -> tuple[Any, State | None]:
@@ -47,7 +47,7 @@ def refuse(system: Any, stacked: tuple[AbstractObservation, ...], scale: str, fr
         return
     if scale == "rotor":
         terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
-        if not any(isinstance(x, Rotor) for x in terms):
+        if not any(isinstance(x, Rotor | SpinningMass) for x in terms):
             raise ValueError(
                 "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but "
                 "it is: nothing sets the scale of the tensor."

@@ -20,7 +20,7 @@ from jrigid.identify._parameters import LogCholesky
 from jrigid.mass import MassProperties
 from jrigid.rotation import hat
 from jrigid.systems import AbstractSystem
-from jrigid.torques import GravityGradient, Sum, UniformGravity
+from jrigid.torques import Sum, UniformGravity
 
 SHAPES = {"tensor": 5, "moments": 2, "symmetric": 3, "top": 1, "flat": 4, "fixed": 0}
 SCALES = ("trace", "known", "rotor")
@@ -219,7 +219,7 @@ class Unknowns(eqx.Module):
         system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
         inertia = self.inertia(numbers)
         body = None if self.ten is None else self.ten.body(numbers[self.slices["shape"]])
-        torque = _of_body(system.torque, inertia, body)
+        torque = _of_body(system.torque, body)
         system = eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque))
         return system, self.gyro(numbers)
 
@@ -259,12 +259,10 @@ class Unknowns(eqx.Module):
         return Unknowns(**{**fields, "held": function, "constraint": (value, unit)})
 
 
-def _of_body(torque: Any, inertia: Array, body: MassProperties | None) -> Any:
-    """The torque, with the body's inertia, mass and lever where it has some of its own."""
+def _of_body(torque: Any, body: MassProperties | None) -> Any:
+    """The torque, with the body's mass and lever where it has some of its own."""
     if isinstance(torque, Sum):
-        return Sum(tuple(_of_body(term, inertia, body) for term in torque.terms))
-    if isinstance(torque, GravityGradient):
-        return eqx.tree_at(lambda x: x.inertia, torque, inertia)
+        return Sum(tuple(_of_body(term, body) for term in torque.terms))
     if isinstance(torque, UniformGravity) and body is not None:
         return UniformGravity(body.mass, body.center_of_mass, torque.gravity)
     return torque

@@ -26,7 +26,6 @@ from jrigid.rotation import exp, multiply, normalize, rotate, rotate_inverse
 from jrigid.stability._eigen import eigenvalues
 from jrigid.stability._steps import checked_state
 from jrigid.systems import RigidBody
-from jrigid.torques._base import has_parts
 
 STABILITY = ("unstable", "marginal", "stable")
 _NO_EQUILIBRIUM = (
@@ -126,7 +125,7 @@ def linearize(
     check_shape("t", time, ())
     check_shape("body_rate", own, (3,))
     check_shape("space_axis", up, (3,))
-    if body_rate is not None and has_parts(state.internal):
+    if body_rate is not None and state.internal is not None:
         raise ValueError(
             "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
             "but it is not."

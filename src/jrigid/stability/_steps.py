@@ -24,7 +24,6 @@ from jrigid._scales import ravel, units, unravel
 from jrigid.dynamics import State
 from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import RigidBody
-from jrigid.torques._base import has_parts
 
 # Largest local error of a step, in the scales of the variables, that a result may have.
 _LARGEST_ERROR = {8: 1e-6, 4: 1e-3}
@@ -71,11 +70,8 @@ def checked_state(system: Any, state: Any, name: str = "state0") -> State:
     attitude, omega = float_arrays(state.attitude, state.omega)
     check_shape("attitude", attitude, (4,))
     check_shape("omega", omega, (3,))
-    internal = state.internal
-    if not has_parts(internal):
-        internal = system.torque.internal_at_rest(State(attitude, omega))
-    internal = jtu.tree_map(lambda x: jnp.asarray(x, omega.dtype), internal)
-    return State(attitude, omega, internal)
+    internal = jtu.tree_map(lambda x: jnp.asarray(x, omega.dtype), state.internal)
+    return system.with_parts(State(attitude, omega, internal))
 
 
 def checked_body(system: Any, state0: Any, duration: Any, t0: Any) -> tuple[State, Array, Array]:

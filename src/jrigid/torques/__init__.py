@@ -2,7 +2,8 @@
 
 A torque is any callable `(t, state, args) -> (3,)` body components [N m]. The classes here add
 what a plain function cannot carry: a potential energy, and internal parts (a damper, a rotor)
-with a state, a momentum and an energy of their own.
+with a state, a momentum and an energy of their own. Their parameters are judged by `simulate` and
+its like, which integrate.
 """
 
 from jrigid.torques._base import AbstractTorque as AbstractTorque
@@ -11,9 +12,12 @@ from jrigid.torques._base import Sum as Sum
 from jrigid.torques._base import Torque as Torque
 from jrigid.torques._base import TorqueFunction as TorqueFunction
 from jrigid.torques._base import as_torque as as_torque
+from jrigid.torques._external import CoulombFriction as CoulombFriction
 from jrigid.torques._external import GravityGradient as GravityGradient
 from jrigid.torques._external import LinearDrag as LinearDrag
+from jrigid.torques._external import MagneticDipole as MagneticDipole
 from jrigid.torques._external import QuadraticDrag as QuadraticDrag
+from jrigid.torques._external import SolarPressure as SolarPressure
 from jrigid.torques._external import UniformGravity as UniformGravity
 from jrigid.torques._internal import InternalDamper as InternalDamper
 from jrigid.torques._internal import Rotor as Rotor

@@ -1,20 +1,84 @@
 """What a torque is, and how torques add."""
 
+# A torque takes t, state and args, whatever it looks at.
+# ruff: noqa: ARG002
+
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import RESULTS, Findings, all_finite, array_of_shape, check_shape
-from jrigid._types import Scalar, ScalarLike, Vector
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    all_positive,
+    array_of_shape,
+    check_shape,
+)
+from jrigid._numerics import safe_norm
+from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 
 TorqueFunction = Callable[[Any, Any, Any], Any]
+
+
+# What a parameter must be, in words and as a test: the metadata of its field.
+FINITE = {"rule": ("finite", all_finite)}
+POSITIVE = {"rule": ("positive and finite", all_positive)}
+NOT_NEGATIVE = {"rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0))}
+DIRECTION = {
+    "rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x != 0, axis=-1)))
+}
+
+
+def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
+    """Note each parameter that breaks the rule of its field."""
+    for field in dataclasses.fields(torque):
+        value = getattr(torque, field.name)
+        if "rule" in field.metadata and eqx.is_array(value):  # not a function of time, nor None
+            words, holds = field.metadata["rule"]
+            name = f"Argument `{field.name}` of `{type(torque).__name__}`"
+            message = f"{name} must be {words}, but it is not."
+            value = jax.lax.stop_gradient(value)
+            findings.require(holds(value), RESULTS.invalid_torque, message, value)
+
+
+def array(name: str, *shape: int | None) -> Callable[[Any], Array]:
+    """A converter to an array of this shape."""
+    return lambda value: array_of_shape(name, value, *shape)
+
+
+def directions(name: str, *shape: int | None) -> Callable[[Any], Array]:
+    """A converter to vectors of length 1; zero stays zero, which `DIRECTION` refuses."""
+
+    def convert(value: Any) -> Array:
+        vectors = array_of_shape(name, value, *shape)
+        lengths = jnp.vectorize(safe_norm, signature="(n)->()")(vectors)[..., None]
+        return vectors / jnp.where(lengths > 0, lengths, 1.0)
+
+    return convert
+
+
+def vector_or_function(name: str) -> Callable[[Any], Any]:
+    """A converter to a vector that leaves a function as it is."""
+    return lambda value: value if callable(value) else array_of_shape(name, value, 3)
+
+
+def vector_at(name: str, source: Any, dtype: Any, *arguments: Any) -> Array:
+    """The value of a vector, or of a function with vectors as values."""
+    vector = jnp.asarray(source(*arguments) if callable(source) else source, dtype)
+    check_shape(name, vector, (3,))
+    return vector
+
+
+def in_dtype_of(state: Any, *parameters: Array) -> list[Array]:
+    """Parameters of a torque in the dtype of a state."""
+    return [x.astype(state.omega.dtype) for x in parameters]
 
 
 def zero_like(state: Any) -> Scalar:
@@ -22,25 +86,12 @@ def zero_like(state: Any) -> Scalar:
     return jnp.zeros((), state.omega.dtype)
 
 
-def require_finite(findings: Findings, owner: Any, *names: str) -> None:
-    """Note each of the named parameters of a torque that is not finite."""
-    for name in names:
-        findings.require(
-            all_finite(jax.lax.stop_gradient(getattr(owner, name))),
-            RESULTS.invalid_torque,
-            f"Argument `{name}` of `{type(owner).__name__}` must be finite, but it is not.",
-        )
-
-
-def has_parts(internal: PyTree) -> bool:
-    """Whether an internal state holds anything."""
-    return bool(jtu.tree_leaves(internal))
-
-
-class AbstractTorque(eqx.Module):
+class AbstractTorque(Readable):
     """A torque, its potential energy, and the internal parts that exert it.
 
     Subclasses give `__call__`; the rest defaults to a torque without potential or internal parts.
+    A torque with internal parts sees in `state.internal` a tuple with an entry for each of its own,
+    alone and in a sum, and answers with such tuples.
 
     Gradients: those of the subclass's own functions.
 
@@ -62,53 +113,56 @@ class AbstractTorque(eqx.Module):
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
 
+    def of_body(self, inertia: InertiaLike) -> "AbstractTorque":
+        """The torque on a body of this inertia: itself, unless it depends on it.
+
+        `RigidBody` and `FloatingBody` ask for it at every use, with their own inertia.
+        """
+        return self
+
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if the torque has none."""
-        del t, args
         return zero_like(state)
 
-    def internal_at_rest(self, state: Any) -> PyTree:
+    def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal state of parts that move with the body; `()` if there are none."""
-        del state
         return ()
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
-        del t, state, args
         return ()
 
-    def internal_scale(self, rate: Scalar) -> PyTree:
+    def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
         """Size of the internal state when the body turns at `rate` [rad/s], for error control."""
-        del rate
         return ()
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the internal parts [kg m^2/s], body components."""
-        del t, args
         return jnp.zeros_like(state.omega)
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of the internal parts [J]."""
-        del t, args
         return zero_like(state)
 
     def check(self, findings: Findings) -> None:
-        """Note parameters with bad values, for `simulate`; by default there are none.
+        """Note parameters with bad values, for `simulate` and its like.
 
         Args:
             findings: What has been found so far; `require` adds to it.
         """
-        del findings
+        check_parameters(findings, self)
 
     def __add__(self, other: TorqueFunction) -> "Sum":
         """Both torques together."""
-        return Sum((*_terms(self), *_terms(other)))
+        return Sum((self, other))
 
-    def __radd__(self, other: TorqueFunction | int) -> "AbstractTorque":
-        """Both torques together; `0 + torque` is the torque, so that `sum()` works."""
-        if isinstance(other, int) and other == 0:
-            return self
-        return Sum((*_terms(other), *_terms(self)))
+    def __radd__(self, other: Any) -> "AbstractTorque":
+        """Both torques together; `0 + torque` is the torque, so that `sum()` works.
+
+        A plain function may not come first in `sum`, since Python adds it to 0 without asking any
+        torque: `Sum([function, torque])` takes them in any order.
+        """
+        return self if other == 0 else Sum((other, self))
 
 
 def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
@@ -119,9 +173,6 @@ def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
 
     Returns:
         The torque itself if it is one already.
-
-    Raises:
-        ValueError: Not callable (trace time).
 
     >>> import jrigid as jr
     >>> type(jr.torques.as_torque(None)).__name__
@@ -146,17 +197,17 @@ def _terms(torque: Any) -> tuple[AbstractTorque, ...]:
 class Sum(AbstractTorque):
     """Torques acting together; what `+` makes.
 
-    The internal state is `()` if no term carries one, the term's own if just one does, and
-    otherwise a tuple with one entry for each term that does, in their order. A term that carries
-    one sees its own as `state.internal`; the others see all of it.
+    The internal state is a tuple with an entry for each torque that carries parts, in their order.
+    Such a torque sees its own entries as `state.internal`; the others see all of it.
 
     Attributes:
-        terms: The torques.
+        terms: The torques, those of sums within the sum among them.
 
     Gradients: the sum of those of the terms.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> total = jr.torques.Constant(jnp.ones(3)) + jr.torques.LinearDrag(2.0)
+    >>> push = lambda t, state, args: jnp.ones(3)
+    >>> total = jr.torques.Sum([push, jr.torques.LinearDrag(2.0)])
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 2.0, 3.0]))
     >>> print(total(0.0, state, None))
     [-1. -3. -5.]
@@ -164,60 +215,57 @@ class Sum(AbstractTorque):
 
     terms: tuple[AbstractTorque, ...]
 
-    def _carriers(self, state: Any) -> list[int]:
-        return [i for i, x in enumerate(self.terms) if has_parts(x.internal_at_rest(state))]
+    def __init__(self, terms: Iterable[TorqueFunction]):
+        """Add torques.
 
-    def _states(self, state: Any) -> list[Any]:
-        """The state as each term sees it: with its own internal part, or all if it has none."""
-        views = [state] * len(self.terms)
-        carriers = self._carriers(state)
-        if len(carriers) > 1:
-            for i, own in zip(carriers, state.internal, strict=True):
-                views[i] = dataclasses.replace(state, internal=own)
-        return views
+        Args:
+            terms: Torques and plain functions `(t, state, args) -> (3,)`, in any order.
+        """
+        self.terms = tuple(x for term in terms for x in _terms(term))
 
-    def _pack(self, state: Any, parts: list[Any]) -> PyTree:
-        kept = tuple(parts[i] for i in self._carriers(state))
-        return kept[0] if len(kept) == 1 else kept
+    def _total(self, start: Any, state: Any, method: Callable[[AbstractTorque, Any], Any]) -> Any:
+        """The sum of a method's values, each term given the state as it sees it."""
+        first = 0
+        for term in self.terms:
+            view, count = state, len(term.internal_at_rest(state))
+            if count:
+                own = state.internal[first : first + count]
+                view, first = dataclasses.replace(state, internal=own), first + count
+            start = start + method(term, view)
+        return start
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Sum of the torques [N m], body components."""
-        total = jnp.zeros_like(state.omega)
-        for term, own in zip(self.terms, self._states(state), strict=True):
-            total = total + term(t, own, args)
-        return total
+        return self._total(jnp.zeros_like(state.omega), state, lambda x, own: x(t, own, args))
+
+    def of_body(self, inertia: InertiaLike) -> "Sum":
+        """The torques on a body of this inertia."""
+        return Sum(term.of_body(inertia) for term in self.terms)
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Sum of the potential energies [J]."""
-        pairs = zip(self.terms, self._states(state), strict=True)
-        return sum((x.potential(t, own, args) for x, own in pairs), zero_like(state))
+        return self._total(zero_like(state), state, lambda x, own: x.potential(t, own, args))
 
-    def internal_at_rest(self, state: Any) -> PyTree:
+    def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal states of the terms that have one."""
-        return self._pack(state, [x.internal_at_rest(state) for x in self.terms])
+        return sum((term.internal_at_rest(state) for term in self.terms), ())
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
-        pairs = zip(self.terms, self._states(state), strict=True)
-        return self._pack(state, [x.internal_rate(t, own, args) for x, own in pairs])
+        return self._total((), state, lambda x, own: x.internal_rate(t, own, args))
 
-    def internal_scale(self, rate: Scalar) -> PyTree:
+    def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
         """Size of the internal state when the body turns at `rate` [rad/s]."""
-        scales = [x.internal_scale(rate) for x in self.terms]
-        kept = tuple(x for x in scales if has_parts(x))
-        return kept[0] if len(kept) == 1 else kept
+        return sum((term.internal_scale(rate) for term in self.terms), ())
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of all internal parts [kg m^2/s], body components."""
-        total = jnp.zeros_like(state.omega)
-        for term, own in zip(self.terms, self._states(state), strict=True):
-            total = total + term.internal_momentum(t, own, args)
-        return total
+        zero = jnp.zeros_like(state.omega)
+        return self._total(zero, state, lambda x, own: x.internal_momentum(t, own, args))
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of all internal parts [J]."""
-        pairs = zip(self.terms, self._states(state), strict=True)
-        return sum((x.internal_energy(t, own, args) for x, own in pairs), zero_like(state))
+        return self._total(zero_like(state), state, lambda x, own: x.internal_energy(t, own, args))
 
     def check(self, findings: Findings) -> None:
         """Note bad parameters of the terms."""
@@ -233,9 +281,6 @@ class Torque(AbstractTorque):
         potential_fn: `(t, state, args) -> ()` potential energy [J], or None.
 
     `state.internal` is that of the whole body, also in a sum.
-
-    Raises:
-        ValueError: A value of `fn` of the wrong shape (trace time, when called).
 
     Gradients: those of the functions.
 
@@ -261,9 +306,7 @@ class Torque(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        torque = jnp.asarray(self.fn(t, state, args), state.omega.dtype)
-        check_shape("torque", torque, (3,))
-        return torque
+        return vector_at("torque", self.fn, state.omega.dtype, t, state, args)
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if none was given."""
@@ -278,22 +321,14 @@ class Constant(AbstractTorque):
     Attributes:
         torque: Body components [N m].
 
-    Raises:
-        ValueError: Wrong shape (trace time). That it is finite is checked by `simulate`.
-
     Gradients: linear in the torque.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> thruster = jr.torques.Constant(jnp.array([0.0, 0.0, 0.1]))
     """
 
-    torque: Float[Array, "3"] = eqx.field(converter=lambda x: array_of_shape("torque", x, 3))
+    torque: Float[Array, "3"] = eqx.field(converter=array("torque", 3), metadata=FINITE)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
         return self.torque.astype(state.omega.dtype)
-
-    def check(self, findings: Findings) -> None:
-        """Note a torque that is not finite."""
-        require_finite(findings, self, "torque")

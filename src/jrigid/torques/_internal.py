@@ -1,26 +1,31 @@
 """Torques of internal parts with a momentum of their own: a damper, a rotor."""
 
+# A torque takes t, state and args, whatever it looks at.
+# ruff: noqa: ARG002
+
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-from jrigid._checks import RESULTS, Findings, array_of_shape, check_shape, float_arrays
-from jrigid._numerics import safe_norm
-from jrigid._types import Scalar, ScalarLike, Vector, VectorLike
-from jrigid.torques._base import AbstractTorque, TorqueFunction, require_finite, zero_like
-
-
-def _require_moment(findings: Findings, part: Any) -> None:
-    inertia = jax.lax.stop_gradient(part.inertia)
-    findings.require(
-        jnp.isfinite(inertia) & (inertia > 0),
-        RESULTS.invalid_torque,
-        f"Argument `inertia` of `{type(part).__name__}` must be positive and finite, but it is "
-        "not.",
-    )
+from jrigid._checks import check_shape
+from jrigid._types import Scalar, ScalarLike, Vector
+from jrigid.torques._base import (
+    DIRECTION,
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    AbstractTorque,
+    TorqueFunction,
+    array,
+    directions,
+    in_dtype_of,
+    vector_at,
+    vector_or_function,
+    zero_like,
+)
 
 
 class InternalDamper(AbstractTorque):
@@ -28,146 +33,65 @@ class InternalDamper(AbstractTorque):
 
     The sphere has an angular velocity of its own; the layer exerts c (omega_sphere - omega) on
     the body and the opposite on the sphere. The total angular momentum in space is constant, the
-    energy falls at the rate c |omega_sphere - omega|^2. `State.internal` is omega_sphere, the
-    absolute angular velocity of the sphere in the components of the body's axes [rad/s]; by
-    default the sphere starts at rest relative to the body. The inertia of the body does not
-    include the sphere's own.
+    energy falls at the rate c |omega_sphere - omega|^2. Its entry in `State.internal` is
+    omega_sphere, the absolute angular velocity of the sphere in the components of the body's axes
+    [rad/s]; by default the sphere starts at rest relative to the body. The inertia of the body does
+    not include the sphere's own.
 
     Attributes:
-        inertia: Moment of inertia of the sphere [kg m^2].
-        coupling: c [N m s].
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values (finite, inertia positive, coupling not
-            negative) are checked by `simulate`.
+        inertia: Moment of inertia of the sphere [kg m^2], positive.
+        coupling: c [N m s], not negative.
 
     Gradients: finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.2, 0.05))
     >>> sphere = jnp.array([0.0, 0.0, 3.0])
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]), sphere)
-    >>> print(body.torque(0.0, state, None).round(6))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]), (sphere,))
+    >>> print(body.torque_on(0.0, state, None).round(6))
     [0.  0.  0.1]
     """
 
-    inertia: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("inertia", x))
-    coupling: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("coupling", x))
+    inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
+    coupling: Float[Array, ""] = eqx.field(converter=array("coupling"), metadata=NOT_NEGATIVE)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        del t, args
-        return self.coupling.astype(state.omega.dtype) * (state.internal - state.omega)
+        (sphere,) = state.internal
+        return self.coupling.astype(state.omega.dtype) * (sphere - state.omega)
 
-    def internal_at_rest(self, state: Any) -> PyTree:
+    def internal_at_rest(self, state: Any) -> tuple[Vector]:
         """The sphere turning with the body."""
-        return state.omega
+        return (state.omega,)
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Vector]:
         """Rate of the sphere's angular velocity, in the turning axes of the body."""
         pull = self(t, state, args) / self.inertia.astype(state.omega.dtype)
-        return -pull - jnp.cross(state.omega, state.internal)
+        return (-pull - jnp.cross(state.omega, *state.internal),)
 
-    def internal_scale(self, rate: Scalar) -> PyTree:
+    def internal_scale(self, rate: Scalar) -> tuple[Scalar]:
         """The sphere turns about as fast as the body."""
-        return rate
+        return (rate,)
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the sphere [kg m^2/s]."""
-        del t, args
-        return self.inertia.astype(state.omega.dtype) * state.internal
+        (sphere,) = state.internal
+        return self.inertia.astype(state.omega.dtype) * sphere
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of the sphere [J]."""
-        del t, args
-        return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(state.internal**2)
-
-    def check(self, findings: Findings) -> None:
-        """Note an inertia that is not positive and a coupling that is negative."""
-        _require_moment(findings, self)
-        coupling = jax.lax.stop_gradient(self.coupling)
-        findings.require(
-            jnp.isfinite(coupling) & (coupling >= 0),
-            RESULTS.invalid_torque,
-            "Argument `coupling` of `InternalDamper` must be finite and not negative, but it is "
-            "not.",
-        )
-
-
-class SpinningMass(eqx.Module):
-    """A wheel with a spin of its own, for `Rotor`.
-
-    Attributes:
-        inertia: Moment of inertia about its axis [kg m^2].
-        axis: Direction of the axis, body components, of any length.
-        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
-            wheel turns freely on its axis.
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values (a positive, finite inertia, an axis that is
-            finite and not zero) are checked by `simulate`.
-
-    Gradients: finite for any axis but zero.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), jnp.array(10.0))
-    >>> print(jr.torques.Rotor(wheel).internal_momentum(0.0, state, None).round(6))
-    [0.  1.2 1.6]
-    """
-
-    inertia: Float[Array, ""]
-    axis: Float[Array, "3"]
-    motor_torque: TorqueFunction | None
-
-    def __init__(
-        self,
-        inertia: ScalarLike,
-        axis: VectorLike,
-        motor_torque: TorqueFunction | None = None,
-    ):
-        """A wheel.
-
-        Args:
-            inertia: Moment of inertia about its axis [kg m^2].
-            axis: Direction of the axis, body components.
-            motor_torque: Torque of the motor on the wheel [N m].
-
-        Raises:
-            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
-        """
-        self.inertia, axis = float_arrays(inertia, axis)
-        check_shape("inertia", self.inertia, ())
-        check_shape("axis", axis, (3,))
-        self.axis = axis / safe_norm(axis)
-        self.motor_torque = motor_torque
-
-    def check(self, findings: Findings) -> None:
-        """Note an inertia that is not positive and an axis that has no direction."""
-        _require_moment(findings, self)
-        axis = jax.lax.stop_gradient(self.axis)
-        findings.require(
-            jnp.all(jnp.isfinite(axis)) & jnp.any(axis != 0),  # a zero axis normalised is NaN
-            RESULTS.invalid_torque,
-            "Argument `axis` of `SpinningMass` must be finite and not zero, but it is not.",
-        )
+        (sphere,) = state.internal
+        return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(sphere**2)
 
 
 class Rotor(AbstractTorque):
-    """A rotor inside the body (a gyrostat): prescribed momentum, or a wheel with its own spin.
+    """A rotor inside the body with a prescribed momentum h (a gyrostat): -h' - omega x h.
 
-    With a prescribed momentum h (an array, or a function of time, in body components, relative to
-    the body) the torque on the body is -h' - omega x h and the body's inertia includes the locked
-    rotor. With a `SpinningMass` of axial moment J the wheel's absolute spin s about its axis a is
-    `State.internal` [rad/s], J s' = motor torque, and the body's inertia includes the wheel except
-    for J about a; by default the wheel starts at rest relative to the body.
+    The body's inertia includes the locked rotor. For a wheel that turns as its motor makes it see
+    `SpinningMass`.
 
     Attributes:
-        momentum: h [kg m^2/s] as an array or `h(t)`, or a `SpinningMass`.
-
-    Raises:
-        ValueError: Wrong shape (trace time; of a function, when called). That an array is finite
-            is checked by `simulate`.
+        momentum: h, relative to the body, body components [kg m^2/s]: an array, or `h(t) -> (3,)`.
 
     Gradients: finite everywhere; a function of time must be differentiable.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
@@ -179,86 +103,81 @@ class Rotor(AbstractTorque):
     [-0.  -0.  -0.5]
     """
 
-    momentum: Any
+    momentum: Any = eqx.field(converter=vector_or_function("momentum"), metadata=FINITE)
 
-    def __init__(self, momentum: Any):
-        """A rotor.
+    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Torque on the body [N m], body components."""
+        time = jnp.asarray(t, state.omega.dtype)
+        momentum_at = lambda t: self.internal_momentum(t, state, args)  # noqa: E731
+        momentum, rate = jax.jvp(momentum_at, (time,), (jnp.ones_like(time),))
+        return -rate - jnp.cross(state.omega, momentum)
 
-        Args:
-            momentum: (3,) array [kg m^2/s], `momentum(t) -> (3,)`, or a `SpinningMass`.
+    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+        """Angular momentum of the rotor [kg m^2/s], body components."""
+        return vector_at("momentum", self.momentum, state.omega.dtype, t)
 
-        Raises:
-            ValueError: Wrong shape (trace time). Values are checked by `simulate`.
-        """
-        if isinstance(momentum, SpinningMass) or callable(momentum):
-            self.momentum = momentum
-        else:
-            self.momentum = array_of_shape("momentum", momentum, 3)
 
-    @property
-    def _wheel(self) -> SpinningMass | None:
-        return self.momentum if isinstance(self.momentum, SpinningMass) else None
+class SpinningMass(AbstractTorque):
+    """A wheel with a spin of its own: -(motor torque) a - omega x (J s a).
 
-    def _momentum_and_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Array, Array]:
-        dtype = state.omega.dtype
-        wheel = self._wheel
-        if wheel is not None:
-            axis = wheel.axis.astype(dtype)
-            motor = self._motor(t, state, args)
-            return wheel.inertia.astype(dtype) * state.internal * axis, motor * axis
-        if callable(self.momentum):
-            time = jnp.asarray(t, dtype)
-            value, rate = jax.jvp(
-                lambda s: jnp.asarray(self.momentum(s), dtype), (time,), (jnp.ones_like(time),)
-            )
-            check_shape("momentum", value, (3,))
-            return value, rate
-        value = self.momentum.astype(dtype)
-        return value, jnp.zeros_like(value)
+    The wheel's absolute spin s about its axis a is its entry in `State.internal` [rad/s]; by
+    default it starts at rest relative to the body. J s' = motor torque. The body's inertia includes
+    the wheel except for its axial moment J about a.
+
+    Attributes:
+        inertia: J [kg m^2], positive.
+        axis: a, body components, of any length but zero.
+        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
+            wheel turns freely on its axis.
+
+    Gradients: finite for any axis but zero.
+    Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), (jnp.array(10.0),))
+    >>> print(wheel.internal_momentum(0.0, state, None).round(6))
+    [0.  1.2 1.6]
+    """
+
+    inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
+    axis: Float[Array, "3"] = eqx.field(converter=directions("axis", 3), metadata=DIRECTION)
+    motor_torque: TorqueFunction | None = None
 
     def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
-        wheel = self._wheel
-        if wheel is None or wheel.motor_torque is None:
+        if self.motor_torque is None:
             return zero_like(state)
-        motor = jnp.asarray(wheel.motor_torque(t, state, args), state.omega.dtype)
+        motor = jnp.asarray(self.motor_torque(t, state, args), state.omega.dtype)
         check_shape("motor_torque", motor, ())
         return motor
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        momentum, rate = self._momentum_and_rate(t, state, args)
-        return -rate - jnp.cross(state.omega, momentum)
+        (axis,) = in_dtype_of(state, self.axis)
+        push = -self._motor(t, state, args) * axis
+        return push - jnp.cross(state.omega, self.internal_momentum(t, state, args))
 
-    def internal_at_rest(self, state: Any) -> PyTree:
+    def internal_at_rest(self, state: Any) -> tuple[Scalar]:
         """The wheel turning with the body."""
-        if self._wheel is None:
-            return ()
-        return jnp.sum(self._wheel.axis.astype(state.omega.dtype) * state.omega)
+        (axis,) = in_dtype_of(state, self.axis)
+        return (jnp.sum(axis * state.omega),)
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> PyTree:
+    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Scalar]:
         """Rate of the wheel's spin [rad/s^2]."""
-        if self._wheel is None:
-            return ()
-        return self._motor(t, state, args) / self._wheel.inertia.astype(state.omega.dtype)
+        (inertia,) = in_dtype_of(state, self.inertia)
+        return (self._motor(t, state, args) / inertia,)
 
-    def internal_scale(self, rate: Scalar) -> PyTree:
+    def internal_scale(self, rate: Scalar) -> tuple[Scalar]:
         """The wheel's spin is judged against the body's."""
-        return () if self._wheel is None else rate
+        return (rate,)
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
-        """Angular momentum of the rotor [kg m^2/s], body components."""
-        return self._momentum_and_rate(t, state, args)[0]
+        """Angular momentum of the wheel about its axis [kg m^2/s], body components."""
+        inertia, axis = in_dtype_of(state, self.inertia, self.axis)
+        (spin,) = state.internal
+        return inertia * spin * axis
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
-        """Kinetic energy of a wheel [J]; zero for a prescribed momentum, whose motor does work."""
-        del t, args
-        if self._wheel is None:
-            return zero_like(state)
-        return 0.5 * self._wheel.inertia.astype(state.omega.dtype) * state.internal**2
-
-    def check(self, findings: Findings) -> None:
-        """Note a momentum that is not finite, or what is wrong with the wheel."""
-        if self._wheel is not None:
-            self._wheel.check(findings)
-        elif not callable(self.momentum):
-            require_finite(findings, self, "momentum")
+        """Kinetic energy of the wheel about its axis [J]."""
+        (inertia,), (spin,) = in_dtype_of(state, self.inertia), state.internal
+        return 0.5 * inertia * spin**2

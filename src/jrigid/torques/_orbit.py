@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import array_of_shape
 from jrigid._types import ScalarLike, Vector
+from jrigid.torques._base import array
 
 
 class KeplerOrbit(eqx.Module):
@@ -20,8 +20,7 @@ class KeplerOrbit(eqx.Module):
         semi_major_axis: Semi-major axis [m].
         eccentricity: Eccentricity, from 0 to below 1.
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked; those of no ellipse give NaN.
+    NaN for the numbers of no ellipse.
 
     Digits: all up to an eccentricity of 0.99; of more extreme ones some are lost near the
     pericentre.
@@ -36,13 +35,9 @@ class KeplerOrbit(eqx.Module):
     [0.9 0.  0. ] [-1.1  0.   0. ]
     """
 
-    mu: Float[Array, ""] = eqx.field(converter=lambda x: array_of_shape("mu", x))
-    semi_major_axis: Float[Array, ""] = eqx.field(
-        converter=lambda x: array_of_shape("semi_major_axis", x)
-    )
-    eccentricity: Float[Array, ""] = eqx.field(
-        converter=lambda x: array_of_shape("eccentricity", x)
-    )
+    mu: Float[Array, ""] = eqx.field(converter=array("mu"))
+    semi_major_axis: Float[Array, ""] = eqx.field(converter=array("semi_major_axis"))
+    eccentricity: Float[Array, ""] = eqx.field(converter=array("eccentricity"))
 
     @property
     def mean_motion(self) -> Float[Array, ""]:
