@@ -249,7 +249,7 @@ def test_derivative_in_time_is_euler_s_equation(times):
 # Exact doubles: every change of the size of the differences below is exact too.
 TENSORS = {
     "sphere": 2.0 * np.eye(3),
-    "symmetric about axis 3": np.diag([1.0, 1.0, 2.0]),
+    "symmetric about the third axis": np.diag([1.0, 1.0, 2.0]),
     "symmetric, turned": np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]),
     "nearly a sphere": np.diag([2.0, 2.0 + 2.0**-13, 2.0 + 2.0**-12]),
     "nearly symmetric": np.diag([1.0, 1.0 + 2.0**-30, 1.5]),

@@ -87,7 +87,7 @@ def test_the_axis_of_a_symmetric_body_precesses_at_the_precession_rate():
 
 
 def test_the_separatrix_is_where_landau_says():
-    """L3/L1 = +-sqrt((I2/I1 - 1) / (1 - I2/I3)); motion is about axis 3 above, axis 1 below."""
+    """L3/L1 = +-sqrt((I2/I1 - 1) / (1 - I2/I3)); about the third axis above, the first below."""
     i1, i2, i3 = 1.0, 1.7, 2.9
     moments = np.array([i1, i2, i3])
     edge = free.separatrix(moments)
@@ -107,11 +107,11 @@ def test_the_separatrix_is_where_landau_says():
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
 def test_which_axis_is_circled_follows_from_energy_and_momentum(share):
-    """About axis 3 for 1/I3 < 2E/L^2 < 1/I2, about axis 1 for 1/I2 < 2E/L^2 < 1/I1."""
+    """About the third axis for 1/I3 < 2E/L^2 < 1/I2, about the first for 1/I2 < 2E/L^2 < 1/I1."""
     moments = np.array([1.0, 1.7, 2.9])
     for low, high, name, fixed in ((2, 1, "largest", 2), (1, 0, "smallest", 0)):
         ratio = (1 - share) / moments[low] + share / moments[high]
-        # L of size 1 with that energy, as far along axis 2 as possible is not asked: L2 = 0.1
+        # L of size 1 with that energy and L2 = 0.1
         rest = 1 - 0.1**2
         along1 = (ratio - 0.1**2 / moments[1] - rest / moments[2]) / (
             1 / moments[0] - 1 / moments[2]
@@ -167,8 +167,8 @@ def test_steady_rotation_about_the_equator_of_a_symmetric_body():
 
 
 BODIES = {
-    "about axis 3": (MOMENTS, np.array([0.3, 0.5, 1.0])),
-    "about axis 1": (MOMENTS, np.array([1.5, 0.5, 0.3])),
+    "about the third axis": (MOMENTS, np.array([0.3, 0.5, 1.0])),
+    "about the first axis": (MOMENTS, np.array([1.5, 0.5, 0.3])),
     "near the separatrix": (MOMENTS, np.array([1.0, 1e-4, 0.5774])),
     "other order": (np.array([2.0, 3.0, 1.0]), np.array([0.5, 1.0, 0.3])),
     "backwards": (MOMENTS, np.array([0.3, 0.5, -1.0])),

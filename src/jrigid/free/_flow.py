@@ -134,10 +134,7 @@ class Labels(NamedTuple):
 
     def shift(self, x: Components) -> Components:
         """The cyclic shift alone."""
-        first, second = self.first_is_middle, self.second_is_middle
-        return tuple(
-            jnp.where(first, x[j - 1], jnp.where(second, x[j], x[j - 2])) for j in range(3)
-        )
+        return self._cycled(x, 1, 2)
 
     def flip(self, x: Components, sign: int = -1) -> Components:
         """The reversal alone, of a vector, or of moments with sign = 1; its own inverse."""
@@ -145,11 +142,11 @@ class Labels(NamedTuple):
 
     def undo(self, x: Components) -> Components:
         """The components of a vector by the names the axes had."""
-        first, second = self.first_is_middle, self.second_is_middle
-        x = self.flip(x)
-        return tuple(
-            jnp.where(first, x[j - 2], jnp.where(second, x[j], x[j - 1])) for j in range(3)
-        )
+        return self._cycled(self.flip(x), 2, 1)
+
+    def _cycled(self, x: Components, by: int, otherwise: int) -> Components:
+        unless = (jnp.where(self.second_is_middle, x[j], x[j - otherwise]) for j in range(3))
+        return tuple(jnp.where(self.first_is_middle, x[j - by], y) for j, y in enumerate(unless))
 
 
 class Invariants(NamedTuple):
