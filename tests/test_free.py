@@ -52,11 +52,23 @@ def exact_states(regime):
     return np.concatenate([RECORD["attitude_out"][chosen], RECORD["omega_out"][chosen]], axis=1)
 
 
+def of_lanes(function):
+    """A function of the cases of any regime, compiled for as many as the largest has."""
+    lanes = max(np.sum(RECORD["regime"] == regime) for regime in REGIMES)
+
+    def call(*inputs):
+        count = len(inputs[0])
+        padded = (np.concatenate([x, np.repeat(x[-1:], lanes - count, 0)]) for x in inputs)
+        return jax.tree.map(lambda x: x[:count], function(*padded))
+
+    return call
+
+
 @pytest.fixture(scope="module")
 def compiled():
     return {
-        "value": jax.jit(jax.vmap(state_at)),
-        "jacobian": quick_jit(jax.vmap(jacobian)),
+        "value": of_lanes(jax.jit(jax.vmap(state_at))),
+        "jacobian": of_lanes(quick_jit(jax.vmap(jacobian))),
     }
 
 
@@ -211,9 +223,10 @@ def test_derivatives_equal_the_variational_equations(duration, per_regime, deriv
         assert np.all(relative <= 1e-9 + 10 * rounding), dict(zip(regimes, relative, strict=True))
 
 
-def test_derivatives_at_rest_are_finite_and_right():
+def test_derivatives_at_rest_are_finite_and_right(compiled):
     attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
-    by_moments, _, by_omega = (np.asarray(x) for x in jacobian(MOMENTS, attitude, np.zeros(3), 2.0))
+    inputs = (x[None] for x in (MOMENTS, attitude, np.zeros(3), np.array(2.0)))
+    by_moments, _, by_omega = (np.asarray(x)[0] for x in compiled["jacobian"](*inputs))
     np.testing.assert_array_equal(by_moments, 0.0)
     np.testing.assert_allclose(by_omega[4:], np.eye(3), atol=ulps(float, 2))
     # q (1, t d omega / 2)
@@ -236,7 +249,7 @@ def test_derivative_in_time_is_euler_s_equation(times):
 # Exact doubles: every change of the size of the differences below is exact too.
 TENSORS = {
     "sphere": 2.0 * np.eye(3),
-    "symmetric about axis 3": np.diag([1.0, 1.0, 2.0]),
+    "symmetric about the third axis": np.diag([1.0, 1.0, 2.0]),
     "symmetric, turned": np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]),
     "nearly a sphere": np.diag([2.0, 2.0 + 2.0**-13, 2.0 + 2.0**-12]),
     "nearly symmetric": np.diag([1.0, 1.0 + 2.0**-30, 1.5]),
@@ -359,22 +372,32 @@ def test_dtype_follows_the_arguments():
     assert state.attitude.dtype == state.omega.dtype == np.float32
 
 
+@pytest.fixture(scope="module")
+def single():
+    return quick_jit(lambda state0, t: jr.free_rotation(TENSOR, state0, t, t0=-1.5, throw=False))
+
+
 @pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3), (0,)])
-def test_times_of_any_shape_and_order(shape):
+def test_times_of_any_shape_and_order(shape, single):
     ts = np.random.default_rng(0).normal(scale=30.0, size=shape)
     state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
-    states = jr.free_rotation(TENSOR, state0, ts, t0=-1.5)
+
+    @quick_jit
+    def motion(ts):
+        return jr.free_rotation(TENSOR, state0, ts, t0=-1.5, throw=False).states
+
+    states = motion(ts)
     assert states.attitude.shape == (*shape, 4)
     assert states.omega.shape == (*shape, 3)
     for index in np.ndindex(shape):
-        one = jr.free_rotation(TENSOR, state0, ts[index], t0=-1.5)
+        one = single(state0, ts[index])
         np.testing.assert_allclose(states.attitude[index], one.attitude, atol=1e-14)
         np.testing.assert_allclose(states.omega[index], one.omega, atol=1e-14)
 
 
 def test_there_and_back_again_and_in_two_steps():
     state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
-    there = jr.free_rotation(TENSOR, state0, 12.5)
+    there = jr.free_rotation(TENSOR, state0, 12.5).states
     back = jr.free_rotation(TENSOR, there, 0.0, t0=12.5)
     np.testing.assert_allclose(back.attitude, state0.attitude, atol=1e-14)
     np.testing.assert_allclose(back.omega, state0.omega, atol=1e-14)
@@ -418,47 +441,140 @@ GOOD = {
     "attitude": np.array([1.0, 0.0, 0.0, 0.0]),
     "omega": OMEGA,
     "ts": np.array([1.0, 2.0]),
+    "t0": np.array(0.5),
 }
 BAD = {
-    "negative moment": ({"inertia": np.array([1.0, -2.0, 3.0])}, "invalid_inertia", "`inertia`"),
-    "NaN moment": ({"inertia": np.array([1.0, np.nan, 3.0])}, "invalid_inertia", "`inertia`"),
-    "NaN rate": ({"omega": np.array([1.0, np.nan, 3.0])}, "invalid_state", "`state0`"),
-    "zero quaternion": ({"attitude": np.zeros(4)}, "invalid_attitude", "unit quaternion"),
+    "negative moment": (
+        {"inertia": np.array([1.0, -2.0, 3.0])},
+        "invalid_inertia",
+        r"`inertia` must hold three positive.*: \[ 1\. -2\.  3\.\] in lane 1\. \(Three",
+    ),
+    "NaN moment": (
+        {"inertia": np.array([1.0, np.nan, 3.0])},
+        "invalid_inertia",
+        r"`inertia` must .*: \[ 1\. nan  3\.\] in lane 1\.",
+    ),
+    "NaN rate": (
+        {"omega": np.array([1.0, np.nan, 3.0])},
+        "invalid_state",
+        r"`state0` must be finite, .*: \[ 1\.  0\.  0\.  0\.  1\. nan  3\.\] in lane 1\.",
+    ),
+    "NaN attitude": (
+        {"attitude": np.array([1.0, 0.0, np.nan, 0.0])},
+        "invalid_state",
+        r"`state0` must be finite",
+    ),
+    "zero quaternion": (
+        {"attitude": np.zeros(4)},
+        "invalid_attitude",
+        r"unit quaternion, .*: \[0\. 0\. 0\. 0\.\] in lane 1\.",
+    ),
     "not unit": ({"attitude": 2.0 * GOOD["attitude"]}, "invalid_attitude", "unit quaternion"),
-    "infinite time": ({"ts": np.array([1.0, np.inf])}, "invalid_times", "`ts` must be finite"),
+    "infinite time": (
+        {"ts": np.array([1.0, np.inf])},
+        "invalid_times",
+        r"`ts` must be finite, but it is not: inf in lane 1\.",
+    ),
+    "NaN t0": ({"t0": np.nan}, "invalid_times", r"`t0` must be finite.*: nan in lane 1\."),
 }
 
 
-def run(inertia, attitude, omega, ts, throw=True):
-    return jr.free_rotation(inertia, jr.State(attitude, omega), ts, throw=throw)
+def run(inertia, attitude, omega, ts, t0, throw=True):
+    return jr.free_rotation(inertia, jr.State(attitude, omega), ts, t0=t0, throw=throw)
+
+
+@quick_jit
+def three_lanes(lanes):
+    """Numbers of two good lanes around a bad one, the motion, and the derivatives of all inputs."""
+
+    def total(lanes, shared):
+        motion = jax.vmap(lambda lane: run(**shift(lane, shared), throw=False))(lanes)
+        good = jnp.sum(motion.omega[0] ** 3) + jnp.sum(motion.attitude[2])
+        return good, motion
+
+    def shift(lane, shared):
+        return jax.tree.map(lambda x, y: x + y, lane, shared)
+
+    shared = jax.tree.map(lambda x: jnp.zeros_like(x[0]), lanes)
+    (_, motion), slopes = jax.value_and_grad(total, (0, 1), has_aux=True)(lanes, shared)
+    forward = jax.jvp(
+        lambda x: total(lanes, x)[0], (shared,), (jax.tree.map(jnp.ones_like, shared),)
+    )
+    return motion, slopes, forward[1]
+
+
+@jax.jit
+def run_under_jit(lane):
+    return run(**lane)
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_value_is_an_error_eagerly_and_under_jit_and_marks_its_lane(name):
     change, code, message = BAD[name]
-    bad = {**GOOD, **change}
-    for call in (run, jax.jit(run)):
-        with pytest.raises(Exception, match=message):
-            jax.block_until_ready(call(**bad))
-    lanes = {key: jnp.stack([GOOD[key], bad[key], GOOD[key]]) for key in GOOD}
-
-    def total(lanes):
-        states = jax.vmap(lambda lane: run(**lane, throw=False))(lanes)
-        return jnp.sum(states.omega[0] ** 3) + jnp.sum(states.attitude[2]), states
-
-    (_, states), slopes = jax.value_and_grad(total, has_aux=True)(lanes)
-    assert np.all(np.isnan(states.omega[1]))
-    assert np.all(np.isnan(states.attitude[1]))
-    assert np.all(np.isfinite(states.omega[jnp.array([0, 2])]))
-    assert all(np.all(np.isfinite(slope[::2])) for slope in slopes.values())
-    codes = jax.vmap(
-        lambda lane: free.motion_validity(
-            lane["inertia"], jr.State(lane["attitude"], lane["omega"]), lane["ts"]
-        )
-    )(lanes)
+    lanes = {k: jnp.stack([x, jnp.asarray(change.get(k, x), float), x]) for k, x in GOOD.items()}
+    with pytest.raises(RuntimeError, match=message):
+        jax.vmap(lambda lane: run(**lane))(lanes)
+    with pytest.raises(RuntimeError, match=message.split(":")[0].split(" in lane")[0]):
+        run(**{**GOOD, **change})
+    with pytest.raises(Exception, match=message.split(":")[0]):
+        jax.block_until_ready(run_under_jit({k: x[1] for k, x in lanes.items()}))
+    motion, (slopes, of_shared), forward = three_lanes(lanes)
+    assert np.all(np.isnan(motion.omega[1]))
+    assert np.all(np.isnan(motion.attitude[1]))
+    assert np.all(np.isfinite(motion.omega[::2]))
+    assert all(np.all(np.isfinite(slope)) for slope in jax.tree.leaves((slopes, of_shared)))
+    assert np.isfinite(forward)
+    np.testing.assert_allclose(sum(np.sum(x) for x in of_shared.values()), forward, rtol=1e-12)
     expected = getattr(jr.RESULTS, code)
-    np.testing.assert_array_equal(codes == expected, [False, True, False])
-    np.testing.assert_array_equal(codes == jr.RESULTS.successful, [True, False, True])
+    np.testing.assert_array_equal(motion.result == expected, [False, True, False])
+    np.testing.assert_array_equal(motion.result == jr.RESULTS.successful, [True, False, True])
+
+
+def test_the_answer_shows_its_numbers_and_what_became_of_the_call():
+    motion = jr.free_rotation(MOMENTS, jr.State(GOOD["attitude"], OMEGA), 0.0)
+    assert isinstance(motion, jr.ExactStates)
+    assert "omega=[ 0.3, -0.5, 0.8]" in repr(motion)
+    assert jr.RESULTS[motion.result] == "All went well."
+    assert motion.states.omega is motion.omega
+
+
+@pytest.mark.parametrize("inertia", [MOMENTS, TENSOR], ids=["moments", "tensor"])
+def test_nothing_that_is_compiled_calls_back(inertia):
+    """Callbacks keep jax's persistent cache from serving a compiled function."""
+    state0 = jr.State(GOOD["attitude"], OMEGA)
+
+    def everything(inertia, omega):
+        names = [
+            "cone_angles", "geometric_phase", "mean_precession_rate", "modulus", "parameter",
+            "poinsot", "polhode", "polhode_period", "precession_per_period", "precession_rate",
+            "regime", "wobble_rate",
+        ]  # fmt: skip
+        state = jr.State(state0.attitude, omega)
+        return (
+            [getattr(free, name)(inertia, omega) for name in names],
+            free.separatrix(inertia),
+            free.herpolhode(inertia, state, GOOD["ts"]),
+            free.relative_rotation(inertia, omega, 1.0),
+            jr.free_rotation(inertia, state, GOOD["ts"], throw=False),
+        )
+
+    assert "callback" not in str(jax.make_jaxpr(everything)(inertia, OMEGA))
+    assert "callback" in str(jax.make_jaxpr(lambda w: run(**{**GOOD, "omega": w}))(OMEGA))
+
+
+@pytest.mark.parametrize("make", [jr.RigidBody, lambda x: jr.MassProperties(1.0, np.zeros(3), x)])
+def test_a_body_in_place_of_its_inertia_is_a_sentence(make, untyped):
+    body, state0 = make(np.array([1.0, 1.5, 2.0])), jr.State(GOOD["attitude"], OMEGA)
+    message = rf"`inertia` must be .* but it is a {type(body).__name__}: pass its `\.inertia`\."
+    for call in (
+        lambda: jr.free_rotation(body, state0, 1.0),
+        lambda: free.polhode_period(body, OMEGA),
+        lambda: free.separatrix(body),
+        lambda: free.herpolhode(body, state0, 1.0),
+        lambda: jr.kinetic_energy(body, OMEGA),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_wrong_shapes_and_types(untyped):

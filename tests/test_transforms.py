@@ -55,11 +55,11 @@ NOTHING_TO_CALL = {
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",
     "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
-    "stability.Marked", "stability.StabilityMap",
+    "stability.Marked", "stability.StabilityMap", "free.REGIMES",
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
-    "free.motion_validity", "free.regime", "top.motion_validity",
+    "free.regime", "top.motion_validity",
     "top.motion_class", "lagrangian.cyclic_coordinates",
 }  # fmt: skip
 # Regressions and fits of records of some length: tests/test_identify*.py.
@@ -443,7 +443,8 @@ CASES = {
     ),
     # systems
     # free
-    "free.free_rotation": free_state(jr.free_rotation),
+    "free.free_rotation": free_state(lambda *x: jr.free_rotation(*x).states),
+    "free.relative_rotation": Case(free.relative_rotation, (MOMENTS, OMEGA, 3.0)),
     "free.herpolhode": free_state(free.herpolhode),
     "free.wobble_rate": of_symmetric_body(free.wobble_rate),
     "free.precession_rate": of_symmetric_body(free.precession_rate),

@@ -20,6 +20,7 @@ from jrigid._checks import RESULTS as RESULTS
 from jrigid._public import list_public_names as _list_public_names
 from jrigid._simulate import simulate as simulate
 from jrigid._trajectory import Trajectory as Trajectory
+from jrigid.dynamics import ExactStates as ExactStates
 from jrigid.dynamics import State as State
 from jrigid.dynamics import angular_momentum as angular_momentum
 from jrigid.dynamics import bearing_torque as bearing_torque

@@ -89,6 +89,12 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
 
 def float_arrays(*values: Any) -> tuple[Array, ...]:
     """Convert to arrays of one floating point dtype, that of the inputs taken together."""
+    for value in values:
+        if hasattr(value, "inertia"):
+            raise ValueError(
+                "Argument `inertia` must be three moments or a (3, 3) tensor, but it is a "
+                f"{type(value).__name__}: pass its `.inertia`."
+            )
     values = tuple(v if eqx.is_array_like(v) else np.asarray(v) for v in values)
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*values, float)

@@ -85,6 +85,12 @@ def _eigh_jvp(primals: tuple, tangents: tuple) -> tuple:
     return _turn_of_axes(primals[0], tangents[0], 4 * jnp.finfo(primals[0].dtype).eps, 0.0)
 
 
+def from_principal_axes(axes: Array, quaternion: Array, vector: Array) -> tuple[Array, Array]:
+    """A rotation and a vector in body axes, from their components in the principal axes."""
+    turned = product("ij,j->i", axes, quaternion[1:])
+    return jnp.concatenate([quaternion[:1], turned]), product("ij,j->i", axes, vector)
+
+
 @jax.custom_jvp
 def eigh_of_distinct(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """As `eigh`; but where a gap is below 1e-6 of the largest moment d axes is NaN."""

@@ -32,6 +32,8 @@ class Readable(eqx.Module):
 
 
 def _brief(value: Any) -> str:
+    if isinstance(value, Readable):
+        return repr(value)
     known = isinstance(value, Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
     if not known or value.size > _FEW:
         return eqx.tree_pformat(value)

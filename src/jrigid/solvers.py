@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jrigid._checks import check_inertia_shape, float_arrays
 from jrigid._types import InertiaLike
 from jrigid.dynamics import euler_equations
-from jrigid.free._motion import relative_motion
+from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, multiply
 
 
@@ -62,7 +62,7 @@ class FreeRotation(diffrax.AbstractTerm):
         inertia, omega, step = (
             x.astype(y.omega.dtype) for x in float_arrays(self.inertia, y.omega, step)
         )
-        turn, omega = relative_motion(inertia, omega, step)
+        turn, omega = relative_rotation(inertia, omega, step)
         return dataclasses.replace(y, attitude=multiply(y.attitude, turn), omega=omega)
 
 

@@ -9,7 +9,7 @@ from jrigid.free._curves import separatrix as separatrix
 from jrigid.free._linear import growth_rate_squared as growth_rate_squared
 from jrigid.free._linear import linearized as linearized
 from jrigid.free._motion import free_rotation as free_rotation
-from jrigid.free._motion import motion_validity as motion_validity
+from jrigid.free._motion import relative_rotation as relative_rotation
 from jrigid.free._periods import REGIMES as REGIMES
 from jrigid.free._periods import geometric_phase as geometric_phase
 from jrigid.free._periods import mean_precession_rate as mean_precession_rate

@@ -7,16 +7,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import (
-    RESULTS,
+    check_inertia_shape,
     float_arrays,
-    nan_where,
+    is_inertia,
+    where_defined,
+    whole_number,
 )
 from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
-from jrigid.free._inputs import checked, in_principal_axes, motion_of
-from jrigid.free._motion import free_rotation
+from jrigid.free._flow import invariants
+from jrigid.free._motion import free_rotation, in_principal_axes, relative_rotation, where_moving
 from jrigid.rotation import rotate
 
 # Phase on either side of the start within which the polhode of an endless motion is drawn.
@@ -24,23 +26,22 @@ _ENDLESS_PHASE = 20.0
 
 
 def polhode(
-    inertia: InertiaLike, omega: VectorLike, points: int = 200, *, throw: bool = True
+    inertia: InertiaLike, omega: VectorLike, points: int = 200
 ) -> Float[Array, "{points} 3"]:
     """The curve of the angular velocity in the body, over one period from the given point.
+
+    It is closed and the attitude plays no part in it: inertia and one of its points say which it
+    is, and no times are asked for. At given times the points are `free_rotation(...).omega`, and
+    as seen from space `herpolhode`.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
         points: Number of points, equally spaced in time; the last equals the first.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Body components [rad/s]. An endless motion (the separatrix) is drawn over 20 e-folding
-        times before and after.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        times before and after. NaN outside positive definite inertia and finite rates.
 
     Gradients: of the points at fixed fractions of the period.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -50,43 +51,38 @@ def polhode(
     >>> print(curve[2].round(6))
     [-0.1  0.   1. ]
     """
-    if points < 2:
-        raise ValueError(f"Argument `points` must be at least 2, but it is {points}.")
-    findings, motion = motion_of(inertia, omega, throw)
-    rate = jnp.sqrt(jnp.where(motion.kap + motion.v > 0, motion.kap + motion.v, 1.0))
-    end = jnp.where(motion.circles, 4 * motion.quarter, _ENDLESS_PHASE / rate)
-    start = jnp.where(motion.circles, 0.0, -end)
-    times = jnp.linspace(start, end, points) / motion.unit
-    _, (inertia, omega) = checked(inertia, omega, False)
-    attitude = jnp.zeros(4, omega.dtype).at[0].set(1)
-    curve = free_rotation(inertia, State(attitude, omega), times, throw=False).omega
-    return nan_where(~findings.ok, curve)
+    count = whole_number("points", points, 2)
+
+    def curve(inertia: Array, omega: Array) -> Array:
+        motion = invariants(*in_principal_axes(inertia, omega))
+        square = motion.kap + motion.v
+        endless = _ENDLESS_PHASE / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        end = jnp.where(motion.circles, 4 * motion.quarter, endless)
+        start = jnp.where(motion.circles, 0.0, -end)
+        times = jnp.linspace(start, end, count) / motion.unit
+        return jax.vmap(lambda t: relative_rotation(inertia, omega, t)[1])(times)
+
+    return where_moving(curve, inertia, omega)
 
 
 def herpolhode(
-    inertia: InertiaLike,
-    state0: State,
-    ts: Real[ArrayLike, "..."],
-    *,
-    t0: ScalarLike = 0.0,
-    throw: bool = True,
+    inertia: InertiaLike, state0: State, ts: Real[ArrayLike, "..."], *, t0: ScalarLike = 0.0
 ) -> Float[Array, "... 3"]:
     """The curve of the angular velocity in space, in a plane at right angles to the momentum.
 
+    In general it never closes, and its pace is that of the precession, not of the polhode (the
+    Earth's goes round in a day, its polhode in 305), so that the times are asked for; the attitude
+    places it in space.
+
     Args:
         inertia: Principal moments or tensor [kg m^2].
-        state0: State at `t0`.
-        ts: Times [s] of any shape: in general the curve never closes.
+        state0: State at `t0`, without internal parts.
+        ts: Times [s] of any shape.
         t0: Time of `state0` [s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Space components [rad/s], with the shape of `ts` in front. Along the momentum they are
-        2 E / |L|, always.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        2 E / |L|, always. NaN outside positive definite inertia, unit attitude and finite values.
 
     Gradients: as those of `free_rotation`.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -96,20 +92,21 @@ def herpolhode(
     >>> print(jr.free.herpolhode(jnp.array([1.0, 2.0, 3.0]), state0, 7.0).round(6))
     [0. 0. 1.]
     """
-    states = free_rotation(inertia, state0, ts, t0=t0, throw=throw)
-    shape = states.omega.shape
-    turned = jax.vmap(rotate)(states.attitude.reshape(-1, 4), states.omega.reshape(-1, 3))
-    return turned.reshape(shape)
+    motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
+    in_space = jax.vmap(rotate)(motion.attitude.reshape(-1, 4), motion.omega.reshape(-1, 3))
+    return in_space.reshape(motion.omega.shape)
 
 
 class Separatrix(NamedTuple):
-    """The planes through the middle axis that part the motions about axis 1 from those about 3.
+    """The planes through the middle axis that part the motions about the outer two.
+
+    I1 < I2 < I3, and L and omega are numbered likewise.
 
     Attributes:
         momentum_ratio: |L3 / L1| on them, sqrt((I2/I1 - 1) / (1 - I2/I3)).
         omega_ratio: |omega3 / omega1| on them.
-        momentum_angle: Angle of the momentum's planes from axis 1 [rad].
-        omega_angle: Angle of the angular velocity's planes from axis 1 [rad].
+        momentum_angle: Angle of the momentum's planes from the axis of I1 [rad].
+        omega_angle: Angle of the angular velocity's planes from the axis of I1 [rad].
     """
 
     momentum_ratio: Scalar
@@ -118,19 +115,15 @@ class Separatrix(NamedTuple):
     omega_angle: Scalar
 
 
-def separatrix(inertia: InertiaLike, *, throw: bool = True) -> Separatrix:
+def separatrix(inertia: InertiaLike) -> Separatrix:
     """Where the separatrix lies; I1 < I2 < I3 are the ascending moments.
 
     Args:
         inertia: Principal moments in any order, or a tensor [kg m^2].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Ratios and angles. For an oblate body the planes are at 0, for a prolate one at 90 degrees.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value, or a sphere, which has none (run time, any lane).
+        NaN for a sphere, which has none, and outside positive definite inertia.
 
     Gradients: infinite in two equal moments, as the truth is.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
@@ -139,29 +132,23 @@ def separatrix(inertia: InertiaLike, *, throw: bool = True) -> Separatrix:
     >>> print(jr.free.separatrix(jnp.array([1.0, 2.0, 3.0])).momentum_ratio.round(6))
     1.732051
     """
+
+    def of_body(inertia: Array) -> Separatrix:
+        i1, i2, i3 = jnp.sort(inertia) if inertia.ndim == 1 else eigh(inertia)[0]
+        return where_defined(i3 > i1, _planes, i1, i2, i3)
+
     (inertia,) = float_arrays(inertia)
-    findings, (inertia, _) = checked(inertia, jnp.zeros(3, inertia.dtype), throw)
-    moments = jnp.sort(inertia) if inertia.ndim == 1 else eigh(inertia)[0]
-    i1, i2, i3 = moments
-    findings.require(
-        i3 > i1, RESULTS.invalid_inertia,
-        "Argument `inertia` must not be that of a sphere, which has no separatrix.",
-    )  # fmt: skip
-    i1, i2, i3 = findings.apply((i1, i2, i3), throw)
-    i1 = jnp.where(findings.ok, i1, 0.5 * i2)
+    check_inertia_shape(inertia)
+    return where_defined(is_inertia(inertia), of_body, inertia)
+
+
+def _planes(i1: Array, i2: Array, i3: Array) -> Separatrix:
     # Roots of products would have NaN slopes in the third moment where two are equal.
     low, high = jnp.sqrt(i2 - i1), jnp.sqrt(i3 - i2)
     up, across = low * jnp.sqrt(i3), high * jnp.sqrt(i1)
     omega_up, omega_across = low * jnp.sqrt(i1), high * jnp.sqrt(i3)
-    return nan_where(
-        ~findings.ok,
-        Separatrix(
-            up / across,
-            omega_up / omega_across,
-            jnp.arctan2(up, across),
-            jnp.arctan2(omega_up, omega_across),
-        ),
-    )
+    angles = jnp.arctan2(up, across), jnp.arctan2(omega_up, omega_across)
+    return Separatrix(up / across, omega_up / omega_across, *angles)
 
 
 class Poinsot(NamedTuple):
@@ -182,20 +169,16 @@ class Poinsot(NamedTuple):
     plane_distance: Scalar
 
 
-def poinsot(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Poinsot:
+def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
     """Poinsot's sphere, ellipsoids and invariable plane.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Radius, semi-axes along the principal axes, and the distance of the plane; zeros at rest.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        NaN outside positive definite inertia and finite rates.
 
     Gradients: finite; zero at rest.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -205,12 +188,14 @@ def poinsot(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> P
     >>> print(surfaces.sphere_radius, surfaces.momentum_ellipsoid)
     8.0 [4. 4. 8.]
     """
-    findings, (inertia, omega) = checked(inertia, omega, throw)
-    moments, omega = in_principal_axes(inertia, omega)
-    momentum = safe_norm(angular_momentum(moments, omega))
-    twice = 2 * kinetic_energy(moments, omega)
-    root = safe_norm(jnp.sqrt(moments) * omega)
-    resting = momentum == 0
-    distance = jnp.where(resting, 0.0, twice / jnp.where(resting, 1.0, momentum))
-    answer = Poinsot(momentum, root * jnp.sqrt(moments), root / jnp.sqrt(moments), distance)
-    return nan_where(~findings.ok, answer)
+
+    def surfaces(inertia: Array, omega: Array) -> Poinsot:
+        moments, omega = in_principal_axes(inertia, omega)
+        momentum = safe_norm(angular_momentum(moments, omega))
+        twice = 2 * kinetic_energy(moments, omega)
+        root = safe_norm(jnp.sqrt(moments) * omega)
+        resting = momentum == 0
+        distance = jnp.where(resting, 0.0, twice / jnp.where(resting, 1.0, momentum))
+        return Poinsot(momentum, root * jnp.sqrt(moments), root / jnp.sqrt(moments), distance)
+
+    return where_moving(surfaces, inertia, omega)

@@ -1,7 +1,7 @@
 r"""The exact flow of the free body in its principal axes: one analytic formula, no regimes.
 
 With a_i = 1 / I_i and the momentum L = I omega, axes labelled so that I2 is the middle moment and
-the momentum circles axis 3, let
+the momentum circles the third axis, let
 
     al = a1 - a2,  be = a2 - a3,  C2 = 2 E - a2 |L|^2,
     kap = al be |L|^2 >= 0,  u = -al C2 >= 0,  v = -be C2 >= 0,  P = kap - u,  Q = kap + v.
@@ -123,7 +123,7 @@ def quarter_period(kap: Array, u: Array, v: Array) -> Components:
 
 
 class Labels(NamedTuple):
-    """How the axes are renamed so that axis 2 has the middle moment and axis 3 is circled.
+    """How the axes are renamed: the second has the middle moment and the third is circled.
 
     A proper rotation: a cyclic shift and, where `reverse`, (x, y, z) to (-z, -y, -x).
     """
@@ -134,33 +134,22 @@ class Labels(NamedTuple):
 
     def shift(self, x: Components) -> Components:
         """The cyclic shift alone."""
-        a, b, c = x
-        return (
-            jnp.where(self.first_is_middle, c, jnp.where(self.second_is_middle, a, b)),
-            jnp.where(self.first_is_middle, a, jnp.where(self.second_is_middle, b, c)),
-            jnp.where(self.first_is_middle, b, jnp.where(self.second_is_middle, c, a)),
-        )
+        return self._cycled(x, 1, 2)
 
     def flip(self, x: Components, sign: int = -1) -> Components:
         """The reversal alone, of a vector, or of moments with sign = 1; its own inverse."""
-        a, b, c = x
-        return (
-            jnp.where(self.reverse, sign * c, a),
-            jnp.where(self.reverse, sign * b, b),
-            jnp.where(self.reverse, sign * a, c),
-        )
+        return tuple(jnp.where(self.reverse, sign * x[2 - j], x[j]) for j in range(3))
 
     def undo(self, x: Components) -> Components:
         """The components of a vector by the names the axes had."""
-        a, b, c = self.flip(x)
-        return (
-            jnp.where(self.first_is_middle, b, jnp.where(self.second_is_middle, a, c)),
-            jnp.where(self.first_is_middle, c, jnp.where(self.second_is_middle, b, a)),
-            jnp.where(self.first_is_middle, a, jnp.where(self.second_is_middle, c, b)),
-        )
+        return self._cycled(self.flip(x), 2, 1)
+
+    def _cycled(self, x: Components, by: int, otherwise: int) -> Components:
+        unless = (jnp.where(self.second_is_middle, x[j], x[j - otherwise]) for j in range(3))
+        return tuple(jnp.where(self.first_is_middle, x[j - by], y) for j, y in enumerate(unless))
 
 
-class Motion(NamedTuple):
+class Invariants(NamedTuple):
     """What a free motion keeps, in units in which the moments and rates are of order one."""
 
     labels: Labels
@@ -179,8 +168,8 @@ class Motion(NamedTuple):
 
 
 @jax.jit  # outside of jit a loop defined in a function is compiled at every call
-def invariants(moments: Vector, omega: Vector) -> Motion:
-    """The labels, the invariants and the period of a motion; values are not checked."""
+def invariants(moments: Vector, omega: Vector) -> Invariants:
+    """The labels, the invariants and the period of a motion."""
     unit = power_of_two(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))
     i = moments / power_of_two(jax.lax.stop_gradient(jnp.max(moments)))
     rates = omega / unit
@@ -200,17 +189,14 @@ def invariants(moments: Vector, omega: Vector) -> Motion:
     circles = u + v > tiny * (kap + v)
     quarter, quarter_w = quarter_period(*(jnp.where(circles, x, 0.5) for x in (kap, u, v)))
     al, be, l1, l2, l3, i1, i2, i3, square = materialize(al, be, l1, l2, l3, i1, i2, i3, square)
-    return Motion(
+    return Invariants(
         labels, unit, (i1, i2, i3), (l1, l2, l3), al, be, square, kap, u, v, circles, quarter,
         quarter_w,
     )  # fmt: skip
 
 
-def at(motion: Motion, t: Scalar) -> tuple[Quaternion, Vector]:
-    """Attitude relative to that at the start, and angular velocity, after a time t [s].
-
-    Both in the principal axes; the quaternion p obeys q(t) = q(0) p(t).
-    """
+def after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:
+    """Rotation p since the start, q(t) = q(0) p(t), and angular velocity, in the principal axes."""
     labels, unit, (i1, i2, i3), momentum, al, be, square, kap, u, v, circles, *quarters = motion
     quarter, quarter_w = quarters
     l1, l2, l3 = momentum

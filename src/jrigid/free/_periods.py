@@ -1,30 +1,30 @@
 """Periods, phases and the kind of a free rotation of any body."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
-from jrigid._checks import (
-    nan_where,
-)
+from jrigid._checks import Enumeration
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
-from jrigid.free._flow import Motion
-from jrigid.free._inputs import motion_of
+from jrigid.free._flow import Invariants
+from jrigid.free._motion import from_invariants
 
 # Below this many eps, relative, two moments are one and a motion is on the separatrix.
 _ROUNDING = 64
 
-REGIMES = (
-    "at rest",
-    "sphere",
-    "steady rotation",
-    "about the axis of the smallest moment",
-    "about the axis of the largest moment",
-    "separatrix",
-)
+
+class REGIMES(Enumeration):
+    """Kinds of free motion: `REGIMES[code]` is the text of what `regime` answers."""
+
+    at_rest = "at rest"
+    sphere = "sphere"
+    steady_rotation = "steady rotation"
+    about_smallest = "about the axis of the smallest moment"
+    about_largest = "about the axis of the largest moment"
+    separatrix = "separatrix"
+    undefined = "undefined: the inertia is not positive definite, or a rate is not finite"
 
 
-def polhode_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time after which the angular velocity of a free body comes back, in the body.
 
     4 K(m) / lam of Jacobi's solution; 2 pi / |wobble rate| for a symmetric body; of spin about a
@@ -34,14 +34,9 @@ def polhode_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tru
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Period [s].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        Period [s]; NaN outside positive definite inertia and finite rates.
 
     Gradients: right wherever the period is finite; zero where it is infinite.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.12.
@@ -50,12 +45,14 @@ def polhode_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tru
     >>> print(jr.free.polhode_period(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0])).round(4))
     6.2884
     """
-    findings, motion = motion_of(inertia, omega, throw)
-    period = jnp.where(motion.circles, 4 * motion.quarter / motion.unit, jnp.inf)
-    return nan_where(~findings.ok, period)
+
+    def period(motion: Invariants) -> Scalar:
+        return jnp.where(motion.circles, 4 * motion.quarter / motion.unit, jnp.inf)
+
+    return from_invariants(period, inertia, omega)
 
 
-def mean_precession_rate(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Mean rate at which the axis that the momentum circles turns about the momentum in space.
 
     |L| / I1 for a symmetric body; |L| / I2 on the separatrix and about an axis of no distinction.
@@ -63,14 +60,9 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike, *, throw: bool
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Rate [rad/s].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        Rate [rad/s]; NaN outside positive definite inertia and finite rates.
 
     Gradients: right off the separatrix; there the rate has infinite slope, and |L| / I2's is given.
     Source: the complete integral of the third kind in docs/free_rotation.md.
@@ -80,33 +72,27 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike, *, throw: bool
     >>> print(rate.round(4))
     2.0008
     """
-    findings, motion = motion_of(inertia, omega, throw)
-    rate = motion.unit * safe_norm(jnp.stack(motion.momentum)) * _advance(motion)
-    return nan_where(~findings.ok, rate)
+    return from_invariants(lambda motion: motion.unit * _mean_rate(motion), inertia, omega)
 
 
-def _advance(motion: Motion) -> Scalar:
-    """Mean precession rate over |L|."""
+def _mean_rate(motion: Invariants) -> Scalar:
+    """Mean precession rate, in units of the motion's."""
     quarter = jnp.where(motion.circles, motion.quarter, 1.0)
     extra = motion.al * motion.v * motion.quarter_w / quarter
-    return 1 / motion.moments[1] + jnp.where(motion.circles, extra, 0.0)
+    over_momentum = 1 / motion.moments[1] + jnp.where(motion.circles, extra, 0.0)
+    return safe_norm(jnp.stack(motion.momentum)) * over_momentum
 
 
-def precession_per_period(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Angle about the momentum by which a free body has turned after one polhode period.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Angle [rad], not reduced: `mean_precession_rate` times `polhode_period`; infinite where the
-        period is.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        period is. NaN outside positive definite inertia and finite rates.
 
     Gradients: right wherever the angle is finite; zero where it is infinite.
     Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
@@ -116,12 +102,14 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike, *, throw: boo
     >>> print(jr.free.precession_per_period(body, omega).round(4))
     12.5821
     """
-    findings, motion = motion_of(inertia, omega, throw)
-    turned = 4 * motion.quarter * safe_norm(jnp.stack(motion.momentum)) * _advance(motion)
-    return nan_where(~findings.ok, jnp.where(motion.circles, turned, jnp.inf))
+
+    def angle(motion: Invariants) -> Scalar:
+        return jnp.where(motion.circles, 4 * motion.quarter * _mean_rate(motion), jnp.inf)
+
+    return from_invariants(angle, inertia, omega)
 
 
-def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Part of `precession_per_period` beyond the dynamic phase 2 E T / |L|.
 
     Up to whole turns it is minus the solid angle that the momentum circles in the body (positive
@@ -131,14 +119,10 @@ def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tr
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Angle [rad], not reduced; 0 where the period is infinite and nothing is circled.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        Angle [rad], not reduced; 0 where the period is infinite and nothing is circled. NaN outside
+        positive definite inertia and finite rates.
 
     Gradients: right wherever the period is finite; zero where it is infinite.
     Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
@@ -148,7 +132,10 @@ def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tr
     >>> print(f"{jr.free.geometric_phase(body, omega):.4f}")
     6.2753
     """
-    findings, motion = motion_of(inertia, omega, throw)
+    return from_invariants(_geometric_phase, inertia, omega)
+
+
+def _geometric_phase(motion: Invariants) -> Scalar:
     square = motion.momentum_square
     size = safe_norm(jnp.stack(motion.momentum))
     # 1 / I2 - 2 E / |L|^2, without the difference: al be (2 E - |L|^2 / I2) is -al v
@@ -156,23 +143,19 @@ def geometric_phase(inertia: InertiaLike, omega: VectorLike, *, throw: bool = Tr
     gap = jnp.where(motion.be == 0, motion.u / jnp.where(motion.al == 0, 1.0, motion.al), gap)
     slow = motion.quarter * gap / jnp.where(square == 0, 1.0, square)
     phase = 4 * size * (slow + motion.al * motion.v * motion.quarter_w)
-    return nan_where(~findings.ok, jnp.where(motion.circles, phase, 0.0))
+    return jnp.where(motion.circles, phase, 0.0)
 
 
-def parameter(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def parameter(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Parameter m = k^2 of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest. NaN outside
+        positive definite inertia and finite rates.
 
     Gradients: right where no two moments are equal; where two are, m has a kink at 0 and the slope
     of one side is given; zero for a sphere and at rest.
@@ -182,11 +165,10 @@ def parameter(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) ->
     >>> print(jr.free.parameter(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])).round(6))
     0.003333
     """
-    findings, motion = motion_of(inertia, omega, throw)
-    return nan_where(~findings.ok, _parameter(motion))
+    return from_invariants(_parameter, inertia, omega)
 
 
-def _parameter(motion: Motion) -> Scalar:
+def _parameter(motion: Invariants) -> Scalar:
     al, be = motion.al, motion.be
     l1, l2, _ = motion.momentum
     p = al * ((al + be) * l1 * l1 + be * l2 * l2)
@@ -194,20 +176,15 @@ def _parameter(motion: Motion) -> Scalar:
     return jnp.where(q > 0, p / jnp.where(q > 0, q, 1.0), 0.0)
 
 
-def modulus(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Modulus k of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        k = sqrt(m), see `parameter`.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        k = sqrt(m), see `parameter`; NaN where that is.
 
     Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth at a stable spin.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
@@ -217,25 +194,21 @@ def modulus(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> S
     >>> print(f"{k:.6f}")
     0.057735
     """
-    m = parameter(inertia, omega, throw=throw)
+    m = parameter(inertia, omega)
     return jnp.where(m == 0, 0.0, jnp.sqrt(jnp.where(m == 0, 1.0, m)))
 
 
-def regime(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Int[Array, ""]:
-    """Which kind of motion it is: an index into `free.REGIMES`.
+def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
+    """Which kind of motion it is.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
-        throw: False: bad values give -1 instead of an error.
 
     Returns:
-        Integer code. A symmetric body goes about the axis of its smallest moment (prolate) or its
-        largest (oblate). Equalities hold to a few eps.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        A member of `free.REGIMES`, `undefined` outside positive definite inertia and finite rates.
+        A symmetric body goes about the axis of its smallest moment (prolate) or its largest
+        (oblate). Equalities hold to a few eps.
 
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
 
@@ -244,21 +217,21 @@ def regime(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> In
     >>> jr.free.REGIMES[code]
     'about the axis of the largest moment'
     """
-    findings, motion = motion_of(inertia, omega, throw)
+    motion = from_invariants(lambda motion: motion, inertia, omega)
     rounding = _ROUNDING * jnp.finfo(motion.kap.dtype).eps
     i1, _, i3 = motion.moments
     l1, l2, l3 = motion.momentum
-    largest = jnp.maximum(i1, i3)
     al, be = motion.al, motion.be
     rate = jnp.stack([be * l2 * l3, (al + be) * l3 * l1, al * l1 * l2])
     size = jnp.maximum(jnp.abs(al), jnp.abs(be)) * motion.momentum_square
-    above = al * l1 * l1 - be * l3 * l3
-    cases = [
-        motion.momentum_square == 0,
-        jnp.abs(i3 - i1) <= rounding * largest,
-        jnp.max(jnp.abs(rate)) <= rounding * size,
-        (jnp.abs(above) <= rounding * jnp.maximum(jnp.abs(al) * l1 * l1, jnp.abs(be) * l3 * l3)),
-        i3 < i1,
-    ]
-    code = jnp.select(cases, [jnp.asarray(n) for n in (0, 1, 2, 5, 3)], jnp.asarray(4))
-    return jnp.where(findings.ok, code, -1)
+    first, third = jnp.abs(al) * l1 * l1, jnp.abs(be) * l3 * l3
+    kind = REGIMES.where(i3 < i1, REGIMES.about_smallest, REGIMES.about_largest)
+    for case, code in (
+        (jnp.abs(first - third) <= rounding * jnp.maximum(first, third), REGIMES.separatrix),
+        (jnp.max(jnp.abs(rate)) <= rounding * size, REGIMES.steady_rotation),
+        (jnp.abs(i3 - i1) <= rounding * jnp.maximum(i1, i3), REGIMES.sphere),
+        (motion.momentum_square == 0, REGIMES.at_rest),
+        (jnp.isnan(motion.unit), REGIMES.undefined),
+    ):
+        kind = REGIMES.where(case, code, kind)
+    return kind

@@ -413,7 +413,7 @@ def residuals(
 
     def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
         if torque_free:
-            return free_rotation(system.inertia, State(q, w), times, t0=begin)
+            return free_rotation(system.inertia, State(q, w), times, t0=begin).states
         return in_any_order(
             lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
             times,

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._numerics import product
-from jrigid._spectral import eigh
+from jrigid._spectral import eigh, from_principal_axes
 from jrigid.dynamics import State
-from jrigid.free._motion import of_moments, turned
+from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import AbstractSystem
 
@@ -28,7 +28,8 @@ _STEPS = 4  # Dopri8's in a segment of half a turn, to 1e-7 of the state
 def free_flow(tensor: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     """Attitude relative to that at the start and angular velocity, of a tensor; unchecked."""
     moments, axes = eigh(tensor)
-    return turned(axes, *of_moments(moments, product("ji,j->i", axes, omega), t))
+    turned = relative_rotation(moments, product("ji,j->i", axes, omega), t)
+    return from_principal_axes(axes, *turned)
 
 
 @free_flow.defjvp
@@ -41,7 +42,7 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
     moments = jnp.stack([moments[0], middle, jnp.maximum(moments[2], apart * middle)])
 
     def motion(x: Array) -> tuple[Array, Array]:
-        return of_moments(x[:3], x[3:], t)
+        return relative_rotation(x[:3], x[3:], t)
 
     point = jnp.concatenate([moments, omega])
     (p, w), (p_columns, w_columns) = jax.vmap(
@@ -60,7 +61,7 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
     p_change = jnp.concatenate([p_change[:1], vector]) + t_change * attitude_rate(p, w)
     momentum = moments * w
     w_change = w_change + jnp.cross(turn, w) + t_change * (jnp.cross(momentum, w) / moments)
-    return turned(axes, p, w), turned(axes, p_change, w_change)
+    return from_principal_axes(axes, p, w), from_principal_axes(axes, p_change, w_change)
 
 
 def forced_flow(

@@ -184,7 +184,7 @@ def _section(
     return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), result)
 
 
-def flip_time(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) -> Scalar:
+def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time between two flips of a free body about its intermediate axis: the tennis racket's.
 
     A flip is a change of sign of the angular velocity's component along the intermediate axis.
@@ -192,14 +192,9 @@ def flip_time(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) ->
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity at any time, body components [rad/s].
-        throw: False: bad values give NaN.
 
     Returns:
         Half of the period of the polhode [s]; infinite on the separatrix and at rest.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
 
     Gradients: those of `jrigid.free.polhode_period`.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; near the separatrix it grows like
@@ -209,7 +204,7 @@ def flip_time(inertia: InertiaLike, omega: VectorLike, *, throw: bool = True) ->
     >>> print(jr.stability.flip_time([1.0, 2.0, 3.0], [1e-3, 1.0, 0.0]).round(4))
     28.7314
     """
-    return 0.5 * polhode_period(inertia, omega, throw=throw)
+    return 0.5 * polhode_period(inertia, omega)
 
 
 class FinalSpin(NamedTuple):
