@@ -58,8 +58,8 @@ NOTHING_TO_CALL = {
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
-    "rotation.rate_record_validity", "free.motion_validity", "free.regime", "top.motion_validity",
-    "top.motion_class", "lagrangian.cyclic_coordinates",
+    "rotation.rate_record_validity", "free.motion_validity", "free.regime",
+    "top.motion_class", "top.CLASSES", "top.SymmetricTop.is_valid", "lagrangian.cyclic_coordinates",
 }  # fmt: skip
 # Regressions and fits of records of some length: tests/test_identify*.py.
 OF_RECORDS = {
