@@ -274,14 +274,9 @@ def _beta_after(
     bend = (2 / n) * (a - mu * sigma + z * (b - g * g * z)) - a
     twist = (2 / n) * (g * s * slope)
     factor = _times(1 / n, turn)
-    return (
-        factor * (beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)),
-        factor
-        * (
-            d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
-            + beta * jax.lax.complex(s * bend, -s * twist)
-        ),
-    )
+    moved = beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)
+    rate = d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
+    return factor * moved, factor * (rate + beta * jax.lax.complex(s * bend, -s * twist))
 
 
 def _alpha_after(
@@ -306,14 +301,10 @@ def _alpha_after(
     bend = (2 / n) * (a - mu * sigma + z * (b - g_beta * g_beta * z))
     bend = bend - mu - a - z * (b + mu * side * side)
     factor = _times(1 / (n * jnp.sqrt(rise)), turn)
-    return (
-        factor * (alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, drift)),
-        factor
-        * (
-            alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
-            + drift * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
-        ),
-    )
+    moved = alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, drift)
+    rate = alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
+    rate = rate + drift * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
+    return factor * moved, factor * rate
 
 
 def state_after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:

@@ -88,59 +88,54 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
                 "Argument `body` must have principal moments where a case is asked for, but it has "
                 "a tensor."
             )
-    numbers = float_arrays(body.inertia, state.attitude, state.omega, *jtu.tree_leaves(body.torque))
-    inertia, attitude, _, mass, *_ = numbers
-    ok = is_inertia(inertia) & all_finite(numbers) & is_unit(attitude) & (mass >= 0)
+    leaves, structure = jtu.tree_flatten((body.inertia, body.torque, state))
+    arguments = jtu.tree_unflatten(structure, float_arrays(*leaves))
+    inertia, gravity, state = arguments
+    ok = is_inertia(inertia) & all_finite(arguments) & is_unit(state.attitude)
+    ok = ok & (gravity.mass >= 0)
     if case is not None:
-        ok = ok & _is_of_case(case, *jax.lax.stop_gradient(numbers))
-    return where_defined(ok, partial(_integrals, case), *numbers)
+        ok = ok & _is_of_case(case, *jax.lax.stop_gradient(arguments))
+    return where_defined(ok, partial(_integrals, case), *arguments)
 
 
 def _integrals(
-    case: Case | None,
-    inertia: Array,
-    attitude: Array,
-    omega: Array,
-    mass: Array,
-    lever: Array,
-    pull: Array,
+    case: Case | None, inertia: Array, gravity: UniformGravity, state: State
 ) -> Integrals:
-    strength = safe_norm(pull)
-    weight = mass * strength
+    strength = safe_norm(gravity.gravity)
     pulls = strength > 0
-    down = rotate_inverse(attitude, pull / jnp.where(pulls, strength, 1.0))
+    down = rotate_inverse(state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0))
     up = jnp.where(pulls, -down, 0.0)
-    momentum = angular_momentum(inertia, omega)
-    energy = kinetic_energy(inertia, omega) + weight * product("i,i->", lever, up)
+    momentum = angular_momentum(inertia, state.omega)
+    energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
+    rate = gravity.mass * strength / inertia[2]
+    (w1, w2, w3), (x, y, _) = state.omega, gravity.lever
     extra = None
-    w1, w2, w3 = omega
     if case == "euler":
         extra = product("i,i->", momentum, momentum)
     elif case == "lagrange":
         extra = momentum[2]
     elif case == "kovalevskaya":
-        rate = weight / inertia[2]
-        real = w1 * w1 - w2 * w2 - rate * (lever[0] * up[0] - lever[1] * up[1])
-        imaginary = 2 * w1 * w2 - rate * (lever[0] * up[1] + lever[1] * up[0])
+        real = w1 * w1 - w2 * w2 - rate * (x * up[0] - y * up[1])
+        imaginary = 2 * w1 * w2 - rate * (x * up[1] + y * up[0])
         extra = real * real + imaginary * imaginary
     elif case == "goryachev-chaplygin":
-        along = lever[0] * w1 + lever[1] * w2
-        extra = w3 * (w1 * w1 + w2 * w2) - weight / inertia[2] * up[2] * along
+        extra = w3 * (w1 * w1 + w2 * w2) - rate * up[2] * (x * w1 + y * w2)
     return Integrals(energy, product("i,i->", momentum, up), extra)
 
 
-def _is_of_case(case: Case, *numbers: Array) -> Array:
-    (i1, i2, i3), _, omega, mass, lever, pull = numbers
-    tolerance = jnp.sqrt(jnp.finfo(i1.dtype).eps)
-    length = jnp.max(jnp.abs(lever))
+def _is_of_case(case: Case, inertia: Array, gravity: UniformGravity, state: State) -> Array:
+    i1, i2, i3 = inertia
+    tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
+    length = jnp.max(jnp.abs(gravity.lever))
     if case == "euler":
-        return mass * safe_norm(pull) * length == 0
+        return gravity.mass * safe_norm(gravity.gravity) * length == 0
     symmetric = jnp.abs(i1 - i2) <= tolerance * i1
+    across, along = jnp.max(jnp.abs(gravity.lever[:2])), jnp.abs(gravity.lever[2])
     if case == "lagrange":
-        return symmetric & (jnp.max(jnp.abs(lever[:2])) <= tolerance * length)
+        return symmetric & (across <= tolerance * length)
     of_ratio = jnp.abs(i1 - _RATIOS[case] * i3) <= tolerance * i1
-    of_case = symmetric & of_ratio & (jnp.abs(lever[2]) <= tolerance * length)
+    of_case = symmetric & of_ratio & (along <= tolerance * length)
     if case == "kovalevskaya":
         return of_case
-    level = jnp.abs(_integrals(None, *numbers).vertical_momentum)
-    return of_case & (level <= tolerance * jnp.max(jnp.abs(jnp.stack([i1, i2, i3]) * omega)))
+    vertical = jnp.abs(_integrals(None, inertia, gravity, state).vertical_momentum)
+    return of_case & (vertical <= tolerance * jnp.max(jnp.abs(inertia * state.omega)))

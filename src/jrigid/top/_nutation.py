@@ -173,11 +173,7 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     >>> print(jr.top.nutation_period(top, state).round(5))
     3.51772
     """
-
-    def period(motion: Invariants) -> Array:
-        return jnp.where(motion.nutates, motion.period / motion.unit, jnp.inf)
-
-    return _of_motion(period, top, state)
+    return _of_motion(lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state)
 
 
 def _side(x: Array, dx: Array) -> Array:
@@ -185,12 +181,13 @@ def _side(x: Array, dx: Array) -> Array:
     return jnp.sign((jnp.conj(x) * dx).imag)
 
 
-def _advance(motion: Invariants) -> tuple[Array, Array]:
+def _advance(motion: Invariants) -> Advance:
     alpha, beta, d_alpha, d_beta = motion.start
     of_alpha = motion.advance_alpha + jnp.pi * _side(alpha, d_alpha)
     of_beta = motion.advance_beta + jnp.where(motion.wide, jnp.pi * _side(beta, d_beta), 0.0)
     spin = jnp.where(motion.hangs, of_beta - of_alpha, of_alpha - of_beta)
-    return of_alpha + of_beta, spin + motion.slip * motion.period
+    advance = of_alpha + of_beta, spin + motion.slip * motion.period
+    return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in advance))
 
 
 def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
@@ -213,11 +210,7 @@ def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
     >>> print(jr.top.advance_per_nutation(top, state).phi.round(5))
     1.62782
     """
-
-    def advance(motion: Invariants) -> Advance:
-        return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in _advance(motion)))
-
-    return _of_motion(advance, top, state)
+    return _of_motion(_advance, top, state)
 
 
 def mean_precession(top: SymmetricTop, state: State) -> Scalar:
@@ -241,9 +234,9 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
     """
 
     def rate(motion: Invariants) -> Array:
-        phi, _ = _advance(motion)
         endless = jnp.where(motion.hangs, -0.5, 0.5) * motion.spin
-        return jnp.where(motion.nutates, motion.unit * phi / motion.period, endless)
+        mean = motion.unit * _advance(motion).phi / motion.period
+        return jnp.where(motion.nutates, mean, endless)
 
     return _of_motion(rate, top, state)
 

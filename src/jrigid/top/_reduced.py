@@ -102,6 +102,16 @@ def _over(momentum: Array, side: Array) -> Array:
     return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
 
 
+def _angle_rates(i1: Array, i3: Array, mgl: Array, theta: Array, *momenta: Array) -> AngleRates:
+    del mgl
+    p_phi, p_psi = momenta
+    # The parts that are large near upright and near upside down, by half the angle.
+    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+    upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
+    phi = 0.5 * (upper + lower) / i1
+    return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
+
+
 def angle_rates(
     top: SymmetricTop, theta: ScalarLike, p_phi: ScalarLike, p_psi: ScalarLike
 ) -> AngleRates:
@@ -128,16 +138,7 @@ def angle_rates(
     >>> print(rates.phi.round(6), rates.psi.round(6))
     3.0 2.0
     """
-
-    def rates(i1: Array, i3: Array, _: Array, theta: Array, *momenta: Array) -> AngleRates:
-        p_phi, p_psi = momenta
-        # The parts that are large near upright and near upside down, by half the angle.
-        sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
-        upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
-        phi = 0.5 * (upper + lower) / i1
-        return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
-
-    return where_valid(rates, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
+    return where_valid(_angle_rates, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
 
 
 def effective_potential(
@@ -237,10 +238,8 @@ def reduced_vector_field(
     def rates(t: Any, y: Float[Array, "4"], args: Any) -> Float[Array, "4"]:
         del t, args
         _, theta, _, theta_dot = y
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        across = (p_phi - p_psi * cos) / (i1 * sin)
-        phi_dot = across / sin
-        pull = mgl * sin / i1 - across * (p_psi / i1 - phi_dot * cos)
-        return jnp.stack([phi_dot, theta_dot, p_psi / i3 - phi_dot * cos, pull])
+        phi_dot, psi_dot = _angle_rates(i1, i3, mgl, theta, p_phi, p_psi)
+        pull = (mgl + phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi)) * jnp.sin(theta) / i1
+        return jnp.stack([phi_dot, theta_dot, psi_dot, pull])
 
     return rates

@@ -28,8 +28,8 @@ _BAD_TILT = (
     "takes degrees.)"
 )
 _TOO_SLOW = (
-    "Argument `{}` must be large enough for steady precession at `theta`, but it is not: see "
-    "`steady_precession`."
+    "Argument `{}` must be large enough for steady precession at `theta`, but it is not. (See "
+    "`steady_precession`.)"
 )
 _LEVEL = "Argument `theta` must not be level for the fast precession, which is infinite, but it is."
 
@@ -235,40 +235,33 @@ def initial_state(
     >>> print(state.omega.round(4))
     [0.     0.1795 6.    ]
     """
+    check_type("top", top, SymmetricTop)
     if psi_dot is not None and omega3 is not None:
         raise ValueError("Argument `psi_dot` must be None where `omega3` is given, but it is not.")
-    steady = phi_dot if isinstance(phi_dot, str) else None
-    if steady is not None:
-        check_option("phi_dot", steady, ("slow", "fast"))
-    spin = 0.0 if psi_dot is None and omega3 is None else (omega3 if psi_dot is None else psi_dot)
-    spin_name = "psi_dot" if omega3 is None else "omega3"
-    rates = {
-        spin_name: spin,
-        "phi_dot": 0.0 if steady else phi_dot,
-        "theta_dot": theta_dot,
-        "phi": phi,
-        "psi": psi,
-    }
-    check_type("top", top, SymmetricTop)
-    i1, i3, mgl, theta, *values = float_arrays(top.I1, top.I3, top.mgl, theta, *rates.values())
+    spin_name, spin = ("omega3", omega3) if psi_dot is None else ("psi_dot", psi_dot)
+    spin = 0.0 if spin is None else spin
+    branch = phi_dot if isinstance(phi_dot, str) else None
+    if branch is not None:
+        check_option("phi_dot", branch, ("slow", "fast"))
+    given = {"theta": theta, spin_name: spin, "phi_dot": 0.0 if branch else phi_dot}
+    given |= {"theta_dot": theta_dot, "phi": phi, "psi": psi}
+    numbers = float_arrays(top.I1, top.I3, top.mgl, *given.values())
     findings = Findings()
-    findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack([i1, i3, mgl]))
-    check_shape("theta", theta, ())
-    in_range = (theta >= -_ROUNDING) & (theta <= jnp.pi + _ROUNDING)
-    findings.require(in_range, RESULTS.invalid_state, _BAD_TILT, theta)
-    for name, value in zip(rates, values, strict=True):
+    findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(numbers[:3]))
+    for name, value in zip(given, numbers[3:], strict=True):
         check_shape(name, value, ())
-        message = f"Argument `{name}` must be finite, but it is not."
-        findings.require(jnp.isfinite(value), RESULTS.invalid_state, message, value)
-    i1, i3, mgl, theta, values = harmless(findings.ok, (i1, i3, mgl, theta, values))
-    spin, rate, theta_dot, phi, psi = values
-    if steady:
+        good, message = jnp.isfinite(value), f"Argument `{name}` must be finite, but it is not."
+        if name == "theta":
+            good, message = (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING), _BAD_TILT
+        findings.require(good, RESULTS.invalid_state, message, value)
+    i1, i3, mgl, theta, spin, rate, theta_dot, phi, psi = harmless(findings.ok, numbers)
+    if branch is not None:
         slow, fast = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
-        rate = slow if steady == "slow" else fast
-        exists = ~jnp.isnan(rate)
-        findings.require(exists, RESULTS.invalid_state, _TOO_SLOW.format(spin_name), spin)
+        rate = slow if branch == "slow" else fast
+        too_slow = _TOO_SLOW.format(spin_name)
+        findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
         findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
-        rate = jnp.where(findings.ok, rate, 0.0)
+        rate = harmless(findings.ok, rate)
     angles = jnp.stack([phi, theta, psi])
     omega = euler_rates_to_omega(angles, jnp.stack([rate, theta_dot, spin]))
     if psi_dot is None:

@@ -28,12 +28,12 @@ from jrigid.torques import UniformGravity
 
 Answer = TypeVar("Answer")
 _STANDARD_GRAVITY = 9.80665  # [m/s^2]
-_ELSE = "for any other body use `RigidBody` under `torques.UniformGravity`"
+_ELSE = "For any other body use `RigidBody` under `torques.UniformGravity`.)"
 _NOT_SYMMETRIC = (
     "Argument `body` must have an inertia symmetric about its axis 3, but it has not. (Shown are "
-    f"I11, I22, I12, I13, I23: {_ELSE}.)"
+    f"I11, I22, I12, I13, I23. {_ELSE}"
 )
-_NOT_ON_AXIS = "Argument `lever` must lie along body axis 3, but it does not. (" + _ELSE + ".)"
+_NOT_ON_AXIS = f"Argument `lever` must lie along body axis 3, but it does not. ({_ELSE}"
 _NOT_VERTICAL = "Argument `gravity` must lie along z in space, but it does not."
 
 
@@ -99,25 +99,24 @@ class SymmetricTop(Readable):
         mass, inertia, lever, gravity = float_arrays(body.mass, body.inertia, lever, gravity)
         check_shape("lever", lever, (3,))
         check_shape("gravity", gravity, (3,))
+        (a, d, e), (_, b, f), (_, _, c) = inertia
         tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
-
-        def on_axis(vector: Array) -> Array:
-            size = jnp.max(jnp.abs(vector))
-            return jnp.isfinite(size) & (jnp.max(jnp.abs(vector[:2])) <= tolerance * size)
-
-        a, b, c = jnp.diagonal(inertia)
-        products = inertia[0, 1], inertia[0, 2], inertia[1, 2]
-        size = jnp.maximum(jnp.max(jnp.abs(inertia)), mass * lever[2] ** 2)
-        off = jnp.max(jnp.abs(jnp.stack([a - b, *products])))
+        size = jnp.maximum(a + b + c, mass * lever[2] ** 2)
+        symmetric = jnp.max(jnp.abs(jnp.stack([a - b, d, e, f]))) <= tolerance * size
         findings = Findings()
-        shown = jnp.stack([a, b, *products])
-        symmetric = jnp.isfinite(mass) & jnp.isfinite(c) & (off <= tolerance * size)
+        shown = jnp.stack([a, b, d, e, f])
         findings.require(symmetric, RESULTS.invalid_inertia, _NOT_SYMMETRIC, shown)
-        findings.require(on_axis(lever), RESULTS.invalid_position, _NOT_ON_AXIS, lever)
-        findings.require(on_axis(gravity), RESULTS.invalid_torque, _NOT_VERTICAL, gravity)
-        mass, inertia, length, pull = harmless(findings.ok, (mass, inertia, lever[2], gravity[2]))
-        across = 0.5 * (inertia[0, 0] + inertia[1, 1]) + mass * length * length
-        return findings.guard(cls(across, inertia[2, 2], -mass * pull * length), throw)
+        for value, code, message in (
+            (lever, RESULTS.invalid_position, _NOT_ON_AXIS),
+            (gravity, RESULTS.invalid_torque, _NOT_VERTICAL),
+        ):
+            off = jnp.max(jnp.abs(value[:2])) > tolerance * jnp.abs(value[2])
+            findings.require(all_finite(value) & ~off, code, message, value)
+        across, c, mass, length, pull = harmless(
+            findings.ok, (0.5 * (a + b), c, mass, lever[2], gravity[2])
+        )
+        top = cls(across + mass * length * length, c, -mass * pull * length)
+        return findings.guard(top, throw)
 
     def as_rigid_body(self) -> RigidBody:
         """The same top for `jrigid.simulate`: a `RigidBody` under `UniformGravity`.
@@ -143,7 +142,7 @@ def _scalar(name: str, value: Any) -> Any:
 
 
 def where_valid(formula: Callable[..., Answer], top: SymmetricTop, **scalars: Any) -> Answer:
-    """A formula of I1, I3, mgl and scalars, in one dtype; NaN where one of them is out of domain."""
+    """A formula of I1, I3, mgl and scalars, in one dtype; NaN where any is outside its domain."""
     check_type("top", top, SymmetricTop)
     numbers = float_arrays(top.I1, top.I3, top.mgl, *scalars.values())
     for name, value in zip(scalars, numbers[3:], strict=True):
