@@ -1,5 +1,7 @@
 """What a textbook says of the heavy top, against other routes to it and printed numbers."""
 
+from typing import NamedTuple
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -44,6 +46,26 @@ KINDS = {
     "sleeping": "sleeping",
     "hanging": "sleeping",
 }
+
+
+class Nutation(NamedTuple):
+    bounds: top.NutationBounds
+    period: jax.Array
+    advance: top.Advance
+    precession: jax.Array
+    kind: top.CLASSES
+
+
+@jax.jit
+def nutation(one, state):
+    """What is said of a motion, compiled once for all tests."""
+    return Nutation(
+        top.nutation_bounds(one, state),
+        top.nutation_period(one, state),
+        top.advance_per_nutation(one, state),
+        top.mean_precession(one, state),
+        top.motion_class(one, state),
+    )
 
 
 def start(name, **more):
@@ -104,7 +126,7 @@ def routes():
         by_quaternions = jr.simulate(TOP.as_rigid_body(), state0, TIMES, rtol=1e-11).states
         return jr.top_motion(TOP, state0, TIMES), by_quaternions, heights_by_cubic(state0)
 
-    return jax.jit(two), jax.jit(
+    return quick_jit(two), quick_jit(
         lambda q0, rates: (by_lagrangian(q0, rates), by_reduction(q0, rates))
     )
 
@@ -179,18 +201,23 @@ def test_potential_at_the_vertical():
     assert np.all(np.isfinite(jax.grad(v, argnums=(0, 1, 2))(0.0, 3.0, 3.0)))
 
 
-@pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
-def test_slopes_of_potential_and_rates_in_the_momenta(p_phi):
-    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
-
+@pytest.fixture(scope="module")
+def of_the_momenta():
     def both(p):
         rates = top.angle_rates(TOP, 1.0, p, 3.0)
         return jnp.stack([top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi])
 
-    found, h = jax.jacfwd(both)(p_phi), 1e-5
-    difference = (both(p_phi + h) - both(p_phi - h)) / (2 * h)
+    return jax.jit(both), quick_jit(jax.jacfwd(both)), quick_jit(jax.jacfwd(jax.jacfwd(both)))
+
+
+@pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
+def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
+    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
+    value, slope, curvature = of_the_momenta
+    found, h = slope(p_phi), 1e-5
+    difference = (value(p_phi + h) - value(p_phi - h)) / (2 * h)
     np.testing.assert_allclose(found, difference, atol=1e-9)
-    curvature = jax.jacfwd(jax.jacfwd(both))(p_phi)
+    curvature = curvature(p_phi)
     np.testing.assert_allclose(curvature, [1 / np.sin(1.0) ** 2, 0, 0], atol=1e-13)
 
 
@@ -227,12 +254,12 @@ def test_bounds_period_and_advance_are_the_textbook_s_integrals(name):
     with mp.workdps(25):
         low, high, period, phi, psi = (float(x) for x in quadratures(TOP, start(name)))
     state = start(name)
-    bounds = top.nutation_bounds(TOP, state)
+    bounds = nutation(TOP, state).bounds
     np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13)
-    assert top.nutation_period(TOP, state) == pytest.approx(period, rel=1e-13)
-    advance = top.advance_per_nutation(TOP, state)
+    assert nutation(TOP, state).period == pytest.approx(period, rel=1e-13)
+    advance = nutation(TOP, state).advance
     np.testing.assert_allclose([advance.phi, advance.psi], [phi, psi], rtol=1e-12)
-    assert top.mean_precession(TOP, state) == pytest.approx(phi / period, rel=1e-12)
+    assert nutation(TOP, state).precession == pytest.approx(phi / period, rel=1e-12)
 
 
 @pytest.mark.parametrize("mgl", [1.0, -1.0, 0.0])
@@ -242,34 +269,34 @@ def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
         one = jr.SymmetricTop(1.3, rng.uniform(0.3, 2), mgl)
         q = rng.normal(size=4)
         state = jr.State(q / np.linalg.norm(q), rng.normal(size=3) * rng.choice([0.3, 1, 3]))
-        period = float(top.nutation_period(one, state))
+        period = float(nutation(one, state).period)
         motion = np.asarray(jr.top_motion(one, state, np.linspace(0, period, 4001)).attitude)
         sum_ = np.unwrap(np.arctan2(motion[:, 3], motion[:, 0]))
         difference = np.unwrap(np.arctan2(motion[:, 2], motion[:, 1]))
         phi, psi = sum_ + difference, sum_ - difference
         tilt = np.arccos(np.clip(2 * (motion[:, 0] ** 2 + motion[:, 3] ** 2) - 1, -1, 1))
-        bounds = top.nutation_bounds(one, state)
+        bounds = nutation(one, state).bounds
         extent = [tilt.min(), tilt.max()]
         np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], extent, atol=1e-4)
         assert tilt[-1] == pytest.approx(tilt[0], abs=1e-11)
-        advance = top.advance_per_nutation(one, state)
+        advance = nutation(one, state).advance
         np.testing.assert_allclose(advance, [phi[-1] - phi[0], psi[-1] - psi[0]], atol=1e-11)
         steps = np.diff(phi)
         kind = top.CLASSES.loop if np.min(steps) < 0 < np.max(steps) else top.CLASSES.wave
-        assert top.motion_class(one, state) == kind
+        assert nutation(one, state).kind == kind
 
 
 @pytest.mark.parametrize("name", STARTS)
 def test_kinds_of_motion(name):
     state = start(name)
-    assert top.CLASSES[top.motion_class(TOP, state)] == KINDS[name]
+    assert top.CLASSES[nutation(TOP, state).kind] == KINDS[name]
     # Any later state is of the same kind, and so is the same motion with the axis named backward.
     later = jr.top_motion(TOP, state, 1.7).states
-    assert top.CLASSES[top.motion_class(TOP, later)] == KINDS[name]
+    assert top.CLASSES[nutation(TOP, later).kind] == KINDS[name]
     back = rotation.multiply(state.attitude, np.array([0.0, 1, 0, 0]))
     backward = jr.State(back, state.omega * np.array([1.0, -1, -1]))
     reversed_ = jr.SymmetricTop(TOP.I1, TOP.I3, -TOP.mgl)
-    assert top.CLASSES[top.motion_class(reversed_, backward)] == KINDS[name]
+    assert top.CLASSES[nutation(reversed_, backward).kind] == KINDS[name]
 
 
 @pytest.mark.parametrize("theta", [0.0, np.pi])
@@ -277,12 +304,12 @@ def test_kinds_of_motion(name):
 def test_a_top_at_the_vertical_sleeps(theta, omega3):
     state = top.initial_state(TOP, theta, omega3=omega3)
     state = jr.State(np.round(state.attitude, 15), state.omega)
-    assert top.motion_class(TOP, state) == top.CLASSES.sleeping
+    assert nutation(TOP, state).kind == top.CLASSES.sleeping
 
 
 def test_a_bad_state_has_no_kind():
     state = jr.State(np.eye(4)[0], np.array([np.nan, 0, 0]))
-    assert top.motion_class(TOP, state) == top.CLASSES.undefined
+    assert nutation(TOP, state).kind == top.CLASSES.undefined
 
 
 def test_kinds_are_listed_with_their_texts():
@@ -324,9 +351,9 @@ def test_small_swings_keep_their_relative_size():
     """Of a pendulum about hanging, and of a cusp beside the vertical."""
     for small in (1e-3, 1e-7, 1e-12):
         attitude = np.array([np.sin(small / 2), np.cos(small / 2), 0, 0])
-        bounds = top.nutation_bounds(TOP, jr.State(attitude, np.zeros(3)))
+        bounds = nutation(TOP, jr.State(attitude, np.zeros(3))).bounds
         assert np.pi - bounds.theta_min == pytest.approx(small, rel=1e-12 + 5e-16 / small)
-        bounds = top.nutation_bounds(TOP, top.initial_state(TOP, small, omega3=6.0))
+        bounds = nutation(TOP, top.initial_state(TOP, small, omega3=6.0)).bounds
         # theta_max^2 / theta_min^2 = spin^2 / (spin^2 - 4 mgl I1 / I3^2)
         assert bounds.theta_max / bounds.theta_min == pytest.approx((36 / 20) ** 0.5, rel=1e-6)
 
@@ -335,15 +362,15 @@ def test_the_endless_motion_comes_to_the_vertical_at_its_rate():
     for mgl, sign in ((1.0, 1.0), (-1.0, -1.0)):
         attitude = np.array([1.0, 0, 0, 0]) if mgl > 0 else np.array([0.0, 1, 0, 0])
         one, state = jr.SymmetricTop(1.0, 0.5, mgl), jr.State(attitude, np.array([0, 0, 2.0]))
-        assert top.nutation_period(one, state) == np.inf
-        assert top.mean_precession(one, state) == pytest.approx(sign * 0.5)
+        assert nutation(one, state).period == np.inf
+        assert nutation(one, state).precession == pytest.approx(sign * 0.5)
 
 
 @pytest.mark.parametrize("tilt", [1e-6, 1e-9, 1e-30])
 def test_precession_at_the_threshold_of_sleeping(tilt):
     """The slower a nutation, the longer the axis stands upright and turns at I3 omega3 / (2 I1)."""
     state = top.initial_state(TOP, tilt, omega3=4.0)
-    assert top.mean_precession(TOP, state) == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
+    assert nutation(TOP, state).precession == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
 
 
 SPECIAL = {
@@ -401,7 +428,7 @@ def test_steady_precession_is_steady(branch, theta, spin):
     advance = rate * ts
     expected = np.sin(theta) * np.stack([np.sin(advance), -np.cos(advance)], axis=1)
     np.testing.assert_allclose(axis[:, :2], expected, atol=1e-11)
-    assert top.mean_precession(TOP, state0) == pytest.approx(rate, rel=1e-12)
+    assert nutation(TOP, state0).precession == pytest.approx(rate, rel=1e-12)
 
 
 def test_when_steady_precession_exists():
@@ -441,11 +468,11 @@ def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least
     spin = factor * float(top.sleeping_spin(TOP))
     assert spin == factor * 4.0
     state = top.initial_state(TOP, 1e-6, omega3=spin)
-    largest = np.degrees(top.nutation_bounds(TOP, state).theta_max)
+    largest = np.degrees(nutation(TOP, state).bounds.theta_max)
     assert least < largest < most
     if factor < 1:
         assert largest == pytest.approx(np.degrees(np.arccos(2 * factor**2 - 1)), rel=1e-6)
-    times = np.linspace(0.0, 2 * float(top.nutation_period(TOP, state)), 4001)
+    times = np.linspace(0.0, 2 * float(nutation(TOP, state).period), 4001)
     motion = np.asarray(jr.top_motion(TOP, state, times).attitude)
     reached = np.degrees(2 * np.arcsin(np.hypot(motion[:, 1], motion[:, 2]).max()))
     assert reached == pytest.approx(largest, rel=1e-4)
@@ -456,11 +483,11 @@ def test_gyroscopic_approximation_becomes_exact():
     errors = []
     for omega3 in (40.0, 80.0):
         state = top.initial_state(TOP, theta, omega3=omega3)
-        bounds = top.nutation_bounds(TOP, state)
+        bounds = nutation(TOP, state).bounds
         exact = np.array(
             [
-                top.mean_precession(TOP, state),
-                2 * np.pi / top.nutation_period(TOP, state),
+                nutation(TOP, state).precession,
+                2 * np.pi / nutation(TOP, state).period,
                 bounds.theta_max - bounds.theta_min,
             ]
         )
@@ -718,7 +745,7 @@ def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
 # --- Printed numbers ----------------------------------------------------------------------------
 
 
-def test_bruls_cardona_heavy_top_in_closed_form():
+def test_bruls_cardona_heavy_top_in_closed_form(long_motion):
     """See tests/test_published.py: symmetric about body axis 2, which is axis 3 here.
 
     At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own error is
@@ -742,12 +769,13 @@ def test_bruls_cardona_heavy_top_in_closed_form():
     np.testing.assert_allclose(motion.omega[0], [1.8644, -4.2537, 150.0], rtol=1e-5)
     # And against the quaternions' equations, to their accuracy over 300 radians.
     body = heavy([15.234375, 15.234375, 0.46875], [0.0, 0.0, 15.0 * 9.81])
-    states = jr.simulate(body, state0, np.array([1.0, 2.0]), rtol=1e-12).states
-    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(states.attitude), strict=True):
+    times = np.linspace(0.0, 2.0, 101)
+    attitudes = long_motion(body.inertia, body.torque.lever, state0, times).attitude
+    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(attitudes)[[50, 100]], strict=True):
         np.testing.assert_allclose(a, b * np.sign(a @ b), atol=1e-9)
 
 
-def test_simo_wong_heavy_top_in_closed_form():
+def test_simo_wong_heavy_top_in_closed_form(long_motion):
     """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
 
     Beside it the quaternions' equations, and the mean precession by quadrature.
@@ -760,14 +788,14 @@ def test_simo_wong_heavy_top_in_closed_form():
     states = jr.top_motion(simo, state0, times)
     energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states.states)
     np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
-    assert np.cos(top.nutation_bounds(simo, state0).theta_min) == pytest.approx(0.99875, abs=5e-6)
+    assert np.cos(nutation(simo, state0).bounds.theta_min) == pytest.approx(0.99875, abs=5e-6)
     body = heavy([5.0, 5.0, 1.0], [0.0, 0.0, 20.0])
-    other = jr.simulate(body, state0, times, rtol=1e-12).states
+    other = long_motion(body.inertia, body.torque.lever, state0, times)
     np.testing.assert_allclose(states.attitude, other.attitude, atol=1e-9)
     with mp.workdps(25):
         _, _, period, phi, _ = quadratures(simo, state0)
-    assert top.nutation_period(simo, state0) == pytest.approx(float(period), rel=1e-12)
-    assert top.mean_precession(simo, state0) == pytest.approx(float(phi / period), rel=1e-11)
+    assert nutation(simo, state0).period == pytest.approx(float(period), rel=1e-12)
+    assert nutation(simo, state0).precession == pytest.approx(float(phi / period), rel=1e-11)
 
 
 def test_curtis_example_11_15():
@@ -781,7 +809,7 @@ def test_curtis_example_11_15():
     rates = top.steady_precession(curtis, np.radians(60), psi_dot=1000 * rpm)
     assert rates.slow / rpm == pytest.approx(51.93, abs=0.005)
     state = top.initial_state(curtis, np.radians(60), psi_dot=1000 * rpm, phi_dot="slow")
-    assert top.mean_precession(curtis, state) / rpm == pytest.approx(51.93, abs=0.005)
+    assert nutation(curtis, state).precession / rpm == pytest.approx(51.93, abs=0.005)
 
 
 # --- Bad input ----------------------------------------------------------------------------------
@@ -840,16 +868,16 @@ def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_
 def test_tilts_that_are_nan_are_so_alone():
     """Of `effective_potential`, which takes tilts of any shape."""
     tilts = jnp.array([[0.3, np.nan], [1.0, np.inf]])
-    v = top.effective_potential(TOP, tilts, 1.0, 2.0)
+
+    def total(p_phi, tilts):
+        v = top.effective_potential(TOP, tilts, p_phi, 2.0)
+        return jnp.nansum(v), v
+
+    both = quick_jit(jax.grad(total, has_aux=True))
+    slope, v = both(1.0, tilts)
     np.testing.assert_array_equal(np.isnan(v), [[False, True], [False, True]])
-
-    def total(p_phi):
-        return jnp.nansum(top.effective_potential(TOP, tilts, p_phi, 2.0))
-
-    def good(p_phi):
-        return jnp.sum(top.effective_potential(TOP, tilts[:, 0], p_phi, 2.0))
-
-    np.testing.assert_allclose(jax.grad(total)(1.0), jax.grad(good)(1.0), rtol=1e-14)
+    good, _ = both(1.0, tilts[:, [0, 0]])
+    np.testing.assert_allclose(2 * slope, good, rtol=1e-14)
 
 
 @pytest.mark.parametrize("attitude", [2 * np.eye(4)[0], np.zeros(4)])
@@ -857,7 +885,7 @@ def test_an_attitude_that_is_none_is_outside_of_every_formula(attitude):
     state = jr.State(attitude, np.array([0.1, 0.2, 5.0]))
     for name in ("conserved", "nutation_bounds", "nutation_period", "mean_precession"):
         assert np.all(np.isnan(jax.tree.leaves(FORMULAS[name](TOP, state))))
-    assert top.motion_class(TOP, state) == top.CLASSES.undefined
+    assert nutation(TOP, state).kind == top.CLASSES.undefined
 
 
 def test_kinds_of_bad_lanes_are_undefined():
@@ -875,8 +903,9 @@ def test_no_steady_precession_leaves_shared_slopes_alone():
         rates = jax.vmap(one)(spins)
         return sum(jnp.nansum(x) for x in rates)
 
-    slope = jax.grad(total)(1.0, jnp.array([6.0, 0.1, 0.0, np.nan, 7.0]))
-    np.testing.assert_allclose(slope, jax.grad(total)(1.0, jnp.array([6.0, 7.0])), rtol=1e-13)
+    slope = quick_jit(jax.grad(total))
+    found = slope(1.0, jnp.array([6.0, 0.1, 0.0, np.nan]))
+    np.testing.assert_allclose(found, slope(1.0, jnp.full(4, 6.0)) / 4, rtol=1e-13)
 
 
 def test_no_spin_is_nan_of_the_fast_top_alone():
