@@ -176,7 +176,9 @@ def test_rates_whose_squares_underflow_and_angles_that_overflow():
     top, state = jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(4)[0], 1e10 * OMEGA)
     with pytest.raises(RuntimeError, match="out of the range"):
         jr.top_motion(top, state, 1e300)
-    assert jr.top.motion_validity(top, state, 1e300) == jr.RESULTS.nonfinite_state
+    beyond = jr.top_motion(top, state, 1e300, throw=False)
+    assert beyond.result == jr.RESULTS.nonfinite_state
+    assert np.all(np.isnan(beyond.omega))
 
 
 def test_without_gravity_it_is_the_free_body():
@@ -300,7 +302,7 @@ def test_derivative_in_time_is_euler_s_equation():
     attitude = ATTITUDE / np.linalg.norm(ATTITUDE)
     for t in (0.7, 40.0):
         found = jax.jacfwd(state_at, argnums=3)(jnp.array([1.3, 0.7, 0.9]), attitude, OMEGA, t)
-        state = jr.top_motion(top, jr.State(attitude, OMEGA), t)
+        state = jr.top_motion(top, jr.State(attitude, OMEGA), t).states
         exact = top.as_rigid_body().vector_field(t, state, None)
         np.testing.assert_allclose(found[:4], exact.attitude, atol=1e-13)
         np.testing.assert_allclose(found[4:], exact.omega, atol=1e-13)
@@ -345,37 +347,59 @@ def test_times_of_any_shape_and_the_time_of_the_start():
 
 # --- Bad input ----------------------------------------------------------------------------------
 
-GOOD = {"I1": 1.0, "I3": 0.5, "mgl": 1.0, "attitude": np.eye(4)[0], "omega": OMEGA, "t": 1.0}
+GOOD = {"I1": 1.0, "I3": 0.5, "mgl": 1.0, "q": np.eye(4)[0], "w": OMEGA, "t": 1.0, "t0": 0.0}
 BAD = {
-    "negative I1": ({"I1": -1.0}, "invalid_inertia", "`top` must have I1 > 0"),
-    "I3 zero": ({"I3": 0.0}, "invalid_inertia", "`top` must have I1 > 0"),
-    "mgl NaN": ({"mgl": np.nan}, "invalid_inertia", "finite mgl"),
-    "omega infinite": ({"omega": np.array([np.inf, 0, 0])}, "invalid_state", "finite"),
-    "attitude of norm 2": ({"attitude": 2 * np.eye(4)[0]}, "invalid_attitude", "unit quaternion"),
-    "time NaN": ({"t": np.nan}, "invalid_times", "`ts` must be finite"),
+    "negative I1": ("I1", -1.0, "invalid_top", r"`top` must have I1 > 0.*: \[-1\. +0\.5 +1\. *\]"),
+    "I3 zero": ("I3", 0.0, "invalid_top", "`top` must have I1 > 0, I3 > 0"),
+    "I3 infinite": ("I3", np.inf, "invalid_top", "`top` must have I1 > 0, I3 > 0"),
+    "mgl NaN": ("mgl", np.nan, "invalid_top", "finite mgl, but it has not: .*nan"),
+    "omega infinite": ("w", np.array([np.inf, 0, 0]), "invalid_state", "`state0` .*finite.*inf"),
+    "attitude of norm 2": ("q", 2 * np.eye(4)[0], "invalid_attitude", r"unit quaternion.*\[2\. 0"),
+    "time NaN": ("t", np.nan, "invalid_times", "`ts` must be finite, but it is not: nan"),
+    "start infinite": ("t0", np.inf, "invalid_times", "`t0` must be finite, but it is not: inf"),
 }
 
 
-def _motion(values, throw=True):
-    top = jr.SymmetricTop(values["I1"], values["I3"], values["mgl"])
-    return jr.top_motion(
-        top, jr.State(values["attitude"], values["omega"]), values["t"], throw=throw
-    )
+def motion_of(I1, I3, mgl, q, w, t, t0, throw=False):
+    return jr.top_motion(jr.SymmetricTop(I1, I3, mgl), jr.State(q, w), t, t0=t0, throw=throw)
+
+
+@pytest.fixture(scope="module")
+def in_lanes():
+    """All bad inputs, each a lane, and the good one as the last."""
+    inputs = [{**GOOD, name: value} for name, value, _, _ in BAD.values()] + [GOOD]
+    lanes = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y, float) for y in x]), *inputs)
+    return lanes, jax.jit(jax.vmap(lambda x: motion_of(**x)))(lanes)
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_values_are_errors_with_a_code(name):
-    changed, code, message = BAD[name]
-    values = {**GOOD, **changed}
+def test_bad_values_are_errors_with_a_code(name, in_lanes):
+    changed, value, code, message = BAD[name]
     with pytest.raises(RuntimeError, match=message):
-        _motion(values)
-    with pytest.raises(RuntimeError, match=message):
-        jax.block_until_ready(jax.jit(_motion)(values))
-    state = _motion(values, throw=False)
-    assert np.all(np.isnan(state.attitude)) and np.all(np.isnan(state.omega))  # noqa: PT018
-    top = jr.SymmetricTop(values["I1"], values["I3"], values["mgl"])
-    found = jr.top.motion_validity(top, jr.State(values["attitude"], values["omega"]), values["t"])
-    assert found == getattr(jr.RESULTS, code)
+        motion_of(**{**GOOD, changed: value}, throw=True)
+    lane = list(BAD).index(name)
+    _, motion = in_lanes
+    assert np.all(np.isnan(motion.attitude[lane]))
+    assert np.all(np.isnan(motion.omega[lane]))
+    codes = motion.result == getattr(jr.RESULTS, code)
+    assert codes[lane]
+    assert not codes[-1]
+
+
+def test_a_good_lane_among_bad_ones_is_as_alone_and_the_first_is_named(in_lanes):
+    lanes, motion = in_lanes
+    alone = motion_of(**GOOD, throw=True)
+    np.testing.assert_allclose(motion.attitude[-1], alone.attitude, rtol=0, atol=ulps(float, 4))
+    np.testing.assert_allclose(motion.omega[-1], alone.omega, rtol=0, atol=ulps(float, 4))
+    assert (motion.result == jr.RESULTS.successful)[-1]
+    assert alone.result == jr.RESULTS.successful
+    with pytest.raises(RuntimeError, match=f"in lane 0 and {len(BAD) - 1} more"):
+        jax.vmap(lambda x: motion_of(**x, throw=True))(lanes)
+
+
+def test_inside_jit_the_error_names_the_argument():
+    with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
+        jax.jit(lambda x: motion_of(**x, throw=True).omega)({**GOOD, "I1": -1.0})
 
 
 def test_a_bad_lane_leaves_the_others_and_shared_gradients_alone():
@@ -399,7 +423,7 @@ def test_a_bad_lane_leaves_the_others_and_shared_gradients_alone():
     ("arguments", "message"),
     [
         ((np.array([1.0, 1.0, 0.5]), jr.State(np.eye(4)[0], OMEGA), 1.0), "`top` must be a Symm"),
-        ((jr.SymmetricTop(1.0, 0.5, 1.0), OMEGA, 1.0), "`state` must be a State"),
+        ((jr.SymmetricTop(1.0, 0.5, 1.0), OMEGA, 1.0), "`state0` must be a State"),
         ((jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(3)[0], OMEGA), 1.0), "shape \\(4,\\)"),
     ],
 )

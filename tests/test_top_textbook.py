@@ -1,5 +1,7 @@
 """What a textbook says of the heavy top, against other routes to it and printed numbers."""
 
+from typing import NamedTuple
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -44,6 +46,26 @@ KINDS = {
     "sleeping": "sleeping",
     "hanging": "sleeping",
 }
+
+
+class Nutation(NamedTuple):
+    bounds: top.NutationBounds
+    period: jax.Array
+    advance: top.Advance
+    precession: jax.Array
+    kind: top.CLASSES
+
+
+@jax.jit
+def nutation(one, state):
+    """What is said of a motion, compiled once for all tests."""
+    return Nutation(
+        top.nutation_bounds(one, state),
+        top.nutation_period(one, state),
+        top.advance_per_nutation(one, state),
+        top.mean_precession(one, state),
+        top.motion_class(one, state),
+    )
 
 
 def start(name, **more):
@@ -104,7 +126,7 @@ def routes():
         by_quaternions = jr.simulate(TOP.as_rigid_body(), state0, TIMES, rtol=1e-11).states
         return jr.top_motion(TOP, state0, TIMES), by_quaternions, heights_by_cubic(state0)
 
-    return jax.jit(two), jax.jit(
+    return quick_jit(two), quick_jit(
         lambda q0, rates: (by_lagrangian(q0, rates), by_reduction(q0, rates))
     )
 
@@ -179,18 +201,23 @@ def test_potential_at_the_vertical():
     assert np.all(np.isfinite(jax.grad(v, argnums=(0, 1, 2))(0.0, 3.0, 3.0)))
 
 
-@pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
-def test_slopes_of_potential_and_rates_in_the_momenta(p_phi):
-    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
-
+@pytest.fixture(scope="module")
+def of_the_momenta():
     def both(p):
         rates = top.angle_rates(TOP, 1.0, p, 3.0)
         return jnp.stack([top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi])
 
-    found, h = jax.jacfwd(both)(p_phi), 1e-5
-    difference = (both(p_phi + h) - both(p_phi - h)) / (2 * h)
+    return jax.jit(both), quick_jit(jax.jacfwd(both)), quick_jit(jax.jacfwd(jax.jacfwd(both)))
+
+
+@pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
+def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
+    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
+    value, slope, curvature = of_the_momenta
+    found, h = slope(p_phi), 1e-5
+    difference = (value(p_phi + h) - value(p_phi - h)) / (2 * h)
     np.testing.assert_allclose(found, difference, atol=1e-9)
-    curvature = jax.jacfwd(jax.jacfwd(both))(p_phi)
+    curvature = curvature(p_phi)
     np.testing.assert_allclose(curvature, [1 / np.sin(1.0) ** 2, 0, 0], atol=1e-13)
 
 
@@ -227,12 +254,12 @@ def test_bounds_period_and_advance_are_the_textbook_s_integrals(name):
     with mp.workdps(25):
         low, high, period, phi, psi = (float(x) for x in quadratures(TOP, start(name)))
     state = start(name)
-    bounds = top.nutation_bounds(TOP, state)
+    bounds = nutation(TOP, state).bounds
     np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13)
-    assert top.nutation_period(TOP, state) == pytest.approx(period, rel=1e-13)
-    advance = top.advance_per_nutation(TOP, state)
+    assert nutation(TOP, state).period == pytest.approx(period, rel=1e-13)
+    advance = nutation(TOP, state).advance
     np.testing.assert_allclose([advance.phi, advance.psi], [phi, psi], rtol=1e-12)
-    assert top.mean_precession(TOP, state) == pytest.approx(phi / period, rel=1e-12)
+    assert nutation(TOP, state).precession == pytest.approx(phi / period, rel=1e-12)
 
 
 @pytest.mark.parametrize("mgl", [1.0, -1.0, 0.0])
@@ -242,34 +269,34 @@ def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
         one = jr.SymmetricTop(1.3, rng.uniform(0.3, 2), mgl)
         q = rng.normal(size=4)
         state = jr.State(q / np.linalg.norm(q), rng.normal(size=3) * rng.choice([0.3, 1, 3]))
-        period = float(top.nutation_period(one, state))
+        period = float(nutation(one, state).period)
         motion = np.asarray(jr.top_motion(one, state, np.linspace(0, period, 4001)).attitude)
         sum_ = np.unwrap(np.arctan2(motion[:, 3], motion[:, 0]))
         difference = np.unwrap(np.arctan2(motion[:, 2], motion[:, 1]))
         phi, psi = sum_ + difference, sum_ - difference
         tilt = np.arccos(np.clip(2 * (motion[:, 0] ** 2 + motion[:, 3] ** 2) - 1, -1, 1))
-        bounds = top.nutation_bounds(one, state)
+        bounds = nutation(one, state).bounds
         extent = [tilt.min(), tilt.max()]
         np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], extent, atol=1e-4)
         assert tilt[-1] == pytest.approx(tilt[0], abs=1e-11)
-        advance = top.advance_per_nutation(one, state)
+        advance = nutation(one, state).advance
         np.testing.assert_allclose(advance, [phi[-1] - phi[0], psi[-1] - psi[0]], atol=1e-11)
         steps = np.diff(phi)
-        kind = "loop" if np.min(steps) < 0 < np.max(steps) else "wave"
-        assert top.CLASSES[int(top.motion_class(one, state))] == kind
+        kind = top.CLASSES.loop if np.min(steps) < 0 < np.max(steps) else top.CLASSES.wave
+        assert nutation(one, state).kind == kind
 
 
 @pytest.mark.parametrize("name", STARTS)
 def test_kinds_of_motion(name):
-    assert top.CLASSES[int(top.motion_class(TOP, start(name)))] == KINDS[name]
-    # Any later state is of the same kind, and so is the same motion with the axis named backward.
-    later = jr.top_motion(TOP, start(name), 1.7)
-    assert top.CLASSES[int(top.motion_class(TOP, later))] == KINDS[name]
     state = start(name)
+    assert top.CLASSES[nutation(TOP, state).kind] == KINDS[name]
+    # Any later state is of the same kind, and so is the same motion with the axis named backward.
+    later = jr.top_motion(TOP, state, 1.7).states
+    assert top.CLASSES[nutation(TOP, later).kind] == KINDS[name]
     back = rotation.multiply(state.attitude, np.array([0.0, 1, 0, 0]))
     backward = jr.State(back, state.omega * np.array([1.0, -1, -1]))
     reversed_ = jr.SymmetricTop(TOP.I1, TOP.I3, -TOP.mgl)
-    assert top.CLASSES[int(top.motion_class(reversed_, backward))] == KINDS[name]
+    assert top.CLASSES[nutation(reversed_, backward).kind] == KINDS[name]
 
 
 @pytest.mark.parametrize("theta", [0.0, np.pi])
@@ -277,12 +304,18 @@ def test_kinds_of_motion(name):
 def test_a_top_at_the_vertical_sleeps(theta, omega3):
     state = top.initial_state(TOP, theta, omega3=omega3)
     state = jr.State(np.round(state.attitude, 15), state.omega)
-    assert top.CLASSES[int(top.motion_class(TOP, state))] == "sleeping"
+    assert nutation(TOP, state).kind == top.CLASSES.sleeping
 
 
 def test_a_bad_state_has_no_kind():
     state = jr.State(np.eye(4)[0], np.array([np.nan, 0, 0]))
-    assert top.motion_class(TOP, state, throw=False) == -1
+    assert nutation(TOP, state).kind == top.CLASSES.undefined
+
+
+def test_kinds_are_listed_with_their_texts():
+    texts = ["wave", "cusp", "loop", "steady", "sleeping", "pendulum", "through the vertical"]
+    assert top.CLASSES.texts == [*texts, "undefined"]
+    assert {"wave", "through_the_vertical", "undefined"} <= set(dir(top.CLASSES))
 
 
 @pytest.fixture(scope="module")
@@ -318,9 +351,9 @@ def test_small_swings_keep_their_relative_size():
     """Of a pendulum about hanging, and of a cusp beside the vertical."""
     for small in (1e-3, 1e-7, 1e-12):
         attitude = np.array([np.sin(small / 2), np.cos(small / 2), 0, 0])
-        bounds = top.nutation_bounds(TOP, jr.State(attitude, np.zeros(3)))
+        bounds = nutation(TOP, jr.State(attitude, np.zeros(3))).bounds
         assert np.pi - bounds.theta_min == pytest.approx(small, rel=1e-12 + 5e-16 / small)
-        bounds = top.nutation_bounds(TOP, top.initial_state(TOP, small, omega3=6.0))
+        bounds = nutation(TOP, top.initial_state(TOP, small, omega3=6.0)).bounds
         # theta_max^2 / theta_min^2 = spin^2 / (spin^2 - 4 mgl I1 / I3^2)
         assert bounds.theta_max / bounds.theta_min == pytest.approx((36 / 20) ** 0.5, rel=1e-6)
 
@@ -329,15 +362,15 @@ def test_the_endless_motion_comes_to_the_vertical_at_its_rate():
     for mgl, sign in ((1.0, 1.0), (-1.0, -1.0)):
         attitude = np.array([1.0, 0, 0, 0]) if mgl > 0 else np.array([0.0, 1, 0, 0])
         one, state = jr.SymmetricTop(1.0, 0.5, mgl), jr.State(attitude, np.array([0, 0, 2.0]))
-        assert top.nutation_period(one, state) == np.inf
-        assert top.mean_precession(one, state) == pytest.approx(sign * 0.5)
+        assert nutation(one, state).period == np.inf
+        assert nutation(one, state).precession == pytest.approx(sign * 0.5)
 
 
 @pytest.mark.parametrize("tilt", [1e-6, 1e-9, 1e-30])
 def test_precession_at_the_threshold_of_sleeping(tilt):
     """The slower a nutation, the longer the axis stands upright and turns at I3 omega3 / (2 I1)."""
     state = top.initial_state(TOP, tilt, omega3=4.0)
-    assert top.mean_precession(TOP, state) == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
+    assert nutation(TOP, state).precession == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
 
 
 SPECIAL = {
@@ -395,7 +428,7 @@ def test_steady_precession_is_steady(branch, theta, spin):
     advance = rate * ts
     expected = np.sin(theta) * np.stack([np.sin(advance), -np.cos(advance)], axis=1)
     np.testing.assert_allclose(axis[:, :2], expected, atol=1e-11)
-    assert top.mean_precession(TOP, state0) == pytest.approx(rate, rel=1e-12)
+    assert nutation(TOP, state0).precession == pytest.approx(rate, rel=1e-12)
 
 
 def test_when_steady_precession_exists():
@@ -412,9 +445,11 @@ def test_when_steady_precession_exists():
     level = top.steady_precession(TOP, np.pi / 2, 5.0)
     assert level.slow == pytest.approx(1 / (0.5 * 5.0))
     assert level.fast == np.inf
-    with pytest.raises(RuntimeError, match="large enough for steady"):
+    with pytest.raises(RuntimeError, match=r"`omega3` must be large enough for steady.*: 1\.0"):
         top.initial_state(TOP, theta, omega3=1.0, phi_dot="slow")
-    with pytest.raises(RuntimeError, match="finite"):
+    with pytest.raises(RuntimeError, match="`psi_dot` must be large enough for steady"):
+        top.initial_state(TOP, theta, psi_dot=1.0, phi_dot="slow")
+    with pytest.raises(RuntimeError, match=r"`theta` must not be level .* infinite"):
         top.initial_state(TOP, np.pi / 2, omega3=5.0, phi_dot="fast")
     slopes = jax.grad(lambda w: top.steady_precession(TOP, theta, w).slow)(6.0)
     assert slopes == pytest.approx(
@@ -433,11 +468,11 @@ def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least
     spin = factor * float(top.sleeping_spin(TOP))
     assert spin == factor * 4.0
     state = top.initial_state(TOP, 1e-6, omega3=spin)
-    largest = np.degrees(top.nutation_bounds(TOP, state).theta_max)
+    largest = np.degrees(nutation(TOP, state).bounds.theta_max)
     assert least < largest < most
     if factor < 1:
         assert largest == pytest.approx(np.degrees(np.arccos(2 * factor**2 - 1)), rel=1e-6)
-    times = np.linspace(0.0, 2 * float(top.nutation_period(TOP, state)), 4001)
+    times = np.linspace(0.0, 2 * float(nutation(TOP, state).period), 4001)
     motion = np.asarray(jr.top_motion(TOP, state, times).attitude)
     reached = np.degrees(2 * np.arcsin(np.hypot(motion[:, 1], motion[:, 2]).max()))
     assert reached == pytest.approx(largest, rel=1e-4)
@@ -448,19 +483,18 @@ def test_gyroscopic_approximation_becomes_exact():
     errors = []
     for omega3 in (40.0, 80.0):
         state = top.initial_state(TOP, theta, omega3=omega3)
-        bounds = top.nutation_bounds(TOP, state)
+        bounds = nutation(TOP, state).bounds
         exact = np.array(
             [
-                top.mean_precession(TOP, state),
-                2 * np.pi / top.nutation_period(TOP, state),
+                nutation(TOP, state).precession,
+                2 * np.pi / nutation(TOP, state).period,
                 bounds.theta_max - bounds.theta_min,
             ]
         )
         errors.append(np.abs(np.array(top.gyroscopic(TOP, theta, omega3)) / exact - 1))
     assert np.all(errors[0] < 4 * 1.0 / (0.5 * 40) ** 2)
     np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.05)
-    with pytest.raises(RuntimeError, match="`omega3` must not be zero"):
-        top.gyroscopic(TOP, theta, 0.0)
+    assert np.all(np.isnan(top.gyroscopic(TOP, theta, 0.0)))
 
 
 def test_starts_mean_what_they_say(untyped):
@@ -476,8 +510,37 @@ def test_starts_mean_what_they_say(untyped):
         top.initial_state(TOP, 0.7, psi_dot=1.0, omega3=1.0)
     with pytest.raises(ValueError, match="must be one of 'slow', 'fast'"):
         top.initial_state(TOP, 0.7, omega3=5.0, phi_dot="quick")
-    with pytest.raises(RuntimeError, match="must be finite"):
-        top.initial_state(TOP, np.nan)
+    for name in ("psi_dot", "omega3", "phi_dot", "theta_dot", "phi", "psi"):
+        with pytest.raises(RuntimeError, match=f"`{name}` must be finite, but it is not: inf"):
+            top.initial_state(TOP, 0.7, **{name: np.inf})
+    with pytest.raises(
+        RuntimeError, match=r"`top` must have I1 > 0, .* not: \[ 1\. +-0\.5 +1\. \]"
+    ):
+        top.initial_state(jr.SymmetricTop(1.0, -0.5, 1.0), 0.7)
+
+
+@pytest.mark.parametrize("theta", [30.0, -0.1, 3.2, np.nan, np.inf])
+def test_a_tilt_beyond_half_a_turn_is_an_error_that_says_radians(theta):
+    with pytest.raises(RuntimeError, match=f"`theta` must be from 0 to pi.*: {theta}.*radians"):
+        top.initial_state(TOP, theta)
+    with pytest.raises(RuntimeError, match="in lane 1"):
+        jax.vmap(lambda x: top.initial_state(TOP, x))(jnp.array([0.5, theta, 0.6]))
+
+    def heights(tilts, omega3):
+        states = jax.vmap(lambda x: top.initial_state(TOP, x, omega3=omega3, throw=False))(tilts)
+        first = states.attitude[:, 0] * states.omega[:, 2]
+        return jnp.sum(jnp.where(jnp.isnan(first), 0.0, first)), states
+
+    tilts = jnp.array([0.5, theta, 0.6])
+    slopes, states = jax.grad(heights, argnums=(0, 1), has_aux=True)(tilts, 2.0)
+    assert list(np.isnan(states.omega[:, 2])) == [False, True, False]
+    np.testing.assert_allclose(slopes[0], [-np.sin(0.25), 0, -np.sin(0.3)])
+    np.testing.assert_allclose(slopes[1], np.cos(0.25) + np.cos(0.3))
+
+
+def test_tilts_of_the_vertical_pass_in_either_precision():
+    for theta in (0.0, np.pi, np.float32(np.pi), float(np.float32(np.pi)), np.radians(180)):
+        assert np.all(np.isfinite(top.initial_state(TOP, theta).attitude))
 
 
 def test_a_top_from_mass_properties():
@@ -485,20 +548,63 @@ def test_a_top_from_mass_properties():
     disk = jr.solids.disk(0.3, 0.05).translated(np.array([0.0, 0.0, 0.08]))
     rod = jr.solids.rod(0.1, 0.2).translated(np.array([0.0, 0.0, 0.1]))
     body = disk + rod
-    held = jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, 9.8)
+    down = np.array([0.0, 0.0, -9.8])
+    held = jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, down)
     across = 0.3 * 0.05**2 / 4 + 0.3 * 0.08**2 + 0.1 * 0.2**2 / 3
     np.testing.assert_allclose(held.I1, across, rtol=1e-14)
     np.testing.assert_allclose(held.I3, 0.3 * 0.05**2 / 2, rtol=1e-14)
     np.testing.assert_allclose(held.mgl, 9.8 * (0.3 * 0.08 + 0.1 * 0.1), rtol=1e-14)
-    below = jr.SymmetricTop.from_mass_properties(body, -body.center_of_mass, 9.8)
-    np.testing.assert_allclose([below.I1, below.mgl], [held.I1, -held.mgl], rtol=1e-14)
-    with pytest.raises(RuntimeError, match="symmetric about body axis 3"):
+    for lever, pull in ((-body.center_of_mass, down), (body.center_of_mass, -down)):
+        below = jr.SymmetricTop.from_mass_properties(body, lever, pull)
+        np.testing.assert_allclose([below.I1, below.mgl], [held.I1, -held.mgl], rtol=1e-14)
+    on_earth = jr.SymmetricTop.from_mass_properties(body, body.center_of_mass)
+    np.testing.assert_allclose(on_earth.mgl / held.mgl, 9.80665 / 9.8, rtol=1e-14)
+    with pytest.raises(RuntimeError, match=r"`lever` must lie along body axis 3.*: \[0\.01 0\. "):
         jr.SymmetricTop.from_mass_properties(body, np.array([0.01, 0.0, 0.1]))
+    with pytest.raises(RuntimeError, match="`gravity` must lie along z in space"):
+        jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, down + 0.1)
+    with pytest.raises(RuntimeError, match=r"`gravity` must lie along z in space.*nan"):
+        jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, down * np.nan)
     box = jr.solids.box(1.0, np.array([1.0, 2.0, 3.0]))
-    with pytest.raises(RuntimeError, match="symmetric about body axis 3"):
+    with pytest.raises(RuntimeError, match=r"`body` .* symmetric about its axis 3.*: \[1\.08"):
         jr.SymmetricTop.from_mass_properties(box, np.array([0.0, 0.0, 1.5]))
-    bad = jr.SymmetricTop.from_mass_properties(body, np.array([0.01, 0, 0.1]), throw=False)
-    assert np.isnan(bad.I1)
+
+
+def test_a_bad_lever_is_nan_in_its_lane_alone():
+    body = jr.solids.disk(0.3, 0.05)
+
+    def weights(mass_scale, levers):
+        def one(lever):
+            scaled = jr.MassProperties(body.mass * mass_scale, np.zeros(3), body.inertia)
+            return jr.SymmetricTop.from_mass_properties(scaled, lever, throw=False).mgl
+
+        mgl = jax.vmap(one)(levers)
+        return jnp.sum(jnp.where(jnp.isnan(mgl), 0.0, mgl)), mgl
+
+    levers = jnp.array([[0, 0, 0.1], [0.01, 0, 0.1], [0, 0, np.nan], [0, 0, 0.2]])
+    slope, mgl = jax.grad(weights, has_aux=True)(1.0, levers)
+    assert list(np.isnan(mgl)) == [False, True, True, False]
+    np.testing.assert_allclose(slope, 0.3 * 9.80665 * 0.3, rtol=1e-13)
+
+
+def test_a_cone_on_its_tip_is_the_top_of_the_example():
+    """About the tip 3 m (R^2 + 4 h^2) / 20 across, and the tip at the pivot."""
+    radius, height = 0.03, 0.08
+    cone = jr.solids.cone(0.5, radius, height)
+    tip_down = cone.rotated(rotation.exp(np.array([np.pi, 0.0, 0.0])))
+    one = jr.SymmetricTop.from_mass_properties(tip_down, np.array([0.0, 0.0, 0.75 * height]))
+    np.testing.assert_allclose(one.I1, 3 * 0.5 * (radius**2 + 4 * height**2) / 20, rtol=1e-14)
+    np.testing.assert_allclose(one.I3, 3 * 0.5 * radius**2 / 10, rtol=1e-14)
+    # The mean height of its points above the pivot, from those of the solid.
+    zs = (np.arange(1000) + 0.5) / 1000 * height
+    mean = np.sum(zs * zs**2) / np.sum(zs**2)
+    np.testing.assert_allclose(one.mgl, 0.5 * 9.80665 * mean, rtol=1e-6)
+
+
+def test_a_top_prints_its_numbers():
+    assert repr(TOP) == "SymmetricTop(I1=1., I3=0.5, mgl=1.)"
+    slope = jax.grad(lambda one: top.sleeping_spin(one))(TOP)
+    assert repr(slope) == "SymmetricTop(I1=2., I3=-8., mgl=2.)"
 
 
 # --- Other integrable bodies --------------------------------------------------------------------
@@ -584,31 +690,62 @@ def test_the_extra_integral_s_rate_is_zero_for_generic_bodies_of_the_case(rng):
         assert abs(moved.extra) > 1e-11
 
 
-def test_a_body_that_is_not_of_the_case_is_an_error(untyped):
+def test_a_body_that_is_not_of_the_case_is_nan(untyped):
     body, omega = INTEGRABLE["kovalevskaya"]
     state = jr.State(ATTITUDE, omega)
-    with pytest.raises(RuntimeError, match="I1 = I2 = 4 I3"):
-        top.integrals(body, state, "goryachev-chaplygin")
-    with pytest.raises(RuntimeError, match="Lagrange's case"):
-        top.integrals(body, state, "lagrange")
-    with pytest.raises(RuntimeError, match="Euler's case"):
-        top.integrals(body, state, "euler")
-    with pytest.raises(RuntimeError, match="no angular momentum about the vertical"):
-        top.integrals(INTEGRABLE["goryachev-chaplygin"][0], state, "goryachev-chaplygin")
+    others = [(body, "goryachev-chaplygin"), (body, "lagrange"), (body, "euler")]
+    others += [(INTEGRABLE["lagrange"][0], "kovalevskaya")]
+    others += [(heavy([2.0, 2.1, 1.0], [0.4, 0.3, 0.0]), "kovalevskaya")]
+    others += [(heavy([2.0, 2.0, 1.0], [0.4, 0.3, 0.1]), "kovalevskaya")]
+    # With angular momentum about the vertical:
+    others += [(INTEGRABLE["goryachev-chaplygin"][0], "goryachev-chaplygin")]
+    for other, case in others:
+        assert np.all(np.isnan(top.integrals(other, state, case))), case
     with pytest.raises(ValueError, match="must be one of"):
         top.integrals(body, state, "steklov")
     with pytest.raises(ValueError, match="UniformGravity"):
         top.integrals(jr.RigidBody(np.ones(3)), state)
     with pytest.raises(ValueError, match="principal moments"):
         top.integrals(heavy(np.eye(3), [0.0, 0, 1]), state, "lagrange")
-    assert np.isnan(top.integrals(body, state, "lagrange", throw=False).extra)
     assert top.integrals(heavy(np.eye(3), [0.0, 0, 1]), state).extra is None
+
+
+@pytest.mark.parametrize("case", INTEGRABLE)
+def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
+    body, omega = INTEGRABLE[case]
+
+    def total(mass, moments, attitude, pull):
+        gravity = jr.torques.UniformGravity(mass, body.torque.lever, pull)
+        values = top.integrals(jr.RigidBody(moments, gravity), jr.State(attitude, omega), case)
+        return sum(jnp.where(jnp.isnan(x), 0.0, x) for x in values), values
+
+    @quick_jit
+    def lanes(mass, *lanes):
+        def sum_(mass):
+            sums, values = jax.vmap(total, (None, 0, 0, 0))(mass, *lanes)
+            return jnp.sum(sums), values
+
+        return jax.value_and_grad(sum_, has_aux=True)(mass)
+
+    moments, down = body.inertia, np.array([0.0, 0.0, -1.0])
+    good = moments, ATTITUDE, down
+    bad = [
+        (-moments, ATTITUDE, down), (moments * np.nan, ATTITUDE, down),
+        (moments, 2 * ATTITUDE, down), (moments, ATTITUDE * np.nan, down),
+        (moments, ATTITUDE, down * np.nan), (moments, ATTITUDE, np.array([np.inf, 0.0, 0.0])),
+    ]  # fmt: skip
+    (_, values), slope = lanes(1.0, *(jnp.stack(x) for x in zip(good, *bad, good, strict=True)))
+    for value in values:
+        assert list(np.isnan(value)) == [False, *(True for _ in bad), False]
+    _, alone = lanes(1.0, *(jnp.stack([x] * (2 + len(bad))) for x in good))
+    np.testing.assert_allclose(slope, alone / 4, rtol=1e-13)
+    assert np.all(np.isnan(total(-1.0, *good)[1]))
 
 
 # --- Printed numbers ----------------------------------------------------------------------------
 
 
-def test_bruls_cardona_heavy_top_in_closed_form():
+def test_bruls_cardona_heavy_top_in_closed_form(long_motion):
     """See tests/test_published.py: symmetric about body axis 2, which is axis 3 here.
 
     At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own error is
@@ -632,12 +769,13 @@ def test_bruls_cardona_heavy_top_in_closed_form():
     np.testing.assert_allclose(motion.omega[0], [1.8644, -4.2537, 150.0], rtol=1e-5)
     # And against the quaternions' equations, to their accuracy over 300 radians.
     body = heavy([15.234375, 15.234375, 0.46875], [0.0, 0.0, 15.0 * 9.81])
-    states = jr.simulate(body, state0, np.array([1.0, 2.0]), rtol=1e-12).states
-    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(states.attitude), strict=True):
+    times = np.linspace(0.0, 2.0, 101)
+    attitudes = long_motion(body.inertia, body.torque.lever, state0, times).attitude
+    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(attitudes)[[50, 100]], strict=True):
         np.testing.assert_allclose(a, b * np.sign(a @ b), atol=1e-9)
 
 
-def test_simo_wong_heavy_top_in_closed_form():
+def test_simo_wong_heavy_top_in_closed_form(long_motion):
     """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
 
     Beside it the quaternions' equations, and the mean precession by quadrature.
@@ -648,16 +786,16 @@ def test_simo_wong_heavy_top_in_closed_form():
     assert keeps.energy == pytest.approx(1269.975, abs=5e-4)
     times = np.linspace(0.0, 10.0, 101)
     states = jr.top_motion(simo, state0, times)
-    energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states)
+    energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states.states)
     np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
-    assert np.cos(top.nutation_bounds(simo, state0).theta_min) == pytest.approx(0.99875, abs=5e-6)
+    assert np.cos(nutation(simo, state0).bounds.theta_min) == pytest.approx(0.99875, abs=5e-6)
     body = heavy([5.0, 5.0, 1.0], [0.0, 0.0, 20.0])
-    other = jr.simulate(body, state0, times, rtol=1e-12).states
+    other = long_motion(body.inertia, body.torque.lever, state0, times)
     np.testing.assert_allclose(states.attitude, other.attitude, atol=1e-9)
     with mp.workdps(25):
         _, _, period, phi, _ = quadratures(simo, state0)
-    assert top.nutation_period(simo, state0) == pytest.approx(float(period), rel=1e-12)
-    assert top.mean_precession(simo, state0) == pytest.approx(float(phi / period), rel=1e-11)
+    assert nutation(simo, state0).period == pytest.approx(float(period), rel=1e-12)
+    assert nutation(simo, state0).precession == pytest.approx(float(phi / period), rel=1e-11)
 
 
 def test_curtis_example_11_15():
@@ -671,42 +809,147 @@ def test_curtis_example_11_15():
     rates = top.steady_precession(curtis, np.radians(60), psi_dot=1000 * rpm)
     assert rates.slow / rpm == pytest.approx(51.93, abs=0.005)
     state = top.initial_state(curtis, np.radians(60), psi_dot=1000 * rpm, phi_dot="slow")
-    assert top.mean_precession(curtis, state) / rpm == pytest.approx(51.93, abs=0.005)
+    assert nutation(curtis, state).precession / rpm == pytest.approx(51.93, abs=0.005)
 
 
 # --- Bad input ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        top.conserved, top.nutation_bounds, top.nutation_period, top.mean_precession,
-        top.advance_per_nutation, top.motion_class,
-    ],
-)  # fmt: skip
-def test_bad_tops_and_states_are_errors_or_nan_in_their_lane(function):
-    state = start("wave")
-    with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
-        function(jr.SymmetricTop(1.0, -0.5, 1.0), state)
-    with pytest.raises(RuntimeError, match="unit quaternion"):
-        jax.jit(function)(TOP, jr.State(2 * state.attitude, state.omega))
-    i1 = jnp.array([1.0, -1.0, 1.2])
-    lanes = jax.vmap(lambda x: function(jr.SymmetricTop(x, 0.5, 1.0), state, throw=False))(i1)
-    for leaf in jax.tree.leaves(lanes):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            assert list(np.isnan(leaf)) == [False, True, False]
-        else:
-            assert list(leaf == -1) == [False, True, False]
+FORMULAS = {
+    "conserved": top.conserved,
+    "nutation_bounds": top.nutation_bounds,
+    "nutation_period": top.nutation_period,
+    "mean_precession": top.mean_precession,
+    "advance_per_nutation": top.advance_per_nutation,
+    "cubic": lambda one, s: top.cubic(one, top.Conserved(s.omega[2], 2.0, s.attitude[0])),
+    "angle_rates": lambda one, s: top.angle_rates(one, s.attitude[0], s.omega[2], 2.0),
+    "effective_potential": lambda one, s: top.effective_potential(
+        one, jnp.stack([s.attitude[0], s.attitude[0]]), s.omega[2], 2.0
+    ),
+    "steady_precession": lambda one, s: top.steady_precession(one, s.attitude[0], s.omega[2])[:2],
+    "gyroscopic": lambda one, s: top.gyroscopic(one, s.attitude[0], s.omega[2]),
+    "sleeping_spin": lambda one, _: top.sleeping_spin(one),
+}
 
 
-def test_bad_values_of_special_motions():
-    with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
-        top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0))
-    with pytest.raises(RuntimeError, match="must be finite"):
-        top.steady_precession(TOP, np.nan, 1.0)
+@pytest.mark.parametrize("name", FORMULAS)
+def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_alone(name):
+    """Bad tops, then bad states; the slopes of what all lanes share are those of the good ones."""
+    state = start("wave", psi=0.3, theta_dot=0.1)
+
+    def total(shared, i1, attitudes, omegas):
+        def one(i1, attitude, omega):
+            own = jr.SymmetricTop(i1 + shared[0], 0.5 + shared[1], 1 + shared[2])
+            return FORMULAS[name](own, jr.State(attitude + shared[3], omega + shared[4]))
+
+        values = jax.tree.leaves(jax.vmap(one)(i1, attitudes, omegas))
+        return sum(jnp.sum(jnp.where(jnp.isnan(x), 0.0, x)) for x in values), values
+
+    both = quick_jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
+    i1 = np.array([1.0, 1.0, -1.0, np.nan, np.inf, 1.0, 1.0, 1.2])
+    bad = np.array([0, 0, 0, 0, 0, 1, 1, 0], bool)
+    attitudes, omegas = (np.tile(x, (8, 1)) for x in (state.attitude, state.omega))
+    attitudes[5], omegas[6] = np.nan, np.inf
+    (_, values), slopes = both(jnp.zeros(5), i1, attitudes, omegas)
+    outside = ~(i1 < 2) | (i1 < 0) | (bad & (name != "sleeping_spin"))
+    for value in values:
+        isnan = np.isnan(value).reshape(8, -1)
+        np.testing.assert_array_equal(isnan, np.broadcast_to(outside[:, None], isnan.shape))
+    tame = np.flatnonzero(~outside)
+    assert np.all(np.isfinite(slopes[0]))
+    assert np.all(np.asarray(slopes[1])[outside] == 0)
+    alone = sum(
+        both(jnp.zeros(5), *(np.stack([x[k]] * 8) for x in (i1, attitudes, omegas)))[1][0] / 8
+        for k in tame
+    )
+    np.testing.assert_allclose(slopes[0], alone, rtol=1e-12, atol=1e-12)
+
+
+def test_tilts_that_are_nan_are_so_alone():
+    """Of `effective_potential`, which takes tilts of any shape."""
+    tilts = jnp.array([[0.3, np.nan], [1.0, np.inf]])
+
+    def total(p_phi, tilts):
+        v = top.effective_potential(TOP, tilts, p_phi, 2.0)
+        return jnp.nansum(v), v
+
+    both = quick_jit(jax.grad(total, has_aux=True))
+    slope, v = both(1.0, tilts)
+    np.testing.assert_array_equal(np.isnan(v), [[False, True], [False, True]])
+    good, _ = both(1.0, tilts[:, [0, 0]])
+    np.testing.assert_allclose(2 * slope, good, rtol=1e-14)
+
+
+@pytest.mark.parametrize("attitude", [2 * np.eye(4)[0], np.zeros(4)])
+def test_an_attitude_that_is_none_is_outside_of_every_formula(attitude):
+    state = jr.State(attitude, np.array([0.1, 0.2, 5.0]))
+    for name in ("conserved", "nutation_bounds", "nutation_period", "mean_precession"):
+        assert np.all(np.isnan(jax.tree.leaves(FORMULAS[name](TOP, state))))
+    assert nutation(TOP, state).kind == top.CLASSES.undefined
+
+
+def test_kinds_of_bad_lanes_are_undefined():
+    i1 = jnp.array([1.0, -1.0, np.nan])
+    kinds = jax.vmap(lambda x: top.motion_class(jr.SymmetricTop(x, 0.5, 1.0), start("wave")))(i1)
+    np.testing.assert_array_equal(kinds == top.CLASSES.undefined, [False, True, True])
+    np.testing.assert_array_equal(kinds == top.CLASSES.wave, [True, False, False])
+
+
+def test_no_steady_precession_leaves_shared_slopes_alone():
+    def total(i1, spins):
+        def one(spin):
+            return top.steady_precession(jr.SymmetricTop(i1, 0.5, 1.0), 0.7, spin)[:2]
+
+        rates = jax.vmap(one)(spins)
+        return sum(jnp.nansum(x) for x in rates)
+
+    slope = quick_jit(jax.grad(total))
+    found = slope(1.0, jnp.array([6.0, 0.1, 0.0, np.nan]))
+    np.testing.assert_allclose(found, slope(1.0, jnp.full(4, 6.0)) / 4, rtol=1e-13)
+
+
+def test_no_spin_is_nan_of_the_fast_top_alone():
+    def total(i3, spins):
+        fast = jax.vmap(lambda w: top.gyroscopic(jr.SymmetricTop(1.0, i3, 1.0), 0.7, w))(spins)
+        return sum(jnp.nansum(x) for x in fast)
+
+    slope = jax.grad(total)(0.5, jnp.array([6.0, 0.0, 7.0]))
+    np.testing.assert_allclose(slope, jax.grad(total)(0.5, jnp.array([6.0, 7.0])), rtol=1e-13)
+
+
+def test_special_motions_outside_their_domain():
+    assert np.isnan(top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0)))
+    rates = top.steady_precession(TOP, np.nan, 1.0)
+    assert np.isnan(rates.slow)
+    assert np.isnan(rates.fast)
+    assert not rates.exists
+    assert not top.steady_precession(jr.SymmetricTop(1.0, 0.0, 1.0), 0.5, 1.0).exists
     with pytest.raises(ValueError, match="must be given, and one only"):
         top.steady_precession(TOP, 0.5)
-    assert np.isnan(top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0), throw=False))
     assert top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, -1.0)) == 0
     assert float(jax.grad(lambda m: top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, m)))(-1.0)) == 0
     assert top.sleeping_spin(TOP) == pytest.approx(4.0, abs=ulps(float, 4))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: top.sleeping_spin(np.ones(3)), "`top` must be a SymmetricTop"),
+        (lambda: top.conserved(np.ones(3), start("wave")), "`top` must be a SymmetricTop"),
+        (lambda: top.conserved(TOP, np.ones(7)), "`state` must be a State"),
+        (lambda: top.gyroscopic(TOP, np.ones(2), 1.0), "`theta` must have shape"),
+        (lambda: top.steady_precession(TOP, 0.5, psi_dot=np.ones(2)), "`psi_dot` must have shape"),
+        (lambda: top.angle_rates(TOP, 0.5, np.ones(2), 1.0), "`p_phi` must have shape"),
+        (lambda: top.effective_potential(TOP, 0.5, 1.0, np.ones(2)), "`p_psi` must have shape"),
+        (lambda: top.cubic(TOP, top.Conserved(1.0, 2.0, np.ones(2))), "`energy` must have shape"),
+        (lambda: top.initial_state(TOP, np.ones(2)), "`theta` must have shape"),
+        (lambda: top.initial_state(np.ones(3), 0.5), "`top` must be a SymmetricTop"),
+        (
+            lambda: jr.SymmetricTop.from_mass_properties(jr.solids.disk(1.0, 1.0), np.ones(3), 9.8),
+            r"`gravity` must have shape \(3,\)",
+        ),
+    ],
+)
+def test_wrong_shapes_and_types_are_value_errors(call, message, untyped):
+    with pytest.raises(ValueError, match=message):
+        call()

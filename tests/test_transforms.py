@@ -59,8 +59,8 @@ NOTHING_TO_CALL = {
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
-    "free.regime", "top.motion_validity",
-    "top.motion_class", "lagrangian.cyclic_coordinates",
+    "free.regime", "top.motion_class", "top.CLASSES", "top.SymmetricTop.is_valid",
+    "lagrangian.cyclic_coordinates",
 }  # fmt: skip
 # Regressions and fits of records of some length: tests/test_identify*.py.
 OF_RECORDS = {

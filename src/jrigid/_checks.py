@@ -50,6 +50,7 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "symmetric, positive definite (3, 3) tensor, but it is not. (Three bodies are three lanes "
         "of `jax.vmap`, not the rows of a (3, 3) array.)"
     )
+    invalid_top = "Argument `top` must have I1 > 0, I3 > 0 and a finite mgl, but it has not."
     unphysical_inertia = (
         "Argument `inertia` must be the tensor of a real body, whose principal moments satisfy "
         "I3 <= I1 + I2, but they do not."

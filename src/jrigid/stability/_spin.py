@@ -11,7 +11,6 @@ from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.free._linear import linear_rates
 from jrigid.top import SymmetricTop, steady_precession
-from jrigid.top._top import as_arrays, require_top
 
 REGIONS = ("unstable", "Lagrange", "DeBra-Delp", "marginal")
 
@@ -168,10 +167,10 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike, *, throw: bool = True) 
     >>> print([jr.stability.top_stability(top, w).growth_rate.item() for w in (0.0, 4.0, 5.0)])
     [1.0, 0.0, 0.0]
     """
-    i1, i3, mgl, spin = as_arrays(top, omega3)
+    i1, i3, mgl, spin = float_arrays(top.I1, top.I3, top.mgl, omega3)
     check_shape("omega3", spin, ())
     findings = Findings()
-    require_top(findings, SymmetricTop(i1, i3, mgl))
+    findings.require(top.is_valid, RESULTS.invalid_top)
     findings.require(all_finite(spin), RESULTS.invalid_state)
     ok = findings.ok
     i1, i3, mgl, spin = (jnp.where(ok, x, 1.0) for x in (i1, i3, mgl, spin))
@@ -198,7 +197,7 @@ class PrecessionStability(NamedTuple):
 
 
 def precession_stability(
-    top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike, *, throw: bool = True
+    top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike
 ) -> PrecessionStability:
     """Stability of steady precession: a small nutation turns and never grows, while there is one.
 
@@ -206,7 +205,6 @@ def precession_stability(
         top: The top.
         theta: Tilt of the axis from the vertical [rad].
         omega3: Third component of the angular velocity [rad/s].
-        throw: False: bad values give NaN.
 
     Returns:
         For the slow and the fast precession p the square -(p^2 sin^2 theta + (I3 omega3 / I1 -
@@ -224,8 +222,8 @@ def precession_stability(
     >>> print(jr.stability.precession_stability(top, jnp.pi / 3, 6.0).growth_rate_squared.round(4))
     [ -7.0941 -30.9059]
     """
-    steady = steady_precession(top, theta, omega3, throw=throw)
-    i1, i3, _, tilt, spin = as_arrays(top, theta, omega3)
+    steady = steady_precession(top, theta, omega3)
+    i1, i3, tilt, spin = float_arrays(top.I1, top.I3, theta, omega3)
     rates = jnp.stack([steady.slow, steady.fast])
     sine, cosine = jnp.sin(tilt), jnp.cos(tilt)
     squares = -((rates * sine) ** 2) - (i3 * spin / i1 - 2 * rates * cosine) ** 2

@@ -2,7 +2,6 @@
 
 from jrigid.top._integrals import Integrals as Integrals
 from jrigid.top._integrals import integrals as integrals
-from jrigid.top._motion import motion_validity as motion_validity
 from jrigid.top._motion import top_motion as top_motion
 from jrigid.top._nutation import CLASSES as CLASSES
 from jrigid.top._nutation import Advance as Advance

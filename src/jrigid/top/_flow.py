@@ -33,11 +33,12 @@ from jrigid._numerics import (
     with_columns,
 )
 from jrigid._types import Quaternion, Scalar, Vector
+from jrigid.dynamics import State
+from jrigid.rotation import normalize
+from jrigid.top._top import SymmetricTop
 
 _DOUBLINGS = 11
 _MEANS = 9  # arithmetic-geometric means: quadratic convergence, from a ratio of 1e-26
-# Nutations are counted beyond this square of a phase; the shortest half one is pi/2 of phase.
-_SHORT_PHASE_SQUARE = 2.0
 # Nearer to the separatrix than this the nutation is out of reach, and beyond this phase a top is
 # taken to stay upright: it would leave only then, from a tilt below exp(-phase).
 _ON_SEPARATRIX = {8: 1e-100, 4: 1e-15}
@@ -134,9 +135,9 @@ def _largest_root(a: Array, b: Array, square: Array) -> Array:
     safe = jnp.where(near, a, 1.0)
     x = jnp.zeros_like(a)
     for _ in range(8):
-        top = safe + x
-        total = jnp.abs(b) + jnp.sqrt(b * b + 4 * top * square)
-        x = jnp.where(b > 0, 2 * square / jnp.where(total > 0, total, 1.0), 0.5 * total / top)
+        leading = safe + x
+        total = jnp.abs(b) + jnp.sqrt(b * b + 4 * leading * square)
+        x = jnp.where(b > 0, 2 * square / jnp.where(total > 0, total, 1.0), 0.5 * total / leading)
     return jnp.where(near & (x < 0.05 * safe), x, jnp.maximum(far, 0.0))
 
 
@@ -160,13 +161,13 @@ def _nutation(root: Array, a: Array, b: Array, g: Array) -> Components:
     return x, q, jnp.pi / arithmetic
 
 
-class Motion(NamedTuple):
-    """What a top's motion keeps, in units in which its rates are of order one."""
+class Invariants(NamedTuple):
+    """What a top's motion keeps, in units in which its rates are of order one; and its start."""
 
     unit: Scalar  # of a rate [rad/s]
     omega3: Scalar  # [rad/s]
+    spin: Scalar  # about the axis, of the spherical top [rad/s]
     hangs: Bool[Array, ""]  # mgl < 0: seen with the axis reversed
-    slip: Scalar  # by which the body turns faster than the spherical top about their axis
     start: tuple[Complex[Array, ""], ...]  # alpha, beta and their rates
     mu: Scalar
     a: Scalar
@@ -181,6 +182,11 @@ class Motion(NamedTuple):
     advance_alpha: Scalar
     advance_beta: Scalar
     wide: Bool[Array, ""]
+
+    @property
+    def slip(self) -> Scalar:
+        """By how much the body turns faster than the spherical top about their axis."""
+        return (self.omega3 - self.spin) / self.unit
 
 
 def square_of(x: Array) -> Array:
@@ -197,16 +203,16 @@ def _reversed(hangs: Array, q: Components, w: Components) -> tuple[Components, C
 
 
 @jax.jit  # outside of jit a loop defined in a function is compiled at every call
-def invariants(i1: Scalar, i3: Scalar, mgl: Scalar, attitude: Quaternion, omega: Vector) -> Motion:
-    """The invariants and the nutation of a motion; values are not checked."""
+def invariants(top: SymmetricTop, state: State) -> Invariants:
+    """The invariants and the nutation of a motion; the attitude is normalised first."""
+    attitude, omega = normalize(state.attitude), state.omega
     w1, w2, w3 = omega
-    spin = i3 / i1 * w3
-    mu = mgl / i1
+    spin = top.I3 / top.I1 * w3
+    mu = top.mgl / top.I1
     sizes = jnp.stack([w1, w2, spin, jnp.sqrt(jnp.abs(jax.lax.stop_gradient(mu)))])
     size = jnp.dtype(mu.dtype).itemsize
     fastest = jnp.max(jnp.abs(jax.lax.stop_gradient(sizes)))
     unit = power_of_two(jnp.where(fastest > 0, jnp.maximum(fastest, _LEAST_UNIT[size]), 1.0))
-    slip = (w3 - spin) / unit
     hangs = mu < 0
     q, w = _reversed(hangs, tuple(attitude), (w1 / unit, w2 / unit, spin / unit))
     mu = jnp.where(hangs, -mu, mu) / unit / unit
@@ -242,8 +248,8 @@ def invariants(i1: Scalar, i3: Scalar, mgl: Scalar, attitude: Quaternion, omega:
     last = jnp.where(wide, g_beta_, -g_beta_ * r) / jnp.where(wide, r * x, b_ + x * (a_ + x))
     advance_beta = 4 * g_beta_ * w_beta + 2 * jnp.arctan(last)
     x, period, advance_alpha, advance_beta = materialize(x, period, advance_alpha, advance_beta)
-    return Motion(
-        unit, omega[2], hangs, slip, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
+    return Invariants(
+        unit, omega[2], spin, hangs, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
         nutates, x, period, advance_alpha, advance_beta, wide,
     )  # fmt: skip
 
@@ -258,38 +264,33 @@ def _times(x: Array, y: Array) -> Array:
 
 
 def _beta_after(
-    beta: Array, d_beta: Array, top: Components, s: Array, slope: Array, turn: Array
+    beta: Array, d_beta: Array, kept: Components, s: Array, slope: Array, turn: Array
 ) -> tuple[Array, Array]:
     """The component beta of the attitude and its rate after the time elapsed, from these."""
-    mu, a, b, _, g = top
+    mu, a, b, _, g = kept
     z, sigma = s * s, square_of(beta)
     n = 1 + mu * sigma * z
     lift = g * s * z
     bend = (2 / n) * (a - mu * sigma + z * (b - g * g * z)) - a
     twist = (2 / n) * (g * s * slope)
     factor = _times(1 / n, turn)
-    return (
-        factor * (beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)),
-        factor
-        * (
-            d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
-            + beta * jax.lax.complex(s * bend, -s * twist)
-        ),
-    )
+    moved = beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)
+    rate = d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
+    return factor * moved, factor * (rate + beta * jax.lax.complex(s * bend, -s * twist))
 
 
 def _alpha_after(
-    start: tuple[Array, ...], top: Components, s: Array, slope: Array, turn: Array
+    start: tuple[Array, ...], kept: Components, s: Array, slope: Array, turn: Array
 ) -> tuple[Array, Array]:
     """The same for alpha, by functions of beta's, which tell how near to upright it comes."""
     alpha, beta, d_alpha, d_beta = start
-    mu, a, b, g_alpha, g_beta = top
+    mu, a, b, g_alpha, g_beta = kept
     z, sigma, rho = s * s, square_of(beta), square_of(alpha)
     turning = (jnp.conj(alpha) * d_alpha).imag  # g_alpha / mu
-    # alpha' - i turning alpha, of second order in a small tilt.
+    # The drift alpha' - i turning alpha, of second order in a small tilt.
     upper = jax.lax.stop_gradient(rho > 0.5)
     small = jax.lax.complex(-(jnp.conj(beta) * d_beta).real, turning * sigma)
-    rest = jnp.where(
+    drift = jnp.where(
         upper,
         alpha * _times(1 / jnp.where(upper, rho, 1.0), small),
         d_alpha - alpha * jax.lax.complex(jnp.zeros_like(turning), turning),
@@ -300,20 +301,16 @@ def _alpha_after(
     bend = (2 / n) * (a - mu * sigma + z * (b - g_beta * g_beta * z))
     bend = bend - mu - a - z * (b + mu * side * side)
     factor = _times(1 / (n * jnp.sqrt(rise)), turn)
-    return (
-        factor * (alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, rest)),
-        factor
-        * (
-            alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
-            + rest * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
-        ),
-    )
+    moved = alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, drift)
+    rate = alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
+    rate = rate + drift * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
+    return factor * moved, factor * rate
 
 
-def at(motion: Motion, t: Scalar) -> tuple[Quaternion, Vector]:
+def state_after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:
     """Attitude and angular velocity after a time t [s]."""
     (
-        unit, omega3, hangs, slip, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
+        unit, omega3, _, hangs, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
         nutates, _, period, advance_alpha, advance_beta, wide,
     ) = motion  # fmt: skip
     t = t * unit
@@ -329,13 +326,13 @@ def at(motion: Motion, t: Scalar) -> tuple[Quaternion, Vector]:
     w_alpha = w_alpha + jnp.where(beyond, z / (1 + mu * z) * (h - stop), 0.0)
     s, slope, w_alpha, w_beta = materialize(s, slope, w_alpha, w_beta)
     turn_alpha, turn_beta = materialize(_turn(g_alpha * w_alpha), _turn(g_beta * w_beta))
-    top = mu, a, b, g_alpha, g_beta
+    kept = mu, a, b, g_alpha, g_beta
 
     def half(_: Any, x: Components) -> Components:
         alpha, d_alpha, beta, d_beta = x
         return (
-            *_alpha_after((alpha, beta, d_alpha, d_beta), top, s, slope, turn_alpha),
-            *_beta_after(beta, d_beta, top, s, slope, turn_beta),
+            *_alpha_after((alpha, beta, d_alpha, d_beta), kept, s, slope, turn_alpha),
+            *_beta_after(beta, d_beta, kept, s, slope, turn_beta),
         )
 
     alpha, d_alpha, beta, d_beta = jax.lax.fori_loop(0, 2, half, (alpha, d_alpha, beta, d_beta))
@@ -354,7 +351,7 @@ def at(motion: Motion, t: Scalar) -> tuple[Quaternion, Vector]:
     q = [jnp.where(hangs, x, y) for x, y in ((q1, q0), (-q0, q1), (-q3, q2), (q2, q3))]
     across = jnp.where(hangs, jnp.conj(across), across)
     alpha, beta = jax.lax.complex(q[0], q[3]), jax.lax.complex(q[1], q[2])
-    turn = _turn(0.5 * slip * t)
+    turn = _turn(0.5 * motion.slip * t)
     alpha, beta, across = alpha * turn, beta * jnp.conj(turn), across * jnp.conj(turn * turn)
     q = jnp.stack([alpha.real, beta.real, beta.imag, alpha.imag])
     q = q / jnp.sqrt(jnp.sum(q * q))

@@ -1,6 +1,7 @@
 """What heavy bodies keep, in the four cases in which they keep more than two things."""
 
-from typing import Literal, NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,13 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._checks import (
-    RESULTS,
-    Findings,
     all_finite,
     check_option,
+    check_type,
     float_arrays,
     is_inertia,
     is_unit,
-    nan_where,
+    where_defined,
 )
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
@@ -24,29 +24,8 @@ from jrigid.rotation import rotate_inverse
 from jrigid.systems import RigidBody
 from jrigid.torques import UniformGravity
 
-CASES = ("euler", "lagrange", "kovalevskaya", "goryachev-chaplygin")
-_RATIO = {"lagrange": None, "kovalevskaya": 2.0, "goryachev-chaplygin": 4.0}
-_CONDITIONS = {
-    "euler": "Argument `body` must have no lever, mass or gravity in Euler's case, but it does.",
-    "lagrange": (
-        "Argument `body` must have I1 = I2 and a lever along axis 3 in Lagrange's case, but it "
-        "does not."
-    ),
-    "kovalevskaya": (
-        "Argument `body` must have I1 = I2 = 2 I3 and a lever across axis 3 in Kovalevskaya's "
-        "case, but it does not."
-    ),
-    "goryachev-chaplygin": (
-        "Argument `body` must have I1 = I2 = 4 I3 and a lever across axis 3 in the case of "
-        "Goryachev and Chaplygin, but it does not."
-    ),
-}
-_NOT_LEVEL = (
-    "Argument `state` must have no angular momentum about the vertical in the case of Goryachev "
-    "and Chaplygin, but it has."
-)
-
 Case = Literal["euler", "lagrange", "kovalevskaya", "goryachev-chaplygin"]
+_RATIOS = {"kovalevskaya": 2.0, "goryachev-chaplygin": 4.0}  # I1 / I3
 
 
 class Integrals(NamedTuple):
@@ -65,9 +44,7 @@ class Integrals(NamedTuple):
     extra: Scalar | None
 
 
-def integrals(
-    body: RigidBody, state: State, case: Case | None = None, *, throw: bool = True
-) -> Integrals:
+def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integrals:
     """Energy, vertical angular momentum and the extra integral of a heavy body.
 
     With w = omega1 + i omega2, c = lever1 + i lever2, G = gamma1 + i gamma2 (gamma the vertical in
@@ -81,15 +58,13 @@ def integrals(
         case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3), "kovalevskaya" (I1 =
             I2 = 2 I3, lever across axis 3), "goryachev-chaplygin" (I1 = I2 = 4 I3, lever across
             axis 3, no vertical angular momentum), or None.
-        throw: False: bad values, and bodies not of the case, give NaN instead of an error.
 
     Returns:
-        What the motion keeps.
+        What the motion keeps. NaN of a body that is not of the case to 1e-8 (float32: 3e-4), nor a
+        body at all, or of a state that is none.
 
     Raises:
-        ValueError: Another torque, another case, a tensor with a case (trace time).
-        RuntimeError: Bad value, a body not of the case to 1e-8 (float32: 3e-4) (run time, any
-            lane).
+        ValueError: Another torque, another case, a tensor with a case.
 
     Gradients: analytic; without gravity those of the vertical momentum are zero.
     Source: V. V. Golubev, Lectures on the Integration of the Equations of Motion of a Rigid Body
@@ -103,92 +78,64 @@ def integrals(
     >>> print(jr.top.integrals(body, state, "kovalevskaya").extra)
     1.0
     """
-    if not isinstance(body, RigidBody) or not isinstance(body.torque, UniformGravity):
-        raise ValueError(
-            "Argument `body` must be a RigidBody under torques.UniformGravity alone, but it is not."
-        )
+    check_type("body", body, RigidBody)
+    check_type("body.torque", body.torque, UniformGravity)
+    check_type("state", state, State)
     if case is not None:
-        check_option("case", case, CASES)
+        check_option("case", case, get_args(Case))
         if body.inertia.ndim != 1:
             raise ValueError(
                 "Argument `body` must have principal moments where a case is asked for, but it has "
                 "a tensor."
             )
-    inertia, attitude, omega, mass, lever, pull = float_arrays(
-        body.inertia, state.attitude, state.omega, *jtu.tree_leaves(body.torque)
-    )
-    strength = safe_norm(pull)
-    weight = mass * strength
-    findings = Findings()
-    findings.require(is_inertia(inertia), RESULTS.invalid_inertia)
-    findings.require(all_finite((attitude, omega)), RESULTS.invalid_state)
-    findings.require(is_unit(attitude), RESULTS.invalid_attitude)
-    findings.require(all_finite((mass, lever, pull)) & (mass >= 0), RESULTS.invalid_torque)
+    leaves, structure = jtu.tree_flatten((body.inertia, body.torque, state))
+    arguments = jtu.tree_unflatten(structure, float_arrays(*leaves))
+    inertia, gravity, state = arguments
+    ok = is_inertia(inertia) & all_finite(arguments) & is_unit(state.attitude)
+    ok = ok & (gravity.mass >= 0)
+    if case is not None:
+        ok = ok & _is_of_case(case, *jax.lax.stop_gradient(arguments))
+    return where_defined(ok, partial(_integrals, case), *arguments)
+
+
+def _integrals(
+    case: Case | None, inertia: Array, gravity: UniformGravity, state: State
+) -> Integrals:
+    strength = safe_norm(gravity.gravity)
     pulls = strength > 0
-    down = rotate_inverse(attitude, pull / jnp.where(pulls, strength, 1.0))
+    down = rotate_inverse(state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0))
     up = jnp.where(pulls, -down, 0.0)
-    momentum = angular_momentum(inertia, omega)
-    vertical = product("i,i->", momentum, up)
-    energy = kinetic_energy(inertia, omega) + weight * product("i,i->", lever, up)
-    if case is None:
-        inertia, energy, vertical = findings.apply((inertia, energy, vertical), throw)
-        energy, vertical = nan_where(~findings.ok, (energy, vertical))
-        return Integrals(energy, vertical, None)
-    _require_case(findings, case, inertia, weight, lever, momentum, vertical)
-    extra = _extra(case, inertia, omega, momentum, weight, lever, up)
-    found = nan_where(~findings.ok, Integrals(energy, vertical, extra))
-    return findings.apply(found, throw)
+    momentum = angular_momentum(inertia, state.omega)
+    energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
+    rate = gravity.mass * strength / inertia[2]
+    (w1, w2, w3), (x, y, _) = state.omega, gravity.lever
+    extra = None
+    if case == "euler":
+        extra = product("i,i->", momentum, momentum)
+    elif case == "lagrange":
+        extra = momentum[2]
+    elif case == "kovalevskaya":
+        real = w1 * w1 - w2 * w2 - rate * (x * up[0] - y * up[1])
+        imaginary = 2 * w1 * w2 - rate * (x * up[1] + y * up[0])
+        extra = real * real + imaginary * imaginary
+    elif case == "goryachev-chaplygin":
+        extra = w3 * (w1 * w1 + w2 * w2) - rate * up[2] * (x * w1 + y * w2)
+    return Integrals(energy, product("i,i->", momentum, up), extra)
 
 
-def _require_case(
-    findings: Findings,
-    case: Case,
-    inertia: Array,
-    weight: Array,
-    lever: Array,
-    momentum: Array,
-    vertical: Array,
-) -> None:
-    inertia, weight, lever, momentum, vertical = jax.lax.stop_gradient(
-        (inertia, weight, lever, momentum, vertical)
-    )
-    tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
+def _is_of_case(case: Case, inertia: Array, gravity: UniformGravity, state: State) -> Array:
     i1, i2, i3 = inertia
-    length = jnp.max(jnp.abs(lever))
+    tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
+    length = jnp.max(jnp.abs(gravity.lever))
     if case == "euler":
-        of_case = weight * length == 0
-    else:
-        ratio = _RATIO[case]
-        of_case = jnp.abs(i1 - i2) <= tolerance * i1
-        if ratio is None:
-            of_case = of_case & (jnp.max(jnp.abs(lever[:2])) <= tolerance * length)
-        else:
-            of_case = of_case & (jnp.abs(i1 - ratio * i3) <= tolerance * i1)
-            of_case = of_case & (jnp.abs(lever[2]) <= tolerance * length)
-    findings.require(of_case, RESULTS.invalid_inertia, _CONDITIONS[case])
-    if case == "goryachev-chaplygin":
-        level = jnp.abs(vertical) <= tolerance * jnp.max(jnp.abs(momentum))
-        findings.require(level, RESULTS.invalid_state, _NOT_LEVEL)
-
-
-def _extra(
-    case: Case,
-    inertia: Array,
-    omega: Array,
-    momentum: Array,
-    weight: Array,
-    lever: Array,
-    up: Array,
-) -> Array:
-    if case == "euler":
-        return product("i,i->", momentum, momentum)
+        return gravity.mass * safe_norm(gravity.gravity) * length == 0
+    symmetric = jnp.abs(i1 - i2) <= tolerance * i1
+    across, along = jnp.max(jnp.abs(gravity.lever[:2])), jnp.abs(gravity.lever[2])
     if case == "lagrange":
-        return momentum[2]
-    pull = weight / inertia[2]
-    w1, w2, w3 = omega
+        return symmetric & (across <= tolerance * length)
+    of_ratio = jnp.abs(i1 - _RATIOS[case] * i3) <= tolerance * i1
+    of_case = symmetric & of_ratio & (along <= tolerance * length)
     if case == "kovalevskaya":
-        real = w1 * w1 - w2 * w2 - pull * (lever[0] * up[0] - lever[1] * up[1])
-        imaginary = 2 * w1 * w2 - pull * (lever[0] * up[1] + lever[1] * up[0])
-        return real * real + imaginary * imaginary
-    along = lever[0] * w1 + lever[1] * w2
-    return w3 * (w1 * w1 + w2 * w2) - pull * up[2] * along
+        return of_case
+    vertical = jnp.abs(_integrals(None, inertia, gravity, state).vertical_momentum)
+    return of_case & (vertical <= tolerance * jnp.max(jnp.abs(inertia * state.omega)))

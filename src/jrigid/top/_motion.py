@@ -1,44 +1,27 @@
 """top_motion(): the state of Lagrange's top at any times."""
 
-from typing import Any
-
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Real
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_shape, nan_where
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    harmless,
+    is_unit,
+    nan_where,
+    settle,
+)
 from jrigid._types import ScalarLike
-from jrigid.dynamics import State
-from jrigid.rotation import normalize
-from jrigid.top._flow import at, invariants
-from jrigid.top._top import SymmetricTop, checked_with
+from jrigid.dynamics import ExactStates, State
+from jrigid.top._flow import invariants, state_after
+from jrigid.top._top import SymmetricTop, top_and_state
 
-
-def motion_validity(
-    top: SymmetricTop, state0: State, ts: Real[ArrayLike, "..."], *, t0: ScalarLike = 0.0
-) -> Any:
-    """What `top_motion` finds wrong with its arguments.
-
-    Args:
-        top: As for `top_motion`, and so on.
-        state0: State at `t0`.
-        ts: Times [s].
-        t0: Time of `state0` [s].
-
-    Returns:
-        A `jrigid.RESULTS`, `RESULTS.successful` if nothing is; the lane's code under vmap.
-
-    Raises:
-        ValueError: Wrong shape or dtype (trace time).
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.1]))
-    >>> code = jr.top.motion_validity(jr.SymmetricTop(1.0, -0.5, 1.0), state, 1.0)
-    >>> code == jr.RESULTS.invalid_inertia
-    Array(True, dtype=bool)
-    """
-    findings, _ = _motion(top, state0, ts, t0)
-    return findings.result
+_BAD_TIMES = "Argument `ts` must be finite, but it is not."
+_BAD_START = "Argument `t0` must be finite, but it is not."
 
 
 def top_motion(
@@ -48,7 +31,7 @@ def top_motion(
     *,
     t0: ScalarLike = 0.0,
     throw: bool = True,
-) -> State:
+) -> ExactStates:
     r"""Exact state of Lagrange's top at any times, at a cost that does not depend on the time.
 
     One formula serves every motion: waves, cusps and loops, steady and sleeping tops, pendulums,
@@ -59,17 +42,16 @@ def top_motion(
         state0: State at `t0`, without internal parts; gravity pulls along -z in space.
         ts: Times [s], in any order, before or after `t0`, of any shape.
         t0: Time of `state0` [s].
-        throw: If False, bad values give NaN states instead of an error, in their lane alone;
-            `top.motion_validity` tells why.
+        throw: False: a bad value gives NaN and its code in `result` instead of an error, in its
+            lane alone.
 
     Returns:
-        Attitude and angular velocity, with the shape of `ts` in front. The error is below
-        1e-13 (1 + radians turned) in float64, plus what the last bits of the arguments do.
+        Attitude and angular velocity (`.states`, or `.attitude` and `.omega`), with the shape of
+        `ts` in front, and `result`. The error is below 1e-13 (1 + radians turned) in float64, plus
+        what the last bits of the arguments do.
 
     Raises:
-        ValueError: Wrong shape or dtype (trace time).
-        RuntimeError: Bad value, or angles turned that overflow, with `throw=True` (run time, any
-            lane).
+        RuntimeError: Bad value, or angles turned that overflow.
 
     Gradients: of any order and in every mode those of the motion, also for a sleeping, steady,
     weightless or hanging top and through the vertical; reverse mode costs a few values.
@@ -82,20 +64,29 @@ def top_motion(
     >>> print(motion.omega.shape, motion.omega[1].round(4))
     (3, 3) [-0.3481  0.2425  5.    ]
     """
-    findings, state = _motion(top, state0, ts, t0)
-    return findings.apply(nan_where(~findings.ok, state), throw)
-
-
-def _motion(top: Any, state0: Any, ts: Any, t0: Any) -> tuple[Findings, State]:
-    findings, top, state0, (times, t0) = checked_with(top, state0, ts, t0)
+    _, top, state0, (ts, t0) = top_and_state("state0", top, state0, ts, t0)
     check_shape("t0", t0, ())
-    state = State(*_states(top, normalize(state0.attitude), state0.omega, times - t0))
-    findings.require(all_finite(state), RESULTS.nonfinite_state)
-    return findings, state
+    return settle(_motion(top, state0, ts, t0), throw, lambda: _findings(top, state0, ts, t0))
+
+
+def _findings(top: SymmetricTop, state0: State, ts: Array, t0: Array) -> Findings:
+    findings = Findings()
+    numbers = jnp.stack(jtu.tree_leaves(top))
+    findings.require(top.is_valid, RESULTS.invalid_top, value=numbers)
+    components = jnp.concatenate([state0.attitude, state0.omega])
+    findings.require(all_finite(state0), RESULTS.invalid_state, value=components)
+    findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude, value=state0.attitude)
+    findings.require(all_finite(ts), RESULTS.invalid_times, _BAD_TIMES, jnp.sum(ts))
+    findings.require(all_finite(t0), RESULTS.invalid_times, _BAD_START, t0)
+    return findings
 
 
 @jax.jit
-def _states(top: SymmetricTop, attitude: Array, omega: Array, times: Array) -> tuple[Array, Array]:
-    motion = invariants(top.I1, top.I3, top.mgl, attitude, omega)
-    states = jax.vmap(lambda t: at(motion, t))(times.reshape(-1))
-    return jtu.tree_map(lambda x: x.reshape(*times.shape, x.shape[-1]), states)
+def _motion(top: SymmetricTop, state0: State, ts: Array, t0: Array) -> ExactStates:
+    findings = _findings(top, state0, ts, t0)
+    top, state0, times = harmless(findings.ok, (top, state0, ts - t0))
+    kept = invariants(top, state0)
+    states = jax.vmap(lambda t: state_after(kept, t))(times.reshape(-1))
+    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, x.shape[-1]), State(*states))
+    findings.require(all_finite(states), RESULTS.nonfinite_state)
+    return ExactStates(nan_where(~findings.ok, states), findings.result)

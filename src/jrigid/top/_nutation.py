@@ -1,31 +1,31 @@
 """What a symmetric top's motion looks like: bounds and period of nutation, precession, kind."""
 
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
-from jrigid._checks import Findings, nan_where
+from jrigid._checks import Enumeration, where_defined
 from jrigid._numerics import safe_arctan2
 from jrigid._types import Scalar
 from jrigid.dynamics import State
-from jrigid.rotation import normalize
-from jrigid.top._flow import Motion, invariants, square_of
-from jrigid.top._top import SymmetricTop, checked
+from jrigid.top._flow import Invariants, invariants, square_of
+from jrigid.top._top import Answer, SymmetricTop, top_and_state
 
-CLASSES = MappingProxyType(
-    {
-        0: "wave",
-        1: "cusp",
-        2: "loop",
-        3: "steady",
-        4: "sleeping",
-        5: "pendulum",
-        6: "through the vertical",
-    }
-)
+
+class CLASSES(Enumeration):
+    """The kinds of motion that `motion_class` tells apart; `CLASSES[kind]` is the text."""
+
+    wave = "wave"
+    cusp = "cusp"
+    loop = "loop"
+    steady = "steady"
+    sleeping = "sleeping"
+    pendulum = "pendulum"
+    through_the_vertical = "through the vertical"
+    undefined = "undefined"
 
 
 class NutationBounds(NamedTuple):
@@ -42,10 +42,10 @@ class Advance(NamedTuple):
     psi: Scalar
 
 
-def _motion(top: SymmetricTop, state: State, throw: bool) -> tuple[Findings, SymmetricTop, Motion]:
-    findings, top, state = checked(top, state, throw)
-    attitude = normalize(state.attitude)
-    return findings, top, invariants(top.I1, top.I3, top.mgl, attitude, state.omega)
+def _of_motion(formula: Callable[[Invariants], Answer], top: SymmetricTop, state: State) -> Answer:
+    """A formula of the invariants; NaN where the top or the state is not valid."""
+    ok, top, state, _ = top_and_state("state", top, state)
+    return where_defined(ok, lambda top, state: formula(invariants(top, state)), top, state)
 
 
 class _Bounds(NamedTuple):
@@ -58,7 +58,7 @@ class _Bounds(NamedTuple):
     spread: Array
 
 
-def _bounds(motion: Motion) -> _Bounds:
+def _bounds(motion: Invariants) -> _Bounds:
     """From the smaller of the two squares, x, which keeps its relative accuracy.
 
     (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of the exact flow.
@@ -101,7 +101,9 @@ def _bounds(motion: Motion) -> _Bounds:
     )
 
 
-def _nearest(motion: Motion, x: Array, dx: Array, at_zero: float, low: Array, high: Array) -> Array:
+def _nearest(
+    motion: Invariants, x: Array, dx: Array, at_zero: float, low: Array, high: Array
+) -> Array:
     """The lower bound of |x|^2 where it is far below the upper one, with its relative accuracy.
 
     At x = 0 the slope's square is -J^2, of the constant momentum J = Im(x* dx/dt).
@@ -120,20 +122,15 @@ def _tilt(of_beta: Array, of_alpha: Array) -> Array:
     return jnp.where(inside, 2 * safe_arctan2(*roots), jnp.where(of_beta > 0, jnp.pi, 0.0))
 
 
-def nutation_bounds(top: SymmetricTop, state: State, *, throw: bool = True) -> NutationBounds:
+def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
     """The tilts between which the axis nods.
 
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Least and largest angle between the axis and the vertical; equal in steady precession.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
 
     Gradients: right where the two differ and neither is vertical; finite everywhere: without the
     infinite part where they meet, zero at the vertical.
@@ -145,30 +142,27 @@ def nutation_bounds(top: SymmetricTop, state: State, *, throw: bool = True) -> N
     >>> print(bounds.theta_min.round(4), bounds.theta_max.round(4))
     0.5 0.7576
     """
-    findings, _, motion = _motion(top, state, throw)
-    at = _bounds(motion)
-    low, high = _tilt(at.beta_low, at.alpha_high), _tilt(at.beta_high, at.alpha_low)
-    found = NutationBounds(
-        jnp.where(motion.hangs, jnp.pi - high, low), jnp.where(motion.hangs, jnp.pi - low, high)
-    )
-    return nan_where(~findings.ok, found)
+
+    def tilts(motion: Invariants) -> NutationBounds:
+        squares = _bounds(motion)
+        low = _tilt(squares.beta_low, squares.alpha_high)
+        high = _tilt(squares.beta_high, squares.alpha_low)
+        least = jnp.where(motion.hangs, jnp.pi - high, low)
+        return NutationBounds(least, jnp.where(motion.hangs, jnp.pi - low, high))
+
+    return _of_motion(tilts, top, state)
 
 
-def nutation_period(top: SymmetricTop, state: State, *, throw: bool = True) -> Scalar:
+def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     """Time from one least tilt to the next.
 
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         The period [s]; in steady precession that of small nutations; of a pendulum half a swing,
         or a whole turn; infinite on the separatrix and for a top without weight at rest.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
 
     Gradients: analytic, also in steady precession; zero where the period is infinite.
     Source: docs/top.md, an arithmetic-geometric mean.
@@ -179,9 +173,7 @@ def nutation_period(top: SymmetricTop, state: State, *, throw: bool = True) -> S
     >>> print(jr.top.nutation_period(top, state).round(5))
     3.51772
     """
-    findings, _, motion = _motion(top, state, throw)
-    period = jnp.where(motion.nutates, motion.period / motion.unit, jnp.inf)
-    return nan_where(~findings.ok, period)
+    return _of_motion(lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state)
 
 
 def _side(x: Array, dx: Array) -> Array:
@@ -189,29 +181,25 @@ def _side(x: Array, dx: Array) -> Array:
     return jnp.sign((jnp.conj(x) * dx).imag)
 
 
-def _advance(motion: Motion) -> tuple[Array, Array]:
+def _advance(motion: Invariants) -> Advance:
     alpha, beta, d_alpha, d_beta = motion.start
     of_alpha = motion.advance_alpha + jnp.pi * _side(alpha, d_alpha)
     of_beta = motion.advance_beta + jnp.where(motion.wide, jnp.pi * _side(beta, d_beta), 0.0)
     spin = jnp.where(motion.hangs, of_beta - of_alpha, of_alpha - of_beta)
-    return of_alpha + of_beta, spin + motion.slip * motion.period
+    advance = of_alpha + of_beta, spin + motion.slip * motion.period
+    return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in advance))
 
 
-def advance_per_nutation(top: SymmetricTop, state: State, *, throw: bool = True) -> Advance:
+def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
     """Angles by which the axis precesses and the body spins in one period of nutation.
 
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Growth of phi and psi [rad]. In a motion through the vertical, where phi jumps by half a
         turn to either side, the mean of the two. Zero where the period is infinite.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
 
     Gradients: those of the branch, also in steady precession and through the vertical.
     Source: docs/top.md.
@@ -222,26 +210,19 @@ def advance_per_nutation(top: SymmetricTop, state: State, *, throw: bool = True)
     >>> print(jr.top.advance_per_nutation(top, state).phi.round(5))
     1.62782
     """
-    findings, _, motion = _motion(top, state, throw)
-    found = Advance(*(jnp.where(motion.nutates, x, 0.0) for x in _advance(motion)))
-    return nan_where(~findings.ok, found)
+    return _of_motion(_advance, top, state)
 
 
-def mean_precession(top: SymmetricTop, state: State, *, throw: bool = True) -> Scalar:
+def mean_precession(top: SymmetricTop, state: State) -> Scalar:
     """Mean rate at which the axis turns about the vertical, over a period of nutation.
 
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         The rate [rad/s]; in steady precession the rate of that; where the period is infinite that
         with which the axis comes upright, I3 omega3 / (2 I1) (mgl < 0: upside down, the opposite).
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
 
     Gradients: analytic, also in steady precession; it jumps where the axis passes the vertical.
     Source: docs/top.md.
@@ -251,15 +232,17 @@ def mean_precession(top: SymmetricTop, state: State, *, throw: bool = True) -> S
     >>> print(jr.top.mean_precession(top, jr.top.initial_state(top, 0.5, omega3=100.0)).round(8))
     0.02000702
     """
-    findings, top, motion = _motion(top, state, throw)
-    phi, _ = _advance(motion)
-    endless = jnp.where(motion.hangs, -0.5, 0.5) * top.I3 * motion.omega3 / top.I1
-    rate = jnp.where(motion.nutates, motion.unit * phi / motion.period, endless)
-    return nan_where(~findings.ok, rate)
+
+    def rate(motion: Invariants) -> Array:
+        endless = jnp.where(motion.hangs, -0.5, 0.5) * motion.spin
+        mean = motion.unit * _advance(motion).phi / motion.period
+        return jnp.where(motion.nutates, mean, endless)
+
+    return _of_motion(rate, top, state)
 
 
-def motion_class(top: SymmetricTop, state: State, *, throw: bool = True) -> Int[Array, ""]:
-    """What kind of motion it is, by a code that `CLASSES` names.
+def motion_class(top: SymmetricTop, state: State) -> CLASSES:
+    """What kind of motion it is, a member of `CLASSES`.
 
     The path of the axis on the sphere is a wave where it precesses one way throughout, a loop
     where it turns back in each nutation, and has cusps between the two. Steady: at a constant
@@ -269,14 +252,10 @@ def motion_class(top: SymmetricTop, state: State, *, throw: bool = True) -> Int[
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give the code -1 instead of an error.
 
     Returns:
-        The code. Two sides are told apart to some 1e-12 (float32: 5e-4) of their size.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        The kind; `CLASSES.undefined` where the top or the state is not valid. Two sides are told
+        apart to some 1e-12 (float32: 5e-4) of their size.
 
     Gradients: none, it is an integer.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 35, problem 1.
@@ -284,38 +263,44 @@ def motion_class(top: SymmetricTop, state: State, *, throw: bool = True) -> Int[
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
     >>> released = jr.top.initial_state(top, 0.5, omega3=5.0)
-    >>> jr.top.CLASSES[int(jr.top.motion_class(top, released))]
-    'cusp'
+    >>> kind = jr.top.motion_class(top, released)
+    >>> print(jr.top.CLASSES[kind], kind == jr.top.CLASSES.cusp)
+    cusp True
     """
-    findings, _, motion = _motion(top, state, throw)
-    motion = jax.lax.stop_gradient(motion)
+    ok, top, state, _ = top_and_state("state", top, state)
+    motion = jax.lax.stop_gradient(invariants(top, state))
     alpha, beta, d_alpha, d_beta = motion.start
-    at = _bounds(motion)
-    eps = jnp.finfo(at.spread.dtype).eps
+    beta_low, beta_high, alpha_low, alpha_high, spread = _bounds(motion)
+    eps = jnp.finfo(spread.dtype).eps
     tolerance = 4096 * eps
     # Momenta about the vertical and the axis, less and plus, over 4 I1
     plus, less = (jnp.conj(alpha) * d_alpha).imag, (jnp.conj(beta) * d_beta).imag
     size = jnp.maximum(jnp.abs(plus), jnp.abs(less))
     rate = jnp.sqrt(motion.mu + square_of(d_alpha) + square_of(d_beta))
     rate = jnp.where(rate > 0, rate, 1.0)
-    spinless = size <= tolerance * rate * at.beta_high * at.alpha_high
-    # phi' sin^2 / 4 = plus |beta|^2 + less |alpha|^2, at either bound
-    turns = []
-    for of_beta, of_alpha in ((at.beta_low, at.alpha_high), (at.beta_high, at.alpha_low)):
+
+    def sense(of_beta: Array, of_alpha: Array) -> Array:
+        """Sign of phi' sin^2 / 4 = plus |beta|^2 + less |alpha|^2, 0 to rounding."""
         parts = plus * of_beta, less * of_alpha
         scale = jnp.abs(parts[0]) + jnp.abs(parts[1])
-        still = jnp.abs(parts[0] + parts[1]) <= tolerance * scale
-        turns.append(jnp.where(still, 0.0, jnp.sign(parts[0] + parts[1])))
-    sense = turns[0] * turns[1]
-    wide = at.spread > tolerance * at.beta_high * at.alpha_high
-    vertical = (at.beta_low <= tolerance * at.beta_high) | (
-        at.alpha_low <= tolerance * at.alpha_high
+        total = parts[0] + parts[1]
+        return jnp.where(jnp.abs(total) <= tolerance * scale, 0.0, jnp.sign(total))
+
+    turns = sense(beta_low, alpha_high) * sense(beta_high, alpha_low)
+    vertical = (beta_low <= tolerance * beta_high) | (alpha_low <= tolerance * alpha_high)
+    upright, hanging = (
+        square_of(x) + square_of(dx) / rate**2 <= (4 * eps) ** 2
+        for x, dx in ((beta, d_beta), (alpha, d_alpha))
     )
-    stands = square_of(beta) + square_of(d_beta) / rate**2 <= (4 * eps) ** 2
-    stands = stands | (square_of(alpha) + square_of(d_alpha) / rate**2 <= (4 * eps) ** 2)
-    code = jnp.where(sense < 0, 2, jnp.where(sense == 0, 1, 0))
-    code = jnp.where(vertical, 6, code)
-    code = jnp.where(spinless, 5, code)
-    code = jnp.where(~wide, 3, code)
-    code = jnp.where(stands, 4, code)
-    return jnp.where(findings.ok, code, -1)
+    kind = CLASSES.wave
+    for holds, other in (
+        (turns < 0, CLASSES.loop),
+        (turns == 0, CLASSES.cusp),
+        (vertical, CLASSES.through_the_vertical),
+        (size <= tolerance * rate * beta_high * alpha_high, CLASSES.pendulum),
+        (spread <= tolerance * beta_high * alpha_high, CLASSES.steady),
+        (upright | hanging, CLASSES.sleeping),
+        (~ok, CLASSES.undefined),
+    ):
+        kind = CLASSES.where(holds, other, kind)
+    return kind

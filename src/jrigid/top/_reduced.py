@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Real
 
-from jrigid._checks import check_shape, nan_where
+from jrigid._checks import check_shape, check_type, float_arrays, where_defined
 from jrigid._numerics import product
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import rotate_inverse
-from jrigid.top._top import SymmetricTop, as_arrays, checked
+from jrigid.top._top import SymmetricTop, top_and_state, where_valid
 
 
 class Conserved(NamedTuple):
@@ -46,9 +46,6 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     Returns:
         The Lagrangian [J].
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
-
     Gradients: analytic; the mass matrix is singular at theta = 0 and pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
@@ -58,7 +55,8 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     >>> print(jr.top.lagrangian(q, q_dot, top).round(6))
     0.5
     """
-    i1, i3, mgl, q, q_dot = as_arrays(top, q, q_dot)
+    check_type("top", top, SymmetricTop)
+    i1, i3, mgl, q, q_dot = float_arrays(top.I1, top.I3, top.mgl, q, q_dot)
     check_shape("q", q, (3,))
     check_shape("q_dot", q_dot, (3,))
     _, theta, _ = q
@@ -69,20 +67,15 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     return 0.5 * (i1 * across + i3 * spin * spin) - mgl * cos
 
 
-def conserved(top: SymmetricTop, state: State, *, throw: bool = True) -> Conserved:
+def conserved(top: SymmetricTop, state: State) -> Conserved:
     """Angular momenta about the vertical and the axis, and the energy.
 
     Args:
         top: The top.
         state: Any state of the motion.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        The three constants of the motion.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        The three constants of the motion; NaN where the top or the state is not valid.
 
     Gradients: analytic.
 
@@ -92,19 +85,31 @@ def conserved(top: SymmetricTop, state: State, *, throw: bool = True) -> Conserv
     >>> print(*(x.round(6) for x in jr.top.conserved(top, state)))
     1.0 2.0 5.0
     """
-    findings, top, state = checked(top, state, throw)
-    moments = jnp.stack([top.I1, top.I1, top.I3])
-    up = rotate_inverse(state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype))
-    momentum = moments * state.omega
-    energy = 0.5 * product("i,i->", momentum, state.omega) + top.mgl * up[2]
-    found = Conserved(product("i,i->", momentum, up), momentum[2], energy)
-    return nan_where(~findings.ok, found)
+
+    def constants(top: SymmetricTop, state: State) -> Conserved:
+        up = rotate_inverse(state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype))
+        momentum = jnp.stack([top.I1, top.I1, top.I3]) * state.omega
+        energy = 0.5 * product("i,i->", momentum, state.omega) + top.mgl * up[2]
+        return Conserved(product("i,i->", momentum, up), momentum[2], energy)
+
+    ok, top, state, _ = top_and_state("state", top, state)
+    return where_defined(ok, constants, top, state)
 
 
 def _over(momentum: Array, side: Array) -> Array:
     """Half the quotient; 0 / 0, at the vertical and allowed to be there, is 0."""
     zero = (momentum == 0) & (side == 0)
     return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
+
+
+def _angle_rates(i1: Array, i3: Array, mgl: Array, theta: Array, *momenta: Array) -> AngleRates:
+    del mgl
+    p_phi, p_psi = momenta
+    # The parts that are large near upright and near upside down, by half the angle.
+    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+    upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
+    phi = 0.5 * (upper + lower) / i1
+    return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
 
 
 def angle_rates(
@@ -122,10 +127,7 @@ def angle_rates(
         phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi' cos theta
         [rad/s]. Infinite at the vertical, unless the momenta let the axis pass: then the mean of
         the two sides. At theta = pi, which no floating point number is, large in place of
-        infinite.
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
+        infinite. NaN where the top is not valid or a number not finite.
 
     Gradients: right inside 0 < theta < pi; in the momenta at the vertical without the singular
     part.
@@ -136,12 +138,7 @@ def angle_rates(
     >>> print(rates.phi.round(6), rates.psi.round(6))
     3.0 2.0
     """
-    i1, i3, _, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
-    # The parts that are large near upright and near upside down, by half the angle.
-    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
-    upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
-    phi = 0.5 * (upper + lower) / i1
-    return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
+    return where_valid(_angle_rates, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
 
 
 def effective_potential(
@@ -157,10 +154,8 @@ def effective_potential(
 
     Returns:
         V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J]; infinite at the
-        vertical unless the momenta let the axis pass.
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
+        vertical unless the momenta let the axis pass; NaN where the top is not valid or a number
+        not finite.
 
     Gradients: right where V is finite; in the momenta at the vertical without the singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -170,11 +165,18 @@ def effective_potential(
     >>> print(jr.top.effective_potential(top, jnp.pi / 2, 1.0, 3.0).round(6))
     0.5
     """
-    i1, _, mgl, theta, p_phi, p_psi = as_arrays(top, theta, p_phi, p_psi)
-    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
-    # (p_phi - p_psi cos theta) / sin theta
-    across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
-    return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
+
+    def potential(i1: Array, _: Array, mgl: Array, theta: Array, *momenta: Array) -> Array:
+        p_phi, p_psi = momenta
+        sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+        # (p_phi - p_psi cos theta) / sin theta
+        across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
+        return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
+
+    def at_tilt(theta: Array) -> Array:
+        return where_valid(potential, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
+
+    return jnp.vectorize(at_tilt)(theta)
 
 
 def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
@@ -186,10 +188,8 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
 
     Returns:
         Coefficients of f [1/s^2], the highest power first, as `jnp.polyval` takes them: f = (1 -
-        u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2.
-
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
+        u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2. NaN where the top is
+        not valid or a constant not finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -199,10 +199,14 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
     >>> print(jr.top.cubic(top, jr.top.Conserved(1.0, 2.0, 5.0)))
     [ 4. -6.  0.  1.]
     """
-    i1, i3, mgl, p_phi, p_psi, energy = as_arrays(top, *conserved)
-    alpha = (2 * energy - p_psi * p_psi / i3) / i1
-    beta, a, b = 2 * mgl / i1, p_psi / i1, p_phi / i1
-    return jnp.stack([beta, -alpha - a * a, 2 * a * b - beta, alpha - b * b])
+
+    def coefficients(i1: Array, i3: Array, mgl: Array, *constants: Array) -> Array:
+        p_phi, p_psi, energy = constants
+        alpha = (2 * energy - p_psi * p_psi / i3) / i1
+        beta, a, b = 2 * mgl / i1, p_psi / i1, p_phi / i1
+        return jnp.stack([beta, -alpha - a * a, 2 * a * b - beta, alpha - b * b])
+
+    return where_valid(coefficients, top, **Conserved(*conserved)._asdict())
 
 
 def reduced_vector_field(
@@ -219,9 +223,6 @@ def reduced_vector_field(
         -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the vertical; an axis that
         may pass there (p_phi = +-p_psi) does pass, theta changing its sign (or beyond pi).
 
-    Raises:
-        ValueError: Wrong shape (trace time). Values are not checked.
-
     Gradients: analytic inside 0 < theta < pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
@@ -231,15 +232,14 @@ def reduced_vector_field(
     >>> print(rates(0.0, jnp.array([0.0, jnp.pi / 2, 0.0, 0.3]), None).round(6))
     [1.  0.3 4.  0. ]
     """
-    i1, i3, mgl, p_phi, p_psi, _ = as_arrays(top, *conserved)
+    check_type("top", top, SymmetricTop)
+    i1, i3, mgl, p_phi, p_psi, _ = float_arrays(top.I1, top.I3, top.mgl, *conserved)
 
     def rates(t: Any, y: Float[Array, "4"], args: Any) -> Float[Array, "4"]:
         del t, args
         _, theta, _, theta_dot = y
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        across = (p_phi - p_psi * cos) / (i1 * sin)
-        phi_dot = across / sin
-        pull = mgl * sin / i1 - across * (p_psi / i1 - phi_dot * cos)
-        return jnp.stack([phi_dot, theta_dot, p_psi / i3 - phi_dot * cos, pull])
+        phi_dot, psi_dot = _angle_rates(i1, i3, mgl, theta, p_phi, p_psi)
+        pull = (mgl + phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi)) * jnp.sin(theta) / i1
+        return jnp.stack([phi_dot, theta_dot, psi_dot, pull])
 
     return rates

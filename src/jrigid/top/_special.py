@@ -1,22 +1,37 @@
 """Starts and special motions of the symmetric top: steady, sleeping, fast."""
 
+from functools import partial
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_option, check_shape, nan_where
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    check_option,
+    check_shape,
+    check_type,
+    float_arrays,
+    harmless,
+    where_defined,
+)
 from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import euler_rates_to_omega, from_euler
-from jrigid.top._top import SymmetricTop, as_arrays, require_top
+from jrigid.top._top import SymmetricTop, where_valid
 
-_NO_STEADY = (
-    "Arguments `omega3` or `psi_dot` must be large enough for steady precession at `theta`, at one "
-    "rate that is finite, but they are not: see `steady_precession`."
+_ROUNDING = 1e-6  # [rad], of 180 degrees in float32
+_BAD_TILT = (
+    "Argument `theta` must be from 0 to pi, but it is not. (Angles are in radians: `jnp.radians` "
+    "takes degrees.)"
 )
+_TOO_SLOW = (
+    "Argument `{}` must be large enough for steady precession at `theta`, but it is not. (See "
+    "`steady_precession`.)"
+)
+_LEVEL = "Argument `theta` must not be level for the fast precession, which is infinite, but it is."
 
 
 class SteadyPrecession(NamedTuple):
@@ -51,7 +66,8 @@ class Gyroscopic(NamedTuple):
 
 def _steady(
     i1: Array, i3: Array, mgl: Array, theta: Array, spin: Array, *, of_psi: bool
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array]:
+    """The slow and the fast rate, NaN where there is none."""
     momentum = i3 * spin
     # psi' = omega3 - p cos(theta) in place of omega3 takes I3 off I1.
     i1 = i1 - i3 if of_psi else i1
@@ -69,7 +85,7 @@ def _steady(
     fast = jnp.where(level, jnp.where(total < 0, -jnp.inf, jnp.inf), fast)
     # At the threshold itself the square is zero to rounding only.
     exists = (square >= -8 * eps * momentum * momentum) & (~still | (mgl == 0))
-    return slow, fast, exists
+    return jnp.where(exists, slow, jnp.nan), jnp.where(exists, fast, jnp.nan)
 
 
 def steady_precession(
@@ -78,7 +94,6 @@ def steady_precession(
     omega3: ScalarLike | None = None,
     *,
     psi_dot: ScalarLike | None = None,
-    throw: bool = True,
 ) -> SteadyPrecession:
     """The rates at which a top may precess at a constant tilt.
 
@@ -91,14 +106,13 @@ def steady_precession(
         omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s]; or
         psi_dot: spin about the axis, as seen by one who precesses with it [rad/s]; one of the two.
             Then I1 - I3 takes the place of I1.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Both rates, and whether there are any.
+        Both rates, and whether there are any: not with too little spin, nor where the top is not
+        valid or a number not finite.
 
     Raises:
-        ValueError: Wrong shape; omega3 and psi_dot both given, or neither (trace time).
-        RuntimeError: Bad value (run time, any lane). Too little spin is none: see `exists`.
+        ValueError: omega3 and psi_dot both given, or neither.
 
     Gradients: right where the two rates differ; where they meet, without the infinite part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -111,41 +125,21 @@ def steady_precession(
     spin = psi_dot if omega3 is None else omega3
     if spin is None or (omega3 is not None and psi_dot is not None):
         raise ValueError("One of the arguments `omega3` and `psi_dot` must be given, and one only.")
-    findings, values = _checked(top, theta, spin)
-    slow, fast, exists = _steady(*findings.apply(values, throw), of_psi=omega3 is None)
-    exists = exists & findings.ok
-    slow, fast = nan_where(~exists, (slow, fast))
-    return SteadyPrecession(slow, fast, exists)
+    formula = partial(_steady, of_psi=omega3 is None)
+    spins = {"psi_dot" if omega3 is None else "omega3": spin}
+    slow, fast = where_valid(formula, top, theta=theta, **spins)
+    return SteadyPrecession(slow, fast, ~jnp.isnan(slow))
 
 
-def _checked(top: SymmetricTop, *angle_and_spin: ScalarLike) -> tuple[Findings, tuple[Array, ...]]:
-    i1, i3, mgl, *values = as_arrays(top, *angle_and_spin)
-    for name, value in zip(("theta", "omega3"), values, strict=False):
-        check_shape(name, value, ())
-    findings = Findings()
-    require_top(findings, SymmetricTop(i1, i3, mgl))
-    findings.require(
-        all_finite(tuple(values)),
-        RESULTS.invalid_state,
-        "Arguments `theta` and `omega3` must be finite, but one is not.",
-    )
-    one = jnp.ones_like(i1)
-    return findings, tuple(jnp.where(findings.ok, x, one) for x in (i1, i3, mgl, *values))
-
-
-def sleeping_spin(top: SymmetricTop, *, throw: bool = True) -> Scalar:
+def sleeping_spin(top: SymmetricTop) -> Scalar:
     """Spin above which a top stands upright stably, 2 sqrt(mgl I1) / I3.
 
     Args:
         top: The top.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        |omega3| at the threshold [rad/s]; 0 if mgl <= 0: such a top hangs.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        |omega3| at the threshold [rad/s]; 0 if mgl <= 0: such a top hangs. NaN where the top is
+        not valid.
 
     Gradients: right for mgl > 0; zero at mgl <= 0.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -154,16 +148,14 @@ def sleeping_spin(top: SymmetricTop, *, throw: bool = True) -> Scalar:
     >>> print(jr.top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, 1.0)))
     4.0
     """
-    findings, values = _checked(top)
-    i1, i3, mgl = findings.apply(values, throw)
-    falls = mgl > 0
-    spin = 2 * jnp.sqrt(i1 * jnp.where(falls, mgl, 1.0)) / i3
-    return nan_where(~findings.ok, jnp.where(falls, spin, 0.0))
+
+    def threshold(i1: Array, i3: Array, mgl: Array) -> Array:
+        return 2 * root_of_positive(i1 * mgl) / i3
+
+    return where_valid(threshold, top)
 
 
-def gyroscopic(
-    top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike, *, throw: bool = True
-) -> Gyroscopic:
+def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyroscopic:
     """The textbook's fast top, to compare with the exact one.
 
     The exact values are `mean_precession`, `nutation_period` and `nutation_bounds`.
@@ -172,15 +164,11 @@ def gyroscopic(
         top: The top.
         theta: Tilt of the axis from the vertical at which it is released [rad].
         omega3: Third component of the angular velocity, not zero [rad/s].
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
         Precession, nutation and the amplitude of nutation, with relative errors of the order of
-        mgl I1 / (I3 omega3)^2.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value, no spin (run time, any lane).
+        mgl I1 / (I3 omega3)^2. NaN without spin, and where the top is not valid or a number not
+        finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -190,14 +178,16 @@ def gyroscopic(
     >>> print(fast.precession, fast.nutation, fast.amplitude.round(5))
     0.02 50.0 0.0004
     """
-    findings, values = _checked(top, theta, omega3)
-    spins = values[-1] != 0
-    findings.require(spins, RESULTS.invalid_state, "Argument `omega3` must not be zero, but it is.")
-    i1, i3, mgl, tilt, spin = findings.apply(values, throw)
-    momentum = i3 * jnp.where(spins, spin, 1.0)
-    fall = 2 * mgl * i1 * jnp.sin(tilt) / (momentum * momentum)
-    found = Gyroscopic(mgl / momentum, momentum / i1, fall)
-    return nan_where(~findings.ok, found)
+
+    def fast(i1: Array, i3: Array, mgl: Array, theta: Array, omega3: Array) -> Gyroscopic:
+        momentum = i3 * omega3
+        fall = 2 * mgl * i1 * jnp.sin(theta) / (momentum * momentum)
+        return Gyroscopic(mgl / momentum, momentum / i1, fall)
+
+    def where_it_spins(*numbers: Array) -> Gyroscopic:
+        return where_defined(numbers[-1] != 0, fast, *numbers)
+
+    return where_valid(where_it_spins, top, theta=theta, omega3=omega3)
 
 
 def initial_state(
@@ -218,7 +208,7 @@ def initial_state(
 
     Args:
         top: The top.
-        theta: Tilt of the axis from the vertical [rad].
+        theta: Tilt of the axis from the vertical, from 0 to pi [rad].
         psi_dot: Spin about the axis, as seen by one who precesses with it [rad/s]; or
         omega3: third component of the angular velocity, psi' + phi' cos theta [rad/s]; one of the
             two, or neither for no spin (omega3 = 0).
@@ -233,8 +223,9 @@ def initial_state(
         Attitude and angular velocity.
 
     Raises:
-        ValueError: Wrong shape, psi_dot and omega3 both given (trace time).
-        RuntimeError: Bad value, or too little spin for steady precession (run time, any lane).
+        ValueError: psi_dot and omega3 both given.
+        RuntimeError: A tilt outside of its range, a value that is not finite, too little spin for
+            steady precession, or the fast one of a level axis, which is infinite.
 
     Gradients: analytic; of a steady precession those of its rate.
 
@@ -244,44 +235,35 @@ def initial_state(
     >>> print(state.omega.round(4))
     [0.     0.1795 6.    ]
     """
+    check_type("top", top, SymmetricTop)
     if psi_dot is not None and omega3 is not None:
         raise ValueError("Argument `psi_dot` must be None where `omega3` is given, but it is not.")
-    steady = phi_dot if isinstance(phi_dot, str) else None
-    if steady is not None:
-        check_option("phi_dot", steady, ("slow", "fast"))
-    spin = 0.0 if psi_dot is None and omega3 is None else (omega3 if psi_dot is None else psi_dot)
-    rate = 0.0 if steady is not None else phi_dot
-    i1, i3, mgl, *values = as_arrays(top, theta, spin, rate, theta_dot, phi, psi)
-    names = (
-        "theta",
-        "psi_dot" if omega3 is None else "omega3",
-        "phi_dot",
-        "theta_dot",
-        "phi",
-        "psi",
-    )
-    for name, value in zip(names, values, strict=True):
-        check_shape(name, value, ())
+    spin_name, spin = ("omega3", omega3) if psi_dot is None else ("psi_dot", psi_dot)
+    spin = 0.0 if spin is None else spin
+    branch = phi_dot if isinstance(phi_dot, str) else None
+    if branch is not None:
+        check_option("phi_dot", branch, ("slow", "fast"))
+    given = {"theta": theta, spin_name: spin, "phi_dot": 0.0 if branch else phi_dot}
+    given |= {"theta_dot": theta_dot, "phi": phi, "psi": psi}
+    numbers = float_arrays(top.I1, top.I3, top.mgl, *given.values())
     findings = Findings()
-    require_top(findings, SymmetricTop(i1, i3, mgl))
-    findings.require(
-        all_finite(tuple(values)),
-        RESULTS.invalid_state,
-        "The angles and rates of a top must be finite, but one is not.",
-    )
-    ok = findings.ok
-    i1, i3, mgl = (jnp.where(ok, x, 1.0) for x in (i1, i3, mgl))
-    theta, spin, rate, theta_dot, phi, psi = (jnp.where(ok, x, 0.0) for x in values)
-    if steady is not None:
-        slow, fast, exists = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
-        rate = slow if steady == "slow" else fast
-        findings.require(
-            exists & jnp.isfinite(jax.lax.stop_gradient(rate)), RESULTS.invalid_state, _NO_STEADY
-        )
-        rate = jnp.where(findings.ok, rate, 0.0)
+    findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(numbers[:3]))
+    for name, value in zip(given, numbers[3:], strict=True):
+        check_shape(name, value, ())
+        good, message = jnp.isfinite(value), f"Argument `{name}` must be finite, but it is not."
+        if name == "theta":
+            good, message = (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING), _BAD_TILT
+        findings.require(good, RESULTS.invalid_state, message, value)
+    i1, i3, mgl, theta, spin, rate, theta_dot, phi, psi = harmless(findings.ok, numbers)
+    if branch is not None:
+        slow, fast = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
+        rate = slow if branch == "slow" else fast
+        too_slow = _TOO_SLOW.format(spin_name)
+        findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
+        findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
+        rate = harmless(findings.ok, rate)
     angles = jnp.stack([phi, theta, psi])
     omega = euler_rates_to_omega(angles, jnp.stack([rate, theta_dot, spin]))
     if psi_dot is None:
         omega = omega.at[2].set(spin)
-    state = State(from_euler(angles), omega)
-    return findings.apply(nan_where(~findings.ok, state), throw)
+    return findings.guard(State(from_euler(angles), omega), throw)

@@ -1,57 +1,58 @@
-"""The symmetric top: its three numbers, where they come from, and their checks."""
+"""The symmetric top: its three numbers, where they come from, and the way into its formulas."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jrigid._checks import (
     RESULTS,
     Findings,
     all_finite,
+    all_positive,
     array_of_shape,
     check_shape,
+    check_type,
     float_arrays,
+    harmless,
     is_unit,
-    pair_of_shapes,
+    where_defined,
 )
-from jrigid._types import ScalarLike, VectorLike
-from jrigid.dynamics import State
+from jrigid._types import Readable, VectorLike
+from jrigid.dynamics import State, plain_state
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 from jrigid.torques import UniformGravity
 
-_SYMMETRIC = (
-    "Arguments `body` and `lever` must describe a top symmetric about body axis 3, with the centre "
-    "of mass on that axis, under a finite gravity, but they do not: for any other body use "
-    "`RigidBody` with `torques.UniformGravity`."
+Answer = TypeVar("Answer")
+_STANDARD_GRAVITY = 9.80665  # [m/s^2]
+_ELSE = "For any other body use `RigidBody` under `torques.UniformGravity`.)"
+_NOT_SYMMETRIC = (
+    "Argument `body` must have an inertia symmetric about its axis 3, but it has not. (Shown are "
+    f"I11, I22, I12, I13, I23. {_ELSE}"
 )
-_BAD_TOP = "Argument `top` must have I1 > 0, I3 > 0 and a finite mgl, but it does not."
+_NOT_ON_AXIS = f"Argument `lever` must lie along body axis 3, but it does not. ({_ELSE}"
+_NOT_VERTICAL = "Argument `gravity` must lie along z in space, but it does not."
 
 
-class SymmetricTop(eqx.Module):
+class SymmetricTop(Readable):
     """A heavy top, symmetric about body axis 3, with a fixed point on that axis (Lagrange's top).
 
-    Gravity pulls along -z in space.
+    Gravity pulls along -z in space. For many tops `jax.vmap` over the numbers, or over a top whose
+    leaves have a leading axis.
 
     Attributes:
-        I1: Moment about a transverse axis through the fixed point [kg m^2].
-        I3: Moment about the axis [kg m^2].
+        I1: Moment about a transverse axis through the fixed point, positive [kg m^2].
+        I3: Moment about the axis, positive [kg m^2].
         mgl: Weight times the distance of the centre of mass from the fixed point along axis 3
             [N m]; negative where the centre of mass is on the negative side, or gravity pulls up.
 
-    Raises:
-        ValueError: Not scalars (trace time). Values are checked where the top is used.
-
-    For many tops `jax.vmap` over the numbers, or over a top whose leaves have a leading axis.
-
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(I1=2e-3, I3=1e-3, mgl=0.2)
-    >>> print(jr.top.sleeping_spin(top).round(6))
-    40.0
+    >>> print(top, jr.top.sleeping_spin(top).round(6))
+    SymmetricTop(I1=0.002, I3=0.001, mgl=0.2) 40.0
     """
 
     I1: Float[Array, ""] = eqx.field(converter=lambda x: _scalar("I1", x))
@@ -63,55 +64,59 @@ class SymmetricTop(eqx.Module):
         cls,
         body: MassProperties,
         lever: VectorLike,
-        gravity: ScalarLike = 9.80665,
+        gravity: VectorLike | None = None,
         *,
         throw: bool = True,
     ) -> "SymmetricTop":
         """The top that a body makes when one of its points is held.
 
         Args:
-            body: Mass properties, about the centre of mass.
-            lever: From the fixed point to the centre of mass, body components [m].
-            gravity: Acceleration of gravity [m/s^2].
+            body: Mass properties, about the centre of mass; symmetric about body axis 3.
+            lever: From the fixed point to the centre of mass, along axis 3, body components [m].
+            gravity: Acceleration of gravity, along z, space components [m/s^2]; standard gravity,
+                9.80665 along -z, by default.
             throw: False: bad values give NaN instead of an error.
 
         Returns:
             The top, its moments about the fixed point (parallel axes).
 
         Raises:
-            ValueError: Wrong shape (trace time).
-            RuntimeError: A body that is not symmetric about axis 3, or a lever off that axis (run
-                time, any lane).
+            RuntimeError: A body that is not symmetric, a lever or gravity off its axis by more
+                than 1e-8 (float32: 3e-4) of its size.
 
-        Gradients: linear in mass and moments, quadratic in the lever.
+        Gradients: linear in mass, moments and gravity, quadratic in the lever.
 
         >>> import jax.numpy as jnp, jrigid as jr
-        >>> cone = jr.solids.cone(0.5, 0.03, 0.08)
-        >>> top = jr.SymmetricTop.from_mass_properties(cone, jnp.array([0.0, 0.0, 0.06]))
+        >>> cone = jr.solids.cone(0.5, 0.03, 0.08)  # its tip is 0.06 above the centre of mass
+        >>> tip_down = cone.rotated(jr.rotation.exp(jnp.array([jnp.pi, 0.0, 0.0])))
+        >>> top = jr.SymmetricTop.from_mass_properties(tip_down, jnp.array([0.0, 0.0, 0.06]))
         >>> print(top.I1.round(7), top.mgl.round(4))
         0.0019875 0.2942
         """
-        lever, gravity = pair_of_shapes("lever", lever, (3,), "gravity", gravity, ())
-        if not isinstance(body, MassProperties):
-            raise ValueError(
-                f"Argument `body` must be MassProperties, but it is {type(body).__name__}."
-            )
-        about = body.about(body.center_of_mass - lever)
-        tensor = jax.lax.stop_gradient(about)
-        size = jnp.max(jnp.abs(tensor))
-        off = jnp.stack([tensor[0, 0] - tensor[1, 1], tensor[0, 1], tensor[0, 2], tensor[1, 2]])
-        tolerance = jnp.sqrt(jnp.finfo(tensor.dtype).eps)
+        check_type("body", body, MassProperties)
+        if gravity is None:
+            gravity = jnp.array([0.0, 0.0, -_STANDARD_GRAVITY], body.mass.dtype)
+        mass, inertia, lever, gravity = float_arrays(body.mass, body.inertia, lever, gravity)
+        check_shape("lever", lever, (3,))
+        check_shape("gravity", gravity, (3,))
+        (a, d, e), (_, b, f), (_, _, c) = inertia
+        tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
+        size = jnp.maximum(a + b + c, mass * lever[2] ** 2)
+        symmetric = jnp.max(jnp.abs(jnp.stack([a - b, d, e, f]))) <= tolerance * size
         findings = Findings()
-        findings.require(
-            jnp.isfinite(gravity)
-            & jnp.all(jnp.abs(off) <= tolerance * size)
-            & jnp.all(jnp.abs(lever[:2]) <= tolerance * jnp.max(jnp.abs(lever))),
-            RESULTS.invalid_inertia,
-            _SYMMETRIC,
+        shown = jnp.stack([a, b, d, e, f])
+        findings.require(symmetric, RESULTS.invalid_inertia, _NOT_SYMMETRIC, shown)
+        for value, code, message in (
+            (lever, RESULTS.invalid_position, _NOT_ON_AXIS),
+            (gravity, RESULTS.invalid_torque, _NOT_VERTICAL),
+        ):
+            off = jnp.max(jnp.abs(value[:2])) > tolerance * jnp.abs(value[2])
+            findings.require(all_finite(value) & ~off, code, message, value)
+        across, c, mass, length, pull = harmless(
+            findings.ok, (0.5 * (a + b), c, mass, lever[2], gravity[2])
         )
-        top = cls(0.5 * (about[0, 0] + about[1, 1]), about[2, 2], body.mass * gravity * lever[2])
-        nan = jtu.tree_map(lambda x: jnp.where(findings.ok, x, jnp.nan), top)
-        return findings.apply(nan, throw)
+        top = cls(across + mass * length * length, c, -mass * pull * length)
+        return findings.guard(top, throw)
 
     def as_rigid_body(self) -> RigidBody:
         """The same top for `jrigid.simulate`: a `RigidBody` under `UniformGravity`.
@@ -122,68 +127,35 @@ class SymmetricTop(eqx.Module):
         [1.  1.  0.5] [0. 0. 2.]
         """
         zero = jnp.zeros_like(self.mgl)
-        gravity = UniformGravity(
-            1.0, jnp.stack([zero, zero, self.mgl]), jnp.array([0.0, 0.0, -1.0])
-        )
+        lever = jnp.stack([zero, zero, self.mgl])
+        gravity = UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
         return RigidBody(jnp.stack([self.I1, self.I1, self.I3]), gravity)
+
+    @property
+    def is_valid(self) -> Bool[Array, ""]:
+        """True where the moments are positive and all is finite: the domain of every formula."""
+        return all_positive((self.I1, self.I3)) & all_finite(self.mgl)
 
 
 def _scalar(name: str, value: Any) -> Any:
     return None if value is None else array_of_shape(name, value)  # None: an axis of vmap
 
 
-def require_top(findings: Findings, top: SymmetricTop) -> None:
-    """Note moments that are not positive and what is not finite."""
-    moments = jnp.stack([top.I1, top.I3])
-    good = all_finite(top) & jnp.all(moments > 0)
-    findings.require(good, RESULTS.invalid_inertia, _BAD_TOP)
+def where_valid(formula: Callable[..., Answer], top: SymmetricTop, **scalars: Any) -> Answer:
+    """A formula of I1, I3, mgl and scalars, in one dtype; NaN where any is outside its domain."""
+    check_type("top", top, SymmetricTop)
+    numbers = float_arrays(top.I1, top.I3, top.mgl, *scalars.values())
+    for name, value in zip(scalars, numbers[3:], strict=True):
+        check_shape(name, value, ())
+    return where_defined(top.is_valid & all_finite(numbers), formula, *numbers)
 
 
-def as_arrays(top: Any, *others: Any) -> tuple[Array, ...]:
-    """I1, I3, mgl and scalars, of one dtype; ValueError if they are not."""
-    if not isinstance(top, SymmetricTop):
-        raise ValueError(f"Argument `top` must be a SymmetricTop, but it is {type(top).__name__}.")
-    return float_arrays(top.I1, top.I3, top.mgl, *others)
-
-
-def checked(top: Any, state: Any, throw: bool) -> tuple[Findings, SymmetricTop, State]:
-    """Top and state of one dtype, harmless where they are bad."""
-    findings, top, state, _ = checked_with(top, state)
-    return findings, *findings.apply((top, state), throw)
-
-
-def checked_with(
-    top: Any, state: Any, *others: Any
-) -> tuple[Findings, SymmetricTop, State, tuple[Array, ...]]:
-    """Top, state and more arrays of one dtype, harmless where top or state are bad."""
-    if not isinstance(state, State):
-        raise ValueError(f"Argument `state` must be a State, but it is {type(state).__name__}.")
-    if jtu.tree_leaves(state.internal):
-        raise ValueError(
-            "Argument `state.internal` must be empty, but it is not: a top with moving parts is "
-            "not Lagrange's; use `jrigid.simulate`."
-        )
-    arrays = as_arrays(top, state.attitude, state.omega, *others)
-    (i1, i3, mgl, attitude, omega), others = arrays[:5], arrays[5:]
-    check_shape("state.attitude", attitude, (4,))
-    check_shape("state.omega", omega, (3,))
-    if i1.dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"Arguments must be float32 or float64, but they are {i1.dtype}.")
-    top, state = SymmetricTop(i1, i3, mgl), State(attitude, omega)
-    findings = Findings()
-    require_top(findings, top)
-    findings.require(all_finite(state), RESULTS.invalid_state)
-    findings.require(is_unit(attitude), RESULTS.invalid_attitude)
-    findings.require(all_finite(others), RESULTS.invalid_times)
-    ok = findings.ok
-    # A bad lane does something harmless: no NaN reaches the derivatives of what lanes share.
-    harmless = (
-        SymmetricTop(*jnp.ones((3,), i1.dtype)),
-        State(jnp.zeros(4, i1.dtype).at[0].set(1), jnp.zeros(3, i1.dtype)),
-    )
-    top, state, others = jtu.tree_map(
-        lambda x, y: jnp.where(ok, x, y),
-        (top, state, others),
-        (*harmless, tuple(jnp.zeros_like(x) for x in others)),
-    )
-    return findings, top, state, others
+def top_and_state(
+    name: str, top: SymmetricTop, state: State, *others: Any
+) -> tuple[Bool[Array, ""], SymmetricTop, State, tuple[Array, ...]]:
+    """Whether a top and its state are valid; these and other arrays in one dtype."""
+    check_type("top", top, SymmetricTop)
+    state, numbers = plain_state(name, state, top.I1, top.I3, top.mgl, *others)
+    top = SymmetricTop(*numbers[:3])
+    ok = top.is_valid & all_finite(state) & is_unit(state.attitude)
+    return ok, top, state, numbers[3:]
