@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._adjoint import guard_inputs, guard_outputs
 from jrigid._checks import (
     RESULTS,
     Findings,
@@ -23,7 +22,12 @@ from jrigid._checks import (
     harmless,
     nan_where,
 )
-from jrigid._controller import (
+from jrigid._numerics import power_of_two
+from jrigid._scales import ravel, units, unravel
+from jrigid._types import ScalarLike
+from jrigid.rotation import normalize
+from jrigid.simulate._adjoint import guard_inputs, guard_outputs
+from jrigid.simulate._controller import (
     LARGEST_STEP,
     WatchfulController,
     constant,
@@ -31,12 +35,8 @@ from jrigid._controller import (
     guarded,
     standing_still,
 )
-from jrigid._inputs import DEFAULT_RTOL, check_values, numbers, tolerances
-from jrigid._numerics import power_of_two
-from jrigid._scales import ravel, units, unravel
-from jrigid._trajectory import Trajectory
-from jrigid._types import ScalarLike
-from jrigid.rotation import normalize
+from jrigid.simulate._options import DEFAULT_RTOL, check_values, numbers, tolerances
+from jrigid.simulate._trajectory import Trajectory
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem, RigidBody
 from jrigid.torques import Sum
