@@ -1,46 +1,39 @@
-"""simulate(): the one call of `diffrax.diffeqsolve`, and the Trajectory it gives."""
+"""simulate(): the one call of `diffrax.diffeqsolve`."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    check_shape,
-    float_arrays,
-    harmless,
-    nan_where,
-)
+from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
+from jrigid._motion import HasRigidBody, motion_arguments
 from jrigid._numerics import power_of_two
-from jrigid._scales import ravel, units, unravel
+from jrigid._scales import ravel, spectral_radius, undamped_rate, units
 from jrigid._types import ScalarLike
 from jrigid.rotation import normalize
-from jrigid.simulate._adjoint import guard_inputs, guard_outputs
+from jrigid.simulate._adjoint import WithTimes, guard_inputs, guard_outputs
 from jrigid.simulate._controller import (
     LARGEST_STEP,
+    SteadyController,
     WatchfulController,
     constant,
     fastest_on_the_way,
     guarded,
     standing_still,
 )
-from jrigid.simulate._options import DEFAULT_RTOL, check_values, numbers, tolerances
+from jrigid.simulate._event import event_in_si
+from jrigid.simulate._options import BLUR, Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
 from jrigid.solvers import ExactFree, FreeRotation
-from jrigid.systems import AbstractSystem, RigidBody
-from jrigid.torques import Sum
-from jrigid.torques._base import has_parts
+from jrigid.systems import AbstractSystem
 
 # One step commits this fraction of rtol. The error of the energy adds up over the turns and that
 # of the phase over the energy's: what is promised of the state after thousands of turns, and of
@@ -50,16 +43,16 @@ _STEP_FRACTION = 1e-3
 _LONG_RADIANS = 2e4
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
+# Below this many eps of the run a step is none. A motion that ends there is looked at so many of
+# them further on, beyond the last step that was tried.
+_RESOLUTION, _AHEAD = 16.0, 8.0
 # After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
 _GROWTH = 1e16
-_DEFAULT_MAX_STEPS = 20_000_000
-_DEFAULT_MAX_STEPS_DIRECT = 4096
-_CHECKPOINTS = 100
-_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
+_COUNTS = ("", "accepted_", "rejected_")
 
 
 def simulate(
-    system: AbstractSystem,
+    system: AbstractSystem | HasRigidBody,
     state0: Any,
     ts: Real[_ArrayLike, "..."],
     args: Any = None,
@@ -145,194 +138,202 @@ def simulate(
     >>> print(jr.RESULTS[trajectory.result])
     Argument `state0` must be finite, but a component is not.
     """
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            "Argument `system` must be a jrigid system (a RigidBody, a FloatingBody), "
-            f"but it is {type(system).__name__}."
-        )
-    if not isinstance(state0, system.state_type):
-        raise ValueError(
-            f"Argument `state0` must be a {system.state_type.__name__}, "
-            f"but it is {type(state0).__name__}."
-        )
-    for name, size in (("attitude", 4), ("omega", 3), ("position", 3), ("velocity", 3)):
-        value = getattr(state0, name, jnp.zeros(size))  # only a body in flight has all
-        if not eqx.is_array(value):
-            raise ValueError(
-                f"Argument `state0.{name}` must be an array of shape ({size},), "
-                f"but it is {value!r}."
-            )
-        check_shape(f"state0.{name}", value, (size,))
-    internal = jtu.tree_map(lambda x: float_arrays(x)[0], state0.internal)
-    state0 = dataclasses.replace(state0, internal=internal)
-    ts, t0 = numbers(ts=ts, t0=t0)
-    if ts.size == 0:
-        raise ValueError("Argument `ts` must hold at least one time, but it is empty.")
-    check_shape("t0", t0, ())
-    dtype = jnp.result_type(*(x.dtype for x in jtu.tree_leaves(state0)))
-    if jnp.dtype(dtype).itemsize not in DEFAULT_RTOL:
-        raise ValueError(
-            f"Argument `state0` must be float32 or float64, but it is {jnp.dtype(dtype).name}."
-        )
-    if solver is None:
-        solver = diffrax.Dopri8()
-    if isinstance(solver, ExactFree):
-        torque = system.torque
-        free = isinstance(system, RigidBody) and isinstance(torque, Sum) and not torque.terms
-        if not free:
-            raise ValueError(
-                "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
-                "torque, but it is."
-            )
-    elif not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise ValueError(
-            "Argument `solver` must be a diffrax solver with an error estimate, or ExactFree(), "
-            f"but it is {type(solver).__name__}."
-        )
-    if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_CHECKPOINTS)
-    if not isinstance(adjoint, _ADJOINTS):
-        raise ValueError(
-            "Argument `adjoint` must be diffrax.RecursiveCheckpointAdjoint(), ForwardMode() or "
-            f"DirectAdjoint(), but it is {adjoint!r}."
-        )
-    if event is not None and not isinstance(event, diffrax.Event):
-        raise ValueError(f"Argument `event` must be a diffrax.Event, but it is {event!r}.")
-    if max_steps is not None and (not isinstance(max_steps, int | np.integer) or max_steps < 1):
-        raise ValueError(
-            f"Argument `max_steps` must be an integer and at least 1, but it is {max_steps!r}."
-        )
-    (longest,) = numbers(max_step=jnp.inf if max_step is None else max_step)
-    check_shape("max_step", longest, ())
-    longest = longest.astype(dtype)
-    if max_steps is None:
-        direct = isinstance(adjoint, diffrax.DirectAdjoint)
-        max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
-    rtol, atol = tolerances(rtol, atol, dtype)
-    if progress is True:
-        meter: diffrax.AbstractProgressMeter = diffrax.TextProgressMeter()
-    elif progress is False:
-        meter = diffrax.NoProgressMeter()
-    elif isinstance(progress, diffrax.AbstractProgressMeter):
-        meter = progress
-    else:
-        raise ValueError(
-            "Argument `progress` must be True, False or a progress meter of diffrax, "
-            f"but it is {progress!r}."
-        )
-    return _simulate(
-        dtype, system, state0, ts, t0, args, solver, rtol, atol, adjoint, int(max_steps), longest,
-        event, throw, meter,
+    system, state0, (ts, t0) = motion_arguments(system, state0, ts=ts, t0=t0)
+    options = checked_options(
+        system, state0.omega.dtype, solver, (rtol, atol), adjoint, (max_steps, max_step), event,
+        progress,
     )  # fmt: skip
+    inputs = Inputs(system, state0, ts, t0, args)
+    trajectory = _simulate(inputs, options)
+
+    def findings() -> Findings:
+        found = judged(inputs, options)
+        for code, value in (
+            (RESULTS.unresolved_times, t0),
+            (RESULTS.nonfinite_torque, trajectory.final_time),
+        ):
+            found.require(trajectory.result != code, code, value=value)
+        return found
+
+    return settle(trajectory, throw, findings)
+
+
+class _Run(NamedTuple):
+    """The motion in its own scales."""
+
+    ok: Array
+    start: Array  # t0, in the precision of the state
+    stretch: Array  # radians in a second
+    scales: Array  # of the components of the state
+    fastest: Array  # rate, per radian
+    taus: Array  # times [rad]
+    end: Array  # of the run [rad]
+
+    @property
+    def resolution(self) -> Array:
+        """The shortest step [rad]."""
+        eps = jnp.finfo(self.end.dtype).eps
+        return _RESOLUTION * eps * jax.lax.stop_gradient(self.end)
+
+
+class _Problem(NamedTuple):
+    """The motion as diffrax takes it."""
+
+    terms: Any
+    y0: Any
+    to_state: Callable[[Any], Any]
+    controller: Any
 
 
 @eqx.filter_jit
-def _simulate(
-    dtype: Any,
-    system: Any,
-    state0: Any,
-    ts: Array,
-    t0: Array,
-    args: Any,
-    solver: Any,
-    rtol: Array,
-    atol: Array,
-    adjoint: Any,
-    max_steps: int,
-    longest: Array,
-    event: Any,
-    throw: bool,
-    meter: Any,
-) -> Trajectory:
-    if not has_parts(state0.internal):
-        state0 = dataclasses.replace(state0, internal=system.torque.internal_at_rest(state0))
-    have, want = (
-        [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
-        for tree in (state0.internal, system.torque.internal_at_rest(state0))
+def _simulate(inputs: Inputs, options: Options) -> Trajectory:
+    findings = judged(inputs, options)
+    usable, options = _usable(findings.ok, inputs, options)
+    usable = guard_inputs(options.adjoint, usable)
+    run = _measured(findings, usable, options)
+    problem = (_exact if isinstance(options.solver, ExactFree) else _stepped)(run, usable, options)
+    # Neither first step nor times are handed to diffrax here: it would check them by callbacks.
+    solution = diffrax.diffeqsolve(
+        problem.terms,
+        options.solver,
+        jnp.zeros_like(run.end),
+        jnp.full_like(run.end, jnp.inf),
+        None,
+        problem.y0,
+        usable.args,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=problem.controller,
+        adjoint=WithTimes(options.adjoint, run.taus, run.end),
+        max_steps=options.max_steps,
+        event=event_in_si(options.event, run.start, run.stretch, problem.to_state),
+        throw=False,
+        progress_meter=options.meter,
     )
-    if have != want:
-        raise ValueError(
-            f"Argument `state0.internal` must hold arrays of the shapes {want}, "
-            f"but it holds {have}."
-        )
+    trajectory = _trajectory(findings, inputs, usable, run, problem, solution, options.event)
+    return guard_outputs(options.adjoint, trajectory)
 
-    flat = ts.reshape(-1)
-    findings = Findings()
-    check_values(findings, system, state0, flat, t0, longest, rtol, atol, args)
-    ok = findings.ok
-    # A bad lane integrates a body that keeps still instead, so that no other lane waits for it,
-    # and so that no NaN reaches the derivatives of what it shares with the others: ones, since
-    # there are forces that are singular at the origin.
-    system, args = harmless(ok, (system, args))
-    state0, rtol, atol = harmless(ok, (state0, rtol, atol))
-    identity = jnp.zeros(4, state0.attitude.dtype).at[0].set(1)
+
+def _usable(ok: Array, inputs: Inputs, options: Options) -> tuple[Inputs, Options]:
+    """The inputs, or those of a body that keeps still.
+
+    No other lane is to wait for a bad one, and no NaN to reach the derivatives of what it shares
+    with the others: ones, since there are forces that are singular at the origin.
+    """
+    system, state0, ts, t0, args = inputs
+    system, state0, args, rtol, atol = harmless(
+        ok, (system, state0, args, options.rtol, options.atol)
+    )
+    identity = jnp.zeros_like(state0.attitude).at[0].set(1)
     attitude = normalize(jnp.where(ok, state0.attitude, identity))
     state0 = dataclasses.replace(state0, attitude=attitude)
-    flat = jnp.where(ok, flat, jnp.zeros_like(flat))
-    t0 = jnp.where(ok, t0, jnp.zeros_like(t0))
-    system, state0, flat, t0, args = guard_inputs(adjoint, (system, state0, flat, t0, args))
-    # Times may come in more digits than states: they are subtracted in their own precision.
-    since_start = (flat - t0).astype(dtype)
-    start = t0.astype(dtype)
+    ts, t0 = (jnp.where(ok, x, jnp.zeros_like(x)) for x in (ts, t0))
+    return Inputs(system, state0, ts, t0, args), options._replace(rtol=rtol, atol=atol)
 
-    measures = units(system, state0, since_start[-1], start, args)
+
+def _fastest_of(solver: Any, rounds: int) -> Callable[[Array], Array]:
+    """What bounds a solver's steps, of the Jacobian; those of an implicit one nothing damped."""
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        return undamped_rate
+    return lambda matrix: spectral_radius(matrix, rounds)
+
+
+def _measured(findings: Findings, inputs: Inputs, options: Options) -> _Run:
+    system, state0, ts, t0, args = inputs
+    ok, dtype = findings.ok, options.rtol.dtype
+    # Times may come in more digits than states: they are subtracted in their own precision.
+    since_start = (ts.reshape(-1) - t0).astype(dtype)
+    start = t0.astype(dtype)
+    measures = units(system, state0, since_start[-1], start, args, _fastest_of(options.solver, 2))
     rate, fastest, scales = harmless(ok, jax.lax.stop_gradient(measures))
+    blur = jnp.finfo(t0.dtype).eps * jnp.abs(t0)
+    findings.require(~(blur.astype(dtype) * fastest > BLUR), RESULTS.unresolved_times)
+    since_start = jnp.where(findings.ok, since_start, jnp.zeros_like(since_start))
     moving = since_start[-1] > 0  # all times at t0: nothing to integrate
     stretch = power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
     taus = since_start * stretch
     end = jnp.where(moving, taus[-1], 1.0)
-    stop = jax.lax.stop_gradient(end)
-    radians = stop * fastest / stretch
-    largest_step = jnp.minimum(LARGEST_STEP * stretch / fastest, longest * stretch)
-    largest_step = jnp.where(ok, largest_step, 1.0)
-    if isinstance(solver, ExactFree):
-        terms, y0, to_state = _exact_problem(system, state0, stretch)
-        controller: Any = diffrax.ConstantStepSize()
-        first_step = stop if event is None else jnp.minimum(largest_step, stop)
-    else:
-        to_state, terms, y0, field, turning = _problem(
-            ok, adjoint, system, state0, args, start, stretch, scales
-        )
-        fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / radians)
-        eps = jnp.finfo(dtype).eps
-        step_rtol, step_atol = (jnp.maximum(fraction * x, _NOISE * eps) for x in (rtol, atol))
-        controller = diffrax.ClipStepSizeController(
-            WatchfulController(
-                rtol=step_rtol,
-                atol=step_atol,
-                dtmax=largest_step,
-                factormax=_GROWTH,
-                resolution=16 * eps * stop,
-                start_rate=fastest / stretch,
-                fastest=constant(jtu.Partial(fastest_on_the_way, ok, field, turning)),
-            ),
-            step_ts=jax.lax.stop_gradient(taus),
-        )
-        first_step = jnp.minimum(0.1 * largest_step, stop)
-    if event is None:
-        saveat = diffrax.SaveAt(ts=taus)
-    else:
-        saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=taus), diffrax.SubSaveAt(t1=True)])
-    solution = diffrax.diffeqsolve(
-        terms,
-        solver,
-        jnp.zeros_like(end),
-        end,
-        first_step,
-        y0,
-        args,
-        saveat=saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        event=_event_in_si(event, start, stretch, to_state),
-        throw=False,
-        progress_meter=meter,
-    )
-    saved: Any = (solution.ts, solution.ys)
-    result: Any = RESULTS.promote(solution.result)
+    return _Run(findings.ok, start, stretch, scales, fastest / stretch, taus, end)
 
-    def to_states(taus: Array, y: Any) -> Any:
+
+def _longest_step(run: _Run, options: Options) -> Array:
+    longest = jnp.minimum(LARGEST_STEP / run.fastest, options.max_step * run.stretch)
+    return jnp.where(run.ok, longest, 1.0)
+
+
+def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
+    """The motion as one array, for a solver with an error estimate."""
+    system, state0, _, _, args = inputs
+    start, stretch, scales = run.start, run.stretch, run.scales
+    flat, unravel = ravel_pytree(state0)
+
+    def to_state(y: Any) -> Any:
+        return unravel(y * scales)
+
+    def plain_field(tau: Any, y: Any, args: Any) -> Any:
+        rates = system.vector_field(start + tau / stretch, to_state(y), args)
+        return ravel(rates) / (scales * stretch)
+
+    y0 = flat / scales
+    y_start = jax.lax.stop_gradient(y0)
+    # What the functions of a user close over becomes visible.
+    converted = eqx.filter_closure_convert(plain_field, jnp.zeros_like(stretch), y0, args)
+    field: Any = harmless(run.ok, converted)
+
+    def vector_field(tau: Any, y: Any, args: Any) -> Any:
+        if isinstance(options.adjoint, diffrax.ForwardMode):  # NaN goes no way but its lane's
+            return standing_still(run.ok, field(tau, y, args))
+        return standing_still(run.ok, guarded(field, y_start, tau, y, args))
+
+    still = jtu.tree_map(jnp.zeros_like, state0)
+    turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
+    stop = jax.lax.stop_gradient(run.end)
+    longest = _longest_step(run, options)
+    fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / (stop * run.fastest))
+    noise = _NOISE * jnp.finfo(y0.dtype).eps
+    rtol, atol = (jnp.maximum(fraction * x, noise) for x in (options.rtol, options.atol))
+    fastest = jtu.Partial(
+        fastest_on_the_way, run.ok, field, turning * scales / stretch,
+        jtu.Partial(_fastest_of(options.solver, 1)),
+    )  # fmt: skip
+    watchful = WatchfulController(
+        diffrax.PIDController(rtol=rtol, atol=atol, dtmax=longest, factormax=_GROWTH),
+        first_step=jnp.minimum(0.1 * longest, stop),
+        resolution=run.resolution,
+        start_rate=run.fastest,
+        fastest=constant(fastest),
+    )
+    controller = diffrax.ClipStepSizeController(watchful, step_ts=jax.lax.stop_gradient(run.taus))
+    return _Problem(diffrax.ODETerm(vector_field), y0, to_state, controller)
+
+
+def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
+    """The free body with time in radians, for `ExactFree`: in one step, or those of an event."""
+    state0, stretch = inputs.state0, run.stretch
+
+    def to_state(y: Any) -> Any:
+        return dataclasses.replace(y, omega=y.omega * stretch)
+
+    y0 = dataclasses.replace(state0, omega=state0.omega / stretch)
+    step = jax.lax.stop_gradient(run.end)
+    if options.event is not None:
+        step = jnp.minimum(_longest_step(run, options), step)
+    terms = FreeRotation(inputs.system.inertia.astype(y0.omega.dtype))
+    return _Problem(terms, y0, to_state, SteadyController(step))
+
+
+def _trajectory(
+    findings: Findings,
+    inputs: Inputs,
+    usable: Inputs,
+    run: _Run,
+    problem: _Problem,
+    solution: Any,
+    event: Any,
+) -> Trajectory:
+    """What became of it, in SI units."""
+    (reached, (end,)), (ys, end_ys) = solution.ts, solution.ys
+
+    def states_of(taus: Array, y: Any) -> Any:
         valid = jnp.isfinite(taus)
 
         def where_valid(tree: Any, otherwise: float) -> Any:
@@ -340,92 +341,47 @@ def _simulate(
                 lambda x: jnp.where(valid.reshape(-1, *(1,) * (x.ndim - 1)), x, otherwise), tree
             )
 
-        state = jax.vmap(to_state)(where_valid(y, 1.0))
+        state = jax.vmap(problem.to_state)(where_valid(y, 1.0))
         state = dataclasses.replace(state, attitude=jax.vmap(normalize)(state.attitude))
         return where_valid(state, jnp.nan)
 
+    states = ends = states_of(reached, ys)
     if event is None:  # the motion ends at the last of the times
-        states = ends = to_states(*saved)
-        end_taus = saved[0]
+        last = reached[-1]
+        end = jnp.where(jnp.isfinite(last), last, jax.lax.stop_gradient(end))
     else:
-        (reached, end_taus), (ys, end_ys) = saved
-        states, ends = to_states(reached, ys), to_states(end_taus, end_ys)
+        ends = states_of(end[None], end_ys)
     final_state = jtu.tree_map(lambda x: x[-1], ends)
-    final_time = jnp.where(moving, t0 + (end_taus[-1] / stretch).astype(t0.dtype), t0)
+    final_time = usable.t0 + (end / run.stretch).astype(usable.t0.dtype)
+    result = RESULTS.promote(solution.result)
+    stuck = result == RESULTS.dt_min_reached
+    stopped = stuck & ~_finite_ahead(usable, run, problem, constant((end, end_ys)))
+    result = RESULTS.where(stopped, RESULTS.nonfinite_torque, result)
     finite = all_finite(final_state) | (result != RESULTS.successful)
     result = RESULTS.where(finite, result, RESULTS.nonfinite_state)
-    result = RESULTS.where(ok, result, findings.result)
+    result = RESULTS.where(run.ok, result, findings.result)
     failed = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
-    states = nan_where(~ok, states)
-    final_state, final_time = nan_where(failed, (final_state, final_time))
-    states, final_state, final_time = guard_outputs(adjoint, (states, final_state, final_time))
-    stats = {
-        name: solution.stats[name]
-        for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")
-    }
-    found = (states, final_state, final_time, stats)
-    if throw:
-        found = result.error_if(found, failed)
-    states, final_state, final_time, stats = found
-    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, *x.shape[1:]), states)
-    return Trajectory(ts, states, result, stats, final_time, final_state, (system, args))
-
-
-def _problem(
-    ok: Array,
-    adjoint: Any,
-    system: Any,
-    state0: Any,
-    args: Any,
-    start: Array,
-    stretch: Array,
-    scales: Array,
-) -> tuple[Any, ...]:
-    """The motion as one array in its own scales, and time in radians."""
-
-    def to_state(y: Any) -> Any:
-        return unravel(y * scales, state0)
-
-    def plain_field(tau: Any, y: Any, args: Any) -> Any:
-        rates = system.vector_field(start + tau / stretch, to_state(y), args)
-        return ravel(rates) / (scales * stretch)
-
-    y0 = ravel(state0) / scales
-    y_start = jax.lax.stop_gradient(y0)
-    # What the functions of a user close over becomes visible.
-    converted = eqx.filter_closure_convert(plain_field, jnp.zeros_like(stretch), y0, args)
-    field: Any = harmless(ok, converted)
-
-    def vector_field(tau: Any, y: Any, args: Any) -> Any:
-        if isinstance(adjoint, diffrax.ForwardMode):  # NaN goes no way but its own lane's
-            return standing_still(ok, field(tau, y, args))
-        return standing_still(ok, guarded(field, y_start, tau, y, args))
-
-    still = jtu.tree_map(jnp.zeros_like, state0)
-    turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
-    return to_state, diffrax.ODETerm(vector_field), y0, field, turning * scales / stretch
-
-
-def _exact_problem(system: Any, state0: Any, stretch: Array) -> tuple[Any, Any, Callable]:
-    """The free body with time in radians, for `ExactFree`."""
-
-    def to_state(y: Any) -> Any:
-        return dataclasses.replace(y, omega=y.omega * stretch)
-
-    y0 = dataclasses.replace(state0, omega=state0.omega / stretch)
-    return FreeRotation(system.inertia.astype(y0.omega.dtype)), y0, to_state
-
-
-def _event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:
-    if event is None:
-        return None
-
-    def in_si(condition: Callable) -> Callable:
-        def wrapped(t: Array, y: Any, args: Any, **kwargs: Any) -> Any:
-            return condition(t0 + t / stretch, to_state(y), args, **kwargs)
-
-        return wrapped
-
-    return diffrax.Event(
-        jtu.tree_map(in_si, event.cond_fn, is_leaf=callable), event.root_finder, event.direction
+    final_state = nan_where(failed, final_state)
+    states, final_time = nan_where(~run.ok, (states, final_time))
+    states = jtu.tree_map(lambda x: x.reshape(*inputs.ts.shape, *x.shape[1:]), states)
+    stats = {f"num_{x}steps": solution.stats[f"num_{x}steps"] for x in _COUNTS}
+    return Trajectory(
+        inputs.ts, states, result, stats, final_time, final_state, (usable.system, usable.args)
     )
+
+
+def _finite_ahead(inputs: Inputs, run: _Run, problem: _Problem, where: tuple[Array, Any]) -> Array:
+    """Whether the vector field is finite a little beyond where the integration ended."""
+    system, _, _, _, args = constant(inputs)
+    end, ys = where
+    step = _AHEAD * run.resolution / run.stretch
+
+    def euler(_: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        t, state, finite = carry
+        rates = system.vector_field(t, state, args)
+        state = jtu.tree_map(lambda x, rate: x + step * rate, state, rates)
+        return t + step, state, finite & all_finite(rates)
+
+    state = problem.to_state(jtu.tree_map(lambda x: x[0], ys))
+    begin = (run.start + end / run.stretch, state, jnp.asarray(True))
+    return jax.lax.fori_loop(0, 2, euler, begin)[2]

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from jrigid._types import Readable
 from jrigid.systems import AbstractSystem
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Readable):
     """States at the times asked for, and what became of the integration.
 
     Attributes:
@@ -31,11 +32,11 @@ class Trajectory(eqx.Module):
     ts: Float[Array, "..."]
     states: Any
     result: Any
-    stats: dict[str, Array]
+    stats: dict[str, Array] = eqx.field(repr=False)
     final_time: Float[Array, "..."]
     final_state: Any
-    _arrays: Any
-    _functions: Any = eqx.field(static=True)
+    _arrays: Any = eqx.field(repr=False)
+    _functions: Any = eqx.field(static=True, repr=False)
 
     def __init__(
         self,
