@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import diffrax
@@ -56,7 +55,9 @@ SCRIPT = """
 import jax
 jax.config.update("jax_enable_x64", True)
 counts = {}
-jax.monitoring.register_event_listener(lambda name, **_: counts.update({name: counts.get(name, 0) + 1}))
+def count(name, **_):
+    counts[name] = counts.get(name, 0) + 1
+jax.monitoring.register_event_listener(count)
 import jax.numpy as jnp
 import jrigid as jr
 
@@ -82,7 +83,7 @@ def test_a_second_process_with_the_persistent_cache_compiles_nothing(tmp_path):
     }
     for process in (1, 2):
         done = subprocess.run(
-            [sys.executable, "-c", textwrap.dedent(SCRIPT)], env=environment, check=True,
+            [sys.executable, "-c", SCRIPT], env=environment, check=True,
             capture_output=True, text=True,
         )  # fmt: skip
         hits, misses = map(int, done.stdout.split())
@@ -105,7 +106,9 @@ def test_an_event_is_located_without_being_asked_and_differentiated_twice():
     np.testing.assert_allclose(trajectory.final_state.attitude[0], np.cos(0.65), atol=1e-12)
     np.testing.assert_array_equal(np.isfinite(trajectory.states.omega[:, 0]), [True, False])
     both = quick_jit(lambda r: (when(r), jax.jacfwd(when)(r), jax.jacfwd(jax.jacfwd(when))(r)))
-    np.testing.assert_allclose(both(2.0), [0.65, -1.3 / 4, 2 * 1.3 / 8], rtol=1e-7)
+    time, slope, curvature = both(2.0)
+    np.testing.assert_allclose([time, slope], [0.65, -1.3 / 4], rtol=1e-8)
+    np.testing.assert_allclose(curvature, 2 * 1.3 / 8, rtol=1e-6)
 
 
 def test_derivatives_of_an_event_in_reverse_and_in_lanes():
@@ -158,11 +161,11 @@ def _pick(code):
     [
         (
             lambda: jr.simulate(BODY, jr.State(UPRIGHT, 1e-200 * OMEGA), 1e200),
-            r"whose squares are in the range of their dtype .* not: 9\.9.*e-201\. \(Choose another",
+            r"whose squares are in the range of their dtype .*not: 9\.89.*e-201\. \(Choose another",
         ),
         (
             lambda: jr.simulate(BODY, jr.State(UPRIGHT, 1e160 * OMEGA), 1e-160),
-            r"whose squares are in the range .* not: 9\.9.*e\+159\. \(Choose another unit of time",
+            r"whose squares are in the range .* not: 9\.89.*e\+159\. \(Choose another unit of time",
         ),
         (lambda: jr.simulate(BODY, STATE, np.array([1.0, 0.5])), r"`ts` must .* not: 0\.5\.$"),
         (lambda: jr.simulate(BODY, STATE, np.array([1.0, 2.0]), t0=1.5), r"`t0`, .* not: 1\.0\.$"),
@@ -177,13 +180,13 @@ def _pick(code):
             lambda: jax.vmap(lambda x: jr.simulate(BODY, jr.State(UPRIGHT, x), 1.0))(
                 jnp.stack([OMEGA, jnp.nan * OMEGA])
             ),
-            r"`state0` must be finite, but a component is not: \[.*nan\] in lane 1\.$",
+            r"`state0` must be finite, but a component is not: \[.*nan\] in lane 1\.",
         ),
         (
             lambda: jax.vmap(lambda x: jr.simulate(BODY, STATE, x, max_steps=20))(
                 jnp.array([0.1, 100.0])
             ),
-            r"maximum number of solver steps.*: in lane 1\.$",
+            r"maximum number of solver steps.*: in lane 1\.",
         ),
     ],
 )  # fmt: skip

@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array
 
 from jrigid._checks import all_finite
@@ -22,6 +23,8 @@ _TOO_LONG = 2.0
 # this many radians: what is switched on at an equilibrium, the error estimate does not see.
 _JUMP = 4.0
 _CONFINED = 1e-6
+# After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
+_GROWTH = 1e16
 
 
 class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
@@ -31,61 +34,48 @@ class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
     stop a step that is short only because a time asked for is near, too.
 
     Attributes:
-        controller: Which goes by the error estimate.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step.
+        longest: Longest step.
         first_step: diffrax would check one that it is given by a callback.
         resolution: Shortest step.
         start_rate: Fastest rate at the start.
         fastest: `(t, y, args)` -> fastest rate there.
+        norm: Of the error.
     """
 
-    controller: diffrax.PIDController
+    rtol: Array
+    atol: Array
+    longest: Array
     first_step: Array
     resolution: Array
     start_rate: Array
     fastest: Callable[[Array, Array, Any], Array]
+    norm: Callable[[Any], Array] = optx.rms_norm
 
     @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Relative tolerance of a step."""
-        return self.controller.rtol
+    def _by_error(self) -> diffrax.PIDController:
+        return diffrax.PIDController(
+            rtol=self.rtol, atol=self.atol, dtmax=self.longest, factormax=_GROWTH
+        )
 
-    @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Absolute tolerance of a step."""
-        return self.controller.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Norm of the error."""
-        return self.controller.norm
-
-    def wrap(self, direction: Any) -> Any:
-        """Time grows."""
+    def wrap(self, direction):  # diffrax's: time grows here
+        """The same."""
         del direction
         return self
 
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, order: Any
-    ) -> Any:
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step; the state also carries the rate where the step begins."""
         del dt0
-        t1, state = self.controller.init(terms, t0, t1, y0, self.first_step, args, func, order)
+        t1, state = self._by_error.init(terms, t0, t1, y0, self.first_step, args, func, error_order)
         return t1, (state, self.start_rate)
 
     def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
         """By the error, then by the fastest rate; a torque that turns NaN or infinite ends here."""
         inner_state, rate0 = controller_state
-        keep, next_t0, next_t1, made_jump, inner_state, result = self.controller.adapt_step_size(
+        keep, next_t0, next_t1, made_jump, inner_state, result = self._by_error.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner_state
         )
         stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
@@ -115,18 +105,18 @@ class SteadyController(diffrax.AbstractStepSizeController):
 
     step: Array
 
-    def wrap(self, direction: Any) -> Any:
-        """Time grows."""
+    def wrap(self, direction):
+        """The same."""
         del direction
         return self
 
-    def init(self, terms: Any, t0: Any, *others: Any) -> Any:
+    def init(self, terms, t0, *others):
         """The end of the first step."""
         del terms, others
         return t0 + self.step, None
 
-    def adapt_step_size(self, t0: Any, t1: Any, *others: Any) -> Any:
-        """The next one."""
+    def adapt_step_size(self, t0, t1, *others):
+        """The end of the next one."""
         del t0, others
         return True, t1, t1 + self.step, False, None, diffrax.RESULTS.successful
 
@@ -151,11 +141,6 @@ def fastest_on_the_way(
     tiny = jnp.finfo(y.dtype).tiny
     rate = jnp.maximum(fastest_of(jacobian(field, t, y, args)), speed)
     return jnp.maximum(jnp.where(ok & jnp.isfinite(rate), rate, 0.0), tiny)
-
-
-def standing_still(ok: Array, rates: Array) -> Array:
-    """The rates, or zero in a lane whose input is bad: no other lane is to wait for it."""
-    return jnp.where(ok, rates, jnp.zeros_like(rates))
 
 
 @eqx.filter_custom_jvp

@@ -27,7 +27,6 @@ from jrigid.simulate._controller import (
     constant,
     fastest_on_the_way,
     guarded,
-    standing_still,
 )
 from jrigid.simulate._event import event_in_si
 from jrigid.simulate._options import BLUR, Inputs, Options, checked_options, judged
@@ -46,8 +45,6 @@ _NOISE = 40.0
 # Below this many eps of the run a step is none. A motion that ends there is looked at so many of
 # them further on, beyond the last step that was tried.
 _RESOLUTION, _AHEAD = 16.0, 8.0
-# After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
-_GROWTH = 1e16
 _COUNTS = ("", "accepted_", "rejected_")
 
 
@@ -74,15 +71,21 @@ def simulate(
     depend on the unit of time, and the error control is set for the promises below.
 
     Args:
-        system: A `RigidBody`, a `FloatingBody`, or another `AbstractSystem`. Torques that are
-            functions are compiled anew for each new function object: define them once.
+        system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or what has a method
+            `as_rigid_body`, as a `SymmetricTop`. A torque that is a function is compiled anew for
+            each new function object, which takes seconds, and memory that only
+            `jax.clear_caches()` frees: define it once, and hand on what changes through `args`.
         state0: Its state at `t0`. Where a damper or a rotor needs an internal state and none is
             given, it starts at rest relative to the body.
         ts: Times [s], non-decreasing in the order of their memory, none before `t0`; any shape.
+            Their dtype may have more digits than the state's, and needs them where `t0` is far
+            from 0, as the seconds of 1970 are.
         args: Passed to torques and forces.
         t0: Time of `state0` [s].
-        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default. For a
-            `RigidBody` without torque `jrigid.solvers.ExactFree()` gives the closed form.
+        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default. An implicit
+            one (`diffrax.Kvaerno5()`) steps over what drag or a damper kills within a radian of its
+            own rate. For a `RigidBody` without torque `jrigid.solvers.ExactFree()` gives the
+            closed form.
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
             phi [rad] the relative error of energy and space angular momentum stays below
             rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
@@ -103,17 +106,14 @@ def simulate(
             turning, or than the run if the body is at rest, can fall between two such looks:
             bound the step by its length.
         event: A `diffrax.Event` that ends the motion; its condition functions are called with
-            (t, state, args), in SI units.
-        throw: If True, bad input and a failed integration raise an error, under jit too; if
-            False, they set the lane's result code and its states to NaN.
+            (t, state, args), in SI units. Where one changes its sign is found by bisection, unless
+            the event brings a root finder; one that is true or false ends the motion with a step.
+        throw: If True, bad input and a failed integration raise an error; if False, they set the
+            lane's result code, and NaN where there is no state.
         progress: True prints a progress meter, or give one of diffrax's.
 
     Returns:
         The trajectory. With `throw=False` look at its `result` before its states.
-
-    Raises:
-        ValueError: Wrong shape or option, or an `rtol` the dtype cannot serve (trace time).
-        RuntimeError: Bad value or failed integration, with `throw=True` (run time, any lane).
 
     Gradients: those of the motion, in the state, the system's parameters, `args`, `t0` and `ts`,
     also at pure spin and the sleeping top. Their error, relative to the norm of the Jacobian, is
@@ -281,8 +281,11 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
 
     def vector_field(tau: Any, y: Any, args: Any) -> Any:
         if isinstance(options.adjoint, diffrax.ForwardMode):  # NaN goes no way but its lane's
-            return standing_still(run.ok, field(tau, y, args))
-        return standing_still(run.ok, guarded(field, y_start, tau, y, args))
+            rates = field(tau, y, args)
+        else:
+            rates = guarded(field, y_start, tau, y, args)
+        # No other lane is to wait for a bad one: that stands still.
+        return jnp.where(run.ok, rates, jnp.zeros_like(rates))
 
     still = jtu.tree_map(jnp.zeros_like, state0)
     turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
@@ -296,7 +299,9 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         jtu.Partial(_fastest_of(options.solver, 1)),
     )  # fmt: skip
     watchful = WatchfulController(
-        diffrax.PIDController(rtol=rtol, atol=atol, dtmax=longest, factormax=_GROWTH),
+        rtol=rtol,
+        atol=atol,
+        longest=longest,
         first_step=jnp.minimum(0.1 * longest, stop),
         resolution=run.resolution,
         start_rate=run.fastest,

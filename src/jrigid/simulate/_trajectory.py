@@ -25,8 +25,9 @@ class Trajectory(Readable):
             `trajectory.result == jrigid.RESULTS.successful`, an array of booleans under vmap;
             `jrigid.RESULTS[trajectory.result]` is the message of a single one.
         stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-        final_time: Where the integration ended [s]: the last of `ts`, or the event.
-        final_state: The state there.
+        final_time: Where the integration ended [s]: the last of `ts`, the event, or where it
+            failed.
+        final_state: The state there; NaN if it failed.
     """
 
     ts: Float[Array, "..."]
