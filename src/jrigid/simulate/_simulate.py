@@ -290,7 +290,9 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     still = jtu.tree_map(jnp.zeros_like, state0)
     turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
     stop = jax.lax.stop_gradient(run.end)
-    longest = _longest_step(run, options)
+    first = longest = _longest_step(run, options)
+    if isinstance(options.solver, diffrax.AbstractImplicitSolver):  # only what is on the way bounds
+        longest = jnp.where(run.ok, options.max_step * stretch, 1.0)
     fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / (stop * run.fastest))
     noise = _NOISE * jnp.finfo(y0.dtype).eps
     rtol, atol = (jnp.maximum(fraction * x, noise) for x in (options.rtol, options.atol))
@@ -302,7 +304,7 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         rtol=rtol,
         atol=atol,
         longest=longest,
-        first_step=jnp.minimum(0.1 * longest, stop),
+        first_step=jnp.minimum(0.1 * first, stop),
         resolution=run.resolution,
         start_rate=run.fastest,
         fastest=constant(fastest),
