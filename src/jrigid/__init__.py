@@ -18,8 +18,6 @@ from jrigid import top as top
 from jrigid import torques as torques
 from jrigid._checks import RESULTS as RESULTS
 from jrigid._public import list_public_names as _list_public_names
-from jrigid._simulate import simulate as simulate
-from jrigid._trajectory import Trajectory as Trajectory
 from jrigid.dynamics import ExactStates as ExactStates
 from jrigid.dynamics import State as State
 from jrigid.dynamics import angular_momentum as angular_momentum
@@ -37,6 +35,8 @@ from jrigid.mass import parallel_axis as parallel_axis
 from jrigid.mass import principal_axes as principal_axes
 from jrigid.mass import tensor_function as tensor_function
 from jrigid.mass import to_center_of_mass as to_center_of_mass
+from jrigid.simulate import Trajectory as Trajectory
+from jrigid.simulate import simulate as simulate
 from jrigid.systems import AbstractSystem as AbstractSystem
 from jrigid.systems import FloatingBody as FloatingBody
 from jrigid.systems import FloatingState as FloatingState

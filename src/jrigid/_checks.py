@@ -68,10 +68,23 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
     invalid_times = (
         "Argument `ts` must be finite, non-decreasing and not earlier than `t0`, but it is not."
     )
+    unresolved_times = (
+        "Arguments `t0` and `ts` must be in a dtype that tells apart times within a tenth of a "
+        "radian of the motion, but they are not. (Subtract the epoch, so that `t0` is near 0, or "
+        "switch on `jax_enable_x64` and pass float64 arrays.)"
+    )
+    rate_out_of_range = (
+        "Arguments `state0` and `system` must give rates whose squares are in the range of their "
+        "dtype (1e-146 to 1e146 rad/s in float64, 3e-16 to 6e15 rad/s in float32), but they do "
+        "not. (Choose another unit of time.)"
+    )
     invalid_max_step = "Argument `max_step` must be positive, but it is not."
     invalid_vector_field = (
         "Argument `system` must have a finite vector field at the initial state, but it is not: "
         "a torque, force or parameter is NaN or infinite there."
+    )
+    nonfinite_torque = (
+        "A torque or a force became NaN or infinite on the way, after `final_time` [s]"
     )
     nonfinite_state = "The motion ran out of the range of floating point numbers."
     no_equilibrium = (

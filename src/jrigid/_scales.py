@@ -1,4 +1,4 @@
-"""Scales in which `simulate` measures a motion: time, each variable, the fastest rate."""
+"""Scales in which a motion is measured: time, each variable, the fastest rate."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,41 +7,42 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import internal_parts
 from jrigid._numerics import power_of_two, safe_norm
-from jrigid.systems import AbstractSystem
+from jrigid.systems import AbstractSystem, FloatingState
 
 
 def ravel(tree: Any) -> Array:
     """All components of a pytree in one array, which is how diffrax steps fastest."""
-    return jnp.concatenate([x.reshape(-1) for x in jtu.tree_leaves(tree)])
+    return ravel_pytree(tree)[0]
 
 
 def unravel(components: Array, like: Any) -> Any:
     """The pytree like `like` whose components these are."""
-    leaves, structure = jtu.tree_flatten(like)
-    parts, start = [], 0
-    for leaf in leaves:
-        parts.append(components[start : start + leaf.size].reshape(leaf.shape))
-        start += leaf.size
-    return structure.unflatten(parts)
+    return ravel_pytree(like)[1](components)
 
 
 def units(
-    system: AbstractSystem, state0: Any, t_end: Array, t0: Array, args: Any
-) -> tuple[Array, Array, Any]:
+    system: AbstractSystem,
+    state0: Any,
+    t_end: Array,
+    t0: Array,
+    args: Any,
+    fastest_of: Callable[[Array], Array] | None = None,
+) -> tuple[Array, Array, Array]:
     """Rates that measure time [rad/s], and a scale for each component of the state.
 
     The first rate is that of turning: a body at rest turns at the rate its torque would give it
     within a radian, and one that nothing turns is measured by the length of the run. The second is
-    the fastest rate of the whole motion, an orbit's included.
+    the fastest rate of the whole motion, an orbit's included: what `fastest_of` says of the
+    Jacobian, by default its spectral radius.
     """
     rates = system.vector_field(t0, state0, args)
     span = jnp.where(t_end > t0, t_end - t0, jnp.ones_like(t_end))
-    turning, spinning_up = safe_norm(state0.omega), safe_norm(rates.omega)
-    rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
+    rate = jnp.maximum(safe_norm(state0.omega), jnp.sqrt(safe_norm(rates.omega)))
     rate = jnp.where(rate > 0, rate, 1 / span)
 
     def spread(length: Array, speed: Array) -> Array:
@@ -50,7 +51,7 @@ def units(
             "omega": rate,
             "internal": internal_parts(system.torque.internal_scale(rate)),
         }
-        if hasattr(state0, "velocity"):
+        if isinstance(state0, FloatingState):
             scale |= {"position": length, "velocity": speed}
         full = {
             name: jtu.tree_map(
@@ -64,11 +65,11 @@ def units(
         def vector_field(t: Array, y: Array, args: Any) -> Array:
             return ravel(system.vector_field(t, unravel(y * scales, state0), args)) / scales
 
-        there = jacobian(vector_field, t0, ravel(state0) / scales, args)
-        radius = spectral_radius(there, 2)
+        matrix = jacobian(vector_field, t0, ravel(state0) / scales, args)
+        radius = spectral_radius(matrix, 2) if fastest_of is None else fastest_of(matrix)
         return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
 
-    if not hasattr(state0, "velocity"):
+    if not isinstance(state0, FloatingState):
         scales = spread(rate, rate)
         return rate, fastest(scales), scales
     # First scales of the place alone, to find how fast the motion of the centre of mass changes;
@@ -77,20 +78,21 @@ def units(
     position, velocity, pull = (
         safe_norm(x) for x in (state0.position, state0.velocity, rates.velocity)
     )
+
+    def length_and_speed(length: Array, speed: Array, time: Array) -> tuple[Array, Array]:
+        length = jnp.where(length > 0, length, speed * time)
+        length = jnp.where(length > 0, length, 1.0)
+        return length, jnp.where(speed > 0, speed, length / time)
+
     time = jnp.minimum(span, 1 / rate)
-    speed = jnp.where(velocity > 0, velocity, pull * time)
     bend = jnp.where(pull > 0, velocity / jnp.where(pull > 0, pull, 1.0), time)
     way = jnp.maximum(position, velocity * jnp.minimum(time, bend))
-    length = jnp.where(way > 0, way, speed * time)
-    length = jnp.where(length > 0, length, 1.0)
-    speed = jnp.where(speed > 0, speed, length / time)
-    quickest = fastest(spread(length, speed))
+    speed = jnp.where(velocity > 0, velocity, pull * time)
+    quickest = fastest(spread(*length_and_speed(way, speed, time)))
     time = jnp.minimum(span, 1 / quickest)
     speed = jnp.maximum(velocity, pull * time)
-    length = jnp.maximum(position, speed * time)
-    length = jnp.where(length > 0, length, 1.0)
-    speed = jnp.where(speed > 0, speed, length / time)
-    return rate, quickest, spread(length, speed)
+    way = jnp.maximum(position, speed * time)
+    return rate, quickest, spread(*length_and_speed(way, speed, time))
 
 
 def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
@@ -100,8 +102,8 @@ def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
     """
     step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y))
     nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
-    there = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
-    return (there[1:] - there[:1]) / step[:, None]
+    rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
+    return (rates[1:] - rates[:1]) / step[:, None]
 
 
 def spectral_radius(matrix: Array, rounds: int) -> Array:
@@ -121,3 +123,15 @@ def spectral_radius(matrix: Array, rounds: int) -> Array:
     for scale in reversed(scales):
         radius = scale * jnp.sqrt(jnp.sqrt(jnp.sqrt(radius)))
     return radius
+
+
+def undamped_rate(matrix: Array) -> Array:
+    """Largest magnitude of an eigenvalue that does not die away within a radian of its own.
+
+    What an implicit solver has to follow: it may step over the others. A matrix that is not finite
+    has none.
+    """
+    matrix = jax.lax.stop_gradient(matrix)
+    values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
+    damped = -values.real > jnp.abs(values.imag)
+    return jnp.max(jnp.where(damped, 0.0, jnp.abs(values)))

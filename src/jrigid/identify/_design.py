@@ -12,7 +12,6 @@ from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, check_inertia_shape
 from jrigid._numerics import product
-from jrigid._simulate import simulate
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify._errors import conclude
@@ -32,6 +31,7 @@ from jrigid.identify._residuals import (
 from jrigid.identify._result import FitResult
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
 from jrigid.identify._unknowns import as_tensor, unknowns_of
+from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
 
 

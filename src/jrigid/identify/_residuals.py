@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._simulate import simulate
 from jrigid.dynamics import State
 from jrigid.identify._flow import forced_flow, free_flow
 from jrigid.identify._layout import Layout
@@ -18,6 +17,7 @@ from jrigid.identify._observations import AbstractObservation, whitened
 from jrigid.identify._shooting import Links, Point, Rows, Stage
 from jrigid.identify._unknowns import Unknowns
 from jrigid.rotation import conjugate, exp, multiply, normalize
+from jrigid.simulate import simulate
 
 RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
 

@@ -1,7 +1,4 @@
-"""How `simulate` steps: the vector field guarded, and a controller that watches the fastest rate.
-
-A module of its own, since both are about one step and nothing else in `simulate` is.
-"""
+"""How `simulate` steps: the vector field guarded, the controller that watches its rates."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,10 +7,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array
 
 from jrigid._checks import all_finite
-from jrigid._scales import jacobian, spectral_radius
+from jrigid._scales import jacobian
 
 # No step is longer than this fraction of the shortest time scale, that of the turning or of the
 # linearised motion: at an equilibrium the error estimate sees nothing, and a step too long to be
@@ -25,44 +23,64 @@ _TOO_LONG = 2.0
 # this many radians: what is switched on at an equilibrium, the error estimate does not see.
 _JUMP = 4.0
 _CONFINED = 1e-6
+# After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
+_GROWTH = 1e16
 
 
-class WatchfulController(diffrax.PIDController):
-    """A PID controller that bounds steps by the motion's fastest rate, which may rise on the way.
+class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller whose steps are bounded by the motion's fastest rate, which may rise on the way.
 
-    It also reports a step rejected at the resolution of time. Its own `dtmin` would stop a step
-    that is short only because a time asked for is near, too.
+    It also reports a step rejected at the resolution of time. A `dtmin` of the PID controller would
+    stop a step that is short only because a time asked for is near, too.
+
+    Attributes:
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step.
+        longest: Longest step.
+        first_step: diffrax would check one that it is given by a callback.
+        resolution: Shortest step.
+        start_rate: Fastest rate at the start.
+        fastest: `(t, y, args)` -> fastest rate there.
+        norm: Of the error.
     """
 
-    resolution: Any = 0.0
-    fastest: Any = None
-    start_rate: Any = 0.0
+    rtol: Array
+    atol: Array
+    longest: Array
+    first_step: Array
+    resolution: Array
+    start_rate: Array
+    fastest: Callable[[Array, Array, Any], Array]
+    norm: Callable[[Any], Array] = optx.rms_norm
 
-    def init(self, *args: Any) -> Any:
-        """As the PID controller; the state also carries the rate where the step begins."""
-        t1, state = super().init(*args)
+    @property
+    def _by_error(self) -> diffrax.PIDController:
+        return diffrax.PIDController(
+            rtol=self.rtol, atol=self.atol, dtmax=self.longest, factormax=_GROWTH
+        )
+
+    def wrap(self, direction):  # diffrax's: time grows here
+        """The same."""
+        del direction
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step; the state also carries the rate where the step begins."""
+        del dt0
+        t1, state = self._by_error.init(terms, t0, t1, y0, self.first_step, args, func, error_order)
         return t1, (state, self.start_rate)
 
     def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
-        """As the PID controller; a torque that turns NaN or infinite ends here."""
-        pid_state, rate0 = controller_state
-        keep, next_t0, next_t1, made_jump, pid_state, result = super().adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, pid_state
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        """By the error, then by the fastest rate; a torque that turns NaN or infinite ends here."""
+        inner_state, rate0 = controller_state
+        keep, next_t0, next_t1, made_jump, inner_state, result = self._by_error.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner_state
         )
         stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
-        t, y, args = constant((t1, y1_candidate, args))
-        rate = jax.lax.stop_gradient(self.fastest(t, y, args))
+        rate = jax.lax.stop_gradient(self.fastest(*constant((t1, y1_candidate, args))))
         # Where a torque jumps, differences see a rate without bound: never down to a standstill.
         shortest = 4 * self.resolution
         longest = jnp.maximum(LARGEST_STEP / rate, shortest)
@@ -78,29 +96,51 @@ class WatchfulController(diffrax.PIDController):
         bound = jnp.where(back, jnp.maximum(tolerable / _TOO_LONG, 0.5 * step), longest)
         next_t0 = jnp.where(back, t0, next_t0)
         next_t1 = jnp.where(keep, jnp.minimum(next_t1, next_t0 + bound), next_t1)
-        state = (pid_state, jnp.where(kept, rate, rate0))
+        state = (inner_state, jnp.where(kept, rate, rate0))
         return kept, next_t0, next_t1, made_jump, state, result
+
+
+class SteadyController(diffrax.AbstractStepSizeController):
+    """Steps of one length, for a solver that makes no error."""
+
+    step: Array
+
+    def wrap(self, direction):
+        """The same."""
+        del direction
+        return self
+
+    def init(self, terms, t0, *others):
+        """The end of the first step."""
+        del terms, others
+        return t0 + self.step, None
+
+    def adapt_step_size(self, t0, t1, *others):
+        """The end of the next one."""
+        del t0, others
+        return True, t1, t1 + self.step, False, None, diffrax.RESULTS.successful
 
 
 def constant(tree: Any) -> Any:
     """The same without derivatives: what decides on steps is not differentiated."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    arrays, others = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), others)
 
 
 def fastest_on_the_way(
-    ok: Array, field: Callable, turning: Array, t: Array, y: Array, args: Any
+    ok: Array,
+    field: Callable,
+    turning: Array,
+    fastest_of: Callable[[Array], Array],
+    t: Array,
+    y: Array,
+    args: Any,
 ) -> Array:
     """The fastest rate at a point of the motion; `turning` weighs out the angular velocity."""
     speed = jnp.sqrt(jnp.sum((turning * y) ** 2))
     tiny = jnp.finfo(y.dtype).tiny
-    rate = jnp.maximum(spectral_radius(jacobian(field, t, y, args), 1), speed)
+    rate = jnp.maximum(fastest_of(jacobian(field, t, y, args)), speed)
     return jnp.maximum(jnp.where(ok & jnp.isfinite(rate), rate, 0.0), tiny)
-
-
-def standing_still(ok: Array, rates: Array) -> Array:
-    """The rates, or zero in a lane whose input is bad: no other lane is to wait for it."""
-    return jnp.where(ok, rates, jnp.zeros_like(rates))
 
 
 @eqx.filter_custom_jvp
@@ -122,8 +162,10 @@ def _(primals: Any, tangents: Any) -> Any:
     field_dot, _, t_dot, y_dot, args_dot = tangents
     usable = all_finite(field(t, y, args))
 
-    def there(field: Callable, t: Array, y: Array, args: Any) -> Array:
+    def usable_field(field: Callable, t: Array, y: Array, args: Any) -> Array:
         return field(jnp.where(usable, t, jnp.zeros_like(t)), jnp.where(usable, y, y0), args)
 
-    _, rates_dot = eqx.filter_jvp(there, (field, t, y, args), (field_dot, t_dot, y_dot, args_dot))
+    _, rates_dot = eqx.filter_jvp(
+        usable_field, (field, t, y, args), (field_dot, t_dot, y_dot, args_dot)
+    )
     return guarded(*primals), jnp.where(usable, rates_dot, jnp.zeros_like(rates_dot))

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from jrigid._types import Readable
 from jrigid.systems import AbstractSystem
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Readable):
     """States at the times asked for, and what became of the integration.
 
     Attributes:
@@ -24,18 +25,19 @@ class Trajectory(eqx.Module):
             `trajectory.result == jrigid.RESULTS.successful`, an array of booleans under vmap;
             `jrigid.RESULTS[trajectory.result]` is the message of a single one.
         stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-        final_time: Where the integration ended [s]: the last of `ts`, or the event.
-        final_state: The state there.
+        final_time: Where the integration ended [s]: the last of `ts`, the event, or where it
+            failed.
+        final_state: The state there; NaN if it failed.
     """
 
     ts: Float[Array, "..."]
     states: Any
     result: Any
-    stats: dict[str, Array]
+    stats: dict[str, Array] = eqx.field(repr=False)
     final_time: Float[Array, "..."]
     final_state: Any
-    _arrays: Any
-    _functions: Any = eqx.field(static=True)
+    _arrays: Any = eqx.field(repr=False)
+    _functions: Any = eqx.field(static=True, repr=False)
 
     def __init__(
         self,

@@ -1,17 +1,23 @@
-"""Guards that turn a mode of differentiation an adjoint cannot serve into an error that helps.
+"""The adjoint that `simulate` runs diffrax with, and guards of what it can serve.
 
-Each guard is the identity on values. What it does is carried by its derivative rules: a linear
-map that can be transposed but not evaluated (reverse mode only), or evaluated but not transposed
-(forward mode only).
+The guards turn a mode of differentiation that it cannot serve into an error that helps. Each is the
+identity on values. What it does is carried by its derivative rules: a linear map that can be
+transposed but not evaluated (reverse mode only), or evaluated but not transposed (forward mode
+only).
 """
 
+import dataclasses
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from jrigid.simulate._event import where_it_happened
 
 _FORWARD_MESSAGE = (
     "This adjoint of `jrigid.simulate` serves first derivatives in reverse mode only (jax.grad, "
@@ -107,3 +113,43 @@ def guard_outputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     if isinstance(adjoint, diffrax.ForwardMode):
         return _map_inexact(_forward_only, tree)
     return tree
+
+
+class WithTimes(diffrax.AbstractAdjoint):
+    """An adjoint that hands the loop its times, and finds where an event ended it.
+
+    diffrax would check times that it is given by callbacks, with which no compiled function can be
+    kept from one process to the next. It is given none: two places to save the end, of which the
+    first is made to hold the times asked for.
+    """
+
+    adjoint: diffrax.AbstractAdjoint
+    taus: Array
+    end: Array
+
+    def loop(self, *, init_state: Any, saveat: Any, t1: Any, event: Any, **others: Any) -> Any:
+        """Run the loop to the end, and back to where a condition changed its sign."""
+        del t1
+        place, last = init_state.save_state
+        size = self.taus.shape
+        ts, ys = jtu.tree_map(
+            lambda x: jnp.full(size + x.shape[1:], jnp.inf, x.dtype), (place.ts, place.ys)
+        )
+        init_state = dataclasses.replace(
+            init_state, save_state=[dataclasses.replace(place, ts=ts, ys=ys), last]
+        )
+        saveat = dataclasses.replace(
+            saveat, subs=[diffrax.SubSaveAt(ts=self.taus), diffrax.SubSaveAt(t1=True)]
+        )
+        final, stats = self.adjoint.loop(
+            init_state=init_state, saveat=saveat, t1=self.end, event=event, **others
+        )
+        if event is None or event.root_finder is not None:
+            return final, stats
+        names = ("terms", "solver", "t0", "dt0", "stepsize_controller", "max_steps")
+        options = {name: others[name] for name in names} | {"saveat": saveat, "t1": self.end}
+        tau, y = where_it_happened(final, event, others["args"], options)
+        place, last = final.save_state
+        place = dataclasses.replace(place, ts=jnp.where(place.ts > tau, jnp.inf, place.ts))
+        last = dataclasses.replace(last, ts=tau[None], ys=jtu.tree_map(lambda x: x[None], y))
+        return dataclasses.replace(final, save_state=[place, last]), stats

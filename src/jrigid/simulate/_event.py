@@ -1,0 +1,76 @@
+"""Events: conditions in SI units, and where between two steps one changed its sign."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._checks import harmless
+
+# Each Newton step doubles the orders of the derivatives that are right: two serve the second.
+_NEWTON_STEPS = 2
+
+
+def event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:
+    """The event with its conditions called in radians and scaled components."""
+    if event is None:
+        return None
+
+    def in_si(condition: Callable) -> Callable:
+        def wrapped(t: Array, y: Any, args: Any, **options: Any) -> Any:
+            return condition(t0 + t / stretch, to_state(y), args, **options)
+
+        return wrapped
+
+    return diffrax.Event(
+        jtu.tree_map(in_si, event.cond_fn, is_leaf=callable), event.root_finder, event.direction
+    )
+
+
+def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[Array, Any]:
+    """Time and state at which a real condition changed its sign within the last step.
+
+    By bisection, which cannot miss. Where no condition ended the loop, or a boolean one did, they
+    are those of its end.
+
+    Gradients: those of the implicit function, of first and second order, in every mode.
+    """
+    masks = jtu.tree_leaves(final.event_mask)
+    values = jtu.tree_leaves(final.event_values)
+    conditions = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
+    real = [
+        (mask, condition)
+        for mask, value, condition in zip(masks, values, conditions, strict=True)
+        if jnp.issubdtype(jnp.result_type(value), jnp.floating)
+    ]
+    happened = jnp.any(jnp.stack([jnp.asarray(False), *(mask for mask, _ in real)]))
+    late = jnp.where(happened, final.event_tnext, final.event_tprev + 1)
+    interpolant = options["solver"].interpolation_cls(
+        t0=final.event_tprev, t1=late, **harmless(happened, final.event_dense_info)
+    )
+    early, late = jax.lax.stop_gradient((final.event_tprev, late))
+
+    def distance(tau: Array) -> Array:
+        y = interpolant.evaluate(tau)
+        terms = [jnp.where(mask, f(tau, y, args, **options), 0.0) for mask, f in real]
+        return sum((x.astype(tau.dtype) for x in terms), jnp.zeros_like(tau))
+
+    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = low + 0.5 * (high - low)
+        beyond = jnp.sign(jax.lax.stop_gradient(distance(middle))) == sign
+        return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
+
+    sign = jnp.sign(jax.lax.stop_gradient(distance(late)))
+    bits = jnp.finfo(late.dtype).nmant + 8
+    tau = jax.lax.fori_loop(0, bits, halve, (early, late))[1]
+    level = jax.lax.stop_gradient(distance(tau))
+    for _ in range(_NEWTON_STEPS):  # these leave the value as it is
+        value, slope = jax.jvp(distance, (tau,), (jnp.ones_like(tau),))
+        tau = tau - jnp.where(slope == 0, 0.0, (value - level) / jnp.where(slope == 0, 1.0, slope))
+    y = jtu.tree_map(lambda x, end: jnp.where(happened, x, end), interpolant.evaluate(tau), final.y)
+    return jnp.where(happened, tau, final.tprev), y

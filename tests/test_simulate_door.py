@@ -1,0 +1,243 @@
+"""simulate(): what it refuses and says, events, and what its compiled function holds."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import ATTITUDE, MOMENTS, OMEGA, quick_jit
+
+import jrigid as jr
+
+FORWARD = diffrax.ForwardMode()
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+STATE = jr.State(UPRIGHT, OMEGA)
+BODY = jr.RigidBody(MOMENTS)
+
+
+# What is compiled ----------------------------------------------------------------------------
+
+
+def _turned_by(angle):
+    """A condition: the body, turning about axis 3, has turned by an angle."""
+    return lambda _t, state, _args, **_: state.attitude[0] - jnp.cos(0.5 * angle)
+
+
+def _spun(rate, event=None, adjoint=None, solver=None):
+    state0 = jr.State(UPRIGHT, rate * jnp.array([0, 0, 1.0]))
+    return jr.simulate(
+        BODY, state0, jnp.array([0.5, 5.0]), event=event, adjoint=adjoint, solver=solver
+    )
+
+
+@pytest.mark.parametrize("event", [None, diffrax.Event(_turned_by(1.3))], ids=["plain", "event"])
+@pytest.mark.parametrize("mode", ["value", "reverse", "forward"])
+def test_the_compiled_function_holds_no_callback(event, mode):
+    """Which would keep it out of jax's persistent cache, with `throw` or without."""
+    adjoint = FORWARD if mode == "forward" else None
+
+    def number(rate):
+        state0 = jr.State(UPRIGHT, rate * jnp.array([0, 0, 1.0]))
+        trajectory = jr.simulate(BODY, state0, 5.0, event=event, adjoint=adjoint, throw=False)
+        return trajectory.final_time + trajectory.final_state.attitude[0]
+
+    function = {"value": number, "reverse": jax.grad(number), "forward": jax.jacfwd(number)}[mode]
+    assert "callback" not in str(jax.make_jaxpr(function)(2.0))
+
+
+SCRIPT = """
+import jax
+jax.config.update("jax_enable_x64", True)
+counts = {}
+def count(name, **_):
+    counts[name] = counts.get(name, 0) + 1
+jax.monitoring.register_event_listener(count)
+import jax.numpy as jnp
+import jrigid as jr
+
+def final(omega):
+    state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
+    return jr.simulate(jr.RigidBody(jnp.array([1.0, 2.0, 3.0])), state0, 1.0).states.omega[0]
+
+omega = jnp.array([0.3, -0.5, 0.8])
+jax.block_until_ready((final(omega), jax.grad(final)(omega)))
+print(*(counts.get("/jax/compilation_cache/" + x, 0) for x in ("cache_hits", "cache_misses")))
+"""
+
+
+def test_a_second_process_with_the_persistent_cache_compiles_nothing(tmp_path):
+    environment = {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        "JAX_EXPLAIN_CACHE_MISSES": "0",
+        "XLA_FLAGS": "--xla_backend_optimization_level=0",  # the compiler's time is not the point
+        "PYTHONPATH": str(Path(jr.__file__).parents[1]),
+    }
+    for process in (1, 2):
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=environment, check=True,
+            capture_output=True, text=True,
+        )  # fmt: skip
+        hits, misses = map(int, done.stdout.split())
+        assert "host callbacks" not in done.stderr
+        assert misses > 0 if process == 1 else (misses == 0 and hits > 0)
+
+
+# Events --------------------------------------------------------------------------------------
+
+
+def test_an_event_is_located_without_being_asked_and_differentiated_twice():
+    """A body turning at `rate` has turned by 1.3 rad at 1.3 / rate."""
+    event = diffrax.Event(_turned_by(1.3))
+
+    def when(rate):
+        return _spun(rate, event, FORWARD).final_time
+
+    trajectory = _spun(2.0, event)
+    assert trajectory.result == jr.RESULTS.event_occurred
+    np.testing.assert_allclose(trajectory.final_state.attitude[0], np.cos(0.65), atol=1e-12)
+    np.testing.assert_array_equal(np.isfinite(trajectory.states.omega[:, 0]), [True, False])
+    both = quick_jit(lambda r: (when(r), jax.jacfwd(when)(r), jax.jacfwd(jax.jacfwd(when))(r)))
+    time, slope, curvature = both(2.0)
+    np.testing.assert_allclose([time, slope], [0.65, -1.3 / 4], rtol=1e-8)
+    np.testing.assert_allclose(curvature, 2 * 1.3 / 8, rtol=1e-6)
+
+
+def test_derivatives_of_an_event_in_reverse_and_in_lanes():
+    event = diffrax.Event([_turned_by(1.3), _turned_by(9.0)])
+
+    def when(rate):
+        return _spun(rate, event).final_time
+
+    rates = jnp.array([2.0, 0.1, 1.0])  # the second turns by half a radian only
+    times, slopes = quick_jit(jax.vmap(jax.value_and_grad(when)))(rates)
+    np.testing.assert_allclose(times, [0.65, 5.0, 1.3], rtol=1e-8)
+    np.testing.assert_allclose(slopes, [-1.3 / 4, 0.0, -1.3], rtol=1e-7, atol=1e-12)
+
+
+def test_conditions_true_or_false_end_at_a_step_and_a_root_finder_is_used_if_given():
+    exact = float(_spun(2.0, diffrax.Event(_turned_by(1.3))).final_time)
+    newton = diffrax.Event(_turned_by(1.3), optx.Newton(1e-12, 1e-12))
+    assert float(_spun(2.0, newton).final_time) == pytest.approx(exact, abs=1e-9)
+    truth = diffrax.Event(lambda _t, state, _args, **_: state.attitude[0] < np.cos(0.65))
+    late = _spun(2.0, truth)
+    assert late.result == jr.RESULTS.event_occurred
+    assert exact < late.final_time < exact + 0.2
+
+
+# Stiffness -----------------------------------------------------------------------------------
+
+
+def test_an_implicit_solver_steps_over_what_is_damped():
+    """Drag of 1e6 a second, and a slow turn by a torque: 2.5 million explicit steps."""
+    drag = jr.torques.LinearDrag(1e6)
+    body = jr.RigidBody(np.ones(3), drag + jr.torques.Constant(np.array([0, 0, 5e5])))
+    trajectory = jr.simulate(
+        body, jr.State(UPRIGHT, OMEGA), 4.0, rtol=1e-6, solver=diffrax.Kvaerno5(), max_steps=2000
+    )
+    assert trajectory.stats["num_steps"] < 500
+    np.testing.assert_allclose(trajectory.states.omega, [0, 0, 0.5], atol=1e-6)
+    turned = jnp.array([np.cos(1.0), 0, 0, np.sin(1.0)])  # by 2 rad
+    assert jr.rotation.angle_between(trajectory.states.attitude, turned) < 1e-5
+
+
+# What is refused -----------------------------------------------------------------------------
+
+
+def _pick(code):
+    return int(getattr(jr.RESULTS, code)._value)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: jr.simulate(BODY, jr.State(UPRIGHT, 1e-200 * OMEGA), 1e200),
+            r"whose squares are in the range of their dtype .*not: 9\.89.*e-201\. \(Choose another",
+        ),
+        (
+            lambda: jr.simulate(BODY, jr.State(UPRIGHT, 1e160 * OMEGA), 1e-160),
+            r"whose squares are in the range .* not: 9\.89.*e\+159\. \(Choose another unit of time",
+        ),
+        (lambda: jr.simulate(BODY, STATE, np.array([1.0, 0.5])), r"`ts` must .* not: 0\.5\.$"),
+        (lambda: jr.simulate(BODY, STATE, np.array([1.0, 2.0]), t0=1.5), r"`t0`, .* not: 1\.0\.$"),
+        (
+            lambda: jr.simulate(
+                jr.RigidBody(MOMENTS, lambda t, _s, _a: jnp.where(t > 3, jnp.nan, 0) * jnp.ones(3)),
+                STATE, 5.0,
+            ),
+            r"became NaN or infinite on the way, after `final_time` \[s\]: (3\.0|2\.999).*\.$",
+        ),
+        (
+            lambda: jax.vmap(lambda x: jr.simulate(BODY, jr.State(UPRIGHT, x), 1.0))(
+                jnp.stack([OMEGA, jnp.nan * OMEGA])
+            ),
+            r"`state0` must be finite, but a component is not: \[.*nan\] in lane 1\.",
+        ),
+        (
+            lambda: jax.vmap(lambda x: jr.simulate(BODY, STATE, x, max_steps=20))(
+                jnp.array([0.1, 100.0])
+            ),
+            r"maximum number of solver steps.*: in lane 1\.",
+        ),
+    ],
+)  # fmt: skip
+def test_an_error_is_one_sentence_with_the_value_and_the_lane(call, message):
+    with pytest.raises(RuntimeError, match=message) as error:
+        call()
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.filterwarnings("ignore:simulate:UserWarning")
+def test_times_that_their_dtype_cannot_tell_apart_are_an_error():
+    """Unix time in float32: its numbers are 128 seconds apart."""
+    single = lambda *x: [np.asarray(a, np.float32) for a in x]  # noqa: E731
+    moments, attitude, omega, ts = single(MOMENTS, UPRIGHT, OMEGA, 1.7e9 + np.arange(11.0))
+    body, state0 = jr.RigidBody(moments), jr.State(attitude, omega)
+    with pytest.raises(RuntimeError, match=r"1700000000.*\(Subtract the epoch.*jax_enable_x64"):
+        jr.simulate(body, state0, ts, t0=ts[0])
+    trajectory = jr.simulate(body, state0, ts, t0=ts[0], throw=False)
+    assert trajectory.result == jr.RESULTS.unresolved_times
+    assert np.all(np.isnan(trajectory.states.omega))
+    fine = jr.simulate(body, state0, ts.astype(np.float64), t0=float(ts[0]))
+    assert fine.result == jr.RESULTS.successful
+
+
+def test_rates_near_the_ends_of_the_range_are_integrated():
+    for unit in (1e-140, 1e140):
+        trajectory = jr.simulate(BODY, jr.State(UPRIGHT, unit * OMEGA), 3.0 / unit)
+        exact = jr.free_rotation(MOMENTS, jr.State(UPRIGHT, OMEGA), 3.0).omega
+        np.testing.assert_allclose(trajectory.states.omega / unit, exact, rtol=1e-8, atol=1e-8)
+
+
+def test_a_torque_that_turns_nan_has_its_own_code_and_time():
+    body = jr.RigidBody(MOMENTS, lambda _t, s, a: -0.1 * s.omega * jnp.sqrt(1 - a * _t))
+    lanes = jax.vmap(lambda a: jr.simulate(body, STATE, 2.0, a, throw=False))(jnp.array([0.1, 1.0]))
+    assert [int(x) for x in lanes.result._value] == [0, _pick("nonfinite_torque")]
+    np.testing.assert_allclose(lanes.final_time, [2.0, 1.0], rtol=1e-12)
+    assert np.all(np.isfinite(lanes.final_state.omega[0]))
+    assert np.all(np.isnan(lanes.final_state.omega[1]))
+
+
+def test_what_is_a_rigid_body_in_other_words_moves():
+    top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
+    found = jr.simulate(top, state0, 2.0)
+    exact = jr.top_motion(top, state0, 2.0)
+    np.testing.assert_allclose(found.states.omega, exact.omega, atol=1e-8)
+    assert isinstance(found.system, jr.RigidBody)
+
+
+def test_a_trajectory_shows_its_numbers():
+    shown = repr(jr.simulate(BODY, STATE, np.array([0.0, 1.0])))
+    assert "ts=[0., 1.]" in shown
+    assert "\n" not in shown
+    assert len(shown) < 400
