@@ -201,7 +201,7 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
 
     def bound(omega, ts):
         plan = identify.Rates(ts, None, 0.02)
-        return identify.cramer_rao(body, plan, jr.State(UNTURNED, omega)).ratios_covariance[1, 1]
+        return identify.cramer_rao(body, jr.State(UNTURNED, omega), plan).ratios_covariance[1, 1]
 
     slopes = quick_jit(jax.grad(bound, argnums=(0, 1)))
     bound = quick_jit(bound)
@@ -209,8 +209,8 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
     start = jr.State(UNTURNED, omega)
     told, information = quick_jit(
         lambda start: (
-            identify.identifiability(body, plan, start),
-            identify.fisher_information(body, plan, start),
+            identify.identifiability(body, start, plan),
+            identify.fisher_information(body, start, plan),
         )
     )(start)
     assert bool(told.status == Status.OK)
@@ -259,7 +259,7 @@ def test_free_motion_tells_everything_but_the_scale():
     omega = TURN @ np.array([0.5, 1.0, 0.4])
     body = jr.RigidBody(turned(ASYMMETRIC[0]))
     found = quick_jit(
-        lambda omega: identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+        lambda omega: identify.identifiability(body, jr.State(UNTURNED, omega), plan)
     )(omega)
     assert found.null_directions == ("overall scale",)
 
@@ -342,7 +342,7 @@ def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
     options = {"shape": "top", "free": lambda body: body.torque.mass}
 
-    told_of = quick_jit(lambda state: identify.identifiability(top, plan, state, **options))
+    told_of = quick_jit(lambda state: identify.identifiability(top, state, plan, **options))
 
     def words(tilt):
         return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
@@ -560,12 +560,12 @@ def test_ten_numbers_are_two_too_many():
     body = jr.RigidBody(arm.about(np.zeros(3)), weight)
     state = jr.State(jr.rotation.exp(jnp.array([2.5, 0.2, 0.0])), np.array([0.5, -1.0, 4.0]))
     plan, ten = identify.Rates(np.arange(100) * 0.05, None, 0.005), identify.LogCholesky(arm)
-    found = identify.identifiability(body, plan, state, shape=ten, scale="known")
+    found = identify.identifiability(body, state, plan, shape=ten, scale="known")
     nulls = [text for text in found.null_directions if "heading" not in text]
     assert len(nulls) == 2
     assert "alpha" in " ".join(nulls)
     with pytest.raises(ValueError, match="LogCholesky"):
-        _ = identify.identifiability(body, plan, state).body
+        _ = identify.identifiability(body, state, plan).body
 
 
 def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
@@ -731,7 +731,7 @@ def test_what_cannot_be_weighed_is_refused():
     with pytest.raises(ValueError, match="each kind"):
         identify.fit(BLIND, (readings, identify.Attitudes(TS, turns)))
     with pytest.raises(ValueError, match="noise"):
-        identify.cramer_rao(BLIND, identify.Rates(TS, None), jr.State(UNTURNED, np.ones(3)))
+        identify.cramer_rao(BLIND, jr.State(UNTURNED, np.ones(3)), identify.Rates(TS, None))
     with pytest.raises(ValueError, match="free"):
         identify.fit(BLIND, readings, free=lambda body: body.inertia)
     stars = [identify.Directions(TS, omegas, 0.01, of=of) for of in np.eye(3)[:2]]
