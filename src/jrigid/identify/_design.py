@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, check_inertia_shape, check_shape, check_type
+from jrigid._checks import RESULTS, check_inertia_shape, check_shape, check_type, nan_where
 from jrigid._numerics import product
 from jrigid._simulate import simulate
 from jrigid.dynamics import State
@@ -18,7 +18,7 @@ from jrigid.free import free_rotation
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse
-from jrigid.identify._layout import Layout, times_of, whole
+from jrigid.identify._layout import Layout, first_and_last, times_of, whole
 from jrigid.identify._observations import AbstractObservation, known, of_throws, whitened
 from jrigid.identify._parameters import LogCholesky
 from jrigid.identify._residuals import (
@@ -118,6 +118,8 @@ def _planned(
     one = jnp.ones((), ts.dtype)
     stage = Stage(0 * one, 2 * one, jnp.asarray(False), jnp.asarray(1))
     rows, _ = evaluation(options)(point, args, layout, stage)
+    if not torque_free:  # which is followed forward only
+        rows = nan_where(jnp.any(layout.start > first_and_last(ts, there)[0][:, None]), rows)
     return _Plan(options, args, point, rows, layout)
 
 
