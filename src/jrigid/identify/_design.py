@@ -7,12 +7,13 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, check_inertia_shape, check_shape, check_type, nan_where
 from jrigid._numerics import product
 from jrigid._simulate import simulate
+from jrigid._types import Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify._errors import conclude

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
     RESULTS,
@@ -22,7 +22,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._numerics import product
-from jrigid._types import InertiaLike, Matrix, Scalar, Vector
+from jrigid._types import InertiaLike, Matrix, Readable, Real, Scalar, Vector
 from jrigid.mass import MassProperties
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
@@ -181,7 +181,7 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     return where_defined(solid, numbers, body.mass, body.center_of_mass, second)
 
 
-class LogCholesky(eqx.Module):
+class LogCholesky(Readable):
     """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
 
     The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and

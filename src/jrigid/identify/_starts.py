@@ -7,11 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where, settle
 from jrigid._numerics import product, safe_norm
-from jrigid._types import Matrix, Readable, Vector
+from jrigid._types import Matrix, Readable, Real, Vector
 from jrigid.rotation import to_matrix
 
 _LEAST_SAMPLES = 8  # to a window
