@@ -128,8 +128,11 @@ class FitResult(eqx.Module):
         """The body that was found."""
         return self.unknowns.system_and_gyro(self.numbers)[0]  # pyright: ignore
 
-    def start(self, throw: int = 0) -> tuple[State, Float[Array, "*fits"]]:
-        """The state of a throw and its time [s], which everything that moves the state needs.
+    def start(self, index: int = 0) -> tuple[State, Float[Array, "*fits"]]:
+        """The state of a throw and its time [s], which whoever moves the state needs.
+
+        Args:
+            index: Which throw.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
@@ -140,8 +143,8 @@ class FitResult(eqx.Module):
         >>> print(t0)
         50.0
         """
-        attitude, omega = self.state.attitude[..., throw, :], self.state.omega[..., throw, :]
-        return State(attitude, omega), self.t0[..., throw]
+        attitude, omega = self.state.attitude[..., index, :], self.state.omega[..., index, :]
+        return State(attitude, omega), self.t0[..., index]
 
     @property
     def body(self) -> MassProperties:
