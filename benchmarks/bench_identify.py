@@ -71,8 +71,8 @@ def fits(values, ts, noise):
 def bound_at_truth(tensor, omega, ts, noise):
     """Covariance of the five numbers, and the relative bounds of the ratios."""
     body, plan = jr.RigidBody(tensor), Rates(ts, None, noise)
-    unknowns = jr.identify.identifiability(body, plan, jr.State(UNTURNED, omega)).unknowns
-    bound = cramer_rao(body, plan, jr.State(UNTURNED, omega))
+    unknowns = jr.identify.identifiability(body, jr.State(UNTURNED, omega), plan).unknowns
+    bound = cramer_rao(body, jr.State(UNTURNED, omega), plan)
     numbers = jr.identify.parameters_from_inertia(tensor)[1:]
     slopes = jax.jacfwd(lambda p: of_elements(unknowns.inertia(p)))(numbers)
     moments = jnp.linalg.eigvalsh(tensor)

@@ -185,6 +185,54 @@ def test_residuals_are_those_of_the_motion_and_have_its_derivatives(one_fit):
     assert np.all(np.abs(slope) < 0.01 * scale)
 
 
+def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
+    """Whoever takes the state of a fit takes its time too; without it all is 50 s off."""
+    _, readings, early = one_fit
+    ts = TS + 50
+    found = identify.fit(BLIND, identify.Rates(ts, readings.values, 0.02))
+    np.testing.assert_allclose(found.inertia, early.inertia, rtol=1e-7)
+    np.testing.assert_array_equal(found.t0, 50.0)
+    assert "rates at t = 50 s" in str(found)
+    state0, t0 = found.start()
+    np.testing.assert_array_equal(state0.omega, found.state.omega[0])
+
+    rows = (jr.simulate(found.system, state0, ts, t0=t0).states.omega - readings.values) / 0.02
+    np.testing.assert_allclose(rows.reshape(1, -1), found.residuals, atol=1e-5)
+    readings = identify.Rates(ts, readings.values, 0.02)
+    rows = identify.residuals(found.system, found.state, readings, t0=found.t0)
+    np.testing.assert_allclose(rows, found.residuals, atol=1e-9)
+    # Everywhere the state is that at t0 = 0.0 unless it is said.
+    at_zero = jr.free_rotation(found.inertia, state0, jnp.zeros(()), t0=t0)
+    at_zero = jr.State(at_zero.attitude, at_zero.omega)
+    rows = identify.residuals(found.system, at_zero, readings)
+    np.testing.assert_allclose(rows, found.residuals, atol=1e-9)
+    both = quick_jit(
+        lambda state, t0: (
+            identify.cramer_rao(found.system, state, readings, t0=t0).ratios_covariance,
+            identify.identifiability(found.system, state, readings, t0=t0).t0,
+        )
+    )
+    bound, stated = both(state0, t0)
+    np.testing.assert_allclose(bound, found.ratios_covariance, rtol=1e-5)
+    np.testing.assert_array_equal(stated, 50.0)
+    bound, stated = both(at_zero, 0.0)
+    np.testing.assert_allclose(bound, found.ratios_covariance, rtol=1e-5)
+    np.testing.assert_array_equal(stated, 0.0)
+
+
+def test_under_a_torque_a_state_after_the_first_sample_is_refused():
+    """The motion under a torque is followed forward only."""
+    body = jr.RigidBody(np.array([1.0, 1.7, 2.3]), jr.torques.LinearDrag(0.01))
+    state, ts = jr.State(UNTURNED, np.array([0.5, 1.0, 0.3])), np.array([1.0, 2.0, 3.0, 4.0])
+    record = identify.Rates(ts, np.ones((4, 3)), 0.01)
+    assert np.all(np.isfinite(identify.residuals(body, state, record)))
+    with pytest.raises(RuntimeError, match="not earlier than `t0`"):
+        identify.residuals(body, state, record, t0=1.5)
+    information = quick_jit(lambda t0: identify.fisher_information(body, state, record, t0=t0))
+    assert np.all(np.isfinite(information(1.0)))
+    assert np.all(np.isnan(information(1.5)))
+
+
 def test_profile_is_the_parabola_of_the_errors_near_the_minimum(one_fit):
     _, _, found = one_fit
     best, error = float(found.moments[0]), float(found.moments_covariance[0, 0] ** 0.5)
@@ -201,7 +249,7 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
 
     def bound(omega, ts):
         plan = identify.Rates(ts, None, 0.02)
-        return identify.cramer_rao(body, plan, jr.State(UNTURNED, omega)).ratios_covariance[1, 1]
+        return identify.cramer_rao(body, jr.State(UNTURNED, omega), plan).ratios_covariance[1, 1]
 
     slopes = quick_jit(jax.grad(bound, argnums=(0, 1)))
     bound = quick_jit(bound)
@@ -209,8 +257,8 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
     start = jr.State(UNTURNED, omega)
     told, information = quick_jit(
         lambda start: (
-            identify.identifiability(body, plan, start),
-            identify.fisher_information(body, plan, start),
+            identify.identifiability(body, start, plan),
+            identify.fisher_information(body, start, plan),
         )
     )(start)
     assert bool(told.status == Status.OK)
@@ -259,7 +307,7 @@ def test_free_motion_tells_everything_but_the_scale():
     omega = TURN @ np.array([0.5, 1.0, 0.4])
     body = jr.RigidBody(turned(ASYMMETRIC[0]))
     found = quick_jit(
-        lambda omega: identify.identifiability(body, plan, jr.State(UNTURNED, omega))
+        lambda omega: identify.identifiability(body, jr.State(UNTURNED, omega), plan)
     )(omega)
     assert found.null_directions == ("overall scale",)
 
@@ -342,7 +390,7 @@ def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
     options = {"shape": "top", "free": lambda body: body.torque.mass}
 
-    told_of = quick_jit(lambda state: identify.identifiability(top, plan, state, **options))
+    told_of = quick_jit(lambda state: identify.identifiability(top, state, plan, **options))
 
     def words(tilt):
         return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
@@ -560,12 +608,12 @@ def test_ten_numbers_are_two_too_many():
     body = jr.RigidBody(arm.about(np.zeros(3)), weight)
     state = jr.State(jr.rotation.exp(jnp.array([2.5, 0.2, 0.0])), np.array([0.5, -1.0, 4.0]))
     plan, ten = identify.Rates(np.arange(100) * 0.05, None, 0.005), identify.LogCholesky(arm)
-    found = identify.identifiability(body, plan, state, shape=ten, scale="known")
+    found = identify.identifiability(body, state, plan, shape=ten, scale="known")
     nulls = [text for text in found.null_directions if "heading" not in text]
     assert len(nulls) == 2
     assert "alpha" in " ".join(nulls)
     with pytest.raises(ValueError, match="LogCholesky"):
-        _ = identify.identifiability(body, plan, state).body
+        _ = identify.identifiability(body, state, plan).body
 
 
 def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
@@ -731,7 +779,7 @@ def test_what_cannot_be_weighed_is_refused():
     with pytest.raises(ValueError, match="each kind"):
         identify.fit(BLIND, (readings, identify.Attitudes(TS, turns)))
     with pytest.raises(ValueError, match="noise"):
-        identify.cramer_rao(BLIND, identify.Rates(TS, None), jr.State(UNTURNED, np.ones(3)))
+        identify.cramer_rao(BLIND, jr.State(UNTURNED, np.ones(3)), identify.Rates(TS, None))
     with pytest.raises(ValueError, match="free"):
         identify.fit(BLIND, readings, free=lambda body: body.inertia)
     stars = [identify.Directions(TS, omegas, 0.01, of=of) for of in np.eye(3)[:2]]

@@ -1,22 +1,38 @@
 """Aliases for the array types of public signatures, and modules that print their numbers."""
 
 import dataclasses
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.core
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Real as _Real
+from typing_extensions import TypeAliasType
 
-Scalar: TypeAlias = Float[Array, ""]
-ScalarLike: TypeAlias = Real[ArrayLike, ""]
-Vector: TypeAlias = Float[Array, "3"]
-VectorLike: TypeAlias = Real[ArrayLike, "3"]
-Quaternion: TypeAlias = Float[Array, "4"]
-QuaternionLike: TypeAlias = Real[ArrayLike, "4"]
-Matrix: TypeAlias = Float[Array, "3 3"]
-MatrixLike: TypeAlias = Real[ArrayLike, "3 3"]
-InertiaLike: TypeAlias = Real[ArrayLike, "3"] | Real[ArrayLike, "3 3"]
+# `help` shows such an alias by its name, where it would spell a union out.
+Scalar = TypeAliasType("Scalar", Float[Array, ""])
+ScalarLike = TypeAliasType("ScalarLike", _Real[ArrayLike, ""])
+Vector = TypeAliasType("Vector", Float[Array, "3"])
+VectorLike = TypeAliasType("VectorLike", _Real[ArrayLike, "3"])
+Quaternion = TypeAliasType("Quaternion", Float[Array, "4"])
+QuaternionLike = TypeAliasType("QuaternionLike", _Real[ArrayLike, "4"])
+Matrix = TypeAliasType("Matrix", Float[Array, "3 3"])
+MatrixLike = TypeAliasType("MatrixLike", _Real[ArrayLike, "3 3"])
+RandomKey = TypeAliasType("RandomKey", PRNGKeyArray)
+InertiaLike = TypeAliasType("InertiaLike", _Real[ArrayLike, "3"] | _Real[ArrayLike, "3 3"])
+
+if TYPE_CHECKING:
+    from jaxtyping import Real as Real
+else:
+
+    class Real:
+        """`jaxtyping.Real[ArrayLike, "..."]`, shown as it is written."""
+
+        def __class_getitem__(cls, item: tuple[Any, str]) -> TypeAliasType:
+            """An alias of that name."""
+            return TypeAliasType(f"Real[ArrayLike, '{item[1]}']", _Real[item])
+
 
 _FEW = 12  # numbers that an array is shown with
 

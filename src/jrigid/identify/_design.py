@@ -7,11 +7,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, check_inertia_shape
+from jrigid._checks import RESULTS, check_inertia_shape, check_shape, check_type, nan_where
 from jrigid._numerics import product
+from jrigid._types import Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify._errors import conclude
@@ -64,20 +65,17 @@ def _with_values(observation: AbstractObservation, values: Array) -> AbstractObs
 
 def _planned(
     system: RigidBody,
-    observations: Any,
     state: State,
+    observations: Any,
+    t0: Any,
     free: Any,
     nuisances: Sequence[str] | Mapping[str, Any],
     scale: str,
     shape: str | LogCholesky,
 ) -> _Plan:
     """Derivatives of a record that is what the body and the state say."""
-    if not isinstance(system, RigidBody):
-        raise ValueError(
-            f"Argument `system` must be a RigidBody, but it is {type(system).__name__}."
-        )
-    if not isinstance(state, State):
-        raise ValueError(f"Argument `state` must be a State, but it is {type(state).__name__}.")
+    check_type("system", system, RigidBody)
+    check_type("state", state, State)
     check_inertia_shape(system.inertia)
     stacked = of_throws(observations)
     torque_free = system.is_free
@@ -101,7 +99,7 @@ def _planned(
         torque_free, any(x.on_attitude for x in stacked) or depends_on_attitude(system), False, 1,
         "squares", 0, True, None, 0, False, False,
     )  # fmt: skip
-    layout = whole(ts, there, 1)
+    layout = whole(ts, there, 1, jnp.asarray(t0, ts.dtype))
     point = Point(numbers, attitude, omega)
     # Values as they would be seen: a residual of zero.
     found, _ = unknowns.system_and_gyro(numbers)
@@ -120,6 +118,8 @@ def _planned(
     one = jnp.ones((), ts.dtype)
     stage = Stage(0 * one, 2 * one, jnp.asarray(False), jnp.asarray(1))
     rows, _ = evaluation(options)(point, args, layout, stage)
+    if not torque_free:  # which is followed forward only
+        rows = nan_where(jnp.any(layout.start > first_and_last(ts, there)[0][:, None]), rows)
     return _Plan(options, args, point, rows, layout)
 
 
@@ -155,9 +155,10 @@ def _inverse(rows: Rows) -> Array:
 
 def fisher_information(
     system: RigidBody,
-    observations: Any,
     state: State,
+    observations: Any,
     *,
+    t0: Real[_ArrayLike, "*throws"] = 0.0,
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
@@ -167,9 +168,11 @@ def fisher_information(
 
     Args:
         system: The body as it is thought to be.
+        state: State at `t0`, of one throw, or with an axis of throws in front.
         observations: When and how well it will be observed, as for `fit`; values play no role and
             may be None.
-        state: State at the first time, of one throw, or with an axis of throws in front.
+        t0: Time of the state [s], or of that of each throw; under a torque not later than the first
+            observation, or all is NaN.
         free: As for `fit`, and so on.
         nuisances: Errors of the gyro that will be sought too; with a prior, if given.
         scale: "trace", "known" or "rotor".
@@ -177,10 +180,7 @@ def fisher_information(
 
     Returns:
         The information about the numbers sought (the shape's, the scale's, leaves, nuisances) and
-        the states (rate, then, if it matters, a small turn, of each throw).
-
-    Raises:
-        ValueError: Wrong shape or option (trace time). Values are not checked.
+        the states at `t0` (rate, then, if it matters, a small turn, of each throw).
 
     Gradients: in the state, the times and the noise; in the tensor they are not to be relied on.
 
@@ -188,17 +188,20 @@ def fisher_information(
     >>> plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
     >>> body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]))
-    >>> print(jr.identify.fisher_information(body, plan, start).shape)
+    >>> print(jr.identify.fisher_information(body, start, plan).shape)
     (8, 8)
     """
-    return _information(_planned(system, observations, state, free, nuisances, scale, shape).rows)
+    return _information(
+        _planned(system, state, observations, t0, free, nuisances, scale, shape).rows
+    )
 
 
 def cramer_rao(
     system: RigidBody,
-    observations: Any,
     state: State,
+    observations: Any,
     *,
+    t0: Real[_ArrayLike, "*throws"] = 0.0,
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
@@ -208,8 +211,9 @@ def cramer_rao(
 
     Args:
         system: As for `fisher_information`, and so on.
+        state: State at `t0`.
         observations: The plan.
-        state: State at the first time.
+        t0: Time of the state [s].
         free: Leaves of the system.
         nuisances: Errors of the gyro.
         scale: "trace", "known" or "rotor".
@@ -217,9 +221,6 @@ def cramer_rao(
 
     Returns:
         Covariances.
-
-    Raises:
-        ValueError: Wrong shape or option (trace time). Values are not checked.
 
     Gradients: as `fisher_information`, where the record tells all that is sought: so a plan can be
     improved by descent.
@@ -229,11 +230,11 @@ def cramer_rao(
     >>> def error(omega):
     ...     plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
     ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
-    ...     return jr.identify.cramer_rao(body, plan, start).ratios_covariance[1, 1] ** 0.5
+    ...     return jr.identify.cramer_rao(body, start, plan).ratios_covariance[1, 1] ** 0.5
     >>> print(f"{jax.jit(error)(jnp.array([0.5, 1.0, 0.3])):.5f}")
     0.00378
     """
-    plan = _planned(system, observations, state, free, nuisances, scale, shape)
+    plan = _planned(system, state, observations, t0, free, nuisances, scale, shape)
     covariance = _inverse(plan.rows)
     numbers, unknowns = plan.point.numbers, plan.args.unknowns
 
@@ -248,9 +249,10 @@ def cramer_rao(
 
 def identifiability(
     system: RigidBody,
-    observations: Any,
     state: State,
+    observations: Any,
     *,
+    t0: Real[_ArrayLike, "*throws"] = 0.0,
     free: Any = None,
     nuisances: Sequence[str] | Mapping[str, Any] = (),
     scale: str = "trace",
@@ -263,8 +265,9 @@ def identifiability(
 
     Args:
         system: As for `fisher_information`, and so on.
+        state: State at `t0`.
         observations: The plan.
-        state: State at the first time.
+        t0: Time of the state [s].
         free: Leaves of the system.
         nuisances: Errors of the gyro.
         scale: "trace", "known" or "rotor".
@@ -273,20 +276,17 @@ def identifiability(
     Returns:
         The result, of chi-square 0.
 
-    Raises:
-        ValueError: Wrong shape or option (trace time). Values are not checked.
-
     Gradients: use `cramer_rao`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
     >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
-    >>> told = jr.identify.identifiability(top, plan, start, nuisances="gyro_scale")
+    >>> told = jr.identify.identifiability(top, start, plan, nuisances="gyro_scale")
     >>> print(told.null_directions)
     ('overall scale', 'I3/I1 against gyro scale')
     """
-    plan = _planned(system, observations, state, free, nuisances, scale, shape)
+    plan = _planned(system, state, observations, t0, free, nuisances, scale, shape)
     seen = tuple(known(x).astype(plan.rows.residual.dtype) for x in plan.args.observations)
     return conclude(
         plan.options, plan.args._replace(weights=seen), plan.point, plan.rows, seen,
@@ -310,9 +310,6 @@ def profile(
     Returns:
         Growth of chi-square, in units of the noise; NaN where no fit was found.
 
-    Raises:
-        ValueError: Wrong shape (trace time).
-
     Gradients: none to be relied on.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -325,10 +322,7 @@ def profile(
     [1. 0. 1.]
     """
     values = jnp.asarray(values, result.numbers.dtype)
-    if values.ndim != 1:
-        raise ValueError(
-            f"Argument `values` must have shape (n,), but it has shape {values.shape}."
-        )
+    check_shape("values", values, (None,))
     return _profile(result, function, values)
 
 
@@ -339,7 +333,7 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     size = result.numbers.size
     error = jnp.sqrt(slope @ result.covariance[:size, :size] @ slope)
     ts, there = times_of(args.observations)
-    layout = whole(ts, there, 1)
+    layout = whole(ts, there, 1, result.t0)
     point = Point(result.numbers, result.state.attitude[:, None], result.state.omega[:, None])
     one = jnp.ones(1, ts.dtype)
     stages = Stage(0 * one, 2 * one, jnp.asarray([False]), jnp.asarray([100]))
@@ -363,7 +357,7 @@ def residuals(
     state: State,
     observations: Any,
     *,
-    t0: Any = None,
+    t0: Real[_ArrayLike, "*throws"] = 0.0,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Float[Array, "throws rows"]:
     """Whitened residuals of a motion, for a loss or an optimiser of one's own (optax, say).
@@ -372,7 +366,8 @@ def residuals(
         system: The body.
         state: Its state at `t0`, of one throw, or with an axis of throws in front.
         observations: As for `fit`.
-        t0: Time of the state [s]; by default that of each throw's first sample.
+        t0: Time of the state [s], or of that of each throw: `found.t0` for that of a fit. Under a
+            torque not later than the first sample.
         adjoint: For `jrigid.simulate`, if there is a torque.
 
     Returns:
@@ -380,8 +375,7 @@ def residuals(
         seen.
 
     Raises:
-        ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        RuntimeError: What `free_rotation` or `simulate` raises.
 
     Gradients: those of the motion, in every mode that `free_rotation` or `simulate` has.
 
@@ -394,22 +388,15 @@ def residuals(
     >>> print(loss(record.true_moments, jnp.array([0.3, 3.0, 0.4])).round(2))
     1.0
     """
+    check_type("system", system, RigidBody)
+    check_type("state", state, State)
     stacked = of_throws(observations)
-    ts, there = times_of(stacked)
+    ts, _ = times_of(stacked)
     throws = ts.shape[0]
-    first, _ = first_and_last(ts, there)
-    begin = first if t0 is None else jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
+    begin = jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
     attitude = jnp.broadcast_to(state.attitude, (throws, 4))
     omega = jnp.broadcast_to(state.omega, (throws, 3))
     torque_free = system.is_free
-
-    if not torque_free:
-        begin = eqx.error_if(
-            begin,
-            begin > first,
-            "Argument `t0` must not be later than the first sample where there is a torque, but it "
-            "is.",
-        )
 
     def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
         if torque_free:
@@ -417,7 +404,6 @@ def residuals(
         return in_any_order(
             lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
             times,
-            begin,
         )
 
     states = jax.vmap(motion)(attitude, omega, ts, begin)

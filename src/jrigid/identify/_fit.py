@@ -95,9 +95,10 @@ def fit(
             principal axes, those of the system's; "symmetric": two moments are equal; "top": they
             are, and the axis is body axis 3; "flat": all mass in a plane; "fixed": all of it. Or a
             `LogCholesky`: ten numbers of the body about a fixed point, of which any are frozen.
-        start: Where to start: a `State` at the first time, of one throw or with an axis of throws
-            in front; or (inertia or None, State or None). Needed where the attitude matters and was
-            not observed: an attitude nearer than about half a turn will do.
+        start: Where to start: a `State` at each throw's first sample (`t0` of what is returned), of
+            one throw or with an axis of throws in front; or (inertia or None, State or None).
+            Needed where the attitude matters and was not observed: an attitude nearer than about
+            half a turn will do.
         loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard deviations
             are left out, throws with more than a quarter of such samples altogether, and the rest
             is fitted by squares.
@@ -112,11 +113,12 @@ def fit(
             they are results with that status (bad input: of NaN).
 
     Returns:
-        What was found, with errors, and what the record does not tell; `print` it.
+        What was found, with errors, and what the record does not tell; `print` it. Its `state` is
+        at its `t0`, the first sample of each throw: `state0, t0 = found.start()` hands out both.
 
     Raises:
-        ValueError: Wrong shape or option; a request that no record could answer (trace time).
-        RuntimeError: Bad value or failed fit, with `throw=True` (run time, any lane).
+        ValueError: A request that no record could answer.
+        RuntimeError: A failed fit.
 
     Gradients: none to be relied on; `residuals` and `cramer_rao` have theirs.
     Source: H. G. Bock, multiple shooting (1983); J. J. More, Levenberg-Marquardt (1978);

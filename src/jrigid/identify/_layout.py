@@ -166,11 +166,11 @@ def angle_turned(samples: Samples) -> Array:
     return jax.vmap(throw)(samples.ts, samples.there, samples.omega)
 
 
-def whole(ts: Array, there: Array, nodes: int) -> Layout:
-    """One segment a throw, in the first of so many nodes."""
+def whole(ts: Array, there: Array, nodes: int, t0: Array | None = None) -> Layout:
+    """One segment a throw, in the first of so many nodes; its state at t0, or the first sample."""
     first, last = first_and_last(ts, there)
     zero = jnp.zeros((ts.shape[0], nodes), ts.dtype)
-    start = zero.at[:, 0].set(first)
+    start = zero.at[:, 0].set(first if t0 is None else t0)
     span = jnp.where(last > first, last - first, 1.0)
     since = (ts - first[:, None]) / span[:, None]
     return Layout(ts, jnp.zeros(ts.shape, int), start, start, zero > 0, since)

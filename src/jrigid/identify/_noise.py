@@ -4,7 +4,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
+
+from jrigid._types import RandomKey
 
 
 def _influence(jacobian: Float[Array, "rows params"]) -> Float[Array, "params rows"]:
@@ -42,7 +44,7 @@ def block_bootstrap(
     jacobian: Float[Array, "times outputs params"],
     residuals: Float[Array, "times outputs"],
     block: int,
-    key: PRNGKeyArray,
+    key: RandomKey,
     *,
     samples: int = 1000,
 ) -> Float[Array, "samples params"]:

@@ -8,26 +8,34 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import check_option, float_arrays, is_concrete
 from jrigid._numerics import product, safe_norm
-from jrigid._types import VectorLike
+from jrigid._types import Readable, Real, VectorLike
 from jrigid.dynamics import State, angular_momentum
 from jrigid.rotation import conjugate, log, multiply, rotate, rotate_inverse
 from jrigid.systems import AbstractSystem
 
 
-class AbstractObservation(eqx.Module):
+class AbstractObservation(Readable):
     """Values seen at some times; subclasses say what they are of.
 
+    NaN stands for "not seen": in a component of `values` (that number is left out; the whole sample
+    where the components hang together, in attitudes, directions and beside a `covariance`), in a
+    whole row, or in `ts` and its row (padding, which brings throws to one length). What was not
+    seen weighs nothing, and its `sigma` may be NaN; it costs what any sample costs.
+
     Attributes:
-        ts: Times [s], increasing.
-        values: One row for each time; NaN where nothing was seen.
-        sigma: Standard deviation: of all, of each component, of each sample, or of each value;
-            None where it is not known.
-        covariance: Of the components of a sample, (k, k) or one for each sample; then no `sigma`.
+        ts: Times [s] (n,), increasing among the samples seen, their origin that of `t0` elsewhere;
+            with an axis of throws in front, (throws, n).
+        values: One row for each time (n, k); a plan, whose values play no role, takes None.
+        sigma: Standard deviation of the noise, in units of the residual: one number for all, (k,)
+            for each component, (n,) for each sample, or (n, k); kept as (n, k). None where it is
+            not known: `fit` takes it from the residuals.
+        covariance: Of the components of a sample, (k, k) or (n, k, k), kept as the latter; then no
+            `sigma`.
     """
 
     width: ClassVar[int | None] = 3  # of a value
@@ -101,6 +109,13 @@ class Rates(AbstractObservation):
 
     The body axes of a fit are those of the sensor.
 
+    Attributes:
+        ts: Times [s] (n,), increasing; NaN pads.
+        values: Rates [rad/s] (n, 3); NaN in a component that was not seen, which leaves the others.
+        sigma: Noise [rad/s]: (), (3,), (n,) or (n, 3); None where it is not known.
+        covariance: Of the three components [rad^2/s^2]: (3, 3) or (n, 3, 3); then no `sigma`, and a
+            sample with a NaN is left out whole.
+
     >>> import jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> print(jr.identify.Rates(record.times, record.omegas, record.sigma).values.shape)
@@ -127,7 +142,17 @@ class Rates(AbstractObservation):
 
 
 class Attitudes(AbstractObservation):
-    """Attitudes, unit quaternions from body to space; noise is an angle about each body axis [rad].
+    """Attitudes, unit quaternions from body to space: a star tracker, or pictures.
+
+    The residual is the rotation vector from the observed to the predicted attitude, about the body
+    axes; q and -q are the same.
+
+    Attributes:
+        ts: Times [s] (n,), increasing; NaN pads.
+        values: Unit quaternions, scalar first (n, 4); a sample with a NaN is left out.
+        sigma: Noise, an angle about each body axis [rad]: (), (3,), (n,) or (n, 3); None where it
+            is not known.
+        covariance: Of the three angles [rad^2]: (3, 3) or (n, 3, 3); then no `sigma`.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.toutatis_1992()
@@ -165,6 +190,12 @@ class Directions(AbstractObservation):
     The residual is along two axes across the observed direction; its length is the chord.
 
     Attributes:
+        ts: Times [s] (n,), increasing; NaN pads.
+        values: Directions (n, 3), of a length near 1, which drops out; a sample with a NaN is left
+            out.
+        sigma: Noise, an angle across the direction [rad]: (), (2,), (n,) or (n, 2); None where it
+            is not known.
+        covariance: Of the two angles [rad^2]: (2, 2) or (n, 2, 2); then no `sigma`.
         of: What is seen: a vector in space axes (a star, the magnetic field), or, with
             `seen_from="space"`, a vector in body axes (a mark on the body).
         seen_from: "body" or "space": the axes of the values.
@@ -219,6 +250,10 @@ class AngularMomenta(AbstractObservation):
     Their size sets the scale of the inertia: `fit(..., scale="known")`.
 
     Attributes:
+        ts: Times [s] (n,), increasing; NaN pads.
+        values: Momenta [kg m^2/s] (n, 3); NaN in a component that was not seen.
+        sigma: Noise [kg m^2/s]: (), (3,), (n,) or (n, 3); None where it is not known.
+        covariance: Of the three components: (3, 3) or (n, 3, 3); then no `sigma`.
         axes: "space" or "body".
     """
 
@@ -250,6 +285,11 @@ class Observed(AbstractObservation):
     """Any function of time, state and system.
 
     Attributes:
+        ts: Times [s] (n,), increasing; NaN pads.
+        values: Of the function (n, k); NaN in a component that was not seen.
+        sigma: Noise, in the units of the values: (), (k,), (n,) or (n, k); None where it is not
+            known.
+        covariance: Of the components: (k, k) or (n, k, k); then no `sigma`.
         function: `(t, state, system) -> (k,)`. Define it once: a new function is compiled anew.
         on_attitude: Whether the function looks at the attitude.
 

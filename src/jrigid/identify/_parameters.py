@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
     RESULTS,
@@ -16,21 +15,15 @@ from jrigid._checks import (
     array_of_shape,
     check_inertia_shape,
     check_option,
+    check_type,
     float_arrays,
     is_positive_definite,
     is_symmetric,
-    nan_where,
+    where_defined,
 )
 from jrigid._numerics import product
-from jrigid._types import InertiaLike, Matrix, Scalar
+from jrigid._types import InertiaLike, Matrix, Readable, Real, Scalar, Vector
 from jrigid.mass import MassProperties
-
-_NOT_SOLID = (
-    "Argument `inertia` must be the symmetric tensor of a body with extent in three directions, "
-    "I3 < I1 + I2, but it is not."
-)
-_NOT_FINITE = "Argument `parameters` must be finite, but it is not."
-
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 
@@ -47,15 +40,7 @@ def _tensor(second_moments: Matrix) -> Matrix:
     return trace * jnp.eye(3, dtype=second_moments.dtype) - second_moments
 
 
-def _checked(parameters: Any, count: int, throw: bool) -> tuple[Findings, Array]:
-    parameters = array_of_shape("parameters", parameters, count)
-    findings = Findings()
-    findings.require(all_finite(parameters), RESULTS.invalid_inertia, _NOT_FINITE)
-    parameters = findings.apply(parameters, throw)
-    return findings, jnp.where(findings.ok, parameters, 0.0)
-
-
-def inertia_from_parameters(parameters: Real[ArrayLike, "6"], *, throw: bool = True) -> Matrix:
+def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
     """Inertia tensor of a real body from six numbers without bounds.
 
     The tensor of second moments of the mass, Sigma = (trace I / 2) 1 - I, is L L^T, L lower
@@ -66,14 +51,9 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"], *, throw: bool = T
 
     Args:
         parameters: The six numbers [-], the first the logarithm of a number in sqrt(kg) m.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        Inertia tensor [kg m^2].
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: A number that is not finite (run time, any lane).
+        Inertia tensor [kg m^2]; NaN unless all six are finite.
 
     Gradients: analytic; every tensor of a body with extent in three directions is reached by one
     set of numbers, so that nothing singular is in the way.
@@ -86,26 +66,26 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"], *, throw: bool = T
      [0. 2. 0.]
      [0. 0. 2.]]
     """
-    findings, p = _checked(parameters, 6, throw)
-    zero, one = jnp.zeros_like(p[0]), jnp.ones_like(p[0])
-    rows = [[one, zero, zero], [p[3], jnp.exp(p[1]), zero], [p[4], p[5], jnp.exp(p[2])]]
-    lower = jnp.exp(p[0]) * jnp.stack([jnp.stack(row) for row in rows])
-    return nan_where(~findings.ok, _tensor(product("ik,jk->ij", lower, lower)))
+    parameters = array_of_shape("parameters", parameters, 6)
+
+    def tensor(p: Array) -> Matrix:
+        zero, one = jnp.zeros_like(p[0]), jnp.ones_like(p[0])
+        rows = [[one, zero, zero], [p[3], jnp.exp(p[1]), zero], [p[4], p[5], jnp.exp(p[2])]]
+        lower = jnp.exp(p[0]) * jnp.stack([jnp.stack(row) for row in rows])
+        return _tensor(product("ik,jk->ij", lower, lower))
+
+    return where_defined(all_finite(parameters), tensor, parameters)
 
 
-def parameters_from_inertia(inertia: InertiaLike, *, throw: bool = True) -> Float[Array, "6"]:
+def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     """Six numbers without bounds for the inertia of a real body: see `inertia_from_parameters`.
 
     Args:
         inertia: Principal moments, or tensor [kg m^2], with I3 < I1 + I2.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        The numbers.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: A tensor that is no body's, or that of a flat one (run time, any lane).
+        The numbers; NaN for a tensor that is not symmetric, or of no body with extent in three
+        directions.
 
     Gradients: right for symmetric changes of the tensor; they grow as the body gets flat.
 
@@ -120,30 +100,19 @@ def parameters_from_inertia(inertia: InertiaLike, *, throw: bool = True) -> Floa
     check_inertia_shape(inertia)
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
     second = _second_moments(0.5 * (tensor + tensor.T))
-    findings = Findings()
-    known = jax.lax.stop_gradient((tensor, second))
-    solid = all_finite(known[0]) & is_symmetric(known[0]) & is_positive_definite(known[1])
-    findings.require(solid, RESULTS.unphysical_inertia, _NOT_SOLID)
-    second = findings.apply(second, throw)
-    second = jnp.where(findings.ok, second, jnp.eye(3, dtype=second.dtype))
-    lower = jnp.linalg.cholesky(second)
-    scale = lower[0, 0]
-    numbers = jnp.stack(
-        [
-            jnp.log(scale),
-            jnp.log(lower[1, 1] / scale),
-            jnp.log(lower[2, 2] / scale),
-            lower[1, 0] / scale,
-            lower[2, 0] / scale,
-            lower[2, 1] / scale,
-        ]
-    )
-    return nan_where(~findings.ok, numbers)
+    solid = all_finite(tensor) & is_symmetric(tensor) & is_positive_definite(second)
+
+    def numbers(second: Matrix) -> Array:
+        lower = jnp.linalg.cholesky(second)
+        scale = lower[0, 0]
+        sizes = jnp.stack([scale, lower[1, 1] / scale, lower[2, 2] / scale])
+        below = jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])
+        return jnp.concatenate([jnp.log(sizes), below / scale])
+
+    return where_defined(solid, numbers, second)
 
 
-def body_from_log_cholesky(
-    parameters: Real[ArrayLike, "10"], *, throw: bool = True
-) -> MassProperties:
+def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     """Mass properties of a real body from the ten numbers of its log-Cholesky parametrisation.
 
     The pseudo-inertia [[Sigma, m c], [m c^T, m]], Sigma the second moments of the mass about the
@@ -153,14 +122,9 @@ def body_from_log_cholesky(
 
     Args:
         parameters: The ten numbers.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        The body.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: A number that is not finite (run time, any lane).
+        The body; NaN unless all ten are finite.
 
     Gradients: analytic.
     Source: C. Rucker, P. M. Wensing, "Smooth parameterization of rigid-body inertia", IEEE Robotics
@@ -171,31 +135,28 @@ def body_from_log_cholesky(
     >>> print(body.mass, body.inertia[0])
     1.0 [2. 0. 0.]
     """
-    findings, p = _checked(parameters, 10, throw)
-    alpha, d1, d2, d3, s12, s23, s13, *t = p
-    zero = jnp.zeros_like(alpha)
-    rows = [[jnp.exp(d1), s12, s13], [zero, jnp.exp(d2), s23], [zero, zero, jnp.exp(d3)]]
-    upper = jnp.stack([jnp.stack(row) for row in rows])
-    mass = jnp.exp(2 * alpha)
-    # About the centre of mass the column t drops out.
-    inertia = mass * _tensor(product("ik,jk->ij", upper, upper))
-    body = nan_where(~findings.ok, (mass, jnp.stack(t), inertia))
-    return MassProperties.unchecked(*body)
+    parameters = array_of_shape("parameters", parameters, 10)
+
+    def body(p: Array) -> tuple[Scalar, Vector, Matrix]:
+        alpha, d1, d2, d3, s12, s23, s13, *t = p
+        zero = jnp.zeros_like(alpha)
+        rows = [[jnp.exp(d1), s12, s13], [zero, jnp.exp(d2), s23], [zero, zero, jnp.exp(d3)]]
+        upper = jnp.stack([jnp.stack(row) for row in rows])
+        mass = jnp.exp(2 * alpha)
+        # About the centre of mass the column t drops out.
+        return mass, jnp.stack(t), mass * _tensor(product("ik,jk->ij", upper, upper))
+
+    return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
 
 
-def log_cholesky_from_body(body: MassProperties, *, throw: bool = True) -> Float[Array, "10"]:
+def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     """The ten numbers of a body's log-Cholesky parametrisation: see `body_from_log_cholesky`.
 
     Args:
         body: A body with extent in three directions.
-        throw: False: bad values give NaN instead of an error.
 
     Returns:
-        (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3).
-
-    Raises:
-        ValueError: Not mass properties (trace time).
-        RuntimeError: A flat body (run time, any lane).
+        (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3); NaN for a flat body.
 
     Gradients: right for symmetric changes of the tensor; they grow as the body gets flat.
 
@@ -204,32 +165,23 @@ def log_cholesky_from_body(body: MassProperties, *, throw: bool = True) -> Float
     >>> print(numbers[:4].round(4))
     [ 1.0397 -1.2425 -0.5493 -0.1438]
     """
-    if not isinstance(body, MassProperties):
-        raise ValueError(
-            f"Argument `body` must be MassProperties, but it is {type(body).__name__}."
+    check_type("body", body, MassProperties)
+    second = _second_moments(body.inertia)
+    solid = (body.mass > 0) & all_finite(body) & is_positive_definite(second)
+
+    def numbers(mass: Scalar, center_of_mass: Vector, second: Matrix) -> Array:
+        second = second / mass
+        # The upper factor is the lower one with rows and columns reversed.
+        upper = jnp.linalg.cholesky(second[::-1, ::-1])[::-1, ::-1]
+        sides = jnp.stack([upper[0, 1], upper[1, 2], upper[0, 2]])
+        return jnp.concatenate(
+            [0.5 * jnp.log(mass)[None], jnp.log(jnp.diagonal(upper)), sides, center_of_mass]
         )
-    second = _second_moments(body.inertia) / body.mass
-    findings = Findings()
-    known = jax.lax.stop_gradient((body.mass, body.center_of_mass, second))
-    solid = (known[0] > 0) & all_finite(known) & is_positive_definite(known[2])
-    findings.require(solid, RESULTS.unphysical_inertia, _NOT_SOLID.replace("inertia", "body"))
-    ok = findings.ok
-    second = jnp.where(ok, second, jnp.eye(3, dtype=second.dtype))
-    mass: Scalar = jnp.where(ok, body.mass, 1.0)
-    # The upper factor is the lower one with rows and columns reversed.
-    upper = jnp.linalg.cholesky(second[::-1, ::-1])[::-1, ::-1]
-    numbers = jnp.concatenate(
-        [
-            0.5 * jnp.log(mass)[None],
-            jnp.log(jnp.diagonal(upper)),
-            jnp.stack([upper[0, 1], upper[1, 2], upper[0, 2]]),
-            body.center_of_mass,
-        ]
-    )
-    return findings.apply(nan_where(~ok, numbers), throw)
+
+    return where_defined(solid, numbers, body.mass, body.center_of_mass, second)
 
 
-class LogCholesky(eqx.Module):
+class LogCholesky(Readable):
     """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
 
     The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
@@ -243,8 +195,7 @@ class LogCholesky(eqx.Module):
         frozen: Names of those that are known.
 
     Raises:
-        ValueError: Not mass properties, or a name that is none of the ten (trace time).
-        RuntimeError: A flat body (run time, any lane).
+        RuntimeError: A flat body.
 
     Gradients: as `body_from_log_cholesky`.
     Source: as `body_from_log_cholesky`.
@@ -264,7 +215,15 @@ class LogCholesky(eqx.Module):
             check_option("frozen", name, LOG_CHOLESKY)
         if not self.sought:
             raise ValueError("Argument `frozen` must leave a number to seek, but it does not.")
-        self.parameters = log_cholesky_from_body(body)
+        parameters = log_cholesky_from_body(body)
+        findings = Findings()
+        findings.require(
+            all_finite(parameters),
+            RESULTS.unphysical_inertia,
+            "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not.",
+            body.inertia,
+        )
+        self.parameters = findings.guard(parameters, throw=True)
 
     @property
     def sought(self) -> tuple[str, ...]:
@@ -274,7 +233,7 @@ class LogCholesky(eqx.Module):
     @property
     def units(self) -> Array:
         """Sizes of the numbers sought: 1, or for those in metres that of the body."""
-        body = body_from_log_cholesky(self.parameters, throw=False)
+        body = body_from_log_cholesky(self.parameters)
         square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
         lengths = {"s12", "s23", "s13", "t1", "t2", "t3"}
         one = jnp.ones_like(square)
@@ -288,7 +247,7 @@ class LogCholesky(eqx.Module):
     def body(self, numbers: Array) -> MassProperties:
         """The body, of other numbers for those that are sought."""
         whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
-        return body_from_log_cholesky(whole, throw=False)
+        return body_from_log_cholesky(whole)
 
     def _indices(self) -> Any:
         return np.array([LOG_CHOLESKY.index(name) for name in self.sought])

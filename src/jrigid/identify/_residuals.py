@@ -46,10 +46,10 @@ class Args(NamedTuple):
     unit: Array  # of residuals whose noise is not known
 
 
-def in_any_order(motion: Callable[[Array], State], ts: Array, t0: Array) -> State:
-    """States of a motion that wants its times in order, none before t0."""
+def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
+    """States of a motion that wants its times in order."""
     order = jnp.argsort(ts)
-    states = motion(jnp.maximum(ts[order], t0))
+    states = motion(ts[order])
     back = jnp.argsort(order)
     return State(states.attitude[back], states.omega[back])
 
@@ -120,7 +120,7 @@ def _integrated(options: Options, system: Any, layout: Layout, point: Point) -> 
                 adjoint=diffrax.ForwardMode(), max_steps=100_000,
             ).states  # fmt: skip
 
-        return in_any_order(motion, ts, t0)
+        return in_any_order(motion, ts)
 
     return jax.vmap(throw)(point.attitude[:, 0], point.omega[:, 0], layout.ts, layout.start[:, 0])
 

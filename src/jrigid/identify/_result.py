@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jrigid._checks import Enumeration
 from jrigid._types import Matrix, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._unknowns import Unknowns
@@ -13,7 +14,7 @@ from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 
 
-class Status(eqx.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
+class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     """What became of a fit."""
 
     OK = "The fit describes the record, and the record tells what was asked."
@@ -61,8 +62,8 @@ class FitResult(eqx.Module):
         axes_errors: Errors of the turn about each principal axis [rad].
         ratios: I2/I1 and I3/I1.
         ratios_covariance: Of the ratios.
-        state: State at `t0`, with an axis of throws in front.
-        t0: First time of each throw [s].
+        state: State at `t0`, not at time 0, with an axis of throws in front: see `start`.
+        t0: Time of each throw's state [s]: that of its first sample, in a fit.
         numbers: The global numbers sought: see `names`.
         covariance: Of `numbers`, then of the states: for each throw the rate, and, if it matters,
             a small turn of the attitude about the body axes.
@@ -126,6 +127,24 @@ class FitResult(eqx.Module):
     def system(self) -> RigidBody:
         """The body that was found."""
         return self.unknowns.system_and_gyro(self.numbers)[0]  # pyright: ignore
+
+    def start(self, index: int = 0) -> tuple[State, Float[Array, "*fits"]]:
+        """The state of a throw and its time [s], which whoever moves the state needs.
+
+        Args:
+            index: Which throw.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> record = jr.datasets.gyro_example()
+        >>> readings = jr.identify.Rates(record.times + 50, record.omegas, record.sigma)
+        >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+        >>> state0, t0 = found.start()
+        >>> later = jr.simulate(found.system, state0, jnp.array([100.0]), t0=t0)
+        >>> print(t0)
+        50.0
+        """
+        attitude, omega = self.state.attitude[..., index, :], self.state.omega[..., index, :]
+        return State(attitude, omega), self.t0[..., index]
 
     @property
     def body(self) -> MassProperties:

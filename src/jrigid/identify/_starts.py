@@ -3,26 +3,24 @@
 Errors of the samples stand on both sides of these equations and bias what comes out.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where
+from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where, settle
 from jrigid._numerics import product, safe_norm
-from jrigid._types import Matrix, Vector
+from jrigid._types import Matrix, Readable, Real, Vector
 from jrigid.rotation import to_matrix
 
 _LEAST_SAMPLES = 8  # to a window
-_TIMES = (
-    "Argument `ts` must be finite and increasing, with four samples that are finite at least, but "
-    "it is not."
-)
+_TIMES = "Argument `ts` must be finite and increasing, but it is not."
+_FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
 
 
-class LinearStart(NamedTuple):
-    """Inertia from a linear regression.
+class LinearStart(Readable):
+    """Inertia from a linear regression, and how it went.
 
     Attributes:
         inertia: Tensor; of trace 1 where only ratios can be known, [kg m^2] beside a known rotor.
@@ -30,10 +28,14 @@ class LinearStart(NamedTuple):
         singular_values: Of the regression's matrix, with columns of unit scale, descending. The
             last is the misfit where ratios are sought; those nearly as small are directions that
             the samples do not tell.
+        result: `jrigid.RESULTS.successful`, or what is wrong with the samples.
+        momentum: That in space which belongs to the tensor, from `momentum`; else None.
     """
 
     inertia: Matrix
     singular_values: Float[Array, " n"]
+    result: Any
+    momentum: Vector | None = None
 
 
 def _momentum_matrix(omega: Array) -> Array:
@@ -49,8 +51,8 @@ def _tensor(six: Array) -> Matrix:
     return jnp.stack([jnp.stack(row) for row in ([xx, xy, xz], [xy, yy, yz], [xz, yz, zz])])
 
 
-def _samples(omegas: Any, ts: Any, *others: Any) -> tuple[Findings, Bool[Array, " n"], list[Array]]:
-    omegas, ts, *rest = float_arrays(omegas, ts, *others)
+def _samples(ts: Any, omegas: Any, *others: Any) -> tuple[Findings, Bool[Array, " n"], list[Array]]:
+    ts, omegas, *rest = float_arrays(ts, omegas, *others)
     check_shape("ts", ts, (None,))
     count = ts.shape[0]
     check_shape("omegas", omegas, (count, 3))
@@ -61,15 +63,24 @@ def _samples(omegas: Any, ts: Any, *others: Any) -> tuple[Findings, Bool[Array, 
         known = known & jnp.all(jnp.isfinite(other), axis=1)
     steps = jnp.diff(jax.lax.stop_gradient(ts))
     findings = Findings()
-    findings.require(
-        jnp.all(jnp.isfinite(ts)) & jnp.all(steps > 0) & (jnp.sum(known) >= 4),
-        RESULTS.invalid_times,
-        _TIMES,
-    )
+    increasing = jnp.all(jnp.isfinite(ts)) & jnp.all(steps > 0)
+    findings.require(increasing, RESULTS.invalid_times, _TIMES)
+    findings.require(jnp.sum(known) >= 4, RESULTS.invalid_state, _FEW, jnp.sum(known))
     ok = findings.ok
     ts = jnp.where(ok, ts, jnp.arange(count, dtype=ts.dtype))
     good = (ok & known)[:, None]
-    return findings, known, [jnp.where(good, x, 0.0) for x in (omegas, *rest)] + [ts]
+    return findings, known, [ts, *(jnp.where(good, x, 0.0) for x in (omegas, *rest))]
+
+
+def _answer(
+    findings: Findings,
+    throw: bool,
+    inertia: Matrix,
+    singular_values: Array,
+    momentum: Vector | None = None,
+) -> LinearStart:
+    start = LinearStart(inertia, singular_values, findings.result, momentum)
+    return settle(nan_where(~findings.ok, start), throw, lambda: findings)
 
 
 def _windows(
@@ -126,8 +137,8 @@ def _of_unit_trace(six: Array) -> Matrix:
 
 
 def weak_form(
-    omegas: Real[ArrayLike, "n 3"],
     ts: Real[ArrayLike, " n"],
+    omegas: Real[ArrayLike, "n 3"],
     *,
     windows: int = 128,
     radians: float = 3.0,
@@ -139,19 +150,18 @@ def weak_form(
     windows of some radians, and integrated by parts: linear equations for I.
 
     Args:
+        ts: Times, increasing [s].
         omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out, with the
             windows they are in.
-        ts: Their times, increasing [s].
         windows: How many, spread over the record.
         radians: Length of a window, in radians turned; at least eight samples.
-        throw: False: bad values give NaN instead of an error.
+        throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
         The tensor of trace 1 in the sensor's axes, and singular values.
 
     Raises:
-        ValueError: Wrong shape, fewer than four samples (trace time).
-        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+        ValueError: Fewer than four samples.
 
     Gradients: those of the singular vector, where the last two singular values differ.
     Source: the weak form of system identification, D. A. Messenger, D. M. Bortz, Multiscale
@@ -161,41 +171,38 @@ def weak_form(
     >>> ts = jnp.linspace(0.0, 40.0, 801)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
     >>> omegas = jr.free_rotation(jnp.array([1.0, 1.7, 2.3]), start, ts).omega
-    >>> tensor = jr.identify.weak_form(omegas, ts).inertia
+    >>> tensor = jr.identify.weak_form(ts, omegas).inertia
     >>> print((jnp.diagonal(tensor) / tensor[0, 0]).round(3))
     [1.  1.7 2.3]
     """
-    findings, known, (omegas, ts) = _samples(omegas, ts)
+    findings, known, (ts, omegas) = _samples(ts, omegas)
     rows, _ = _weak_rows(omegas, ts, known, windows, radians)
     six, values = _null_vector(rows)
-    found = nan_where(~findings.ok, LinearStart(_of_unit_trace(six), values))
-    return findings.apply(found, throw)
+    return _answer(findings, throw, _of_unit_trace(six), values)
 
 
 def momentum(
+    ts: Real[ArrayLike, " n"],
     attitudes: Real[ArrayLike, "n 4"],
     omegas: Real[ArrayLike, "n 3"],
-    ts: Real[ArrayLike, " n"],
     *,
     throw: bool = True,
-) -> tuple[LinearStart, Vector]:
+) -> LinearStart:
     """Ratios of inertia from attitudes and rates of a free body: its momentum stays in space.
 
     R I omega = L is linear in I and L.
 
     Args:
-        attitudes: Unit quaternions, body to space.
-        omegas: Angular velocities, body components [rad/s].
-        ts: Their times, increasing [s]; only their order is used.
-        throw: False: bad values give NaN instead of an error.
+        ts: Times, increasing [s]; only their order is used.
+        attitudes: Unit quaternions, body to space; samples with NaN are left out.
+        omegas: Angular velocities, body components [rad/s]; likewise.
+        throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
-        The tensor of trace 1 in the body's axes with singular values, and the momentum in space
-        that belongs to it.
+        The tensor of trace 1 in the body's axes, singular values, and the momentum in space.
 
     Raises:
-        ValueError: Wrong shape, fewer than four samples (trace time).
-        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+        ValueError: Fewer than four samples.
 
     Gradients: those of the singular vector, where the last two singular values differ.
 
@@ -203,13 +210,13 @@ def momentum(
     >>> ts = jnp.linspace(0.0, 40.0, 101)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
     >>> motion = jr.free_rotation(jnp.array([1.0, 1.7, 2.3]), start, ts)
-    >>> found, total = jr.identify.momentum(motion.attitude, motion.omega, ts)
-    >>> print((jnp.diagonal(found.inertia) / found.inertia[0, 0]).round(3))
+    >>> tensor = jr.identify.momentum(ts, motion.attitude, motion.omega).inertia
+    >>> print((jnp.diagonal(tensor) / tensor[0, 0]).round(3))
     [1.  1.7 2.3]
     """
-    attitudes, omegas, ts = float_arrays(attitudes, omegas, ts)
+    ts, attitudes, omegas = float_arrays(ts, attitudes, omegas)
     check_shape("attitudes", attitudes, (*ts.shape, 4))
-    findings, known, (omegas, attitudes, ts) = _samples(omegas, ts, attitudes)
+    findings, known, (ts, omegas, attitudes) = _samples(ts, omegas, attitudes)
     identity = jnp.zeros_like(attitudes).at[:, 0].set(1)
     matrices = jax.vmap(to_matrix)(jnp.where(known[:, None], attitudes, identity))
     turned = product("nij,njk->nik", matrices, jax.vmap(_momentum_matrix)(omegas))
@@ -221,14 +228,13 @@ def momentum(
     vector, values = _null_vector(rows.reshape(-1, 9))
     trace = vector[0] + vector[1] + vector[2]
     scale = 1 / jnp.where(trace == 0, 1.0, trace)
-    found = LinearStart(_of_unit_trace(vector[:6]), values), vector[6:] * size * scale
-    return findings.apply(nan_where(~findings.ok, found), throw)
+    return _answer(findings, throw, _of_unit_trace(vector[:6]), values, vector[6:] * size * scale)
 
 
 def gyrostat(
+    ts: Real[ArrayLike, " n"],
     omegas: Real[ArrayLike, "n 3"],
     rotor: Real[ArrayLike, "n 3"],
-    ts: Real[ArrayLike, " n"],
     *,
     windows: int = 128,
     radians: float = 3.0,
@@ -239,19 +245,18 @@ def gyrostat(
     The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares.
 
     Args:
+        ts: Times, increasing [s].
         omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out.
-        rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s].
-        ts: Their times, increasing [s].
+        rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s]; likewise.
         windows: How many, spread over the record.
         radians: Length of a window, in radians turned; at least eight samples.
-        throw: False: bad values give NaN instead of an error.
+        throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
         The tensor [kg m^2] and singular values.
 
     Raises:
-        ValueError: Wrong shape, fewer than four samples (trace time).
-        RuntimeError: Times not finite or increasing, too few finite samples (run time, any lane).
+        ValueError: Fewer than four samples.
 
     Gradients: those of the least-squares solution, where it is unique.
 
@@ -261,12 +266,12 @@ def gyrostat(
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
     >>> omegas = jr.simulate(body, start, ts).states.omega
     >>> h = jnp.stack([0 * ts, 0 * ts, 0.5 * ts], axis=1)
-    >>> print(jnp.diagonal(jr.identify.gyrostat(omegas, h, ts).inertia).round(2))
+    >>> print(jnp.diagonal(jr.identify.gyrostat(ts, omegas, h).inertia).round(2))
     [1.  1.7 2.3]
     """
-    omegas, rotor, ts = float_arrays(omegas, rotor, ts)
+    ts, omegas, rotor = float_arrays(ts, omegas, rotor)
     check_shape("rotor", rotor, (*ts.shape, 3))
-    findings, known, (omegas, rotor, ts) = _samples(omegas, ts, rotor)
+    findings, known, (ts, omegas, rotor) = _samples(ts, omegas, rotor)
     rows, (bump, fall) = _weak_rows(omegas, ts, known, windows, radians)
     given = product("wn,ni->wi", fall, rotor)
     given = given + product("wn,ni->wi", bump, jnp.cross(omegas, rotor))
@@ -276,8 +281,7 @@ def gyrostat(
     projected = product("ni,n->i", left, -given.reshape(-1) / size)
     told = values > jnp.finfo(values.dtype).eps * 64 * values[0]
     six = product("ij,i->j", right, jnp.where(told, projected / jnp.where(told, values, 1.0), 0.0))
-    found = nan_where(~findings.ok, LinearStart(_tensor(six), values))
-    return findings.apply(found, throw)
+    return _answer(findings, throw, _tensor(six), values)
 
 
 def linear_start(

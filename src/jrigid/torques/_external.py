@@ -19,7 +19,7 @@ from jrigid._checks import (
     float_arrays,
     is_positive_definite,
     is_symmetric,
-    of_unit_size,
+    scaled_together,
 )
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
@@ -278,7 +278,7 @@ def _takes_energy(coefficient: Array) -> Array:
     """True where a drag takes energy or nothing: no negative number, axis or eigenvalue."""
     if coefficient.ndim < 2:
         return all_finite(coefficient) & jnp.all(coefficient >= 0)
-    (unit,) = of_unit_size(coefficient)
+    (unit,) = scaled_together(coefficient)
     rounding = 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype)
     return is_symmetric(coefficient) & is_positive_definite(unit + rounding)
 

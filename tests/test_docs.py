@@ -1,0 +1,27 @@
+"""Code in docs/ runs: the blocks of a page, one after the other, after the README's imports."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jrigid as jr
+
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PAGES = [
+    x
+    for x in sorted((Path(__file__).parents[1] / "docs").glob("*.md"))
+    if BLOCK.search(x.read_text())
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_blocks_run(page):
+    text, namespace = page.read_text(), {"jax": jax, "jnp": jnp, "jr": jr}
+    for block in BLOCK.finditer(text):
+        above = text[: block.start(1)].count("\n")  # so that an error names the page's line
+        code = compile("\n" * above + block[1], str(page), "exec")
+        with jax.numpy_dtype_promotion("standard"):  # as users have it, and as optax needs it
+            exec(code, namespace)

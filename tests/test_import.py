@@ -1,0 +1,41 @@
+"""What `import jrigid` costs: its own modules, and nothing is computed."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+LOOK = """
+import sys, time
+import jax, diffrax, equinox
+before, start = set(sys.modules), time.process_time()
+import jrigid
+took = time.process_time() - start
+print(*sorted({name.partition(".")[0] for name in set(sys.modules) - before}), took)
+"""
+
+
+@pytest.fixture(scope="module")
+def imported():
+    # There is no such platform: whatever is computed at import fails.
+    out = subprocess.run(
+        [sys.executable, "-W", "error", "-c", LOOK],
+        env={**os.environ, "JAX_PLATFORMS": "nowhere"},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    *packages, took = out.stdout.split()
+    return packages, float(took)
+
+
+def test_nothing_is_computed_and_no_other_package_imported(imported):
+    packages, _ = imported
+    assert packages == ["jrigid"]
+
+
+def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
+    """0.1 s of processor time, 0.3 where no bytecode may be written; idle or not."""
+    _, took = imported
+    assert took < 1.0
