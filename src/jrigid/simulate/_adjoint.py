@@ -11,12 +11,14 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from jrigid.simulate._controller import KnownSteps, constant
 from jrigid.simulate._event import where_it_happened
 
 _FORWARD_MESSAGE = (
@@ -130,17 +132,9 @@ class WithTimes(diffrax.AbstractAdjoint):
     def loop(self, *, init_state: Any, saveat: Any, t1: Any, event: Any, **others: Any) -> Any:
         """Run the loop to the end, and back to where a condition changed its sign."""
         del t1
-        place, last = init_state.save_state
-        size = self.taus.shape
-        ts, ys = jtu.tree_map(
-            lambda x: jnp.full(size + x.shape[1:], jnp.inf, x.dtype), (place.ts, place.ys)
-        )
-        init_state = dataclasses.replace(
-            init_state, save_state=[dataclasses.replace(place, ts=ts, ys=ys), last]
-        )
-        saveat = dataclasses.replace(
-            saveat, subs=[diffrax.SubSaveAt(ts=self.taus), diffrax.SubSaveAt(t1=True)]
-        )
+        if isinstance(self.adjoint, diffrax.DirectAdjoint):
+            init_state, others = self._with_known_steps(init_state, saveat, others)
+        init_state, saveat = _saving(init_state, saveat, ts=self.taus)
         final, stats = self.adjoint.loop(
             init_state=init_state, saveat=saveat, t1=self.end, event=event, **others
         )
@@ -153,3 +147,35 @@ class WithTimes(diffrax.AbstractAdjoint):
         place = dataclasses.replace(place, ts=jnp.where(place.ts > tau, jnp.inf, place.ts))
         last = dataclasses.replace(last, ts=tau[None], ys=jtu.tree_map(lambda x: x[None], y))
         return dataclasses.replace(final, save_state=[place, last]), stats
+
+    def _with_known_steps(self, init_state: Any, saveat: Any, others: Any) -> tuple[Any, Any]:
+        """The loop with steps that a first run has found, which has no derivatives.
+
+        `DirectAdjoint` computes parts of the loop a second time on its way back. XLA compiles them
+        to other roundings, with which a controller takes other steps: then what is kept of the
+        first time and what is computed the second time belong to different motions.
+        """
+        state, saving = _saving(init_state, saveat, steps=others["max_steps"])
+        pilot, _ = diffrax.ForwardMode().loop(
+            init_state=constant(state), saveat=saving, t1=constant(self.end), event=None,
+            **constant(others),
+        )  # fmt: skip
+        ends = jax.lax.stop_gradient(pilot.save_state[0].ts)
+        controller = KnownSteps(ends, pilot.result)
+        init_state = dataclasses.replace(
+            init_state, tnext=jnp.minimum(ends[0], init_state.tnext), controller_state=jnp.array(1)
+        )
+        return init_state, others | {"stepsize_controller": controller}
+
+
+def _saving(state: Any, saveat: Any, ts: Any = None, steps: int | None = None) -> tuple[Any, Any]:
+    """The loop's state and what it saves, of two places to save the end: times or all steps."""
+    place, last = state.save_state
+    size = (steps,) if ts is None else ts.shape
+    places = jtu.tree_map(
+        lambda x: jnp.full(size + x.shape[1:], jnp.inf, x.dtype), (place.ts, place.ys)
+    )
+    place = dataclasses.replace(place, ts=places[0], ys=places[1])
+    subs = [diffrax.SubSaveAt(ts=ts, steps=ts is None), diffrax.SubSaveAt(t1=True)]
+    state = dataclasses.replace(state, save_state=[place, last])
+    return state, dataclasses.replace(saveat, subs=subs)

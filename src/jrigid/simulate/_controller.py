@@ -121,6 +121,36 @@ class SteadyController(diffrax.AbstractStepSizeController):
         return True, t1, t1 + self.step, False, None, diffrax.RESULTS.successful
 
 
+class KnownSteps(diffrax.AbstractStepSizeController):
+    """Steps that another run has taken.
+
+    Attributes:
+        ends: Their ends, then infinity.
+        result: What became of that run.
+    """
+
+    ends: Array
+    result: Any
+
+    def wrap(self, direction):
+        """The same."""
+        del direction
+        return self
+
+    def init(self, *arguments):
+        """The end of the first step, and the number of the next."""
+        del arguments
+        return self.ends[0], jnp.array(1)
+
+    def adapt_step_size(self, t0, t1, *others):
+        """The end of the next one, or what stopped the other run."""
+        del t0
+        number = others[-1]
+        end = self.ends[number]
+        result = diffrax.RESULTS.where(jnp.isfinite(end), diffrax.RESULTS.successful, self.result)
+        return True, t1, end, False, number + 1, result
+
+
 def constant(tree: Any) -> Any:
     """The same without derivatives: what decides on steps is not differentiated."""
     arrays, others = eqx.partition(tree, eqx.is_inexact_array)

@@ -279,13 +279,8 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     converted = eqx.filter_closure_convert(plain_field, jnp.zeros_like(stretch), y0, args)
     field: Any = harmless(run.ok, converted)
 
-    def vector_field(tau: Any, y: Any, args: Any) -> Any:
-        if isinstance(options.adjoint, diffrax.ForwardMode):  # NaN goes no way but its lane's
-            rates = field(tau, y, args)
-        else:
-            rates = guarded(field, y_start, tau, y, args)
-        # No other lane is to wait for a bad one: that stands still.
-        return jnp.where(run.ok, rates, jnp.zeros_like(rates))
+    forward = isinstance(options.adjoint, diffrax.ForwardMode)
+    vector_field = jtu.Partial(_rates if forward else _guarded_rates, run.ok, field, y_start)
 
     still = jtu.tree_map(jnp.zeros_like, state0)
     turning = ravel(dataclasses.replace(still, omega=jnp.ones_like(state0.omega)))
@@ -311,6 +306,17 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     )
     controller = diffrax.ClipStepSizeController(watchful, step_ts=jax.lax.stop_gradient(run.taus))
     return _Problem(diffrax.ODETerm(vector_field), y0, to_state, controller)
+
+
+def _rates(ok: Array, field: Any, _: Array, tau: Any, y: Any, args: Any) -> Array:
+    """No other lane is to wait for a bad one: that stands still."""
+    rates = field(tau, y, args)
+    return jnp.where(ok, rates, jnp.zeros_like(rates))
+
+
+def _guarded_rates(ok: Array, field: Any, start: Array, tau: Any, y: Any, args: Any) -> Array:
+    """The same in reverse mode, in which NaN goes to all that lanes share."""
+    return _rates(ok, jtu.Partial(guarded, field, start), start, tau, y, args)
 
 
 def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
