@@ -431,7 +431,7 @@ def test_running_out_of_steps_is_reported():
 def test_a_torque_that_turns_nan_on_the_way_is_reported_at_once():
     body = jr.RigidBody(TENSOR, lambda t, _s, _a: jnp.where(t > 3, jnp.nan, 0.0) * jnp.ones(3))
     trajectory = jr.simulate(body, jr.State(ATTITUDE, OMEGA), np.array([1.0, 5.0]), throw=False)
-    assert trajectory.result == jr.RESULTS.dt_min_reached
+    assert trajectory.result == jr.RESULTS.nonfinite_torque
     assert trajectory.stats["num_steps"] < 300
     assert np.all(np.isfinite(trajectory.states.omega[0]))
 
@@ -574,7 +574,7 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
         ),
         (
             lambda b, s: jr.simulate(b, (s.attitude, s.omega), 1.0),
-            "`state0` must be a State, but it is tuple",
+            "`state0` must be a State, but it is a tuple",
         ),
         (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a diffrax.Event"),
         (

@@ -23,6 +23,8 @@ from jrigid._checks import (
 from jrigid._numerics import safe_norm
 from jrigid.systems import AbstractSystem, RigidBody
 
+_SIZES = {"position": 3, "velocity": 3, "attitude": 4, "omega": 3}
+
 
 @runtime_checkable
 class HasRigidBody(Protocol):
@@ -62,9 +64,9 @@ def motion_arguments(
 
 
 def _checked_state(system: AbstractSystem, state: Any, name: str) -> Any:
-    fields = [x.name for x in dataclasses.fields(state) if x.name != "internal"]
+    fields = [x.name for x in dataclasses.fields(state) if x.name in _SIZES]
     for field in fields:
-        value, size = getattr(state, field), 4 if field == "attitude" else 3
+        value, size = getattr(state, field), _SIZES[field]
         if not eqx.is_array(value):
             raise ValueError(
                 f"Argument `{name}.{field}` must be an array of shape ({size},), "
