@@ -1,68 +1,30 @@
-"""Bisection that asks for the place of a change of sign, whatever the unit of the function."""
+"""Where a function of one number changes its sign, whatever the unit of its values."""
 
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array
 
-
-class _Interval(NamedTuple):
-    lower: Array
-    upper: Array
-    falls: Array
+from jrigid._types import Scalar
 
 
-class PlaceOfRoot(optx.AbstractRootFinder):
-    """Bisection that ends by the length of the interval alone, and that raises nothing.
+def place_of_root(
+    rising: Callable[[Array, Any], Array], args: Any, tolerance: float, dtype: Any
+) -> Scalar:
+    """Place between 0 and 1 at which `rising(x, args)` goes from negative to positive.
 
-    `optimistix.Bisection` also bounds the function's value, in units that only its user knows, and
-    raises where the ends have one sign, which under vmap are also lanes that look for no root.
+    So many halvings as the place asks for, and no look at the size of the values. A function that
+    is known to rise (`flip=False`) needs no check of its ends, which would raise in a lane of vmap
+    that looks for no root.
+
+    Gradients: by the implicit function theorem in `args`.
     """
-
-    rtol: Any
-    atol: Any
-    norm: Any = optx.max_norm
-
-    def init(
-        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> _Interval:
-        """The interval, and whether the function falls in it."""
-        del y, f_struct, aux_struct, tags
-        lower, upper = jnp.asarray(options["lower"]), jnp.asarray(options["upper"])
-        return _Interval(lower, upper, fn(lower, args)[0] > fn(upper, args)[0])
-
-    def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _Interval, tags: Any
-    ) -> tuple[Array, _Interval, Any]:
-        """Half of the interval."""
-        del y, options, tags
-        middle = state.lower + 0.5 * (state.upper - state.lower)
-        value, aux = fn(middle, args)
-        below = state.falls ^ (value < 0)
-        lower = jnp.where(below, middle, state.lower)
-        upper = jnp.where(below, state.upper, middle)
-        return lower + 0.5 * (upper - lower), _Interval(lower, upper, state.falls), aux
-
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _Interval, tags: Any
-    ) -> tuple[Array, optx.RESULTS]:
-        """Whether the interval is short enough."""
-        del fn, args, options, tags
-        scale = self.atol + self.rtol * jnp.abs(y)
-        return jnp.abs(state.upper - state.lower) <= scale, optx.RESULTS.successful
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: _Interval,
-        tags: Any,
-        result: Any,
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        """Nothing more."""
-        del fn, args, options, state, tags, result
-        return y, aux, {}
+    bisection = optx.Bisection(rtol=0.0, atol=tolerance, flip=False)
+    zero = jnp.zeros((), dtype)
+    return optx.root_find(
+        rising, bisection, zero + 0.5, args, options={"lower": zero, "upper": zero + 1},
+        max_steps=1 - math.floor(math.log2(tolerance)), throw=False,
+    ).value  # fmt: skip
