@@ -1,6 +1,5 @@
 """Order and chaos: the spectrum of Lyapunov exponents, and an indicator that tells early."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +21,6 @@ from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
     Motion,
-    Walk,
     findings_of,
     motion_of,
     orthonormal,
@@ -146,33 +144,48 @@ def _plan(steps: Any, every: Any, samples: Any) -> _Plan:
     return _Plan(samples, -(-steps // (samples * every)), every)
 
 
-def _followed(
-    path: Walk, plan: _Plan, rows: Array, tally: Any, add: Callable[..., Any]
-) -> tuple[Array, Any, State, Array]:
-    """Times and tallies of each sample, the state at the end, the largest local error.
+class _Growth(NamedTuple):
+    """How small motions beside a motion grew, up to each of some times."""
 
-    After some steps the rows are made orthonormal, and `add(tally, logs, number)` takes in the
-    logarithms of their growth and the number of the interval.
-    """
+    ts: Array
+    exponents: Array
+    megno: Array
+    final_state: State
+    error: Array
+    result: Any
+
+
+@eqx.filter_jit
+def _growth(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> _Growth:
+    """Orthonormal again after each interval; the indicator is that of the first one."""
+    findings = _findings(motion, rows)
+    path = walk(motion, plan.steps, solver, findings.ok)
     samples, each, every = plan
-    dtype = path.start.dtype
+    dtype = rows.dtype
 
-    def sample(carry: tuple, k: Array) -> tuple[tuple, Any]:
-        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
-            y, rows, tally, error = carry
-            index = k * each + j
-            y, rows, local = path.follow(index * every, every, y, rows)
-            rows, lengths = orthonormal(rows)
-            tally = add(tally, jnp.log(lengths), (1 + index).astype(dtype))
-            return (y, rows, tally, jnp.maximum(error, local)), None
+    def interval(carry: tuple, index: Array) -> tuple[tuple, None]:
+        y, rows, (totals, weighted, indicator), error = carry
+        y, rows, local = path.follow(index * every, every, y, rows)
+        rows, lengths = orthonormal(rows)
+        logs, number = jnp.log(lengths), (1 + index).astype(dtype)
+        weighted = weighted + number * logs[0]
+        tally = (totals + logs, weighted, indicator + 2 * weighted / number)
+        return (y, rows, tally, jnp.maximum(error, local)), None
 
-        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
+    def sample(carry: tuple, first: Array) -> tuple[tuple, Any]:
+        carry, _ = jax.lax.scan(interval, carry, first + jnp.arange(each))
         return carry, carry[2]
 
-    begin = (path.start, rows, tally, jnp.zeros((), dtype))
-    (y, _, _, error), tallies = jax.lax.scan(sample, begin, jnp.arange(samples))
-    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
-    return ts, tallies, path.state(y), error
+    none = jnp.zeros((), dtype)
+    tally = (jnp.zeros(len(rows), dtype), none, none)
+    begin = (path.start, _unit_rows(rows)[0], tally, none)
+    firsts = each * jnp.arange(samples)
+    (y, *_, error), (totals, _, indicator) = jax.lax.scan(sample, begin, firsts)
+    counts = (firsts + each).astype(dtype)
+    ts = path.step * every * counts
+    answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
+    result, _, answer = verdict(findings, error, answer)
+    return _Growth(*answer, error, result)
 
 
 def lyapunov_spectrum(
@@ -232,21 +245,9 @@ def lyapunov_spectrum(
     """
     motion = motion_of(system, state0, args, t0, duration)
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
-    spectrum = _spectrum(motion, plan, rows, solver_of(solver))
-    return settle(spectrum, throw, lambda: _findings(motion, rows))
-
-
-@eqx.filter_jit
-def _spectrum(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> LyapunovSpectrum:
-    findings = _findings(motion, rows)
-    path = walk(motion, plan.steps, solver, findings.ok)
-    none = jnp.zeros(len(rows), rows.dtype)
-    ts, totals, state, error = _followed(
-        path, plan, _unit_rows(rows)[0], none, lambda total, logs, _: total + logs
-    )
-    result, _, values = verdict(findings, error, (ts, totals / ts[:, None], state))
-    ts, history, state = values
-    return LyapunovSpectrum(history[-1], ts, history, state, error, result)
+    growth = _growth(motion, plan, rows, solver_of(solver))
+    ts, history, _, *others = settle(growth, throw, lambda: _findings(motion, rows))
+    return LyapunovSpectrum(history[-1], ts, history, *others)
 
 
 def megno(
@@ -308,25 +309,10 @@ def megno(
         check_shape("vector", vector, (motion.dimension,))
         vector = vector[None]
     rows = _starting_vectors(motion, vector, 1)
-    indicator = _megno(motion, plan, rows, solver_of(solver))
-    return settle(indicator, throw, lambda: _findings(motion, rows))
-
-
-@eqx.filter_jit
-def _megno(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> Megno:
-    def add(tally: tuple[Array, Array], logs: Array, number: Array) -> tuple[Array, Array]:
-        weighted, total = tally
-        weighted = weighted + number * logs[0]
-        return weighted, total + 2 * weighted / number
-
-    findings = _findings(motion, rows)
-    path = walk(motion, plan.steps, solver, findings.ok)
-    none = jnp.zeros((), rows.dtype)
-    ts, (_, totals), state, error = _followed(path, plan, _unit_rows(rows)[0], (none, none), add)
-    history = totals / (plan.each * (1 + jnp.arange(plan.samples))).astype(rows.dtype)
-    result, ok, (ts, history, state) = verdict(findings, error, (ts, history, state))
+    growth = _growth(motion, plan, rows, solver_of(solver))
+    ts, _, history, *others = settle(growth, throw, lambda: _findings(motion, rows))
     mean = history[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
-    order = ORDER.where(ok, order, ORDER.undefined)
-    return Megno(mean, 2 * mean / ts[-1], order, ts, history, state, error, result)
+    order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
+    return Megno(mean, 2 * mean / ts[-1], order, ts, history, *others)

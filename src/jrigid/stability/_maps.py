@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays
 from jrigid._types import Scalar, ScalarLike
-from jrigid.stability._roots import place_of_root
 
 _Code = type(RESULTS.successful)  # an item of any enumeration
 # Part of the larger end value that a function may have left at a root; at a pole it has more.
@@ -176,6 +176,25 @@ def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> C
         return jax.vmap(evaluate)(point)
 
     return block
+
+
+def place_of_root(
+    rising: Callable[[Array, Any], Array], args: Any, tolerance: float, dtype: Any
+) -> Scalar:
+    """Place between 0 and 1 at which `rising(x, args)` goes from negative to positive.
+
+    So many halvings as the place asks for, and no look at the size of the values. A function that
+    is known to rise (`flip=False`) needs no check of its ends, which would raise in a lane of vmap
+    that looks for no root.
+
+    Gradients: by the implicit function theorem in `args`.
+    """
+    bisection = optx.Bisection(rtol=0.0, atol=tolerance, flip=False)
+    zero = jnp.zeros((), dtype)
+    return optx.root_find(
+        rising, bisection, zero + 0.5, args, options={"lower": zero, "upper": zero + 1},
+        max_steps=1 - math.floor(math.log2(tolerance)), throw=False,
+    ).value  # fmt: skip
 
 
 def boundary(

@@ -28,7 +28,7 @@ from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
-from jrigid.stability._roots import place_of_root
+from jrigid.stability._maps import place_of_root
 from jrigid.stability._steps import (
     Motion,
     Walk,
