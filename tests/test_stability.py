@@ -128,6 +128,93 @@ def test_slope_of_the_growth_rate_is_finite_at_the_threshold():
     assert np.isfinite(jax.grad(jax.grad(rate))(1.0))
 
 
+@pytest.mark.parametrize("bad", [[1.0, np.nan, 3.0], [1.0, -2.0, 3.0], [0.0, 1.0, 2.0]])
+def test_rates_outside_their_domain_are_nan_in_that_lane_alone(bad):
+    """... not 0, "stable"; what the lanes share keeps its derivative."""
+    moments = jnp.array([bad, [1.0, 2.0, 3.0]])
+    formulas = (
+        lambda m, w: st.growth_rate_squared(m, 1, w),
+        lambda m, w: st.growth_rate(m, 1, w),
+        lambda m, w: st.frequency(m, 0, w),
+        lambda m, w: st.modes(m, 2, w).amplitude_ratio,
+        lambda m, w: st.linearized(m, 1, jnp.stack([w, 1.0, w]), 0.3)[2],
+    )
+
+    @jax.jit
+    def rates(moments, w):
+        return jnp.stack([jax.vmap(lambda m, f=f: f(m, w))(moments) for f in formulas])
+
+    found = rates(moments, 1.5)
+    assert np.isnan(found[:, 0]).all()
+    assert np.isfinite(found[:, 1]).all()
+    assert np.all(found[:2, 1] > 0)
+
+    def seen(moments, w):
+        found = rates(moments, w)
+        return jnp.sum(jnp.where(jnp.isnan(found), 0.0, found))
+
+    for of_both, of_good in zip(
+        jax.grad(seen, (0, 1))(moments, 1.5),
+        jax.grad(seen, (0, 1))(jnp.stack([moments[1]] * 2), 1.5),
+        strict=True,
+    ):
+        if np.ndim(of_both):
+            np.testing.assert_array_equal(of_both[0], 0)
+            np.testing.assert_allclose(of_both[1], of_good[1], rtol=1e-12)
+        else:
+            np.testing.assert_allclose(of_both, of_good / 2, rtol=1e-12)
+    assert np.isnan(st.growth_rate(moments[1], 1, jnp.inf))
+    waves = st.linearized(moments[1], 1, jnp.array([0.1, 1.0, 0.0]), jnp.array([[1.0, np.nan]]))
+    np.testing.assert_array_equal(np.isnan(waves), [[[False] * 3, [True] * 3]])
+
+
+def test_a_map_over_an_unphysical_region_marks_it():
+    def rate(second, third):
+        return st.growth_rate(jnp.stack([1.0, second, third]), 1, 1.0)
+
+    def region(second, third):
+        return st.satellite_stability(jnp.stack([1.0, second, third])).region
+
+    axes = {"second": np.linspace(-1.0, 3.0, 9), "third": np.linspace(-1.0, 3.0, 9)}
+    positive = axes["second"] > 0
+    found = st.stability_map(rate, axes)
+    assert np.all(found.valid == (positive[:, None] & positive[None, :]))
+    found = st.stability_map(region, axes)
+    a, b, c = np.broadcast_arrays(1.0, axes["second"][:, None], axes["third"][None, :])
+    real = (a <= b + c) & (b <= c + a) & (c <= a + b)
+    assert np.all(found.valid == (positive[:, None] & positive[None, :] & real))
+    assert np.all(np.asarray(found.values == st.REGIONS.undefined) == ~found.valid)
+
+
+def test_tops_and_satellites_outside_their_domain():
+    tops = jax.vmap(jr.SymmetricTop)(
+        jnp.array([1.0, -1.0, 1.0]), jnp.array([0.5, 0.5, np.nan]), jnp.ones(3)
+    )
+    for call in (
+        lambda top, w: st.top_stability(top, w)[:2],
+        lambda top, w: st.precession_stability(top, 0.7, w)[:2],
+    ):
+        lanes = jax.vmap(call, in_axes=(0, None))
+        for value in lanes(tops, 6.0):
+            assert np.isfinite(value[0]).all()
+            assert np.isnan(value[1:]).all()
+
+        def total(w, lanes=lanes):
+            return sum(jnp.sum(jnp.where(jnp.isnan(x), 0.0, x)) for x in lanes(tops, w))
+
+        assert np.isfinite(jax.grad(total)(6.0))
+    assert not st.precession_stability(jr.SymmetricTop(-1.0, 0.5, 1.0), 0.7, 6.0).exists
+    region = st.REGIONS[st.satellite_stability(jnp.array([1.0, 2.0, 10.0])).region]
+    assert region == "undefined"  # no real body
+    assert np.isfinite(st.satellite_stability(jnp.array([1.0, 2.0, 10.0])).growth_rate)
+    flat = st.satellite_stability(jnp.array([0.1, 0.2, 0.30000000000000004]))
+    assert st.REGIONS[flat.region] == "Lagrange"
+    bad = st.satellite_stability(jnp.array([1.0, np.nan, 2.0]))
+    assert st.REGIONS[bad.region] == "undefined"
+    assert np.isnan(bad.margins).all()
+    assert np.isnan(st.eigenvalues(jnp.full((2, 2), np.nan))).all()
+
+
 # Tops and satellites
 
 
@@ -136,7 +223,7 @@ def test_sleeping_top_map_against_the_formula():
 
     def square(omega3, mgl):
         top = jr.SymmetricTop(1.3, 0.6, mgl)
-        return st.top_stability(top, omega3, throw=False).growth_rate_squared
+        return st.top_stability(top, omega3).growth_rate_squared
 
     spins, weights = np.linspace(0.1, 9.0, 60), np.linspace(-0.5, 4.0, 50)
     found = st.stability_map(square, {"omega3": spins, "mgl": weights}, block_size=700)
@@ -176,6 +263,7 @@ def test_steady_precession_linearised_and_in_closed_form(theta, which):
     own = jnp.array([0.0, 0.0, 6.0]) - closed.precession[i] * jnp.cos(theta) * jnp.eye(3)[2]
     about = st.linearize(top.as_rigid_body(), state, body_rate=own)
     assert st.STABILITY[about.stability] == "stable"
+    np.testing.assert_allclose(about.margin, -closed.growth_rate_squared[i], rtol=1e-10)
     nutation = np.max(about.eigenvalues.imag)
     np.testing.assert_allclose(-(nutation**2), closed.growth_rate_squared[i], rtol=1e-10)
     # A nutation of 1e-5 has that frequency.
@@ -197,21 +285,28 @@ def test_no_steady_precession_is_marked():
 
 def test_satellites_against_linearisation_and_the_sign_of_the_energy(rng):
     """200 bodies; Lagrange's region is where the energy has a minimum."""
-    moments = rng.uniform(0.5, 2.0, (200, 3))
+    moments = rng.uniform(0.5, 2.0, (300, 3))
 
     @jax.jit
     @jax.vmap
     def both(m):
         about = st.linearize(satellite(m), spin(2), throw=False)
-        return about.growth_rate, about.stability, st.satellite_stability(m, throw=False)
+        return about.growth_rate, about.stability, about.margin, st.satellite_stability(m)
 
-    growth, stability, closed = both(moments)
+    growth, stability, margin, closed = both(moments)
     np.testing.assert_allclose(growth, closed.growth_rate, atol=1e-7)
-    regions = np.array(st.REGIONS)[closed.region]
-    assert np.all((regions == "unstable") == (np.asarray(stability) == 0))
+    unstable = np.asarray(stability == st.STABILITY.unstable)
+    assert np.all(unstable == ~np.all(np.asarray(closed.margins) > 0, axis=1))
+    assert np.all(unstable == (np.asarray(margin) < 0))
+    np.testing.assert_allclose(margin[unstable], -(growth[unstable] ** 2), atol=1e-9)
+    real = 2 * moments.max(axis=1) <= moments.sum(axis=1)
+    assert real.sum() >= 200
+    regions = np.array(st.REGIONS.texts)[closed.region._value]
+    assert np.all((regions == "undefined") == ~real)
+    assert np.all((regions == "unstable")[real] == unstable[real])
     a, b, c = moments.T
-    assert np.all((regions == "Lagrange") == ((c > b) & (b > a)))
-    assert set(regions) == set(st.REGIONS) - {"marginal"}
+    assert np.all((regions == "Lagrange")[real] == ((c > b) & (b > a))[real])
+    assert set(regions) == set(st.REGIONS.texts) - {"marginal"}
     assert st.REGIONS[st.satellite_stability(jnp.ones(3)).region] == "marginal"
 
 
@@ -224,7 +319,7 @@ def test_regions_of_debra_and_delp_located_to_1e_10():
         return jnp.stack([jnp.ones_like(b), b, b + yaw])
 
     def margin(yaw, roll, index):
-        return st.satellite_stability(moments(yaw, roll), throw=False).margins[index]
+        return st.satellite_stability(moments(yaw, roll)).margins[index]
 
     # 1 + 3 R + R Y = 4 sqrt(R Y): a quadratic in sqrt(-Y), for R < 0.
     for roll in (-0.1, -0.2, -0.3):
@@ -383,11 +478,118 @@ def test_bad_requests(untyped):
         st.linearize(pushed, spin(2, 0.0))
     lanes = jax.vmap(lambda w: st.linearize(body, jr.State(UP, w), throw=False))
     found = lanes(jnp.array([[1.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.0, np.nan, 0.0]]))
-    assert list(found.stability) == [2, -1, -1]
+    stable, undefined = st.STABILITY.stable, st.STABILITY.undefined
+    np.testing.assert_array_equal(found.stability == stable, [True, False, False])
+    np.testing.assert_array_equal(found.stability == undefined, [False, True, True])
+    assert np.isfinite(found.margin[0])
+    assert np.isnan(found.margin[1:]).all()
     assert np.isfinite(found.matrix[0]).all()
     assert np.isnan(found.growth_rate[1:]).all()
     assert bool((found.result == jr.RESULTS.no_equilibrium)[1])
     assert bool((found.result == jr.RESULTS.invalid_state)[2])
+
+
+# The margin
+
+
+def test_margin_of_a_spin_is_minus_the_square_of_its_growth_rate():
+    """For any body and rotor; also in the rotor's slope, and where it changes its sign."""
+    axes = np.array([0, 1, 2, 1, 1, 1])
+    rotors = np.array([0.0, 0.0, 0.0, 0.3, 0.9, -1.1])
+
+    @jax.jit
+    @jax.vmap
+    def margin(axis, rotor):
+        along = jnp.eye(3)[axis]
+
+        def of(h):
+            body = jr.RigidBody(jnp.array([1.0, 2.0, 2.7]), jr.torques.Rotor(h * along))
+            about = st.linearize(body, jr.State(UP, 1.3 * along), throw=False)
+            return about.margin, about.stability
+
+        slope, _ = jax.jacfwd(of, has_aux=True)(rotor)
+        return *of(rotor), slope
+
+    found, stability, slopes = margin(axes, rotors)
+    for i, (axis, h) in enumerate(zip(axes, rotors, strict=True)):
+
+        def square(h, axis=int(axis)):
+            return -st.growth_rate_squared(jnp.array([1.0, 2.0, 2.7]), axis, 1.3, h)
+
+        np.testing.assert_allclose(found[i], square(h), rtol=1e-12)
+        np.testing.assert_allclose(slopes[i], jax.grad(square)(h), rtol=1e-9, atol=1e-12)
+    assert np.all(np.asarray(stability == st.STABILITY.stable) == (np.asarray(found) > 0))
+
+
+@pytest.fixture(scope="module")
+def margin_of_top():
+    @jax.jit
+    @jax.vmap
+    def margin(omega3, mgl):
+        def of(omega3, mgl):
+            body = jr.SymmetricTop(1.0, 0.5, mgl).as_rigid_body()
+            state = jr.State(UP, omega3 * jnp.array([0.0, 0.0, 1.0]))
+            return st.linearize(body, state, throw=False).margin
+
+        return of(omega3, mgl), jnp.stack(jax.jacfwd(of, (0, 1))(omega3, mgl))
+
+    return margin
+
+
+def test_margin_of_a_sleeping_top_is_smooth_through_the_collision(margin_of_top):
+    """Krein's collision at omega3 = 4, where each eigenvalue has an infinite slope."""
+    spins = np.array([1.0, 3.9, 4 - 1e-9, 4.0, 4 + 1e-9, 4.1, 6.0])
+
+    def square(omega3, mgl):
+        return -st.top_stability(jr.SymmetricTop(1.0, 0.5, mgl), omega3).growth_rate_squared
+
+    found, slopes = margin_of_top(spins, np.ones(7))
+    np.testing.assert_allclose(found, [square(w, 1.0) for w in spins], rtol=1e-12, atol=1e-14)
+    exact = np.array([jnp.stack(jax.grad(square, (0, 1))(w, 1.0)) for w in spins])
+    np.testing.assert_allclose(slopes, exact, rtol=1e-7)
+
+
+def test_a_boundary_by_the_margin_of_a_linearisation():
+    """The sleeping top's threshold to 1e-10, and its slope in the weight."""
+
+    def margin(omega3, mgl):
+        body = jr.SymmetricTop(1.0, 0.5, mgl).as_rigid_body()
+        state = jr.State(UP, omega3 * jnp.array([0.0, 0.0, 1.0]))
+        return st.linearize(body, state, throw=False).margin
+
+    edge = quick_jit(jax.value_and_grad(lambda m: st.boundary(margin, 2.0, 7.0, m, throw=False)))
+    value, slope = edge(1.0)
+    assert float(value) == pytest.approx(4.0, abs=1e-10)
+    assert float(slope) == pytest.approx(2.0, rel=1e-9)
+
+
+def test_margin_with_damping_is_minus_the_largest_real_part():
+    """The largest axis attracts; the sign changes where it is no longer the largest."""
+    damper = jr.torques.InternalDamper(0.3, 0.2)
+    seconds = np.array([1.5, 1.9, 1.999, 2.0, 2.001, 2.1, 2.6])
+
+    @jax.jit
+    @jax.vmap
+    def about(second):
+        body = jr.RigidBody(jnp.stack([1.0, second, 2.0]), damper)
+        return st.linearize(body, spin(2), throw=False)
+
+    found = about(seconds)
+    margin = np.asarray(found.margin)
+    assert np.all(margin[:3] > 0)
+    assert np.all(margin[4:] < 0)
+    assert abs(margin[3]) < 1e-12
+    np.testing.assert_allclose(margin[2] - margin[3], margin[3] - margin[4], rtol=1e-2)
+    np.testing.assert_allclose(margin[4:], -np.asarray(found.growth_rate)[4:], rtol=1e-9)
+
+
+def test_margin_of_what_hangs_and_of_a_precession():
+    up, top = np.array([0.0, 0.0, 1.0]), jr.SymmetricTop(1.0, 0.5, 1.0)
+    for theta, margin in ((jnp.pi, 1.0), (0.0, -1.0)):
+        state = jr.top.initial_state(top, theta)
+        about = st.linearize(top.as_rigid_body(), state, space_axis=up)
+        np.testing.assert_allclose(about.margin, margin, rtol=1e-12)
+    assert st.linearize(jr.RigidBody(jnp.ones(3)), spin(0)).margin == 0
 
 
 # Eigenvalues where they meet
@@ -477,12 +679,14 @@ def test_points_that_are_undefined_are_marked():
     np.testing.assert_allclose(found.extent, (-0.05, 1.05, -0.05, 1.05))
 
     def truth(x, y):
-        return st.Marked(x > 0.5, x > y)
+        order = st.ORDER.where(x > 0.5, st.ORDER.chaotic, st.ORDER.regular)
+        return {"order": st.ORDER.where(x > y, order, st.ORDER.undefined), "count": jnp.array(3)}
 
-    found = st.stability_map(truth, axes)
-    assert found.values.dtype == bool
+    found = st.stability_map(truth, axes, block_size=50)
     assert np.all(found.valid == (axes["x"][:, None] > axes["y"][None, :]))
-    with pytest.raises(ValueError, match="Marked"):
+    chaotic = np.asarray(found.values["order"] == st.ORDER.chaotic)
+    assert np.all(chaotic == (found.valid & (axes["x"] > 0.5)[:, None]))
+    with pytest.raises(ValueError, match="could say so"):
         st.stability_map(lambda x, y: x > y, axes)
     with pytest.raises(ValueError, match="shape"):
         st.stability_map(root, {"x": np.ones((2, 2)), "y": np.ones(3)})

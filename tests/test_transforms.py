@@ -55,7 +55,8 @@ NOTHING_TO_CALL = {
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",
     "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
-    "stability.Marked", "stability.StabilityMap", "free.REGIMES",
+    "stability.StabilityMap", "stability.STABILITY", "stability.ORDER", "stability.REGIONS",
+    "stability.SIDES", "free.REGIMES",
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
@@ -546,6 +547,12 @@ CASES = {
         ),
     ),
     # stability
+    "stability.growth_rate_squared": Case(
+        lambda i, w, h: stability.growth_rate_squared(i, 1, w, h), (MOMENTS, 1.3, 0.2)
+    ),
+    "stability.linearized": Case(
+        lambda i, w, t: stability.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)
+    ),
     "stability.growth_rate": Case(
         lambda i, w, h: stability.growth_rate(i, 1, w, h), (MOMENTS, 1.3, 0.2)
     ),
@@ -555,7 +562,7 @@ CASES = {
     "stability.modes": Case(
         lambda i, w: parts(stability.modes(i, 2, w)), (MOMENTS * np.array([1.0, 1.3, 1.0]), 1.3)
     ),
-    "stability.flip_time": Case(stability.flip_time, (MOMENTS, OMEGA)),
+    "stability.flip_time": Case(stability.flip_time, (MOMENTS, np.array([0.3, -0.9, 0.2]))),
     "stability.eigenvalues": Case(
         lambda m: parts(stability.eigenvalues(number(m))), (MATRIX + np.diag([1.0, 3.0, -2.0]),)
     ),

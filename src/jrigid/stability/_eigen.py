@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact
 
+from jrigid._checks import all_finite, check_shape, float_arrays, where_defined
 from jrigid._numerics import product
 
 _POINTS = 48  # of the contour: its error is 2^-48 for an eigenvalue by itself
+_SHARED = 0.999  # cosine of the angle below which two eigenvectors count as one
 _TOGETHER = 8.0  # sqrt(eps) of the matrix: eigenvalues nearer than that count as one
 
 
@@ -18,7 +20,7 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
 
     Returns:
         Its eigenvalues; real parts closer than 1e-5 of the matrix's norm count as equal, and there
-        the larger imaginary part comes first.
+        the larger imaginary part comes first. NaN of a matrix that is not finite.
 
     Gradients: exact where an eigenvalue is by itself. Eigenvalues that are nearer than 8 sqrt(eps)
     of the matrix's norm (1e-7 in float64) count as one, and each gets the derivative of their mean,
@@ -32,7 +34,9 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
     >>> print(pair(4.0), jax.jacfwd(pair)(4.0), abs(jax.jacfwd(pair)(0.0)).round(9))
     [ 2. -2.] [ 0.25 -0.25] [0. 0.]
     """
-    return _eigenvalues(jnp.asarray(matrix))
+    (matrix,) = float_arrays(matrix)
+    check_shape("matrix", matrix, (matrix.shape[:1] or (None,)) * 2)
+    return where_defined(all_finite(matrix), _eigenvalues, matrix)
 
 
 @jax.custom_jvp
@@ -84,3 +88,23 @@ def _slopes(matrix: Array, values: Array, change: Array) -> Array:
         return jnp.sum(spoke * spread) / (_POINTS * count)
 
     return jax.vmap(one)(centre, radius.astype(values.dtype), count.astype(values.dtype))
+
+
+def eigenvectors(matrix: Array, values: Array) -> Array:
+    """Eigenvectors in the order of the eigenvalues; without derivatives."""
+    unordered, columns = jnp.linalg.eig(matrix)
+    gaps = jnp.abs(unordered[None, :] - values[:, None])
+    # Each eigenvalue takes the nearest that is left.
+    order = []
+    for i in range(values.size):
+        nearest = jnp.argmin(gaps[i])
+        order.append(nearest)
+        gaps = jnp.where(jnp.arange(values.size)[None, :] == nearest, jnp.inf, gaps)
+    return columns[:, jnp.stack(order)]
+
+
+def pairs(values: Array, vectors: Array) -> tuple[Array, Array]:
+    """Distances of each two eigenvalues, and whether they share a direction; infinite to itself."""
+    gaps = jnp.abs(values[:, None] - values[None, :])
+    overlap = jnp.abs(product("ki,kj->ij", jnp.conj(vectors), vectors))
+    return jnp.where(jnp.eye(values.size, dtype=bool), jnp.inf, gaps), overlap > _SHARED

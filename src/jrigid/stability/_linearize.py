@@ -1,44 +1,56 @@
 """Linearisation about an equilibrium, or a motion that is one in a turning frame."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Complex, Float, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
 
 from jrigid._checks import (
     RESULTS,
+    Enumeration,
     Findings,
     all_finite,
     check_shape,
     float_arrays,
-    is_unit,
+    internal_parts,
     nan_where,
+    settle,
 )
 from jrigid._numerics import product, safe_norm
-from jrigid._scales import ravel, unravel
-from jrigid._types import ScalarLike, VectorLike
+from jrigid._types import Readable, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
-from jrigid.rotation import exp, multiply, normalize, rotate, rotate_inverse
-from jrigid.stability._eigen import eigenvalues
-from jrigid.stability._steps import checked_state
+from jrigid.rotation import exp, multiply, rotate, rotate_inverse
+from jrigid.stability._eigen import eigenvalues, eigenvectors, pairs
+from jrigid.stability._margin import margin, without_symmetries
+from jrigid.stability._steps import Motion, findings_of, harmless_motion, motion_of
 from jrigid.systems import RigidBody
 
-STABILITY = ("unstable", "marginal", "stable")
+# Times, in units of the motion, at which the system is looked at again.
+_LATER = (0.7, 1.9)
 _NO_EQUILIBRIUM = (
-    "Argument `state` must be an equilibrium, at rest or in the frame that turns with `body_rate` "
+    "Argument `state0` must be an equilibrium, at rest or in the frame that turns with `body_rate` "
     "and with the motion, but it is not: the state changes there."
 )
 _NOT_STATIONARY = (
     "The system must look the same at all times in the frame that turns with the motion, but it "
-    "does not: what is linear about `state` has no constant matrix."
+    "does not: what is linear about `state0` has no constant matrix."
 )
 
 
-class Linearization(eqx.Module):
+class STABILITY(Enumeration):
+    """What the linearisation says of an equilibrium."""
+
+    unstable = "unstable"
+    marginal = "marginal"
+    stable = "stable"
+    undefined = "undefined"
+
+
+class Linearization(Readable):
     """Small motions about an equilibrium: x' = matrix x.
 
     The components of x are a small turn of the attitude about the body axes (q = q0 exp(x)) [rad],
@@ -49,18 +61,26 @@ class Linearization(eqx.Module):
         matrix: Its matrix.
         eigenvalues: Rates [1/s], the one of largest real part first.
         eigenvectors: Columns, in the order of the eigenvalues; without derivatives.
-        stability: Index into `STABILITY`: "unstable" where a part grows exponentially; "stable"
-            where none does and none drifts; "marginal" between: two eigenvalues that share an
+        stability: One of `STABILITY`: "unstable" where a part grows exponentially; "stable" where
+            none does and none drifts; "marginal" between: two eigenvalues that share an
             eigenvector, beside those that come with every motion of a symmetric system (it may turn
             a little further, at a slightly other rate). Rates below 1e-6 of that of the motion (in
             float64; 2e-2 in float32) count as 0.
+        margin: Positive where stable, negative where unstable, smooth where it changes its sign,
+            which is where `boundary` looks [1/s^2]. Without damping, minus the square of the
+            largest growth rate where something grows, else the square of half the smallest
+            difference of two frequencies (of one and its own negative: of the frequency), which
+            also touches zero where two pass through each other. With damping, minus the largest
+            real part times the rate of the motion. What every motion of a symmetric system does
+            counts for neither, nor does the turning of the momentum of a free body in space.
         result: `jrigid.RESULTS` of the input.
     """
 
     matrix: Float[Array, "n n"]
     eigenvalues: Complex[Array, " n"]
     eigenvectors: Complex[Array, "n n"]
-    stability: Int[Array, ""]
+    stability: STABILITY
+    margin: Scalar
     result: Any
 
     @property
@@ -71,10 +91,10 @@ class Linearization(eqx.Module):
 
 def linearize(
     system: RigidBody,
-    state: State,
+    state0: State,
     args: Any = None,
     *,
-    t: ScalarLike = 0.0,
+    t0: ScalarLike = 0.0,
     body_rate: VectorLike | None = None,
     space_axis: VectorLike | None = None,
     throw: bool = True,
@@ -88,9 +108,9 @@ def linearize(
 
     Args:
         system: The body and its torque.
-        state: Its state, an equilibrium in the frame.
+        state0: Its state, an equilibrium in the frame.
         args: Passed to the torque.
-        t: Time of the state [s].
+        t0: Time of the state [s].
         body_rate: Turning of the body seen from the frame, body components [rad/s]; about an axis
             of symmetry of the body and its torque.
         space_axis: A direction in space about which the system is symmetric, where it is at rest:
@@ -101,12 +121,12 @@ def linearize(
         Matrix, eigenvalues, eigenvectors, and what they mean.
 
     Raises:
-        ValueError: Wrong shape; `body_rate` with internal parts (trace time).
+        ValueError: `body_rate` with internal parts.
         RuntimeError: Bad value; a state that is no equilibrium; a system that changes in the frame,
-            such as a body on an eccentric orbit (run time, any lane).
+            such as a body on an eccentric orbit.
 
-    Gradients: of matrix and eigenvalues, in all parameters of the system and in the state; where
-    eigenvalues meet see `eigenvalues`. None of the eigenvectors.
+    Gradients: of matrix, eigenvalues and margin, in all parameters of the system and in the state;
+    where eigenvalues meet see `eigenvalues`. None of the eigenvectors.
     Source: J. E. Marsden, T. S. Ratiu, Introduction to Mechanics and Symmetry, 2nd ed. (1999), for
     relative equilibria; docs/stability.md. Eigenvalues on a GPU need a jaxlib that has them there.
 
@@ -117,141 +137,179 @@ def linearize(
     >>> print(about.growth_rate.round(6), jr.stability.STABILITY[about.stability])
     1.154701 unstable
     """
-    state = checked_state(system, state, "state")
-    dtype = state.omega.dtype
-    none = jnp.zeros(3, dtype)
+    motion = motion_of(system, state0, args, t0)
+    none = jnp.zeros(3, motion.t0.dtype)
     own, up = (none if x is None else x for x in (body_rate, space_axis))
-    time, own, up = (float_arrays(x)[0].astype(dtype) for x in (t, own, up))
-    check_shape("t", time, ())
+    own, up = (float_arrays(x)[0].astype(none.dtype) for x in (own, up))
     check_shape("body_rate", own, (3,))
     check_shape("space_axis", up, (3,))
-    if body_rate is not None and state.internal is not None:
+    if body_rate is not None and motion.dimension > 6:
         raise ValueError(
             "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
             "but it is not."
         )
-    return _linearize(system, state, args, time, own, up, throw)
+    return settle(_linearize(motion, own, up), throw, lambda: _findings(motion, own, up)[0])
+
+
+class _Frame(eqx.Module):
+    """A motion as seen in a frame that turns with it: an equilibrium, if all is well.
+
+    Small motions beside it are x; in `units` all their components are angles.
+    """
+
+    motion: Motion
+    own: Array
+    up: Array
+
+    @property
+    def across(self) -> Array:
+        """Turning of the frame in space."""
+        state = self.motion.state0
+        return rotate(state.attitude, state.omega - self.own)
+
+    @property
+    def along(self) -> Array:
+        """The direction in space about which the system is symmetric."""
+        return jnp.where(safe_norm(self.up) > 0, self.up, self.across)
+
+    def state(self, x: Array, later: Array) -> State:
+        """The state of the body some time later."""
+        state = self.motion.state0
+        parts, unravel = ravel_pytree(state.internal)
+        internal = unravel(parts.astype(x.dtype) + x[6:])
+        on = exp(later * self.own)
+        seen = multiply(state.attitude, exp(x[:3]))
+        attitude = multiply(exp(later * self.across), multiply(seen, on))
+        return State(attitude, rotate_inverse(on, state.omega + x[3:6]), internal)
+
+    def rates(self, x: Array, later: Array) -> Array:
+        """Rates of the small motion, some time later."""
+        system, state, args, t0, _ = self.motion
+        rates = system.vector_field(t0 + later, self.state(x, later), args)
+        spin = state.omega + x[3:6]
+        seen = multiply(state.attitude, exp(x[:3]))
+        turning = spin - self.own - rotate_inverse(seen, self.across)
+        change = rotate(exp(later * self.own), rates.omega) + jnp.cross(self.own, spin)
+        inner = ravel_pytree(rates.internal)[0].astype(x.dtype)
+        return jnp.concatenate([turning, change, inner])
+
+    def look(self, later: Array) -> tuple[Array, Array]:
+        """What is linear about the motion some time later, and how it moves."""
+        still = jnp.zeros(self.motion.dimension, later.dtype)
+        return jax.jacfwd(lambda x: (self.rates(x, later),) * 2, has_aux=True)(still)
+
+    def symmetries(self, rate: Scalar) -> tuple[Array, Array]:
+        """Where every motion of a symmetric system may go, and slopes of what it keeps.
+
+        It may turn about an axis in space, and about one in the body; it keeps its momentum along.
+        """
+        system, state, args, t0, _ = self.motion
+        own, none = self.own, jnp.zeros(self.motion.dimension, rate.dtype)
+        turned = none.at[:3].set(rotate_inverse(state.attitude, self.along))
+        slewed = none.at[:6].set(jnp.concatenate([own, jnp.cross(state.omega, own) / rate]))
+
+        def momenta(x: Array) -> Array:
+            state = self.state(x, jnp.zeros_like(t0))
+            momentum = system.angular_momentum(t0, state, args)
+            in_body = rotate_inverse(state.attitude, momentum)
+            return jnp.stack([jnp.sum(self.along * momentum), jnp.sum(own * in_body)])
+
+        return jnp.stack([turned, slewed]), jax.jacfwd(momenta)(none)
+
+    def rate(self, matrix: Array) -> Scalar:
+        """The rate to measure by: of the motion, or of what the torque does to a turn.
+
+        Not of what damps it, beside which all the rest may be slow.
+        """
+        stiff = jnp.sqrt(jnp.max(jnp.abs(matrix[3:6, :3])))
+        turns = (self.motion.state0.omega, self.own, self.across)
+        return jnp.max(jnp.stack([*(safe_norm(v) for v in turns), stiff]))
+
+    def units(self, rate: Scalar) -> Array:
+        """Size of each component of x for an angle of 1."""
+        system, state, *_ = self.motion
+        scale = internal_parts(system.torque.internal_scale(rate))
+        full = jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), scale, state.internal)
+        inner = ravel_pytree(full)[0].astype(rate.dtype)
+        return jnp.concatenate([jnp.ones(3, rate.dtype), jnp.full(3, rate), inner])
+
+
+def _accuracy(dtype: Any) -> Scalar:
+    """What counts as zero beside the motion."""
+    return 64 * jnp.sqrt(jnp.finfo(dtype).eps)
+
+
+def _findings(motion: Motion, own: Array, up: Array) -> tuple[Findings, _Frame, Array, Scalar]:
+    """What is wrong; the frame, harmless where it is, the matrix in it, and the rate."""
+    findings = findings_of(motion)
+    for name, value in (("body_rate", own), ("space_axis", up)):
+        message = f"Argument `{name}` must be finite, but it is not."
+        findings.require(all_finite(value), RESULTS.invalid_state, message, value)
+    ok = findings.ok
+    frame = _Frame(harmless_motion(ok, motion), *(jnp.where(ok, x, 0.0) for x in (own, up)))
+    known = jax.lax.stop_gradient
+    matrix, moves = frame.look(jnp.zeros_like(motion.t0))
+    fixed = known(matrix)
+    findings.require(all_finite(fixed), RESULTS.invalid_vector_field)
+    rate = known(frame.rate(fixed))
+    rests = rate == 0  # and nothing holds it: then it must not move at all
+    rate = jnp.where(jnp.isfinite(rate) & ~rests, rate, 1.0)
+    units, accuracy = frame.units(rate), _accuracy(rate.dtype)
+    size = units[None, :] / units[:, None] / rate
+    largest = jnp.where(rests, 0.0, accuracy) * units * rate
+    stays = jnp.all(jnp.abs(known(moves)) <= largest)
+    findings.require(stays, RESULTS.no_equilibrium, _NO_EQUILIBRIUM)
+    others, moves = known(jax.vmap(frame.look)(jnp.asarray(_LATER, rate.dtype) / rate))
+    change = jnp.abs((others - fixed[None]) * size[None])
+    same = jnp.all(change <= accuracy * jnp.maximum(jnp.abs(fixed * size), 1.0)[None])
+    same = same & jnp.all(jnp.abs(moves) <= largest[None])
+    findings.require(same, RESULTS.no_equilibrium, _NOT_STATIONARY)
+    return findings, frame, matrix, rate
 
 
 @eqx.filter_jit
-def _linearize(
-    system: RigidBody,
-    state: State,
-    args: Any,
-    time: Array,
-    own: Array,
-    up: Array,
-    throw: bool,
-) -> Linearization:
-    dtype = state.omega.dtype
-    findings = Findings()
-    system.check(findings)
-    findings.require(all_finite((state, time, own, up)), RESULTS.invalid_state)
-    findings.require(is_unit(jax.lax.stop_gradient(state.attitude)), RESULTS.invalid_attitude)
-    state = dataclasses.replace(state, attitude=normalize(state.attitude))
-    across = rotate(state.attitude, state.omega - own)  # turning of the frame in space
-
-    def rates(x: Array, later: Array) -> Array:
-        """Rates of the components, at a state x away, as seen in the frame some time later."""
-        turn, change, parts = x[:3], x[3:6], x[6:]
-        seen = multiply(state.attitude, exp(turn))
-        spin = state.omega + change
-        on = exp(later * own)
-        attitude = multiply(exp(later * across), multiply(seen, on))
-        inside = unravel(ravel(state.internal) + parts, state.internal) if parts.size else None
-        actual = State(attitude, rotate_inverse(on, spin), inside)
-        found = system.vector_field(time + later, actual, args)
-        turning = spin - own - rotate_inverse(seen, across)
-        change = rotate(on, found.omega) + jnp.cross(own, spin)
-        inner = ravel(found.internal) if parts.size else parts
-        return jnp.concatenate([turning, change, inner])
-
-    extra = sum(x.size for x in jtu.tree_leaves(state.internal))
-    still, now = jnp.zeros(6 + extra, dtype), jnp.zeros((), dtype)
-    matrix = jax.jacfwd(rates)(still, now)
-    # The rate to measure by: of the motion, or of what the torque does to a turn; not of what damps
-    # it, beside which all the rest may be slow.
+def _linearize(motion: Motion, own: Array, up: Array) -> Linearization:
+    findings, frame, matrix, rate = _findings(motion, own, up)
+    ok, units, accuracy = findings.ok, frame.units(rate), _accuracy(rate.dtype)
     known = jax.lax.stop_gradient
-    fixed = known(matrix)
-    stiff = jnp.sqrt(jnp.max(jnp.abs(fixed[3:6, :3])))
-    rate = known(jnp.max(jnp.stack([*(safe_norm(v) for v in (state.omega, own, across)), stiff])))
-    findings.require(all_finite(fixed), RESULTS.invalid_vector_field)
-    rests = rate == 0  # and nothing holds it: then it must not move at all
-    rate = jnp.where(jnp.isfinite(rate) & ~rests, rate, 1.0)
-    units = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, rate)])
-    if extra:
-        scale = system.torque.internal_scale(rate)
-        full = jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), scale, state.internal)
-        units = jnp.concatenate([units, ravel(full).astype(dtype)])
-
-    def measured(x: Array) -> Array:
-        return x * units[None, :] / units[:, None] / rate
-
-    def moved(later: Array) -> Array:
-        return jnp.max(jnp.abs(known(rates(still, later)) / units / rate))
-
-    accuracy = 64 * jnp.sqrt(jnp.finfo(dtype).eps)
-    largest = jnp.where(rests, 0.0, accuracy)
-    findings.require(moved(now) <= largest, RESULTS.no_equilibrium, _NO_EQUILIBRIUM)
-    for later in (0.7 / rate, 1.9 / rate):
-        there = known(jax.jacfwd(rates)(still, later))
-        differs = jnp.abs(measured(there - fixed))
-        same = jnp.all(differs <= accuracy * jnp.maximum(jnp.abs(measured(fixed)), 1.0))
-        same = same & (moved(later) <= largest)
-        findings.require(same, RESULTS.no_equilibrium, _NOT_STATIONARY)
-    ok = findings.ok
-    plain = jnp.where(ok, measured(matrix), jnp.eye(6 + extra, dtype=dtype))
+    eye = jnp.eye(units.size, dtype=units.dtype)
+    plain = jnp.where(ok, matrix * units[None, :] / units[:, None] / rate, eye)
     values = eigenvalues(plain)
-    vectors = _vectors(known(plain), known(values))
-    along = jnp.where(safe_norm(up) > 0, up, across)
-    neutral = [
-        jnp.concatenate([rotate_inverse(state.attitude, along), jnp.zeros_like(still[3:])]),
-        jnp.concatenate([own, jnp.cross(state.omega, own) / rate, jnp.zeros_like(still[6:])]),
-    ]
-    stability = _classify(known(plain), known(values), vectors, known(jnp.stack(neutral)), accuracy)
-    of_units = units.astype(vectors.dtype)[:, None] * vectors
-    length = jnp.sqrt(jnp.sum(jnp.abs(of_units) ** 2, axis=0))
-    of_units = of_units / length.astype(values.dtype)[None, :]
-    found = (matrix, rate.astype(values.dtype) * values, of_units)
-    matrix, values, vectors = findings.apply(nan_where(~ok, found), throw)
-    return Linearization(matrix, values, vectors, jnp.where(ok, stability, -1), findings.result)
-
-
-def _vectors(matrix: Array, values: Array) -> Array:
-    """Eigenvectors in the order of the eigenvalues."""
-    found, columns = jnp.linalg.eig(matrix)
-    gaps = jnp.abs(found[None, :] - values[:, None])
-    # Each eigenvalue takes the nearest that is left.
-    order = []
-    for i in range(values.size):
-        nearest = jnp.argmin(gaps[i])
-        order.append(nearest)
-        gaps = jnp.where(jnp.arange(values.size)[None, :] == nearest, jnp.inf, gaps)
-    return columns[:, jnp.stack(order)]
+    vectors = eigenvectors(known(plain), known(values))
+    neutral, conserved = frame.symmetries(rate)
+    conserved = conserved * units[None, :]
+    stability = _classify(known(plain), known(values), vectors, known(neutral), accuracy)
+    reduced, size = without_symmetries(plain, neutral, conserved, accuracy)
+    left = margin(reduced, size, accuracy) * rate * rate
+    shapes = units.astype(vectors.dtype)[:, None] * vectors
+    length = jnp.sqrt(jnp.sum(jnp.abs(shapes) ** 2, axis=0))
+    shapes = shapes / length.astype(values.dtype)[None, :]
+    answer = (matrix, rate.astype(values.dtype) * values, shapes)
+    matrix, values, shapes, left = nan_where(~ok, (*answer, left))
+    stability = STABILITY.where(ok, stability, STABILITY.undefined)
+    return Linearization(matrix, values, shapes, stability, left, findings.result)
 
 
 def _classify(
     matrix: Array, values: Array, vectors: Array, neutral: Array, accuracy: Array
-) -> Int[Array, ""]:
+) -> STABILITY:
     # Rounding of the largest entries splits a double zero by the root of it.
     largest = jnp.maximum(jnp.max(jnp.abs(values)), 1.0)
     tiny = jnp.maximum(accuracy, 4 * jnp.sqrt(jnp.finfo(values.real.dtype).eps * largest))
     grows = jnp.max(values.real) > tiny
     # Directions along which the motion only turns further, at a rate that a neighbour may change.
     length = jnp.sqrt(jnp.sum(neutral**2, axis=1))
-    there = length > 0
-    neutral = neutral / jnp.where(there, length, 1.0)[:, None]
-    kept = jnp.sqrt(jnp.sum(product("ij,kj->ki", matrix, neutral) ** 2, axis=1)) <= tiny
-    there = there & kept
+    neutral = neutral / jnp.where(length > 0, length, 1.0)[:, None]
+    images = jnp.sqrt(jnp.sum(product("ij,kj->ki", matrix, neutral) ** 2, axis=1))
+    kept = (length > 0) & (images <= tiny)
     twins = jnp.abs(jnp.sum(neutral[0] * neutral[1])) > 1 - 1e-6
-    explained = jnp.where(there[0] & there[1] & twins, 1, jnp.sum(there))
+    explained = jnp.where(kept[0] & kept[1] & twins, 1, jnp.sum(kept))
     # A zero with an eigenvector of its own stays where it is; the others drift.
     zeros = jnp.sum(jnp.abs(values) <= tiny)
-    rest = jnp.sum(jnp.linalg.svd(matrix, compute_uv=False) <= tiny)
-    gaps = jnp.abs(values[:, None] - values[None, :])
-    overlap = jnp.abs(product("ki,kj->ij", jnp.conj(vectors), vectors))
-    others = ~jnp.eye(values.size, dtype=bool)
+    staying = jnp.sum(jnp.linalg.svd(matrix, compute_uv=False) <= tiny)
     on_axis = (jnp.abs(values.real) <= tiny) & (jnp.abs(values) > tiny)
-    pairs = others & on_axis[:, None] & on_axis[None, :] & (gaps <= tiny) & (overlap > 0.999)
-    drifts = (zeros - rest > explained) | jnp.any(pairs)
-    return jnp.where(grows, 0, jnp.where(drifts, 1, 2))
+    gaps, alike = pairs(values, vectors)
+    shared = on_axis[:, None] & on_axis[None, :] & (gaps <= tiny) & alike
+    drifts = (zeros - staying > explained) | jnp.any(shared)
+    steady = STABILITY.where(drifts, STABILITY.marginal, STABILITY.stable)
+    return STABILITY.where(grows, STABILITY.unstable, steady)

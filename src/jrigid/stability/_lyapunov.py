@@ -1,20 +1,28 @@
 """Order and chaos: the spectrum of Lyapunov exponents, and an indicator that tells early."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, Real
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Real
 
-from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, whole_number
+from jrigid._checks import (
+    RESULTS,
+    Enumeration,
+    Findings,
+    check_shape,
+    float_arrays,
+    settle,
+    whole_number,
+)
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
-    Walk,
-    checked_body,
-    follow,
+    Motion,
+    findings_of,
+    motion_of,
     orthonormal,
     solver_of,
     verdict,
@@ -22,8 +30,29 @@ from jrigid.stability._steps import (
 )
 from jrigid.systems import RigidBody
 
-ORDER = ("regular", "undecided", "chaotic")
-_REGULAR, _CHAOTIC = 3.0, 5.0
+_REGULAR, _CHAOTIC = 3.0, 5.0  # between them MEGNO has not decided
+_INDEPENDENT = 1e3  # eps that must be left of a small motion once those before it are taken off
+
+
+class ORDER(Enumeration):
+    """What MEGNO says of a motion."""
+
+    regular = "regular"
+    undecided = "undecided"
+    chaotic = "chaotic"
+    undefined = "undefined"
+
+
+class _Plan(NamedTuple):
+    """Samples, intervals between renormalisations in each, steps in each of those."""
+
+    samples: int
+    each: int
+    every: int
+
+    @property
+    def steps(self) -> int:
+        return self.samples * self.each * self.every
 
 
 class LyapunovSpectrum(NamedTuple):
@@ -53,8 +82,8 @@ class Megno(NamedTuple):
         megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one near a
             periodic orbit), and to half the exponent times the time for a chaotic one.
         exponent: 2 / time of it: an estimate of the largest exponent [1/s].
-        order: Index into `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided". It
-            starts at "regular" and needs some ten e-folding times to leave it.
+        order: One of `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided". It starts
+            at "regular" and needs some ten e-folding times to leave it.
         ts: Times since the start [s].
         history: `megno` up to each of these times.
         final_state: Where the motion ended.
@@ -64,7 +93,7 @@ class Megno(NamedTuple):
 
     megno: Scalar
     exponent: Scalar
-    order: Int[Array, ""]
+    order: ORDER
     ts: Float[Array, " samples"]
     history: Float[Array, " samples"]
     final_state: State
@@ -72,72 +101,91 @@ class Megno(NamedTuple):
     result: Any
 
 
-def _starting_vectors(vectors: Any, count: int | None, dimension: int, dtype: Any) -> Array:
+def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
     """Rows to start from: those given, or some that lie along no axis."""
+    dimension, dtype = motion.dimension, motion.t0.dtype
     if vectors is None:
-        assert count is not None
-        i = jnp.arange(dimension, dtype=dtype)
-        rows = jnp.cos((1.0 + jnp.arange(count, dtype=dtype))[:, None] * (0.9 * i + 0.45)[None, :])
-        return rows + 0.3 * jnp.eye(count, dimension, dtype=dtype)
-    rows = float_arrays(vectors)[0].astype(dtype)
-    check_shape("vectors", rows, (None, dimension))
-    if len(rows) > dimension or len(rows) != (count or len(rows)):
+        count = dimension if count is None else whole_number("count", count)
+        angles = np.outer(np.arange(1, count + 1), 0.9 * np.arange(dimension) + 0.45)
+        rows = jnp.asarray(np.cos(angles) + 0.3 * np.eye(count, dimension), dtype)
+    else:
+        rows = float_arrays(vectors)[0].astype(dtype)
+        check_shape("vectors", rows, (count, dimension))
+    if len(rows) > dimension:
         raise ValueError(
-            f"Argument `vectors` must have as many rows as `count` and at most {dimension}, but it "
-            f"has {len(rows)}."
+            f"Arguments `count` and `vectors` must name at most {dimension} small motions, but "
+            f"they name {len(rows)}."
         )
     return rows
 
 
-def _independent(findings: Findings, rows: Array) -> Array:
-    """Orthonormal rows; those that depend on each other, or are not finite, are noted."""
-    rows = rows / jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True))
-    rows, lengths = orthonormal(rows)
+def _unit_rows(rows: Array) -> tuple[Array, Array]:
+    """Orthonormal rows, and what was left of the length of each."""
+    return orthonormal(rows / jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True)))
+
+
+def _findings(motion: Motion, rows: Array) -> Findings:
+    findings = findings_of(motion)
+    _, lengths = _unit_rows(rows)
     findings.require(
-        jnp.all(lengths > 1e3 * jnp.finfo(rows.dtype).eps),
+        jnp.all(lengths > _INDEPENDENT * jnp.finfo(rows.dtype).eps),
         RESULTS.invalid_state,
         "Arguments `vector` and `vectors` must be finite and linearly independent, but they are "
         "not.",
     )
-    return rows
+    return findings
 
 
-def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
-    """Samples, renormalisations of each, steps of each: all of one length, at least `steps`."""
+def _plan(steps: Any, every: Any, samples: Any) -> _Plan:
+    """All samples of one length, in at least `steps` steps."""
     steps, every = whole_number("steps", steps), whole_number("every", every)
     samples = min(whole_number("samples", samples), steps)
     every = min(every, -(-steps // samples))
-    each = -(-steps // (samples * every))
-    return samples, each, every
+    return _Plan(samples, -(-steps // (samples * every)), every)
 
 
-def _followed(
-    path: Walk, plan: tuple[int, int, int], rows: Array, tally: Any, add: Callable[..., Any]
-) -> tuple[Array, Any, State, Array]:
-    """Times and tallies of each sample, the state at the end, the largest local error.
+class _Growth(NamedTuple):
+    """How small motions beside a motion grew, up to each of some times."""
 
-    After some steps the rows are made orthonormal, and `add(tally, logs, number)` takes in the
-    logarithms of their growth, of NaN or of nothing not finite, and the number of the interval.
-    """
+    ts: Array
+    exponents: Array
+    megno: Array
+    final_state: State
+    error: Array
+    result: Any
+
+
+@eqx.filter_jit
+def _growth(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> _Growth:
+    """Orthonormal again after each interval; the indicator is that of the first one."""
+    findings = _findings(motion, rows)
+    path = walk(motion, plan.steps, solver, findings.ok)
     samples, each, every = plan
-    dtype = path.start.dtype
+    dtype = rows.dtype
 
-    def sample(carry: tuple, k: Array) -> tuple[tuple, Any]:
-        def interval(carry: tuple, j: Array) -> tuple[tuple, None]:
-            y, rows, tally, error = carry
-            index = k * each + j
-            y, rows, local = follow(path, index * every, every, y, rows)
-            rows, lengths = orthonormal(rows)
-            tally = add(tally, jnp.log(lengths), (1 + index).astype(dtype))
-            return (y, rows, tally, jnp.maximum(error, local)), None
+    def interval(carry: tuple, index: Array) -> tuple[tuple, None]:
+        y, rows, (totals, weighted, indicator), error = carry
+        y, rows, local = path.follow(index * every, every, y, rows)
+        rows, lengths = orthonormal(rows)
+        logs, number = jnp.log(lengths), (1 + index).astype(dtype)
+        weighted = weighted + number * logs[0]
+        tally = (totals + logs, weighted, indicator + 2 * weighted / number)
+        return (y, rows, tally, jnp.maximum(error, local)), None
 
-        carry, _ = jax.lax.scan(interval, carry, jnp.arange(each))
+    def sample(carry: tuple, first: Array) -> tuple[tuple, Any]:
+        carry, _ = jax.lax.scan(interval, carry, first + jnp.arange(each))
         return carry, carry[2]
 
-    begin = (path.start, rows, tally, jnp.zeros((), dtype))
-    (y, _, _, error), tallies = jax.lax.scan(sample, begin, jnp.arange(samples))
-    ts = path.step * (each * every * (1 + jnp.arange(samples))).astype(dtype)
-    return ts, tallies, path.to_state(y), error
+    none = jnp.zeros((), dtype)
+    tally = (jnp.zeros(len(rows), dtype), none, none)
+    begin = (path.start, _unit_rows(rows)[0], tally, none)
+    firsts = each * jnp.arange(samples)
+    (y, *_, error), (totals, _, indicator) = jax.lax.scan(sample, begin, firsts)
+    counts = (firsts + each).astype(dtype)
+    ts = path.step * every * counts
+    answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
+    result, _, answer = verdict(findings, error, answer)
+    return _Growth(*answer, error, result)
 
 
 def lyapunov_spectrum(
@@ -183,8 +231,7 @@ def lyapunov_spectrum(
         all intervals.)
 
     Raises:
-        ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value, steps too coarse (run time, any lane).
+        RuntimeError: Bad value, steps too coarse.
 
     Gradients: none to be relied on: those of a chaotic motion grow as fast as it does.
     Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980) 9.
@@ -192,47 +239,15 @@ def lyapunov_spectrum(
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))  # integrable: none grows
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
-    >>> found = jr.stability.lyapunov_spectrum(body, state0, 1000.0, 5000)
-    >>> print(bool(jnp.all(jnp.abs(found.exponents) < 0.02)), found.history.shape)
+    >>> spectrum = jr.stability.lyapunov_spectrum(body, state0, 1000.0, 5000)
+    >>> print(bool(jnp.all(jnp.abs(spectrum.exponents) < 0.02)), spectrum.history.shape)
     True (50, 6)
     """
-    state0, duration, t0 = checked_body(system, state0, duration, t0)
-    plan, solver = _plan(steps, every, samples), solver_of(solver)
-    if count is not None:
-        count = whole_number("count", count)
-    return _spectrum(system, state0, duration, plan, args, t0, count, vectors, solver, throw)
-
-
-@eqx.filter_jit
-def _spectrum(
-    system: RigidBody,
-    state0: State,
-    duration: Array,
-    plan: tuple[int, int, int],
-    args: Any,
-    t0: Array,
-    count: int | None,
-    vectors: Any,
-    solver: Any,
-    throw: bool,
-) -> LyapunovSpectrum:
-    samples, each, every = plan
-    path = walk(system, state0, duration, samples * each * every, args, t0, solver)
-    if count is not None and count > path.dimension:
-        raise ValueError(f"Argument `count` must be at most {path.dimension}, but it is {count}.")
-    dtype = path.start.dtype
-    if vectors is None and count is None:
-        count = path.dimension
-    rows = _starting_vectors(vectors, count, path.dimension, dtype)
-    rows = _independent(path.findings, rows)
-
-    none = jnp.zeros(rows.shape[0], dtype)
-    ts, totals, state, error = _followed(
-        path, plan, rows, none, lambda total, logs, _: total + logs
-    )
-    found = (ts, totals / ts[:, None], state)
-    result, _, (ts, history, state) = verdict(path.findings, error, found, throw)
-    return LyapunovSpectrum(history[-1], ts, history, state, error, result)
+    motion = motion_of(system, state0, args, t0, duration)
+    plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
+    growth = _growth(motion, plan, rows, solver_of(solver))
+    ts, history, _, *others = settle(growth, throw, lambda: _findings(motion, rows))
+    return LyapunovSpectrum(history[-1], ts, history, *others)
 
 
 def megno(
@@ -274,8 +289,7 @@ def megno(
         intervals.)
 
     Raises:
-        ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value, steps too coarse (run time, any lane).
+        RuntimeError: Bad value, steps too coarse.
 
     Gradients: none to be relied on.
     Source: P. M. Cincotta, C. Simo, Astronomy & Astrophysics Supplement 147 (2000) 205; in steps,
@@ -284,47 +298,21 @@ def megno(
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
-    >>> found = jr.stability.megno(body, state0, 1000.0, 5000)
-    >>> print(found.megno.round(), jr.stability.ORDER[found.order])
+    >>> indicator = jr.stability.megno(body, state0, 1000.0, 5000)
+    >>> print(indicator.megno.round(), jr.stability.ORDER[indicator.order])
     2.0 regular
     """
-    state0, duration, t0 = checked_body(system, state0, duration, t0)
-    plan, solver = _plan(steps, every, samples), solver_of(solver)
-    return _megno(system, state0, duration, plan, args, t0, vector, solver, throw)
-
-
-@eqx.filter_jit
-def _megno(
-    system: RigidBody,
-    state0: State,
-    duration: Array,
-    plan: tuple[int, int, int],
-    args: Any,
-    t0: Array,
-    vector: Any,
-    solver: Any,
-    throw: bool,
-) -> Megno:
-    samples, each, every = plan
-    path = walk(system, state0, duration, samples * each * every, args, t0, solver)
-    dtype = path.start.dtype
+    motion = motion_of(system, state0, args, t0, duration)
+    plan = _plan(steps, every, samples)
     if vector is not None:
-        vector = float_arrays(vector)[0]
-        check_shape("vector", vector, (path.dimension,))
+        (vector,) = float_arrays(vector)
+        check_shape("vector", vector, (motion.dimension,))
         vector = vector[None]
-    rows = _independent(path.findings, _starting_vectors(vector, 1, path.dimension, dtype))
-
-    def add(tally: tuple[Array, Array], logs: Array, number: Array) -> tuple[Array, Array]:
-        weighted, total = tally
-        weighted = weighted + number * logs[0]
-        return weighted, total + 2 * weighted / number
-
-    none = jnp.zeros((), dtype)
-    ts, (_, totals), state, error = _followed(path, plan, rows, (none, none), add)
-    history = totals / (each * (1 + jnp.arange(samples))).astype(dtype)
-    found = (ts, history, state)
-    result, ok, (ts, history, state) = verdict(path.findings, error, found, throw)
+    rows = _starting_vectors(motion, vector, 1)
+    growth = _growth(motion, plan, rows, solver_of(solver))
+    ts, _, history, *others = settle(growth, throw, lambda: _findings(motion, rows))
     mean = history[-1]
-    order = jnp.where(mean > _CHAOTIC, 2, jnp.where(mean > _REGULAR, 1, 0))
-    order = jnp.where(ok, order, -1)
-    return Megno(mean, 2 * mean / ts[-1], order, ts, history, state, error, result)
+    order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
+    order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
+    order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
+    return Megno(mean, 2 * mean / ts[-1], order, ts, history, *others)

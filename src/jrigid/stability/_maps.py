@@ -14,21 +14,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool
 
-from jrigid._checks import check_shape, float_arrays
+from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays
 from jrigid._types import Scalar, ScalarLike
-from jrigid.stability._roots import PlaceOfRoot
 
-
-class Marked(NamedTuple):
-    """What a function of a map returns to say itself whether its values are defined.
-
-    Attributes:
-        values: Arrays, the same at every point.
-        valid: Whether they mean anything.
-    """
-
-    values: Any
-    valid: Bool[Array, ""]
+_Code = type(RESULTS.successful)  # an item of any enumeration
+# Part of the larger end value that a function may have left at a root; at a pole it has more.
+_ROOT = 1e-3
 
 
 class StabilityMap(NamedTuple):
@@ -36,7 +27,8 @@ class StabilityMap(NamedTuple):
 
     Attributes:
         values: As the function returned them, with the axes of the grid in front; numpy arrays.
-        valid: Where the function was defined and finite: a mask of the shape of the grid.
+        valid: Where all numbers are finite and no code is `undefined`: a mask of the shape of the
+            grid.
         axes: Names and points of the axes, in their order.
     """
 
@@ -81,8 +73,8 @@ def stability_map(
     Args:
         function: A pure function (as for `jax.jit`: what it closes over must not change) of one
             number for each axis, given by name, for a single point: a growth rate, an indicator of
-            chaos, a tree of several. With `throw=False` inside, so that points that fail are NaN.
-            Codes of a result are -1 there: return `Marked(code, code >= 0)`.
+            chaos, a region, a tree of several. With `throw=False` inside where it takes it, so
+            that points that fail are NaN.
         axes: Name and points of each axis, two or more as a rule; the last one runs fastest.
         block_size: Points of a block. Large for what is cheap; for long integrations some hundreds,
             since a block takes as long as its slowest lane.
@@ -93,8 +85,8 @@ def stability_map(
 
     Raises:
         ValueError: An axis that is not one array of numbers, or a function that returns integers or
-            booleans only, which cannot say that they are undefined: return floats (NaN where
-            undefined), or a `Marked`.
+            booleans only, which cannot say that they are undefined: return floats, NaN where they
+            are.
 
     Gradients: none; differentiate the function, or a `boundary`.
 
@@ -102,8 +94,8 @@ def stability_map(
     >>> def square(second, third):
     ...     return jr.stability.growth_rate_squared(jnp.stack([1.0, second, third]), 2, 1.0)
     >>> ratios = jnp.linspace(0.5, 2.0, 4)
-    >>> found = jr.stability.stability_map(square, {"second": ratios, "third": ratios})
-    >>> print(found.values.shape, found.labels, (found.values > 0).sum())
+    >>> grid = jr.stability.stability_map(square, {"second": ratios, "third": ratios})
+    >>> print(grid.values.shape, grid.labels, (grid.values > 0).sum())
     (4, 4) ('second', 'third') 1
     """
     points = {name: np.asarray(x) for name, x in axes.items()}
@@ -126,49 +118,51 @@ def stability_map(
         block = _block(function, tuple(points), size)
     except TypeError:  # a module of arrays cannot be hashed
         block = _block.__wrapped__(function, tuple(points), size)
-    values: list[np.ndarray] = []
+    leaves: list[np.ndarray] = []
     structure: Any = None
     valid = np.empty(total, bool)
-    told = time.monotonic()
+    printed = time.monotonic()
     for start in range(0, total, size):
         first = tuple(np.int32(i) for i in np.unravel_index(start, shape))
-        found, good = block(arrays, first)
-        flat, structure = jtu.tree_flatten(found)
-        if not values:
-            values = [np.empty((total, *x.shape[1:]), x.dtype) for x in flat]
+        values, defined = block(arrays, first)
+        parts, structure = jtu.tree_flatten(values)
+        if not leaves:
+            leaves = [np.empty((total, *x.shape[1:]), x.dtype) for x in parts]
         stop = min(start + size, total)
-        for whole, part in zip(values, flat, strict=True):
+        for whole, part in zip(leaves, parts, strict=True):
             whole[start:stop] = np.asarray(part)[: stop - start]
-        valid[start:stop] = np.asarray(good)[: stop - start]
-        if progress and time.monotonic() - told > 5:
-            told = time.monotonic()
+        valid[start:stop] = np.asarray(defined)[: stop - start]
+        if progress and time.monotonic() - printed > 5:
+            printed = time.monotonic()
             print(f"{stop} of {total} points", flush=True)
-    values = [x.reshape(*shape, *x.shape[1:]) for x in values]
-    axes_of_it = {name: np.asarray(x) for name, x in zip(points, arrays, strict=True)}
-    return StabilityMap(structure.unflatten(values), valid.reshape(shape), axes_of_it)
+    leaves = [x.reshape(*shape, *x.shape[1:]) for x in leaves]
+    named = {name: np.asarray(x) for name, x in zip(points, arrays, strict=True)}
+    return StabilityMap(structure.unflatten(leaves), valid.reshape(shape), named)
+
+
+def _defined(values: Any) -> Bool[Array, ""]:
+    """Whether all numbers are finite and no code is `undefined`."""
+    leaves = jtu.tree_leaves(values, is_leaf=lambda x: isinstance(x, _Code))
+    codes = [x for x in leaves if isinstance(x, _Code)]
+    if not codes and not any(eqx.is_inexact_array(x) for x in leaves):
+        raise ValueError(
+            "Argument `function` must return floats, NaN where it is undefined, or codes, but it "
+            "returns nothing that could say so."
+        )
+    defined = all_finite(leaves)
+    for code in codes:
+        undefined = getattr(code._enumeration, "undefined", None)
+        defined = defined if undefined is None else defined & (code != undefined)
+    return defined
 
 
 @functools.lru_cache(maxsize=16)
 def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> Callable:
     """One block of the grid: values at `size` points that follow a first one."""
 
-    def at(point: dict[str, Array]) -> tuple[Any, Array]:
-        found = function(**point)
-        if isinstance(found, Marked):
-            values, valid = jtu.tree_map(jnp.asarray, tuple(found))
-            check_shape("valid", valid, ())
-        else:
-            values = jtu.tree_map(jnp.asarray, found)
-            valid = jnp.asarray(True)
-            if not any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(values)):
-                raise ValueError(
-                    "Argument `function` must return floats, NaN where it is undefined, or a "
-                    "`jrigid.stability.Marked`, but it returns nothing that could say so."
-                )
-        finite = [
-            jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(values) if eqx.is_inexact_array(x)
-        ]
-        return values, jnp.all(jnp.stack([valid, *finite]))
+    def evaluate(point: dict[str, Array]) -> tuple[Any, Array]:
+        values = jtu.tree_map(jnp.asarray, function(**point))
+        return values, _defined(values)
 
     @jax.jit
     def block(axes: tuple[Array, ...], first: tuple[Array, ...]) -> tuple[Any, Array]:
@@ -179,9 +173,28 @@ def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> C
             index = carry + digit
             carry = index // x.size
             point[name] = x[index % x.size]
-        return jax.vmap(at)(point)
+        return jax.vmap(evaluate)(point)
 
     return block
+
+
+def place_of_root(
+    rising: Callable[[Array, Any], Array], args: Any, tolerance: float, dtype: Any
+) -> Scalar:
+    """Place between 0 and 1 at which `rising(x, args)` goes from negative to positive.
+
+    So many halvings as the place asks for, and no look at the size of the values. A function that
+    is known to rise (`flip=False`) needs no check of its ends, which would raise in a lane of vmap
+    that looks for no root.
+
+    Gradients: by the implicit function theorem in `args`.
+    """
+    bisection = optx.Bisection(rtol=0.0, atol=tolerance, flip=False)
+    zero = jnp.zeros((), dtype)
+    return optx.root_find(
+        rising, bisection, zero + 0.5, args, options={"lower": zero, "upper": zero + 1},
+        max_steps=1 - math.floor(math.log2(tolerance)), throw=False,
+    ).value  # fmt: skip
 
 
 def boundary(
@@ -207,13 +220,12 @@ def boundary(
         The parameter at the boundary.
 
     Raises:
-        ValueError: Wrong shape (trace time).
         RuntimeError: The function has the same sign at both ends, is not finite there, or jumps
-            where its sign changes, as at a pole (run time, any lane).
+            where its sign changes, as at a pole.
 
     Gradients: by the implicit function theorem in `args`, not in what the function closes over.
     Infinite where the slope of the function is 0.
-    Source: bisection, `optimistix.Bisection`.
+    Source: bisection (`optimistix.Bisection`).
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> def upright(omega3, mgl):
@@ -227,33 +239,27 @@ def boundary(
     lower, upper = float_arrays(lower, upper)
     check_shape("lower", lower, ())
     check_shape("upper", upper, ())
-    eps = float(jnp.finfo(lower.dtype).eps)
     ends = [jnp.asarray(function(x, *args), lower.dtype) for x in (lower, upper)]
     for end in ends:
         check_shape("function", end, ())
     known = jax.lax.stop_gradient(jnp.stack(ends))
-    ok = jnp.all(jnp.isfinite(known)) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
-    width = upper - lower
+    ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
+    falls = known[0] > known[1]
 
-    def inside(x: Array, args: tuple) -> Array:
-        found = jnp.asarray(function(lower + width * x, *args), lower.dtype)
-        return jnp.where(ok, found, x - 0.5)
+    def rising(x: Array, args: tuple) -> Array:
+        value = jnp.asarray(function(lower + (upper - lower) * x, *args), lower.dtype)
+        return jnp.where(ok, jnp.where(falls, -value, value), x - 0.5)
 
-    tolerance = 64 * eps if rtol is None else rtol
-    solver = PlaceOfRoot(rtol=0.0, atol=tolerance)
-    solution = optx.root_find(
-        inside, solver, jnp.asarray(0.5, lower.dtype), args,
-        options={"lower": jnp.zeros_like(lower), "upper": jnp.ones_like(lower)},
-        max_steps=200, throw=False,
-    )  # fmt: skip
+    tolerance = 64 * float(jnp.finfo(lower.dtype).eps) if rtol is None else rtol
+    place = place_of_root(rising, args, tolerance, lower.dtype)
     # At a pole, or a jump, or where it is NaN between the ends, there is no root.
-    left = jnp.abs(jax.lax.stop_gradient(inside(solution.value, args)))
-    ok = ok & (left <= 1e-3 * jnp.max(jnp.abs(known)))
-    found = jnp.where(ok, lower + width * solution.value, jnp.nan)
-    if not throw:
-        return found
-    message = (
+    left = jnp.abs(jax.lax.stop_gradient(rising(place, args)))
+    findings = Findings()
+    findings.require(
+        ok & (left <= _ROOT * jnp.max(jnp.abs(known))),
+        RESULTS.invalid_state,
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
-        "which must be continuous there, but they are not."
+        "which must be continuous there, but they are not.",
+        jnp.stack([lower, upper]),
     )
-    return eqx.error_if(found, ~ok, message)
+    return findings.guard(lower + (upper - lower) * place, throw)

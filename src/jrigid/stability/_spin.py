@@ -1,126 +1,36 @@
-"""Closed forms: spin about a principal axis, sleeping and precessing tops, satellites."""
+"""Closed forms: sleeping and precessing tops, satellites."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays, nan_where
+from jrigid._checks import (
+    Enumeration,
+    all_finite,
+    all_positive,
+    check_shape,
+    check_type,
+    float_arrays,
+    where_defined,
+)
 from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike, VectorLike
-from jrigid.free._linear import linear_rates
 from jrigid.top import SymmetricTop, steady_precession
 
-REGIONS = ("unstable", "Lagrange", "DeBra-Delp", "marginal")
+# Moments of a flat body, of which one is the sum of the others, pass with this many eps.
+_FLAT = 8
 
 
-class Modes(NamedTuple):
-    """The two small motions about a principal axis, each in proportion to exp(rate t).
+class REGIONS(Enumeration):
+    """Where in DeBra and Delp's plane the moments of a satellite lie."""
 
-    Attributes:
-        rates: Growing or turning, and its opposite [1/s].
-        shapes: For each the two small components of the angular velocity, those of the axes that
-            follow the spin axis in cyclic order; of unit length. Both the same, at rates of 0,
-            where the motion drifts; zero where nothing couples the two.
-        amplitude_ratio: |second component / first|; infinite or NaN, and its slopes, where a
-            coupling is zero.
-    """
-
-    rates: Complex[Array, "2"]
-    shapes: Complex[Array, "2 2"]
-    amplitude_ratio: Scalar
-
-
-def growth_rate(
-    moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
-) -> Scalar:
-    """Rate at which a small wobble grows about a principal axis; 0 where it does not.
-
-    Args:
-        moments: Principal moments [kg m^2].
-        axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
-
-    Returns:
-        Growth rate [1/s]. Where it is 0 the wobble turns: see `frequency`.
-
-    Raises:
-        ValueError: Wrong shape or axis (trace time). Values are not checked.
-
-    Gradients: exact where it is positive; at the threshold itself, where they are infinite, 0. Use
-    `growth_rate_squared`, which is smooth there, to find thresholds.
-    Source: as `growth_rate_squared`.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.stability.growth_rate(jnp.array([1.0, 2.0, 3.0]), 1, 2.0).round(6))
-    1.154701
-    """
-    towards, back, _, _ = linear_rates(moments, axis, spin, rotor)
-    return root_of_positive(towards * back)
-
-
-def frequency(moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0) -> Scalar:
-    """Angular frequency of a small wobble about a principal axis; 0 where it grows.
-
-    Args:
-        moments: Principal moments [kg m^2].
-        axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
-
-    Returns:
-        Angular frequency [rad/s].
-
-    Raises:
-        ValueError: Wrong shape or axis (trace time). Values are not checked.
-
-    Gradients: as `growth_rate`.
-    Source: as `growth_rate_squared`.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.stability.frequency(jnp.array([1.0, 2.0, 3.0]), 2, 2.0))
-    2.0
-    """
-    towards, back, _, _ = linear_rates(moments, axis, spin, rotor)
-    return root_of_positive(-towards * back)
-
-
-def modes(moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0) -> Modes:
-    """The two small motions about spin on a principal axis.
-
-    Args:
-        moments: Principal moments [kg m^2].
-        axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
-
-    Returns:
-        Rates, shapes, and the ratio of the amplitudes; `jrigid.free.linearized` is the solution.
-
-    Raises:
-        ValueError: Wrong shape or axis (trace time). Values are not checked.
-
-    Gradients: exact where the two rates differ.
-    Source: as `growth_rate_squared`.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.stability.modes(jnp.array([1.0, 2.0, 3.0]), 2, 1.0).amplitude_ratio)
-    1.0
-    """
-    towards, back, _, _ = linear_rates(moments, axis, spin, rotor)
-    square = towards * back
-    rate = jax.lax.complex(root_of_positive(square), root_of_positive(-square))
-    rates = jnp.stack([rate, -rate])
-    # (towards, rate) and (rate, back) are parallel: the longer one is the better one.
-    of_first = jnp.abs(towards) >= jnp.abs(back)
-    upper = jnp.where(of_first, towards.astype(rates.dtype), rates)
-    lower = jnp.where(of_first, rates, back.astype(rates.dtype))
-    length = root_of_positive(jnp.abs(square) + jnp.maximum(towards**2, back**2))
-    length = jnp.where(length > 0, length, 1.0).astype(rates.dtype)
-    shapes = jnp.stack([upper, lower], axis=1) / length
-    return Modes(rates, shapes, jnp.sqrt(jnp.abs(back / towards)))
+    unstable = "unstable"
+    Lagrange = "Lagrange"
+    DeBra_Delp = "DeBra-Delp"
+    marginal = "marginal"
+    undefined = "undefined"
 
 
 class TopStability(NamedTuple):
@@ -133,16 +43,23 @@ class TopStability(NamedTuple):
         growth_rate: Its root, or 0 [1/s].
         frequencies: At which the tilt goes round the vertical, the nutation and the slow
             precession; both the same where it grows [rad/s].
-        result: `jrigid.RESULTS` of the input.
     """
 
     growth_rate_squared: Scalar
     growth_rate: Scalar
     frequencies: Float[Array, "2"]
-    result: object
 
 
-def top_stability(top: SymmetricTop, omega3: ScalarLike, *, throw: bool = True) -> TopStability:
+def _top_arrays(top: Any, **numbers: Any) -> tuple[Bool[Array, ""], tuple[Array, ...]]:
+    """Whether all is in the domain; I1, I3, mgl and the numbers, of one dtype."""
+    check_type("top", top, SymmetricTop)
+    arrays = float_arrays(top.I1, top.I3, top.mgl, *numbers.values())
+    for name, value in zip(numbers, arrays[3:], strict=True):
+        check_shape(name, value, ())
+    return all_positive(arrays[:2]) & all_finite(arrays), arrays
+
+
+def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
     """Stability of a vertical top: sleeping (mgl > 0), or hanging (mgl < 0).
 
     The tilt, as a complex number in the plane, obeys I1 z'' - i I3 omega3 z' - mgl z = 0.
@@ -150,14 +67,9 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike, *, throw: bool = True) 
     Args:
         top: The top.
         omega3: Its spin [rad/s].
-        throw: False: bad values are a result code and NaN.
 
     Returns:
-        Growth rate or frequencies.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        Growth rate or frequencies; NaN outside positive, finite moments, finite mgl and spin.
 
     Gradients: of the square exact everywhere; of its root as `growth_rate`.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -167,19 +79,16 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike, *, throw: bool = True) 
     >>> print([jr.stability.top_stability(top, w).growth_rate.item() for w in (0.0, 4.0, 5.0)])
     [1.0, 0.0, 0.0]
     """
-    i1, i3, mgl, spin = float_arrays(top.I1, top.I3, top.mgl, omega3)
-    check_shape("omega3", spin, ())
-    findings = Findings()
-    findings.require(top.is_valid, RESULTS.invalid_top)
-    findings.require(all_finite(spin), RESULTS.invalid_state)
-    ok = findings.ok
-    i1, i3, mgl, spin = (jnp.where(ok, x, 1.0) for x in (i1, i3, mgl, spin))
-    half = i3 * spin / (2 * i1)
-    square = mgl / i1 - half * half
-    split = root_of_positive(-square)
-    found = (square, root_of_positive(square), jnp.stack([half + split, half - split]))
-    square, growth, frequencies = findings.apply(nan_where(~ok, found), throw)
-    return TopStability(square, growth, frequencies, findings.result)
+
+    def formula(i1: Array, i3: Array, mgl: Array, spin: Array) -> TopStability:
+        half = i3 * spin / (2 * i1)
+        square = mgl / i1 - half * half
+        split = root_of_positive(-square)
+        frequencies = jnp.stack([half + split, half - split])
+        return TopStability(square, root_of_positive(square), frequencies)
+
+    ok, arrays = _top_arrays(top, omega3=omega3)
+    return where_defined(ok, formula, *arrays)
 
 
 class PrecessionStability(NamedTuple):
@@ -208,11 +117,7 @@ def precession_stability(
 
     Returns:
         For the slow and the fast precession p the square -(p^2 sin^2 theta + (I3 omega3 / I1 -
-        2 p cos theta)^2).
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        2 p cos theta)^2); NaN outside positive, finite moments, finite mgl, tilt and spin.
 
     Gradients: as those of `top.steady_precession`.
     Source: from the second derivative of `top.effective_potential`; docs/stability.md.
@@ -222,12 +127,16 @@ def precession_stability(
     >>> print(jr.stability.precession_stability(top, jnp.pi / 3, 6.0).growth_rate_squared.round(4))
     [ -7.0941 -30.9059]
     """
-    steady = steady_precession(top, theta, omega3)
-    i1, i3, tilt, spin = float_arrays(top.I1, top.I3, theta, omega3)
-    rates = jnp.stack([steady.slow, steady.fast])
-    sine, cosine = jnp.sin(tilt), jnp.cos(tilt)
-    squares = -((rates * sine) ** 2) - (i3 * spin / i1 - 2 * rates * cosine) ** 2
-    return PrecessionStability(rates, squares, steady.exists)
+
+    def formula(i1: Array, i3: Array, mgl: Array, tilt: Array, spin: Array) -> PrecessionStability:
+        steady = steady_precession(SymmetricTop(i1, i3, mgl), tilt, spin)
+        rates = jnp.stack([steady.slow, steady.fast])
+        sine, cosine = jnp.sin(tilt), jnp.cos(tilt)
+        squares = -((rates * sine) ** 2) - (i3 * spin / i1 - 2 * rates * cosine) ** 2
+        return PrecessionStability(rates, squares, steady.exists & ok)
+
+    ok, arrays = _top_arrays(top, theta=theta, omega3=omega3)
+    return where_defined(ok, formula, *arrays)
 
 
 class SatelliteStability(NamedTuple):
@@ -241,36 +150,30 @@ class SatelliteStability(NamedTuple):
         margins: Four numbers that are all positive where it is stable, each smooth through 0, of
             the moments (A, B, C) with k_R = (C - A)/B, k_Y = (C - B)/A: (B - A)/C (pitch), k_R k_Y,
             1 + 3 k_R + k_R k_Y, and its square less 16 k_R k_Y.
-        region: Index into `REGIONS`; "marginal" where nothing grows but a margin is not positive.
-        result: `jrigid.RESULTS` of the input.
+        region: One of `REGIONS`; "marginal" where nothing grows but a margin is not positive,
+            "undefined" for moments of no real body.
     """
 
     pitch_squared: Scalar
     roll_yaw_squared: Complex[Array, "2"]
     growth_rate: Scalar
     margins: Float[Array, "4"]
-    region: Int[Array, ""]
-    result: object
+    region: REGIONS
 
 
-def satellite_stability(
-    moments: VectorLike, orbital_rate: ScalarLike = 1.0, *, throw: bool = True
-) -> SatelliteStability:
+def satellite_stability(moments: VectorLike, orbital_rate: ScalarLike = 1.0) -> SatelliteStability:
     """Stability of a satellite held by the gravity gradient on a circular orbit.
 
     Args:
         moments: Principal moments about the axes that point along the radius (yaw), along the
             flight (roll) and along the normal of the orbit (pitch) [kg m^2].
         orbital_rate: n [rad/s].
-        throw: False: bad values are a result code and NaN.
 
     Returns:
         Growth rates, margins, and the region: Lagrange's (largest moment along the normal, smallest
-        along the radius), DeBra and Delp's, stable in the linear sense only, or unstable.
-
-    Raises:
-        ValueError: Wrong shape (trace time).
-        RuntimeError: Bad value (run time, any lane).
+        along the radius), DeBra and Delp's, stable in the linear sense only, or unstable. NaN
+        outside positive, finite moments and a finite rate. A region is of a real body: it is
+        "undefined" where one moment exceeds the sum of the others, which the equations allow.
 
     Gradients: of squares and margins exact where roll and yaw have different rates; of the growth
     rate as `growth_rate`.
@@ -278,39 +181,42 @@ def satellite_stability(
     Journal of the Astronautical Sciences 8 (1961) 14; derived in docs/stability.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> found = jr.stability.satellite_stability(jnp.array([1.0, 2.0, 2.5]))
-    >>> print(jr.stability.REGIONS[found.region], found.pitch_squared)
+    >>> satellite = jr.stability.satellite_stability(jnp.array([1.0, 2.0, 2.5]))
+    >>> print(jr.stability.REGIONS[satellite.region], satellite.pitch_squared)
     Lagrange -1.2
     """
     moments, n = float_arrays(moments, orbital_rate)
     check_shape("moments", moments, (3,))
     check_shape("orbital_rate", n, ())
-    findings = Findings()
-    findings.require(all_finite(moments) & jnp.all(moments > 0), RESULTS.invalid_inertia)
-    findings.require(all_finite(n), RESULTS.invalid_state)
-    ok = findings.ok
-    a, b, c = jnp.where(ok, moments, 1.0)
-    n = jnp.where(ok, n, 1.0)
+    ok = all_positive(moments) & jnp.isfinite(n)
+    whole, largest = jnp.sum(moments), jnp.max(moments)
+    real = ok & (2 * largest <= whole * (1 + _FLAT * jnp.finfo(moments.dtype).eps))
+    answer = where_defined(ok, _satellite, moments, n)
+    region = REGIONS.where(real, answer.region, REGIONS.undefined)
+    return answer._replace(region=region)
+
+
+def _satellite(moments: Array, n: Array) -> SatelliteStability:
+    a, b, c = moments
     roll, yaw = (c - a) / b, (c - b) / a
-    both, sum_ = roll * yaw, 1 + 3 * roll + roll * yaw
-    inside = sum_ * sum_ - 16 * both
+    both, middle = roll * yaw, 1 + 3 * roll + roll * yaw
+    inside = middle * middle - 16 * both
     pitch = 3 * (a - b) / c
-    # s^4 + sum s^2 + 4 both = 0, for s^2, in units of n
-    real = root_of_positive(inside)
-    first = -0.5 * (sum_ + jnp.where(sum_ < 0, -real, real))
-    second = jnp.where(first != 0, 4 * both / jnp.where(first != 0, first, 1.0), -sum_ - first)
+    # s^4 + middle s^2 + 4 both = 0, for s^2, in units of n
+    root = root_of_positive(inside)
+    first = -0.5 * (middle + jnp.where(middle < 0, -root, root))
+    second = jnp.where(first != 0, 4 * both / jnp.where(first != 0, first, 1.0), -middle - first)
     apart, spiral = inside < 0, 0.5 * root_of_positive(-inside)
     squares = jax.lax.complex(
-        jnp.where(apart, -0.5 * sum_, jnp.stack([first, second])), jnp.stack([spiral, -spiral])
+        jnp.where(apart, -0.5 * middle, jnp.stack([first, second])), jnp.stack([spiral, -spiral])
     )
     # Re sqrt(z) = sqrt((|z| + Re z) / 2), and |z| is 2 sqrt(both) for both of a complex pair.
-    of_spiral = root_of_positive(root_of_positive(both) - 0.25 * sum_)
+    of_spiral = root_of_positive(root_of_positive(both) - 0.25 * middle)
     of_real = root_of_positive(jnp.maximum(first, second))
     growth = jnp.maximum(root_of_positive(pitch), jnp.where(apart, of_spiral, of_real))
-    margins = jnp.stack([(b - a) / c, both, sum_, inside])
-    stable = jnp.all(margins > 0)
-    region = jnp.where(stable, jnp.where(yaw > 0, 1, 2), jnp.where(growth > 0, 0, 3))
-    found = (n * n * pitch, (n * n).astype(squares.dtype) * squares, jnp.abs(n) * growth, margins)
-    pitch, squares, growth, margins = findings.apply(nan_where(~ok, found), throw)
-    region = jnp.where(ok, region, -1)
-    return SatelliteStability(pitch, squares, growth, margins, region, findings.result)
+    margins = jnp.stack([(b - a) / c, both, middle, inside])
+    stable = REGIONS.where(yaw > 0, REGIONS.Lagrange, REGIONS.DeBra_Delp)
+    others = REGIONS.where(growth > 0, REGIONS.unstable, REGIONS.marginal)
+    region = REGIONS.where(jnp.all(margins > 0), stable, others)
+    squares = (n * n).astype(squares.dtype) * squares
+    return SatelliteStability(n * n * pitch, squares, jnp.abs(n) * growth, margins, region)

@@ -5,22 +5,23 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import (
     RESULTS,
     Findings,
     all_finite,
-    check_shape,
-    float_arrays,
+    all_positive,
     harmless,
-    is_unit,
     nan_where,
 )
-from jrigid._scales import ravel, units, unravel
+from jrigid._motion import check_motion, motion_arguments
+from jrigid._scales import units
 from jrigid.dynamics import State
 from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import RigidBody
@@ -29,22 +30,50 @@ from jrigid.systems import RigidBody
 _LARGEST_ERROR = {8: 1e-6, 4: 1e-3}
 
 
-class Walk(NamedTuple):
-    """A motion in equal steps, checked and measured.
+class Motion(NamedTuple):
+    """A motion that is asked for."""
 
-    The state is one array in its own scales; a tangent is (turn about the body axes, change of the
-    rate, change of the internal state) in the same.
-    """
-
-    advance: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
-    to_state: Callable[[Array], State]
-    on_sphere: Callable[[Array], Array]
-    field: Callable[[Array, Array], Array]
-    start: Array
+    system: RigidBody
+    state0: State
+    args: Any
     t0: Array
-    step: Array
-    dimension: int
-    findings: Findings
+    duration: Array
+
+    @property
+    def dimension(self) -> int:
+        """How many numbers a small motion beside it has."""
+        return 6 + sum(x.size for x in jtu.tree_leaves(self.state0.internal))
+
+
+def motion_of(system: Any, state0: Any, args: Any, t0: Any, duration: Any = 1.0) -> Motion:
+    """A motion with shapes checked and internal parts, its times in the precision of the state."""
+    system, state0, times = motion_arguments(system, state0, RigidBody, t0=t0, duration=duration)
+    t0, duration = (x.astype(state0.omega.dtype) for x in times)
+    return Motion(system, state0, args, t0, duration)
+
+
+def findings_of(motion: Motion) -> Findings:
+    """What is wrong with the values of the arguments."""
+    system, state0, args, t0, duration = motion
+    findings = Findings()
+    findings.require(
+        jnp.isfinite(t0), RESULTS.invalid_times, "Argument `t0` must be finite, but it is not.", t0
+    )
+    findings.require(
+        all_positive(duration),
+        RESULTS.invalid_times,
+        "Argument `duration` (or `step`) must be positive and finite, but it is not.",
+        duration,
+    )
+    check_motion(findings, system, state0, t0, args)
+    return findings
+
+
+def harmless_motion(ok: Array, motion: Motion) -> Motion:
+    """The motion, its attitude normalised; where it is bad another that can be followed."""
+    motion = harmless(ok, motion)
+    state0 = dataclasses.replace(motion.state0, attitude=normalize(motion.state0.attitude))
+    return motion._replace(state0=state0)
 
 
 def solver_of(solver: Any) -> Any:
@@ -59,149 +88,114 @@ def solver_of(solver: Any) -> Any:
     return solver
 
 
-def checked_state(system: Any, state: Any, name: str = "state0") -> State:
-    """Shapes and types, at trace time: the state, with its internal parts."""
-    if not isinstance(system, RigidBody):
-        raise ValueError(
-            f"Argument `system` must be a RigidBody, but it is {type(system).__name__}."
-        )
-    if not isinstance(state, State):
-        raise ValueError(f"Argument `{name}` must be a State, but it is {type(state).__name__}.")
-    attitude, omega = float_arrays(state.attitude, state.omega)
-    check_shape("attitude", attitude, (4,))
-    check_shape("omega", omega, (3,))
-    internal = jtu.tree_map(lambda x: jnp.asarray(x, omega.dtype), state.internal)
-    return system.with_parts(State(attitude, omega, internal))
+class Walk(eqx.Module):
+    """A motion in equal steps.
 
+    Its state is one array in its own scales; a tangent is (turn about the body axes, change of the
+    rate, change of the internal state) in the same.
+    """
 
-def checked_body(system: Any, state0: Any, duration: Any, t0: Any) -> tuple[State, Array, Array]:
-    """The state, and the times in a dtype that serves all."""
-    state0 = checked_state(system, state0)
-    duration, t0, attitude, omega = float_arrays(duration, t0, state0.attitude, state0.omega)
-    check_shape("duration", duration, ())
-    check_shape("t0", t0, ())
-    internal = jtu.tree_map(lambda x: x.astype(omega.dtype), state0.internal)
-    return State(attitude, omega, internal), duration, t0
+    motion: Motion
+    solver: Any
+    step: Array
+    scales: Array
 
+    @property
+    def start(self) -> Array:
+        """The state at the start."""
+        return ravel_pytree(self.motion.state0)[0] / self.scales
 
-def walk(
-    system: RigidBody,
-    state0: State,
-    duration: Array,
-    steps: int,
-    args: Any,
-    t0: Array,
-    solver: Any,
-) -> Walk:
-    """Set up `steps` equal steps over a duration."""
-    dtype = state0.omega.dtype
-    findings = Findings()
-    system.check(findings)
-    findings.require(all_finite(state0), RESULTS.invalid_state)
-    findings.require(is_unit(jax.lax.stop_gradient(state0.attitude)), RESULTS.invalid_attitude)
-    findings.require(
-        all_finite((duration, t0)) & (duration > 0),
-        RESULTS.invalid_times,
-        "Argument `duration` must be positive and finite, and `t0` finite, but they are not.",
-    )
-    field = system.vector_field(t0, state0, args)
-    findings.require(all_finite(field), RESULTS.invalid_vector_field)
-    ok = findings.ok
-    system, state0, args = harmless(ok, (system, state0, args))
-    identity = jnp.zeros(4, dtype).at[0].set(1)
-    attitude = normalize(jnp.where(ok, state0.attitude, identity))
-    state0 = dataclasses.replace(state0, attitude=attitude)
-    duration = jnp.where(ok, duration, 1.0).astype(dtype)
-    t0 = jnp.where(ok, t0, 0.0).astype(dtype)
-    _, _, scales = jax.lax.stop_gradient(units(system, state0, t0 + duration, t0, args))
-    size, dimension = scales.size, scales.size - 1
+    def state(self, y: Array) -> State:
+        """The state in SI units."""
+        return ravel_pytree(self.motion.state0)[1](y * self.scales)
 
-    def to_state(y: Array) -> State:
-        return unravel(y * scales, state0)
+    def on_sphere(self, y: Array) -> Array:
+        """The same with a quaternion of norm 1."""
+        attitude = normalize(y[:4] * self.scales[:4]) / self.scales[:4]
+        return jnp.concatenate([attitude, y[4:]])
 
-    def on_sphere(y: Array) -> Array:
-        return jnp.concatenate([normalize(y[:4] * scales[:4]) / scales[:4], y[4:]])
+    def rates(self, t: Array, y: Array) -> Array:
+        """Time derivative of the state."""
+        rates = self.motion.system.vector_field(t, self.state(y), self.motion.args)
+        return ravel_pytree(rates)[0] / self.scales
 
-    def rates(t: Array, y: Array) -> Array:
-        return ravel(system.vector_field(t, to_state(y), args)) / scales
-
-    def beside(y: Array, tangent: Array) -> Array:
-        """A tangent as a change of the state's components."""
-        turned = attitude_rate(to_state(y).attitude, tangent[:3])
-        return jnp.concatenate([turned / scales[:4], tangent[3:]])
-
-    def together(t: Any, both: Any, _: Any) -> Array:
-        y = both[:size]
-        tangents = both[size:].reshape(-1, dimension)
-        spin, unit = to_state(y).omega, scales[4]
-
+    def _together(self, t: Array, both: Array) -> Array:
+        """Time derivatives of a state and of the tangents that follow it in the array."""
+        size = self.scales.size
+        y, tangents = both[:size], both[size:].reshape(-1, size - 1)
         if not tangents.size:
-            return rates(t, y)
+            return self.rates(t, y)
+        state, unit = self.state(y), self.scales[4]
 
-        def of(tangent: Array) -> tuple[Array, Array]:
-            now, change = jax.jvp(lambda y: rates(t, y), (y,), (beside(y, tangent),))
-            turn = unit * tangent[3:6] - jnp.cross(spin, tangent[:3])
-            return now, jnp.concatenate([turn, change[4:]])
+        def beside(tangent: Array) -> tuple[Array, Array]:
+            turned = attitude_rate(state.attitude, tangent[:3]) / self.scales[:4]
+            moved = jnp.concatenate([turned, tangent[3:]])
+            rates, change = jax.jvp(lambda y: self.rates(t, y), (y,), (moved,))
+            turn = unit * tangent[3:6] - jnp.cross(state.omega, tangent[:3])
+            return rates, jnp.concatenate([turn, change[4:]])
 
         if len(tangents) == 1:
-            return jnp.concatenate(of(tangents[0]))
-        now, changes = jax.vmap(of, out_axes=(None, 0))(tangents)
-        return jnp.concatenate([now, changes.reshape(-1)])
+            return jnp.concatenate(beside(tangents[0]))
+        rates, changes = jax.vmap(beside, out_axes=(None, 0))(tangents)
+        return jnp.concatenate([rates, changes.reshape(-1)])
 
-    term = diffrax.ODETerm(together)
-    step = duration / steps
+    def _solve(self, t: Array, both: Array) -> tuple[Array, Array, Any]:
+        """One step of the solver: its end, its error, and what interpolates it."""
+        term = diffrax.ODETerm(lambda t, both, _: self._together(t, both))  # pyright: ignore
+        end = t + self.step
+        memory = self.solver.init(term, t, end, both, None)
+        return self.solver.step(term, t, end, both, None, memory, made_jump=False)[:3]
 
-    def advance(t: Array, y: Array, tangents: Array) -> tuple[Array, Array, Array]:
+    def advance(self, t: Array, y: Array, tangents: Array) -> tuple[Array, Array, Array]:
         """One step: the state, its tangents (a row each), the local error of the state."""
-        both = jnp.concatenate([y, tangents.reshape(-1)])
-        solver_state = solver.init(term, t, t + step, both, None)
-        after, error, _, _, _ = solver.step(
-            term, t, t + step, both, None, solver_state, made_jump=False
-        )
-        y = on_sphere(after[:size])
-        return y, after[size:].reshape(tangents.shape), jnp.max(jnp.abs(error[:size]))
+        size = self.scales.size
+        after, error, _ = self._solve(t, jnp.concatenate([y, tangents.reshape(-1)]))
+        local = jnp.max(jnp.abs(error[:size]))
+        return self.on_sphere(after[:size]), after[size:].reshape(tangents.shape), local
 
-    start = ravel(state0) / scales
-    return Walk(advance, to_state, on_sphere, rates, start, t0, step, dimension, findings)
+    def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
+        """States within one step, by the fraction of it that has passed."""
+        *_, dense = self._solve(t, y)
+        zero = jnp.zeros_like(t)
+        curve = self.solver.interpolation_cls(t0=zero, t1=zero + 1, **dense)
+        return lambda fraction: self.on_sphere(curve.evaluate(fraction))
+
+    def follow(self, first: Any, count: int, y: Array, rows: Array) -> tuple[Array, Array, Array]:
+        """Steps from the one of a number on: state, tangents, largest local error."""
+
+        def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
+            y, rows, error = carry
+            t = self.motion.t0 + self.step * (first + i).astype(y.dtype)
+            y, rows, local = self.advance(t, y, rows)
+            return (y, rows, jnp.maximum(error, local)), None
+
+        begin = (y, rows, jnp.zeros((), y.dtype))
+        return jax.lax.scan(step, begin, jnp.arange(count))[0]
 
 
-def follow(path: Walk, first: Any, count: int, y: Array, rows: Array) -> tuple[Array, Array, Array]:
-    """Some steps from the one of a number on: state, tangents, largest local error."""
-
-    def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
-        y, rows, error = carry
-        t = path.t0 + path.step * (first + i).astype(y.dtype)
-        y, rows, local = path.advance(t, y, rows)
-        return (y, rows, jnp.maximum(error, local)), None
-
-    begin = (y, rows, jnp.zeros((), y.dtype))
-    return jax.lax.scan(step, begin, jnp.arange(count))[0]
+def walk(motion: Motion, steps: int, solver: Any, ok: Array) -> Walk:
+    """Set up `steps` equal steps over the duration, harmless where the arguments are not ok."""
+    motion = harmless_motion(ok, motion)
+    system, state0, args, t0, duration = motion
+    _, _, scales = jax.lax.stop_gradient(units(system, state0, t0 + duration, t0, args))
+    return Walk(motion, solver, duration / steps, scales)
 
 
-def verdict(findings: Findings, error: Array, found: Any, throw: bool) -> tuple[Any, Array, Any]:
-    """What became of it: the code, whether it is good, and what was found, an error or NaN if not.
+def verdict(findings: Findings, error: Array, values: Any) -> tuple[Any, Array, Any]:
+    """What became of it: the code, whether it is good, the values, NaN if not.
 
-    Beside a bad input that is a motion that left its accuracy, or the numbers.
+    Beside bad arguments that is a motion that left its accuracy, or the numbers.
     """
-    worst = _LARGEST_ERROR[error.dtype.itemsize]
-    ok = findings.ok
-    findings.require(
-        (error <= worst) | ~ok,
-        RESULTS.inaccurate,
-        "Arguments `steps` or `step` must be fine enough for a local error below "
-        f"{worst:g} a step, but they are not.",
-    )
-    findings.require(all_finite(found) | ~ok, RESULTS.nonfinite_state)
-    ok = findings.ok
-    return findings.result, ok, findings.apply(nan_where(~ok, found), throw)
+    findings.require(error <= _LARGEST_ERROR[error.dtype.itemsize], RESULTS.inaccurate)
+    findings.require(all_finite(values), RESULTS.nonfinite_state)
+    return findings.result, findings.ok, nan_where(~findings.ok, values)
 
 
 def orthonormal(rows: Array) -> tuple[Array, Array]:
     """Rows made orthogonal one after the other, and the lengths that were left of them."""
     done: list[Array] = []
     lengths = []
-    for i in range(rows.shape[0]):
-        row = rows[i]
+    for row in rows:
         for other in done:
             row = row - jnp.sum(row * other) * other
         length = jnp.sqrt(jnp.sum(row * row))

@@ -3,29 +3,55 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jrigid._checks import RESULTS, check_option, check_shape, nan_where, whole_number
+from jrigid._checks import (
+    RESULTS,
+    Enumeration,
+    Findings,
+    all_finite,
+    check_inertia_shape,
+    check_option,
+    check_shape,
+    float_arrays,
+    is_inertia,
+    nan_where,
+    settle,
+    where_defined,
+    whole_number,
+)
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
-from jrigid.dynamics import State
+from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
-from jrigid.stability._roots import PlaceOfRoot
+from jrigid.stability._maps import place_of_root
 from jrigid.stability._steps import (
-    checked_body,
-    follow,
+    Motion,
+    Walk,
+    findings_of,
+    motion_of,
     solver_of,
     verdict,
     walk,
 )
 from jrigid.systems import RigidBody
 
-SIDES = ("along", "not settled", "against")
+_SETTLED = 5.0  # degrees from an axis within which a body counts as turning about it
+# Part of a step to which a crossing is located.
+_PLACE = {8: 1e-11, 4: 1e-5}
+
+
+class SIDES(Enumeration):
+    """On which side a tumbling body came to spin."""
+
+    along = "along"
+    not_settled = "not settled"
+    against = "against"
+    undefined = "undefined"
 
 
 class Section(NamedTuple):
@@ -80,138 +106,175 @@ def poincare_section(
         States and times of the crossings; a start on the surface itself is none.
 
     Raises:
-        ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value, a step too coarse (run time, any lane). Fewer crossings than asked
-            for are none: see `valid`.
+        RuntimeError: Bad value, a step too coarse. Fewer crossings than asked for are no error: see
+            `valid`.
 
     Gradients: none to be relied on.
-    Source: M. Henon, Physica D 5 (1982) 412; crossings are located as events of diffrax.
+    Source: M. Henon, Physica D 5 (1982) 412; a crossing is located by bisection of the solver's
+    own interpolation.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.3, 0.8]))
-    >>> found = jr.stability.poincare_section(body, state0, lambda t, s: s.omega[0], 3, 0.1)
-    >>> between = jnp.diff(found.ts) / jr.free.polhode_period(body.inertia, state0.omega)
+    >>> section = jr.stability.poincare_section(body, state0, lambda t, s: s.omega[0], 3, 0.1)
+    >>> between = jnp.diff(section.ts) / jr.free.polhode_period(body.inertia, state0.omega)
     >>> print(between.round(6))
     [1. 1.]
     """
     check_option("direction", direction, (True, False, None))
     crossings, steps = whole_number("crossings", crossings), whole_number("steps", steps)
-    state0, step, t0 = checked_body(system, state0, step, t0)
-    solver = solver_of(solver)
-    return _section(
-        system, state0, condition, crossings, step, args, t0, direction, steps, solver, throw
+    motion = motion_of(system, state0, args, t0, step)
+    plan = _Plan(condition, crossings, direction, steps)
+    section = _section(motion, plan, solver_of(solver))
+    return settle(section, throw, lambda: _section_findings(motion, condition))
+
+
+class _Plan(NamedTuple):
+    """What is looked for, and for how long."""
+
+    condition: Callable[[Any, State], Any]
+    crossings: int
+    direction: bool | None
+    steps: int
+
+
+def _section_findings(motion: Motion, condition: Callable) -> Findings:
+    findings = findings_of(motion)
+    value = jnp.asarray(condition(motion.t0, motion.state0), motion.t0.dtype)
+    check_shape("condition", value, ())
+    findings.require(
+        jnp.isfinite(value),
+        RESULTS.invalid_vector_field,
+        "Argument `condition` must be finite at the start, but it is not.",
+        value,
     )
+    return findings
+
+
+class _Place(NamedTuple):
+    """Where a search for crossings has come to; `above`: the condition is positive there."""
+
+    t: Array
+    y: Array
+    above: Array
+    alive: Array
+    error: Array
 
 
 @eqx.filter_jit
-def _section(
-    system: RigidBody,
-    state0: State,
-    condition: Callable,
-    crossings: int,
-    step: Array,
-    args: Any,
-    t0: Array,
-    direction: bool | None,
-    steps: int,
-    solver: Any,
-    throw: bool,
-) -> Section:
-    path = walk(system, state0, step, 1, args, t0, solver)
-    dtype = path.start.dtype
-    step, ok = path.step, path.findings.ok
-    field: Any = path.field
-    term = diffrax.ODETerm(lambda t, y, _: field(t, y))
-    eps = float(jnp.finfo(dtype).eps)
-    tolerance: Any = step * (1e-11 if eps < 1e-10 else 1e-5)
+def _section(motion: Motion, plan: _Plan, solver: Any) -> Section:
+    findings = _section_findings(motion, plan.condition)
+    path = walk(motion, 1, solver, findings.ok)
 
-    def of(t: Array, y: Array) -> Array:
-        found = jnp.asarray(condition(t, path.to_state(y)), dtype)
-        check_shape("condition", found, ())
-        return found
+    def value(t: Array, y: Array) -> Array:
+        return jnp.asarray(plan.condition(t, path.state(y)), y.dtype)
 
-    # Just after a crossing rounding may leave the motion before it: the first instant is taken to
-    # lie on the side to which it crossed.
-    def crossing(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        begun, y, side, alive, error = carry
+    def crossing(place: _Place, _: None) -> tuple[_Place, tuple]:
+        t, y, above, alive, error = _before_crossing(path, plan, value, place)
+        state = path.within(t, y)
 
-        def watched(t: Array, y: Array, args: Any, **_: Any) -> Array:
-            del args
-            value = of(t, y)
-            opening = (t <= begun + 1e-6 * step) & (side != 0)
-            return jnp.where(opening, side, value).astype(jnp.result_type(float))
+        def rising(part: Array, _: Any) -> Array:
+            ahead = value(t + part * path.step, state(part))
+            return jnp.where(above, -ahead, ahead)
 
-        finder = PlaceOfRoot(rtol=4 * eps, atol=tolerance)
-        event = diffrax.Event(watched, finder, direction)
-        end = begun + jnp.where(alive, step * steps, step)
-        solution = diffrax.diffeqsolve(
-            term, solver, begun, end, step, y, None,
-            saveat=diffrax.SaveAt(t1=True), event=event, max_steps=steps + 2, throw=False,
-        )  # fmt: skip
-        alive = alive & (solution.result == diffrax.RESULTS.event_occurred)
-        assert solution.ts is not None
-        assert solution.ys is not None
-        at, there = solution.ts[-1], solution.ys[-1]
-        there = jnp.where(alive, path.on_sphere(there), path.start)
-        at = jnp.where(alive, at, begun)
-        left = jnp.abs(of(at, there))
-        error = jnp.maximum(error, jnp.where(alive, path.advance(at, there, none)[2], 0.0))
-        found = (at, path.to_state(there), alive, left)
-        return (at, there, side_of(at, there), alive, error), found
+        part = place_of_root(rising, None, _PLACE[y.dtype.itemsize], y.dtype)
+        t, y = t + part * path.step, state(part)
+        crossed = _Place(t, y, ~above, alive, error)
+        return crossed, (t, path.state(y), alive, jnp.abs(value(t, y)))
 
-    def side_of(t: Array, y: Array) -> Array:
-        """To which side of the surface the motion goes from here."""
-        ahead = of(t + 1e-3 * step, y + 1e-3 * step * path.field(t, y))
-        return jnp.where(ahead > of(t, y), 1.0, -1.0).astype(dtype)
-
-    none = jnp.zeros((0, path.dimension), dtype)
-    value = of(path.t0, path.start)
-    path.findings.require(
-        jnp.isfinite(jax.lax.stop_gradient(value)) | ~ok,
-        RESULTS.invalid_vector_field,
-        "Argument `condition` must be finite at the start, but it is not.",
-    )
-    # A start on the surface itself is no crossing.
-    side = jnp.where(value == 0, side_of(path.t0, path.start), 0.0).astype(dtype)
-    error = path.advance(path.t0, path.start, none)[2]
-    begin = (path.t0, path.start, side, path.findings.ok, error)
-    (*_, error), found = jax.lax.scan(crossing, begin, None, length=crossings)
-    ts, states, valid, left = found
-    result, ok, (ts, states) = verdict(path.findings, error, (ts, states), throw)
+    t, y = path.motion.t0, path.start
+    # A start on the surface itself is no crossing: the motion is where it goes from there.
+    now, small = value(t, y), 1e-3 * path.step
+    ahead = value(t + small, y + small * path.rates(t, y))
+    above = jnp.where(now == 0, ahead > now, now > 0)
+    begin = _Place(t, y, above, findings.ok, jnp.zeros_like(t))
+    place, crossings = jax.lax.scan(crossing, begin, None, length=plan.crossings)
+    ts, states, valid, left = crossings
+    result, ok, (ts, states) = verdict(findings, place.error, (ts, states))
     valid = valid & ok
     ts, states = jax.vmap(lambda good, x: nan_where(~good, x))(valid, (ts, states))
     return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), result)
 
 
+def _before_crossing(path: Walk, plan: _Plan, value: Callable, place: _Place) -> _Place:
+    """The start of the step in which the motion crosses; not alive if there is none."""
+    none = jnp.zeros((0, path.scales.size - 1), path.scales.dtype)
+
+    def goes_on(search: tuple[_Place, Array, Array]) -> Array:
+        place, count, crossed = search
+        return place.alive & ~crossed & (count < plan.steps)
+
+    def step(search: tuple[_Place, Array, Array]) -> tuple[_Place, Array, Array]:
+        (t, y, above, alive, error), count, _ = search
+        after, _, local = path.advance(t, y, none)
+        count = count + 1
+        later = begun + path.step * count.astype(t.dtype)
+        higher = value(later, after) >= 0
+        wanted = True if plan.direction is None else higher == plan.direction
+        crossed = (higher != above) & wanted
+        t, y, above = (
+            jnp.where(crossed, old, new) for old, new in ((t, later), (y, after), (above, higher))
+        )
+        return _Place(t, y, above, alive, jnp.maximum(error, local)), count, crossed
+
+    begun = place.t
+    zero = jnp.zeros((), jnp.int32)
+    place, _, crossed = jax.lax.while_loop(goes_on, step, (place, zero, jnp.asarray(False)))
+    return place._replace(alive=crossed)
+
+
 def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time between two flips of a free body about its intermediate axis: the tennis racket's.
 
-    A flip is a change of sign of the angular velocity's component along the intermediate axis.
+    A body flips if, on its polhode, it now and then turns faster about the intermediate axis than
+    about each of the others. That component of the angular velocity then changes its sign twice in
+    a period of the polhode, and the body's intermediate axis turns over against the angular
+    momentum. A body that always turns mainly about the axis of its largest or smallest moment only
+    wobbles, and never flips.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity at any time, body components [rad/s].
 
     Returns:
-        Half of the period of the polhode [s]; infinite on the separatrix and at rest.
+        Half of the period of the polhode [s]; infinite where the body never flips: such a wobble,
+        any steady rotation, the separatrix, rest, a body of two equal moments. NaN outside finite,
+        positive definite inertia and finite rates.
 
-    Gradients: those of `jrigid.free.polhode_period`.
+    Gradients: those of `jrigid.free.polhode_period`; 0 where it is infinite.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; near the separatrix it grows like
     twice the logarithm of one over the offset, over `growth_rate`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.stability.flip_time([1.0, 2.0, 3.0], [1e-3, 1.0, 0.0]).round(4))
+    >>> racket = jnp.array([1.0, 2.0, 3.0])
+    >>> print(jr.stability.flip_time(racket, [1e-3, 1.0, 0.0]).round(4))
     28.7314
+    >>> print(jr.stability.flip_time(racket, [1e-3, 0.0, 1.0]))
+    inf
     """
-    return 0.5 * polhode_period(inertia, omega)
+    inertia, omega = float_arrays(inertia, omega)
+    check_inertia_shape(inertia)
+    check_shape("omega", omega, (3,))
+
+    def formula(inertia: Array, omega: Array) -> Scalar:
+        known, rates = jax.lax.stop_gradient((inertia, omega))
+        i1, i2, i3 = jnp.sort(known) if known.ndim == 1 else principal_axes(known).moments
+        square = jnp.sum(angular_momentum(known, rates) ** 2)
+        twice = 2 * kinetic_energy(known, rates)
+        # Where w2 is largest one of the others is 0, and w2^2 exceeds the square of the third.
+        outer = jnp.where(square > twice * i2, i3, i1)
+        faster = jnp.abs(twice * outer - square) * outer > jnp.abs(square - twice * i2) * i2
+        flips = faster & (i1 < i2) & (i2 < i3)
+        return jnp.where(flips, 0.5 * polhode_period(inertia, omega), jnp.inf)
+
+    return where_defined(is_inertia(inertia) & all_finite(omega), formula, inertia, omega)
 
 
 class FinalSpin(NamedTuple):
     """On which side a tumbling body came to spin.
 
     Attributes:
-        side: Index into `SIDES`: whether it turns along the axis of largest moment, against it, or
+        side: One of `SIDES`: whether it turns along the axis of largest moment, against it, or
             is not within 5 degrees of either.
         alignment: Cosine of the angle between the angular velocity and that axis.
         state: At the end.
@@ -219,7 +282,7 @@ class FinalSpin(NamedTuple):
         result: `jrigid.RESULTS`.
     """
 
-    side: Int[Array, ""]
+    side: SIDES
     alignment: Scalar
     state: State
     error: Scalar
@@ -259,8 +322,7 @@ def final_spin(
         The side, or that it has not settled.
 
     Raises:
-        ValueError: Wrong shape or option (trace time).
-        RuntimeError: Bad value, steps too coarse (run time, any lane).
+        RuntimeError: Bad value, steps too coarse.
 
     Gradients: of the state and the alignment, in forward mode; the side has none.
     Source: R. N. Bracewell, O. K. Garriott, Nature 182 (1958) 760, for the rule.
@@ -269,39 +331,33 @@ def final_spin(
     >>> damper = jr.torques.InternalDamper(0.3, 0.2)
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), damper)
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.1, 0.2]))
-    >>> found = jr.stability.final_spin(body, state0, 500.0, 2000)
-    >>> print(abs(found.alignment).round(6), jr.stability.SIDES[found.side])
+    >>> final = jr.stability.final_spin(body, state0, 500.0, 2000)
+    >>> print(abs(final.alignment).round(6), jr.stability.SIDES[final.side])
     1.0 against
     """
     steps = whole_number("steps", steps)
-    state0, duration, t0 = checked_body(system, state0, duration, t0)
-    return _final_spin(system, state0, duration, steps, args, t0, solver_of(solver), throw)
+    motion = motion_of(system, state0, args, t0, duration)
+    final = _final_spin(motion, steps, solver_of(solver))
+    return settle(final, throw, lambda: findings_of(motion))
 
 
 @eqx.filter_jit
-def _final_spin(
-    system: RigidBody,
-    state0: State,
-    duration: Array,
-    steps: int,
-    args: Any,
-    t0: Array,
-    solver: Any,
-    throw: bool,
-) -> FinalSpin:
-    path = walk(system, state0, duration, steps, args, t0, solver)
-    none = jnp.zeros((0, path.dimension), path.start.dtype)
-    y, _, error = follow(path, 0, steps, path.start, none)
-    state = path.to_state(y)
-    inertia = jnp.where(path.findings.ok, system.inertia, jnp.ones_like(system.inertia))
+def _final_spin(motion: Motion, steps: int, solver: Any) -> FinalSpin:
+    findings = findings_of(motion)
+    path = walk(motion, steps, solver, findings.ok)
+    none = jnp.zeros((0, motion.dimension), path.scales.dtype)
+    y, _, error = path.follow(0, steps, path.start, none)
+    state = path.state(y)
+    inertia = path.motion.system.inertia
     if inertia.ndim == 1:
         axis = jnp.eye(3, dtype=y.dtype)[jnp.argmax(inertia)]
     else:
-        axis = principal_axes(system.inertia).axes[:, 2].astype(y.dtype)
+        axis = principal_axes(inertia).axes[:, 2].astype(y.dtype)
     rate = safe_norm(state.omega)
     alignment = jnp.sum(state.omega * axis) / jnp.where(rate > 0, rate, 1.0)
-    result, ok, found = verdict(path.findings, error, (alignment, state), throw)
-    alignment, state = found
-    settled = jnp.abs(alignment) > jnp.cos(jnp.radians(jnp.asarray(5.0, y.dtype)))
-    side = jnp.where(settled, jnp.where(alignment > 0, 0, 2), 1)
-    return FinalSpin(jnp.where(ok, side, -1), alignment, state, error, result)
+    result, ok, (alignment, state) = verdict(findings, error, (alignment, state))
+    settled = jnp.abs(alignment) > jnp.cos(jnp.radians(jnp.asarray(_SETTLED, y.dtype)))
+    side = SIDES.where(alignment > 0, SIDES.along, SIDES.against)
+    side = SIDES.where(settled, side, SIDES.not_settled)
+    side = SIDES.where(ok, side, SIDES.undefined)
+    return FinalSpin(side, alignment, state, error, result)
