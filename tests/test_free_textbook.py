@@ -328,11 +328,11 @@ def test_linearised_motion_agrees_to_the_square_of_the_wobble(axis):
         omega[axis] = 1.3
         ts = np.linspace(-4.0, 6.0, 11)
         exact = np.asarray(motion_of(MOMENTS, omega, ts).omega)
-        linear = np.asarray(free.linearized(MOMENTS, axis, omega, ts))
+        linear = np.asarray(jr.stability.linearized(MOMENTS, axis, omega, ts))
         wobble = np.max(np.abs(np.delete(exact, axis, axis=1)))
         assert np.max(np.abs(exact - linear)) < 2 * wobble**2
         assert wobble < 100 * size
-    growth = free.growth_rate_squared(MOMENTS, axis, 1.3)
+    growth = jr.stability.growth_rate_squared(MOMENTS, axis, 1.3)
     assert (growth > 0) == (axis == 1)
     if axis != 1:
         period = free.polhode_period(MOMENTS, 1.3 * np.eye(3)[axis])
@@ -340,7 +340,7 @@ def test_linearised_motion_agrees_to_the_square_of_the_wobble(axis):
 
 
 def test_linearised_motion_stays_finite_and_the_modulus_at_most_one():
-    far = free.linearized(MOMENTS, 1, np.array([1e-3, 1.0, 0.0]), np.array([2000.0, -1e6]))
+    far = jr.stability.linearized(MOMENTS, 1, np.array([1e-3, 1.0, 0.0]), np.array([2000.0, -1e6]))
     assert np.all(np.isfinite(far))
     assert free.parameter(np.array([1.0, 2.0, 2.25]), np.array([0.75, 0.5, 1.0])) <= 1
 
@@ -362,8 +362,10 @@ def test_a_body_less_symmetric_than_it_is_flat_has_no_wobble_rate():
 
 
 def test_linearised_sphere_and_symmetric_body_are_exact_limits():
-    np.testing.assert_array_equal(free.growth_rate_squared(np.ones(3), 0, 2.0), 0.0)
-    slope = jax.jacfwd(lambda i: free.linearized(i, 2, np.array([0.1, 0.2, 1.0]), 3.0))(np.ones(3))
+    np.testing.assert_array_equal(jr.stability.growth_rate_squared(np.ones(3), 0, 2.0), 0.0)
+    slope = jax.jacfwd(lambda i: jr.stability.linearized(i, 2, np.array([0.1, 0.2, 1.0]), 3.0))(
+        np.ones(3)
+    )
     # w1' = (I2 - I3) w2 w3 / I1: a first step of the motion, 3 seconds long
     np.testing.assert_allclose(slope[0], [0.0, 0.6, -0.6], atol=1e-14)
     np.testing.assert_allclose(slope[1], [-0.3, 0.0, 0.3], atol=1e-14)
@@ -536,7 +538,7 @@ def test_wrong_shapes_and_options(untyped):
         with pytest.raises(ValueError, match="`points` must be an integer and at least 2"):
             free.polhode(MOMENTS, np.ones(3), points)
     with pytest.raises(ValueError, match="`axis` must be one of 0, 1, 2"):
-        free.growth_rate_squared(MOMENTS, 3, 1.0)
+        jr.stability.growth_rate_squared(MOMENTS, 3, 1.0)
     with pytest.raises(ValueError, match=r"`omega` must have shape \(3,\)"):
         free.polhode_period(MOMENTS, np.ones(4))
     with pytest.raises(ValueError, match=r"`duration` must have shape \(\)"):

@@ -459,10 +459,12 @@ CASES = {
     "free.polhode": of_body(lambda i, w: free.polhode(i, w, 5)),
     "free.separatrix": Case(free.separatrix, (MOMENTS,), ("free.Separatrix",)),
     "free.poinsot": Case(free.poinsot, (MOMENTS, OMEGA), ("free.Poinsot",)),
-    "free.growth_rate_squared": Case(
-        lambda i, spin: free.growth_rate_squared(i, 1, spin), (MOMENTS, 1.3)
+    "stability.growth_rate_squared": Case(
+        lambda i, spin: stability.growth_rate_squared(i, 1, spin), (MOMENTS, 1.3)
     ),
-    "free.linearized": Case(lambda i, w, t: free.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)),
+    "stability.linearized": Case(
+        lambda i, w, t: stability.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)
+    ),
     # lagrangian
     "lagrangian.acceleration": Case(
         all_of_a_lagrangian,

@@ -6,8 +6,6 @@ from jrigid.free._curves import herpolhode as herpolhode
 from jrigid.free._curves import poinsot as poinsot
 from jrigid.free._curves import polhode as polhode
 from jrigid.free._curves import separatrix as separatrix
-from jrigid.free._linear import growth_rate_squared as growth_rate_squared
-from jrigid.free._linear import linearized as linearized
 from jrigid.free._motion import free_rotation as free_rotation
 from jrigid.free._motion import relative_rotation as relative_rotation
 from jrigid.free._periods import REGIMES as REGIMES
