@@ -96,7 +96,6 @@ def test_the_ten_numbers_are_the_factor_of_the_pseudo_inertia(rng):
 def test_any_ten_numbers_are_a_real_body_s(rng):
     for _ in range(20):
         body = identify.body_from_log_cholesky(rng.normal(size=10))
-        assert body.result == jr.RESULTS.successful
         jr.MassProperties(body.mass, body.center_of_mass, body.inertia)  # checks and does not raise
 
 

@@ -167,9 +167,9 @@ class MassProperties(Readable):
         >>> print(ball.translated(jnp.array([0.0, 2.0, 0.0])).center_of_mass)
         [0. 2. 0.]
         """
-        body, displacement = _in_one_dtype(self, displacement)
-        check_shape("displacement", displacement, (3,))
-        return MassProperties.unchecked(body.mass, body.center_of_mass + displacement, body.inertia)
+        body, shift = _in_one_dtype(self, displacement)
+        check_shape("displacement", shift, (3,))
+        return MassProperties.unchecked(body.mass, body.center_of_mass + shift, body.inertia)
 
     def rotated(self, attitude: QuaternionLike) -> "MassProperties":
         """The body turned about the origin of the coordinates.
@@ -188,9 +188,9 @@ class MassProperties(Readable):
         >>> print(turned.center_of_mass.round(6)[2])
         -1.0
         """
-        body, attitude = _in_one_dtype(self, attitude)
-        check_shape("attitude", attitude, (4,))
-        return _rotated(body, attitude)
+        body, turn = _in_one_dtype(self, attitude)
+        check_shape("attitude", turn, (4,))
+        return _rotated(body, turn)
 
     def principal_axes(self) -> PrincipalAxes:
         """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`.

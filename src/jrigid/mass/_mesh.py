@@ -155,17 +155,17 @@ def from_mesh(
     vertices, density = float_arrays(vertices, density)
     check_shape("vertices", vertices, (None, 3))
     check_shape("density", density, ())
-    faces = _index_array(faces)
-    closed_of = is_closed if isinstance(faces, np.ndarray) else is_closed_traced
+    indices = _index_array(faces)
+    closed: Any = is_closed if isinstance(indices, np.ndarray) else is_closed_traced
     findings = Findings()
     finite = jnp.all(jnp.isfinite(vertices), axis=1)
     message = "Argument `vertices` must be finite, but it is not."
     findings.require(jnp.all(finite), None, message, vertices[jnp.argmin(finite)])
     message = "Argument `density` must be positive and finite, but it is not."
     findings.require((density > 0) & jnp.isfinite(density), None, message, density)
-    findings.require(jnp.asarray(closed_of(faces, vertices.shape[0])), None, _OPEN)
+    findings.require(jnp.asarray(closed(indices, vertices.shape[0])), None, _OPEN)
     vertices, density = harmless(findings.ok, (vertices, density))
-    volume, magnitude, center, tensor = _mesh_integrals(vertices, faces)
+    volume, magnitude, center, tensor = _mesh_integrals(vertices, indices)
     rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude
     findings.require(jax.lax.stop_gradient(volume) > rounding, None, _INSIDE_OUT)
     positive, triangle = is_physical(tensor)

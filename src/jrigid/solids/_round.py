@@ -50,7 +50,8 @@ def shell(mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike) 
         # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
         q = inner / outer
         ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
-        return (0.4 * outer * outer * ratio,) * 3
+        moment = 0.4 * outer * outer * ratio
+        return moment, moment, moment
 
     return solid(
         moments, mass, inner_radius=inner_radius, outer_radius=outer_radius, fits=_in_order
@@ -133,8 +134,14 @@ def tube(
         transverse = height * height / 12 + squares / 4
         return transverse, transverse, squares / 2
 
-    radii = {"inner_radius": inner_radius, "outer_radius": outer_radius}
-    return solid(moments, mass, **radii, height=height, fits=_in_order)
+    return solid(
+        moments,
+        mass,
+        inner_radius=inner_radius,
+        outer_radius=outer_radius,
+        height=height,
+        fits=_in_order,
+    )
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
