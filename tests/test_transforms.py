@@ -478,8 +478,10 @@ CASES = {
         methods("top.SymmetricTop", "as_rigid_body", "from_mass_properties"),
     ),
     "top.top_motion": Case(
-        lambda i1, i3, mgl, q, w, t: jr.top_motion(
-            jr.SymmetricTop(i1, i3, mgl), jr.State(rotation.normalize(q), w), t
+        lambda i1, i3, mgl, q, w, t: (
+            jr.top_motion(
+                jr.SymmetricTop(i1, i3, mgl), jr.State(rotation.normalize(q), w), t
+            ).states
         ),
         (1.0, 0.6, 0.8, ATTITUDE, OMEGA, 3.0),
     ),
