@@ -49,7 +49,7 @@ MODULES = {
 # Abstract classes, aliases and records: nothing to call.
 NOTHING_TO_CALL = {
     "torques.AbstractTorque", "torques.TorqueFunction", "systems.AbstractSystem",
-    "dynamics.ExactStates", "dynamics.plain_state",
+    "dynamics.ExactStates",
     "identify.AbstractObservation", "identify.AngularMomenta", "identify.Attitudes",
     "identify.Directions", "identify.Observed", "identify.Rates", "identify.FitResult",
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",
@@ -459,12 +459,6 @@ CASES = {
     "free.polhode": of_body(lambda i, w: free.polhode(i, w, 5)),
     "free.separatrix": Case(free.separatrix, (MOMENTS,), ("free.Separatrix",)),
     "free.poinsot": Case(free.poinsot, (MOMENTS, OMEGA), ("free.Poinsot",)),
-    "stability.growth_rate_squared": Case(
-        lambda i, spin: stability.growth_rate_squared(i, 1, spin), (MOMENTS, 1.3)
-    ),
-    "stability.linearized": Case(
-        lambda i, w, t: stability.linearized(i, 1, w, t), (MOMENTS, OMEGA, 2.0)
-    ),
     # lagrangian
     "lagrangian.acceleration": Case(
         all_of_a_lagrangian,

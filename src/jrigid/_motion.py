@@ -21,6 +21,7 @@ from jrigid._checks import (
     is_unit,
 )
 from jrigid._numerics import safe_norm
+from jrigid.dynamics import State
 from jrigid.systems import AbstractSystem, RigidBody
 
 _SIZES = {"position": 3, "velocity": 3, "attitude": 4, "omega": 3}
@@ -81,6 +82,21 @@ def _checked_state(system: AbstractSystem, state: Any, name: str) -> Any:
         state, **dict(zip(fields, known, strict=True)), internal=structure.unflatten(parts)
     )
     return system.with_parts(state)
+
+
+def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array, ...]]:
+    """A state without internal parts and other arrays in one dtype, or ValueError."""
+    check_type(name, state, State)
+    if jtu.tree_leaves(state.internal):
+        raise ValueError(
+            f"Argument `{name}.internal` must be empty, but it is not: a body with moving parts "
+            "has no motion in closed form; use `jrigid.simulate`."
+        )
+    attitude, omega, *converted = float_arrays(state.attitude, state.omega, *others)
+    check_shape(f"{name}.attitude", attitude, (4,))
+    check_shape(f"{name}.omega", omega, (3,))
+    check_precision(omega.dtype)
+    return State(attitude, omega), tuple(converted)
 
 
 def numbers(**values: Any) -> tuple[Array, ...]:

@@ -5,14 +5,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
     check_inertia_shape,
-    check_precision,
     check_shape,
-    check_type,
     float_arrays,
     internal_parts,
     state_array,
@@ -62,21 +59,6 @@ class ExactStates(Readable):
     def omega(self) -> Float[Array, "... 3"]:
         """Angular velocities, body components [rad/s]."""
         return self.states.omega
-
-
-def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array, ...]]:
-    """A state without internal parts and other arrays in one dtype, or ValueError."""
-    check_type(name, state, State)
-    if jtu.tree_leaves(state.internal):
-        raise ValueError(
-            f"Argument `{name}.internal` must be empty, but it is not: a body with moving parts "
-            "has no motion in closed form; use `jrigid.simulate`."
-        )
-    attitude, omega, *converted = float_arrays(state.attitude, state.omega, *others)
-    check_shape(f"{name}.attitude", attitude, (4,))
-    check_shape(f"{name}.omega", omega, (3,))
-    check_precision(omega.dtype)
-    return State(attitude, omega), tuple(converted)
 
 
 def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:

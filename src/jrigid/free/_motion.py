@@ -22,10 +22,11 @@ from jrigid._checks import (
     settle,
     where_defined,
 )
+from jrigid._motion import plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, eigh_of_distinct, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, ScalarLike, Vector, VectorLike
-from jrigid.dynamics import ExactStates, State, plain_state
+from jrigid.dynamics import ExactStates, State
 from jrigid.free._flow import Invariants, after, invariants
 from jrigid.rotation import multiply, normalize
 

@@ -20,8 +20,9 @@ from jrigid._checks import (
     is_unit,
     where_defined,
 )
+from jrigid._motion import plain_state
 from jrigid._types import Readable, VectorLike
-from jrigid.dynamics import State, plain_state
+from jrigid.dynamics import State
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 from jrigid.torques import UniformGravity
