@@ -124,6 +124,11 @@ def test_codes_are_listed_each_with_a_text():
     names = [x for x in dir(RESULTS) if isinstance(getattr(RESULTS, x), RESULTS)]
     assert {"successful", "invalid_inertia", "max_steps_reached"} <= set(names)
     assert all(RESULTS[getattr(RESULTS, name)] for name in names)
+    found = jax.vmap(lambda x: work(MOMENTS, x, throw=False))(XS)
+    texts = RESULTS[found.result]
+    assert texts.shape == (3,)
+    assert texts[0] == "All went well."
+    assert "must be finite" in texts[1]
 
 
 def test_a_readable_module_shows_its_numbers():

@@ -29,7 +29,9 @@ class _Listed(type(eqx.Enumeration)):
     def __dir__(cls) -> list[str]:
         return [*super().__dir__(), *cls._name_to_item]
 
-    def __getitem__(cls, item: Any) -> str:
+    def __getitem__(cls, item: Any) -> Any:
+        if isinstance(item, cls) and item._value.ndim and is_concrete(item._value):
+            return np.array(cls.texts)[np.asarray(item._value)]  # a text for each lane
         return super().__getitem__(item) or "All went well."
 
     @property
