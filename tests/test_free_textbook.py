@@ -545,3 +545,18 @@ def test_wrong_shapes_and_options(untyped):
         free.relative_rotation(MOMENTS, np.ones(3), np.ones(2))
     with pytest.raises(ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"):
         free.separatrix(np.ones(2))
+
+
+def test_times_that_their_dtype_cannot_tell_apart_are_an_error():
+    """Unix time in float32: its numbers are 128 seconds apart."""
+    single = [jnp.asarray(x, jnp.float32) for x in ([1.0, 2.0, 3.0], [1.0, 0, 0, 0], [0.1, 1, 0.2])]
+    state0 = jr.State(*single[1:])
+    ts = jnp.asarray(1.7e9 + np.arange(11.0), jnp.float32)
+    with pytest.raises(RuntimeError, match=r"tells apart times .*Subtract the epoch"):
+        jr.free_rotation(single[0], state0, ts, t0=jnp.float32(1.7e9))
+    motion = jr.free_rotation(single[0], state0, ts, t0=jnp.float32(1.7e9), throw=False)
+    assert motion.result == jr.RESULTS.unresolved_times
+    assert np.isnan(motion.omega).all()
+    top = jr.SymmetricTop(*(jnp.float32(x) for x in (1.0, 0.5, 1.0)))
+    with pytest.raises(RuntimeError, match="tells apart times"):
+        jr.top_motion(top, state0, ts, t0=jnp.float32(1.7e9))

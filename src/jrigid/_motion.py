@@ -99,6 +99,16 @@ def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array
     return State(attitude, omega), tuple(converted)
 
 
+# Times are told apart while their last bit is worth less than this turn [rad].
+_BLUR = 0.1
+
+
+def resolves(t0: Array, rate: Array) -> Array:
+    """Whether times near `t0` can be told apart in their dtype, for a body that turns at a rate."""
+    blur = (jnp.finfo(t0.dtype).eps * jnp.abs(t0)).astype(rate.dtype)
+    return ~(blur * rate > _BLUR)
+
+
 def numbers(**values: Any) -> tuple[Array, ...]:
     """Floating point arrays of one dtype, or a ValueError that names what is not numbers."""
     for name, value in values.items():

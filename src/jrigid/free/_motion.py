@@ -22,7 +22,7 @@ from jrigid._checks import (
     settle,
     where_defined,
 )
-from jrigid._motion import plain_state
+from jrigid._motion import plain_state, resolves
 from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, eigh_of_distinct, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, ScalarLike, Vector, VectorLike
@@ -92,6 +92,8 @@ def _findings(inertia: Array, state0: State, ts: Array, t0: Array) -> Findings:
     for name, times in (("t0", t0), ("ts", ts)):
         message = f"Argument `{name}` must be finite, but it is not."  # the sum shows in what way
         findings.require(all_finite(times), RESULTS.invalid_times, message, jnp.sum(times))
+    told_apart = resolves(t0, safe_norm(state0.omega))
+    findings.require(told_apart, RESULTS.unresolved_times, value=t0)
     return findings
 
 

@@ -18,8 +18,6 @@ _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
 _CHECKPOINTS = 100
 _ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
-# Times are told apart if the rounding of `t0` is no more than this part of a radian.
-BLUR = 0.1
 
 
 class Inputs(NamedTuple):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Real
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
-from jrigid._motion import HasRigidBody, motion_arguments
+from jrigid._motion import HasRigidBody, motion_arguments, resolves
 from jrigid._numerics import power_of_two
 from jrigid._scales import ravel, spectral_radius, undamped_rate, units
 from jrigid._types import ScalarLike
@@ -29,7 +29,7 @@ from jrigid.simulate._controller import (
     guarded,
 )
 from jrigid.simulate._event import event_in_si
-from jrigid.simulate._options import BLUR, Inputs, Options, checked_options, judged
+from jrigid.simulate._options import Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem
@@ -245,8 +245,7 @@ def _measured(findings: Findings, inputs: Inputs, options: Options) -> _Run:
     start = t0.astype(dtype)
     measures = units(system, state0, since_start[-1], start, args, _fastest_of(options.solver, 2))
     rate, fastest, scales = harmless(ok, jax.lax.stop_gradient(measures))
-    blur = jnp.finfo(t0.dtype).eps * jnp.abs(t0)
-    findings.require(~(blur.astype(dtype) * fastest > BLUR), RESULTS.unresolved_times)
+    findings.require(resolves(t0, fastest), RESULTS.unresolved_times)
     since_start = jnp.where(findings.ok, since_start, jnp.zeros_like(since_start))
     moving = since_start[-1] > 0  # all times at t0: nothing to integrate
     stretch = power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by

@@ -15,6 +15,8 @@ from jrigid._checks import (
     nan_where,
     settle,
 )
+from jrigid._motion import resolves
+from jrigid._numerics import safe_norm
 from jrigid._types import ScalarLike
 from jrigid.dynamics import ExactStates, State
 from jrigid.top._flow import invariants, state_after
@@ -78,6 +80,8 @@ def _findings(top: SymmetricTop, state0: State, ts: Array, t0: Array) -> Finding
     findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude, value=state0.attitude)
     findings.require(all_finite(ts), RESULTS.invalid_times, _BAD_TIMES, jnp.sum(ts))
     findings.require(all_finite(t0), RESULTS.invalid_times, _BAD_START, t0)
+    told_apart = resolves(t0, safe_norm(state0.omega))
+    findings.require(told_apart, RESULTS.unresolved_times, value=t0)
     return findings
 
 

@@ -1,0 +1,66 @@
+"""Every way to differentiate an integration gives the same derivative, under every torque."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jrigid as jr
+
+MOMENTS = jnp.array([1.0, 1.6, 2.1])
+OMEGA = jnp.array([0.3, 1.0, -0.4])
+ATTITUDE = jr.rotation.exp(jnp.array([0.3, 0.2, 0.1]))
+TS = jnp.array([1.0, 4.0])
+PUSH = jr.torques.Torque(lambda t, *_: jnp.array([0.3, 0.0, 0.0]) * jnp.sin(1.7 * t))
+ALONG_Z = jnp.array([0.0, 0.0, 1.0])
+TORQUES = {
+    "none": None,
+    "constant": jr.torques.Constant(jnp.array([0.1, 0.0, 0.2])),
+    "function of time": PUSH,
+    "linear drag": jr.torques.LinearDrag(0.2),
+    "quadratic drag": jr.torques.QuadraticDrag(0.2),
+    "friction": jr.torques.CoulombFriction(0.1, 0.05),
+    "weight": jr.torques.UniformGravity(1.0, jnp.array([0.1, 0.0, 0.3]), -ALONG_Z),
+    "gravity gradient": jr.torques.GravityGradient(0.3, jr.torques.KeplerOrbit(1.0, 1.0, 0.2)),
+    "magnet": jr.torques.MagneticDipole(jnp.array([0.2, 0.0, 0.1]), ALONG_Z),
+    "rotor": jr.torques.Rotor(lambda t: jnp.array([0.0, 0.2, 0.3]) * jnp.cos(t)),
+    "wheel": jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0])),
+    "damper": jr.torques.InternalDamper(0.3, 0.1),
+    "damper and function of time": jr.torques.InternalDamper(0.3, 0.1) + PUSH,
+}
+
+
+def last_rate(parameters, torque, adjoint):
+    body = jr.RigidBody(parameters[:3], torque)
+    state0 = jr.State(ATTITUDE, parameters[3:])
+    steps = 256 if isinstance(adjoint, diffrax.DirectAdjoint) else None
+    return jr.simulate(body, state0, TS, adjoint=adjoint, max_steps=steps).states.omega[-1]
+
+
+PARAMETERS = jnp.concatenate([MOMENTS, OMEGA])
+FORWARD, DIRECT = diffrax.ForwardMode(), diffrax.DirectAdjoint()
+
+
+def test_what_direct_computes_twice_is_the_same_motion():
+    torque = TORQUES["damper and function of time"]
+    slopes = jax.jacrev(lambda p: last_rate(p, torque, DIRECT))(PARAMETERS)
+    expected = jax.jacfwd(lambda p: last_rate(p, torque, FORWARD))(PARAMETERS)
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TORQUES)
+def test_every_adjoint_in_every_mode_under_every_torque(name):
+    ways = {
+        "forward": (jax.jacfwd, FORWARD),
+        "reverse": (jax.jacrev, None),
+        "direct, reverse": (jax.jacrev, DIRECT),
+        "direct, forward": (jax.jacfwd, DIRECT),
+    }
+    found = {
+        way: mode(lambda p, adjoint=adjoint: last_rate(p, TORQUES[name], adjoint))(PARAMETERS)
+        for way, (mode, adjoint) in ways.items()
+    }
+    for way, slopes in found.items():
+        np.testing.assert_allclose(slopes, found["forward"], rtol=0, atol=1e-9, err_msg=way)
