@@ -138,12 +138,12 @@ def simulate(
     >>> print(jr.RESULTS[trajectory.result])
     Argument `state0` must be finite, but a component is not.
     """
-    system, state0, (ts, t0) = motion_arguments(system, state0, ts=ts, t0=t0)
+    body, state0, (ts, t0) = motion_arguments(system, state0, ts=ts, t0=t0)
     options = checked_options(
-        system, state0.omega.dtype, solver, (rtol, atol), adjoint, (max_steps, max_step), event,
+        body, state0.omega.dtype, solver, (rtol, atol), adjoint, (max_steps, max_step), event,
         progress,
     )  # fmt: skip
-    inputs = Inputs(system, state0, ts, t0, args)
+    inputs = Inputs(body, state0, ts, t0, args)
     trajectory = _simulate(inputs, options)
 
     def findings() -> Findings:
