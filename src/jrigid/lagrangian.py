@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import all_finite, check_shape, float_arrays, nan_where, where_defined
 from jrigid._numerics import power_of_two, product
-from jrigid._types import Scalar
+from jrigid._types import Real, Scalar
 
 Lagrangian: TypeAlias = Callable[..., Any]
 Coordinates: TypeAlias = Float[Array, " n"]

@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import float_arrays
+from jrigid._types import Real
 
 Values: TypeAlias = Float[Array, "..."]
 ValuesLike: TypeAlias = Real[ArrayLike, "..."]

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
     check_inertia_shape,
@@ -15,7 +15,7 @@ from jrigid._checks import (
 )
 from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
-from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector, VectorLike
+from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.free._flow import invariants
 from jrigid.free._motion import free_rotation, in_principal_axes, relative_rotation, where_moving

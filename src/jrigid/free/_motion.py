@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Real
+from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import (
     RESULTS,
@@ -25,7 +25,7 @@ from jrigid._checks import (
 from jrigid._motion import plain_state, resolves
 from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, eigh_of_distinct, from_principal_axes
-from jrigid._types import InertiaLike, Quaternion, ScalarLike, Vector, VectorLike
+from jrigid._types import InertiaLike, Quaternion, Real, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import ExactStates, State
 from jrigid.free._flow import Invariants, after, invariants
 from jrigid.rotation import multiply, normalize

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Int, Real
+from jaxtyping import Array, ArrayLike, Bool, Int
 
 from jrigid._checks import (
     Findings,
@@ -15,7 +15,7 @@ from jrigid._checks import (
     harmless,
     is_concrete,
 )
-from jrigid._types import Matrix, Scalar, ScalarLike, Vector
+from jrigid._types import Matrix, Real, Scalar, ScalarLike, Vector
 from jrigid.mass._axes import ULPS, inertia_of_second_moment, is_physical
 from jrigid.mass._body import MassProperties
 from jrigid.mass._points import lane_sum

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import (
     Findings,
@@ -19,7 +19,7 @@ from jrigid._checks import (
     whole_number,
 )
 from jrigid._numerics import product
-from jrigid._types import Matrix, Scalar, Vector, VectorLike
+from jrigid._types import Matrix, Real, Scalar, Vector, VectorLike
 from jrigid.mass._axes import inertia_of_second_moment
 from jrigid.mass._body import MassProperties
 

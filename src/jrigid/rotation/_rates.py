@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import (
@@ -13,7 +13,7 @@ from jrigid._checks import (
     pair_of_shapes,
     where_defined,
 )
-from jrigid._types import MatrixLike, Quaternion, QuaternionLike, Vector, VectorLike
+from jrigid._types import MatrixLike, Quaternion, QuaternionLike, Real, Vector, VectorLike
 from jrigid.rotation._forms import vee
 from jrigid.rotation._quaternion import exp, identity, multiply, normalize
 

@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Real
+from jaxtyping import Array
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
 from jrigid._motion import HasRigidBody, motion_arguments, resolves
 from jrigid._numerics import power_of_two
 from jrigid._scales import ravel, spectral_radius, undamped_rate, units
-from jrigid._types import ScalarLike
+from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._adjoint import WithTimes, guard_inputs, guard_outputs
 from jrigid.simulate._controller import (

@@ -1,10 +1,10 @@
 """Solids with plane faces, and the rod."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Real
+from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import all_finite, all_positive, pair_of_shapes, where_defined
-from jrigid._types import ScalarLike, VectorLike
+from jrigid._types import Real, ScalarLike, VectorLike
 from jrigid.mass import MassProperties, inertia_tensor
 from jrigid.solids._common import solid
 

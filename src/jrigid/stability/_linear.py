@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Complex, Float, Real
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jrigid._checks import (
     all_finite,
@@ -16,7 +16,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._numerics import cosh_sqrt, root_of_positive, sinhc_sqrt
-from jrigid._types import Scalar, ScalarLike, VectorLike
+from jrigid._types import Real, Scalar, ScalarLike, VectorLike
 
 Answer = TypeVar("Answer")
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
     RESULTS,
@@ -17,7 +17,7 @@ from jrigid._checks import (
     settle,
     whole_number,
 )
-from jrigid._types import Scalar, ScalarLike
+from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
     Motion,

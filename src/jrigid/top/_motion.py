@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Real
+from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import (
     RESULTS,
@@ -17,7 +17,7 @@ from jrigid._checks import (
 )
 from jrigid._motion import resolves
 from jrigid._numerics import safe_norm
-from jrigid._types import ScalarLike
+from jrigid._types import Real, ScalarLike
 from jrigid.dynamics import ExactStates, State
 from jrigid.top._flow import invariants, state_after
 from jrigid.top._top import SymmetricTop, top_and_state

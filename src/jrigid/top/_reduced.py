@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import check_shape, check_type, float_arrays, where_defined
 from jrigid._numerics import product
-from jrigid._types import Scalar, ScalarLike
+from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import rotate_inverse
 from jrigid.top._top import SymmetricTop, top_and_state, where_valid
