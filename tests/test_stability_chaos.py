@@ -358,13 +358,13 @@ def test_a_body_flips_if_it_now_and_then_turns_mainly_about_its_intermediate_axi
     np.testing.assert_allclose(turned, expected, rtol=1e-9)
     for omega in ([1.0, 0.01, 0.0], [0.0, 0.01, 1.0], [0.0, 1.0, 0.0], [1.0, 0, 0], [0.0, 0, 0]):
         assert np.isinf(st.flip_time(MOMENTS, jnp.array(omega)))
-    assert np.isinf(st.flip_time([1.0, 1.0, 2.0], [1.0, 0.1, 0.3]))
+    assert np.isinf(st.flip_time(np.array([1.0, 1.0, 2.0]), np.array([1.0, 0.1, 0.3])))
     lanes = jnp.array([[0.1, 1.0, 0.0], [np.nan, 1.0, 0.0]])
     found, slopes = jax.vmap(jax.value_and_grad(lambda w: st.flip_time(MOMENTS, w)))(lanes)
     assert np.isfinite(found[0])
     assert np.isnan(found[1])
     assert np.isfinite(slopes).all()
-    assert np.isnan(st.flip_time([1.0, -2.0, 3.0], [0.1, 1.0, 0.0]))
+    assert np.isnan(st.flip_time(np.array([1.0, -2.0, 3.0]), np.array([0.1, 1.0, 0.0])))
 
 
 def test_compiled_work_has_no_callbacks():

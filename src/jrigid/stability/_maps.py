@@ -239,10 +239,12 @@ def boundary(
     lower, upper = float_arrays(lower, upper)
     check_shape("lower", lower, ())
     check_shape("upper", upper, ())
-    ends = [jnp.asarray(function(x, *args), lower.dtype) for x in (lower, upper)]
-    for end in ends:
-        check_shape("function", end, ())
-    known = jax.lax.stop_gradient(jnp.stack(ends))
+    fixed = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, args)
+    ends = jax.lax.stop_gradient(jnp.stack([lower, upper]))
+    values = [jnp.asarray(function(x, *fixed), lower.dtype) for x in ends]
+    for value in values:
+        check_shape("function", value, ())
+    known = jax.lax.stop_gradient(jnp.stack(values))
     ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     falls = known[0] > known[1]
 
@@ -253,13 +255,13 @@ def boundary(
     tolerance = 64 * float(jnp.finfo(lower.dtype).eps) if rtol is None else rtol
     place = place_of_root(rising, args, tolerance, lower.dtype)
     # At a pole, or a jump, or where it is NaN between the ends, there is no root.
-    left = jnp.abs(jax.lax.stop_gradient(rising(place, args)))
+    left = jnp.abs(jax.lax.stop_gradient(rising(jax.lax.stop_gradient(place), fixed)))
     findings = Findings()
     findings.require(
         ok & (left <= _ROOT * jnp.max(jnp.abs(known))),
         RESULTS.invalid_state,
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
         "which must be continuous there, but they are not.",
-        jnp.stack([lower, upper]),
+        ends,
     )
     return findings.guard(lower + (upper - lower) * place, throw)
