@@ -91,7 +91,7 @@ def main(path):
     import matplotlib.pyplot as plt
 
     jax.config.update("jax_enable_x64", True)
-    book = jr.solids.box(0.6, [0.24, 0.17, 0.03])
+    book = jr.solids.box(0.6, jnp.array([0.24, 0.17, 0.03]))
     moments = jnp.diagonal(book.inertia)  # long side, short side, normal
     figure = plt.figure(figsize=(9.0, 4.4))
     grid = figure.add_gridspec(3, 2, width_ratios=(1.15, 1), hspace=0.5, wspace=0.08)

@@ -27,7 +27,7 @@ class _Listed(type(eqx.Enumeration)):
     """Lists the names of an enumeration, each with a text."""
 
     def __dir__(cls) -> list[str]:
-        return [*super().__dir__(), *cls._name_to_item]
+        return [*super().__dir__(), *vars(cls)["_name_to_item"]]
 
     def __getitem__(cls, item: Any) -> Any:
         if isinstance(item, cls) and item._value.ndim and is_concrete(item._value):
@@ -37,7 +37,7 @@ class _Listed(type(eqx.Enumeration)):
     @property
     def texts(cls) -> list[str]:
         """The texts in the order of the codes."""
-        return [x or "All went well." for x in cls._index_to_message]
+        return [x or "All went well." for x in vars(cls)["_index_to_message"]]
 
 
 class Enumeration(eqx.Enumeration, metaclass=_Listed):
@@ -328,7 +328,7 @@ class Findings:
             self.result = RESULTS.where(self.ok & ~ok, code, self.result)
         self.ok = self.ok & ok
         message = RESULTS[code] if message is None else message
-        self.all.append(_Finding(~ok, message, value))
+        self.all.append(_Finding(~ok, str(message), value))
 
     def guard(self, tree: Tree, throw: bool) -> Tree:
         """What a builder made: an error where something was found, or NaN without `throw`."""

@@ -170,7 +170,8 @@ class Walk(eqx.Module):
             return (y, rows, jnp.maximum(error, local)), None
 
         begin = (y, rows, jnp.zeros((), y.dtype))
-        return jax.lax.scan(step, begin, jnp.arange(count))[0]
+        (y, rows, error), _ = jax.lax.scan(step, begin, jnp.arange(count))
+        return y, rows, error
 
 
 def walk(motion: Motion, steps: int, solver: Any, ok: Array) -> Walk:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jrigid._checks import (
-    RESULTS,
     Findings,
     all_finite,
     all_positive,
@@ -106,13 +105,10 @@ class SymmetricTop(Readable):
         symmetric = jnp.max(jnp.abs(jnp.stack([a - b, d, e, f]))) <= tolerance * size
         findings = Findings()
         shown = jnp.stack([a, b, d, e, f])
-        findings.require(symmetric, RESULTS.invalid_inertia, _NOT_SYMMETRIC, shown)
-        for value, code, message in (
-            (lever, RESULTS.invalid_position, _NOT_ON_AXIS),
-            (gravity, RESULTS.invalid_torque, _NOT_VERTICAL),
-        ):
+        findings.require(symmetric, None, _NOT_SYMMETRIC, shown)
+        for value, message in ((lever, _NOT_ON_AXIS), (gravity, _NOT_VERTICAL)):
             off = jnp.max(jnp.abs(value[:2])) > tolerance * jnp.abs(value[2])
-            findings.require(all_finite(value) & ~off, code, message, value)
+            findings.require(all_finite(value) & ~off, None, message, value)
         across, c, mass, length, pull = harmless(
             findings.ok, (0.5 * (a + b), c, mass, lever[2], gravity[2])
         )
