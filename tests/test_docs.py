@@ -1,4 +1,4 @@
-"""Code in docs/ runs: the blocks of a page, one after the other, after the README's imports."""
+"""Code in README and docs/ runs: the blocks of a page, after the usual imports."""
 
 import re
 from pathlib import Path
@@ -10,9 +10,10 @@ import pytest
 import jrigid as jr
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+ROOT = Path(__file__).parents[1]
 PAGES = [
     x
-    for x in sorted((Path(__file__).parents[1] / "docs").glob("*.md"))
+    for x in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
     if BLOCK.search(x.read_text())
 ]
 

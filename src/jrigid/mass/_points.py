@@ -92,7 +92,7 @@ def _cloud(masses: Array, positions: Array) -> MassProperties:
     origin = jax.lax.stop_gradient(_first_moment(masses, positions) / divisor)
     local = positions - origin[None, :]
     center = _first_moment(masses, local) / divisor
-    second = _second_moment(masses, local - center[None, :])
+    second = _second_moment(masses, local) - mass * center[:, None] * center[None, :]
     return MassProperties.unchecked(mass, origin + center, inertia_of_second_moment(second))
 
 
