@@ -44,7 +44,7 @@ def satellite(roll, yaw):
     """DeBra and Delp's plane: k_R and k_Y."""
     b = (1 - yaw) / (1 - roll)
     moments = jnp.stack([jnp.ones_like(b), b, b + yaw])
-    found = jr.stability.satellite_stability(moments, throw=False)
+    found = jr.stability.satellite_stability(moments)
     return found.growth_rate, found.region
 
 

@@ -184,8 +184,8 @@ def _growth(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> _Growth:
     counts = (firsts + each).astype(dtype)
     ts = path.step * every * counts
     answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
-    result, _, answer = verdict(findings, error, answer)
-    return _Growth(*answer, error, result)
+    result, _, (ts, exponents, mean, state) = verdict(findings, error, answer)
+    return _Growth(ts, exponents, mean, state, error, result)
 
 
 def lyapunov_spectrum(
@@ -246,8 +246,8 @@ def lyapunov_spectrum(
     motion = motion_of(system, state0, args, t0, duration)
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
     growth = _growth(motion, plan, rows, solver_of(solver))
-    ts, history, _, *others = settle(growth, throw, lambda: _findings(motion, rows))
-    return LyapunovSpectrum(history[-1], ts, history, *others)
+    ts, history, _, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
+    return LyapunovSpectrum(history[-1], ts, history, state, error, result)
 
 
 def megno(
@@ -310,9 +310,9 @@ def megno(
         vector = vector[None]
     rows = _starting_vectors(motion, vector, 1)
     growth = _growth(motion, plan, rows, solver_of(solver))
-    ts, _, history, *others = settle(growth, throw, lambda: _findings(motion, rows))
+    ts, _, history, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
     mean = history[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
     order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
-    return Megno(mean, 2 * mean / ts[-1], order, ts, history, *others)
+    return Megno(mean, 2 * mean / ts[-1], order, ts, history, state, error, result)
