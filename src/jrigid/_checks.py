@@ -91,7 +91,7 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
     )
     nonfinite_state = "The motion ran out of the range of floating point numbers."
     no_equilibrium = (
-        "Argument `state` must be an equilibrium in a frame in which the system does not change, "
+        "Argument `state0` must be an equilibrium in a frame in which the system does not change, "
         "but it is not."
     )
     inaccurate = (

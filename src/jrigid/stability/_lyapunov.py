@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from jrigid._checks import (
     RESULTS,
@@ -17,7 +17,7 @@ from jrigid._checks import (
     settle,
     whole_number,
 )
-from jrigid._types import Real, Scalar, ScalarLike
+from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import (
     Motion,
@@ -184,8 +184,8 @@ def _growth(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> _Growth:
     counts = (firsts + each).astype(dtype)
     ts = path.step * every * counts
     answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
-    result, _, answer = verdict(findings, error, answer)
-    return _Growth(*answer, error, result)  # pyright: ignore[reportCallIssue]
+    result, _, (ts, exponents, mean, state) = verdict(findings, error, answer)
+    return _Growth(ts, exponents, mean, state, error, result)
 
 
 def lyapunov_spectrum(
@@ -246,8 +246,7 @@ def lyapunov_spectrum(
     motion = motion_of(system, state0, args, t0, duration)
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
     growth = _growth(motion, plan, rows, solver_of(solver))
-    growth = settle(growth, throw, lambda: _findings(motion, rows))
-    ts, history, _, state, error, result = growth
+    ts, history, _, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
     return LyapunovSpectrum(history[-1], ts, history, state, error, result)
 
 
@@ -311,8 +310,7 @@ def megno(
         vector = vector[None]
     rows = _starting_vectors(motion, vector, 1)
     growth = _growth(motion, plan, rows, solver_of(solver))
-    growth = settle(growth, throw, lambda: _findings(motion, rows))
-    ts, _, history, state, error, result = growth
+    ts, _, history, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
     mean = history[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)

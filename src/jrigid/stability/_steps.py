@@ -163,7 +163,7 @@ class Walk(eqx.Module):
     def follow(self, first: Any, count: int, y: Array, rows: Array) -> tuple[Array, Array, Array]:
         """Steps from the one of a number on: state, tangents, largest local error."""
 
-        def step(carry: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
+        def step(carry: tuple, i: Array) -> tuple[tuple, None]:
             y, rows, error = carry
             t = self.motion.t0 + self.step * (first + i).astype(y.dtype)
             y, rows, local = self.advance(t, y, rows)
