@@ -285,8 +285,8 @@ def program(nuisances, prior):
     return quick_jit(
         lambda tensor, omega: identify.identifiability(
             jr.RigidBody(tensor),
-            identify.Rates(TS, None, 0.01),
             jr.State(UNTURNED, omega),
+            identify.Rates(TS, None, 0.01),
             nuisances=sought,
         )
     )

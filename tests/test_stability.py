@@ -460,7 +460,8 @@ def test_bad_requests(untyped):
     with pytest.raises(RuntimeError, match="finite"):
         st.linearize(body, spin(0, np.nan))
     with pytest.raises(ValueError, match="system"):
-        st.linearize(jr.SymmetricTop(1.0, 1.0, 1.0), spin(0))
+        st.linearize(jr.solids.sphere(1.0, 1.0), spin(0))
+    assert st.linearize(jr.SymmetricTop(1.0, 1.0, 1.0), spin(2, 3.0)).margin > 0
     damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
     with pytest.raises(ValueError, match="body_rate"):
         st.linearize(damped, spin(0), body_rate=np.ones(3))

@@ -445,7 +445,7 @@ def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
     with pytest.raises(RuntimeError, match="condition"):
         st.poincare_section(body, start, lambda _, s: s.omega[0] * np.nan, 3, 0.1)
     with pytest.raises(ValueError, match="system"):
-        st.megno(jr.SymmetricTop(1.0, 1.0, 1.0), start, 10.0, 100)
+        st.megno(jr.solids.sphere(1.0, 1.0), start, 10.0, 100)
     with pytest.raises(ValueError, match="state0"):
         st.final_spin(body, UP, 10.0, 100)
     with pytest.raises(ValueError, match="direction"):

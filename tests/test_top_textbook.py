@@ -148,10 +148,9 @@ def test_four_ways_to_the_same_motion(name, routes):
     np.testing.assert_allclose(heights[:, 0], here.as_matrix()[:, 2, 2], atol=1e-8)
 
 
-def test_where_the_angles_fail_it_is_said():
+def test_where_the_angles_fail_the_accelerations_are_nan():
     q, q_dot = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
-    with pytest.raises(RuntimeError, match="singular"):
-        lagrangian.acceleration(top.lagrangian, q, q_dot, TOP)
+    assert np.isnan(lagrangian.acceleration(top.lagrangian, q, q_dot, TOP)).all()
 
 
 # --- Momenta, energy, potential -----------------------------------------------------------------

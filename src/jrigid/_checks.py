@@ -68,8 +68,8 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
     )
     invalid_state = "Argument `state0` must be finite, but a component is not."
     invalid_times = (
-        "Argument `ts` must be finite, for `simulate` also non-decreasing and not before `t0`, "
-        "but it is not."
+        "Argument `ts` must be finite, and for `simulate` non-decreasing and not earlier than "
+        "`t0`, but it is not."
     )
     unresolved_times = (
         "Arguments `t0` and `ts` must be in a dtype that tells apart times within a tenth of a "
