@@ -223,9 +223,7 @@ def _usable(ok: Array, inputs: Inputs, options: Options) -> tuple[Inputs, Option
     system, state0, args, rtol, atol = harmless(
         ok, (system, state0, args, options.rtol, options.atol)
     )
-    identity = jnp.zeros_like(state0.attitude).at[0].set(1)
-    attitude = normalize(jnp.where(ok, state0.attitude, identity))
-    state0 = dataclasses.replace(state0, attitude=attitude)
+    state0 = dataclasses.replace(state0, attitude=normalize(state0.attitude))
     ts, t0 = (jnp.where(ok, x, jnp.zeros_like(x)) for x in (ts, t0))
     return Inputs(system, state0, ts, t0, args), options._replace(rtol=rtol, atol=atol)
 
