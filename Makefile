@@ -31,7 +31,7 @@ slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow
 
 doctest: $(VENV)/.dev
-	$(BIN)/python -m pytest --override-ini=addopts= --doctest-modules src
+	$(BIN)/python -m pytest --override-ini=addopts= --numprocesses 2 --doctest-modules src
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check $(SOURCES)

@@ -3,6 +3,7 @@
 from functools import wraps
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 # A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot show.
@@ -48,3 +49,12 @@ def quick_jit(function):
         return plain(*args)
 
     return call
+
+
+def both_ways(function, x):
+    """Value and Jacobian, by columns and by rows, from one trace."""
+    value, push = jax.linearize(function, x)
+    pull = jax.linear_transpose(push, x)
+    basis = jnp.eye(x.size).reshape(x.size, *x.shape)
+    columns = jnp.moveaxis(jax.vmap(push)(basis), 0, -1).reshape(*value.shape, *x.shape)
+    return value, columns, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size))

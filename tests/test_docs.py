@@ -18,10 +18,24 @@ PAGES = [
 ]
 
 
+LONG = "jr.identify.fit("  # the same lines are an example in the docstring of `fit`
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_code_blocks_run(page):
+    run(page, lambda code: LONG not in code)
+
+
+@pytest.mark.slow
+def test_code_blocks_that_fit_run():
+    run(ROOT / "docs" / "guide.md", lambda code: LONG in code)
+
+
+def run(page, wanted):
     text, namespace = page.read_text(), {"jax": jax, "jnp": jnp, "jr": jr}
     for block in BLOCK.finditer(text):
+        if not wanted(block[1]):
+            continue
         above = text[: block.start(1)].count("\n")  # so that an error names the page's line
         code = compile("\n" * above + block[1], str(page), "exec")
         with jax.numpy_dtype_promotion("standard"):  # as users have it, and as optax needs it

@@ -256,17 +256,57 @@ def partial(function, index):
     return derivative
 
 
-def gradients(function, count):
-    """All partial derivatives, forward and reverse, by one compilation each."""
-    forward = quick_jit(lambda *args: [partial(function, i)(*args) for i in range(count)])
-    reverse = quick_jit(jax.grad(lambda *args: jnp.sum(function(*args)), tuple(range(count))))
-    return forward, reverse
+def forward(function, pairs):
+    """First partial derivatives, and second ones by pairs of arguments, as lanes of one trace."""
+
+    def derivatives(*args):
+        count = len(args)
+        missing = sorted(set(range(count)) - {i for i, _ in pairs})
+        every = [*pairs, *((i, count - 1) for i in missing)]
+
+        def along(indices):
+            ones = np.ones(args[0].shape, args[0].dtype)
+            return tuple(np.concatenate([ones * (i == k) for i in indices]) for k in range(count))
+
+        def first(*args):
+            return jax.jvp(function, args, along([i for i, _ in every]))[1]
+
+        def part(tree, k):
+            return jax.tree.map(lambda x: x.reshape(len(every), -1)[k], tree)
+
+        tiled = tuple(jnp.tile(x, len(every)) for x in args)
+        if pairs:
+            firsts, seconds = jax.jvp(first, tiled, along([j for _, j in every]))
+        else:
+            firsts, seconds = first(*tiled), None
+        starts = [[i for i, _ in every].index(k) for k in range(count)]
+        return [part(firsts, k) for k in starts], [part(seconds, k) for k in range(len(pairs))]
+
+    return derivatives
 
 
-def check_gradients(function, reference, rows, forward_ulps, both_ulps):
-    inputs = columns(rows)
-    forward, reverse = gradients(function, len(inputs))
-    compare_gradients(forward(*inputs), reverse(*inputs), reference, rows, forward_ulps, both_ulps)
+@functools.cache
+def derivatives(name):
+    """By one compilation: the first derivatives, forward and reverse, and pairs of the second."""
+    function, _, rows = OF_POINTS[name]
+    count, pairs = len(rows[0]), PAIRS_OF[name]
+
+    @quick_jit
+    def every(*args):
+        reverse = jax.grad(lambda *args: jnp.sum(function(*args)), tuple(range(count)))
+        firsts, seconds = forward(function, pairs)(*args)
+        if name == "rc":  # whose two modes agree to the last bits where one argument moves
+            firsts = [partial(function, i)(*args) for i in range(count)]
+        return firsts, seconds, reverse(*args)
+
+    firsts, seconds, reverse = every(*columns(rows))
+    return firsts, reverse, dict(zip(pairs, seconds, strict=True))
+
+
+def check_gradients(name, forward_ulps, both_ulps):
+    _, reference, rows = OF_POINTS[name]
+    firsts, reverse, _ = derivatives(name)
+    compare_gradients(firsts, reverse, reference, rows, forward_ulps, both_ulps)
 
 
 def compare_gradients(forward, reverse, reference, rows, forward_ulps, both_ulps):
@@ -276,13 +316,11 @@ def compare_gradients(forward, reverse, reference, rows, forward_ulps, both_ulps
         np.testing.assert_allclose(backward, found, rtol=ulps(float, both_ulps))
 
 
-def check_second(function, reference, rows, pairs, allowed, scale=None):
-    compare_second(second(function, pairs)(*columns(rows)), reference, rows, pairs, allowed, scale)
-
-
-def second(function, pairs):
-    """Second partial derivatives, by one compilation."""
-    return quick_jit(lambda *args: [partial(partial(function, i), j)(*args) for i, j in pairs])
+def check_second(name, rows, pairs, allowed):
+    _, reference, every = OF_POINTS[name]
+    lanes = [every.index(row) for row in rows]
+    found = [np.asarray(derivatives(name)[2][pair])[lanes] for pair in pairs]
+    compare_second(found, reference, rows, pairs, allowed)
 
 
 def compare_second(derivatives, reference, rows, pairs, allowed, scale=None):
@@ -324,31 +362,40 @@ def slope_in(reference, index, arguments):
 
 @pytest.mark.parametrize("name", CARLSON)
 def test_first_derivatives_of_carlson_also_of_coincident_arguments(name):
-    function, reference, _ = CARLSON[name]
-    check_gradients(function, reference, POINTS[name], 400, 8)
+    check_gradients(name, 400, 8)
 
 
 @pytest.mark.parametrize("name", CARLSON)
 def test_second_derivatives_of_carlson_also_of_coincident_arguments(name):
-    function, reference, count = CARLSON[name]
+    count = CARLSON[name][2]
     rows = [row for row in POINTS[name] if row[-1] > 0]
-    pairs = [(0, 0), (count - 1, count - 1), (0, count - 1)]
-    check_second(function, reference, rows, pairs, 4000)
+    check_second(name, rows, [(0, 0), (count - 1, count - 1), (0, count - 1)], 4000)
 
 
 def test_derivatives_of_carlson_at_zero_are_infinite_there_and_nowhere_else():
-    for name, arguments in (
-        ("rf", (0.0, 1.0, 2.0)),
-        ("rd", (0.0, 1.0, 2.0)),
-        ("rj", (0.0, 1.0, 2.0, 3.0)),
-        ("rc", (0.0, 1.0)),
-    ):
-        function, reference, count = CARLSON[name]
-        forward, _ = gradients(function, count)
-        found = forward(*map(jnp.asarray, arguments))
+    points = {name: (0.0, 1.0, 2.0, 3.0)[: CARLSON[name][2]] for name in CARLSON}
+
+    @quick_jit  # one compilation for all
+    def slopes(points):
+        found = {}
+        for name, (zero, *others) in points.items():
+            function = CARLSON[name][0]
+            count = len(others)
+
+            def of_others(*args, function=function, zero=zero):
+                return function(jnp.full_like(args[0], zero), *args)
+
+            along = tuple(np.eye(count))
+            lanes = tuple(jnp.full(count, x) for x in others)
+            rest = jax.jvp(of_others, lanes, along)[1]
+            found[name] = [partial(function, 0)(zero, *others), *(rest[i] for i in range(count))]
+        return found
+
+    for name, found in slopes(jax.tree.map(jnp.asarray, points)).items():
         assert found[0] == -np.inf
-        for index in range(1, count):
-            check([found[index]], [slope(reference, index, arguments)], 64, columns([arguments]))
+        for index in range(1, len(found)):
+            exact = slope(CARLSON[name][1], index, points[name])
+            check([found[index]], [exact], 64, columns([points[name]]))
 
 
 # --- Legendre -------------------------------------------------------------------------------------
@@ -524,19 +571,30 @@ LEGENDRE = {
 }
 
 
+OF_POINTS = {name: (*CARLSON[name][:2], POINTS[name]) for name in CARLSON} | LEGENDRE
+PAIRS_OF = {
+    **{name: [(0, 0), (n - 1, n - 1), (0, n - 1)] for name, (_, _, n) in CARLSON.items()},
+    "ellipk": [(0, 0)],
+    "ellipe": [(0, 0)],
+    "ellippi": [(1, 1)],
+    "ellipkinc": [(1, 1), (0, 1)],
+    "ellipeinc": [(1, 1)],
+    "ellippiinc": [],
+}
+
+
 @pytest.mark.parametrize("name", LEGENDRE)
 def test_first_derivatives_of_legendre_integrals(name):
-    check_gradients(*LEGENDRE[name], 4000, 64)
+    check_gradients(name, 4000, 64)
 
 
 @pytest.mark.parametrize("name", [name for name in LEGENDRE if name != "ellippiinc"])
 def test_second_derivatives_of_legendre_integrals(name):
-    function, reference, rows = LEGENDRE[name]
-    rows = [row for row in rows if abs(row[-1]) > 1e-100 or row[-1] == 0]
+    rows = [row for row in LEGENDRE[name][2] if abs(row[-1]) > 1e-100 or row[-1] == 0]
     rows = [row for row in rows if row[-2:] != (1e-6, 0.3)][:11]
     last = len(rows[0]) - 1
     pairs = [(last, last)] if name != "ellipkinc" else [(last, last), (0, last)]
-    check_second(function, reference, rows, pairs, 40000)
+    check_second(name, rows, pairs, 40000)
 
 
 def test_a_derivative_by_m_is_minus_that_by_mc():
@@ -564,18 +622,23 @@ def test_derivatives_at_m_1_are_infinite_where_the_truth_is():
         (lambda m: elliptic.ellipeinc(phi, m), -sign),
     )
 
-    @quick_jit  # one compilation for all
-    def both_modes(m):
-        reverse = [jax.grad(lambda m, f=f: jnp.sum(f(m))) for f, _ in cases]
-        return [(partial(f, 0)(m), of(m)) for (f, _), of in zip(cases, reverse, strict=True)]
+    def steep(phi):
+        return elliptic.ellipkinc(phi, 4.0)
 
-    for (_, truth), (forward, reverse) in zip(cases, both_modes(one), strict=True):
-        np.testing.assert_array_equal(forward, truth * np.inf)
-        np.testing.assert_array_equal(reverse, truth * np.inf)
-    for function, truth in ((elliptic.ellipk, np.inf), (elliptic.ellipe, -np.inf)):
-        assert jax.jit(jax.hessian(function))(jnp.asarray(1.0)) == truth
-    steep = jax.jit(partial(lambda phi: elliptic.ellipkinc(phi, 4.0), 0))
-    assert steep(jnp.asarray(np.arcsin(0.5) * (1 - 1e-15))) > 1e6
+    @quick_jit  # one compilation for all, and one trace for both modes
+    def both_modes(m, phi):
+        found = []
+        for function, _ in cases:
+            _, along = jax.linearize(function, m)
+            found.append((along(jnp.ones(4)), *jax.linear_transpose(along, m)(jnp.ones(4))))
+        twice = [jax.hessian(function)(m[0]) for function in (elliptic.ellipk, elliptic.ellipe)]
+        return found, twice, partial(steep, 0)(phi)
+
+    found, twice, slope_of_steep = both_modes(one, np.arcsin(0.5) * (1 - 1e-15))
+    for (_, truth), both in zip(cases, found, strict=True):
+        np.testing.assert_array_equal(both, [truth * np.inf] * 2)
+    assert twice == [np.inf, -np.inf]
+    assert slope_of_steep > 1e6
 
 
 # --- Jacobi ---------------------------------------------------------------------------------------
@@ -668,29 +731,33 @@ JACOBI_POINTS = [
 
 SECOND_POINTS = [(0.7, mc) for mc in (1.0, 0.6, 1e-9, 0.0, -1e-12, -0.8, 3.5)]
 SECOND_POINTS += [(9.1, mc) for mc in (1.0, 0.6, 1e-9, 0.0, 1e-200)]
+JACOBI_POINTS += [row for row in SECOND_POINTS if row not in JACOBI_POINTS]
 PAIRS = [(0, 0), (1, 1), (0, 1)]
 
 
 @pytest.fixture(scope="module")
 def of_jacobi():
-    """Derivatives of the four functions, by one compilation each: forward, reverse, second."""
-    inputs = columns(JACOBI_POINTS)
-    each = [lambda u, mc, k=k: ELLIPJ(u, mc)[k] for k in range(4)]
-    reverse = [jax.grad(lambda *args, f=f: jnp.sum(f(*args)), (0, 1)) for f in each]
-    return (
-        gradients(ELLIPJ, 2)[0](*inputs),
-        quick_jit(lambda *args: [derivative(*args) for derivative in reverse])(*inputs),
-        second(ELLIPJ, PAIRS)(*columns(SECOND_POINTS)),
-    )
+    """Derivatives of the four functions, by one compilation: forward, reverse, second."""
+
+    @quick_jit
+    def every(*args):
+        ones = np.eye(4)[:, :, None] * np.ones(args[0].shape)
+        pull = jax.vjp(ELLIPJ, *args)[1]
+        kind = type(elliptic.ellipj(0.0, 0.5))
+        reverse = [pull(kind(*jnp.asarray(one))) for one in ones]
+        return forward(ELLIPJ, [(0, 0), (1, 1), (0, 1)])(*args), reverse
+
+    (firsts, seconds), reverse = every(*columns(JACOBI_POINTS))
+    return firsts, reverse, seconds
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_first_derivatives_of_jacobi_functions(name, of_jacobi):
     index = NAMES.index(name)
     kept = [not (name == "cn" and row[0] == 1e-5) for row in JACOBI_POINTS]
-    forward, reverse, _ = of_jacobi
+    firsts, reverse, _ = of_jacobi
     compare_gradients(
-        [np.asarray(by[index])[kept] for by in forward],
+        [np.asarray(by[index])[kept] for by in firsts],
         [np.asarray(by)[kept] for by in reverse[index]],
         lambda u, mc: jacobi(u, mc)[index],
         [row for row, keep in zip(JACOBI_POINTS, kept, strict=True) if keep],
@@ -702,8 +769,9 @@ def test_first_derivatives_of_jacobi_functions(name, of_jacobi):
 @pytest.mark.parametrize("name", NAMES)
 def test_second_derivatives_of_jacobi_functions(name, of_jacobi):
     index = NAMES.index(name)
+    *_, twice = of_jacobi
     compare_second(
-        [by[index] for by in of_jacobi[2]],
+        [np.asarray(by[index])[[JACOBI_POINTS.index(x) for x in SECOND_POINTS]] for by in twice],
         lambda u, mc: jacobi(u, mc)[index],
         SECOND_POINTS,
         PAIRS,
@@ -719,7 +787,7 @@ def test_second_derivatives_of_jacobi_functions(name, of_jacobi):
 def test_derivatives_in_single_precision():
     rows = [(u, mc) for u in (0.7, 4.0) for mc in (1.0, 0.5, 1e-3, 1e-30, 0.0, -0.5)]
     inputs = columns(rows, np.float32)
-    for axis, derivatives in enumerate(gradients(ELLIPJ, 2)[0](*inputs)):
+    for axis, derivatives in enumerate(quick_jit(forward(ELLIPJ, []))(*inputs)[0]):
         for index, found in enumerate(derivatives):
             assert found.dtype == np.float32
             exact = [

@@ -14,7 +14,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import reference
-from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, both_ways, quick_jit, ulps
 from scipy.spatial.transform import Rotation
 
 import jrigid as jr
@@ -68,6 +68,7 @@ def of_lanes(function):
 def compiled():
     return {
         "value": of_lanes(jax.jit(jax.vmap(state_at))),
+        "single": of_lanes(quick_jit(jax.vmap(state_at))),
         "jacobian": of_lanes(quick_jit(jax.vmap(jacobian))),
     }
 
@@ -111,10 +112,14 @@ def test_a_flip_that_begins_very_near_the_unstable_axis_goes_through(dtype, offs
     growth = np.sqrt(1 / 3)
     times = np.linspace(0.6, 1.5, 7) * 2 * np.log(1 / offset) / (2 * growth)
     moments = MOMENTS.astype(dtype)
-    rate = jax.jit(jax.jacfwd(state_at, argnums=3))
+
+    @jax.jit
+    def moving(t):
+        return jax.jvp(lambda t: state_at(moments, attitude, omega, t), (t,), (jnp.ones_like(t),))
+
     for t in times.astype(dtype):
-        state = state_at(moments, attitude, omega, t)
-        found = rate(moments, attitude, omega, t)[4:]
+        state, rate = moving(t)
+        found = rate[4:]
         exact = jr.euler_equations(moments, state[4:])
         np.testing.assert_allclose(found, exact, atol=2e3 * np.finfo(dtype).eps)
     assert state[5] < -0.9
@@ -180,15 +185,21 @@ def of_inputs(x, t):
 def derivatives():
     def along(x, v, t):
         """Jacobian by columns and by rows, and its derivative along v in both orders."""
-        forward, by_columns = jax.jvp(lambda y: jax.jacfwd(of_inputs)(y, t), (x,), (v,))
-        reverse, by_rows = jax.jvp(lambda y: jax.jacrev(of_inputs)(y, t), (x,), (v,))
-        return of_inputs(x, t), forward, reverse, by_columns, by_rows
+        (value, *first), (_, *second) = jax.jvp(
+            lambda y: both_ways(lambda z: of_inputs(z, t), y), (x,), (v,)
+        )
+        return value, *first, *second
 
     return quick_jit(jax.vmap(along, (0, 0, None)))
 
 
 @pytest.mark.parametrize(
-    ("duration", "per_regime"), [(20.0, 5), pytest.param(-200.0, 2, marks=pytest.mark.slow)]
+    ("duration", "per_regime"),
+    [
+        (20.0, 2),
+        pytest.param(20.0, 5, marks=pytest.mark.slow),
+        pytest.param(-200.0, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_equal_the_variational_equations(duration, per_regime, derivatives):
     inputs, regimes = of_unit_rate(per_regime)
@@ -264,10 +275,11 @@ def of_tensor():
         def moved(s):
             return state_at(tensor + s * change, jnp.eye(4)[0], omega + s * turn, t)
 
-        first = jax.jvp(moved, (0.0,), (1.0,))[1]
-        back = jax.vjp(moved, 0.0)[1]
-        reverse = jax.vmap(lambda row: back(row)[0])(jnp.eye(7))
-        return moved(0.0), first, reverse
+        zero = jnp.zeros(())
+        (value, forward, reverse), (_, second, _) = jax.jvp(
+            lambda s: both_ways(moved, s), (zero,), (zero + 1,)
+        )
+        return value, forward, reverse, second
 
     return quick_jit(along)
 
@@ -291,7 +303,7 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
     h = 2.0**-14
     with mp.workdps(40):
         exact = np.array((64 * slope(h / 4) - 20 * slope(h / 2) + slope(h)) / 45, float)
-    value, forward, reverse = (np.asarray(x) for x in of_tensor(tensor, omega, change, turn, t))
+    value, forward, reverse, _ = map(np.asarray, of_tensor(tensor, omega, change, turn, t))
     sign = np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
     exact[:4] *= sign
     bound = 1e-9 * np.linalg.norm(exact)
@@ -299,7 +311,7 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
     np.testing.assert_allclose(reverse, exact, rtol=0, atol=bound)
 
 
-def test_second_derivatives_in_a_tensor_of_distinct_moments():
+def test_second_derivatives_in_a_tensor_of_distinct_moments(of_tensor):
     tensor, t = TENSORS["generic"], 9.0
     omega, turn = np.array([0.5, -0.75, 0.25]), np.array([0.25, 0.5, -1.0])
     change = np.array([[0.5, -0.25, 0.75], [-0.25, -1.0, 0.5], [0.75, 0.5, 0.25]])
@@ -317,14 +329,7 @@ def test_second_derivatives_in_a_tensor_of_distinct_moments():
     with mp.workdps(40):
         exact = np.array((64 * bend(h / 4) - 20 * bend(h / 2) + bend(h)) / 45, float)
 
-    @quick_jit
-    def second(tensor, omega):
-        def moved(s):
-            return state_at(tensor + s * change, jnp.eye(4)[0], omega + s * turn, t)
-
-        return moved(0.0), jax.jacfwd(jax.jacfwd(moved))(0.0)
-
-    value, found = (np.asarray(x) for x in second(tensor, omega))
+    value, _, _, found = map(np.asarray, of_tensor(tensor, omega, change, turn, t))
     exact[:4] *= np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.linalg.norm(exact))
 
@@ -343,7 +348,7 @@ def test_float32_within_a_multiple_of_its_eps(regime, compiled):
     if regime == "tensor":
         inertia = 0.5 * (inertia + np.swapaxes(inertia, 1, 2))
     with jax.numpy_dtype_promotion("standard"):
-        found = np.asarray(compiled["value"](inertia, attitude, omega, time), float)
+        found = np.asarray(compiled["single"](inertia, attitude, omega, time), float)
         exact_inputs = [x.astype(float) for x in (inertia, attitude, omega, time)]
         exact = np.asarray(compiled["value"](*exact_inputs))
     assert not np.any(np.isnan(found))
@@ -382,11 +387,7 @@ def test_times_of_any_shape_and_order(shape, single):
     ts = np.random.default_rng(0).normal(scale=30.0, size=shape)
     state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
 
-    @quick_jit
-    def motion(ts):
-        return jr.free_rotation(TENSOR, state0, ts, t0=-1.5, throw=False).states
-
-    states = motion(ts)
+    states = single(state0, ts)
     assert states.attitude.shape == (*shape, 4)
     assert states.omega.shape == (*shape, 3)
     for index in np.ndindex(shape):
@@ -409,8 +410,13 @@ def test_there_and_back_again_and_in_two_steps():
 def test_equals_simulate():
     state0 = jr.State(ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA)
     ts = np.linspace(0.0, 30.0, 7)
-    exact = jr.free_rotation(TENSOR, state0, ts)
-    integrated = jr.simulate(jr.RigidBody(TENSOR), state0, ts, rtol=1e-11).states
+
+    @quick_jit
+    def both(state0, ts):
+        integrated = jr.simulate(jr.RigidBody(TENSOR), state0, ts, rtol=1e-11, throw=False)
+        return jr.free_rotation(TENSOR, state0, ts, throw=False).states, integrated.states
+
+    exact, integrated = both(state0, ts)
     np.testing.assert_allclose(exact.attitude, integrated.attitude, atol=1e-11)
     np.testing.assert_allclose(exact.omega, integrated.omega, atol=1e-11)
 
@@ -528,6 +534,15 @@ def test_bad_value_is_an_error_eagerly_and_under_jit_and_marks_its_lane(name):
     expected = getattr(jr.RESULTS, code)
     np.testing.assert_array_equal(motion.result == expected, [False, True, False])
     np.testing.assert_array_equal(motion.result == jr.RESULTS.successful, [True, False, True])
+
+
+def test_angles_that_overflow_are_an_error_or_have_a_code():
+    state0 = jr.State(GOOD["attitude"], 1e10 * OMEGA)
+    with pytest.raises(RuntimeError, match="out of the range"):
+        jr.free_rotation(MOMENTS, state0, 1e300)
+    motion = jr.free_rotation(MOMENTS, state0, 1e300, throw=False)
+    assert motion.result == jr.RESULTS.nonfinite_state
+    assert np.all(np.isnan(motion.omega))
 
 
 def test_the_answer_shows_its_numbers_and_what_became_of_the_call():

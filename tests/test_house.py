@@ -5,8 +5,8 @@ from graphlib import TopologicalSorter
 import house
 import pytest
 
-# Code lines outside identify: 6,432 before, 5,600 wanted. It may only fall.
-_BUDGET = 6410
+# Code lines outside identify. It may only fall, but for a new part of the package.
+_BUDGET = 5600
 
 
 def package(module):

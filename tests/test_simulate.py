@@ -5,7 +5,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 import scipy.linalg
 from free_reference import free_motion
@@ -31,10 +30,15 @@ def ten_thousand_turns():
     return start, ts, attitudes, omegas
 
 
+def _slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("rtol", "unit"),
-    [(1e-4, 1), (1e-6, 1), (1e-8, 1), (1e-10, 1), (1e-12, 1), (1e-8, 1e-7), (1e-8, 1e4)],
-)
+    [(1e-4, 1), _slow(1e-6, 1), (1e-8, 1), _slow(1e-10, 1), (1e-12, 1), (1e-8, 1e-7),
+     _slow(1e-8, 1e4)],
+)  # fmt: skip
 def test_ten_thousand_turns_keep_the_promised_accuracy(ten_thousand_turns, rtol, unit):
     """DESIGN.md's bars for integration; omega in other units of time behaves the same."""
     start, ts, attitudes, omegas = ten_thousand_turns
@@ -59,7 +63,7 @@ def test_ten_thousand_turns_keep_the_promised_accuracy(ten_thousand_turns, rtol,
 def test_default_tolerance_follows_the_dtype_and_float32_warns():
     body = jr.RigidBody(MOMENTS.astype(np.float32))
     state0 = jr.State(UPRIGHT.astype(np.float32), OMEGA.astype(np.float32))
-    ts = np.linspace(0, 100, 5, dtype=np.float32)
+    ts = np.array([0, 100], np.float32)
     with pytest.warns(UserWarning, match="float32"):
         trajectory = jr.simulate(body, state0, ts)
     assert trajectory.states.omega.dtype == jnp.float32
@@ -115,11 +119,11 @@ def spin_jacobians():
 
     def value_and_jacobian(omega, moments, rtol):
         def final(q, w, i):
-            return _final(q, w, i, None, rtol)
+            return (_final(q, w, i, None, rtol),) * 2
 
-        return final(attitude, omega, moments), jnp.concatenate(
-            jax.jacfwd(final, argnums=(0, 1, 2))(jnp.asarray(attitude), omega, moments), axis=1
-        )
+        slopes = jax.jacfwd(final, argnums=(0, 1, 2), has_aux=True)
+        jacobians, value = slopes(jnp.asarray(attitude), omega, moments)
+        return value, jnp.concatenate(jacobians, axis=1)
 
     lanes = jax.jit(jax.vmap(value_and_jacobian, in_axes=(0, 0, None)))
     errors, found = {}, {}
@@ -153,8 +157,11 @@ def test_jacobian_of_pure_spin_is_a_matrix_exponential(spin_jacobians):
         for (moments, omega, axis, wobble), jacobian in zip(cases, jacobians, strict=True):
             if wobble > 0:
                 continue
-            linear = jax.jacfwd(jr.euler_equations, argnums=1)(np.array(moments), omega)
-            exact = scipy.linalg.expm(40 * np.asarray(linear))
+            i1, i2, i3 = moments
+            ratios = np.array([(i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3])
+            a, b, c = omega
+            linear = ratios[:, None] * np.array([[0, c, b], [c, 0, a], [b, a, 0]])
+            exact = scipy.linalg.expm(40 * linear)
             error = np.linalg.norm(jacobian[4:, 4:7] - exact) / np.linalg.norm(exact)
             # scipy's own error is some eps of the growth, e^23
             assert error <= 1000 * rtol + 1e-10, (moments, axis, rtol, error)
@@ -172,8 +179,9 @@ def test_jacobian_of_the_sleeping_top():
 
     def value_and_jacobian(attitude, omega, rtol):
         args = (attitude, omega, jnp.asarray(moments), jnp.asarray(weight))
-        jacobians = jax.jacfwd(_final, argnums=(0, 1, 2, 3))(*args, rtol)
-        return _final(*args, rtol), jnp.concatenate(jacobians, axis=1)
+        twice = lambda *args: (_final(*args, rtol),) * 2  # noqa: E731
+        jacobians, final = jax.jacfwd(twice, argnums=(0, 1, 2, 3), has_aux=True)(*args)
+        return final, jnp.concatenate(jacobians, axis=1)
 
     lanes = jax.jit(jax.vmap(value_and_jacobian, in_axes=(0, 0, None)))
     for rtol in (1e-6, 1e-8, 1e-10):
@@ -197,65 +205,98 @@ def test_jacobian_of_the_sleeping_top():
 
 # Equilibria with a rate much faster than the turning itself, and d omega1 / d omega1 there, from
 # the matrix exponential of the linearised motion or, for the damper, of body and sphere together.
+# Of each: moments, the lever, the rotor and the drag that it has, spin and duration.
 FAST = {
-    "hanging at rest": (
-        (1.0, 1.0, 0.5), jr.torques.UniformGravity(1.0, [0, 0, -1.0], [0, 0, -1.0]), 0.0, 200.0,
-        np.cos(200.0),
-    ),
-    "gyrostat": ((1.0, 1.0, 1.5), jr.torques.Rotor([0, 0, 50.0]), 0.1, 40.0, np.cos(50.05 * 40)),
-    "needle-like wheel": ((0.01, 0.01, 1.0), None, 1.0, 40.0, np.cos(99.0 * 40)),
-    "stiff damper": ((1.0, 1.0, 1.5), jr.torques.InternalDamper(1e-3, 1.0), 1.0, 40.0, None),
-    "stiff drag": ((1.0, 1.0, 1.5), jr.torques.LinearDrag(100.0), 0.0, 40.0, 0.0),
-}  # fmt: skip
+    "hanging at rest": ((1.0, 1.0, 0.5), -1.0, 0.0, 0.0, 0.0, 200.0),
+    "gyrostat": ((1.0, 1.0, 1.5), 0.0, 50.0, 0.0, 0.1, 40.0),
+    "needle-like wheel": ((0.01, 0.01, 1.0), 0.0, 0.0, 0.0, 1.0, 40.0),
+    "stiff drag": ((1.0, 1.0, 1.5), 0.0, 0.0, 100.0, 0.0, 40.0),
+}
+EXACT = {
+    "hanging at rest": np.cos(200.0),
+    "gyrostat": np.cos(50.05 * 40),
+    "needle-like wheel": np.cos(99.0 * 40),
+    "stiff drag": 0.0,
+}
+
+
+def _first_rate_by_itself(moments, torque, spin, duration):
+    def final(omega):
+        body, state0 = jr.RigidBody(moments, torque), jr.State(UPRIGHT, omega)
+        return jr.simulate(body, state0, duration, adjoint=FORWARD).states.omega
+
+    return jax.jvp(final, (jnp.array([0, 0, 1.0]) * spin,), (jnp.array([1.0, 0, 0]),))[1][0]
+
+
+@pytest.fixture(scope="module")
+def fast_slopes():
+    """By one compilation: each is a lane of one body that has all torques, most of them zero."""
+
+    def lane(moments, lever, rotor, drag, spin, duration):
+        along = jnp.array([0, 0, 1.0])
+        torque = (
+            jr.torques.UniformGravity(1.0, lever * along, -along)
+            + jr.torques.Rotor(rotor * along)
+            + jr.torques.LinearDrag(drag)
+        )
+        return _first_rate_by_itself(moments, torque, spin, duration)
+
+    lanes = [np.array(x) for x in zip(*FAST.values(), strict=True)]
+    return dict(zip(FAST, np.asarray(jax.jit(jax.vmap(lane))(*lanes)), strict=True))
 
 
 @pytest.mark.parametrize("what", FAST)
-def test_derivative_at_an_equilibrium_with_a_fast_rate(what):
-    moments, torque, spin, duration, exact = FAST[what]
-    if exact is None:
-        # omega = Omega to first order in the inertia over the coupling: see the linear system
-        # I (a' + i w a) = ..., solved here for (omega1, omega2, sphere1, sphere2).
-        ratio, coupling, inertia = 0.5, 1.0, 1e-3
-        linear = np.zeros((4, 4))
-        linear[:2, :2] = [[-coupling, -ratio * spin], [ratio * spin, -coupling]]
-        linear[:2, 2:] = coupling * np.eye(2)
-        linear[2:, :2] = coupling / inertia * np.eye(2) + spin * np.array([[0, -1], [1, 0]])
-        linear[2:, 2:] = -coupling / inertia * np.eye(2) + spin * np.array([[0, 1], [-1, 0]])
-        start = np.array([1.0, 0, 1.0, 0])  # the sphere starts with the body
-        exact = (scipy.linalg.expm(duration * linear) @ start)[0]
-
-    def final(omega):
-        body, state0 = jr.RigidBody(np.array(moments), torque), jr.State(UPRIGHT, omega)
-        return jr.simulate(body, state0, duration, adjoint=FORWARD).states.omega
-
-    omega0 = jnp.array([0.0, 0.0, spin])
-    _, column = jax.jit(lambda w: jax.jvp(final, (w,), (jnp.array([1.0, 0, 0]),)))(omega0)
-    assert abs(float(column[0]) - exact) <= 1e-5, (column, exact)
+def test_derivative_at_an_equilibrium_with_a_fast_rate(what, fast_slopes):
+    assert abs(fast_slopes[what] - EXACT[what]) <= 1e-5
 
 
-def _observable(omega, adjoint=None):
+def test_derivative_at_an_equilibrium_with_a_stiff_damper():
+    # omega = Omega to first order in the inertia over the coupling: see the linear system
+    # I (a' + i w a) = ..., solved here for (omega1, omega2, sphere1, sphere2).
+    ratio, coupling, inertia, spin, duration = 0.5, 1.0, 1e-3, 1.0, 40.0
+    linear = np.zeros((4, 4))
+    linear[:2, :2] = [[-coupling, -ratio * spin], [ratio * spin, -coupling]]
+    linear[:2, 2:] = coupling * np.eye(2)
+    linear[2:, :2] = coupling / inertia * np.eye(2) + spin * np.array([[0, -1], [1, 0]])
+    linear[2:, 2:] = -coupling / inertia * np.eye(2) + spin * np.array([[0, 1], [-1, 0]])
+    start = np.array([1.0, 0, 1.0, 0])  # the sphere starts with the body
+    exact = (scipy.linalg.expm(duration * linear) @ start)[0]
+    damper = jr.torques.InternalDamper(inertia, coupling)
+    slope = jax.jit(lambda w: _first_rate_by_itself(np.array([1.0, 1.0, 1.5]), damper, w, duration))
+    assert abs(float(slope(spin)) - exact) <= 1e-5
+
+
+def _observable(omega, adjoint=None, max_steps=None):
     state0 = jr.State(jnp.asarray(UPRIGHT), omega)
     trajectory = jr.simulate(
-        jr.RigidBody(MOMENTS), state0, jnp.array([1.0, 2.0]), adjoint=adjoint, rtol=1e-9
-    )
+        jr.RigidBody(MOMENTS), state0, jnp.array([1.0, 2.0]), adjoint=adjoint, rtol=1e-9,
+        max_steps=max_steps,
+    )  # fmt: skip
     return trajectory.states.omega[-1, 0] * trajectory.states.attitude[-1, 1]
 
 
 def test_reverse_forward_and_direct_agree():
     omega = jnp.asarray(OMEGA)
-    reverse = quick_jit(jax.grad(_observable))(omega)
-    forward = quick_jit(jax.jacfwd(lambda w: _observable(w, FORWARD)))(omega)
+    value, reverse = quick_jit(jax.value_and_grad(_observable))(omega)
+
+    def by_forward(w):
+        return (jax.jacfwd(lambda w: _observable(w, FORWARD))(w),) * 2
+
+    twice, forward = quick_jit(jax.jacfwd(by_forward, has_aux=True))(omega)
     np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
-    twice = quick_jit(jax.jacfwd(jax.jacfwd(lambda w: _observable(w, FORWARD))))(omega)
-    direct = diffrax.DirectAdjoint()
-    hessian = quick_jit(jax.hessian(lambda w: _observable(w, direct)))(omega)
-    np.testing.assert_allclose(twice, hessian, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(twice, twice.T, rtol=1e-7, atol=1e-9)
+    # forward over reverse along one direction
+    along, direct = np.array([1.0, -0.6, 0.3]), diffrax.DirectAdjoint()
+    slope = jax.grad(lambda w: _observable(w, direct, max_steps=64))
+    first, second = quick_jit(lambda w: jax.jvp(slope, (w,), (along,)))(omega)
+    np.testing.assert_allclose(first, forward, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(second, twice @ along, rtol=1e-10, atol=1e-12)
     step = 1e-5
     for k in range(3):
-        e = step * jnp.eye(3)[k]
+        e = step * np.eye(3)[k]
         difference = (_observable(omega + e) - _observable(omega - e)) / (2 * step)
         np.testing.assert_allclose(reverse[k], difference, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(_observable(omega), value, rtol=1e-12)
 
 
 def test_derivatives_in_times_and_initial_time():
@@ -263,10 +304,10 @@ def test_derivatives_in_times_and_initial_time():
     ts = jnp.array([0.7, 1.9])
 
     def final(ts, t0):
-        return jr.simulate(body, state0, ts, t0=t0, adjoint=FORWARD).states.omega
+        return (jr.simulate(body, state0, ts, t0=t0, adjoint=FORWARD).states.omega,) * 2
 
-    by_time, by_start = jax.jit(jax.jacfwd(final, argnums=(0, 1)))(ts, jnp.array(0.0))
-    omega = final(ts, 0.0)
+    slopes = quick_jit(jax.jacfwd(final, argnums=(0, 1), has_aux=True))
+    (by_time, by_start), omega = slopes(ts, jnp.array(0.0))
     for k in range(2):
         rate = jr.euler_equations(TENSOR, omega[k])
         np.testing.assert_allclose(by_time[k, :, k], rate, atol=1e-7)
@@ -282,7 +323,7 @@ def test_derivatives_in_times_and_initial_time():
         (lambda f: jax.jacfwd(jax.jit(f)), None, "adjoint=diffrax.ForwardMode()"),
         (jax.hessian, None, "adjoint=diffrax.DirectAdjoint()"),
         (lambda f: jax.jacrev(jax.jacrev(f)), None, "adjoint=diffrax.DirectAdjoint()"),
-        (jax.grad, FORWARD, "RecursiveCheckpointAdjoint()"),
+        pytest.param(jax.grad, FORWARD, "RecursiveCheckpointAdjoint()", marks=pytest.mark.slow),
         (lambda f: jax.jit(jax.grad(f)), FORWARD, "RecursiveCheckpointAdjoint()"),
     ],
 )
@@ -296,22 +337,25 @@ def test_a_mode_the_adjoint_cannot_serve_names_one_that_can(mode, adjoint, advic
 
 
 def test_times_of_any_shape():
-    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
-    flat = jr.simulate(body, state0, np.linspace(0, 5, 6))
-    square = jr.simulate(body, state0, np.linspace(0, 5, 6).reshape(2, 3))
+    body, state0 = jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)
+    flat = jr.simulate(body, state0, np.array([0.0, 5.0]))
+    square = jr.simulate(body, state0, np.array([0.0, 2.0, 3.0, 5.0]).reshape(2, 2))
     single = jr.simulate(body, state0, 5.0)
-    assert square.states.attitude.shape == (2, 3, 4)
-    assert square.energy.shape == (2, 3)
-    assert square.angular_momentum.shape == (2, 3, 3)
-    np.testing.assert_array_equal(square.states.omega.reshape(6, 3), flat.states.omega)
+    assert square.states.attitude.shape == (2, 2, 4)
+    assert square.energy.shape == (2, 2)
+    assert square.angular_momentum.shape == (2, 2, 3)
+    order = jr.simulate(body, state0, np.array([2.0, 3.0])).states.omega
+    np.testing.assert_allclose(square.states.omega[0, 1], order[0], atol=1e-9)
+    np.testing.assert_allclose(square.states.omega[1], [order[1], flat.states.omega[1]], atol=1e-9)
     np.testing.assert_allclose(single.states.omega, flat.states.omega[-1], atol=1e-9)
     np.testing.assert_array_equal(flat.states.omega[0], OMEGA)
 
 
 def test_repeated_times_and_all_times_at_the_start():
-    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
-    repeated = jr.simulate(body, state0, np.array([0.0, 0.0, 2.0, 2.0]))
-    np.testing.assert_array_equal(repeated.states.omega[2], repeated.states.omega[3])
+    body, state0 = jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)
+    repeated = jr.simulate(body, state0, np.array([0.0, 0.0, 2.0, 2.0]).reshape(2, 2)).states.omega
+    np.testing.assert_array_equal(repeated[0], [OMEGA, OMEGA])
+    np.testing.assert_array_equal(repeated[1, 0], repeated[1, 1])
     still = jr.simulate(body, state0, np.array([3.0, 3.0]), t0=3.0)
     np.testing.assert_array_equal(still.states.omega, [OMEGA, OMEGA])
     assert float(still.final_time) == 3.0
@@ -333,9 +377,9 @@ def test_a_time_an_ulp_after_the_end_of_a_step_is_not_a_stall():
 
 
 def test_a_body_at_rest_stays_at_rest():
-    body = jr.RigidBody(TENSOR)
-    trajectory = jr.simulate(body, jr.State(ATTITUDE, jnp.zeros(3)), np.array([1e6]))
-    np.testing.assert_array_equal(trajectory.states.omega, np.zeros((1, 3)))
+    body = jr.RigidBody(MOMENTS)
+    trajectory = jr.simulate(body, jr.State(ATTITUDE, np.zeros(3)), np.array([1.0, 1e6]))
+    np.testing.assert_array_equal(trajectory.states.omega, np.zeros((2, 3)))
 
 
 def test_a_body_spun_up_from_rest_in_any_unit_of_time():
@@ -357,8 +401,12 @@ def test_invariants_of_a_vmapped_trajectory():
     many = eqx.filter_vmap(lambda w: jr.simulate(body, jr.State(ATTITUDE, w), ts))(omegas)
     assert many.energy.shape == (2, 3)
     assert many.angular_momentum.shape == (2, 3, 3)
-    one = jr.simulate(body, jr.State(ATTITUDE, omegas[1]), ts)
-    np.testing.assert_allclose(many.energy[1], one.energy, rtol=1e-9)
+    states = many.states
+    for k in range(3):  # of the other lane, as told by its states alone
+        state = jr.State(states.attitude[1, k], states.omega[1, k], (states.internal[0][1, k],))
+        np.testing.assert_allclose(many.energy[1, k], body.energy(0.0, state, None), rtol=1e-14)
+        momentum = body.angular_momentum(0.0, state, None)
+        np.testing.assert_allclose(many.angular_momentum[1, k], momentum, rtol=0, atol=1e-14)
     assert np.all(many.result == jr.RESULTS.successful)
 
 
@@ -390,24 +438,8 @@ def test_derivative_in_a_time_at_the_start():
     def omega(ts):
         return jr.simulate(body, jr.State(ATTITUDE, OMEGA), ts).states.omega
 
-    slope = jax.jacrev(omega)(jnp.array([0.0]))
+    slope = quick_jit(jax.jacrev(omega))(jnp.array([0.0]))
     np.testing.assert_allclose(slope[0, :, 0], jr.euler_equations(MOMENTS, OMEGA), atol=1e-9)
-
-
-def test_an_event_ends_the_motion_in_si_units():
-    """A body turning at 2 rad/s about z has turned by 1.3 rad after 0.65 s."""
-
-    def condition(t, state, args, **kwargs):
-        return state.attitude[0] - jnp.cos(0.65)
-
-    event = diffrax.Event(condition, optx.Newton(1e-12, 1e-12))
-    state0 = jr.State(UPRIGHT, np.array([0.0, 0.0, 2.0]))
-    trajectory = jr.simulate(jr.RigidBody(MOMENTS), state0, np.linspace(0, 5, 11), event=event)
-    assert trajectory.result == jr.RESULTS.event_occurred
-    np.testing.assert_allclose(trajectory.final_time, 0.65, atol=1e-8)
-    np.testing.assert_allclose(trajectory.final_state.omega, [0, 0, 2], atol=1e-9)
-    reached = np.isfinite(trajectory.states.omega[:, 0])
-    np.testing.assert_array_equal(reached, trajectory.ts <= 0.65)
 
 
 def test_progress_meter_prints(capfd):
@@ -426,14 +458,6 @@ def test_running_out_of_steps_is_reported():
     assert np.all(np.isnan(trajectory.states.omega[1]))
     with pytest.raises(RuntimeError, match="maximum number of solver steps"):
         jr.simulate(body, state0, ts, max_steps=20)
-
-
-def test_a_torque_that_turns_nan_on_the_way_is_reported_at_once():
-    body = jr.RigidBody(TENSOR, lambda t, _s, _a: jnp.where(t > 3, jnp.nan, 0.0) * jnp.ones(3))
-    trajectory = jr.simulate(body, jr.State(ATTITUDE, OMEGA), np.array([1.0, 5.0]), throw=False)
-    assert trajectory.result == jr.RESULTS.nonfinite_torque
-    assert trajectory.stats["num_steps"] < 300
-    assert np.all(np.isfinite(trajectory.states.omega[0]))
 
 
 # Bad input -----------------------------------------------------------------------------------
@@ -533,14 +557,33 @@ def test_gradients_in_what_lanes_share_are_untouched_by_a_bad_one():
     np.testing.assert_allclose(gradient(jnp.array(0.1), attitudes), alone, rtol=1e-12)
 
 
-@pytest.mark.parametrize("field", ["final_state", "final_time", "stats", "states"])
-def test_every_field_of_a_trajectory_carries_the_error(field):
-    def part(attitude):
-        state0 = jr.State(attitude, jnp.asarray(OMEGA))
-        return getattr(jr.simulate(jr.RigidBody(MOMENTS), state0, jnp.array([1.0])), field)
+FIELDS = ("final_state", "final_time", "stats", "states")
 
-    with pytest.raises(RuntimeError, match="unit quaternion"):
-        jax.block_until_ready(eqx.filter_jit(part)(jnp.zeros(4)))
+
+@pytest.fixture(scope="module")
+def reached_by_the_error():
+    """Which leaves of a trajectory, traced, are computed from what raises the error."""
+
+    def every(attitude):
+        state0 = jr.State(attitude, jnp.asarray(OMEGA))
+        trajectory = jr.simulate(jr.RigidBody(MOMENTS), state0, jnp.array([1.0]))
+        return {field: jax.tree.leaves(getattr(trajectory, field)) for field in FIELDS}
+
+    closed, shapes = jax.make_jaxpr(every, return_shape=True)(jnp.zeros(4))
+    reached = set()
+    for equation in closed.jaxpr.eqns:
+        raises = "callback" in str(equation.params) or "callback" in equation.primitive.name
+        if raises or any(id(x) in reached for x in equation.invars):
+            reached.update(id(x) for x in equation.outvars)
+    leaves = [id(x) in reached for x in closed.jaxpr.outvars]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_field_of_a_trajectory_carries_the_error(field, reached_by_the_error):
+    """What it does carry is raised in `test_bad_value_raises_eagerly_and_under_jit...`."""
+    assert reached_by_the_error[field]
+    assert all(reached_by_the_error[field])
 
 
 def test_nan_in_a_torque_at_the_start_is_an_error():
@@ -576,14 +619,14 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
             lambda b, s: jr.simulate(b, (s.attitude, s.omega), 1.0),
             "`state0` must be a State, but it is a tuple",
         ),
-        (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a diffrax.Event"),
+        (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a Event"),
         (
             lambda b, s: jr.simulate(b, s, 1.0, max_steps=0),
             "`max_steps` must be an integer and at least 1",
         ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, adjoint=diffrax.BacksolveAdjoint()),
-            "`adjoint` must be diffrax.RecursiveCheckpointAdjoint",
+            "`adjoint` must be a RecursiveCheckpointAdjoint or",
         ),
     ],
 )
@@ -593,8 +636,8 @@ def test_wrong_shape_or_option_is_a_value_error(untyped, call, message):
 
 
 def test_another_solver_keeps_the_promise():
-    body, state0 = jr.RigidBody(TENSOR), jr.State(ATTITUDE, OMEGA)
-    ts = np.linspace(0, 20, 5)
+    body, state0 = jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)
+    ts = np.array([0.0, 20.0])
     default = jr.simulate(body, state0, ts, rtol=1e-7)
     other = jr.simulate(body, state0, ts, rtol=1e-7, solver=diffrax.Tsit5())
     np.testing.assert_allclose(default.states.omega, other.states.omega, atol=1e-6)

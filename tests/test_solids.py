@@ -1,6 +1,7 @@
 # ruff: noqa: E501
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -201,13 +202,17 @@ def test_every_solid_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
             mass, *lengths = arguments[name]
             return SOLIDS[name][0](mass * mass_scale, *(x * length_scale for x in lengths))
 
-        one = jnp.ones_like(scale)
-        bodies = {name: scaled(name, one, scale) for name in SOLIDS}
-        by_mass = {name: jax.jacfwd(lambda s, n=name: scaled(n, s, scale))(one) for name in SOLIDS}
-        by_length = {
-            name: jax.grad(lambda s, n=name: jnp.sum(jnp.trace(scaled(n, one, s).inertia)))(scale)
-            for name in SOLIDS
-        }
+        bodies, by_mass, by_length = {}, {}, {}
+        ones = jnp.stack([jnp.ones_like(scale), scale])
+        for name in SOLIDS:  # one trace for both modes
+            body, along = jax.linearize(lambda s, n=name: scaled(n, *s), ones)
+            trace = eqx.tree_at(
+                lambda x: x.inertia,
+                jax.tree.map(jnp.zeros_like, body),
+                jnp.eye(3, dtype=scale.dtype),
+            )
+            bodies[name], by_mass[name] = body, along(jnp.array([1.0, 0.0], scale.dtype))
+            by_length[name] = jax.linear_transpose(along, ones)(trace)[0][1]
         return bodies, by_mass, by_length
 
     batched = quick_jit(jax.vmap(everything, in_axes=(0, None)))
@@ -249,13 +254,25 @@ def test_a_bad_lane_is_nan_and_leaves_the_others_and_their_gradients_alone():
         leaves = jax.tree.leaves(function(*arguments))
         return sum(jnp.sum(jnp.sin(jnp.where(jnp.isnan(x), 0.0, x))) for x in leaves), leaves
 
-    for name, (function, arguments) in SOLIDS.items():
-        lanes = [arguments] + [changed for other, changed in cases if other == name]
-        lanes = jax.tree.map(lambda *x: np.stack(x), *lanes)
-        gradient = jax.grad(functools.partial(size, function), has_aux=True)
-        gradient = jax.jit(jax.vmap(gradient))
-        slopes, leaves = gradient(lanes)
-        alone, expected = gradient(jax.tree.map(lambda x: x[[0] * len(x)], lanes))
+    @quick_jit  # one compilation for all
+    def gradients(lanes):
+        return {
+            name: jax.vmap(jax.grad(functools.partial(size, SOLIDS[name][0]), has_aux=True))(own)
+            for name, own in lanes.items()
+        }
+
+    lanes = {
+        name: jax.tree.map(
+            lambda *x: np.stack(x),
+            arguments,
+            *(changed for other, changed in cases if other == name),
+        )
+        for name, (_, arguments) in SOLIDS.items()
+    }
+    together = gradients(lanes)
+    good_alone = gradients(jax.tree.map(lambda x: x[[0] * len(x)], lanes))
+    for name in SOLIDS:
+        (slopes, leaves), (alone, expected) = together[name], good_alone[name]
         for found, good in ((slopes, alone), (leaves, expected)):
             jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), found, good)
         for leaf in leaves:
@@ -277,7 +294,7 @@ def test_a_bad_lane_leaves_the_gradient_in_shared_arguments_alone():
         traces = [jnp.trace(body.inertia) for body in bodies]
         return sum(jnp.where(jnp.isnan(x), 0.0, x) for x in traces)
 
-    both = jax.jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
+    both = quick_jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
     alone = both(2.0, np.array([1.0, 1.0])) / 2
     for bad in (np.nan, np.inf, 0.0, -1.0):
         lanes = both(2.0, np.array([1.0, bad]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 
 import jrigid as jr
 from jrigid import rotation as ro
@@ -34,7 +34,7 @@ def orbit(t):
 def along_the_motion(system, t, state, args=None):
     """Energy, its rate, momentum, its rate along the vector field, at a frozen time."""
 
-    @jax.jit
+    @quick_jit
     def both(t, state):
         state_rate = system.vector_field(t, state, args)
         invariants = lambda s: (  # noqa: E731
@@ -154,24 +154,30 @@ def test_the_gradient_of_gravity_acts_on_the_bodys_own_inertia(inertia):
     )
     rate = lambda i: swinging(i).vector_field(0.7, STATE, None).omega  # noqa: E731
     other = inertia + 0.2 * (np.eye(3) if inertia.ndim == 2 else 1)
-    bodies = jnp.stack([inertia, other])
-    expected = np.stack([by_hand(x) for x in bodies])
-    np.testing.assert_allclose(jax.vmap(rate)(bodies), expected, atol=ulps(float, 8))
-    replaced = eqx.tree_at(lambda body: body.inertia, swinging(inertia), jnp.asarray(other))
-    found = replaced.vector_field(0.7, STATE, None).omega
-    np.testing.assert_allclose(found, expected[1], atol=ulps(float, 8))
-    for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(
-            derivative(rate)(inertia), derivative(by_hand)(inertia), atol=ulps(float, 32)
+
+    @quick_jit
+    def every(inertia, other):
+        bodies = jnp.stack([inertia, other])
+        replaced = eqx.tree_at(lambda body: body.inertia, swinging(inertia), other)
+        slopes = [d(f)(inertia) for d in (jax.jacfwd, jax.jacrev) for f in (rate, by_hand)]
+        torques = (
+            swinging(inertia).torque_on(0.7, STATE, None),
+            gradient.of_body(inertia)(0.7, STATE, None) - 0.1 * OMEGA,
         )
-    on_body = swinging(inertia).torque_on(0.7, STATE, None)
-    expected = gradient.of_body(inertia)(0.7, STATE, None) - 0.1 * OMEGA
-    np.testing.assert_allclose(on_body, expected, atol=ulps(float, 4))
+        rates = jax.vmap(rate)(bodies), replaced.vector_field(0.7, STATE, None).omega
+        return rates, jnp.stack([by_hand(inertia), by_hand(other)]), slopes, torques
+
+    (in_lanes, replaced), expected, slopes, torques = every(inertia, other)
+    np.testing.assert_allclose(in_lanes, expected, atol=ulps(float, 8))
+    np.testing.assert_allclose(replaced, expected[1], atol=ulps(float, 8))
+    for found, by_product_rule in (slopes[:2], slopes[2:]):
+        np.testing.assert_allclose(found, by_product_rule, atol=ulps(float, 32))
+    np.testing.assert_allclose(*torques, atol=ulps(float, 4))
     if inertia.ndim == 2:
         flying = jr.FloatingState(orbit(0.7), VELOCITY, ATTITUDE, OMEGA)
         in_flight = jr.FloatingBody(BODY, None, tq.GravityGradient(4.0))
         own = in_flight.torque_on(0.0, flying, None)
-        np.testing.assert_allclose(own, on_body + 0.1 * OMEGA, atol=ulps(float, 4))
+        np.testing.assert_allclose(own, torques[0] + 0.1 * OMEGA, atol=ulps(float, 4))
 
 
 def test_a_body_without_torque_is_free():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from helpers import quick_jit, ulps
+from helpers import both_ways, quick_jit, ulps
 from scipy.spatial.transform import Rotation
 
 import jrigid as jr
@@ -206,17 +206,20 @@ def of_the_momenta():
         rates = top.angle_rates(TOP, 1.0, p, 3.0)
         return jnp.stack([top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi])
 
-    return jax.jit(both), quick_jit(jax.jacfwd(both)), quick_jit(jax.jacfwd(jax.jacfwd(both)))
+    def slope(p):
+        value, slope = jax.jvp(both, (p,), (1.0,))
+        return slope, (value, slope)
+
+    return quick_jit(jax.jacfwd(slope, has_aux=True))
 
 
 @pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
 def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
     """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
-    value, slope, curvature = of_the_momenta
-    found, h = slope(p_phi), 1e-5
-    difference = (value(p_phi + h) - value(p_phi - h)) / (2 * h)
-    np.testing.assert_allclose(found, difference, atol=1e-9)
-    curvature = curvature(p_phi)
+    h = 1e-5
+    curvature, (_, found) = of_the_momenta(p_phi)
+    up, down = (of_the_momenta(p_phi + step)[1][0] for step in (h, -h))
+    np.testing.assert_allclose(found, (up - down) / (2 * h), atol=1e-9)
     np.testing.assert_allclose(curvature, [1 / np.sin(1.0) ** 2, 0, 0], atol=1e-13)
 
 
@@ -324,7 +327,12 @@ def slopes():
         one, moved = jr.SymmetricTop(x[0], x[1], x[2]), jr.State(state.attitude, x[3:])
         return jnp.stack([top.nutation_period(one, moved), top.mean_precession(one, moved)])
 
-    return jax.jit(both), quick_jit(jax.jacfwd(both)), quick_jit(jax.jacrev(both))
+    @quick_jit
+    def every(s, direction, state):
+        """Value, slopes forward and in reverse, by one trace."""
+        return both_ways(lambda s: both(s, direction, state), s)
+
+    return every
 
 
 @pytest.mark.parametrize("name", STARTS)
@@ -334,16 +342,15 @@ def test_derivatives_of_period_and_precession_are_differences(name, slopes):
     if name == "plane pendulum" or name in AT_THE_VERTICAL:  # stay in the plane, or at the vertical
         moves = not name.startswith("plane") and state.omega[0] == 0
         direction[3:] = [0.0, 0.0, 0.4] if moves else [0.4, 0.0, 0.0]
-    value, forward, reverse = slopes
 
     def both(s):
-        return np.asarray(value(s, direction, state))
+        return np.asarray(slopes(s, direction, state)[0])
 
     h = 1e-4
-    found = forward(0.0, direction, state)
+    _, found, reverse = slopes(0.0, direction, state)
     difference = (8 * (both(h) - both(-h)) - (both(2 * h) - both(-2 * h))) / (12 * h)
     np.testing.assert_allclose(found, difference, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(reverse(0.0, direction, state), found, rtol=1e-11)
+    np.testing.assert_allclose(reverse, found, rtol=1e-11)
 
 
 def test_small_swings_keep_their_relative_size():
@@ -397,8 +404,8 @@ def special():
         return jnp.stack(jax.tree.leaves(found))
 
     def with_derivatives(x, attitude):
-        forward, reverse = (d(everything)(x, attitude) for d in (jax.jacfwd, jax.jacrev))
-        return everything(x, attitude), forward, reverse
+        values, forward, reverse = both_ways(lambda x: everything(x, attitude), x)
+        return values, forward.T, reverse
 
     return quick_jit(with_derivatives)
 
@@ -635,26 +642,47 @@ INTEGRABLE = {
 }
 
 
+LONG = {
+    **INTEGRABLE,
+    "bruls": (
+        heavy([15.234375, 15.234375, 0.46875], [0.0, 0.0, 15.0 * 9.81]),
+        np.array([-4.61538, 0.0, 150.0]),
+    ),
+    "simo": (heavy([5.0, 5.0, 1.0], [0.0, 0.0, 20.0]), np.array([0.0, 0.0, 50.0])),
+}
+# The axes (3, 1, 2) of Bruls's benchmark are (1, 2, 3): q = q_benchmark * p.
+FROM_BENCHMARK = rotation.from_matrix(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+TILTED = rotation.exp(np.array([0.05, 0, 0]))
+
+
 @pytest.fixture(scope="module")
-def long_motion():
-    def run(moments, lever, state0, ts):
+def long_motions():
+    """All of them by one compilation, as lanes: at this size a step of six costs that of one."""
+
+    def run(moments, lever, attitude, omega, ts):
         gravity = jr.torques.UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
         body = jr.RigidBody(moments, gravity)
-        return jr.simulate(body, state0, ts, rtol=1e-13, max_step=0.05).states
+        return jr.simulate(body, jr.State(attitude, omega), ts, rtol=1e-13, max_step=0.05).states
 
-    return jax.jit(run)
+    attitudes = [*[ATTITUDE] * len(INTEGRABLE), FROM_BENCHMARK, TILTED]
+    ends = [2000 * np.pi / np.linalg.norm(omega) for _, omega in INTEGRABLE.values()]
+    lanes = (
+        np.stack([body.inertia for body, _ in LONG.values()]),
+        np.stack([body.torque.lever for body, _ in LONG.values()]),
+        np.stack(attitudes),
+        np.stack([omega for _, omega in LONG.values()]),
+        np.linspace(0.0, [*ends, 2.0, 10.0], 101, axis=1),
+    )
+    states = jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(*lanes))
+    return {name: jax.tree.map(lambda x, k=k: x[k], states) for k, name in enumerate(LONG)}
 
 
 @pytest.mark.parametrize("case", INTEGRABLE)
-def test_extra_integrals_are_constant_to_1e_12_over_a_thousand_turns(case, long_motion):
-    body, omega = INTEGRABLE[case]
-    state0 = jr.State(ATTITUDE, omega)
-    ts = np.linspace(0.0, 2000 * np.pi / np.linalg.norm(omega), 101)
-    states = long_motion(body.inertia, body.torque.lever, state0, ts)
-    first = top.integrals(body, state0, case)
-    later = jax.vmap(lambda s: top.integrals(body, s, case))(states)
-    for before, after in zip(first, later, strict=True):
-        assert np.max(np.abs(after - before)) < 1e-12 * max(1.0, abs(float(before)))
+def test_extra_integrals_are_constant_to_1e_12_over_a_thousand_turns(case, long_motions):
+    body, _ = INTEGRABLE[case]
+    integrals = quick_jit(jax.vmap(lambda s: top.integrals(body, s, case)))
+    for values in map(np.asarray, integrals(long_motions[case])):
+        assert np.max(np.abs(values - values[0])) < 1e-12 * max(1.0, abs(float(values[0])))
 
 
 def test_the_extra_integral_s_rate_is_zero_for_generic_bodies_of_the_case(rng):
@@ -744,15 +772,14 @@ def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
 # --- Printed numbers ----------------------------------------------------------------------------
 
 
-def test_bruls_cardona_heavy_top_in_closed_form(long_motion):
+def test_bruls_cardona_heavy_top_in_closed_form(long_motions):
     """See tests/test_published.py: symmetric about body axis 2, which is axis 3 here.
 
     At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own error is
     1.2e-7 m; at 0.03 s and 0.2 s the five digits of EXUDYN.
     """
     bruls = jr.SymmetricTop(15.234375, 0.46875, 15.0 * 9.81)
-    # The axes (3, 1, 2) of the benchmark are (1, 2, 3): q = q_benchmark * p.
-    p = rotation.from_matrix(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+    p = FROM_BENCHMARK
     state0 = jr.State(p, np.array([-4.61538, 0.0, 150.0]))
     motion = jr.top_motion(bruls, state0, np.array([0.03, 0.2, 1.0, 2.0]))
     attitudes = jax.vmap(lambda q: rotation.multiply(q, rotation.conjugate(p)))(motion.attitude)
@@ -767,20 +794,18 @@ def test_bruls_cardona_heavy_top_in_closed_form(long_motion):
         np.testing.assert_allclose(found, quaternion, rtol=0, atol=digit)
     np.testing.assert_allclose(motion.omega[0], [1.8644, -4.2537, 150.0], rtol=1e-5)
     # And against the quaternions' equations, to their accuracy over 300 radians.
-    body = heavy([15.234375, 15.234375, 0.46875], [0.0, 0.0, 15.0 * 9.81])
-    times = np.linspace(0.0, 2.0, 101)
-    attitudes = long_motion(body.inertia, body.torque.lever, state0, times).attitude
-    for a, b in zip(np.asarray(motion.attitude[2:]), np.asarray(attitudes)[[50, 100]], strict=True):
+    attitudes = long_motions["bruls"].attitude
+    for a, b in zip(np.asarray(motion.attitude[2:]), attitudes[[50, 100]], strict=True):
         np.testing.assert_allclose(a, b * np.sign(a @ b), atol=1e-9)
 
 
-def test_simo_wong_heavy_top_in_closed_form(long_motion):
+def test_simo_wong_heavy_top_in_closed_form(long_motions):
     """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
 
     Beside it the quaternions' equations, and the mean precession by quadrature.
     """
     simo = jr.SymmetricTop(5.0, 1.0, 20.0)
-    state0 = jr.State(rotation.exp(np.array([0.05, 0, 0])), np.array([0.0, 0.0, 50.0]))
+    state0 = jr.State(TILTED, np.array([0.0, 0.0, 50.0]))
     keeps = top.conserved(simo, state0)
     assert keeps.energy == pytest.approx(1269.975, abs=5e-4)
     times = np.linspace(0.0, 10.0, 101)
@@ -788,9 +813,7 @@ def test_simo_wong_heavy_top_in_closed_form(long_motion):
     energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states.states)
     np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
     assert np.cos(nutation(simo, state0).bounds.theta_min) == pytest.approx(0.99875, abs=5e-6)
-    body = heavy([5.0, 5.0, 1.0], [0.0, 0.0, 20.0])
-    other = long_motion(body.inertia, body.torque.lever, state0, times)
-    np.testing.assert_allclose(states.attitude, other.attitude, atol=1e-9)
+    np.testing.assert_allclose(states.attitude, long_motions["simo"].attitude, atol=1e-9)
     with mp.workdps(25):
         _, _, period, phi, _ = quadratures(simo, state0)
     assert nutation(simo, state0).period == pytest.approx(float(period), rel=1e-12)

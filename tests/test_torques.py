@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.optimize
-from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, ulps
+from helpers import ATTITUDE, MOMENTS, OMEGA, TENSOR, quick_jit, ulps
 
 import jrigid as jr
 from jrigid import rotation as ro
@@ -239,19 +239,49 @@ def test_drag_against_numpy(name):
     )
 
 
-def test_a_sphere_slows_down_as_linear_and_quadratic_drag_say():
-    """omega0 exp(-c t / I) and omega0 / (1 + c |omega0| t / I), at once in two lanes."""
-    moment, c = 0.8, 0.3
-    ts = np.linspace(0, 10, 6)
+FRICTION = {"coefficient": 0.3, "width": 1e-3, "start": 1.5, "moment": 2.0}
+FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Four motions as lanes of one compilation, of a body that has all torques, some of them zero.
+
+    Slowed by linear and by quadratic drag, stopped by friction, a gyrostat.
+    """
 
     @jax.jit
     @jax.vmap
-    def lanes(linear, quadratic):
-        torque = tq.LinearDrag(linear) + tq.QuadraticDrag(quadratic)
-        body = jr.RigidBody(jnp.full(3, moment), torque)
-        return jr.simulate(body, STATE, ts, rtol=1e-10).states.omega
+    def lanes(moments, linear, quadratic, friction, momentum, state0, ts, rtol):
+        torque = tq.LinearDrag(linear) + tq.QuadraticDrag(quadratic) + tq.Rotor(momentum)
+        torque += tq.CoulombFriction(friction, FRICTION["width"], FRICTION_AXIS)
+        run = jr.simulate(jr.RigidBody(moments, torque), state0, ts, rtol=rtol)
+        return run.states, run.stats["num_steps"], run.energy, run.angular_momentum
 
-    slow, slower = lanes(jnp.array([c, 0.0]), jnp.array([0.0, c]))
+    spheres, rest = np.full((2, 3), 0.8), np.full(3, FRICTION["moment"])
+    stop = FRICTION["moment"] * FRICTION["start"] / FRICTION["coefficient"]  # 10 s
+    states = [STATE, STATE, jr.State(np.eye(4)[0], FRICTION["start"] * FRICTION_AXIS), STATE]
+    zero, fall = np.zeros(6), np.array([0.3, 0.7, 0.95, 0.999, 2.0, 3.0]) * stop
+    found = lanes(
+        np.stack([*spheres, rest, MOMENTS]),
+        np.array([0.3, 0, 0, 0]),
+        np.array([0, 0.3, 0, 0]),
+        np.array([0, 0, FRICTION["coefficient"], 0]),
+        np.stack([zero[:3], zero[:3], zero[:3], H]),
+        jax.tree.map(lambda *x: np.stack(x), *states),
+        np.stack([np.linspace(0, 10, 6)] * 2 + [fall, np.linspace(0, 20, 6)]),
+        np.array([1e-10, 1e-10, 1e-9, 1e-12]),
+    )
+    names = ("linear", "quadratic", "friction", "gyrostat")
+    found = jax.tree.map(np.asarray, found)
+    return {name: jax.tree.map(lambda x, k=k: x[k], found) for k, name in enumerate(names)}
+
+
+def test_a_sphere_slows_down_as_linear_and_quadratic_drag_say(runs):
+    """omega0 exp(-c t / I) and omega0 / (1 + c |omega0| t / I)."""
+    moment, c = 0.8, 0.3
+    ts = np.linspace(0, 10, 6)
+    slow, slower = (runs[name][0].omega for name in ("linear", "quadratic"))
     exact = OMEGA * np.exp(-c * ts / moment)[:, None]
     np.testing.assert_allclose(slow, exact, rtol=1e-9)
     rate = np.linalg.norm(OMEGA)
@@ -262,7 +292,8 @@ def test_quadratic_drag_at_rest_has_value_and_gradient_zero():
     for coefficient in COEFFICIENTS.values():
         drag = lambda w, c=coefficient: tq.QuadraticDrag(c)(0.0, jr.State(ATTITUDE, w), None)  # noqa: E731
         for derivative in (jax.jacfwd, jax.jacrev):
-            value, jacobian = jax.jit(lambda w, f=drag, d=derivative: (f(w), d(f)(w)))(jnp.zeros(3))
+            both = quick_jit(lambda w, f=drag, d=derivative: (f(w), d(f)(w)))
+            value, jacobian = both(jnp.zeros(3))
             assert np.all(np.asarray(value) == 0)
             assert np.all(np.asarray(jacobian) == 0)
 
@@ -286,34 +317,32 @@ def test_friction_is_of_one_size_and_linear_below_its_width(dtype):
     for friction, slope in ((joint, np.eye(3)), (bearing, np.outer(unit, unit))):
         torque = lambda w, f=friction: f(0.0, jr.State(ATTITUDE.astype(dtype), w), None)  # noqa: E731
         for derivative in (jax.jacfwd, jax.jacrev):
-            found = jax.jit(derivative(torque))(np.zeros(3, dtype))
+            found = quick_jit(derivative(torque))(np.zeros(3, dtype))
             np.testing.assert_allclose(found, -300.0 * slope, rtol=1e-6, atol=1e-4)
         assert np.all(np.asarray(torque(np.zeros(3, dtype))) == 0)
 
 
-def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps():
+def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps(runs):
     """I w' = -c w / sqrt(w^2 + e^2): sqrt(w^2 + e^2) - e arsinh(e / w) falls as c t / I.
 
     A callable -c sign(omega) took 43 s and ended at `max_steps`.
     """
-    moment, c, width, start = 2.0, 0.3, 1e-3, 1.5
-    axis = np.array([0.0, 0.6, 0.8])
-    body = jr.RigidBody(np.full(3, moment), tq.CoulombFriction(c, width, axis))
-    stop = moment * start / c  # 10 s
+    c, width, start, moment = FRICTION.values()
+    axis, stop = FRICTION_AXIS, moment * start / c
     ts = np.array([0.3, 0.7, 0.95, 0.999, 2.0, 3.0]) * stop
-    run = jr.simulate(body, jr.State(np.eye(4)[0], start * axis), ts, rtol=1e-9)
-    assert int(run.stats["num_steps"]) < 10_000  # most of them at rest: 2.5 for I e / c
+    states, steps, energy, _ = runs["friction"]
+    assert int(steps) < 10_000  # most of them at rest: 2.5 for I e / c
     fall = lambda w: np.hypot(w, width) - width * np.arcsinh(width / w)  # noqa: E731
-    for t, omega in zip(ts[:4], np.asarray(run.states.omega), strict=False):
+    for t, omega in zip(ts[:4], states.omega, strict=False):
         exact = scipy.optimize.brentq(
             lambda w, t=t: fall(w) - fall(start) + c * t / moment, 1e-12, start, xtol=1e-14
         )
         np.testing.assert_allclose(omega, exact * axis, atol=1e-8)
-    assert np.linalg.norm(run.states.omega[4:]) < 1e-9
+    assert np.linalg.norm(states.omega[4:]) < 1e-9
     # the energy went into heat, and the angle is that of a constant torque, to the width
-    assert np.all(np.diff(run.energy[:5]) < 0)
+    assert np.all(np.diff(energy[:5]) < 0)
     angle = start**2 * moment / (2 * c)
-    turned = ro.angle_between(run.states.attitude[-1], ro.from_axis_angle(axis, angle))
+    turned = ro.angle_between(states.attitude[-1], ro.from_axis_angle(axis, angle))
     assert turned < 1e-4
 
 
@@ -486,7 +515,7 @@ def test_damping_ends_in_spin_about_the_major_axis_with_all_momentum_kept():
 # --- rotors -----------------------------------------------------------------------------------
 
 
-def test_a_gyrostat_follows_hand_derived_equations():
+def test_a_gyrostat_follows_hand_derived_equations(runs):
     """(I w)' = (I w + h) x w for constant h, written out and integrated by scipy."""
 
     def rate(t, w):
@@ -499,13 +528,11 @@ def test_a_gyrostat_follows_hand_derived_equations():
             ((i1 - i2) * a * b + h1 * b - h2 * a) / i3,
         ]
 
-    ts = np.linspace(0, 20, 5)
-    body = jr.RigidBody(MOMENTS, tq.Rotor(H))
-    run = jr.simulate(body, STATE, ts, rtol=1e-12)
+    ts = np.linspace(0, 20, 6)
+    states, _, _, momentum = runs["gyrostat"]
     exact = scipy.integrate.solve_ivp(rate, (0, 20), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(run.states.omega, exact.y.T, atol=1e-10)
-    momentum = np.asarray(run.angular_momentum)
-    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (5, 3)), atol=2e-12)
+    np.testing.assert_allclose(states.omega, exact.y.T, atol=1e-10)
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (6, 3)), atol=2e-12)
     np.testing.assert_allclose(momentum[0], ro.rotate(ATTITUDE, MOMENTS * OMEGA + H), atol=1e-14)
 
 
@@ -716,7 +743,7 @@ WRONG = {
     ),
     "linear": (
         lambda: tq.LinearDrag(FOUR),
-        r"`coefficient` must have shape \(\), \(3,\) or \(3, 3\), but it has shape \(4,\)",
+        r"`coefficient` must have shape \(\) or \(3,\) or \(3, 3\), but it has shape \(4,\)",
     ),
     "quadratic": (lambda: tq.QuadraticDrag(FOUR), r"`coefficient` must have shape"),
     "damper": (

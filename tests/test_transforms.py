@@ -636,7 +636,7 @@ def weighted(case, dtype):
     def total(x):
         values = outputs(x)
         weights = np.cos(1.0 + np.arange(values.size)).astype(dtype)
-        return jnp.sum(weights * values)
+        return jnp.sum(weights * values), values
 
     return np.asarray(flat), outputs, total
 
@@ -658,15 +658,11 @@ def derivatives():
 
             @quick_jit
             def everything(x, direction):
-                reverse, curvature = jax.jvp(jax.grad(total), (x,), (direction,))
-                found = {
-                    "value": outputs(x),
-                    "reverse": reverse,
-                    "forward": jax.jvp(total, (x,), (direction,))[1],
-                    "second": curvature,
-                }
+                ahead = jax.jvp(jax.value_and_grad(total, has_aux=True), (x,), (direction,))
+                ((_, value), reverse), ((forward, _), second) = ahead
+                found = {"value": value, "reverse": reverse, "forward": forward, "second": second}
                 if dtype == np.float64:
-                    found["jacobian"] = jax.jacfwd(total)(x)
+                    found["jacobian"] = jax.jacfwd(total, has_aux=True)(x)[0]
                 return found
 
             direction = direction_of(flat)

@@ -7,6 +7,7 @@ its result code (`settle`). An error is raised in Python where the values are kn
 the compiled function without callbacks, and by `equinox.error_if` inside of someone's jit.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,6 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Tree = TypeVar("Tree")
+
+INERTIA = (3,), (3, 3)  # shapes of an inertia: principal moments or a tensor
 
 
 class _Listed(type(eqx.Enumeration)):
@@ -128,53 +131,39 @@ def internal_parts(internal: Any) -> Any:
     return None if isinstance(internal, tuple) and not internal else internal
 
 
-def check_shape(name: str, value: Array | np.ndarray, shape: tuple[int | None, ...]) -> None:
-    """Raise ValueError unless `value` has the shape; None stands for any length."""
-    fits = value.ndim == len(shape) and all(
-        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
-    )
-    if not fits:
-        wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape)
-        wanted += ",)" if len(shape) == 1 else ")"
-        raise ValueError(
-            f"Argument `{name}` must have shape {wanted}, but it has shape {value.shape}."
-        )
+def check_shape(name: str, value: Array | np.ndarray, *shapes: tuple[int | None, ...]) -> None:
+    """Raise ValueError unless `value` has one of the shapes; None stands for any length."""
+    for shape in shapes:
+        pairs = zip(value.shape, shape, strict=False)
+        if len(shape) == value.ndim and all(wanted in (None, length) for length, wanted in pairs):
+            return
+    wanted = " or ".join(str(shape).replace("None", "n") for shape in shapes)
+    raise ValueError(f"Argument `{name}` must have shape {wanted}, but it has shape {value.shape}.")
 
 
-def array_of_shape(name: str, value: Any, *shape: int | None) -> Array:
+def array_of_shape(name: str, value: Any, *shape: Any) -> Array:
     """Convert to a floating point array, or raise ValueError if the shape is wrong."""
-    (array,) = float_arrays(value)
-    check_shape(name, array, shape)
-    return array
+    return shaped(**{name: (value, *shape)})[0]
 
 
-def pair_of_shapes(
-    name_a: str,
-    a: Any,
-    shape_a: tuple[int | None, ...],
-    name_b: str,
-    b: Any,
-    shape_b: tuple[int | None, ...],
-) -> tuple[Array, Array]:
-    """Convert two arguments to one dtype, or raise ValueError if a shape is wrong."""
-    array_a, array_b = float_arrays(a, b)
-    check_shape(name_a, array_a, shape_a)
-    check_shape(name_b, array_b, shape_b)
-    return array_a, array_b
+def shaped(**arguments: tuple[Any, ...]) -> tuple[Array, ...]:
+    """Convert arguments to one dtype, or raise ValueError if a shape is wrong.
 
-
-def check_inertia_shape(inertia: Array, name: str = "inertia") -> None:
-    """Raise ValueError unless `inertia` is three moments or a (3, 3) tensor."""
-    if inertia.shape not in ((3,), (3, 3)):
-        raise ValueError(
-            f"Argument `{name}` must have shape (3,) or (3, 3), but it has shape {inertia.shape}."
-        )
+    Args:
+        **arguments: By name: the value, then the lengths of its axes (`vector=(vector, 3)`) or the
+            shapes it may have (`inertia=(inertia, *INERTIA)`).
+    """
+    arrays = float_arrays(*(value for value, *_ in arguments.values()))
+    for array, (name, (_, *shape)) in zip(arrays, arguments.items(), strict=True):
+        several = bool(shape) and isinstance(shape[0], tuple)
+        check_shape(name, array, *(shape if several else [tuple(shape)]))
+    return arrays
 
 
 def check_option(name: str, value: Any, options: Sequence[Any]) -> None:
     """Raise ValueError unless `value` is one of `options`."""
     if value not in options:
-        listed = ", ".join(repr(option) for option in options)
+        listed = ", ".join(map(repr, options))
         raise ValueError(f"Argument `{name}` must be one of {listed}, but it is {value!r}.")
 
 
@@ -185,12 +174,6 @@ def check_type(name: str, value: Any, *types: type) -> None:
         raise ValueError(
             f"Argument `{name}` must be a {wanted}, but it is a {type(value).__name__}."
         )
-
-
-def check_precision(dtype: Any) -> None:
-    """Raise ValueError unless a motion can be followed in this dtype."""
-    if jnp.dtype(dtype) not in (jnp.float32, jnp.float64):
-        raise ValueError(f"Arguments must be float32 or float64, but they are {jnp.dtype(dtype)}.")
 
 
 def whole_number(name: str, value: Any, least: int = 1) -> int:
@@ -209,22 +192,20 @@ def is_concrete(value: Any) -> bool:
     )
 
 
+def _holds(condition: Callable[[Array], Array], tree: Any) -> Bool[Array, ""]:
+    """True where a condition holds for every inexact leaf of a pytree."""
+    leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
+    return functools.reduce(lambda ok, x: ok & jnp.all(condition(x)), leaves, jnp.array(True))
+
+
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """True where every inexact leaf of a pytree is finite."""
-    leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
-    ok = jnp.array(True)
-    for leaf in leaves:
-        ok = ok & jnp.all(jnp.isfinite(leaf))
-    return ok
+    return _holds(jnp.isfinite, tree)
 
 
 def all_positive(tree: Any) -> Bool[Array, ""]:
     """True where every inexact leaf of a pytree is positive and finite."""
-    leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
-    ok = jnp.array(True)
-    for leaf in leaves:
-        ok = ok & jnp.all((leaf > 0) & jnp.isfinite(leaf))
-    return ok
+    return _holds(lambda x: (x > 0) & jnp.isfinite(x), tree)
 
 
 def is_unit(quaternion: Float[Array, "4"]) -> Bool[Array, ""]:
@@ -277,23 +258,19 @@ def harmless(ok: Array, tree: Tree) -> Tree:
     Derivatives of NaN are NaN, even those that a mask multiplies by zero: a bad lane that went on
     with its values would spoil the derivatives of what it shares with the others.
     """
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
 
-    def replace(x: Any) -> Array:  # a constant of a jaxpr may be numpy's
-        x = jnp.asarray(x)
-        unit = jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else jnp.ones_like(x)
-        return jnp.where(ok, x, unit)
+    def replaced(x: Any) -> Any:
+        if not eqx.is_inexact_array(x):
+            return x
+        return jnp.where(ok, x, jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else 1.0)
 
-    return eqx.combine(jtu.tree_map(replace, arrays), rest)
+    return jtu.tree_map(replaced, tree)
 
 
 def nan_where(bad: Bool[Array, ""], tree: Tree) -> Tree:
     """Replace the inexact leaves of a pytree by NaN where `bad`."""
     return jtu.tree_map(
-        lambda x: (
-            jnp.where(bad, jnp.asarray(jnp.nan, x.dtype), x) if eqx.is_inexact_array(x) else x
-        ),
-        tree,
+        lambda x: jnp.where(bad, jnp.nan, x) if eqx.is_inexact_array(x) else x, tree
     )
 
 
@@ -305,7 +282,7 @@ def where_defined(ok: Bool[Array, ""], formula: Callable[..., Tree], *arguments:
 class _Finding(NamedTuple):
     failed: Array
     message: str
-    value: Any
+    value: Any = None
 
 
 class Findings:
@@ -334,12 +311,7 @@ class Findings:
         """What a builder made: an error where something was found, or NaN without `throw`."""
         if not throw:
             return nan_where(~self.ok, tree)
-        return _refuse(tree, ~self.ok, lambda: self)
-
-    # What `identify` still calls.
-    def apply(self, value: Any, throw: bool) -> Any:
-        """Return `value`, guarded by the error if `throw`."""
-        return _refuse(value, ~self.ok, lambda: self) if throw and self.all else value
+        return _refuse(tree, ~self.ok, lambda: self.all)
 
 
 def settle(answer: Tree, throw: bool, findings: Callable[[], Findings]) -> Tree:
@@ -354,20 +326,21 @@ def settle(answer: Tree, throw: bool, findings: Callable[[], Findings]) -> Tree:
         return answer
     result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]
     good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    return _refuse(answer, ~good, findings, result)
+
+    def found() -> list[_Finding]:
+        ends = [_Finding(~good & (result._value == i), x) for i, x in enumerate(RESULTS.texts)]
+        return findings().all + ends  # what became of the work itself last
+
+    return _refuse(answer, ~good, found)
 
 
-def _refuse(tree: Tree, bad: Array, findings: Callable[[], Findings], result: Any = None) -> Tree:
+def _refuse(tree: Tree, bad: Array, findings: Callable[[], list[_Finding]]) -> Tree:
     """The tree; an error where `bad`, in Python if that is known now, as under vmap and grad."""
     some = eqxi.unvmap_any(bad)
     traced = isinstance(some, jax.core.Tracer)
     if not traced and not some:
         return tree
-    found = list(findings().all)
-    if result is not None:  # what became of the work itself
-        found += [
-            _Finding(bad & (result._value == i), x, None) for i, x in enumerate(RESULTS.texts)
-        ]
+    found = findings()
     failed = jnp.stack([jax.lax.stop_gradient(x.failed) for x in found])
     if traced:  # of several bad lanes the last message wins
         return eqx.branched_error_if(tree, bad, jnp.argmax(failed), [x.message for x in found])
@@ -377,13 +350,13 @@ def _refuse(tree: Tree, bad: Array, findings: Callable[[], Findings], result: An
     details = []
     if first.value is not None:
         value = _all_lanes(bad, jax.lax.stop_gradient(jnp.asarray(first.value)))[1][lane]
-        details.append(str(value.item()) if value.ndim == 0 else np.array2string(value))
+        details.append(str(value))
     if lane:
         others = f" and {known.sum() - 1} more" if known.sum() > 1 else ""
         details.append(f"in lane {lane[0] if len(lane) == 1 else lane}{others}")
-    told, stop, hint = first.message.partition(". (")
-    told = f"{told.rstrip('.')}: {' '.join(details)}" if details else told.rstrip(".")
-    raise RuntimeError(told + (stop + hint if hint else "."))
+    sentence, stop, hint = first.message.partition(". (")
+    shown = f": {' '.join(details)}" if details else ""
+    raise RuntimeError(sentence.rstrip(".") + shown + (stop or ".") + hint)
 
 
 def _all_lanes(*values: Any) -> list[np.ndarray]:

@@ -4,12 +4,13 @@ Functions of an angle or a norm that are even in it are written as functions of 
 makes them analytic where `sqrt`, `norm` and `sin(x) / x` have none or NaN derivatives.
 """
 
-import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Components = tuple[Array, ...]
@@ -21,11 +22,9 @@ _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector)))
-    zero = largest == 0
-    scale = jnp.where(zero, jnp.ones_like(largest), largest)
+    scale = jnp.where(largest == 0, 1.0, largest)
     scaled = vector / scale
-    square = jnp.sum(scaled * scaled)
-    return jnp.where(zero, jnp.zeros_like(square), scale * jnp.sqrt(jnp.where(zero, 1.0, square)))
+    return scale * root_of_positive(jnp.sum(scaled * scaled))
 
 
 def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -52,6 +51,7 @@ def _series(coefficients: list[float], z: Array) -> Array:
 
 _COS = [(-1) ** k / math.factorial(2 * k) for k in range(_SERIES_TERMS + 1)]
 _SINC = [(-1) ** k / math.factorial(2 * k + 1) for k in range(_SERIES_TERMS + 1)]
+_ARCTANC = [(-1) ** k / (2 * k + 1) for k in range(12)]
 
 
 def cos_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -93,6 +93,12 @@ def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.ldexp(jnp.ones_like(x), exponent)
 
 
+def gauss_legendre(count: int, dtype: Any) -> tuple[Array, Array]:
+    """Nodes and weights of the integral from 0 to 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return jnp.asarray((nodes + 1) / 2, dtype), jnp.asarray(weights / 2, dtype)
+
+
 def materialize(*arrays: Array) -> tuple[Array, ...]:
     """The arrays themselves, computed once.
 
@@ -122,11 +128,7 @@ def with_columns(function: Callable[..., Components]) -> Callable[..., Component
     Reverse mode then transposes a small matrix, not the loops in `function`. The rule is plain
     code, which every mode differentiates again.
     """
-
-    @jax.custom_jvp
-    @functools.wraps(function)
-    def wrapped(*arguments: Array) -> Components:
-        return function(*arguments)
+    wrapped = jax.custom_jvp(function)
 
     @wrapped.defjvp
     def rule(arguments: Components, changes: Components) -> tuple[Components, Components]:
@@ -140,33 +142,19 @@ def with_columns(function: Callable[..., Components]) -> Callable[..., Component
     return wrapped
 
 
-def with_slope(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """Give an elementwise function a rule that computes its slope once, for any number of tangents.
-
-    The rule is plain code, which every mode differentiates again.
-    """
-
-    @jax.custom_jvp
-    @functools.wraps(function)
-    def wrapped(x: Array) -> Array:
-        return function(x)
-
-    @wrapped.defjvp
-    def rule(arguments: Components, changes: Components) -> tuple[Array, Array]:
-        value, slope = jax.jvp(function, arguments, (jnp.ones_like(arguments[0]),))
-        return value, slope * changes[0]
-
-    return wrapped
-
-
-@with_slope
+@jax.custom_jvp
 def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """arctan(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0: halved angles, then a series."""
     factor = jnp.ones_like(z)
     for _ in range(3):
         below = 1 + jnp.sqrt(1 + z)
         factor, z = factor * (2 / below), z / (below * below)
-    total = jnp.full_like(z, -1 / 23)
-    for k in range(10, -1, -1):
-        total = (-1) ** k / (2 * k + 1) + z * total
-    return factor * total
+    return factor * _series(_ARCTANC, z)
+
+
+@arctanc_sqrt.defjvp
+def _arctanc_sqrt_jvp(arguments: Components, changes: Components) -> tuple[Array, Array]:
+    """The slope once, for any number of tangents; plain code, which every mode differentiates."""
+    function = arctanc_sqrt.__wrapped__
+    value, slope = jax.jvp(function, arguments, (jnp.ones_like(arguments[0]),))
+    return value, slope * changes[0]

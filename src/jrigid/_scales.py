@@ -15,23 +15,70 @@ from jrigid._numerics import power_of_two, safe_norm
 from jrigid.systems import AbstractSystem, FloatingState
 
 
-def ravel(tree: Any) -> Array:
-    """All components of a pytree in one array, which is how diffrax steps fastest."""
-    return ravel_pytree(tree)[0]
+def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
+    """Jacobian of the vector field by differences, which ask nothing of a torque but its value.
+
+    A row for each component of y: the transpose of the usual one.
+    """
+    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y))
+    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
+    rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
+    return (rates[1:] - rates[:1]) / step[:, None]
 
 
-def unravel(components: Array, like: Any) -> Any:
-    """The pytree like `like` whose components these are."""
-    return ravel_pytree(like)[1](components)
+def spectral_radius(matrix: Array, rounds: int = 2) -> Array:
+    """Upper estimate of the largest magnitude of an eigenvalue: ||J^n||^(1/n), n = 8^rounds.
+
+    It does not depend much on the scales of the components, as a norm would. Products are written
+    out: a dot of this size costs several times more.
+    """
+    if rounds == 0:
+        return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
+    largest = jnp.max(jnp.abs(matrix))
+    scale = jnp.where(largest > 0, largest, 1.0)
+    matrix = matrix / scale
+    for _ in range(3):
+        matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
+    return scale * jnp.sqrt(jnp.sqrt(jnp.sqrt(spectral_radius(matrix, rounds - 1))))
+
+
+def undamped_rate(matrix: Array) -> Array:
+    """Largest magnitude of an eigenvalue that does not die away within a radian of its own.
+
+    What an implicit solver has to follow: it may step over the others. A matrix that is not finite
+    has none.
+    """
+    matrix = jax.lax.stop_gradient(matrix)
+    values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
+    damped = -values.real > jnp.abs(values.imag)
+    return jnp.max(jnp.where(damped, 0.0, jnp.abs(values)))
+
+
+def spread(
+    system: AbstractSystem, state: Any, rate: Array, length: Any = None, speed: Any = None
+) -> Array:
+    """A scale for each component of the state of what turns at a rate; length and speed of flight.
+
+    Those of internal parts are what the torque says.
+    """
+    scale: dict[str, Any] = {
+        "position": length,
+        "velocity": speed,
+        "attitude": jnp.ones_like(rate),
+        "omega": rate,
+        "internal": internal_parts(system.torque.internal_scale(rate)),
+    }
+    full = {x: jtu.tree_map(jnp.full_like, value, scale[x]) for x, value in vars(state).items()}
+    return ravel_pytree(dataclasses.replace(state, **full))[0]
 
 
 def units(
     system: AbstractSystem,
     state0: Any,
-    t_end: Array,
+    duration: Array,
     t0: Array,
     args: Any,
-    fastest_of: Callable[[Array], Array] | None = None,
+    fastest_of: Callable[[Array], Array] = spectral_radius,
 ) -> tuple[Array, Array, Array]:
     """Rates that measure time [rad/s], and a scale for each component of the state.
 
@@ -41,36 +88,24 @@ def units(
     Jacobian, by default its spectral radius.
     """
     rates = system.vector_field(t0, state0, args)
-    span = jnp.where(t_end > t0, t_end - t0, jnp.ones_like(t_end))
+    span = jnp.where(duration > 0, duration, 1.0)
     rate = jnp.maximum(safe_norm(state0.omega), jnp.sqrt(safe_norm(rates.omega)))
     rate = jnp.where(rate > 0, rate, 1 / span)
+    flat, unravel = ravel_pytree(state0)
 
-    def spread(length: Array, speed: Array) -> Array:
-        scale: dict[str, Any] = {
-            "attitude": jnp.ones_like(rate),
-            "omega": rate,
-            "internal": internal_parts(system.torque.internal_scale(rate)),
-        }
-        if isinstance(state0, FloatingState):
-            scale |= {"position": length, "velocity": speed}
-        full = {
-            name: jtu.tree_map(
-                lambda s, x: jnp.broadcast_to(s, x.shape), value, getattr(state0, name)
-            )
-            for name, value in scale.items()
-        }
-        return power_of_two(ravel(dataclasses.replace(state0, **full)))
+    def powers(length: Array, speed: Array) -> Array:
+        return power_of_two(spread(system, state0, rate, length, speed))
 
     def fastest(scales: Array) -> Array:
         def vector_field(t: Array, y: Array, args: Any) -> Array:
-            return ravel(system.vector_field(t, unravel(y * scales, state0), args)) / scales
+            rates = system.vector_field(t, unravel(y * scales), args)
+            return ravel_pytree(rates)[0] / scales
 
-        matrix = jacobian(vector_field, t0, ravel(state0) / scales, args)
-        radius = spectral_radius(matrix, 2) if fastest_of is None else fastest_of(matrix)
+        radius = fastest_of(jacobian(vector_field, t0, flat / scales, args))
         return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
 
     if not isinstance(state0, FloatingState):
-        scales = spread(rate, rate)
+        scales = powers(rate, rate)
         return rate, fastest(scales), scales
     # First scales of the place alone, to find how fast the motion of the centre of mass changes;
     # then its way in that time, or in the whole run if that is shorter. A run of many orbits is
@@ -88,50 +123,8 @@ def units(
     bend = jnp.where(pull > 0, velocity / jnp.where(pull > 0, pull, 1.0), time)
     way = jnp.maximum(position, velocity * jnp.minimum(time, bend))
     speed = jnp.where(velocity > 0, velocity, pull * time)
-    quickest = fastest(spread(*length_and_speed(way, speed, time)))
+    quickest = fastest(powers(*length_and_speed(way, speed, time)))
     time = jnp.minimum(span, 1 / quickest)
     speed = jnp.maximum(velocity, pull * time)
     way = jnp.maximum(position, speed * time)
-    return rate, quickest, spread(*length_and_speed(way, speed, time))
-
-
-def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
-    """Jacobian of the vector field by differences, which ask nothing of a torque but its value.
-
-    A row for each component of y: the transpose of the usual one.
-    """
-    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y))
-    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
-    rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
-    return (rates[1:] - rates[:1]) / step[:, None]
-
-
-def spectral_radius(matrix: Array, rounds: int) -> Array:
-    """Upper estimate of the largest magnitude of an eigenvalue: ||J^n||^(1/n), n = 8^rounds.
-
-    It does not depend much on the scales of the components, as a norm would. Products are written
-    out: a dot of this size costs several times more.
-    """
-    scales = []
-    for _ in range(rounds):
-        largest = jnp.max(jnp.abs(matrix))
-        scales.append(jnp.where(largest > 0, largest, 1.0))
-        matrix = matrix / scales[-1]
-        for _ in range(3):
-            matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
-    radius = jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
-    for scale in reversed(scales):
-        radius = scale * jnp.sqrt(jnp.sqrt(jnp.sqrt(radius)))
-    return radius
-
-
-def undamped_rate(matrix: Array) -> Array:
-    """Largest magnitude of an eigenvalue that does not die away within a radian of its own.
-
-    What an implicit solver has to follow: it may step over the others. A matrix that is not finite
-    has none.
-    """
-    matrix = jax.lax.stop_gradient(matrix)
-    values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
-    damped = -values.real > jnp.abs(values.imag)
-    return jnp.max(jnp.where(damped, 0.0, jnp.abs(values)))
+    return rate, quickest, powers(*length_and_speed(way, speed, time))

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._numerics import product
+from jrigid._numerics import gauss_legendre, product
 
 _ROTATIONS = 18  # six sweeps; convergence is quadratic and four reach float64 rounding
 _NEAR = 0.1  # gaps below this fraction of the moment are integrated, wider ones divided
-_NODES = 8  # Gauss-Legendre: the error of 1/x across such a gap is below 1e-24
+# Nodes of the quadrature: the error of 1/x across such a gap is below 1e-24.
+_NODES = 8
 
 
 def _rotate(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -39,14 +40,25 @@ def _rotate(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
     return a22, a33, a11, a23, zero, a13, x2, x3, x1, y2, y3, y1, z2, z3, z1
 
 
-def _jacobi(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Cyclic Jacobi: high relative accuracy of small moments, and a GPU needs no LAPACK."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def eigh(
+    tensor: Float[Array, "3 3"], distinct: bool = False
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Moments, ascending, and axes, the columns of a rotation, of a symmetric tensor.
+
+    Cyclic Jacobi: high relative accuracy of small moments, and a GPU needs no LAPACK. Signs: in
+    axes 1 and 3 the first component of at least 0.9 of the largest magnitude is positive; axis 2
+    completes the rotation. Gradients: d moments = diag(axes^T dI axes), which is right for
+    symmetric functions of the moments also where they repeat; d axes has 1 / gap replaced by 0
+    where the gap is below rounding or, of `distinct` moments, by NaN where it is below 1e-6 of the
+    largest.
+    """
+    del distinct  # the derivatives need it
     _, exponent = jnp.frexp(jnp.max(jnp.abs(tensor)))
     scaled = jnp.ldexp(0.5 * (tensor + tensor.T), -exponent)
-    entries = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    entries = [scaled[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     identity = [jnp.asarray(x, tensor.dtype) for x in np.eye(3).ravel()]
-    state = (*(scaled[i, j] for i, j in entries), *identity)
-    state = jax.lax.fori_loop(0, _ROTATIONS, _rotate, state)
+    state = jax.lax.fori_loop(0, _ROTATIONS, _rotate, (*entries, *identity))
     columns = [[state[j], *state[6 + j :: 3]] for j in range(3)]
     for low, high in ((0, 1), (1, 2), (0, 1)):
         swap = columns[low][0] > columns[high][0]
@@ -68,21 +80,17 @@ def _sign(axis: Float[Array, "3"]) -> Float[Array, ""]:
     return jnp.where(leading < 0, -1.0, 1.0)
 
 
-@jax.custom_jvp
-def eigh(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Moments, ascending, and axes, the columns of a rotation, of a symmetric tensor.
-
-    Signs: in axes 1 and 3 the first component of at least 0.9 of the largest magnitude is positive;
-    axis 2 completes the rotation. Gradients: d moments = diag(axes^T dI axes), which is right
-    for symmetric functions of the moments also where they repeat; d axes has 1 / gap
-    replaced by 0 where the gap is below rounding.
-    """
-    return _jacobi(tensor)
-
-
 @eigh.defjvp
-def _eigh_jvp(primals: tuple, tangents: tuple) -> tuple:
-    return _turn_of_axes(primals[0], tangents[0], 4 * jnp.finfo(primals[0].dtype).eps, 0.0)
+def _eigh_jvp(distinct: bool, primals: tuple, tangents: tuple) -> tuple:
+    (tensor,), (change,) = primals, tangents
+    moments, axes = eigh(tensor)
+    inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
+    gap = moments[None, :] - moments[:, None]
+    closest, otherwise = (1e-6, jnp.nan) if distinct else (4 * jnp.finfo(gap.dtype).eps, 0.0)
+    resolved = jnp.abs(gap) > closest * jnp.max(jnp.abs(moments))
+    unresolved = jnp.where(np.eye(3, dtype=bool), 0.0, otherwise)
+    inverse = jnp.where(resolved, 1 / jnp.where(resolved, gap, 1.0), unresolved)
+    return (moments, axes), (jnp.diagonal(inside), product("ik,kj->ij", axes, inverse * inside))
 
 
 def from_principal_axes(axes: Array, quaternion: Array, vector: Array) -> tuple[Array, Array]:
@@ -91,29 +99,7 @@ def from_principal_axes(axes: Array, quaternion: Array, vector: Array) -> tuple[
     return jnp.concatenate([quaternion[:1], turned]), product("ij,j->i", axes, vector)
 
 
-@jax.custom_jvp
-def eigh_of_distinct(tensor: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """As `eigh`; but where a gap is below 1e-6 of the largest moment d axes is NaN."""
-    return _jacobi(tensor)
-
-
-@eigh_of_distinct.defjvp
-def _eigh_of_distinct_jvp(primals: tuple, tangents: tuple) -> tuple:
-    return _turn_of_axes(primals[0], tangents[0], 1e-6, jnp.nan)
-
-
-def _turn_of_axes(tensor: Array, change: Array, closest: Any, otherwise: float) -> tuple:
-    moments, axes = eigh(tensor)
-    inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
-    gap = moments[None, :] - moments[:, None]
-    resolved = jnp.abs(gap) > closest * jnp.max(jnp.abs(moments))
-    off_diagonal = ~np.eye(3, dtype=bool)
-    inverse = jnp.where(
-        resolved, 1 / jnp.where(resolved, gap, 1.0), jnp.where(off_diagonal, otherwise, 0.0)
-    )
-    return (moments, axes), (jnp.diagonal(inside), product("ik,kj->ij", axes, inverse * inside))
-
-
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def spectral_function(
     f: Callable[..., Array], tensor: Float[Array, "3 3"], *parameters: Array
 ) -> Float[Array, "3 3"]:
@@ -122,21 +108,16 @@ def spectral_function(
     Gradients: first and second, in every mode and in `parameters`, at any moments at which f is
     smooth. A third derivative in the tensor raises NotImplementedError.
     """
-    return _spectral_function(f, tensor, *parameters)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _spectral_function(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Array:
     moments, axes = eigh(tensor)
     values = jax.vmap(lambda moment: f(moment, *parameters))(moments)
     return product("ik,k,jk->ij", axes, values, axes)
 
 
-@_spectral_function.defjvp
+@spectral_function.defjvp
 def _spectral_function_jvp(f: Callable[..., Array], primals: tuple, tangents: tuple) -> tuple:
     # The rule is plain algebra, so every mode differentiates it again without further rules.
     _, tangent = jax.jvp(functools.partial(_expansion, f), primals, tangents)
-    return _spectral_function(f, *primals), tangent
+    return spectral_function(f, *primals), tangent
 
 
 def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Array:
@@ -154,20 +135,18 @@ def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Ar
     def g(moment: Array) -> Array:
         return f(moment, *parameters)
 
-    def differences(of: Callable[..., Array], indices: np.ndarray) -> Array:
-        """Of the moments of each set of indices, once, in ascending order."""
-        wanted = np.sort(indices, axis=-1)
-        sets, which = np.unique(wanted.reshape(-1, wanted.shape[-1]), axis=0, return_inverse=True)
-        values = jax.vmap(functools.partial(of, g))(*(moments[k] for k in sets.T))
+    def differences(count: int) -> Array:
+        """Of all sets of so many moments; each is computed once, in ascending order."""
+        wanted = np.sort(np.moveaxis(np.indices((3,) * count), 0, -1), axis=-1)
+        sets, which = np.unique(wanted.reshape(-1, count), axis=0, return_inverse=True)
+        values = jax.vmap(functools.partial(_difference, g))(*(moments[k] for k in sets.T))
         return values[which.reshape(wanted.shape[:-1])]
 
-    first = differences(_first_difference, np.moveaxis(np.indices((3, 3)), 0, -1))
-    second = differences(_second_difference, np.moveaxis(np.indices((3, 3, 3)), 0, -1))
     matrix = (
-        jnp.diag(jax.vmap(g)(moments))
-        + first * inside
-        + product("ikj,ik,kj->ij", second, inside, inside)
-        + _zero_with_derivatives(2)(inside)
+        jnp.diag(differences(1))
+        + differences(2) * inside
+        + product("ikj,ik,kj->ij", differences(3), inside, inside)
+        + _zero_with_derivatives(2, inside)
     )
     return product("ik,kl,jl->ij", axes, matrix, axes)
 
@@ -176,50 +155,41 @@ def _derivative(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
     return lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1]
 
 
-def _gauss_legendre(dtype: Any) -> tuple[Array, Array]:
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return jnp.asarray((nodes + 1) / 2, dtype), jnp.asarray(weights / 2, dtype)
-
-
-def _first_difference(f: Callable[[Array], Array], a: Array, b: Array) -> Array:
-    """f[a, b], without the cancellation of the quotient where a and b are close."""
-    gap = b - a
-    near = jnp.abs(gap) <= _NEAR * jnp.maximum(jnp.abs(a), jnp.abs(b))
-    s, w = _gauss_legendre(a.dtype)
-    close = jnp.where(near, gap, 0.0)
-    integral = jnp.sum(w * jax.vmap(_derivative(f))(a + s * close))
-    return jnp.where(near, integral, (f(b) - f(a)) / jnp.where(near, 1.0, gap))
-
-
-def _second_difference(f: Callable[[Array], Array], a: Array, b: Array, c: Array) -> Array:
-    """f[a, b, c] of a <= b <= c: Genocchi-Hermite integral or quotient over the widest gap."""
-    gap = c - a
-    near = jnp.abs(gap) <= _NEAR * jnp.maximum(jnp.abs(a), jnp.abs(c))
-    s, w = _gauss_legendre(a.dtype)
-    to_b, to_c = jnp.where(near, b - a, 0.0), jnp.where(near, c - a, 0.0)
-    t = s[None, :] * s[:, None]
-    points = a + (s[:, None] - t) * to_b + t * to_c
-    weights = (w * s)[:, None] * w[None, :]
-    integral = jnp.sum(weights * jax.vmap(jax.vmap(_derivative(_derivative(f))))(points))
-    quotient = _first_difference(f, b, c) - _first_difference(f, a, b)
+def _difference(f: Callable[[Array], Array], *moments: Array) -> Array:
+    """f[a, b, ...] of ascending moments, without the cancellation of close ones."""
+    if len(moments) == 1:
+        return f(moments[0])
+    first, last = moments[0], moments[-1]
+    gap = last - first
+    near = jnp.abs(gap) <= _NEAR * jnp.maximum(jnp.abs(first), jnp.abs(last))
+    integral = _hermite_genocchi(f, *(jnp.where(near, x, first) for x in moments))
+    quotient = _difference(f, *moments[1:]) - _difference(f, *moments[:-1])
     return jnp.where(near, integral, quotient / jnp.where(near, 1.0, gap))
 
 
-@functools.cache
-def _zero_with_derivatives(orders: int) -> Callable[[Array], Array]:
+def _hermite_genocchi(f: Callable[[Array], Array], first: Array, *others: Array) -> Array:
+    """f[a, b, ...] = integral of s^n f'[a + s (b - a), ...] over s from 0 to 1, n + 2 moments."""
+    if not others:
+        return f(first)
+
+    def integrand(s: Array) -> Array:
+        return _hermite_genocchi(_derivative(f), *(first + s * (x - first) for x in others))
+
+    nodes, weights = gauss_legendre(_NODES, first.dtype)
+    return jnp.sum(weights * nodes ** (len(others) - 1) * jax.vmap(integrand)(nodes))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _zero_with_derivatives(_orders: int, x: Array) -> Array:
     """A zero that counts derivatives: the series has no third, and must not answer 0."""
+    return jnp.zeros((), x.dtype)
 
-    @jax.custom_jvp
-    def zero(x: Array) -> Array:
-        return jnp.zeros((), x.dtype)
 
-    @zero.defjvp
-    def _(primals: tuple, tangents: tuple) -> tuple:
-        if orders == 0:
-            raise NotImplementedError(
-                "Third derivatives of `jrigid.tensor_function` in its tensor are not available."
-            )
-        (x,), (change,) = primals, tangents
-        return zero(x), _zero_with_derivatives(orders - 1)(x) * jnp.sum(change)
-
-    return zero
+@_zero_with_derivatives.defjvp
+def _zero_with_derivatives_jvp(orders: int, primals: tuple, tangents: tuple) -> tuple:
+    if orders == 0:
+        raise NotImplementedError(
+            "Third derivatives of `jrigid.tensor_function` in its tensor are not available."
+        )
+    change = _zero_with_derivatives(orders - 1, *primals) * jnp.sum(tangents[0])
+    return _zero_with_derivatives(orders, *primals), change

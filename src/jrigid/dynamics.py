@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
-    check_inertia_shape,
+    INERTIA,
     check_shape,
     float_arrays,
     internal_parts,
+    shaped,
     state_array,
 )
 from jrigid._types import InertiaLike, Readable, Scalar, Vector, VectorLike
@@ -62,19 +63,16 @@ class ExactStates(Readable):
 
 
 def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:
-    inertia, vector = float_arrays(inertia, vector)
-    check_inertia_shape(inertia)
-    check_shape("omega", vector, (3,))
+    inertia, vector = shaped(inertia=(inertia, *INERTIA), omega=(vector, 3))
     return inertia, vector
 
 
-def _inertia_times(inertia: Array, vector: Array) -> tuple[Array, Array, Array]:
+def _inertia_times(inertia: Array, vector: Array) -> tuple[Array, ...]:
     """Components of I v; written out, so that XLA can fuse it and no dot is involved."""
     a, b, c = vector
     if inertia.ndim == 1:
         return inertia[0] * a, inertia[1] * b, inertia[2] * c
-    rows = [inertia[i, 0] * a + inertia[i, 1] * b + inertia[i, 2] * c for i in range(3)]
-    return rows[0], rows[1], rows[2]
+    return tuple(inertia[i, 0] * a + inertia[i, 1] * b + inertia[i, 2] * c for i in range(3))
 
 
 def _inverse_times(inertia: Array, vector: Array) -> Array:
@@ -110,8 +108,7 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     >>> print(jr.angular_momentum(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     [1. 2. 3.]
     """
-    tensor, w = _inertia_and_vector(inertia, omega)
-    return jnp.stack(_inertia_times(tensor, w))
+    return jnp.stack(_inertia_times(*_inertia_and_vector(inertia, omega)))
 
 
 def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
@@ -174,8 +171,7 @@ def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
         i1, i2, i3 = inertia
         return jnp.stack([(i2 - i3) * b * c, (i3 - i1) * c * a, (i1 - i2) * a * b])
     # An isotropic part of the tensor gives no torque; without it a sphere's is exactly zero.
-    shift = inertia[2, 2]
-    i = inertia
+    i, shift = inertia, inertia[2, 2]
     p = (i[0, 0] - shift) * a + i[0, 1] * b + i[0, 2] * c
     q = i[1, 0] * a + (i[1, 1] - shift) * b + i[1, 2] * c
     r = i[2, 0] * a + i[2, 1] * b
@@ -199,5 +195,4 @@ def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
     >>> print(jr.bearing_torque(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     [ 1. -2.  1.]
     """
-    tensor, w = _inertia_and_vector(inertia, omega)
-    return -_momentum_cross_omega(tensor, w)
+    return -_momentum_cross_omega(*_inertia_and_vector(inertia, omega))

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jrigid._checks import all_finite, check_shape, float_arrays, nan_where, where_defined
+from jrigid._checks import all_finite, check_shape, float_arrays, nan_where, shaped, where_defined
 from jrigid._numerics import power_of_two, product
 from jrigid._types import Real, Scalar
 
 Lagrangian: TypeAlias = Callable[..., Any]
 Coordinates: TypeAlias = Float[Array, " n"]
 CoordinatesLike: TypeAlias = Real[ArrayLike, " n"]
+_Bound: TypeAlias = Callable[[Array, Array], Array]  # without parameters
 
 _SCALING_SWEEPS = 5  # each takes the square root of what is left of a ratio of 1e16
 _PROBES = 4
@@ -27,17 +28,13 @@ _ROUNDING_ERRORS = 64
 
 
 def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
-    q, q_dot = float_arrays(q, q_dot)
-    check_shape("q", q, (None,))
-    check_shape("q_dot", q_dot, q.shape)
+    q, q_dot = shaped(q=(q, None), q_dot=(q_dot, *np.shape(q)))
     if q.size == 0:
         raise ValueError("Argument `q` must have one coordinate at least, but it has none.")
     return q, q_dot
 
 
-def _bind(
-    lagrangian: Lagrangian, params: tuple[Any, ...], dtype: Any
-) -> Callable[[Array, Array], Array]:
+def _bind(lagrangian: Lagrangian, params: tuple[Any, ...], dtype: Any) -> _Bound:
     """The Lagrangian of coordinates and rates alone, known to be a real scalar."""
 
     def bound(q: Array, q_dot: Array) -> Array:
@@ -52,19 +49,12 @@ def _bind(
     return bound
 
 
-def _equations(
-    lagrangian: Callable[[Array, Array], Array], q: Array, q_dot: Array
-) -> tuple[Array, Array]:
+def _equations(lagrangian: _Bound, q: Array, q_dot: Array) -> tuple[Array, Array]:
     """Mass matrix M and generalised force f of M q'' = f."""
     momenta = jax.grad(lagrangian, argnums=1)
-
-    def rate_of_momenta(dq: Array, dq_dot: Array) -> Array:
-        return jax.jvp(momenta, (q, q_dot), (dq, dq_dot))[1]
-
-    none = jnp.zeros_like(q)
-    mass = jax.vmap(rate_of_momenta, (None, 0))(none, jnp.eye(q.size, dtype=q.dtype))
-    force = jax.grad(lagrangian)(q, q_dot) - rate_of_momenta(q_dot, none)
-    return 0.5 * (mass + mass.T), force
+    mass = jax.jacfwd(momenta, argnums=1)(q, q_dot)
+    carried = jax.jvp(lambda q: momenta(q, q_dot), (q,), (q_dot,))[1]
+    return 0.5 * (mass + mass.T), jax.grad(lagrangian)(q, q_dot) - carried
 
 
 def _scales(mass: Array) -> Array:
@@ -75,7 +65,7 @@ def _scales(mass: Array) -> Array:
     """
     mass = jnp.abs(mass)
     diagonal = jnp.diagonal(mass)
-    scales = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    scales = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     for _ in range(_SCALING_SWEEPS):
         rows = jnp.max(scales[:, None] * mass * scales[None, :], axis=1)
         scales = scales / jnp.sqrt(jnp.where(rows > 0, rows, 1.0))
@@ -98,10 +88,7 @@ def _accelerations(mass: Array, force: Array) -> Array:
 
 
 def acceleration(
-    lagrangian: Lagrangian,
-    q: CoordinatesLike,
-    q_dot: CoordinatesLike,
-    *params: Any,
+    lagrangian: Lagrangian, q: CoordinatesLike, q_dot: CoordinatesLike, *params: Any
 ) -> Coordinates:
     r"""Accelerations q'' of the motion that a Lagrangian makes stationary.
 
@@ -250,8 +237,7 @@ def energy(
     4.0
     """
     q, q_dot = _coordinates(q, q_dot)
-    bound = _bind(lagrangian, params, q.dtype)
-    value, slope = jax.value_and_grad(bound, argnums=1)(q, q_dot)
+    value, slope = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=1)(q, q_dot)
     return product("i,i->", q_dot, slope) - value
 
 
@@ -297,19 +283,15 @@ def cyclic_coordinates(
     """
     q, q_dot = _coordinates(q, q_dot)
     slopes = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=(0, 1))
-    if reach is None:
-        spread = 0.25 * (1 + jnp.abs(q))
-    else:
-        spread = float_arrays(reach)[0].astype(q.dtype)
-        if spread.shape != ():
-            check_shape("reach", spread, q.shape)
-        spread = jnp.broadcast_to(spread, q.shape)
+    spread = 0.25 * (1 + jnp.abs(q)) if reach is None else float_arrays(reach)[0].astype(q.dtype)
+    if spread.shape != ():
+        check_shape("reach", spread, q.shape)
     fastest = jnp.max(jnp.abs(q_dot))
     speed = jnp.where(fastest == 0, 1.0, fastest)
     tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
 
-    def flat(q: Array, q_dot: Array) -> Array:
-        value, (slope, momentum) = slopes(q, q_dot)
+    def flat(place: Array, q_dot: Array) -> Array:
+        value, (slope, momentum) = slopes(q + place * spread, q_dot)
         # As changes of L over the reach, which coordinates of any unit have in common
         change = jnp.abs(slope) * spread
         largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
@@ -317,6 +299,5 @@ def cyclic_coordinates(
 
     steps = np.random.default_rng(0).uniform(-1, 1, (2, _PROBES, q.size))
     places, rates = jnp.asarray(steps, q.dtype)
-    places, rates = q[None, :] + places * spread[None, :], q_dot[None, :] + rates * speed
-    moving, resting = jax.vmap(flat)(places, rates), jax.vmap(flat)(places, jnp.zeros_like(rates))
-    return jnp.all(moving & resting, axis=0)
+    rates = jnp.stack([q_dot[None] + rates * speed, jnp.zeros_like(rates)])
+    return jnp.all(jax.vmap(jax.vmap(flat), (None, 0))(places, rates), axis=(0, 1))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_inertia_shape, float_arrays
+from jrigid._checks import INERTIA, array_of_shape, float_arrays
 from jrigid._types import InertiaLike
 from jrigid.dynamics import euler_equations
 from jrigid.free import relative_rotation
@@ -35,22 +35,17 @@ class FreeRotation(diffrax.AbstractTerm):
 
     def __init__(self, inertia: InertiaLike):
         """The free body with this inertia."""
-        (self.inertia,) = float_arrays(inertia)
-        check_inertia_shape(self.inertia)
+        self.inertia = array_of_shape("inertia", inertia, *INERTIA)
 
     def vf(self, t: Any, y: Any, args: Any) -> Any:
         """Time derivative of the state."""
         del t, args
         rest = jtu.tree_map(lambda x: 0 * x, y)
-        return dataclasses.replace(
-            rest,
-            attitude=attitude_rate(y.attitude, y.omega),
-            omega=euler_equations(self.inertia.astype(y.omega.dtype), y.omega),
-        )
+        omega = euler_equations(self.inertia.astype(y.omega.dtype), y.omega)
+        return dataclasses.replace(rest, attitude=attitude_rate(y.attitude, y.omega), omega=omega)
 
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+    def contr(self, t0: Any, t1: Any, **_: Any) -> Any:
         """The step of time."""
-        del kwargs
         return t1 - t0
 
     def prod(self, vf: Any, control: Any) -> Any:
@@ -78,12 +73,9 @@ class _ExactInterpolation(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Any:
         """The state at t0, or its change from t0 to t1."""
         del left
-        term = FreeRotation(self.inertia)
-        early = term.after(self.y0, self.direction * (t0 - self.t0))
-        if t1 is None:
-            return early
-        late = term.after(self.y0, self.direction * (t1 - self.t0))
-        return jtu.tree_map(lambda a, b: b - a, early, late)
+        if t1 is not None:
+            return jtu.tree_map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+        return FreeRotation(self.inertia).after(self.y0, self.direction * (t0 - self.t0))
 
 
 class ExactFree(diffrax.AbstractSolver):

@@ -12,13 +12,13 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
     all_positive,
-    check_inertia_shape,
+    array_of_shape,
     check_shape,
     check_type,
-    float_arrays,
     internal_parts,
     is_inertia,
     state_array,
@@ -143,14 +143,7 @@ class RigidBody(AbstractSystem):
             torque: `(t, state, args) -> (3,)` body components [N m], a torque of
                 `jrigid.torques`, or None.
         """
-        if isinstance(inertia, MassProperties):
-            raise ValueError(
-                "Argument `inertia` must hold moments or a tensor, but it is a MassProperties: "
-                "pass its `.inertia`, or `.principal_axes().moments` for body axes along the "
-                "principal ones."
-            )
-        (self.inertia,) = float_arrays(inertia)
-        check_inertia_shape(self.inertia)
+        self.inertia = array_of_shape("inertia", inertia, *INERTIA)
         self.torque = as_torque(torque)
 
     @property
@@ -295,13 +288,6 @@ class FloatingBody(AbstractSystem):
         findings.require(all_positive(mass), RESULTS.invalid_mass, value=mass)
         self.rotation.check(findings)
 
-    def _force(self, t: ScalarLike, state: Any, args: Any) -> Array:
-        if self.force is None:
-            return jnp.zeros_like(state.velocity)
-        force = jnp.asarray(self.force(t, state, args), state.velocity.dtype)
-        check_shape("force", force, (3,))
-        return force
-
     def vector_field(self, t: ScalarLike, state: FloatingState, args: Any) -> FloatingState:
         """Time derivative of the state.
 
@@ -317,12 +303,13 @@ class FloatingBody(AbstractSystem):
         """
         check_shape("position", state.position, (3,))
         check_shape("velocity", state.velocity, (3,))
-        mass = self.mass_properties.mass.astype(state.velocity.dtype)
-        acceleration = self._force(t, state, args) / mass
+        force = jnp.zeros_like(state.velocity)
+        if self.force is not None:
+            force = jnp.asarray(self.force(t, state, args), force.dtype)
+            check_shape("force", force, (3,))
+        acceleration = force / self.mass_properties.mass.astype(force.dtype)
         turning = self.rotation.vector_field(t, state, args)
-        return FloatingState(
-            state.velocity, acceleration, turning.attitude, turning.omega, turning.internal
-        )
+        return FloatingState(state.velocity, acceleration, **vars(turning))
 
     def translational_energy(self, state: FloatingState) -> Scalar:
         """Kinetic energy of the centre of mass [J], m v^2 / 2.
@@ -333,8 +320,7 @@ class FloatingBody(AbstractSystem):
         Returns:
             Energy [J]; with the rotational kinetic energy the whole kinetic energy (Koenig).
         """
-        mass = self.mass_properties.mass.astype(state.velocity.dtype)
-        return 0.5 * mass * jnp.sum(state.velocity**2)
+        return 0.5 * jnp.sum(state.velocity * self.momentum(state))
 
     def rotational_energy(self, state: FloatingState) -> Scalar:
         """Kinetic energy of the rotation about the centre of mass [J].

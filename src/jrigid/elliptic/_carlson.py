@@ -6,6 +6,7 @@ never out of range. Every tangent of that step is positive, so differentiating i
 as stable as the step itself, also where arguments coincide.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -15,13 +16,11 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import float_arrays
+from jrigid._numerics import arctanc_sqrt
 from jrigid._types import Real
 
 Values: TypeAlias = Float[Array, "..."]
 ValuesLike: TypeAlias = Real[ArrayLike, "..."]
-
-# A square root quotient of 1e-300 (float64) or 1e-38 (float32) is down to 1e-3 after so many steps.
-_STEPS, _STEPS_OTHERS = {"float64": 15}, 11
 
 
 def elementwise(*values: Any) -> list[Array]:
@@ -30,7 +29,8 @@ def elementwise(*values: Any) -> list[Array]:
 
 
 def _steps(x: Array) -> int:
-    return _STEPS.get(x.dtype.name, _STEPS_OTHERS)
+    """In so many a root quotient of 1e-300 (float64) or 1e-38 (float32) is down to 1e-3."""
+    return 15 if x.dtype == jnp.float64 else 11
 
 
 # --- kernels of roots of order one -------------------------------------------------------------
@@ -53,8 +53,15 @@ def _rf_series(a: Array, b: Array, c: Array) -> Array:
     return (1 + (series + e3 * (1 / 14 + 3 / 104 * e3))) / jnp.sqrt(mean)
 
 
-def _rj_series(mean: Array, e2: Array, e3: Array, e4: Array, e5: Array) -> Array:
+def _rj_series(x: Array, y: Array, z: Array, p: Array) -> Array:
     """R_J of nearly equal arguments, DLMF 19.36.2."""
+    mean = (x + y + z + 2 * p) / 5
+    dx, dy, dz = (mean - x) / mean, (mean - y) / mean, (mean - z) / mean
+    dp = -(dx + dy + dz) / 2
+    pp, xyz = dp * dp, dx * dy * dz
+    e2 = dx * dy + dx * dz + dy * dz - 3 * pp
+    e3 = xyz + dp * (2 * e2 + 4 * pp)
+    e4, e5 = (2 * xyz + dp * (e2 + 3 * pp)) * dp, xyz * pp
     series = e2 * (-3 / 14 + e2 * (9 / 88 - e2 / 16) + e3 * (-9 / 52 + 45 / 272 * e2))
     series = series + e3 * (1 / 6 + 3 / 40 * e3) + e4 * (-3 / 22 + 3 / 20 * e2)
     series = series + 3 / 26 * e5 - 9 / 68 * (e3 * e4 + e2 * e5)
@@ -73,30 +80,16 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     total = 1 / ((c + a) * (c + b))
     start = (*_next_roots(a, b, c), 0.25 * c, total)
     a, b, c, weight, total = jax.lax.fori_loop(1, _steps(a), step, start)
-    x, y, z = a * a, b * b, c * c
-    mean = (x + y + 3 * z) / 5
-    dx, dy = (mean - x) / mean, (mean - y) / mean
-    dz = -(dx + dy) / 3
-    xy, zz = dx * dy, dz * dz
-    e2, e3, e4 = xy - 6 * zz, (3 * xy - 8 * zz) * dz, 3 * (xy - zz) * zz
-    last = _rj_series(mean, e2, e3, e4, xy * zz * dz)
-    return _rf_series(a, b, c), total + weight * last / 3
+    return _rf_series(a, b, c), total + weight * _rj_series(a * a, b * b, c * c, c * c) / 3
 
 
 def _rc_of_one(root: Array) -> Array:
     """R_C(1, root^2), differentiable as it stands; DLMF 19.2.17, 19.2.18."""
     e = (root - 1) * (root + 1)
-    near = jnp.abs(e) < 0.1
-    series = jnp.zeros_like(e)
-    safe = jnp.where(near, e, 0.0)
-    for k in range(15, -1, -1):
-        series = 1 / (2 * k + 1) - safe * series
-    above = e > 0
-    up = jnp.sqrt(jnp.where(above & ~near, e, 1.0))
-    down = jnp.sqrt(jnp.where(above | near, 0.75, -e))
-    low = jnp.where(above | near, 0.5, root)
-    logarithm = jnp.log1p((1 - low + down) / low) / down
-    return jnp.where(near, series, jnp.where(above, jnp.arctan(up) / up, logarithm))
+    low = e < -0.5
+    down, root = jnp.sqrt(jnp.where(low, -e, 0.75)), jnp.where(low, root, 0.5)
+    logarithm = jnp.log1p((1 - root + down) / root) / down
+    return jnp.where(low, logarithm, arctanc_sqrt(jnp.where(low, 0.0, e)))
 
 
 def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
@@ -112,15 +105,7 @@ def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]
 
     start = (a, b, c, q, jnp.ones_like(a), jnp.zeros_like(a))
     a, b, c, q, weight, total = jax.lax.fori_loop(0, _steps(a) + 1, step, start)
-    x, y, z, p = a * a, b * b, c * c, q * q
-    mean = (x + y + z + 2 * p) / 5
-    dx, dy, dz = (mean - x) / mean, (mean - y) / mean, (mean - z) / mean
-    dp = -(dx + dy + dz) / 2
-    pp, xyz = dp * dp, dx * dy * dz
-    e2 = dx * dy + dx * dz + dy * dz - 3 * pp
-    e3 = xyz + dp * (2 * e2 + 4 * pp)
-    e4 = (2 * xyz + dp * (e2 + 3 * pp)) * dp
-    return _rf_series(a, b, c), total + weight * _rj_series(mean, e2, e3, e4, xyz * pp)
+    return _rf_series(a, b, c), total + weight * _rj_series(a * a, b * b, c * c, q * q)
 
 
 # --- kernels of any roots, with their derivatives ----------------------------------------------
@@ -136,82 +121,56 @@ def _two_zero(a: Array, b: Array, c: Array) -> Array:
 
 def _scale(*roots: Array) -> Array:
     """The largest root, by which all are divided; NaN where one is NaN, 1 where all are 0."""
-    largest = roots[0]
-    for root in roots[1:]:
-        largest = jnp.maximum(largest, root)
+    largest = functools.reduce(jnp.maximum, roots)
     return jax.lax.stop_gradient(jnp.where(largest == 0, jnp.ones_like(largest), largest))
 
 
-def _rf_g_scaled(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    scale = _scale(a, b, c)
-    two = _two_zero(a, b, c)
-    # Where the answer is infinite or zero the loop runs on ones.
-    plain = ~two & (scale < jnp.inf)
-    size = jnp.where(jnp.isinf(scale), 1.0, scale)
-    a, b, c = (jnp.where(plain | jnp.isnan(root), root / size, 1.0) for root in (a, b, c))
-    rf, g = _rf_g_kernel(a, b, c)
-    answer = jnp.where(two, jnp.inf, jnp.zeros_like(scale))
-    nan = jnp.isnan(scale)
-    per = 1 / size
-    return jnp.where(plain | nan, rf * per, answer), jnp.where(plain | nan, g * per * per, answer)
+def _of_any_roots(kernel: Callable[..., Any], degree: int) -> Callable[..., Any]:
+    """A kernel of roots of any size; its second value is of that degree in their reciprocals."""
 
+    def scaled(a: Array, b: Array, c: Array, *q: Array) -> tuple[Array, Array]:
+        scale = _scale(a, b, c, *q)
+        nan, two = jnp.isnan(scale), _two_zero(a, b, c)
+        pole = functools.reduce(jnp.logical_or, [x == 0 for x in q], two)  # of the second alone
+        # Where the answer is infinite or zero the loop runs on ones.
+        size = jnp.where(jnp.isinf(scale), 1.0, scale)
+        plain = [~bad & (scale < jnp.inf) | nan for bad in (two, pole)]
+        roots = [jnp.where(plain[0], x / size, 1.0) for x in (a, b, c)]
+        values = kernel(*roots, *(jnp.where(plain[1], x / size, 1.0) for x in q))
+        answers = []
+        for value, fine, bad, power in zip(values, plain, (two, pole), (1, degree), strict=True):
+            for _ in range(power):
+                value = value * (1 / size)
+            answers.append(jnp.where(fine, value, jnp.where(bad, jnp.inf, 0.0)))
+        return tuple(answers)
 
-def _rf_rj_scaled(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
-    scale = _scale(a, b, c, q)
-    two = _two_zero(a, b, c)
-    pole = two | (q == 0)  # of R_J; a zero q does not spoil R_F
-    nan = jnp.isnan(scale)
-    plain = (~two & (scale < jnp.inf)) | nan
-    size = jnp.where(jnp.isinf(scale), 1.0, scale)
-    a, b, c = (jnp.where(plain, root / size, 1.0) for root in (a, b, c))
-    rf, rj = _rf_rj_kernel(a, b, c, jnp.where(plain & (q != 0), q / size, 1.0))
-    zero, per = jnp.zeros_like(scale), 1 / size
-    of_rf = jnp.where(plain, rf * per, jnp.where(two, jnp.inf, zero))
-    infinite = jnp.where(pole, jnp.inf, zero)
-    return of_rf, jnp.where(plain & ~pole | nan, rj * per * per * per, infinite)
+    return scaled
 
 
 def _along_axes(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A rule: the partial derivatives of a kernel, in one loop, which the tangents do not enter.
+    """A kernel with its partial derivatives in one loop, which the tangents do not enter.
 
     An argument that is not varied costs nothing, and its infinite derivative does no harm.
     """
+    function = jax.custom_jvp(kernel)
 
-    def rule(primals: Any, tangents: Any) -> Any:
+    def rule(roots: Any, tangents: Any) -> Any:
         varied = _varied(tangents)
-        axes = [
-            jnp.stack([jnp.full_like(x, float(i == k)) for i in varied])
-            for k, x in enumerate(primals)
-        ]
-        values, partials = jax.vmap(
-            lambda *axis: jax.jvp(kernel, tuple(primals), axis), out_axes=(None, 0)
-        )(*axes)
-        totals = []
-        for value, partial in zip(values, partials, strict=True):
-            slope = jnp.where(jnp.isposinf(value), -jnp.inf, partial)
-            totals.append(sum(slope[n] * tangents[i] for n, i in enumerate(varied)))
-        return values, tuple(totals)
+        axes = [jnp.stack([jnp.full_like(x, i == k) for i in varied]) for k, x in enumerate(roots)]
+        along = jax.vmap(functools.partial(jax.jvp, kernel, list(roots)), out_axes=(None, 0))
+        values, partials = along(axes)
+        slopes = jax.tree.map(lambda x, d: jnp.where(x == jnp.inf, -jnp.inf, d), values, partials)
+        return values, tuple(sum(d[n] * tangents[i] for n, i in enumerate(varied)) for d in slopes)
 
-    return rule
+    function.defjvp(rule, symbolic_zeros=True)
+    return function
 
 
-@jax.custom_jvp
-def rf_g(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """R_F(a^2, b^2, c^2) and G = (c / 3) R_D(a^2, b^2, c^2), the derivative of -R_F by c.
-
-    G is 1 / (a b) at c = 0; where two roots are zero both are infinite.
-    """
-    return _rf_g_scaled(a, b, c)
-
-
-@jax.custom_jvp
-def rf_rj(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
-    """R_F and R_J of the squares, for q not many times the largest of the others."""
-    return _rf_rj_scaled(a, b, c, q)
-
-
-rf_g.defjvp(_along_axes(_rf_g_scaled), symbolic_zeros=True)
-rf_rj.defjvp(_along_axes(_rf_rj_scaled), symbolic_zeros=True)
+# R_F(a^2, b^2, c^2) and G = (c / 3) R_D(a^2, b^2, c^2), the derivative of -R_F by c. G is 1 / (a b)
+# at c = 0; where two roots are zero both are infinite.
+rf_g = _along_axes(_of_any_roots(_rf_g_kernel, 2))
+# R_F and R_J of the squares, for q not many times the largest of the others.
+rf_rj = _along_axes(_of_any_roots(_rf_rj_kernel, 3))
 
 
 def g_of(a: Array, b: Array, c: Array) -> Array:
@@ -243,10 +202,8 @@ def _by_slopes(function: jax.custom_jvp[Array], *slopes: Callable[..., Array]) -
     """A rule of the partial derivatives, of which those that are not varied are not computed."""
 
     def rule(primals: Any, tangents: Any) -> Any:
-        total = jnp.zeros_like(primals[0])
-        for i in _varied(tangents):
-            total = total - slopes[i](*primals) * tangents[i]
-        return function(*primals), total
+        total = sum(slopes[i](*primals) * tangents[i] for i in _varied(tangents))
+        return function(*primals), -total
 
     function.defjvp(rule, symbolic_zeros=True)
 

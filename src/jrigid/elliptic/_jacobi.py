@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid.elliptic._carlson import Values, ValuesLike, g_of
-from jrigid.elliptic._legendre import root_where_turned, with_parameters
+from jrigid.elliptic._legendre import with_parameters
 
 # Landen steps that take mc = 1e-300 (float64) or 1e-37 (float32) to 1 within rounding.
 _LANDEN_STEPS, _LANDEN_STEPS_OTHERS = {"float64": 13}, 9
@@ -40,6 +40,13 @@ def _hyperbolic(u: Array) -> tuple[Array, Array]:
     return jnp.copysign(tanh, u), 2 * decay / (1 + square)
 
 
+def _sides(cotangent: Array) -> tuple[Array, Array]:
+    """Sine and cosine over the larger one of them."""
+    flat = jnp.abs(cotangent) <= 1
+    tangent = 1 / jnp.where(flat, 1.0, cotangent)
+    return jnp.where(flat, 1.0, tangent), jnp.where(flat, cotangent, 1.0)
+
+
 def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
     """Sn, |cn|, dn of u - 2 j K and the half turns j, for 0 < mc; Bulirsch (1965), `sncndn`.
 
@@ -63,19 +70,13 @@ def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
     def up(carry: Any, quotient: Any) -> Any:
         cotangent, dn = carry
         half = 0.5 * (1 + quotient)
-        scaled = cotangent * half
-        flat = jnp.abs(cotangent) <= 1
-        inverse = 1 / jnp.where(flat, 1.0, cotangent)
-        ss = jnp.where(flat, 1.0, inverse * inverse)
-        cc = half * jnp.where(flat, cotangent * cotangent, 1.0)
-        return (scaled * dn, (quotient * ss + cc) / (ss + cc)), None
+        sine, cosine = _sides(cotangent)
+        ss, cc = sine * sine, half * (cosine * cosine)
+        return (cotangent * half * dn, (quotient * ss + cc) / (ss + cc)), None
 
     start = (jnp.cos(angle) / jnp.abs(jnp.sin(angle)), jnp.ones_like(angle))
     (cotangent, dn), _ = jax.lax.scan(up, start, quotients, reverse=True)
-    cotangent = jnp.abs(cotangent)
-    flat = cotangent <= 1
-    tangent = 1 / jnp.where(flat, 1.0, cotangent)
-    sine, cosine = jnp.where(flat, 1.0, tangent), jnp.where(flat, cotangent, 1.0)
+    sine, cosine = _sides(jnp.abs(cotangent))
     norm = jax.lax.rsqrt(sine * sine + cosine * cosine)
     return jnp.copysign(sine * norm, angle), cosine * norm, dn, turns
 
@@ -99,7 +100,7 @@ def _reduced_rule(primals: Any, tangents: Any) -> Any:
     turns = jax.lax.stop_gradient(turns)
     # d am / d mc = dn dF/dm, dF/dm = s^3 R_D(c^2, 1, dn^2) / 6 + 2 j K'(m)
     one = jnp.ones_like(s)
-    root = root_where_turned(turns, mc)
+    root = jnp.sqrt(jnp.where(turns == 0, 1.0, mc))  # no infinite slopes where nothing is turned
     tiny = jnp.finfo(s.dtype).tiny
     low = jnp.maximum(dn, 4 * tiny)
     reduced = 0.5 * s * s * s * g_of(jnp.maximum(c, 4 * tiny), one, low)

@@ -4,6 +4,8 @@ Inside, m and mc = 1 - m travel together: each is exact where the other is round
 with respect to the parameter is taken along mc, whose tangent is minus that of m.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,13 +26,10 @@ from jrigid.elliptic._carlson import (
 
 def with_parameters(m: Any, mc: Any, *others: Any) -> tuple[Array, ...]:
     """The other arguments, m and mc, of one dtype and shape."""
-    if mc is None:
-        if m is None:
-            raise ValueError("Argument `m` must be given, or else `mc`, but neither is.")
-        *arrays, m = elementwise(*others, m)
-        return *arrays, m, 1 - m
-    *arrays, mc = elementwise(*others, mc)
-    return *arrays, 1 - mc, mc
+    if m is None and mc is None:
+        raise ValueError("Argument `m` must be given, or else `mc`, but neither is.")
+    *arrays, given = elementwise(*others, m if mc is None else mc)
+    return (*arrays, given, 1 - given) if mc is None else (*arrays, 1 - given, given)
 
 
 def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
@@ -43,125 +42,22 @@ def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
     return turns, jnp.where(beyond, -sine, sine), jnp.where(beyond, -cosine, cosine)
 
 
-def _times(turns: Array, value: Array) -> Array:
-    """Turns * value, zero where there are no turns, whatever the value."""
-    some = turns != 0
-    return jnp.where(some, turns * jnp.where(some, value, 1.0), 0.0)
+def _complete(integral: Callable[..., Array], *parameters: Array) -> Array:
+    """An integral `(sine, cosine, *parameters)` up to a quarter turn."""
+    zero = jnp.zeros_like(parameters[-1])
+    return integral(zero + 1, zero, *parameters)
 
 
-def root_where_turned(turns: Array, mc: Array) -> Array:
-    """sqrt(mc), or 1 where there are no turns that need it: infinite slopes stay out of there."""
-    return jnp.sqrt(jnp.where(turns == 0, 1.0, mc))
+def _of_any_turns(integral: Callable[..., Array], phi: Array, *parameters: Array) -> Array:
+    """An integral `(sine, cosine, *parameters)` up to any amplitude; the last parameter is mc."""
+    turns, sine, cosine = reduce_amplitude(phi)
+    # Where there are no turns, the complete one is asked at m = 0, far from its infinite slopes.
+    *others, mc = (jnp.where(turns == 0, 0.0, x) for x in parameters)
+    whole = _complete(integral, *others, jnp.where(turns == 0, 1.0, mc))
+    return integral(sine, cosine, *parameters) + 2 * turns * whole
 
 
-# --- complete ----------------------------------------------------------------------------------
-
-
-@jax.custom_jvp
-def _e_complete(m: Array, mc: Array) -> Array:
-    """DLMF 19.25.1, as a sum of positive terms on either side of m = 0."""
-    root = jnp.sqrt(mc)
-    one = jnp.ones_like(root)
-    above = m > 0
-    rf, g = rf_g(jnp.zeros_like(root), jnp.where(above, one, root), jnp.where(above, root, one))
-    value = jnp.where(above, mc * rf + m * root * g, rf - m * g)
-    return jnp.where(mc == 0, 1.0, value)
-
-
-@_e_complete.defjvp
-def _e_complete_rule(primals: Any, tangents: Any) -> Any:
-    m, mc = primals
-    root = jnp.sqrt(mc)
-    slope = 0.5 * g_of(jnp.zeros_like(root), root, jnp.ones_like(root))
-    return _e_complete(m, mc), slope * tangents[1]
-
-
-@jax.jit
-def _k(mc: Array) -> Array:
-    return rf_of(jnp.zeros_like(mc), jnp.sqrt(mc), jnp.ones_like(mc))
-
-
-@jax.jit
-def _pi(n: Array, m: Array, mc: Array) -> Array:
-    return _pi_of(jnp.ones_like(m), jnp.zeros_like(m), n, m, mc)
-
-
-_e = jax.jit(_e_complete)
-
-
-def ellipk(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
-    r"""Complete elliptic integral of the first kind, as `scipy.special.ellipk`.
-
-    $K(m) = \int_0^{\pi/2} d\theta / \sqrt{1 - m \sin^2 \theta}$.
-
-    Args:
-        m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m; where it is given m may be None.
-
-    Returns:
-        K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments broadcast.
-
-    Gradients: R_D(0, 1, mc) / 6, positive, to any order, right at m = 0; inf at m = 1.
-    Source: DLMF 19.2.8, 19.25.1.
-
-    >>> import jrigid.elliptic
-    >>> print(jrigid.elliptic.ellipk(0.5).round(12))
-    1.854074677301
-    >>> print(jrigid.elliptic.ellipk(None, mc=1e-300).round(3))
-    346.774
-    """
-    return _k(with_parameters(m, mc)[1])
-
-
-def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
-    r"""Complete elliptic integral of the second kind, as `scipy.special.ellipe`.
-
-    $E(m) = \int_0^{\pi/2} \sqrt{1 - m \sin^2 \theta} \, d\theta$.
-
-    Args:
-        m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m; where it is given m may be None.
-
-    Returns:
-        E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
-
-    Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m = 1.
-    Source: DLMF 19.2.8, 19.25.1.
-
-    >>> import jrigid.elliptic
-    >>> print(jrigid.elliptic.ellipe(0.5).round(12))
-    1.350643881048
-    """
-    return _e(*with_parameters(m, mc))
-
-
-def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
-    r"""Complete elliptic integral of the third kind, as `mpmath.ellippi`.
-
-    $\Pi(n, m) = \int_0^{\pi/2} d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
-
-    Args:
-        n: Characteristic. For n > 1 the value is Cauchy's principal value, the real part of
-            mpmath's.
-        m: Parameter, the square of the modulus, at most 1.
-        mc: 1 - m; where it is given m may be None.
-
-    Returns:
-        The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n, m) for
-        n > 1; inf at n = 1 and at m = 1 (-inf there for n > 1), NaN for m > 1. Arguments
-        broadcast.
-
-    Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at m = 1.
-    Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive terms.
-
-    >>> import jrigid.elliptic
-    >>> print(jrigid.elliptic.ellippi(0.3, 0.5).round(12))
-    2.250376821944
-    """
-    return _pi(*with_parameters(m, mc, n))
-
-
-# --- incomplete --------------------------------------------------------------------------------
+# --- within a quarter turn ---------------------------------------------------------------------
 
 
 def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
@@ -169,57 +65,38 @@ def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
     return jnp.sqrt(cosine * cosine + mc * sine * sine)
 
 
-@jax.custom_jvp
-def _f_incomplete(phi: Array, mc: Array) -> Array:
-    turns, sine, cosine = reduce_amplitude(phi)
-    one = jnp.ones_like(sine)
-    first = sine * rf_of(cosine, _delta(sine, cosine, mc), one)
-    complete = rf_of(jnp.zeros_like(one), root_where_turned(turns, mc), one)
-    return first + _times(2 * turns, complete)
+def _delta_of(phi: Array, mc: Array) -> Array:
+    return _delta(*reduce_amplitude(phi)[1:], mc)
 
 
-@_f_incomplete.defjvp
-def _f_incomplete_rule(primals: Any, tangents: Any) -> Any:
-    phi, mc = primals
-    turns, sine, cosine = reduce_amplitude(phi)
+def _f(sine: Array, cosine: Array, mc: Array) -> Array:
+    return sine * rf_of(cosine, _delta(sine, cosine, mc), jnp.ones_like(sine))
+
+
+def _f_by_m(sine: Array, cosine: Array, mc: Array) -> Array:
     delta = _delta(sine, cosine, mc)
-    one = jnp.ones_like(sine)
-    root = root_where_turned(turns, mc)
-    by_m = sine * sine * sine / (2 * delta) * g_of(cosine, one, delta)
-    by_m = by_m + _times(turns, g_of(jnp.zeros_like(one), one, root) / root)
-    return _f_incomplete(phi, mc), tangents[0] / delta - by_m * tangents[1]
+    return sine * sine * sine / (2 * delta) * g_of(cosine, jnp.ones_like(sine), delta)
 
 
-@jax.custom_jvp
-def _e_incomplete(phi: Array, m: Array, mc: Array) -> Array:
+def _e(s: Array, c: Array, m: Array, mc: Array) -> Array:
     """DLMF 19.25.9 for m <= 0, 19.25.10 for 0 < m <= 1, 19.25.11 above: positive terms each."""
-    turns, s, c = reduce_amplitude(phi)
-    d = _delta(s, c, mc)
-    one = jnp.ones_like(s)
+    d, one = _delta(s, c, mc), jnp.ones_like(s)
     low, high = m <= 0, mc < 0
     last = jnp.where(low, one, jnp.where(high, c, d))
     rf, g = rf_g(jnp.where(high, d, c), jnp.where(low, d, one), last)
     cube = s * s * s
     middle = mc * s * rf + m * s * (c / last) + m * mc * cube * (g / last)
     above = s * d / last - mc * cube * (g / last)
-    first = jnp.where(low, s * rf - m * cube * g, jnp.where(high, above, middle))
-    complete = _e_complete(jnp.where(turns == 0, 0.0, m), jnp.where(turns == 0, 1.0, mc))
-    return first + _times(2 * turns, complete)
+    value = jnp.where(low, s * rf - m * cube * g, jnp.where(high, above, middle))
+    return jnp.where((c == 0) & (mc == 0), s, value)
 
 
-@_e_incomplete.defjvp
-def _e_incomplete_rule(primals: Any, tangents: Any) -> Any:
-    phi, m, mc = primals
-    turns, sine, cosine = reduce_amplitude(phi)
+def _e_by_mc(sine: Array, cosine: Array, mc: Array) -> Array:
     delta = _delta(sine, cosine, mc)
-    one = jnp.ones_like(sine)
-    by_mc = 0.5 * sine * sine * sine * g_of(cosine, delta, one)
-    complete = g_of(jnp.zeros_like(one), root_where_turned(turns, mc), one)
-    by_mc = by_mc + _times(turns, complete)
-    return _e_incomplete(phi, m, mc), delta * tangents[0] + by_mc * tangents[2]
+    return 0.5 * sine * sine * sine * g_of(cosine, delta, jnp.ones_like(sine))
 
 
-def _pi_of(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
+def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     """Pi for |phi| <= pi/2; m > 1 by the reciprocal modulus, DLMF 19.7.4."""
     end = (cosine == 0) & (mc == 0)
     delta = _delta(sine, cosine, jnp.where(end, 1.0, mc))
@@ -251,17 +128,126 @@ def _pi_of(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     return jnp.where(end, infinite, s / k * value)
 
 
-def _pi_of_parameters(phi: Array, n: Array, m: Array, mc: Array) -> Array:
-    """Pi(n, phi, m) for any phi, with parts that can be differentiated by n, m and mc."""
-    turns, sine, cosine = reduce_amplitude(phi)
-    none = turns == 0
-    zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
-    turned = [jnp.where(none, 0.0, n), jnp.where(none, 0.0, m), jnp.where(none, 1.0, mc)]
-    complete = jnp.where(turned[2] < 0, jnp.nan, _pi_of(one, zero, *turned))
-    return _pi_of(sine, cosine, n, m, mc) + _times(2 * turns, complete)
+# --- complete ----------------------------------------------------------------------------------
 
 
-_pi_incomplete = jax.custom_jvp(_pi_of_parameters)
+@jax.custom_jvp
+def _e_complete(m: Array, mc: Array) -> Array:
+    return _complete(_e, m, mc)
+
+
+@_e_complete.defjvp
+def _e_complete_rule(primals: Any, tangents: Any) -> Any:
+    return _e_complete(*primals), _complete(_e_by_mc, primals[1]) * tangents[1]
+
+
+_k_compiled = jax.jit(functools.partial(_complete, _f))
+_e_compiled = jax.jit(_e_complete)
+_pi_compiled = jax.jit(functools.partial(_complete, _pi))
+
+
+def ellipk(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the first kind, as `scipy.special.ellipk`.
+
+    $K(m) = \int_0^{\pi/2} d\theta / \sqrt{1 - m \sin^2 \theta}$.
+
+    Args:
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m; where it is given m may be None.
+
+    Returns:
+        K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments broadcast.
+
+    Gradients: R_D(0, 1, mc) / 6, positive, to any order, right at m = 0; inf at m = 1.
+    Source: DLMF 19.2.8, 19.25.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipk(0.5).round(12))
+    1.854074677301
+    >>> print(jrigid.elliptic.ellipk(None, mc=1e-300).round(3))
+    346.774
+    """
+    return _k_compiled(with_parameters(m, mc)[1])
+
+
+def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the second kind, as `scipy.special.ellipe`.
+
+    $E(m) = \int_0^{\pi/2} \sqrt{1 - m \sin^2 \theta} \, d\theta$.
+
+    Args:
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m; where it is given m may be None.
+
+    Returns:
+        E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
+
+    Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m = 1.
+    Source: DLMF 19.2.8, 19.25.1.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellipe(0.5).round(12))
+    1.350643881048
+    """
+    return _e_compiled(*with_parameters(m, mc))
+
+
+def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+    r"""Complete elliptic integral of the third kind, as `mpmath.ellippi`.
+
+    $\Pi(n, m) = \int_0^{\pi/2} d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
+
+    Args:
+        n: Characteristic. For n > 1 the value is Cauchy's principal value, the real part of
+            mpmath's.
+        m: Parameter, the square of the modulus, at most 1.
+        mc: 1 - m; where it is given m may be None.
+
+    Returns:
+        The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n, m) for
+        n > 1; inf at n = 1 and at m = 1 (-inf there for n > 1), NaN for m > 1. Arguments
+        broadcast.
+
+    Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at m = 1.
+    Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive terms.
+
+    >>> import jrigid.elliptic
+    >>> print(jrigid.elliptic.ellippi(0.3, 0.5).round(12))
+    2.250376821944
+    """
+    return _pi_compiled(*with_parameters(m, mc, n))
+
+
+# --- incomplete --------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def _f_incomplete(phi: Array, mc: Array) -> Array:
+    return _of_any_turns(_f, phi, mc)
+
+
+@_f_incomplete.defjvp
+def _f_incomplete_rule(primals: Any, tangents: Any) -> Any:
+    phi, mc = primals
+    slope = _of_any_turns(_f_by_m, phi, mc)
+    return _f_incomplete(phi, mc), tangents[0] / _delta_of(phi, mc) - slope * tangents[1]
+
+
+@jax.custom_jvp
+def _e_incomplete(phi: Array, m: Array, mc: Array) -> Array:
+    return _of_any_turns(_e, phi, m, mc)
+
+
+@_e_incomplete.defjvp
+def _e_incomplete_rule(primals: Any, tangents: Any) -> Any:
+    phi, m, mc = primals
+    slope = _of_any_turns(_e_by_mc, phi, mc)
+    return _e_incomplete(phi, m, mc), _delta_of(phi, mc) * tangents[0] + slope * tangents[2]
+
+
+@jax.custom_jvp
+def _pi_incomplete(phi: Array, n: Array, m: Array, mc: Array) -> Array:
+    return _of_any_turns(_pi, phi, n, m, mc)
 
 
 @_pi_incomplete.defjvp
@@ -271,12 +257,12 @@ def _pi_incomplete_rule(primals: Any, tangents: Any) -> Any:
     _, sine, cosine = reduce_amplitude(phi)
     pole = (cosine * cosine + (1 - n) * sine * sine) * _delta(sine, cosine, mc)
     _, by_parameters = jax.jvp(
-        lambda n, m, mc: _pi_of_parameters(phi, n, m, mc), (n, m, mc), (d_n, -d_mc, d_mc)
+        functools.partial(_of_any_turns, _pi, phi), (n, m, mc), (d_n, -d_mc, d_mc)
     )
     return _pi_incomplete(phi, n, m, mc), d_phi / pole + by_parameters
 
 
-_f, _e_of_phi, _pi_of_phi = map(jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete))
+_f_of_phi, _e_of_phi, _pi_of_phi = map(jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete))
 
 
 def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
@@ -303,7 +289,7 @@ def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
     1.083216772845
     """
     phi, _, mc = with_parameters(m, mc, phi)
-    return _f(phi, mc)
+    return _f_of_phi(phi, mc)
 
 
 def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:

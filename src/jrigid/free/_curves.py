@@ -6,13 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import (
-    check_inertia_shape,
-    float_arrays,
-    is_inertia,
-    where_defined,
-    whole_number,
-)
+from jrigid._checks import where_defined, whole_number
 from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
@@ -62,7 +56,7 @@ def polhode(
         times = jnp.linspace(start, end, count) / motion.unit
         return jax.vmap(lambda t: relative_rotation(inertia, omega, t)[1])(times)
 
-    return where_moving(curve, inertia, omega)
+    return where_moving(curve, inertia, omega=omega)
 
 
 def herpolhode(
@@ -93,8 +87,7 @@ def herpolhode(
     [0. 0. 1.]
     """
     motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
-    in_space = jax.vmap(rotate)(motion.attitude.reshape(-1, 4), motion.omega.reshape(-1, 3))
-    return in_space.reshape(motion.omega.shape)
+    return jnp.vectorize(rotate, signature="(4),(3)->(3)")(motion.attitude, motion.omega)
 
 
 class Separatrix(NamedTuple):
@@ -137,9 +130,7 @@ def separatrix(inertia: InertiaLike) -> Separatrix:
         i1, i2, i3 = jnp.sort(inertia) if inertia.ndim == 1 else eigh(inertia)[0]
         return where_defined(i3 > i1, _planes, i1, i2, i3)
 
-    (inertia,) = float_arrays(inertia)
-    check_inertia_shape(inertia)
-    return where_defined(is_inertia(inertia), of_body, inertia)
+    return where_moving(of_body, inertia)
 
 
 def _planes(i1: Array, i2: Array, i3: Array) -> Separatrix:
@@ -198,4 +189,4 @@ def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
         distance = jnp.where(resting, 0.0, twice / jnp.where(resting, 1.0, momentum))
         return Poinsot(momentum, root * jnp.sqrt(moments), root / jnp.sqrt(moments), distance)
 
-    return where_moving(surfaces, inertia, omega)
+    return where_moving(surfaces, inertia, omega=omega)

@@ -1,30 +1,27 @@
 """free_rotation(): the state of a free body at any times, for moments or a tensor."""
 
-import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
     all_finite,
-    check_inertia_shape,
     check_shape,
-    float_arrays,
     is_inertia,
-    is_unit,
-    settle,
+    shaped,
     where_defined,
 )
-from jrigid._motion import plain_state, resolves
-from jrigid._numerics import product, safe_norm
-from jrigid._spectral import eigh, eigh_of_distinct, from_principal_axes
+from jrigid._motion import exact_motion, plain_state
+from jrigid._numerics import gauss_legendre, product, safe_norm
+from jrigid._spectral import eigh, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, Real, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import ExactStates, State
 from jrigid.free._flow import Invariants, after, invariants
@@ -34,7 +31,6 @@ Tree = TypeVar("Tree")
 
 # Moments whose gap turns the motion by less than this [rad] are near.
 _NEAR = 1e-2
-_NODES = (0.5 - 0.5 / 3**0.5, 0.5 + 0.5 / 3**0.5)  # Gauss-Legendre: error of 1e-12 when near
 
 
 def free_rotation(
@@ -77,38 +73,17 @@ def free_rotation(
     (3, 3) [ 0.9768  0.2145 -0.5639]
     """
     state0, (inertia, ts, t0) = plain_state("state0", state0, inertia, ts, t0)
-    check_inertia_shape(inertia)
-    check_shape("t0", t0, ())
-    answer = _free_rotation(inertia, state0, ts, t0)
-    return settle(answer, throw, lambda: _findings(inertia, state0, ts, t0))
+    check_shape("inertia", inertia, *INERTIA)
+    return exact_motion(_check, _flow, throw, inertia, state0, ts, t0)
 
 
-def _findings(inertia: Array, state0: State, ts: Array, t0: Array) -> Findings:
-    findings = Findings()
+def _check(findings: Findings, inertia: Array) -> None:
     findings.require(is_inertia(inertia), RESULTS.invalid_inertia, value=inertia)
-    state = jnp.concatenate([state0.attitude, state0.omega])
-    findings.require(all_finite(state), RESULTS.invalid_state, value=state)
-    findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude, value=state0.attitude)
-    for name, times in (("t0", t0), ("ts", ts)):
-        message = f"Argument `{name}` must be finite, but it is not."  # the sum shows in what way
-        findings.require(all_finite(times), RESULTS.invalid_times, message, jnp.sum(times))
-    told_apart = resolves(t0, safe_norm(state0.omega))
-    findings.require(told_apart, RESULTS.unresolved_times, value=t0)
-    return findings
 
 
-@jax.jit
-def _free_rotation(inertia: Array, state0: State, ts: Array, t0: Array) -> ExactStates:
-    findings = _findings(inertia, state0, ts, t0)
-    states = where_defined(findings.ok, _states, inertia, state0, ts - t0)
-    return ExactStates(states, findings.result)
-
-
-def _states(inertia: Array, state0: State, times: Array) -> State:
-    start = normalize(state0.attitude)
-    turns, rates = jax.vmap(lambda t: _turn(inertia, state0.omega, t))(times.reshape(-1))
-    attitudes = jax.vmap(lambda turn: multiply(start, turn))(turns)
-    return State(attitudes.reshape(*times.shape, 4), rates.reshape(*times.shape, 3))
+def _flow(inertia: Array, state0: State, t: Array) -> tuple[Array, Array]:
+    turn, omega = _turn(inertia, state0.omega, t)
+    return multiply(normalize(state0.attitude), turn), omega
 
 
 def relative_rotation(
@@ -133,12 +108,7 @@ def relative_rotation(
     >>> print(turn.round(6), omega)
     [0. 0. 0. 1.] [0. 0. 1.]
     """
-    inertia, omega, duration = float_arrays(inertia, omega, duration)
-    check_inertia_shape(inertia)
-    check_shape("omega", omega, (3,))
-    check_shape("duration", duration, ())
-    ok = is_inertia(inertia) & all_finite((omega, duration))
-    return where_defined(ok, _turn, inertia, omega, duration)
+    return where_moving(_turn, inertia, omega=omega, duration=duration)
 
 
 def from_invariants(formula: Callable[[Invariants], Tree], inertia: Any, omega: Any) -> Tree:
@@ -147,15 +117,14 @@ def from_invariants(formula: Callable[[Invariants], Tree], inertia: Any, omega: 
     def of_body(inertia: Array, omega: Array) -> Tree:
         return formula(invariants(*in_principal_axes(inertia, omega)))
 
-    return where_moving(of_body, inertia, omega)
+    return where_moving(of_body, inertia, omega=omega)
 
 
-def where_moving(formula: Callable[[Array, Array], Tree], inertia: Any, omega: Any) -> Tree:
-    """A formula of a free body; NaN outside positive definite inertia and finite rates."""
-    inertia, omega = float_arrays(inertia, omega)
-    check_inertia_shape(inertia)
-    check_shape("omega", omega, (3,))
-    return where_defined(is_inertia(inertia) & all_finite(omega), formula, inertia, omega)
+def where_moving(formula: Callable[..., Tree], inertia: Any, **others: Any) -> Tree:
+    """A formula of inertia, `omega` and scalars; NaN outside positive definite and finite ones."""
+    shapes = {x: (value, 3) if x == "omega" else (value,) for x, value in others.items()}
+    inertia, *numbers = shaped(inertia=(inertia, *INERTIA), **shapes)
+    return where_defined(is_inertia(inertia) & all_finite(numbers), formula, inertia, *numbers)
 
 
 def in_principal_axes(inertia: Array, omega: Array) -> tuple[Array, Array]:
@@ -186,18 +155,16 @@ def _of_tensor_jvp(primals: tuple, tangents: tuple) -> tuple:
     # In the principal axes a change of the tensor changes the moments, and, off its diagonal, turns
     # the axes: a motion about turned axes is the turned motion.
     (tensor, omega, t), (change, omega_change, t_change) = primals, tangents
-    moments, axes = eigh_of_distinct(tensor)
+    moments, axes = eigh(tensor, distinct=True)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     omega, omega_change = (product("ji,j->i", axes, x) for x in (omega, omega_change))
     value, tangent = jax.jvp(
         _of_moments, (moments, omega, t), (jnp.diagonal(inside), omega_change, t_change)
     )
     axis = jnp.eye(3, dtype=moments.dtype)
-    second, third = jnp.roll(axis, -1, axis=0), jnp.roll(axis, 1, axis=0)
-    elements = product("ki,ij,kj->k", second, inside, third)
-    slopes = jax.vmap(functools.partial(_slope_off_diagonal, moments, omega, t))(
-        axis, 0.5 * (second - third)
-    )
+    apart = 0.5 * (jnp.roll(axis, -1, axis=0) - jnp.roll(axis, 1, axis=0))
+    elements = jnp.stack([inside[1, 2], inside[2, 0], inside[0, 1]])
+    slopes = jax.vmap(partial(_slope_off_diagonal, moments, omega, t))(axis, apart)
     tangent = jtu.tree_map(lambda x, y: x + product("k,kn->n", elements, y), tangent, slopes)
     return from_principal_axes(axes, *value), from_principal_axes(axes, *tangent)
 
@@ -219,13 +186,11 @@ def _slope_off_diagonal(
         vector = jnp.cross(axis, p[1:]) - dp[1:]
         return jnp.concatenate([-dp[:1], vector]), jnp.cross(axis, w) - dw
 
-    gap = 2 * jnp.sum(apart * moments)
-    radians = 1 + safe_norm(omega) * jnp.abs(t)
-    size = jnp.sum(jnp.abs(apart) * moments)
-    near = jax.lax.stop_gradient(jnp.abs(gap) * radians < _NEAR * size)
-    quotient = jtu.tree_map(lambda x: x / jnp.where(near, 1.0, gap), effect(moments))
-    nodes = jnp.asarray(np.array(_NODES), moments.dtype)
-    slopes = jax.vmap(
-        lambda node: jax.jvp(effect, (moments + (node - 1) * gap * apart,), (apart,))[1]
-    )(nodes)
-    return jtu.tree_map(lambda x, y: jnp.where(near, 0.5 * (x[0] + x[1]), y), slopes, quotient)
+    gap, size = 2 * jnp.sum(apart * moments), jnp.sum(jnp.abs(apart) * moments)
+    near = jnp.abs(gap) * (1 + safe_norm(omega) * jnp.abs(t)) < _NEAR * size
+    nodes, _ = gauss_legendre(2, moments.dtype)  # error of 1e-12 when near
+    between = moments[None, :] + (nodes[:, None] - 1) * gap * apart[None, :]
+    slopes = jax.vmap(lambda moments: jax.jvp(effect, (moments,), (apart,))[1])(between)
+    safe = jnp.where(near, 1.0, gap)
+    quotients = jtu.tree_map(lambda x: x / safe, effect(moments))
+    return jtu.tree_map(lambda x, y: jnp.where(near, jnp.mean(x, axis=0), y), slopes, quotients)

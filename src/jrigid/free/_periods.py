@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jrigid._checks import Enumeration
-from jrigid._numerics import safe_norm
+from jrigid._numerics import root_of_positive, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
 from jrigid.free._flow import Invariants
 from jrigid.free._motion import from_invariants
@@ -45,11 +45,9 @@ def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(jr.free.polhode_period(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0])).round(4))
     6.2884
     """
-
-    def period(motion: Invariants) -> Scalar:
-        return jnp.where(motion.circles, 4 * motion.quarter / motion.unit, jnp.inf)
-
-    return from_invariants(period, inertia, omega)
+    return from_invariants(
+        lambda x: jnp.where(x.circles, 4 * x.quarter / x.unit, jnp.inf), inertia, omega
+    )
 
 
 def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
@@ -102,11 +100,9 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(jr.free.precession_per_period(body, omega).round(4))
     12.5821
     """
-
-    def angle(motion: Invariants) -> Scalar:
-        return jnp.where(motion.circles, 4 * motion.quarter * _mean_rate(motion), jnp.inf)
-
-    return from_invariants(angle, inertia, omega)
+    return from_invariants(
+        lambda x: jnp.where(x.circles, 4 * x.quarter * _mean_rate(x), jnp.inf), inertia, omega
+    )
 
 
 def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
@@ -194,8 +190,7 @@ def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(f"{k:.6f}")
     0.057735
     """
-    m = parameter(inertia, omega)
-    return jnp.where(m == 0, 0.0, jnp.sqrt(jnp.where(m == 0, 1.0, m)))
+    return from_invariants(lambda x: root_of_positive(_parameter(x)), inertia, omega)
 
 
 def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:

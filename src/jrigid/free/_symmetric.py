@@ -47,7 +47,7 @@ def _where_symmetric(
         even = jnp.all(jnp.abs(jax.lax.stop_gradient(uneven)) <= tolerance)
         return where_defined(even, formula, 0.5 * (i1 + i2), i3, omega)
 
-    return where_moving(of_body, inertia, omega)
+    return where_moving(of_body, inertia, omega=omega)
 
 
 def wobble_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, check_inertia_shape, check_shape, check_type, nan_where
+from jrigid._checks import INERTIA, RESULTS, check_shape, check_type, nan_where
 from jrigid._numerics import product
 from jrigid._types import Real
 from jrigid.dynamics import State
@@ -76,7 +76,7 @@ def _planned(
     """Derivatives of a record that is what the body and the state say."""
     check_type("system", system, RigidBody)
     check_type("state", state, State)
-    check_inertia_shape(system.inertia)
+    check_shape("inertia", system.inertia, *INERTIA)
     stacked = of_throws(observations)
     torque_free = system.is_free
     refuse(system, stacked, scale, torque_free)

@@ -210,7 +210,7 @@ def _prepare(
     samples = samples_of(stacked, attitude0)
     rate = typical_rate(samples, state, ts.dtype)
     findings = findings_of(system, stacked, samples, tensor, state)
-    stacked = findings.apply(stacked, throw)
+    stacked = findings.guard(stacked, throw) if throw else stacked
     angle = jnp.zeros(()) if samples is None else jnp.max(angle_turned(samples)[:, -1])
     return stacked, samples, rate, angle, findings.result
 

@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
     all_finite,
     array_of_shape,
-    check_inertia_shape,
     check_option,
     check_type,
-    float_arrays,
     is_positive_definite,
     is_symmetric,
     where_defined,
@@ -96,8 +95,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
      [0.  2.  0. ]
      [0.  0.  2.5]]
     """
-    (inertia,) = float_arrays(inertia)
-    check_inertia_shape(inertia)
+    inertia = array_of_shape("inertia", inertia, *INERTIA)
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
     second = _second_moments(0.5 * (tensor + tensor.T))
     solid = all_finite(tensor) & is_symmetric(tensor) & is_positive_definite(second)

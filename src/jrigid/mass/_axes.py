@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import (
+    INERTIA,
     all_finite,
-    check_inertia_shape,
     check_shape,
     float_arrays,
     is_symmetric,
     scaled_together,
+    shaped,
     where_defined,
 )
 from jrigid._spectral import eigh, spectral_function
@@ -25,7 +26,7 @@ ULPS = 64  # rounding allowed in "not negative" and "I3 <= I1 + I2"
 
 def as_tensor(inertia: Array) -> Matrix:
     """A tensor of moments or of a tensor, or ValueError."""
-    check_inertia_shape(inertia)
+    check_shape("inertia", inertia, *INERTIA)
     return jnp.diag(inertia) if inertia.ndim == 1 else inertia
 
 
@@ -69,16 +70,28 @@ def is_physical(tensor: Matrix) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     return is_symmetric(tensor) & is_semidefinite(unit, trace), is_semidefinite(second, trace)
 
 
-def _displaced(
-    inertia: ArrayLike, mass: ArrayLike, displacement: ArrayLike
-) -> tuple[Bool[Array, ""], tuple[Matrix, Scalar, Vector]]:
-    """Whether the parallel axis theorem applies, and its arguments."""
-    inertia, mass, displacement = float_arrays(inertia, mass, displacement)
-    tensor = as_tensor(inertia)
-    check_shape("mass", mass, ())
-    check_shape("displacement", displacement, (3,))
+def body_arrays(
+    inertia: ArrayLike, mass: ArrayLike, **vector: ArrayLike
+) -> tuple[Matrix, Scalar, Vector]:
+    """Tensor, mass and a vector, given by its name, of one dtype, or ValueError."""
+    ((name, value),) = vector.items()
+    inertia, mass, value = shaped(inertia=(inertia, *INERTIA), mass=(mass,), **{name: (value, 3)})
+    return as_tensor(inertia), mass, value
+
+
+def _displaced(arguments: tuple[Matrix, Scalar, Vector], *, to_center: bool) -> Matrix:
+    """Parallel axis theorem, from the centre of mass or to it; NaN where it does not apply."""
+
+    def displaced(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
+        excess = mass * steiner(displacement)
+        return tensor - excess if to_center else tensor + excess
+
+    tensor, mass, displacement = known = jax.lax.stop_gradient(arguments)
     ok = is_symmetric(tensor) & (mass >= 0) & all_finite((mass, displacement))
-    return ok, (tensor, mass, displacement)
+    if to_center:
+        whole, own = scaled_together(tensor, displaced(*known))
+        ok = ok & is_semidefinite(own, jnp.trace(whole))
+    return where_defined(ok, displaced, *arguments)
 
 
 def parallel_axis(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
@@ -102,8 +115,7 @@ def parallel_axis(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLi
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    ok, arguments = _displaced(inertia, mass, displacement)
-    return where_defined(ok, lambda tensor, mass, d: tensor + mass * steiner(d), *arguments)
+    return _displaced(body_arrays(inertia, mass, displacement=displacement), to_center=False)
 
 
 def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
@@ -129,14 +141,7 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    ok, arguments = _displaced(inertia, mass, displacement)
-
-    def reduced(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
-        return tensor - mass * steiner(displacement)
-
-    tensor = jax.lax.stop_gradient(arguments[0])
-    whole, own = scaled_together(tensor, jax.lax.stop_gradient(reduced(*arguments)))
-    return where_defined(ok & is_semidefinite(own, jnp.trace(whole)), reduced, *arguments)
+    return _displaced(body_arrays(inertia, mass, displacement=displacement), to_center=True)
 
 
 @final

@@ -5,9 +5,9 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from jrigid._checks import Findings, all_finite, check_shape, float_arrays, where_defined
+from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays, where_defined
 from jrigid._numerics import product
 from jrigid._types import (
     InertiaLike,
@@ -15,14 +15,12 @@ from jrigid._types import (
     Quaternion,
     QuaternionLike,
     Readable,
-    Scalar,
     ScalarLike,
-    Vector,
     VectorLike,
 )
 from jrigid.mass._axes import (
     PrincipalAxes,
-    as_tensor,
+    body_arrays,
     is_physical,
     parallel_axis,
     principal_axes,
@@ -34,10 +32,6 @@ _NOT_A_BODY = (
     "Argument `inertia` must hold three finite, non-negative principal moments or be a finite, "
     "symmetric, positive semi-definite (3, 3) tensor, but it is not. (Three bodies are three "
     "lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
-)
-_NOT_PHYSICAL = (
-    "Argument `inertia` must be the tensor of a real body, whose principal moments satisfy "
-    "I3 <= I1 + I2, but they do not."
 )
 
 
@@ -90,17 +84,16 @@ class MassProperties(Readable):
 
         Gradients: the identity, on symmetric tensors.
         """
-        values = _arrays(mass, center_of_mass, inertia)
-        mass, center_of_mass, tensor = jax.lax.stop_gradient(values)
+        values = body_arrays(inertia, mass, center_of_mass=center_of_mass)
+        tensor, mass, center_of_mass = jax.lax.stop_gradient(values)
         findings = Findings()
-        message = "Argument `mass` must be positive and finite, but it is not."
-        findings.require((mass > 0) & jnp.isfinite(mass), None, message, mass)
+        findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass, value=mass)
         message = "Argument `center_of_mass` must be finite, but it is not."
         findings.require(all_finite(center_of_mass), None, message, center_of_mass)
         positive, triangle = is_physical(tensor)
         findings.require(positive, None, _NOT_A_BODY, inertia)
-        findings.require(triangle, None, _NOT_PHYSICAL, inertia)
-        self.mass, self.center_of_mass, tensor = findings.guard(values, throw)
+        findings.require(triangle, RESULTS.unphysical_inertia, value=inertia)
+        tensor, self.mass, self.center_of_mass = findings.guard(values, throw)
         self.inertia = _symmetrised(tensor)
 
     @classmethod
@@ -124,7 +117,7 @@ class MassProperties(Readable):
         1.0
         """
         body = object.__new__(cls)
-        mass, center_of_mass, tensor = _arrays(mass, center_of_mass, inertia)
+        tensor, mass, center_of_mass = body_arrays(inertia, mass, center_of_mass=center_of_mass)
         object.__setattr__(body, "mass", mass)
         object.__setattr__(body, "center_of_mass", center_of_mass)
         object.__setattr__(body, "inertia", _symmetrised(tensor))
@@ -147,9 +140,9 @@ class MassProperties(Readable):
         >>> print(ball.about(jnp.zeros(3))[2, 2])
         3.0
         """
-        point, center = float_arrays(point, self.center_of_mass)
-        check_shape("point", point, (3,))
-        return parallel_axis(self.inertia, self.mass, point - center)
+        body, place = _in_one_dtype(self, point)
+        check_shape("point", place, (3,))
+        return parallel_axis(body.inertia, body.mass, place - body.center_of_mass)
 
     def translated(self, displacement: VectorLike) -> "MassProperties":
         """The body moved by a displacement, without turning it.
@@ -218,15 +211,6 @@ class MassProperties(Readable):
         if isinstance(other, int) and other == 0:
             return self
         return NotImplemented
-
-
-def _arrays(
-    mass: ArrayLike, center_of_mass: ArrayLike, inertia: ArrayLike
-) -> tuple[Scalar, Vector, Matrix]:
-    mass, center_of_mass, inertia = float_arrays(mass, center_of_mass, inertia)
-    check_shape("mass", mass, ())
-    check_shape("center_of_mass", center_of_mass, (3,))
-    return mass, center_of_mass, as_tensor(inertia)
 
 
 def _symmetrised(tensor: Matrix) -> Matrix:

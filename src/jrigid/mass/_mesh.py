@@ -8,17 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jrigid._checks import (
-    Findings,
-    check_shape,
-    float_arrays,
-    harmless,
-    is_concrete,
-)
+from jrigid._checks import Findings, check_shape, harmless, is_concrete, shaped
 from jrigid._types import Matrix, Real, Scalar, ScalarLike, Vector
 from jrigid.mass._axes import ULPS, inertia_of_second_moment, is_physical
 from jrigid.mass._body import MassProperties
-from jrigid.mass._points import lane_sum
+from jrigid.mass._points import PAIRS, lane_sum, symmetric
 
 _OPEN = (
     "Argument `faces` must describe a closed surface in which every edge is shared by two "
@@ -87,26 +81,17 @@ def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vect
     origin = jax.lax.stop_gradient(sums / vertices.shape[0])
     local = [vertices[:, i] - origin[i] for i in range(3)]
     a, b, c = ([x.at[faces[:, k]].get(mode="clip") for x in local] for k in range(3))
-    six_volumes = (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
+    six_volumes: Any = sum(a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3))
     s = [a[i] + b[i] + c[i] for i in range(3)]
     volume = lane_sum(six_volumes) / 6
     magnitude = lane_sum(jnp.abs(jax.lax.stop_gradient(six_volumes))) / 6
     first = jnp.stack([lane_sum(six_volumes * s[i]) for i in range(3)]) / 24
-    second = {
-        (i, j): lane_sum(six_volumes * (a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j]))
-        / 120
-        for i in range(3)
-        for j in range(i, 3)
-    }
-    center = first / jnp.where(volume == 0, 1.0, volume)
-    matrix = jnp.stack(
-        [jnp.stack([second[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)]
+    second = symmetric(
+        lane_sum(six_volumes * (a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j])) / 120
+        for i, j in PAIRS
     )
-    about_center = matrix - volume * center[:, None] * center[None, :]
+    center = first / jnp.where(volume == 0, 1.0, volume)
+    about_center = second - volume * center[:, None] * center[None, :]
     return volume, magnitude, origin + center, inertia_of_second_moment(about_center)
 
 
@@ -152,9 +137,7 @@ def from_mesh(
     >>> print(body.mass, body.center_of_mass)
     1.0 [1.5  0.25 0.25]
     """
-    vertices, density = float_arrays(vertices, density)
-    check_shape("vertices", vertices, (None, 3))
-    check_shape("density", density, ())
+    vertices, density = shaped(vertices=(vertices, None, 3), density=(density,))
     indices = _index_array(faces)
     closed: Any = is_closed if isinstance(indices, np.ndarray) else is_closed_traced
     findings = Findings()

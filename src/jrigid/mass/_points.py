@@ -1,6 +1,6 @@
 """Mass properties of point clouds, and of densities by quadrature."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -12,10 +12,9 @@ from jrigid._checks import (
     Findings,
     all_finite,
     check_shape,
-    float_arrays,
     harmless,
     nan_where,
-    pair_of_shapes,
+    shaped,
     whole_number,
 )
 from jrigid._numerics import product
@@ -26,6 +25,15 @@ from jrigid.mass._body import MassProperties
 # Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU reductions
 # and products of tall thin matrices run below numpy's speed; lanes of partial sums mend both.
 _LANES = 64
+
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def symmetric(entries: Iterable[Array]) -> Matrix:
+    """The symmetric matrix of these entries, in the order of `PAIRS`."""
+    xx, xy, xz, yy, yz, zz = entries
+    return jnp.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def lane_sum(x: Float[Array, " points"]) -> Scalar:
@@ -40,23 +48,14 @@ def _outer_sum(weights: Array, positions: Array) -> Matrix:
 
 
 def _outer_sum_in_lanes(weights: Array, positions: Array) -> Matrix:
-    def add(sums: tuple, block: tuple) -> tuple[tuple, None]:
+    def add(sums: list[Array], block: tuple[Array, Array]) -> tuple[list[Array], None]:
         m, r = block
-        x, y, z = r[:, 0], r[:, 1], r[:, 2]
-        mx, my, mz = m * x, m * y, m * z
-        terms = (mx * x, my * y, mz * z, mx * y, mx * z, my * z)
-        return tuple(s + t for s, t in zip(sums, terms, strict=True)), None
+        return [s + m * r[:, i] * r[:, j] for s, (i, j) in zip(sums, PAIRS, strict=True)], None
 
     whole = weights.shape[0] // _LANES * _LANES
-    blocks = (
-        weights[:whole].reshape(-1, _LANES),
-        positions[:whole].reshape(-1, _LANES, 3),
-    )
-    start = (jnp.zeros(_LANES, weights.dtype),) * 6
-    lanes, _ = jax.lax.scan(add, start, blocks)
-    xx, yy, zz, xy, xz, yz = (jnp.sum(lane) for lane in lanes)
-    matrix = jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
-    return matrix + _outer_sum(weights[whole:], positions[whole:])
+    blocks = weights[:whole].reshape(-1, _LANES), positions[:whole].reshape(-1, _LANES, 3)
+    lanes, _ = jax.lax.scan(add, [jnp.zeros(_LANES, weights.dtype)] * len(PAIRS), blocks)
+    return symmetric(map(jnp.sum, lanes)) + _outer_sum(weights[whole:], positions[whole:])
 
 
 @jax.custom_jvp
@@ -108,8 +107,7 @@ def _examined(masses: Array, positions: Array) -> list[tuple[Bool[Array, ""], Ar
 
 
 def _cloud_arrays(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array]:
-    masses, positions = float_arrays(masses, positions)
-    check_shape("masses", masses, (None,))
+    masses, positions = shaped(masses=(masses, None), positions=(positions, None, 3))
     check_shape("positions", positions, (masses.shape[0], 3))
     if masses.shape[0] == 0:
         raise ValueError("Argument `masses` must hold at least one point, but it is empty.")
@@ -151,8 +149,7 @@ def from_points(
     findings = Findings()
     message = "Argument `masses` must be finite and non-negative, but it is not."
     findings.require(fine, None, message, mass)
-    message = "Argument `positions` must be finite, but it is not."
-    findings.require(finite, None, message, position)
+    findings.require(finite, None, "Argument `positions` must be finite, but it is not.", position)
     if not throw:  # NaN in the sums would reach the gradients of the other lanes
         arrays = harmless(findings.ok, arrays)
     body = _cloud(*arrays)
@@ -227,7 +224,7 @@ def from_density(
     >>> print(wedge.mass.round(6), wedge.center_of_mass.round(6))
     1.0 [0.666667 0.5      0.5     ]
     """
-    lower, upper = pair_of_shapes("lower", lower, (3,), "upper", upper, (3,))
+    lower, upper = shaped(lower=(lower, 3), upper=(upper, 3))
     order = whole_number("order", order, 2)
     shape = jax.eval_shape(density, jax.ShapeDtypeStruct((3,), lower.dtype))
     if getattr(shape, "shape", None) != ():

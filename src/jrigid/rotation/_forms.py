@@ -4,19 +4,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import array_of_shape
 from jrigid._numerics import safe_arctan2, safe_norm
-from jrigid._types import (
-    Matrix,
-    MatrixLike,
-    Quaternion,
-    QuaternionLike,
-    Vector,
-    VectorLike,
-)
+from jrigid._types import Matrix, MatrixLike, Quaternion, QuaternionLike, Vector, VectorLike
 from jrigid.rotation._quaternion import multiply, normalize, rescaled, rotate
 
 
@@ -102,12 +94,12 @@ def from_matrix(matrix: MatrixLike) -> Quaternion:
     p, q, r = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     s, t, u = m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2]
     # Each row is 4 q_k q; the one with the largest q_k is the accurate one.
-    rows = jnp.stack(
+    rows = jnp.array(
         [
-            jnp.stack([1 + a + b + c, p, q, r]),
-            jnp.stack([p, 1 + a - b - c, s, t]),
-            jnp.stack([q, s, 1 - a + b - c, u]),
-            jnp.stack([r, t, u, 1 - a - b + c]),
+            [1 + a + b + c, p, q, r],
+            [p, 1 + a - b - c, s, t],
+            [q, s, 1 - a + b - c, u],
+            [r, t, u, 1 - a - b + c],
         ]
     )
     row = rows[jnp.argmax(jnp.diagonal(rows))]
@@ -160,7 +152,7 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
     """
     value = rotation.as_quat() if isinstance(rotation, _ScipyRotation) else rotation
     try:
-        quaternion = array_of_shape("rotation", value, 4)
+        return jnp.roll(array_of_shape("rotation", value, 4), 1)
     except (TypeError, ValueError) as error:
         shape = getattr(value, "shape", None)
         kind = type(rotation).__name__ if shape is None else f"of shape {shape}"
@@ -168,7 +160,6 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
             "Argument `rotation` must be a single scipy.spatial.transform.Rotation or a quaternion "
             f"(x, y, z, w) of shape (4,), but it is {kind}."
         ) from error
-    return jnp.roll(quaternion, 1)
 
 
 def from_euler(angles: VectorLike) -> Quaternion:
@@ -188,14 +179,8 @@ def from_euler(angles: VectorLike) -> Quaternion:
     """
     phi, theta, psi = 0.5 * array_of_shape("angles", angles, 3)
     c, s = jnp.cos(theta), jnp.sin(theta)
-    return jnp.stack(
-        [
-            c * jnp.cos(phi + psi),
-            s * jnp.cos(phi - psi),
-            s * jnp.sin(phi - psi),
-            c * jnp.sin(phi + psi),
-        ]
-    )
+    plus, minus = phi + psi, phi - psi
+    return jnp.stack([c * jnp.cos(plus), s * jnp.cos(minus), s * jnp.sin(minus), c * jnp.sin(plus)])
 
 
 def to_euler(attitude: QuaternionLike) -> Vector:
@@ -220,8 +205,7 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     """
     w, x, y, z = rescaled(array_of_shape("attitude", attitude, 4))
     upper, lower = (w == 0) & (z == 0), (x == 0) & (y == 0)
-    half_sum = safe_arctan2(z, w)
-    half_difference = safe_arctan2(y, x)
+    half_sum, half_difference = safe_arctan2(z, w), safe_arctan2(y, x)
     half_difference = jnp.where(lower, half_sum, half_difference)
     half_sum = jnp.where(upper, half_difference, half_sum)
     theta = 2 * safe_arctan2(safe_norm(jnp.stack([x, y])), safe_norm(jnp.stack([w, z])))
@@ -256,17 +240,8 @@ def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     half = 0.5 * array_of_shape("angles", angles, 3)
     (a, b, c), (p, q, r) = jnp.cos(half), jnp.sin(half)
     return jnp.stack(
-        [
-            a * b * c + p * q * r,
-            p * b * c - a * q * r,
-            a * q * c + p * b * r,
-            a * b * r - p * q * c,
-        ]
+        [a * b * c + p * q * r, p * b * c - a * q * r, a * q * c + p * b * r, a * b * r - p * q * c]
     )
-
-
-# Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; this is C^-1.
-_TO_ZXZ = np.array([0.5, 0.5, 0.5, 0.5])
 
 
 def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
@@ -292,7 +267,8 @@ def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     [ 0.3 -0.8  1.2]
     """
     q = rescaled(array_of_shape("attitude", attitude, 4))
-    q = multiply(q, _TO_ZXZ.astype(q.dtype))
+    # Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; four halves are C^-1.
+    q = multiply(q, jnp.full(4, 0.5, q.dtype))
     # No float is a pole exactly: a pair of components is zero where it is so to rounding.
     w, x, y, z = jnp.abs(q) / (4 * jnp.finfo(q.dtype).eps)
     upper, lower = w + z < 1, x + y < 1

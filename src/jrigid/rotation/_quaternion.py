@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, PRNGKeyArray
 
-from jrigid._checks import array_of_shape, check_shape, float_arrays, pair_of_shapes, where_defined
+from jrigid._checks import array_of_shape, shaped, where_defined
 from jrigid._numerics import arctanc_sqrt, cos_sqrt, safe_norm, sinc_sqrt
 from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
 
@@ -92,8 +92,7 @@ def normalize(quaternion: QuaternionLike) -> Quaternion:
     >>> print(jr.rotation.normalize(jnp.array([0.0, 3.0, 0.0, 4.0])))
     [0.  0.6 0.  0.8]
     """
-    q = array_of_shape("quaternion", quaternion, 4)
-    return _direction(q)
+    return _direction(array_of_shape("quaternion", quaternion, 4))
 
 
 def _direction(vector: Array) -> Array:
@@ -121,7 +120,7 @@ def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
     >>> print(jr.rotation.multiply(i, j))
     [0. 0. 0. 1.]
     """
-    (a, b, c, d), (w, x, y, z) = pair_of_shapes("p", p, (4,), "q", q, (4,))
+    (a, b, c, d), (w, x, y, z) = shaped(p=(p, 4), q=(q, 4))
     return jnp.stack(
         [
             a * w - b * x - c * y - d * z,
@@ -197,7 +196,7 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     >>> print(jr.rotation.rotate(quarter, jnp.array([1.0, 0.0, 0.0])).round(6))
     [0. 1. 0.]
     """
-    quaternion, (a, b, c) = pair_of_shapes("attitude", attitude, (4,), "vector", vector, (3,))
+    quaternion, (a, b, c) = shaped(attitude=(attitude, 4), vector=(vector, 3))
     w, x, y, z = rescaled(quaternion)
     # v + 2 (w u x v + u x (u x v)) / |q|^2
     scale = 2 / (w * w + x * x + y * y + z * z)
@@ -298,7 +297,7 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     >>> print(round(float(jr.rotation.angle_between(jnp.array([1.0, 0.0, 0.0, 0.0]), q)), 9))
     0.001
     """
-    p, q = pair_of_shapes("p", p, (4,), "q", q, (4,))
+    p, q = shaped(p=(p, 4), q=(q, 4))
     return safe_norm(log(multiply(rescaled(conjugate(p)), rescaled(q))))
 
 
@@ -324,10 +323,7 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
     >>> print(jr.rotation.log(jr.rotation.slerp(jr.rotation.identity(), half, 0.25)).round(6))
     [0.   0.   0.25]
     """
-    p, q, s = float_arrays(p, q, s)
-    check_shape("p", p, (4,))
-    check_shape("q", q, (4,))
-    check_shape("s", s, ())
+    p, q, s = shaped(p=(p, 4), q=(q, 4), s=(s,))
 
     def formula(p: Array, q: Array, s: Array) -> Array:
         p = normalize(p)
@@ -352,5 +348,5 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
     >>> print(jr.rotation.from_axis_angle(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(6))
     [0. 0. 0. 1.]
     """
-    v, a = pair_of_shapes("axis", axis, (3,), "angle", angle, ())
+    v, a = shaped(axis=(axis, 3), angle=(angle,))
     return normalize(jnp.concatenate([jnp.cos(0.5 * a)[None], jnp.sin(0.5 * a) * _direction(v)]))

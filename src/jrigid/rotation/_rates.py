@@ -2,20 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import (
-    all_finite,
-    check_shape,
-    float_arrays,
-    is_unit,
-    pair_of_shapes,
-    where_defined,
-)
+from jrigid._checks import all_finite, is_unit, shaped, where_defined
 from jrigid._types import MatrixLike, Quaternion, QuaternionLike, Real, Vector, VectorLike
 from jrigid.rotation._forms import vee
-from jrigid.rotation._quaternion import exp, identity, multiply, normalize
+from jrigid.rotation._quaternion import exp, multiply, normalize
 
 
 def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
@@ -35,7 +29,7 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     >>> print(jr.rotation.attitude_rate(q, jnp.array([2.0, 4.0, 6.0])).round(6))
     [-2.4 -1.   2.   1.8]
     """
-    (w, x, y, z), (a, b, c) = pair_of_shapes("attitude", attitude, (4,), "omega", omega, (3,))
+    (w, x, y, z), (a, b, c) = shaped(attitude=(attitude, 4), omega=(omega, 3))
     return 0.5 * jnp.stack(
         [
             -x * a - y * b - z * c,
@@ -66,7 +60,7 @@ def angular_velocity(rotation: MatrixLike, rotation_rate: MatrixLike) -> Vector:
     >>> print(jr.rotation.angular_velocity(R, dR).round(5))
     [0. 0. 2.]
     """
-    r, dr = pair_of_shapes("rotation", rotation, (3, 3), "rotation_rate", rotation_rate, (3, 3))
+    r, dr = shaped(rotation=(rotation, 3, 3), rotation_rate=(rotation_rate, 3, 3))
     # A sum, not a dot, which a GPU may round to ten bits in float32.
     return vee(jnp.sum(r[:, :, None] * dr[:, None, :], axis=0))
 
@@ -90,17 +84,9 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     >>> print(jr.rotation.euler_rates_to_omega(angles, rates))
     [2. 0. 4.]
     """
-    (_, theta, psi), (dphi, dtheta, dpsi) = pair_of_shapes(
-        "angles", angles, (3,), "rates", rates, (3,)
-    )
-    s, c = jnp.sin(psi), jnp.cos(psi)
-    return jnp.stack(
-        [
-            dphi * jnp.sin(theta) * s + dtheta * c,
-            dphi * jnp.sin(theta) * c - dtheta * s,
-            dpsi + dphi * jnp.cos(theta),
-        ]
-    )
+    (_, theta, psi), (dphi, dtheta, dpsi) = shaped(angles=(angles, 3), rates=(rates, 3))
+    s, c, tilt = jnp.sin(psi), jnp.cos(psi), dphi * jnp.sin(theta)
+    return jnp.stack([tilt * s + dtheta * c, tilt * c - dtheta * s, dpsi + dphi * jnp.cos(theta)])
 
 
 def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
@@ -124,7 +110,7 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     >>> print(jr.rotation.omega_to_euler_rates(angles, omega).round(6))
     [1. 2. 3.]
     """
-    (_, theta, psi), (a, b, c) = pair_of_shapes("angles", angles, (3,), "omega", omega, (3,))
+    (_, theta, psi), (a, b, c) = shaped(angles=(angles, 3), omega=(omega, 3))
     sine = jnp.sin(theta)
     # sin(pi) is 1.2e-16 in floating point: the pole is where theta is its closest float.
     pole = jnp.abs(sine) <= 0.5 * jnp.finfo(sine.dtype).eps * jnp.abs(theta)
@@ -167,12 +153,9 @@ def integrate_rate(
     >>> print(jr.rotation.log(attitudes[-1]).round(5))
     [0. 0. 1.]
     """
-    ts, omegas = float_arrays(ts, omegas)
-    start = identity(ts.dtype) if attitude0 is None else attitude0
-    ts, omegas, start = float_arrays(ts, omegas, start)
-    check_shape("ts", ts, (None,))
-    check_shape("omegas", omegas, (ts.shape[0], 3))
-    check_shape("attitude0", start, (4,))
+    start = np.array([1, 0, 0, 0]) if attitude0 is None else attitude0
+    vectors = (omegas, *np.shape(ts), 3)
+    ts, omegas, start = shaped(ts=(ts, None), omegas=vectors, attitude0=(start, 4))
     if ts.shape[0] < 2:
         raise ValueError(
             f"Argument `ts` must hold at least two samples, but it has shape {ts.shape}."

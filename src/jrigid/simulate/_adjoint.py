@@ -7,6 +7,7 @@ only).
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -21,21 +22,12 @@ from jaxtyping import Array
 from jrigid.simulate._controller import KnownSteps, constant
 from jrigid.simulate._event import where_it_happened
 
-_FORWARD_MESSAGE = (
-    "This adjoint of `jrigid.simulate` serves first derivatives in reverse mode only (jax.grad, "
-    "jax.vjp, jax.jacrev). For jax.jvp, jax.jacfwd and forward over forward pass "
-    "`adjoint=diffrax.ForwardMode()`; for every mode and order `adjoint=diffrax.DirectAdjoint()`."
-)
-_REVERSE_MESSAGE = (
-    "`adjoint=diffrax.ForwardMode()` of `jrigid.simulate` serves forward mode only (jax.jvp, "
-    "jax.jacfwd, forward over forward). For jax.grad, jax.vjp and jax.jacrev leave `adjoint` out "
-    "or pass `diffrax.RecursiveCheckpointAdjoint()`; for every mode and order "
-    "`adjoint=diffrax.DirectAdjoint()`."
-)
-_SECOND_ORDER_MESSAGE = (
-    "This adjoint of `jrigid.simulate` serves first derivatives only. For second derivatives pass "
-    "`adjoint=diffrax.ForwardMode()` and use forward over forward (jax.jacfwd of jax.jacfwd), or "
-    "`adjoint=diffrax.DirectAdjoint()` with any modes."
+_MESSAGE = (
+    "This adjoint of `jrigid.simulate` cannot serve the derivative that is asked for. Left out, or "
+    "as `adjoint=diffrax.RecursiveCheckpointAdjoint()`, it serves first derivatives in reverse "
+    "mode (jax.grad, jax.vjp, jax.jacrev); `adjoint=diffrax.ForwardMode()` serves jax.jvp, "
+    "jax.jacfwd and forward over forward (jax.jacfwd of jax.jacfwd); "
+    "`adjoint=diffrax.DirectAdjoint()` serves every mode and order."
 )
 
 
@@ -43,78 +35,48 @@ class UnsupportedDerivative(TypeError):
     """A mode of differentiation was asked for that the adjoint in use cannot serve."""
 
 
-def _raise(message: str) -> Any:
-    raise UnsupportedDerivative(message)
+def _refuse(*_: Any) -> Any:
+    raise UnsupportedDerivative(_MESSAGE)
 
 
-def _identity_primitive(name: str) -> Primitive:
+def _primitive(name: str, run: Callable[[Any], Any] = lambda x: x) -> Primitive:
+    """An identity, which refuses to be evaluated if told to."""
     primitive = Primitive(name)
-    primitive.def_impl(lambda x: x)
+    primitive.def_impl(run)
     primitive.def_abstract_eval(lambda x: x)
-    mlir.register_lowering(primitive, mlir.lower_fun(lambda x: x, multiple_results=False))
+    mlir.register_lowering(primitive, mlir.lower_fun(run, multiple_results=False))
     batching.primitive_batchers[primitive] = lambda args, dims: (primitive.bind(*args), dims[0])
     return primitive
 
 
-def _unevaluable(name: str, message: str) -> Primitive:
-    """A linear identity that may be transposed away but never run."""
-    primitive = Primitive(name)
-    primitive.def_impl(lambda _: _raise(message))
-    primitive.def_abstract_eval(lambda x: x)
-    mlir.register_lowering(primitive, lambda _ctx, _: _raise(message))
-    batching.primitive_batchers[primitive] = lambda _args, _dims: _raise(message)
-    return primitive
+# Forward mode only: a linear map that can be evaluated, not transposed.
+_forward_only = _primitive("jrigid_forward_only")
+ad.deflinear2(_forward_only, _refuse)
+# Reverse mode only: the tangent map can be transposed, not run; and the cotangent that it gives,
+# the first derivative, cannot be differentiated again.
+_reverse_only = _primitive("jrigid_reverse_only")
+_tangent = _primitive("jrigid_reverse_only_tangent", _refuse)
+_cotangent = _primitive("jrigid_reverse_only_cotangent")
+ad.defjvp(_reverse_only, lambda tangent, _: _tangent.bind(tangent))
+ad.deflinear2(_tangent, lambda cotangent, _: [_cotangent.bind(cotangent)])
+ad.primitive_jvps[_tangent] = ad.primitive_jvps[_cotangent] = _refuse
+batching.primitive_batchers[_tangent] = _refuse
 
 
-# Reverse mode only: the tangent map can be transposed, not run.
-_reverse_only = _identity_primitive("jrigid_reverse_only")
-_reverse_only_tangent = _unevaluable("jrigid_reverse_only_tangent", _FORWARD_MESSAGE)
-# On the cotangent: the first derivative may not be differentiated again.
-_first_order = _identity_primitive("jrigid_first_order")
-# Forward mode only: the tangent map can be run, not transposed.
-_forward_only = _identity_primitive("jrigid_forward_only")
-_forward_only_tangent = _identity_primitive("jrigid_forward_only_tangent")
-
-ad.primitive_jvps[_reverse_only] = lambda primals, tangents: (
-    _reverse_only.bind(primals[0]),
-    _bind_tangent(_reverse_only_tangent, tangents[0]),
-)
-ad.primitive_jvps[_reverse_only_tangent] = lambda _primals, _tangents: _raise(_SECOND_ORDER_MESSAGE)
-ad.primitive_transposes[_reverse_only_tangent] = lambda cotangent, _: [
-    _bind_tangent(_first_order, cotangent)
-]
-ad.primitive_jvps[_first_order] = lambda _primals, _tangents: _raise(_SECOND_ORDER_MESSAGE)
-ad.primitive_jvps[_forward_only] = lambda primals, tangents: (
-    _forward_only.bind(primals[0]),
-    _bind_tangent(_forward_only_tangent, tangents[0]),
-)
-ad.primitive_jvps[_forward_only_tangent] = lambda primals, tangents: (
-    _forward_only_tangent.bind(primals[0]),
-    _bind_tangent(_forward_only_tangent, tangents[0]),
-)
-ad.primitive_transposes[_forward_only_tangent] = lambda _cotangent, _: _raise(_REVERSE_MESSAGE)
-
-
-def _bind_tangent(primitive: Primitive, tangent: Any) -> Any:
-    return tangent if isinstance(tangent, ad.Zero) else primitive.bind(tangent)
-
-
-def _map_inexact(primitive: Primitive, tree: Any) -> Any:
-    return jtu.tree_map(lambda x: primitive.bind(x) if eqx.is_inexact_array(x) else x, tree)
+def _through(primitive: Primitive, applies: bool, tree: Any) -> Any:
+    return jtu.tree_map(
+        lambda x: primitive.bind(x) if applies and eqx.is_inexact_array(x) else x, tree
+    )
 
 
 def guard_inputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     """Guard what goes into an integration whose adjoint serves reverse mode only."""
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return _map_inexact(_reverse_only, tree)
-    return tree
+    return _through(_reverse_only, isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint), tree)
 
 
 def guard_outputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     """Guard what comes out of an integration whose adjoint serves forward mode only."""
-    if isinstance(adjoint, diffrax.ForwardMode):
-        return _map_inexact(_forward_only, tree)
-    return tree
+    return _through(_forward_only, isinstance(adjoint, diffrax.ForwardMode), tree)
 
 
 class WithTimes(diffrax.AbstractAdjoint):

@@ -11,7 +11,6 @@ import optimistix as optx
 from jaxtyping import Array
 
 from jrigid._checks import all_finite
-from jrigid._scales import jacobian
 
 # No step is longer than this fraction of the shortest time scale, that of the turning or of the
 # linearised motion: at an equilibrium the error estimate sees nothing, and a step too long to be
@@ -27,7 +26,16 @@ _CONFINED = 1e-6
 _GROWTH = 1e16
 
 
-class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
+class _Onwards(diffrax.AbstractStepSizeController):
+    """A controller for time that grows."""
+
+    def wrap(self, direction):
+        """The same."""
+        del direction
+        return self
+
+
+class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     """A controller whose steps are bounded by the motion's fastest rate, which may rise on the way.
 
     It also reports a step rejected at the resolution of time. A `dtmin` of the PID controller would
@@ -59,22 +67,15 @@ class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
             rtol=self.rtol, atol=self.atol, dtmax=self.longest, factormax=_GROWTH
         )
 
-    def wrap(self, direction):  # diffrax's: time grows here
-        """The same."""
-        del direction
-        return self
-
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step; the state also carries the rate where the step begins."""
         del dt0
         t1, state = self._by_error.init(terms, t0, t1, y0, self.first_step, args, func, error_order)
         return t1, (state, self.start_rate)
 
-    def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, *others):
         """By the error, then by the fastest rate; a torque that turns NaN or infinite ends here."""
-        inner_state, rate0 = controller_state
+        y_error, error_order, (inner_state, rate0) = others
         keep, next_t0, next_t1, made_jump, inner_state, result = self._by_error.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner_state
         )
@@ -100,28 +101,23 @@ class WatchfulController(diffrax.AbstractAdaptiveStepSizeController):
         return kept, next_t0, next_t1, made_jump, state, result
 
 
-class SteadyController(diffrax.AbstractStepSizeController):
+class SteadyController(_Onwards):
     """Steps of one length, for a solver that makes no error."""
 
     step: Array
 
-    def wrap(self, direction):
-        """The same."""
-        del direction
-        return self
-
-    def init(self, terms, t0, *others):
+    def init(self, terms, t0, *_):
         """The end of the first step."""
-        del terms, others
+        del terms
         return t0 + self.step, None
 
-    def adapt_step_size(self, t0, t1, *others):
+    def adapt_step_size(self, t0, t1, *_):
         """The end of the next one."""
-        del t0, others
+        del t0
         return True, t1, t1 + self.step, False, None, diffrax.RESULTS.successful
 
 
-class KnownSteps(diffrax.AbstractStepSizeController):
+class KnownSteps(_Onwards):
     """Steps that another run has taken.
 
     Attributes:
@@ -132,14 +128,8 @@ class KnownSteps(diffrax.AbstractStepSizeController):
     ends: Array
     result: Any
 
-    def wrap(self, direction):
-        """The same."""
-        del direction
-        return self
-
-    def init(self, *arguments):
+    def init(self, *_):
         """The end of the first step, and the number of the next."""
-        del arguments
         return self.ends[0], jnp.array(1)
 
     def adapt_step_size(self, t0, t1, *others):
@@ -155,22 +145,6 @@ def constant(tree: Any) -> Any:
     """The same without derivatives: what decides on steps is not differentiated."""
     arrays, others = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.lax.stop_gradient(arrays), others)
-
-
-def fastest_on_the_way(
-    ok: Array,
-    field: Callable,
-    turning: Array,
-    fastest_of: Callable[[Array], Array],
-    t: Array,
-    y: Array,
-    args: Any,
-) -> Array:
-    """The fastest rate at a point of the motion; `turning` weighs out the angular velocity."""
-    speed = jnp.sqrt(jnp.sum((turning * y) ** 2))
-    tiny = jnp.finfo(y.dtype).tiny
-    rate = jnp.maximum(fastest_of(jacobian(field, t, y, args)), speed)
-    return jnp.maximum(jnp.where(ok & jnp.isfinite(rate), rate, 0.0), tiny)
 
 
 @eqx.filter_custom_jvp

@@ -1,9 +1,9 @@
 """Events: conditions in SI units, and where between two steps one changed its sign."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -26,9 +26,8 @@ def event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> An
 
         return wrapped
 
-    return diffrax.Event(
-        jtu.tree_map(in_si, event.cond_fn, is_leaf=callable), event.root_finder, event.direction
-    )
+    conditions = jtu.tree_map(in_si, event.cond_fn, is_leaf=callable)
+    return dataclasses.replace(event, cond_fn=conditions)
 
 
 def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[Array, Any]:
@@ -39,15 +38,13 @@ def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[
 
     Gradients: those of the implicit function, of first and second order, in every mode.
     """
-    masks = jtu.tree_leaves(final.event_mask)
-    values = jtu.tree_leaves(final.event_values)
-    conditions = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
-    real = [
-        (mask, condition)
-        for mask, value, condition in zip(masks, values, conditions, strict=True)
-        if jnp.issubdtype(jnp.result_type(value), jnp.floating)
-    ]
-    happened = jnp.any(jnp.stack([jnp.asarray(False), *(mask for mask, _ in real)]))
+    conditions, masks, values = (
+        jtu.tree_leaves(x, is_leaf=callable)
+        for x in (event.cond_fn, final.event_mask, final.event_values)
+    )
+    real = jnp.array([jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in values])
+    ended = jnp.stack(masks) & real
+    happened = jnp.any(ended)
     late = jnp.where(happened, final.event_tnext, final.event_tprev + 1)
     interpolant = options["solver"].interpolation_cls(
         t0=final.event_tprev, t1=late, **harmless(happened, final.event_dense_info)
@@ -56,8 +53,8 @@ def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[
 
     def distance(tau: Array) -> Array:
         y = interpolant.evaluate(tau)
-        terms = [jnp.where(mask, f(tau, y, args, **options), 0.0) for mask, f in real]
-        return sum((x.astype(tau.dtype) for x in terms), jnp.zeros_like(tau))
+        values = [jnp.asarray(f(tau, y, args, **options), tau.dtype) for f in conditions]
+        return jnp.sum(jnp.where(ended, jnp.stack(values), 0.0))
 
     def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket

@@ -1,14 +1,18 @@
 """The options of `simulate`: checked when it is traced, and the values that it judges."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, check_shape, is_concrete, whole_number
-from jrigid._motion import check_motion, numbers
+from jrigid._checks import RESULTS, Findings, check_type, is_concrete, whole_number
+from jrigid._motion import check_motion, numbers, resolves, solver_of
+from jrigid._scales import spectral_radius, undamped_rate, units
+from jrigid.simulate._controller import constant
 from jrigid.solvers import ExactFree
 from jrigid.systems import AbstractSystem, RigidBody
 
@@ -29,87 +33,64 @@ class Inputs(NamedTuple):
     t0: Array
     args: Any
 
+    @property
+    def since_start(self) -> Array:
+        """Times since the start, in the precision of the state.
+
+        They may come in more digits: they are subtracted in their own.
+        """
+        return (self.ts.reshape(-1) - self.t0).astype(self.state0.omega.dtype)
+
 
 class Options(NamedTuple):
     """How it is integrated."""
 
     solver: Any
-    rtol: Array
-    atol: Array
+    rtol: Any
+    atol: Any
     adjoint: Any
-    max_steps: int
-    max_step: Array
+    max_steps: Any
+    max_step: Any
     event: Any
     meter: Any
 
+    @property
+    def is_implicit(self) -> bool:
+        """True of a solver that may step over what is damped."""
+        return isinstance(self.solver, diffrax.AbstractImplicitSolver)
 
-def checked_options(
-    system: AbstractSystem,
-    dtype: Any,
-    solver: Any,
-    tolerances: tuple[Any, Any],
-    adjoint: Any,
-    steps: tuple[Any, Any],
-    event: Any,
-    progress: Any,
-) -> Options:
-    """Options with their defaults, or ValueError; steps are how many at most, and how long."""
+    def fastest_of(self, rounds: int) -> Callable[[Array], Array]:
+        """What bounds the steps, of the Jacobian: its fastest rate, or that which nothing damps."""
+        return undamped_rate if self.is_implicit else lambda matrix: spectral_radius(matrix, rounds)
+
+
+def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Options:
+    """The options with their defaults, or ValueError."""
+    solver, rtol, atol, adjoint, max_steps, max_step, event, meter = asked
+    if not isinstance(solver, ExactFree):
+        solver = solver_of(solver, diffrax.Dopri8(), ", or ExactFree()")
+    elif not (isinstance(system, RigidBody) and system.is_free):
+        raise ValueError(
+            "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
+            "torque, but it is."
+        )
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_CHECKPOINTS)
-    if not isinstance(adjoint, _ADJOINTS):
-        raise ValueError(
-            "Argument `adjoint` must be diffrax.RecursiveCheckpointAdjoint(), ForwardMode() or "
-            f"DirectAdjoint(), but it is {adjoint!r}."
-        )
-    if event is not None and not isinstance(event, diffrax.Event):
-        raise ValueError(f"Argument `event` must be a diffrax.Event, but it is {event!r}.")
-    max_steps, max_step = steps
+    check_type("adjoint", adjoint, *_ADJOINTS)
     if max_steps is None:
         direct = isinstance(adjoint, diffrax.DirectAdjoint)
         max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
-    (longest,) = numbers(max_step=jnp.inf if max_step is None else max_step)
-    check_shape("max_step", longest, ())
-    rtol, atol = _tolerances(*tolerances, dtype)
-    return Options(
-        _solver(solver, system), rtol, atol, adjoint, whole_number("max_steps", max_steps),
-        longest.astype(dtype), event, _meter(progress),
-    )  # fmt: skip
-
-
-def _solver(solver: Any, system: AbstractSystem) -> Any:
-    if isinstance(solver, ExactFree):
-        if not (isinstance(system, RigidBody) and system.is_free):
-            raise ValueError(
-                "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
-                "torque, but it is."
-            )
-    elif not isinstance(solver, diffrax.AbstractAdaptiveSolver | None):
-        raise ValueError(
-            "Argument `solver` must be a diffrax solver with an error estimate, or ExactFree(), "
-            f"but it is {type(solver).__name__}."
-        )
-    return diffrax.Dopri8() if solver is None else solver
-
-
-def _meter(progress: Any) -> diffrax.AbstractProgressMeter:
-    if isinstance(progress, diffrax.AbstractProgressMeter):
-        return progress
-    if not isinstance(progress, bool):
-        raise ValueError(
-            "Argument `progress` must be True, False or a progress meter of diffrax, "
-            f"but it is {progress!r}."
-        )
-    return diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
-
-
-def _tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Array, Array]:
-    """Both tolerances as arrays; what is known now to be out of bounds is a ValueError."""
+    if event is not None:
+        check_type("event", event, diffrax.Event)
+    check_type("progress", meter, bool, diffrax.AbstractProgressMeter)
+    if isinstance(meter, bool):
+        meter = diffrax.TextProgressMeter() if meter else diffrax.NoProgressMeter()
     size = jnp.dtype(dtype).itemsize
     rtol = _DEFAULT_RTOL[size] if rtol is None else rtol
-    atol = rtol if atol is None else atol
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        check_shape(name, numbers(**{name: value})[0], ())
-        smallest = _SMALLEST_RTOL[size]
+    limits = {"rtol": rtol, "atol": rtol if atol is None else atol}
+    arrays = numbers(**limits, max_step=jnp.inf if max_step is None else max_step)
+    smallest = _SMALLEST_RTOL[size]
+    for name, value in limits.items():  # what is known now; the rest is judged
         if is_concrete(value) and not smallest <= float(value) < 1:
             raise ValueError(
                 f"Argument `{name}` must be at least {smallest} and below 1 in "
@@ -119,21 +100,29 @@ def _tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Array, Array]:
         warnings.warn(
             "simulate() runs in float32: errors of 1e-6 a radian are usual. Switch on "
             "`jax_enable_x64` and pass float64 arrays for more.",
-            stacklevel=4,
+            stacklevel=3,
         )
-    return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
+    rtol, atol, max_step = (x.astype(dtype) for x in arrays)
+    max_steps = whole_number("max_steps", max_steps)
+    return Options(solver, rtol, atol, adjoint, max_steps, max_step, event, meter)
 
 
-def judged(inputs: Inputs, options: Options) -> Findings:
-    """Every bad value that goes into an integration."""
+def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, ...]]:
+    """Every bad value that goes into an integration; the units in which it is measured."""
+    inputs = constant(inputs)
     system, state0, ts, t0, args = inputs
-    findings, flat, dtype = Findings(), ts.reshape(-1), options.rtol.dtype
-    smallest = _SMALLEST_RTOL[dtype.itemsize]
+    findings, flat, since_start = Findings(), ts.reshape(-1), inputs.since_start
+    smallest = _SMALLEST_RTOL[since_start.dtype.itemsize]
     for x in (options.rtol, options.atol):
         findings.require((x >= smallest) & (x < 1), RESULTS.invalid_tolerance, value=x)
     findings.require(options.max_step > 0, RESULTS.invalid_max_step, value=options.max_step)
     before = jnp.concatenate([t0[None], flat[:-1]])
-    wrong = ~jnp.isfinite((flat - t0).astype(dtype)) | ~(flat >= before)
+    wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
     findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=flat[jnp.argmax(wrong)])
-    check_motion(findings, system, state0, t0.astype(dtype), args)
-    return findings
+    start = t0.astype(since_start.dtype)
+    check_motion(findings, system, state0, start, args)
+    rate, fastest, scales = jax.lax.stop_gradient(
+        units(system, state0, since_start[-1], start, args, options.fastest_of(2))
+    )
+    findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
+    return findings, (rate, fastest, scales)

@@ -36,23 +36,9 @@ class Trajectory(Readable):
     stats: dict[str, Array] = eqx.field(repr=False)
     final_time: Float[Array, "..."]
     final_state: Any
+    # Of system and args: functions are kept apart, so that jit and vmap can return it.
     _arrays: Any = eqx.field(repr=False)
     _functions: Any = eqx.field(static=True, repr=False)
-
-    def __init__(
-        self,
-        ts: Array,
-        states: Any,
-        result: Any,
-        stats: dict[str, Array],
-        final_time: Array,
-        final_state: Any,
-        system_and_args: tuple[AbstractSystem, Any],
-    ):
-        """What `simulate` found; functions are kept apart, so that jit and vmap can return it."""
-        self.ts, self.states, self.result, self.stats = ts, states, result, stats
-        self.final_time, self.final_state = final_time, final_state
-        self._arrays, self._functions = eqx.partition(system_and_args, eqx.is_array)
 
     @property
     def system(self) -> AbstractSystem:

@@ -4,40 +4,35 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool
+from jaxtyping import Array, ArrayLike
 
-from jrigid._checks import all_positive, check_shape, float_arrays, where_defined
+from jrigid._checks import all_positive, shaped, where_defined
 from jrigid.mass import MassProperties
 
 
 def solid(
-    moments: Callable[..., tuple[Array, Array, Array]],
+    mean_squares: Callable[..., Any],
     mass: ArrayLike,
     *,
     shape: tuple[int, ...] = (),
-    fits: Callable[..., Bool[Array, ""]] | None = None,
+    fits: Callable[..., Any] = lambda *_: True,
     **lengths: Any,
 ) -> MassProperties:
     """The body about its centre; NaN where its mass or a length is not positive and finite.
 
     Args:
-        moments: The moments for a mass of 1, of the lengths.
+        mean_squares: The means of x^2, y^2 and z^2 over the body, of the lengths.
         mass: Mass.
         shape: That of each of the lengths.
         fits: Whether lengths that are positive go together.
         **lengths: By the names that they have as arguments.
     """
-    mass, *sizes = float_arrays(mass, *lengths.values())
-    check_shape("mass", mass, ())
-    for name, size in zip(lengths, sizes, strict=True):
-        check_shape(name, size, shape)
-    ok = all_positive((mass, sizes))
-    if fits is not None:
-        ok = ok & fits(*sizes)
+    shapes = {name: (length, *shape) for name, length in lengths.items()}
+    mass, *sizes = shaped(mass=(mass,), **shapes)
 
     def body(mass: Array, *sizes: Array) -> MassProperties:
-        return MassProperties.unchecked(
-            mass, jnp.zeros(3, mass.dtype), mass * jnp.stack(moments(*sizes))
-        )
+        x, y, z = mean_squares(*sizes)
+        moments = mass * jnp.stack([y + z, x + z, x + y])
+        return MassProperties.unchecked(mass, jnp.zeros(3, mass.dtype), moments)
 
-    return where_defined(ok, body, mass, *sizes)
+    return where_defined(all_positive((mass, sizes)) & fits(*sizes), body, mass, *sizes)

@@ -1,12 +1,18 @@
 """Solids with curved faces."""
 
+from typing import Any
+
 from jaxtyping import Array
 
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.mass import MassProperties
 from jrigid.solids._common import solid
 
-Moments = tuple[Scalar, Scalar, Scalar]
+MeanSquares = tuple[ScalarLike, ScalarLike, ScalarLike]
+
+
+def _round(across: ScalarLike, along: ScalarLike) -> MeanSquares:
+    return across, across, along
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -25,7 +31,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
     [2. 2. 2.]
     """
-    return solid(lambda r: (0.4 * r * r,) * 3, mass, radius=radius)
+    return solid(lambda r: (r * r / 5,) * 3, mass, radius=radius)
 
 
 def shell(mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike) -> MassProperties:
@@ -46,16 +52,15 @@ def shell(mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike) 
     [2. 2. 2.]
     """
 
-    def moments(inner: Scalar, outer: Scalar) -> Moments:
+    def mean_squares(inner: Scalar, outer: Scalar) -> MeanSquares:
         # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
         q = inner / outer
         ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
-        moment = 0.4 * outer * outer * ratio
-        return moment, moment, moment
+        square = outer * outer / 5 * ratio
+        return square, square, square
 
-    return solid(
-        moments, mass, inner_radius=inner_radius, outer_radius=outer_radius, fits=_in_order
-    )
+    radii: dict[str, Any] = {"inner_radius": inner_radius, "outer_radius": outer_radius}
+    return solid(mean_squares, mass, **radii, fits=_in_order)
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
@@ -74,12 +79,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.ellipsoid(5.0, jnp.array([1.0, 2.0, 3.0])).inertia))
     [13. 10.  5.]
     """
-
-    def moments(semi_axes: Array) -> Moments:
-        x, y, z = semi_axes * semi_axes / 5
-        return y + z, x + z, x + y
-
-    return solid(moments, mass, shape=(3,), semi_axes=semi_axes)
+    return solid(lambda axes: axes * axes / 5, mass, shape=(3,), semi_axes=semi_axes)
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -100,12 +100,7 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
     >>> print(jnp.diag(jr.solids.cylinder(12.0, 2.0, 1.0).inertia))
     [13. 13. 24.]
     """
-
-    def moments(radius: Scalar, height: Scalar) -> Moments:
-        transverse = height * height / 12 + radius * radius / 4
-        return transverse, transverse, radius * radius / 2
-
-    return solid(moments, mass, radius=radius, height=height)
+    return solid(lambda r, h: _round(r * r / 4, h * h / 12), mass, radius=radius, height=height)
 
 
 def tube(
@@ -129,19 +124,11 @@ def tube(
     [34. 34. 60.]
     """
 
-    def moments(inner: Scalar, outer: Scalar, height: Scalar) -> Moments:
-        squares = inner * inner + outer * outer
-        transverse = height * height / 12 + squares / 4
-        return transverse, transverse, squares / 2
+    def mean_squares(inner: Scalar, outer: Scalar, height: Scalar) -> MeanSquares:
+        return _round((inner * inner + outer * outer) / 4, height * height / 12)
 
-    return solid(
-        moments,
-        mass,
-        inner_radius=inner_radius,
-        outer_radius=outer_radius,
-        height=height,
-        fits=_in_order,
-    )
+    radii: dict[str, Any] = {"inner_radius": inner_radius, "outer_radius": outer_radius}
+    return solid(mean_squares, mass, **radii, height=height, fits=_in_order)
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -162,12 +149,9 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     >>> print(jnp.diag(jr.solids.cone(80.0, 2.0, 4.0).inertia))
     [96. 96. 96.]
     """
-
-    def moments(radius: Scalar, height: Scalar) -> Moments:
-        transverse = 3 * (4 * radius * radius + height * height) / 80
-        return transverse, transverse, 3 * radius * radius / 10
-
-    return solid(moments, mass, radius=radius, height=height)
+    return solid(
+        lambda r, h: _round(3 * r * r / 20, 3 * h * h / 80), mass, radius=radius, height=height
+    )
 
 
 def disk(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -186,7 +170,7 @@ def disk(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.disk(4.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    return solid(lambda r: (r * r / 4, r * r / 4, r * r / 2), mass, radius=radius)
+    return solid(lambda r: _round(r * r / 4, 0.0), mass, radius=radius)
 
 
 def hoop(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -205,7 +189,7 @@ def hoop(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.hoop(2.0, 1.0).inertia))
     [1. 1. 2.]
     """
-    return solid(lambda r: (r * r / 2, r * r / 2, r * r), mass, radius=radius)
+    return solid(lambda r: _round(r * r / 2, 0.0), mass, radius=radius)
 
 
 def torus(mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike) -> MassProperties:
@@ -226,17 +210,11 @@ def torus(mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike) ->
     [56. 56. 96.]
     """
 
-    def moments(ring: Scalar, tube: Scalar) -> Moments:
-        transverse = ring * ring / 2 + 5 * tube * tube / 8
-        return transverse, transverse, ring * ring + 3 * tube * tube / 4
+    def mean_squares(ring: Scalar, tube: Scalar) -> MeanSquares:
+        return _round(ring * ring / 2 + 3 * tube * tube / 8, tube * tube / 4)
 
-    return solid(
-        moments,
-        mass,
-        ring_radius=ring_radius,
-        tube_radius=tube_radius,
-        fits=lambda ring, tube: tube <= ring,
-    )
+    radii: dict[str, Any] = {"ring_radius": ring_radius, "tube_radius": tube_radius}
+    return solid(mean_squares, mass, **radii, fits=lambda ring, tube: tube <= ring)
 
 
 def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -257,19 +235,15 @@ def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPro
     [169.4 169.4  64.4]
     """
 
-    def moments(radius: Scalar, height: Scalar) -> Moments:
+    def mean_squares(r: Scalar, h: Scalar) -> MeanSquares:
         # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
-        whole = height + 4 * radius / 3
-        middle, ends = height / whole, 4 * radius / (3 * whole)
-        r2, h2 = radius * radius, height * height
-        along = middle * r2 / 2 + ends * 2 * r2 / 5
-        # A half ball has its centre of mass 3 r / 8 above its base and 2/5 m r^2 about the base.
-        transverse = middle * (h2 / 12 + r2 / 4) + ends * (
-            2 * r2 / 5 + h2 / 4 + 3 * radius * height / 8
-        )
-        return transverse, transverse, along
+        whole = h + 4 * r / 3
+        middle, ends = h / whole, 4 * r / (3 * whole)
+        # A half ball has its centre of mass 3 r / 8 above its base, and r^2 / 5 about the base.
+        along = middle * h * h / 12 + ends * (r * r / 5 + h * h / 4 + 3 * r * h / 8)
+        return _round(middle * r * r / 4 + ends * r * r / 5, along)
 
-    return solid(moments, mass, radius=radius, height=height)
+    return solid(mean_squares, mass, radius=radius, height=height)
 
 
 def _in_order(inner: Scalar, outer: Scalar, *_: Scalar) -> Array:

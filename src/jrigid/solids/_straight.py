@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from jrigid._checks import all_finite, all_positive, pair_of_shapes, where_defined
+from jrigid._checks import all_finite, all_positive, shaped, where_defined
 from jrigid._types import Real, ScalarLike, VectorLike
 from jrigid.mass import MassProperties, inertia_tensor
 from jrigid.solids._common import solid
@@ -25,12 +25,7 @@ def box(mass: ScalarLike, lengths: VectorLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.box(12.0, jnp.array([1.0, 2.0, 3.0])).inertia))
     [13. 10.  5.]
     """
-
-    def moments(lengths: Array) -> tuple[Array, Array, Array]:
-        x, y, z = lengths * lengths
-        return (y + z) / 12, (x + z) / 12, (x + y) / 12
-
-    return solid(moments, mass, shape=(3,), lengths=lengths)
+    return solid(lambda edges: edges * edges / 12, mass, shape=(3,), lengths=lengths)
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
@@ -49,7 +44,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.rod(12.0, 1.0).inertia))
     [1. 1. 0.]
     """
-    return solid(lambda x: (x * x / 12, x * x / 12, jnp.zeros_like(x)), mass, length=length)
+    return solid(lambda z: (0.0, 0.0, z * z / 12), mass, length=length)
 
 
 def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
@@ -68,12 +63,7 @@ def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
     >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
     [4. 1. 5.]
     """
-
-    def moments(lengths: Array) -> tuple[Array, Array, Array]:
-        x, y = lengths * lengths / 12
-        return y, x, x + y
-
-    return solid(moments, mass, shape=(2,), lengths=lengths)
+    return solid(lambda edges: (*(edges * edges / 12), 0.0), mass, shape=(2,), lengths=lengths)
 
 
 def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassProperties:
@@ -96,7 +86,7 @@ def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassPrope
      [1. 6. 1.]
      [1. 1. 6.]]
     """
-    mass, vertices = pair_of_shapes("mass", mass, (), "vertices", vertices, (4, 3))
+    mass, vertices = shaped(mass=(mass,), vertices=(vertices, 4, 3))
 
     def body(mass: Array, vertices: Array) -> MassProperties:
         origin = vertices[0]

@@ -1,12 +1,19 @@
 """Stability: growth rates, linearisation, maps, chaos, and where a damped body ends."""
 
+from jrigid.stability._closed import REGIONS as REGIONS
+from jrigid.stability._closed import Modes as Modes
+from jrigid.stability._closed import PrecessionStability as PrecessionStability
+from jrigid.stability._closed import SatelliteStability as SatelliteStability
+from jrigid.stability._closed import TopStability as TopStability
+from jrigid.stability._closed import frequency as frequency
+from jrigid.stability._closed import growth_rate as growth_rate
+from jrigid.stability._closed import growth_rate_squared as growth_rate_squared
+from jrigid.stability._closed import linearized as linearized
+from jrigid.stability._closed import modes as modes
+from jrigid.stability._closed import precession_stability as precession_stability
+from jrigid.stability._closed import satellite_stability as satellite_stability
+from jrigid.stability._closed import top_stability as top_stability
 from jrigid.stability._eigen import eigenvalues as eigenvalues
-from jrigid.stability._linear import Modes as Modes
-from jrigid.stability._linear import frequency as frequency
-from jrigid.stability._linear import growth_rate as growth_rate
-from jrigid.stability._linear import growth_rate_squared as growth_rate_squared
-from jrigid.stability._linear import linearized as linearized
-from jrigid.stability._linear import modes as modes
 from jrigid.stability._linearize import STABILITY as STABILITY
 from jrigid.stability._linearize import Linearization as Linearization
 from jrigid.stability._linearize import linearize as linearize
@@ -18,13 +25,6 @@ from jrigid.stability._lyapunov import megno as megno
 from jrigid.stability._maps import StabilityMap as StabilityMap
 from jrigid.stability._maps import boundary as boundary
 from jrigid.stability._maps import stability_map as stability_map
-from jrigid.stability._spin import REGIONS as REGIONS
-from jrigid.stability._spin import PrecessionStability as PrecessionStability
-from jrigid.stability._spin import SatelliteStability as SatelliteStability
-from jrigid.stability._spin import TopStability as TopStability
-from jrigid.stability._spin import precession_stability as precession_stability
-from jrigid.stability._spin import satellite_stability as satellite_stability
-from jrigid.stability._spin import top_stability as top_stability
 from jrigid.stability._tumbling import SIDES as SIDES
 from jrigid.stability._tumbling import FinalSpin as FinalSpin
 from jrigid.stability._tumbling import Section as Section

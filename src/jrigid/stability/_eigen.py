@@ -1,11 +1,15 @@
-"""Eigenvalues of a small matrix whose derivatives are finite, also where two of them meet."""
+"""Eigenvalues of a small matrix whose derivatives are finite, also where two of them meet.
+
+And how far they are from the edge of stability, smooth through it.
+"""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact
 
 from jrigid._checks import all_finite, check_shape, float_arrays, where_defined
-from jrigid._numerics import product
+from jrigid._numerics import product, safe_norm
+from jrigid._types import Scalar
 
 _POINTS = 48  # of the contour: its error is 2^-48 for an eigenvalue by itself
 _SHARED = 0.999  # cosine of the angle below which two eigenvectors count as one
@@ -36,71 +40,55 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
     """
     (matrix,) = float_arrays(matrix)
     check_shape("matrix", matrix, (matrix.shape[:1] or (None,)) * 2)
-    return where_defined(all_finite(matrix), _eigenvalues, matrix)
+    return where_defined(all_finite(matrix), eigensystem, matrix)[0]
 
 
 @jax.custom_jvp
-def _eigenvalues(matrix: Array) -> Array:
-    values = jnp.linalg.eigvals(matrix)
-    size = _size(matrix)
+def eigensystem(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues in their order, and eigenvectors, columns without derivatives."""
+    values, vectors = jnp.linalg.eig(matrix)
     # Real parts that differ by rounding do not decide the order.
-    rounded = jnp.round(values.real / jnp.where(size > 0, size, 1.0) * 1e5)
-    return values[jnp.lexsort((-values.imag, -rounded))]
+    rounded = jnp.round(values.real / _size(matrix) * 1e5)
+    order = jnp.lexsort((-values.imag, -rounded))
+    return values[order], vectors[:, order]
 
 
 def _size(matrix: Array) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(jnp.abs(matrix) ** 2))
+    """Its norm; 1 of zeros."""
+    size = jnp.sqrt(jnp.sum(jnp.abs(matrix) ** 2))
+    return jnp.where(size > 0, size, 1.0)
 
 
-@_eigenvalues.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+@eigensystem.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     (matrix,), (change,) = primals, tangents
-    values = _eigenvalues(matrix)
-    return values, _slopes(matrix, jax.lax.stop_gradient(values), change.astype(values.dtype))
+    values, vectors = eigensystem(matrix)
+    slopes = _slopes(matrix, jax.lax.stop_gradient(values), change)
+    return (values, vectors), (slopes, jnp.zeros_like(vectors))
 
 
+@jax.numpy_dtype_promotion("standard")
 def _slopes(matrix: Array, values: Array, change: Array) -> Array:
     n, real = values.size, values.real.dtype
     size = jax.lax.stop_gradient(_size(matrix))
-    size = jnp.where(size > 0, size, 1.0)
     gaps = jnp.abs(values[:, None] - values[None, :])
     near = gaps <= _TOGETHER * jnp.sqrt(jnp.finfo(real).eps) * size
     # Neighbours of neighbours belong together too.
     for _ in range(max(n - 1, 1).bit_length()):
         near = jnp.any(near[:, :, None] & near[None, :, :], axis=1)
-    members = near.astype(real)
-    count = jnp.sum(members, axis=1)
-    centre = product("ij,j->i", members.astype(values.dtype), values) / count.astype(values.dtype)
+    count = jnp.sum(near, axis=1)
+    centre = jnp.sum(jnp.where(near, values[None, :], 0.0), axis=1) / count
     away = jnp.abs(values[None, :] - centre[:, None])
-    inner = jnp.max(jnp.where(near, away, 0.0), axis=1)
-    outer = jnp.min(jnp.where(near, jnp.inf, away), axis=1)
-    outer = jnp.where(jnp.isfinite(outer), outer, 4 * jnp.maximum(inner, size))
+    inner = jnp.max(away, axis=1, initial=0.0, where=near)
+    outer = jnp.min(away, axis=1, initial=4 * size, where=~near)  # none is so far
     radius = jnp.where(inner < 0.25 * outer, 0.5 * outer, jnp.sqrt(inner * outer))
     angles = 2 * jnp.pi * (jnp.arange(_POINTS).astype(real) + 0.5) / _POINTS
-    turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
-    eye = jnp.eye(n, dtype=values.dtype)
-
-    def one(centre: Array, radius: Array, count: Array) -> Array:
-        spoke = radius * turn
-        points = (centre + spoke)[:, None, None] * eye[None] - matrix.astype(values.dtype)[None]
-        # The sum of the eigenvalues inside changes by the trace of the projector times the change.
-        spread = jnp.trace(product("pij,jk->pik", jnp.linalg.inv(points), change), axis1=1, axis2=2)
-        return jnp.sum(spoke * spread) / (_POINTS * count)
-
-    return jax.vmap(one)(centre, radius.astype(values.dtype), count.astype(values.dtype))
-
-
-def eigenvectors(matrix: Array, values: Array) -> Array:
-    """Eigenvectors in the order of the eigenvalues; without derivatives."""
-    unordered, columns = jnp.linalg.eig(matrix)
-    gaps = jnp.abs(unordered[None, :] - values[:, None])
-    # Each eigenvalue takes the nearest that is left.
-    order = []
-    for i in range(values.size):
-        nearest = jnp.argmin(gaps[i])
-        order.append(nearest)
-        gaps = jnp.where(jnp.arange(values.size)[None, :] == nearest, jnp.inf, gaps)
-    return columns[:, jnp.stack(order)]
+    spokes = radius[:, None] * jax.lax.complex(jnp.cos(angles), jnp.sin(angles))[None, :]
+    points = (centre[:, None] + spokes)[:, :, None, None] * jnp.eye(n, dtype=real)[None, None]
+    # The sum of the eigenvalues inside changes by the trace of the projector times the change.
+    resolvents = jnp.linalg.inv(points - matrix[None, None])
+    spread = product("ipjk,kj->ip", resolvents, change.astype(values.dtype))
+    return jnp.sum(spokes * spread, axis=1) / (_POINTS * count)
 
 
 def pairs(values: Array, vectors: Array) -> tuple[Array, Array]:
@@ -108,3 +96,76 @@ def pairs(values: Array, vectors: Array) -> tuple[Array, Array]:
     gaps = jnp.abs(values[:, None] - values[None, :])
     overlap = jnp.abs(product("ki,kj->ij", jnp.conj(vectors), vectors))
     return jnp.where(jnp.eye(values.size, dtype=bool), jnp.inf, gaps), overlap > _SHARED
+
+
+def null_directions(vectors: Array, operator: Array, tiny: Array) -> Array:
+    """Those of some rows that an operator takes to zero, orthonormal; zeros in place of others."""
+    rows: list[Array] = []
+    for vector in vectors:
+        length = safe_norm(vector)
+        for row in rows:
+            vector = vector - jnp.sum(row * vector) * row
+        left = safe_norm(vector)
+        vector = vector / jnp.where(left > 0, left, 1.0)
+        image = safe_norm(product("i,ij->j", vector, operator))
+        rows.append(jnp.where((left > tiny * length) & (image <= tiny), vector, 0.0))
+    return jnp.stack(rows)
+
+
+def _without_symmetries(matrix: Array, neutral: Array, conserved: Array, tiny: Array) -> Array:
+    """The matrix, what comes with every motion moved from the axis to -1.
+
+    Moved are the eigenvalues of directions that the matrix takes to zero, of rows that it does,
+    and, where the torque does not look at the attitude, the turn of the body, which all follows. An
+    eigenvalue of a known vector v is moved by adding a multiple of v v^T, which leaves the others
+    where they are, for each value of a parameter and so for derivatives.
+    """
+    blind = jnp.all(matrix[3:, :3] == 0)
+    away = -jnp.eye(3, len(matrix), dtype=matrix.dtype)
+    matrix = matrix.at[:3].set(jnp.where(blind, away, matrix[:3]))
+    conserved = conserved.at[:, :3].set(jnp.where(blind, 0.0, conserved[:, :3]))
+    directions = null_directions(neutral, matrix.T, tiny), null_directions(conserved, matrix, tiny)
+    rows = jnp.concatenate(directions)
+    return matrix - product("ki,kj->ij", rows, rows)
+
+
+def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> Scalar:
+    """The margin of a matrix, in its units.
+
+    Without damping the eigenvalues lie in mirror images about the imaginary axis. Two that meet
+    there, at zero or in a collision of Krein's kind, leave it: ((s - s') / 2)^2 of the two goes
+    smoothly from minus the square of half their distance to the square of the growth rate. It is a
+    double eigenvalue of the square of the matrix less their mean, simple in kind where they meet.
+    """
+    # Over the size all eigenvalues but those that are moved are within 1/4 of zero.
+    size = 4 * (1 + jnp.sqrt(jnp.sum(jax.lax.stop_gradient(matrix) ** 2)))
+    tiny = accuracy / size
+    matrix = _without_symmetries(matrix / size, neutral, conserved, tiny)
+    values, vectors = eigensystem(matrix)
+    known = jax.lax.stop_gradient(values)
+    free = known.real > -0.5
+    mirrored = jnp.abs(known[:, None] + jnp.conj(known)[None, :]) <= tiny
+    undamped = jnp.all(~free | jnp.any(mirrored, axis=1))
+    damped = -jnp.max(jnp.where(free, values.real, -1.0))
+    i, j = _nearest(known, vectors, free, tiny)
+    mean = 0.5 * (values[i] + values[j])
+    shifted = matrix.astype(mean.dtype) - mean * jnp.eye(len(matrix), dtype=mean.dtype)
+    squares, _ = eigensystem(product("ij,jk->ik", shifted, shifted))
+    apart = 0.25 * (known[i] - known[j]) ** 2
+    place = jnp.argmin(jnp.abs(jax.lax.stop_gradient(squares) - apart))
+    return jnp.where(undamped, -squares[place].real * size, damped) * size
+
+
+def _nearest(values: Array, vectors: Array, free: Array, tiny: Array) -> tuple[Array, Array]:
+    """The two eigenvalues of an undamped motion that are nearest to growth, or grow most.
+
+    Two of one rate that have directions of their own do not count, nor does one with a zero that
+    stays where it is.
+    """
+    gaps, alike = pairs(values, vectors)
+    zero = jnp.abs(values) <= tiny
+    counts = jnp.isfinite(gaps) & free[:, None] & free[None, :] & (zero[:, None] == zero[None, :])
+    counts = counts & ((gaps > tiny) | alike)
+    squares = (0.25 * (values[:, None] - values[None, :]) ** 2).real
+    best = jnp.argmax(jnp.where(counts, squares, -jnp.inf))
+    return best // values.size, best % values.size

@@ -1,11 +1,10 @@
 """Linearisation about an equilibrium, or a motion that is one in a turning frame."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
@@ -14,19 +13,19 @@ from jrigid._checks import (
     Enumeration,
     Findings,
     all_finite,
-    check_shape,
-    float_arrays,
-    internal_parts,
+    harmless,
     nan_where,
     settle,
+    shaped,
 )
-from jrigid._numerics import product, safe_norm
+from jrigid._motion import harmless_motion
+from jrigid._numerics import safe_norm
+from jrigid._scales import spread
 from jrigid._types import Readable, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.rotation import exp, multiply, rotate, rotate_inverse
-from jrigid.stability._eigen import eigenvalues, eigenvectors, pairs
-from jrigid.stability._margin import margin, without_symmetries
-from jrigid.stability._steps import Motion, findings_of, harmless_motion, motion_of
+from jrigid.stability._eigen import eigensystem, margin, null_directions, pairs
+from jrigid.stability._steps import Motion, findings_of, motion_of
 from jrigid.systems import RigidBody
 
 # Times, in units of the motion, at which the system is looked at again.
@@ -140,18 +139,17 @@ def linearize(
     motion = motion_of(system, state0, args, t0)
     none = jnp.zeros(3, motion.t0.dtype)
     own, up = (none if x is None else x for x in (body_rate, space_axis))
-    own, up = (float_arrays(x)[0].astype(none.dtype) for x in (own, up))
-    check_shape("body_rate", own, (3,))
-    check_shape("space_axis", up, (3,))
+    turns = shaped(body_rate=(own, 3), space_axis=(up, 3))
+    frame = _Frame(motion, *(x.astype(none.dtype) for x in turns))
     if body_rate is not None and motion.dimension > 6:
         raise ValueError(
             "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
             "but it is not."
         )
-    return settle(_linearize(motion, own, up), throw, lambda: _findings(motion, own, up)[0])
+    return settle(_linearize(frame), throw, lambda: _findings(frame)[0])
 
 
-class _Frame(eqx.Module):
+class _Frame(NamedTuple):
     """A motion as seen in a frame that turns with it: an equilibrium, if all is well.
 
     Small motions beside it are x; in `units` all their components are angles.
@@ -167,11 +165,6 @@ class _Frame(eqx.Module):
         state = self.motion.state0
         return rotate(state.attitude, state.omega - self.own)
 
-    @property
-    def along(self) -> Array:
-        """The direction in space about which the system is symmetric."""
-        return jnp.where(safe_norm(self.up) > 0, self.up, self.across)
-
     def state(self, x: Array, later: Array) -> State:
         """The state of the body some time later."""
         state = self.motion.state0
@@ -184,7 +177,7 @@ class _Frame(eqx.Module):
 
     def rates(self, x: Array, later: Array) -> Array:
         """Rates of the small motion, some time later."""
-        system, state, args, t0, _ = self.motion
+        system, state, args, t0, *_ = self.motion
         rates = system.vector_field(t0 + later, self.state(x, later), args)
         spin = state.omega + x[3:6]
         seen = multiply(state.attitude, exp(x[:3]))
@@ -203,16 +196,17 @@ class _Frame(eqx.Module):
 
         It may turn about an axis in space, and about one in the body; it keeps its momentum along.
         """
-        system, state, args, t0, _ = self.motion
+        system, state, args, t0, *_ = self.motion
         own, none = self.own, jnp.zeros(self.motion.dimension, rate.dtype)
-        turned = none.at[:3].set(rotate_inverse(state.attitude, self.along))
+        along = jnp.where(safe_norm(self.up) > 0, self.up, self.across)  # the system's own axis
+        turned = none.at[:3].set(rotate_inverse(state.attitude, along))
         slewed = none.at[:6].set(jnp.concatenate([own, jnp.cross(state.omega, own) / rate]))
 
         def momenta(x: Array) -> Array:
             state = self.state(x, jnp.zeros_like(t0))
             momentum = system.angular_momentum(t0, state, args)
             in_body = rotate_inverse(state.attitude, momentum)
-            return jnp.stack([jnp.sum(self.along * momentum), jnp.sum(own * in_body)])
+            return jnp.stack([jnp.sum(along * momentum), jnp.sum(own * in_body)])
 
         return jnp.stack([turned, slewed]), jax.jacfwd(momenta)(none)
 
@@ -228,10 +222,7 @@ class _Frame(eqx.Module):
     def units(self, rate: Scalar) -> Array:
         """Size of each component of x for an angle of 1."""
         system, state, *_ = self.motion
-        scale = internal_parts(system.torque.internal_scale(rate))
-        full = jtu.tree_map(lambda s, x: jnp.broadcast_to(s, x.shape), scale, state.internal)
-        inner = ravel_pytree(full)[0].astype(rate.dtype)
-        return jnp.concatenate([jnp.ones(3, rate.dtype), jnp.full(3, rate), inner])
+        return spread(system, state, rate)[1:]  # a turn has a component less than a quaternion
 
 
 def _accuracy(dtype: Any) -> Scalar:
@@ -239,14 +230,14 @@ def _accuracy(dtype: Any) -> Scalar:
     return 64 * jnp.sqrt(jnp.finfo(dtype).eps)
 
 
-def _findings(motion: Motion, own: Array, up: Array) -> tuple[Findings, _Frame, Array, Scalar]:
+def _findings(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
     """What is wrong; the frame, harmless where it is, the matrix in it, and the rate."""
-    findings = findings_of(motion)
-    for name, value in (("body_rate", own), ("space_axis", up)):
+    findings = findings_of(frame.motion)
+    for name, value in (("body_rate", frame.own), ("space_axis", frame.up)):
         message = f"Argument `{name}` must be finite, but it is not."
         findings.require(all_finite(value), RESULTS.invalid_state, message, value)
-    ok = findings.ok
-    frame = _Frame(harmless_motion(ok, motion), *(jnp.where(ok, x, 0.0) for x in (own, up)))
+    motion, *turns = harmless(findings.ok, frame)
+    frame = _Frame(harmless_motion(findings.ok, motion), *turns)
     known = jax.lax.stop_gradient
     matrix, moves = frame.look(jnp.zeros_like(motion.t0))
     fixed = known(matrix)
@@ -268,26 +259,22 @@ def _findings(motion: Motion, own: Array, up: Array) -> tuple[Findings, _Frame, 
 
 
 @eqx.filter_jit
-def _linearize(motion: Motion, own: Array, up: Array) -> Linearization:
-    findings, frame, matrix, rate = _findings(motion, own, up)
+def _linearize(frame: _Frame) -> Linearization:
+    findings, frame, matrix, rate = _findings(frame)
     ok, units, accuracy = findings.ok, frame.units(rate), _accuracy(rate.dtype)
     known = jax.lax.stop_gradient
     eye = jnp.eye(units.size, dtype=units.dtype)
     plain = jnp.where(ok, matrix * units[None, :] / units[:, None] / rate, eye)
-    values = eigenvalues(plain)
-    vectors = eigenvectors(known(plain), known(values))
+    values, vectors = eigensystem(plain)
     neutral, conserved = frame.symmetries(rate)
-    conserved = conserved * units[None, :]
     stability = _classify(known(plain), known(values), vectors, known(neutral), accuracy)
-    reduced, size = without_symmetries(plain, neutral, conserved, accuracy)
-    left = margin(reduced, size, accuracy) * rate * rate
+    left = margin(plain, neutral, conserved * units[None, :], accuracy) * rate * rate
     shapes = units.astype(vectors.dtype)[:, None] * vectors
-    length = jnp.sqrt(jnp.sum(jnp.abs(shapes) ** 2, axis=0))
-    shapes = shapes / length.astype(values.dtype)[None, :]
-    answer = (matrix, rate.astype(values.dtype) * values, shapes)
-    matrix, values, shapes, left = nan_where(~ok, (*answer, left))
+    shapes = shapes / jnp.linalg.norm(shapes, axis=0, keepdims=True).astype(shapes.dtype)
     stability = STABILITY.where(ok, stability, STABILITY.undefined)
-    return Linearization(matrix, values, shapes, stability, left, findings.result)
+    values = rate.astype(values.dtype) * values
+    answer = Linearization(matrix, values, shapes, stability, left, findings.result)
+    return nan_where(~ok, answer)
 
 
 def _classify(
@@ -295,21 +282,15 @@ def _classify(
 ) -> STABILITY:
     # Rounding of the largest entries splits a double zero by the root of it.
     largest = jnp.maximum(jnp.max(jnp.abs(values)), 1.0)
-    tiny = jnp.maximum(accuracy, 4 * jnp.sqrt(jnp.finfo(values.real.dtype).eps * largest))
-    grows = jnp.max(values.real) > tiny
+    tiny = jnp.maximum(accuracy, 4 * jnp.sqrt(jnp.finfo(matrix.dtype).eps * largest))
     # Directions along which the motion only turns further, at a rate that a neighbour may change.
-    length = jnp.sqrt(jnp.sum(neutral**2, axis=1))
-    neutral = neutral / jnp.where(length > 0, length, 1.0)[:, None]
-    images = jnp.sqrt(jnp.sum(product("ij,kj->ki", matrix, neutral) ** 2, axis=1))
-    kept = (length > 0) & (images <= tiny)
-    twins = jnp.abs(jnp.sum(neutral[0] * neutral[1])) > 1 - 1e-6
-    explained = jnp.where(kept[0] & kept[1] & twins, 1, jnp.sum(kept))
+    turning = jnp.sum(jnp.any(null_directions(neutral, matrix.T, tiny) != 0, axis=1))
     # A zero with an eigenvector of its own stays where it is; the others drift.
-    zeros = jnp.sum(jnp.abs(values) <= tiny)
+    zero = jnp.abs(values) <= tiny
     staying = jnp.sum(jnp.linalg.svd(matrix, compute_uv=False) <= tiny)
-    on_axis = (jnp.abs(values.real) <= tiny) & (jnp.abs(values) > tiny)
+    on_axis = (jnp.abs(values.real) <= tiny) & ~zero
     gaps, alike = pairs(values, vectors)
     shared = on_axis[:, None] & on_axis[None, :] & (gaps <= tiny) & alike
-    drifts = (zeros - staying > explained) | jnp.any(shared)
+    drifts = (jnp.sum(zero) - staying > turning) | jnp.any(shared)
     steady = STABILITY.where(drifts, STABILITY.marginal, STABILITY.stable)
-    return STABILITY.where(grows, STABILITY.unstable, steady)
+    return STABILITY.where(jnp.max(values.real) > tiny, STABILITY.unstable, steady)

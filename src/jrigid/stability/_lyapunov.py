@@ -8,26 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
-from jrigid._checks import (
-    RESULTS,
-    Enumeration,
-    Findings,
-    check_shape,
-    float_arrays,
-    settle,
-    whole_number,
-)
+from jrigid._checks import RESULTS, Enumeration, Findings, array_of_shape, settle, whole_number
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.stability._steps import (
-    Motion,
-    findings_of,
-    motion_of,
-    orthonormal,
-    solver_of,
-    verdict,
-    walk,
-)
+from jrigid.stability._steps import Motion, findings_of, motion_of, orthonormal, verdict, walk
 from jrigid.systems import RigidBody
 
 _REGULAR, _CHAOTIC = 3.0, 5.0  # between them MEGNO has not decided
@@ -41,18 +25,6 @@ class ORDER(Enumeration):
     undecided = "undecided"
     chaotic = "chaotic"
     undefined = "undefined"
-
-
-class _Plan(NamedTuple):
-    """Samples, intervals between renormalisations in each, steps in each of those."""
-
-    samples: int
-    each: int
-    every: int
-
-    @property
-    def steps(self) -> int:
-        return self.samples * self.each * self.every
 
 
 class LyapunovSpectrum(NamedTuple):
@@ -103,14 +75,12 @@ class Megno(NamedTuple):
 
 def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
     """Rows to start from: those given, or some that lie along no axis."""
-    dimension, dtype = motion.dimension, motion.t0.dtype
+    dimension = motion.dimension
     if vectors is None:
         count = dimension if count is None else whole_number("count", count)
         angles = np.outer(np.arange(1, count + 1), 0.9 * np.arange(dimension) + 0.45)
-        rows = jnp.asarray(np.cos(angles) + 0.3 * np.eye(count, dimension), dtype)
-    else:
-        rows = float_arrays(vectors)[0].astype(dtype)
-        check_shape("vectors", rows, (count, dimension))
+        vectors = np.cos(angles) + 0.3 * np.eye(count, dimension)
+    rows = array_of_shape("vectors", vectors, count, dimension).astype(motion.t0.dtype)
     if len(rows) > dimension:
         raise ValueError(
             f"Arguments `count` and `vectors` must name at most {dimension} small motions, but "
@@ -119,16 +89,11 @@ def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
     return rows
 
 
-def _unit_rows(rows: Array) -> tuple[Array, Array]:
-    """Orthonormal rows, and what was left of the length of each."""
-    return orthonormal(rows / jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True)))
-
-
 def _findings(motion: Motion, rows: Array) -> Findings:
     findings = findings_of(motion)
-    _, lengths = _unit_rows(rows)
+    least = _INDEPENDENT * jnp.finfo(rows.dtype).eps * jnp.sqrt(jnp.sum(rows**2, axis=1))
     findings.require(
-        jnp.all(lengths > _INDEPENDENT * jnp.finfo(rows.dtype).eps),
+        jnp.all(orthonormal(rows)[1] > least),
         RESULTS.invalid_state,
         "Arguments `vector` and `vectors` must be finite and linearly independent, but they are "
         "not.",
@@ -136,56 +101,51 @@ def _findings(motion: Motion, rows: Array) -> Findings:
     return findings
 
 
-def _plan(steps: Any, every: Any, samples: Any) -> _Plan:
-    """All samples of one length, in at least `steps` steps."""
+def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
+    """Samples, all of one length; intervals between renormalisations in each; steps in each."""
     steps, every = whole_number("steps", steps), whole_number("every", every)
     samples = min(whole_number("samples", samples), steps)
     every = min(every, -(-steps // samples))
-    return _Plan(samples, -(-steps // (samples * every)), every)
-
-
-class _Growth(NamedTuple):
-    """How small motions beside a motion grew, up to each of some times."""
-
-    ts: Array
-    exponents: Array
-    megno: Array
-    final_state: State
-    error: Array
-    result: Any
+    return samples, -(-steps // (samples * every)), every
 
 
 @eqx.filter_jit
-def _growth(motion: Motion, plan: _Plan, rows: Array, solver: Any) -> _Growth:
+def _growth(
+    motion: Motion, plan: tuple[int, int, int], rows: Array
+) -> tuple[LyapunovSpectrum, Megno]:
     """Orthonormal again after each interval; the indicator is that of the first one."""
-    findings = _findings(motion, rows)
-    path = walk(motion, plan.steps, solver, findings.ok)
+    findings, dtype = _findings(motion, rows), rows.dtype
     samples, each, every = plan
-    dtype = rows.dtype
+    path = walk(motion, samples * each * every, findings.ok)
 
     def interval(carry: tuple, index: Array) -> tuple[tuple, None]:
-        y, rows, (totals, weighted, indicator), error = carry
-        y, rows, local = path.follow(index * every, every, y, rows)
-        rows, lengths = orthonormal(rows)
+        y, (totals, weighted, indicator), error = carry
+        y, local = path.follow(index * every, every, y)
+        rows, lengths = orthonormal(path.tangents(y))
         logs, number = jnp.log(lengths), (1 + index).astype(dtype)
         weighted = weighted + number * logs[0]
         tally = (totals + logs, weighted, indicator + 2 * weighted / number)
-        return (y, rows, tally, jnp.maximum(error, local)), None
+        return (path.with_tangents(y, rows), tally, jnp.maximum(error, local)), None
 
     def sample(carry: tuple, first: Array) -> tuple[tuple, Any]:
         carry, _ = jax.lax.scan(interval, carry, first + jnp.arange(each))
-        return carry, carry[2]
+        return carry, carry[1]
 
     none = jnp.zeros((), dtype)
-    tally = (jnp.zeros(len(rows), dtype), none, none)
-    begin = (path.start, _unit_rows(rows)[0], tally, none)
+    y = path.with_tangents(path.start, orthonormal(rows)[0])
+    begin = (y, (jnp.zeros(len(rows), dtype), none, none), none)
     firsts = each * jnp.arange(samples)
-    (y, *_, error), (totals, _, indicator) = jax.lax.scan(sample, begin, firsts)
+    (y, _, error), (totals, _, indicator) = jax.lax.scan(sample, begin, firsts)
     counts = (firsts + each).astype(dtype)
     ts = path.step * every * counts
     answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
-    result, _, (ts, exponents, mean, state) = verdict(findings, error, answer)
-    return _Growth(ts, exponents, mean, state, error, result)
+    ts, exponents, means, state = verdict(findings, error, answer)
+    mean, end = means[-1], (state, error, findings.result)
+    order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
+    order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
+    order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
+    spectrum = LyapunovSpectrum(exponents[-1], ts, exponents, *end)
+    return spectrum, Megno(mean, 2 * mean / ts[-1], order, ts, means, *end)
 
 
 def lyapunov_spectrum(
@@ -243,11 +203,9 @@ def lyapunov_spectrum(
     >>> print(bool(jnp.all(jnp.abs(spectrum.exponents) < 0.02)), spectrum.history.shape)
     True (50, 6)
     """
-    motion = motion_of(system, state0, args, t0, duration)
+    motion = motion_of(system, state0, args, t0, duration, solver)
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
-    growth = _growth(motion, plan, rows, solver_of(solver))
-    ts, history, _, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
-    return LyapunovSpectrum(history[-1], ts, history, state, error, result)
+    return settle(_growth(motion, plan, rows)[0], throw, lambda: _findings(motion, rows))
 
 
 def megno(
@@ -302,17 +260,8 @@ def megno(
     >>> print(indicator.megno.round(), jr.stability.ORDER[indicator.order])
     2.0 regular
     """
-    motion = motion_of(system, state0, args, t0, duration)
-    plan = _plan(steps, every, samples)
+    motion = motion_of(system, state0, args, t0, duration, solver)
     if vector is not None:
-        (vector,) = float_arrays(vector)
-        check_shape("vector", vector, (motion.dimension,))
-        vector = vector[None]
-    rows = _starting_vectors(motion, vector, 1)
-    growth = _growth(motion, plan, rows, solver_of(solver))
-    ts, _, history, state, error, result = settle(growth, throw, lambda: _findings(motion, rows))
-    mean = history[-1]
-    order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
-    order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
-    order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
-    return Megno(mean, 2 * mean / ts[-1], order, ts, history, state, error, result)
+        vector = array_of_shape("vector", vector, motion.dimension)[None]
+    plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vector, 1)
+    return settle(_growth(motion, plan, rows)[1], throw, lambda: _findings(motion, rows))

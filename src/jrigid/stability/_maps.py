@@ -1,6 +1,5 @@
 """Maps of stability over any parameters, in blocks, and the boundaries between their regions."""
 
-import functools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -14,7 +13,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    array_of_shape,
+    float_arrays,
+    shaped,
+    whole_number,
+)
 from jrigid._types import Scalar, ScalarLike
 
 _Code = type(RESULTS.successful)  # an item of any enumeration
@@ -107,37 +114,26 @@ def stability_map(
             )
     if not points:
         raise ValueError("Argument `axes` must name at least one axis, but it is empty.")
-    if block_size < 1:
-        raise ValueError(f"Argument `block_size` must be at least 1, but it is {block_size}.")
     shape = tuple(x.size for x in points.values())
     total = math.prod(shape)
-    size = min(block_size, total)
+    size = min(whole_number("block_size", block_size), total)
     # One dtype, that of all axes taken together.
     arrays = float_arrays(*points.values())
-    try:
-        block = _block(function, tuple(points), size)
-    except TypeError:  # a module of arrays cannot be hashed
-        block = _block.__wrapped__(function, tuple(points), size)
-    leaves: list[np.ndarray] = []
-    structure: Any = None
-    valid = np.empty(total, bool)
+    whole: Any = None
     printed = time.monotonic()
     for start in range(0, total, size):
-        first = tuple(np.int32(i) for i in np.unravel_index(start, shape))
-        values, defined = block(arrays, first)
-        parts, structure = jtu.tree_flatten(values)
-        if not leaves:
-            leaves = [np.empty((total, *x.shape[1:]), x.dtype) for x in parts]
+        first = jnp.array(np.unravel_index(start, shape), jnp.int32)
+        block = _block(function, tuple(points), size, arrays, first)
+        if whole is None:
+            whole = jtu.tree_map(lambda x: np.empty((total, *x.shape[1:]), x.dtype), block)
         stop = min(start + size, total)
-        for whole, part in zip(leaves, parts, strict=True):
-            whole[start:stop] = np.asarray(part)[: stop - start]
-        valid[start:stop] = np.asarray(defined)[: stop - start]
+        for leaf, part in zip(jtu.tree_leaves(whole), jtu.tree_leaves(block), strict=True):
+            leaf[start:stop] = np.asarray(part)[: stop - start]
         if progress and time.monotonic() - printed > 5:
             printed = time.monotonic()
             print(f"{stop} of {total} points", flush=True)
-    leaves = [x.reshape(*shape, *x.shape[1:]) for x in leaves]
-    named = {name: np.asarray(x) for name, x in zip(points, arrays, strict=True)}
-    return StabilityMap(structure.unflatten(leaves), valid.reshape(shape), named)
+    values, valid = jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), whole)
+    return StabilityMap(values, valid, dict(zip(points, map(np.asarray, arrays), strict=True)))
 
 
 def _defined(values: Any) -> Bool[Array, ""]:
@@ -156,26 +152,24 @@ def _defined(values: Any) -> Bool[Array, ""]:
     return defined
 
 
-@functools.lru_cache(maxsize=16)
-def _block(function: Callable[..., Any], names: tuple[str, ...], size: int) -> Callable:
-    """One block of the grid: values at `size` points that follow a first one."""
+@eqx.filter_jit
+def _block(
+    function: Callable, names: tuple[str, ...], size: int, axes: tuple[Array, ...], first: Array
+) -> tuple[Any, Array]:
+    """One block of the grid: values at `size` points that follow a first one; if defined."""
+    # Digits of the index in the grid's own bases: no number beyond 32 bits is needed.
+    carry = jnp.arange(size, dtype=jnp.int32)
+    point = {}
+    for name, x, digit in zip(names[::-1], axes[::-1], first[::-1], strict=True):
+        index = carry + digit
+        carry = index // x.size
+        point[name] = x[index % x.size]
 
     def evaluate(point: dict[str, Array]) -> tuple[Any, Array]:
         values = jtu.tree_map(jnp.asarray, function(**point))
         return values, _defined(values)
 
-    @jax.jit
-    def block(axes: tuple[Array, ...], first: tuple[Array, ...]) -> tuple[Any, Array]:
-        # Digits of the index in the grid's own bases: no number beyond 32 bits is needed.
-        carry = jnp.arange(size, dtype=jnp.int32)
-        point = {}
-        for name, x, digit in zip(names[::-1], axes[::-1], first[::-1], strict=True):
-            index = carry + digit
-            carry = index // x.size
-            point[name] = x[index % x.size]
-        return jax.vmap(evaluate)(point)
-
-    return block
+    return jax.vmap(evaluate)(point)
 
 
 def place_of_root(
@@ -236,15 +230,11 @@ def boundary(
     >>> print(jax.grad(lambda mgl: jr.stability.boundary(upright, 1.0, 9.0, mgl))(1.0).round(9))
     2.0
     """
-    lower, upper = float_arrays(lower, upper)
-    check_shape("lower", lower, ())
-    check_shape("upper", upper, ())
+    lower, upper = shaped(lower=(lower,), upper=(upper,))
     fixed = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, args)
     ends = jax.lax.stop_gradient(jnp.stack([lower, upper]))
-    values = [jnp.asarray(function(x, *fixed), lower.dtype) for x in ends]
-    for value in values:
-        check_shape("function", value, ())
-    known = jax.lax.stop_gradient(jnp.stack(values))
+    values = [array_of_shape("function", function(x, *fixed)) for x in ends]
+    known = jax.lax.stop_gradient(jnp.stack(values).astype(lower.dtype))
     ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     falls = known[0] > known[1]
 

@@ -1,25 +1,28 @@
 """Sections of a motion, its flips, and the side on which a tumbling body ends."""
 
+import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Enumeration,
     Findings,
     all_finite,
-    check_inertia_shape,
     check_option,
     check_shape,
-    float_arrays,
     is_inertia,
     nan_where,
     settle,
+    shaped,
     where_defined,
     whole_number,
 )
@@ -29,15 +32,7 @@ from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
 from jrigid.stability._maps import place_of_root
-from jrigid.stability._steps import (
-    Motion,
-    Walk,
-    findings_of,
-    motion_of,
-    solver_of,
-    verdict,
-    walk,
-)
+from jrigid.stability._steps import Motion, findings_of, motion_of, verdict, walk
 from jrigid.systems import RigidBody
 
 _SETTLED = 5.0  # degrees from an axis within which a body counts as turning about it
@@ -123,54 +118,61 @@ def poincare_section(
     """
     check_option("direction", direction, (True, False, None))
     crossings, steps = whole_number("crossings", crossings), whole_number("steps", steps)
-    motion = motion_of(system, state0, args, t0, step)
-    plan = _Plan(condition, crossings, direction, steps)
-    section = _section(motion, plan, solver_of(solver))
+    motion = motion_of(system, state0, args, t0, step, solver)
+    section = _section(motion, condition, crossings, direction, steps)
     return settle(section, throw, lambda: _section_findings(motion, condition))
-
-
-class _Plan(NamedTuple):
-    """What is looked for, and for how long."""
-
-    condition: Callable[[Any, State], Any]
-    crossings: int
-    direction: bool | None
-    steps: int
 
 
 def _section_findings(motion: Motion, condition: Callable) -> Findings:
     findings = findings_of(motion)
     value = jnp.asarray(condition(motion.t0, motion.state0), motion.t0.dtype)
     check_shape("condition", value, ())
-    findings.require(
-        jnp.isfinite(value),
-        RESULTS.invalid_vector_field,
-        "Argument `condition` must be finite at the start, but it is not.",
-        value,
-    )
+    message = "Argument `condition` must be finite at the start, but it is not."
+    findings.require(jnp.isfinite(value), RESULTS.invalid_vector_field, message, value)
     return findings
 
 
 class _Place(NamedTuple):
-    """Where a search for crossings has come to; `above`: the condition is positive there."""
+    """Where a search for crossings has come to."""
 
     t: Array
     y: Array
-    above: Array
-    alive: Array
+    above: Array  # whether the condition is positive there
+    crosses: Array  # whether the motion crosses within a step, or has just crossed
     error: Array
 
 
 @eqx.filter_jit
-def _section(motion: Motion, plan: _Plan, solver: Any) -> Section:
-    findings = _section_findings(motion, plan.condition)
-    path = walk(motion, 1, solver, findings.ok)
+def _section(
+    motion: Motion, condition: Callable, crossings: int, direction: bool | None, steps: int
+) -> Section:
+    findings = _section_findings(motion, condition)
+    path = walk(motion, 1, findings.ok)
 
     def value(t: Array, y: Array) -> Array:
-        return jnp.asarray(plan.condition(t, path.state(y)), y.dtype)
+        return jnp.asarray(condition(t, path.state(y)), y.dtype)
+
+    def before_crossing(start: _Place) -> _Place:
+        """The start of the step in which the motion crosses, if it ever does."""
+
+        def step(search: tuple[_Place, Array]) -> tuple[_Place, Array]:
+            (t, y, above, _, error), count = search
+            after, local = path.advance(t, y)
+            later = start.t + path.step * (count + 1).astype(t.dtype)
+            higher = value(later, after) >= 0
+            crosses = (higher != above) & (direction is None or higher == direction)
+            here, ahead = (t, y, above), (later, after, higher)
+            t, y, above = jtu.tree_map(partial(jnp.where, crosses), here, ahead)
+            return _Place(t, y, above, crosses, jnp.maximum(error, local)), count + 1
+
+        def goes_on(search: tuple[_Place, Array]) -> Array:
+            return ~search[0].crosses & (search[1] < steps)
+
+        begin = start._replace(crosses=jnp.zeros_like(start.crosses))
+        return jax.lax.while_loop(goes_on, step, (begin, jnp.where(start.crosses, 0, steps)))[0]
 
     def crossing(place: _Place, _: None) -> tuple[_Place, tuple]:
-        t, y, above, alive, error = _before_crossing(path, plan, value, place)
+        t, y, above, crosses, error = before_crossing(place)
         state = path.within(t, y)
 
         def rising(part: Array, _: Any) -> Array:
@@ -179,8 +181,8 @@ def _section(motion: Motion, plan: _Plan, solver: Any) -> Section:
 
         part = place_of_root(rising, None, _PLACE[y.dtype.itemsize], y.dtype)
         t, y = t + part * path.step, state(part)
-        crossed = _Place(t, y, ~above, alive, error)
-        return crossed, (t, path.state(y), alive, jnp.abs(value(t, y)))
+        crossed = (t, path.state(y), crosses, jnp.abs(value(t, y)))
+        return _Place(t, y, ~above, crosses, error), crossed
 
     t, y = path.motion.t0, path.start
     # A start on the surface itself is no crossing: the motion is where it goes from there.
@@ -188,39 +190,11 @@ def _section(motion: Motion, plan: _Plan, solver: Any) -> Section:
     ahead = value(t + small, y + small * path.rates(t, y))
     above = jnp.where(now == 0, ahead > now, now > 0)
     begin = _Place(t, y, above, findings.ok, jnp.zeros_like(t))
-    place, crossings = jax.lax.scan(crossing, begin, None, length=plan.crossings)
-    ts, states, valid, left = crossings
-    result, ok, (ts, states) = verdict(findings, place.error, (ts, states))
-    valid = valid & ok
-    ts, states = jax.vmap(lambda good, x: nan_where(~good, x))(valid, (ts, states))
-    return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), result)
-
-
-def _before_crossing(path: Walk, plan: _Plan, value: Callable, place: _Place) -> _Place:
-    """The start of the step in which the motion crosses; not alive if there is none."""
-    none = jnp.zeros((0, path.scales.size - 1), path.scales.dtype)
-
-    def goes_on(search: tuple[_Place, Array, Array]) -> Array:
-        place, count, crossed = search
-        return place.alive & ~crossed & (count < plan.steps)
-
-    def step(search: tuple[_Place, Array, Array]) -> tuple[_Place, Array, Array]:
-        (t, y, above, alive, error), count, _ = search
-        after, _, local = path.advance(t, y, none)
-        count = count + 1
-        later = begun + path.step * count.astype(t.dtype)
-        higher = value(later, after) >= 0
-        wanted = True if plan.direction is None else higher == plan.direction
-        crossed = (higher != above) & wanted
-        t, y, above = (
-            jnp.where(crossed, old, new) for old, new in ((t, later), (y, after), (above, higher))
-        )
-        return _Place(t, y, above, alive, jnp.maximum(error, local)), count, crossed
-
-    begun = place.t
-    zero = jnp.zeros((), jnp.int32)
-    place, _, crossed = jax.lax.while_loop(goes_on, step, (place, zero, jnp.asarray(False)))
-    return place._replace(alive=crossed)
+    place, (ts, states, valid, left) = jax.lax.scan(crossing, begin, None, length=crossings)
+    ts, states = verdict(findings, place.error, (ts, states))
+    valid = valid & findings.ok
+    ts, states = jax.vmap(nan_where)(~valid, (ts, states))
+    return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), findings.result)
 
 
 def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
@@ -252,9 +226,7 @@ def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(jr.stability.flip_time(racket, [1e-3, 0.0, 1.0]))
     inf
     """
-    inertia, omega = float_arrays(inertia, omega)
-    check_inertia_shape(inertia)
-    check_shape("omega", omega, (3,))
+    inertia, omega = shaped(inertia=(inertia, *INERTIA), omega=(omega, 3))
 
     def formula(inertia: Array, omega: Array) -> Scalar:
         known, rates = jax.lax.stop_gradient((inertia, omega))
@@ -336,28 +308,25 @@ def final_spin(
     1.0 against
     """
     steps = whole_number("steps", steps)
-    motion = motion_of(system, state0, args, t0, duration)
-    final = _final_spin(motion, steps, solver_of(solver))
-    return settle(final, throw, lambda: findings_of(motion))
+    motion = motion_of(system, state0, args, t0, duration, solver)
+    return settle(_final_spin(motion, steps), throw, lambda: findings_of(motion))
 
 
 @eqx.filter_jit
-def _final_spin(motion: Motion, steps: int, solver: Any) -> FinalSpin:
+def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     findings = findings_of(motion)
-    path = walk(motion, steps, solver, findings.ok)
-    none = jnp.zeros((0, motion.dimension), path.scales.dtype)
-    y, _, error = path.follow(0, steps, path.start, none)
-    state = path.state(y)
-    inertia = path.motion.system.inertia
+    path = walk(motion, steps, findings.ok)
+    y, error = path.follow(0, steps, path.start)
+    state, inertia = path.state(y), path.motion.system.inertia
     if inertia.ndim == 1:
         axis = jnp.eye(3, dtype=y.dtype)[jnp.argmax(inertia)]
     else:
         axis = principal_axes(inertia).axes[:, 2].astype(y.dtype)
     rate = safe_norm(state.omega)
     alignment = jnp.sum(state.omega * axis) / jnp.where(rate > 0, rate, 1.0)
-    result, ok, (alignment, state) = verdict(findings, error, (alignment, state))
-    settled = jnp.abs(alignment) > jnp.cos(jnp.radians(jnp.asarray(_SETTLED, y.dtype)))
+    alignment, state = verdict(findings, error, (alignment, state))
+    settled = jnp.abs(alignment) > math.cos(math.radians(_SETTLED))
     side = SIDES.where(alignment > 0, SIDES.along, SIDES.against)
     side = SIDES.where(settled, side, SIDES.not_settled)
-    side = SIDES.where(ok, side, SIDES.undefined)
-    return FinalSpin(side, alignment, state, error, result)
+    side = SIDES.where(findings.ok, side, SIDES.undefined)
+    return FinalSpin(side, alignment, state, error, findings.result)

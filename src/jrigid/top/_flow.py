@@ -15,21 +15,26 @@ pm = -m / 2 - h / 6, they are solved by functions of the elapsed time alone,
 
 A, B and G polynomials of the state (in `Invariants`), without roots, moduli or phases, so that
 vertical, sleeping, steady, weightless tops and pendulums are no special cases. A polynomial gives s
-and w for a short time; doubling formulas do the rest, after whole nutations have been taken off.
+for a short time, and quadratures w; doubling formulas do the rest, after whole nutations have been
+taken off.
 docs/top.md derives it.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex
 
+from jrigid._checks import harmless
 from jrigid._numerics import (
     Components,
     arctanc_sqrt,
+    gauss_legendre,
     materialize,
     power_of_two,
+    root_of_positive,
     with_columns,
 )
 from jrigid._types import Quaternion, Scalar, Vector
@@ -38,6 +43,10 @@ from jrigid.rotation import normalize
 from jrigid.top._top import SymmetricTop
 
 _DOUBLINGS = 11
+# Quadratures over a short time: 5 nodes are enough where poles are not nearer than mu s^2 says.
+_NODES = 5
+_POLE_IS_NEAR = 0.02
+_NEWTON_STEPS = 4  # from an error of a twentieth
 _MEANS = 9  # arithmetic-geometric means: quadratic convergence, from a ratio of 1e-26
 # Nearer to the separatrix than this the nutation is out of reach, and beyond this phase a top is
 # taken to stay upright: it would leave only then, from a tilt below exp(-phase).
@@ -49,80 +58,53 @@ _LEAST_UNIT = {8: 1e-140, 4: 1e-17}
 _LONGEST_PHASE = {8: 60.0, 4: 10.0}
 
 
-def _short_time(a: Array, b: Array, g: Array, h: Array) -> tuple[Array, Array]:
-    """Functions s and w of a short time."""
-    x = h * h
-    a, b, c = a * x, b * x * x, -((g * x) ** 2) * x
-    c1 = a / 6
-    c2 = (a * a + 12 * b) / 120
-    c3 = (a**3 + 132 * a * b + 360 * c) / 5040
-    c4 = (a**4 + 1224 * a * a * b + 12960 * a * c + 3024 * b * b) / 362880
-    d1, d2, d3 = 2 * c1, c1 * c1 + 2 * c2, 2 * (c3 + c1 * c2)
-    s = h * (1 + (c1 + (c2 + (c3 + c4))))
-    return s, h**3 * (1 / 3 + (d1 / 5 + (d2 / 7 + d3 / 9)))
-
-
-def _short_time_of_alpha(mu: Array, a: Array, b: Array, g: Array, s: Array) -> Array:
-    """The integral w of alpha, of z / (1 + mu z), where beta's s is short but mu s^2 need not be.
-
-    Near the threshold of sleeping a nutation lasts much longer than 1 / sqrt(mu). The inverse of
-    s' is a series in s^2; what is left are the moments of 1 / (1 + mu s^2).
-    """
-    x = s * s
-    a, b, c = a * x, b * x * x, (g * x) ** 2 * x
-    weights = (
-        jnp.ones_like(x),
-        -a / 2,
-        3 * a * a / 8 - b / 2,
-        -5 * a**3 / 16 + 3 * a * b / 4 + c / 2,
-        35 * a**4 / 128 - 15 * a * a * b / 16 + 3 * b * b / 8 - 3 * a * c / 4,
-    )
-    q = mu * x
-    small = q < 0.25
-    # Integrals of y^(2 k) / (1 + q y^2) from 0 to 1: backward from a series, or forward.
-    near = jnp.where(small, q, 0.0)
-    total = jnp.full_like(x, 1 / 49)
-    for k in range(18, -1, -1):
-        total = 1 / (2 * k + 11) - near * total
-    moments = [total]
-    for k in range(4, 0, -1):
-        moments.insert(0, 1 / (2 * k + 1) - near * moments[0])
-    far = jnp.where(small, 1.0, q)
-    moment = arctanc_sqrt(far)
-    sum_ = jnp.zeros_like(x)
-    for k, (weight, close) in enumerate(zip(weights, moments, strict=True)):
-        moment = (1 / (2 * k + 1) - moment) / far
-        sum_ = sum_ + weight * jnp.where(small, close, moment)
-    return s * x * sum_
-
-
 def _slope(a: Array, b: Array, g: Array, z: Array) -> Array:
     """The derivative s' from z = s^2, up to the half period."""
     return jnp.sqrt(1 + z * (a + z * b) - (g * z) ** 2 * z)
 
 
+def _short_time(mu: Array, a: Array, b: Array, g: Array, h: Array) -> Components:
+    """Functions s (of beta), w of alpha and w of beta of a short time: a series, and quadratures.
+
+    The integrand of alpha's w is z / (1 + mu z), where beta's s is short but mu s^2 need not be:
+    near the threshold of sleeping a nutation lasts much longer than 1 / sqrt(mu). Then the pole is
+    taken out and integrated by itself.
+    """
+    x = h * h
+    p, q, r = a * x, b * x * x, -((g * x) ** 2) * x
+    c1, c2 = p / 6, (p * p + 12 * q) / 120
+    c3 = (p**3 + 132 * p * q + 360 * r) / 5040
+    c4 = (p**4 + 1224 * p * p * q + 12960 * p * r + 3024 * q * q) / 362880
+    s = h * (1 + (c1 + (c2 + (c3 + c4))))
+    far = mu * s * s > _POLE_IS_NEAR
+    pole = -1 / jnp.where(far, mu, 1.0)
+    residue = jnp.where(far, 1 / _slope(a, b, g, jnp.where(far, pole, 0.0)), 0.0)
+    nodes, weights = gauss_legendre(_NODES, s.dtype)
+    z = (s * nodes) ** 2
+    weights, inverse = s * z * weights, 1 / _slope(a, b, g, z)
+    w_alpha = jnp.sum(weights / (1 + mu * z) * (inverse - residue))
+    w_alpha = w_alpha - s * pole * residue * (1 - arctanc_sqrt(mu * s * s))
+    return s, w_alpha, jnp.sum(weights * inverse)
+
+
 @with_columns
 def _elapsed(mu: Array, a: Array, b: Array, g_alpha: Array, g_beta: Array, h: Array) -> Components:
     """Functions s (of beta), w of alpha and w of beta, at most a quarter of a nutation."""
-    h = h * 2.0**-_DOUBLINGS
-    s, w_beta = _short_time(a, b, g_beta, h)
-    w_alpha = _short_time_of_alpha(mu, a, b, g_beta, s)
 
     def twice(_: Any, at_half: Components) -> Components:
         s, w_alpha, w_beta = at_half
         z = s * s
-        slope = _slope(a, b, g_beta, z)
         rise, cube = z * (b * z), (g_beta * z) ** 2 * z
-        double = 2 * s * slope
+        double = 2 * s * _slope(a, b, g_beta, z)
         # The differences of w, of alpha and of beta, are arctan(g f) / g.
         f_alpha = z * double / (1 + mu * z * (3 + 2 * a * z + rise) - rise + 2 * cube)
         f_beta = z * double / (1 - rise + 2 * cube)
         w_alpha = 2 * w_alpha + f_alpha * arctanc_sqrt((g_alpha * f_alpha) ** 2)
         w_beta = 2 * w_beta + f_beta * arctanc_sqrt((g_beta * f_beta) ** 2)
-        s = double / jnp.sqrt((1 - rise) ** 2 + 4 * cube * (2 + a * z))
-        return s, w_alpha, w_beta
+        return double / jnp.sqrt((1 - rise) ** 2 + 4 * cube * (2 + a * z)), w_alpha, w_beta
 
-    return jax.lax.fori_loop(0, _DOUBLINGS, twice, (s, w_alpha, w_beta))
+    start = _short_time(mu, a, b, g_beta, h * 2.0**-_DOUBLINGS)
+    return jax.lax.fori_loop(0, _DOUBLINGS, twice, start)
 
 
 def _largest_root(a: Array, b: Array, square: Array) -> Array:
@@ -131,25 +113,19 @@ def _largest_root(a: Array, b: Array, square: Array) -> Array:
     cosine = (9 * a * b + 27 * square - 2 * a**3) / jnp.where(m > 0, 2 * m**3, 1.0)
     far = (2 * m * jnp.cos(jnp.arccos(jnp.clip(cosine, -1, 1)) / 3) - a) / 3
     # The two largest roots are near each other and zero: a quadratic.
-    near = a > 0
-    safe = jnp.where(near, a, 1.0)
-    x = jnp.zeros_like(a)
-    for _ in range(8):
-        leading = safe + x
-        total = jnp.abs(b) + jnp.sqrt(b * b + 4 * leading * square)
-        x = jnp.where(b > 0, 2 * square / jnp.where(total > 0, total, 1.0), 0.5 * total / leading)
-    return jnp.where(near & (x < 0.05 * safe), x, jnp.maximum(far, 0.0))
-
-
-def _newton(x: Array, a: Array, b: Array, square: Array) -> Array:
-    return x - (x * (b + x * (a + x)) - square) / (b + x * (2 * a + 3 * x))
+    leading = jnp.where(a > 0, a, 1.0)
+    total = jnp.abs(b) + jnp.sqrt(b * b + 4 * leading * square)
+    near = jnp.where(b > 0, 2 * square / jnp.where(total > 0, total, 1.0), 0.5 * total / leading)
+    return jnp.where((a > 0) & (near < 0.05 * leading), near, jnp.maximum(far, 0.0))
 
 
 @with_columns
 def _nutation(root: Array, a: Array, b: Array, g: Array) -> Components:
     """From the largest root X: X, the root of the cubic's slope there, and the period 2 omega1."""
     # Newton's steps, not the root given, carry the derivatives: two of them to the third order.
-    x = _newton(_newton(jax.lax.stop_gradient(root), a, b, g * g), a, b, g * g)
+    x = jax.lax.stop_gradient(root)
+    for _ in range(_NEWTON_STEPS):
+        x = x - (x * (b + x * (a + x)) - g * g) / (b + x * (2 * a + 3 * x))
     q = jnp.sqrt(b + x * (2 * a + 3 * x))
 
     def mean(_: Any, pair: Components) -> Components:
@@ -157,8 +133,7 @@ def _nutation(root: Array, a: Array, b: Array, g: Array) -> Components:
         return 0.5 * (arithmetic + geometric), jnp.sqrt(arithmetic * geometric)
 
     pair = 0.5 * jnp.sqrt(a + 3 * x + 2 * q), jnp.sqrt(q)
-    arithmetic, _ = jax.lax.fori_loop(0, _MEANS, mean, pair)
-    return x, q, jnp.pi / arithmetic
+    return x, q, jnp.pi / jax.lax.fori_loop(0, _MEANS, mean, pair)[0]
 
 
 class Invariants(NamedTuple):
@@ -167,26 +142,18 @@ class Invariants(NamedTuple):
     unit: Scalar  # of a rate [rad/s]
     omega3: Scalar  # [rad/s]
     spin: Scalar  # about the axis, of the spherical top [rad/s]
-    hangs: Bool[Array, ""]  # mgl < 0: seen with the axis reversed
-    start: tuple[Complex[Array, ""], ...]  # alpha, beta and their rates
-    mu: Scalar
-    a: Scalar
-    b: Scalar
-    g_alpha: Scalar
-    g_beta: Scalar
+    hangs: Bool[Array, ""]  # mgl < 0: seen upside down
+    start: tuple[Complex[Array, ""], ...]  # alpha, its rate, beta, its rate
+    momenta: Components  # Im x* x' of alpha and of beta, in units of 4 I1
+    kept: Components  # mu, A, B, G of alpha, G of beta
     nutates: Bool[Array, ""]  # False where no nutation ends in any time
     root: Scalar  # largest root X of X^3 + A X^2 + B X - G^2, G that of beta
     period: Scalar
     # Of the arguments of alpha and beta in a nutation, without the half turn that either makes when
-    # it passes zero, or would; `wide` where beta does.
+    # it passes zero, or would; beta's is 0 where its argument is small.
     advance_alpha: Scalar
     advance_beta: Scalar
-    wide: Bool[Array, ""]
-
-    @property
-    def slip(self) -> Scalar:
-        """By how much the body turns faster than the spherical top about their axis."""
-        return (self.omega3 - self.spin) / self.unit
+    half_turn: Scalar
 
 
 def square_of(x: Array) -> Array:
@@ -194,64 +161,54 @@ def square_of(x: Array) -> Array:
     return x.real * x.real + x.imag * x.imag
 
 
-def _reversed(hangs: Array, q: Components, w: Components) -> tuple[Components, Components]:
-    """Attitude and rates about body axes turned half about axis 1; q becomes q i, up to order."""
-    q0, q1, q2, q3 = q
-    w1, w2, w3 = w
-    q = tuple(jnp.where(hangs, x, y) for x, y in ((-q1, q0), (q0, q1), (q3, q2), (-q2, q3)))
-    return q, (w1, jnp.where(hangs, -w2, w2), jnp.where(hangs, -w3, w3))
+def _whole_nutation(
+    root: Array, mu: Array, a: Array, b: Array, g_alpha: Array, g_beta: Array
+) -> Components:
+    """The largest root, the period, the advances of alpha and beta, and the half turn of beta."""
+    x, q, period = _nutation(root, a, b, g_beta)
+    _, w_alpha, w_beta = _elapsed(mu, a, b, g_alpha, g_beta, 0.25 * period)
+    r = jnp.sqrt(2 * q + a + 3 * x)
+    advance_alpha = 4 * g_alpha * w_alpha + 2 * jnp.arctan(g_alpha / (r * (x + mu)))
+    # The same for beta, which is 0 / 0 where the largest root is zero: then its complement.
+    wide = r * x > jnp.abs(g_beta)
+    last = jnp.where(wide, g_beta, -g_beta * r) / jnp.where(wide, r * x, b + x * (a + x))
+    advance_beta = 4 * g_beta * w_beta + 2 * jnp.arctan(last)
+    half_turn = jnp.where(wide, jnp.pi, jnp.zeros_like(x))
+    return materialize(x, period, advance_alpha, advance_beta, half_turn)
 
 
 @jax.jit  # outside of jit a loop defined in a function is compiled at every call
 def invariants(top: SymmetricTop, state: State) -> Invariants:
     """The invariants and the nutation of a motion; the attitude is normalised first."""
-    attitude, omega = normalize(state.attitude), state.omega
-    w1, w2, w3 = omega
-    spin = top.I3 / top.I1 * w3
-    mu = top.mgl / top.I1
-    sizes = jnp.stack([w1, w2, spin, jnp.sqrt(jnp.abs(jax.lax.stop_gradient(mu)))])
+    q0, q1, q2, q3 = normalize(state.attitude)
+    w1, w2, omega3 = state.omega
+    spin, mu = top.I3 / top.I1 * omega3, top.mgl / top.I1
     size = jnp.dtype(mu.dtype).itemsize
-    fastest = jnp.max(jnp.abs(jax.lax.stop_gradient(sizes)))
+    rates = jax.lax.stop_gradient(jnp.stack([w1, w2, spin, jnp.sqrt(jnp.abs(mu))]))
+    fastest = jnp.max(jnp.abs(rates))
     unit = power_of_two(jnp.where(fastest > 0, jnp.maximum(fastest, _LEAST_UNIT[size]), 1.0))
     hangs = mu < 0
-    q, w = _reversed(hangs, tuple(attitude), (w1 / unit, w2 / unit, spin / unit))
     mu = jnp.where(hangs, -mu, mu) / unit / unit
-    w1, w2, w3 = w
-    alpha, beta = jax.lax.complex(q[0], q[3]), jax.lax.complex(q[1], q[2])
-    across = jax.lax.complex(0.5 * w1, 0.5 * w2)
-    along = jax.lax.complex(jnp.zeros_like(w3), 0.5 * w3)
+    alpha, beta = jax.lax.complex(q0, q3), jax.lax.complex(q1, q2)
+    alpha, beta = jnp.where(hangs, -jnp.conj(beta), alpha), jnp.where(hangs, jnp.conj(alpha), beta)
+    across = jax.lax.complex(0.5 * (w1 / unit), 0.5 * (w2 / unit))
+    along = jax.lax.complex(jnp.zeros_like(spin), 0.5 * (spin / unit))
     d_alpha = along * alpha - beta * jnp.conj(across)
     d_beta = alpha * across - along * beta
     sigma = square_of(beta)
     h = 2 * (square_of(d_alpha) + square_of(d_beta)) + mu * (1 - 2 * sigma)
     a = 0.5 * (3 * mu - h)
     b = -mu * (square_of(d_beta) + sigma * (mu * sigma - a))  # of second order in a small tilt
-    g_alpha = mu * (jnp.conj(alpha) * d_alpha).imag
-    g_beta = -mu * (jnp.conj(beta) * d_beta).imag
-    mu, a, b, g_alpha, g_beta = materialize(mu, a, b, g_alpha, g_beta)
+    plus, less = (jnp.conj(alpha) * d_alpha).imag, (jnp.conj(beta) * d_beta).imag
+    kept = mu, a, b, _, g = materialize(mu, a, b, mu * plus, -mu * less)
 
     # Over the fourth power of the fastest rate the square of q is zero on the separatrix.
-    root = jax.lax.stop_gradient(_largest_root(a, b, g_beta * g_beta))
+    root = jax.lax.stop_gradient(_largest_root(a, b, g * g))
     stretch = b + root * (2 * a + 3 * root)
     nutates = stretch > _ON_SEPARATRIX[size] * (a + 3 * root) ** 2 + _SLOWEST[size]
-    example = (1.0, 1.0, 1.0, 1.0, 3**0.5, 3**0.5)
-    mu_, x, a_, b_, g_alpha_, g_beta_ = (
-        jnp.where(nutates, value, other)
-        for value, other in zip((mu, root, a, b, g_alpha, g_beta), example, strict=True)
-    )
-    x, q, period = _nutation(x, a_, b_, g_beta_)
-    _, w_alpha, w_beta = _elapsed(mu_, a_, b_, g_alpha_, g_beta_, 0.25 * period)
-    r = jnp.sqrt(2 * q + a_ + 3 * x)
-    advance_alpha = 4 * g_alpha_ * w_alpha + 2 * jnp.arctan(g_alpha_ / (r * (x + mu_)))
-    # The same for beta, which is 0 / 0 where the largest root is zero: then its complement.
-    wide = jax.lax.stop_gradient(r * x > jnp.abs(g_beta_))
-    last = jnp.where(wide, g_beta_, -g_beta_ * r) / jnp.where(wide, r * x, b_ + x * (a_ + x))
-    advance_beta = 4 * g_beta_ * w_beta + 2 * jnp.arctan(last)
-    x, period, advance_alpha, advance_beta = materialize(x, period, advance_alpha, advance_beta)
-    return Invariants(
-        unit, omega[2], spin, hangs, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
-        nutates, x, period, advance_alpha, advance_beta, wide,
-    )  # fmt: skip
+    nutation = _whole_nutation(*harmless(nutates, (root, *kept)))
+    start = alpha, d_alpha, beta, d_beta
+    return Invariants(unit, omega3, spin, hangs, start, (plus, less), kept, nutates, *nutation)
 
 
 def _turn(angle: Array) -> Array:
@@ -263,96 +220,62 @@ def _times(x: Array, y: Array) -> Array:
     return jax.lax.complex(x * y.real, x * y.imag)
 
 
-def _beta_after(
-    beta: Array, d_beta: Array, kept: Components, s: Array, slope: Array, turn: Array
-) -> tuple[Array, Array]:
-    """The component beta of the attitude and its rate after the time elapsed, from these."""
-    mu, a, b, _, g = kept
-    z, sigma = s * s, square_of(beta)
-    n = 1 + mu * sigma * z
-    lift = g * s * z
-    bend = (2 / n) * (a - mu * sigma + z * (b - g * g * z)) - a
-    twist = (2 / n) * (g * s * slope)
-    factor = _times(1 / n, turn)
-    moved = beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)
-    rate = d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
-    return factor * moved, factor * (rate + beta * jax.lax.complex(s * bend, -s * twist))
+def _carried(x: Components, kept: Components, s: Array, slope: Array) -> Components:
+    """Alpha, beta and their rates after the time elapsed, from these, without their turns.
 
-
-def _alpha_after(
-    start: tuple[Array, ...], kept: Components, s: Array, slope: Array, turn: Array
-) -> tuple[Array, Array]:
-    """The same for alpha, by functions of beta's, which tell how near to upright it comes."""
-    alpha, beta, d_alpha, d_beta = start
+    Those of alpha by functions of beta's, which tell how near to upright it comes.
+    """
+    alpha, d_alpha, beta, d_beta = x
     mu, a, b, g_alpha, g_beta = kept
     z, sigma, rho = s * s, square_of(beta), square_of(alpha)
+    n, rise = 1 + mu * sigma * z, 1 + mu * z
+    bend = (2 / n) * (a - mu * sigma + z * (b - g_beta * g_beta * z)) - a
+    lift, twist = g_beta * s * z, (2 / n) * (g_beta * s * slope)
+    moved = beta * jax.lax.complex(slope, -lift) + _times(s, d_beta)
+    rate = d_beta * jax.lax.complex(slope * (2 / n - 1), lift)
+    rate = rate + beta * jax.lax.complex(s * bend, -s * twist)
+
     turning = (jnp.conj(alpha) * d_alpha).imag  # g_alpha / mu
+    along = jnp.conj(beta) * d_beta  # its imaginary part -g_beta / mu
     # The drift alpha' - i turning alpha, of second order in a small tilt.
-    upper = jax.lax.stop_gradient(rho > 0.5)
-    small = jax.lax.complex(-(jnp.conj(beta) * d_beta).real, turning * sigma)
-    drift = jnp.where(
-        upper,
-        alpha * _times(1 / jnp.where(upper, rho, 1.0), small),
-        d_alpha - alpha * jax.lax.complex(jnp.zeros_like(turning), turning),
-    )
-    n = 1 + mu * sigma * z
-    rise = 1 + mu * z
-    side = (jnp.conj(beta) * d_beta).imag  # -g_beta / mu
-    bend = (2 / n) * (a - mu * sigma + z * (b - g_beta * g_beta * z))
-    bend = bend - mu - a - z * (b + mu * side * side)
-    factor = _times(1 / (n * jnp.sqrt(rise)), turn)
-    moved = alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, drift)
-    rate = alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
-    rate = rate + drift * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
-    return factor * moved, factor * rate
+    upper = rho > 0.5
+    small = _times(1 / jnp.where(upper, rho, 1.0), jax.lax.complex(-along.real, turning * sigma))
+    still = jax.lax.complex(jnp.zeros_like(turning), turning)
+    drift = jnp.where(upper, alpha * small, d_alpha - alpha * still)
+    bend = bend - mu - z * (b + mu * along.imag * along.imag)
+    risen = alpha * jax.lax.complex(slope, turning * s) + _times(s * rise, drift)
+    gain = alpha * jax.lax.complex(s * bend, turning * slope * (2 / n - 1))
+    gain = gain + drift * jax.lax.complex(slope * (2 * rise / n - 1), g_alpha * s * z)
+    factor = 1 / (n * jnp.sqrt(rise))
+    return _times(factor, risen), _times(factor, gain), _times(1 / n, moved), _times(1 / n, rate)
 
 
 def state_after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:
     """Attitude and angular velocity after a time t [s]."""
-    (
-        unit, omega3, _, hangs, (alpha, beta, d_alpha, d_beta), mu, a, b, g_alpha, g_beta,
-        nutates, _, period, advance_alpha, advance_beta, wide,
-    ) = motion  # fmt: skip
-    t = t * unit
-    whole = jnp.where(nutates, jnp.round(jax.lax.stop_gradient(t / period)), 0.0)
-    h = 0.5 * (t - whole * jnp.where(nutates, period, 0.0))
-    longest = _LONGEST_PHASE[jnp.dtype(t.dtype).itemsize]
-    reach = jax.lax.stop_gradient(a) * h * h
-    beyond = ~nutates & (reach > longest * longest)
-    stop = jnp.where(beyond, h * (longest / jnp.sqrt(jnp.where(beyond, reach, 1.0))), h)
-    s, w_alpha, w_beta = _elapsed(mu, a, b, g_alpha, g_beta, stop)
+    mu, a, b, g_alpha, g_beta = motion.kept
+    phase = t * motion.unit
+    whole = jnp.where(motion.nutates, jnp.round(phase / motion.period), 0.0)
+    h = 0.5 * (phase - whole * motion.period)
+    growth = root_of_positive(jax.lax.stop_gradient(jnp.where(motion.nutates, 0.0, a)))
+    longest = _LONGEST_PHASE[jnp.dtype(t.dtype).itemsize] / growth
+    stop = jnp.clip(h, -longest, longest)
+    s, w_alpha, w_beta = _elapsed(*motion.kept, stop)
     z = s * s
-    slope = _slope(a, b, g_beta, z)
-    w_alpha = w_alpha + jnp.where(beyond, z / (1 + mu * z) * (h - stop), 0.0)
-    s, slope, w_alpha, w_beta = materialize(s, slope, w_alpha, w_beta)
-    turn_alpha, turn_beta = materialize(_turn(g_alpha * w_alpha), _turn(g_beta * w_beta))
-    kept = mu, a, b, g_alpha, g_beta
-
-    def half(_: Any, x: Components) -> Components:
-        alpha, d_alpha, beta, d_beta = x
-        return (
-            *_alpha_after((alpha, beta, d_alpha, d_beta), kept, s, slope, turn_alpha),
-            *_beta_after(beta, d_beta, kept, s, slope, turn_beta),
-        )
-
-    alpha, d_alpha, beta, d_beta = jax.lax.fori_loop(0, 2, half, (alpha, d_alpha, beta, d_beta))
+    w_alpha = w_alpha + z / (1 + mu * z) * (h - stop)
+    s, slope, w_alpha, w_beta = materialize(s, _slope(a, b, g_beta, z), w_alpha, w_beta)
+    carry = partial(_carried, kept=motion.kept, s=s, slope=slope)
+    alpha, d_alpha, beta, d_beta = jax.lax.fori_loop(0, 2, lambda _, x: carry(x), motion.start)
     across = jnp.conj(alpha) * d_beta - beta * jnp.conj(d_alpha)
-    across = across + across
-    advance_alpha = advance_alpha + jnp.pi
-    advance_beta = advance_beta + jnp.where(wide, jnp.pi, 0.0)
-    turn_alpha, turn_beta = _turn(whole * advance_alpha), _turn(whole * advance_beta)
-    alpha, beta, across = (
-        alpha * turn_alpha,
-        beta * turn_beta,
-        across * turn_beta * jnp.conj(turn_alpha),
+    # The turns, and that of the body against the spherical top.
+    slip = 0.5 * (motion.omega3 - motion.spin) * t
+    angle_alpha = 2 * g_alpha * w_alpha + whole * (motion.advance_alpha + jnp.pi) + slip
+    angle_beta = 2 * g_beta * w_beta + whole * (motion.advance_beta + motion.half_turn) - slip
+    turn_alpha, turn_beta = materialize(_turn(angle_alpha), _turn(angle_beta))
+    across = _times(2 * motion.unit, across * turn_beta * jnp.conj(turn_alpha))
+    alpha, beta = alpha * turn_alpha, beta * turn_beta
+    upside_down = jnp.conj(beta), -jnp.conj(alpha)
+    alpha, beta = (
+        jnp.where(motion.hangs, *x) for x in zip(upside_down, (alpha, beta), strict=True)
     )
-    # Back to the axis as it was, and to the body.
-    (q0, q1), (q2, q3) = (alpha.real, beta.real), (beta.imag, alpha.imag)
-    q = [jnp.where(hangs, x, y) for x, y in ((q1, q0), (-q0, q1), (-q3, q2), (q2, q3))]
-    across = jnp.where(hangs, jnp.conj(across), across)
-    alpha, beta = jax.lax.complex(q[0], q[3]), jax.lax.complex(q[1], q[2])
-    turn = _turn(0.5 * motion.slip * t)
-    alpha, beta, across = alpha * turn, beta * jnp.conj(turn), across * jnp.conj(turn * turn)
     q = jnp.stack([alpha.real, beta.real, beta.imag, alpha.imag])
-    q = q / jnp.sqrt(jnp.sum(q * q))
-    return q, jnp.stack([unit * across.real, unit * across.imag, omega3])
+    return q / jnp.sqrt(jnp.sum(q * q)), jnp.stack([across.real, across.imag, motion.omega3])

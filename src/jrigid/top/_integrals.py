@@ -8,20 +8,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import (
-    all_finite,
-    check_option,
-    check_type,
-    float_arrays,
-    is_inertia,
-    is_unit,
-    where_defined,
-)
+from jrigid._checks import all_finite, check_option, check_type, is_inertia, is_unit, where_defined
+from jrigid._motion import plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.rotation import rotate_inverse
 from jrigid.systems import RigidBody
+from jrigid.top._flow import square_of
 from jrigid.torques import UniformGravity
 
 Case = Literal["euler", "lagrange", "kovalevskaya", "goryachev-chaplygin"]
@@ -80,21 +74,17 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
     """
     check_type("body", body, RigidBody)
     check_type("body.torque", body.torque, UniformGravity)
-    check_type("state", state, State)
-    if case is not None:
-        check_option("case", case, get_args(Case))
-        if body.inertia.ndim != 1:
-            raise ValueError(
-                "Argument `body` must have principal moments where a case is asked for, but it has "
-                "a tensor."
-            )
-    leaves, structure = jtu.tree_flatten((body.inertia, body.torque, state))
-    arguments = jtu.tree_unflatten(structure, float_arrays(*leaves))
-    inertia, gravity, state = arguments
+    check_option("case", case, (None, *get_args(Case)))
+    if case is not None and body.inertia.ndim != 1:
+        raise ValueError(
+            "Argument `body` must have principal moments where a case is asked for, but it has a "
+            "tensor."
+        )
+    pull, structure = jtu.tree_flatten(body.torque)
+    state, (inertia, *pull) = plain_state("state", state, body.inertia, *pull)
+    arguments = inertia, structure.unflatten(pull), state
     ok = is_inertia(inertia) & all_finite(arguments) & is_unit(state.attitude)
-    ok = ok & (gravity.mass >= 0)
-    if case is not None:
-        ok = ok & _is_of_case(case, *jax.lax.stop_gradient(arguments))
+    ok = ok & _is_of_case(case, *jax.lax.stop_gradient(arguments))
     return where_defined(ok, partial(_integrals, case), *arguments)
 
 
@@ -108,34 +98,34 @@ def _integrals(
     momentum = angular_momentum(inertia, state.omega)
     energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
     rate = gravity.mass * strength / inertia[2]
-    (w1, w2, w3), (x, y, _) = state.omega, gravity.lever
+    w, c, g = (jax.lax.complex(*x[:2]) for x in (state.omega, rate * gravity.lever, up))
     extra = None
     if case == "euler":
         extra = product("i,i->", momentum, momentum)
     elif case == "lagrange":
         extra = momentum[2]
     elif case == "kovalevskaya":
-        real = w1 * w1 - w2 * w2 - rate * (x * up[0] - y * up[1])
-        imaginary = 2 * w1 * w2 - rate * (x * up[1] + y * up[0])
-        extra = real * real + imaginary * imaginary
+        extra = square_of(w * w - c * g)
     elif case == "goryachev-chaplygin":
-        extra = w3 * (w1 * w1 + w2 * w2) - rate * up[2] * (x * w1 + y * w2)
+        extra = state.omega[2] * square_of(w) - up[2] * (jnp.conj(c) * w).real
     return Integrals(energy, product("i,i->", momentum, up), extra)
 
 
-def _is_of_case(case: Case, inertia: Array, gravity: UniformGravity, state: State) -> Array:
+def _is_of_case(case: Case | None, inertia: Array, gravity: UniformGravity, state: State) -> Array:
+    def vanishes(x: Array, beside: Array) -> Array:
+        tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
+        return jnp.max(jnp.abs(x)) <= tolerance * jnp.max(jnp.abs(beside))
+
     i1, i2, i3 = inertia
-    tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
-    length = jnp.max(jnp.abs(gravity.lever))
+    of_case = gravity.mass >= 0
     if case == "euler":
-        return gravity.mass * safe_norm(gravity.gravity) * length == 0
-    symmetric = jnp.abs(i1 - i2) <= tolerance * i1
-    across, along = jnp.max(jnp.abs(gravity.lever[:2])), jnp.abs(gravity.lever[2])
-    if case == "lagrange":
-        return symmetric & (across <= tolerance * length)
-    of_ratio = jnp.abs(i1 - _RATIOS[case] * i3) <= tolerance * i1
-    of_case = symmetric & of_ratio & (along <= tolerance * length)
-    if case == "kovalevskaya":
-        return of_case
-    vertical = jnp.abs(_integrals(None, inertia, gravity, state).vertical_momentum)
-    return of_case & (vertical <= tolerance * jnp.max(jnp.abs(inertia * state.omega)))
+        of_case &= gravity.mass * safe_norm(gravity.gravity) * safe_norm(gravity.lever) == 0
+    elif case is not None:
+        off = gravity.lever[:2] if case == "lagrange" else gravity.lever[2]
+        of_case &= vanishes(i1 - i2, i1) & vanishes(off, gravity.lever)
+    if case in _RATIOS:
+        of_case &= vanishes(i1 - _RATIOS[case] * i3, i1)
+    if case == "goryachev-chaplygin":
+        vertical = _integrals(None, inertia, gravity, state).vertical_momentum
+        of_case &= vanishes(vertical, inertia * state.omega)
+    return of_case

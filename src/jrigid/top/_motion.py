@@ -1,29 +1,15 @@
 """top_motion(): the state of Lagrange's top at any times."""
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    check_shape,
-    harmless,
-    is_unit,
-    nan_where,
-    settle,
-)
-from jrigid._motion import resolves
-from jrigid._numerics import safe_norm
-from jrigid._types import Real, ScalarLike
+from jrigid._checks import RESULTS, Findings, check_type
+from jrigid._motion import exact_motion, plain_state
+from jrigid._types import Quaternion, Real, Scalar, ScalarLike, Vector
 from jrigid.dynamics import ExactStates, State
 from jrigid.top._flow import invariants, state_after
-from jrigid.top._top import SymmetricTop, top_and_state
-
-_BAD_TIMES = "Argument `ts` must be finite, but it is not."
-_BAD_START = "Argument `t0` must be finite, but it is not."
+from jrigid.top._top import SymmetricTop
 
 
 def top_motion(
@@ -66,31 +52,15 @@ def top_motion(
     >>> print(motion.omega.shape, motion.omega[1].round(4))
     (3, 3) [-0.3481  0.2425  5.    ]
     """
-    _, top, state0, (ts, t0) = top_and_state("state0", top, state0, ts, t0)
-    check_shape("t0", t0, ())
-    return settle(_motion(top, state0, ts, t0), throw, lambda: _findings(top, state0, ts, t0))
+    check_type("top", top, SymmetricTop)
+    numbers = top.I1, top.I3, top.mgl, ts, t0
+    state0, (i1, i3, mgl, ts, t0) = plain_state("state0", state0, *numbers)
+    return exact_motion(_check, _flow, throw, SymmetricTop(i1, i3, mgl), state0, ts, t0)
 
 
-def _findings(top: SymmetricTop, state0: State, ts: Array, t0: Array) -> Findings:
-    findings = Findings()
-    numbers = jnp.stack(jtu.tree_leaves(top))
-    findings.require(top.is_valid, RESULTS.invalid_top, value=numbers)
-    components = jnp.concatenate([state0.attitude, state0.omega])
-    findings.require(all_finite(state0), RESULTS.invalid_state, value=components)
-    findings.require(is_unit(state0.attitude), RESULTS.invalid_attitude, value=state0.attitude)
-    findings.require(all_finite(ts), RESULTS.invalid_times, _BAD_TIMES, jnp.sum(ts))
-    findings.require(all_finite(t0), RESULTS.invalid_times, _BAD_START, t0)
-    told_apart = resolves(t0, safe_norm(state0.omega))
-    findings.require(told_apart, RESULTS.unresolved_times, value=t0)
-    return findings
+def _check(findings: Findings, top: SymmetricTop) -> None:
+    findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(jtu.tree_leaves(top)))
 
 
-@jax.jit
-def _motion(top: SymmetricTop, state0: State, ts: Array, t0: Array) -> ExactStates:
-    findings = _findings(top, state0, ts, t0)
-    top, state0, times = harmless(findings.ok, (top, state0, ts - t0))
-    kept = invariants(top, state0)
-    states = jax.vmap(lambda t: state_after(kept, t))(times.reshape(-1))
-    states = jtu.tree_map(lambda x: x.reshape(*ts.shape, x.shape[-1]), State(*states))
-    findings.require(all_finite(states), RESULTS.nonfinite_state)
-    return ExactStates(nan_where(~findings.ok, states), findings.result)
+def _flow(top: SymmetricTop, state0: State, t: Scalar) -> tuple[Quaternion, Vector]:
+    return state_after(invariants(top, state0), t)

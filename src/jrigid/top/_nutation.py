@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._checks import Enumeration, where_defined
-from jrigid._numerics import safe_arctan2
+from jrigid._checks import Enumeration
+from jrigid._numerics import root_of_positive, safe_arctan2, safe_norm
 from jrigid._types import Scalar
 from jrigid.dynamics import State
 from jrigid.top._flow import Invariants, invariants, square_of
-from jrigid.top._top import Answer, SymmetricTop, top_and_state
+from jrigid.top._top import Answer, SymmetricTop, of_motion
 
 
 class CLASSES(Enumeration):
@@ -42,84 +42,51 @@ class Advance(NamedTuple):
     psi: Scalar
 
 
-def _of_motion(formula: Callable[[Invariants], Answer], top: SymmetricTop, state: State) -> Answer:
+def _of_invariants(
+    formula: Callable[[Invariants], Answer], top: SymmetricTop, state: State
+) -> Answer:
     """A formula of the invariants; NaN where the top or the state is not valid."""
-    ok, top, state, _ = top_and_state("state", top, state)
-    return where_defined(ok, lambda top, state: formula(invariants(top, state)), top, state)
+    return of_motion(lambda top, state: formula(invariants(top, state)), top, state)
 
 
-class _Bounds(NamedTuple):
-    """|beta|^2 = (1 - cos tilt) / 2 and |alpha|^2 at the bounds; mgl < 0: of the axis reversed."""
+def _bounds(motion: Invariants) -> tuple[Array, Array, Array]:
+    """At the least and at the largest tilt |beta|^2 = (1 - cos tilt) / 2 and |alpha|^2; the spread.
 
-    beta_low: Array
-    beta_high: Array
-    alpha_low: Array
-    alpha_high: Array
-    spread: Array
-
-
-def _bounds(motion: Invariants) -> _Bounds:
-    """From the smaller of the two squares, x, which keeps its relative accuracy.
-
-    (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of the exact flow.
+    For mgl < 0 of the motion upside down. From the smaller of the two squares, x, which keeps its
+    relative accuracy: (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of the
+    exact flow.
     """
-    alpha, beta, d_alpha, d_beta = motion.start
+    alpha, d_alpha, beta, d_beta = motion.start
+    mu, a, *_ = motion.kept
     hanging = square_of(alpha) < square_of(beta)
     x, dx = jnp.where(hanging, alpha, beta), jnp.where(hanging, d_alpha, d_beta)
-    m = jnp.where(hanging, motion.mu, -motion.mu)
-    a = jnp.where(hanging, motion.a - 3 * motion.mu, motion.a)
+    m, c = jnp.where(hanging, mu, -mu), jnp.where(hanging, a - 3 * mu, a)
     now = square_of(x)
-    slope = square_of(dx) + now * (a + 2 * m * now)  # zero in steady motion
-    front = motion.mu * square_of(beta) + jnp.where(motion.nutates, motion.root, 0.0)
+    slope = square_of(dx) + now * (c + 2 * m * now)  # zero in steady motion
+    root = jnp.where(motion.nutates, motion.root, 0.0)
+    front = mu * square_of(beta) + root
     # Upright at the separatrix: from there to -mu x^2 + a x = 0.
     plain = front > 0
     front = jnp.where(plain, front, 1.0)
-    speed = (jnp.conj(x) * dx).real / jnp.sqrt(front)
-    skew = slope / front + m * (speed / jnp.sqrt(front)) * (speed / jnp.sqrt(front))
-    fall = jnp.maximum(a, 0.0) / jnp.where(motion.mu > 0, motion.mu, 1.0)
-    skew = jnp.where(plain, skew, jnp.where(motion.mu > 0, fall, 0.0))
-    speed = jnp.where(plain, speed, 0.0)
-    # A length without underflow, and at a double root zero without a derivative.
-    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(skew), jnp.abs(speed)))
-    distinct = size > 0
-    size = jnp.where(distinct, size, 1.0)
-    square = (skew / size) ** 2 + 4 * (speed / size) ** 2
-    spread = jnp.where(distinct, size * jnp.sqrt(jnp.where(distinct, square, 1.0)), 0.0)
+    speed = jnp.where(plain, (jnp.conj(x) * dx).real / jnp.sqrt(front), 0.0)
+    fall = jnp.maximum(a, 0.0) / jnp.where(mu > 0, mu, 1.0)
+    skew = jnp.where(plain, slope / front + m * (speed * (speed / front)), fall)
+    spread = safe_norm(jnp.stack([skew, 2 * speed]))
     # Without cancellation at the near end.
     far = 0.5 * (jnp.abs(skew) + spread)
-    near = speed * (speed / jnp.where(distinct, far, 1.0))
+    near = speed * (speed / jnp.where(spread > 0, far, 1.0))
     low = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
     high = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
-    beta_low, beta_high = jnp.where(hanging, 1 - high, low), jnp.where(hanging, 1 - low, high)
-    alpha_low, alpha_high = jnp.where(hanging, low, 1 - high), jnp.where(hanging, high, 1 - low)
-    return _Bounds(
-        _nearest(motion, beta, d_beta, 0.0, beta_low, beta_high),
-        beta_high,
-        _nearest(motion, alpha, d_alpha, 1.0, alpha_low, alpha_high),
-        alpha_high,
-        spread,
-    )
-
-
-def _nearest(
-    motion: Invariants, x: Array, dx: Array, at_zero: float, low: Array, high: Array
-) -> Array:
-    """The lower bound of |x|^2 where it is far below the upper one, with its relative accuracy.
-
-    At x = 0 the slope's square is -J^2, of the constant momentum J = Im(x* dx/dt).
-    """
-    front = jnp.where(motion.nutates, motion.root, 0.0) + at_zero * motion.mu
-    # Roots of a smaller size carry rounding of the larger numbers they come from.
-    sound = motion.nutates & (front > 0.01 * motion.mu) & (front > 0) & (low < 0.25 * high)
-    momentum = (jnp.conj(x) * dx).imag
-    of_root = momentum * (momentum / jnp.where(sound, front, 1.0))
-    return jnp.where(sound, of_root / jnp.where(sound, high, 1.0), low)
-
-
-def _tilt(of_beta: Array, of_alpha: Array) -> Array:
-    inside = (of_beta > 0) & (of_alpha > 0)
-    roots = (jnp.sqrt(jnp.where(inside, x, 0.5)) for x in (of_beta, of_alpha))
-    return jnp.where(inside, 2 * safe_arctan2(*roots), jnp.where(of_beta > 0, jnp.pi, 0.0))
+    low, high = jnp.stack([low, 1 - high]), jnp.stack([high, 1 - low])
+    low, high = (jnp.where(hanging, y[::-1], y) for y in (low, high))  # of beta and of alpha
+    # Where the lower bound is far below the upper one, with its relative accuracy: at x = 0 the
+    # slope's square is -J^2, of the constant momentum J. Roots of a smaller size carry rounding of
+    # the larger numbers they come from.
+    front, momenta = jnp.stack([root, root + mu]), jnp.stack(motion.momenta[::-1])
+    sound = motion.nutates & (front > 0.01 * mu) & (front > 0) & (low < 0.25 * high)
+    of_root = momenta * (momenta / jnp.where(sound, front, 1.0))
+    low = jnp.where(sound, of_root / jnp.where(sound, high, 1.0), low)
+    return jnp.stack([low[0], high[0]]), jnp.stack([high[1], low[1]]), spread
 
 
 def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
@@ -144,13 +111,11 @@ def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
     """
 
     def tilts(motion: Invariants) -> NutationBounds:
-        squares = _bounds(motion)
-        low = _tilt(squares.beta_low, squares.alpha_high)
-        high = _tilt(squares.beta_high, squares.alpha_low)
-        least = jnp.where(motion.hangs, jnp.pi - high, low)
-        return NutationBounds(least, jnp.where(motion.hangs, jnp.pi - low, high))
+        of_beta, of_alpha, _ = _bounds(motion)
+        both = 2 * safe_arctan2(root_of_positive(of_beta), root_of_positive(of_alpha))
+        return NutationBounds(*jnp.where(motion.hangs, jnp.pi - both[::-1], both))
 
-    return _of_motion(tilts, top, state)
+    return _of_invariants(tilts, top, state)
 
 
 def nutation_period(top: SymmetricTop, state: State) -> Scalar:
@@ -173,21 +138,16 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     >>> print(jr.top.nutation_period(top, state).round(5))
     3.51772
     """
-    return _of_motion(lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state)
-
-
-def _side(x: Array, dx: Array) -> Array:
-    """Sign of the sense in which a complex number turns."""
-    return jnp.sign((jnp.conj(x) * dx).imag)
+    return _of_invariants(lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state)
 
 
 def _advance(motion: Invariants) -> Advance:
-    alpha, beta, d_alpha, d_beta = motion.start
-    of_alpha = motion.advance_alpha + jnp.pi * _side(alpha, d_alpha)
-    of_beta = motion.advance_beta + jnp.where(motion.wide, jnp.pi * _side(beta, d_beta), 0.0)
-    spin = jnp.where(motion.hangs, of_beta - of_alpha, of_alpha - of_beta)
-    advance = of_alpha + of_beta, spin + motion.slip * motion.period
-    return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in advance))
+    plus, less = motion.momenta
+    of_alpha = motion.advance_alpha + jnp.pi * jnp.sign(plus)
+    of_beta = motion.advance_beta + motion.half_turn * jnp.sign(less)
+    phi = jnp.where(motion.hangs, -1.0, 1.0) * (of_alpha + of_beta)
+    psi = of_alpha - of_beta + (motion.omega3 - motion.spin) / motion.unit * motion.period
+    return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in (phi, psi)))
 
 
 def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
@@ -210,7 +170,7 @@ def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
     >>> print(jr.top.advance_per_nutation(top, state).phi.round(5))
     1.62782
     """
-    return _of_motion(_advance, top, state)
+    return _of_invariants(_advance, top, state)
 
 
 def mean_precession(top: SymmetricTop, state: State) -> Scalar:
@@ -238,7 +198,7 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
         mean = motion.unit * _advance(motion).phi / motion.period
         return jnp.where(motion.nutates, mean, endless)
 
-    return _of_motion(rate, top, state)
+    return _of_invariants(rate, top, state)
 
 
 def motion_class(top: SymmetricTop, state: State) -> CLASSES:
@@ -267,40 +227,32 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     >>> print(jr.top.CLASSES[kind], kind == jr.top.CLASSES.cusp)
     cusp True
     """
-    ok, top, state, _ = top_and_state("state", top, state)
-    motion = jax.lax.stop_gradient(invariants(top, state))
-    alpha, beta, d_alpha, d_beta = motion.start
-    beta_low, beta_high, alpha_low, alpha_high, spread = _bounds(motion)
+    motion = jax.lax.stop_gradient(_of_invariants(lambda motion: motion, top, state))
+    alpha, d_alpha, beta, d_beta = motion.start
+    plus, less = motion.momenta  # about the vertical and the axis, added and subtracted
+    of_beta, of_alpha, spread = _bounds(motion)
     eps = jnp.finfo(spread.dtype).eps
     tolerance = 4096 * eps
-    # Momenta about the vertical and the axis, less and plus, over 4 I1
-    plus, less = (jnp.conj(alpha) * d_alpha).imag, (jnp.conj(beta) * d_beta).imag
-    size = jnp.maximum(jnp.abs(plus), jnp.abs(less))
-    rate = jnp.sqrt(motion.mu + square_of(d_alpha) + square_of(d_beta))
+    rate = jnp.sqrt(motion.kept[0] + square_of(d_alpha) + square_of(d_beta))
     rate = jnp.where(rate > 0, rate, 1.0)
-
-    def sense(of_beta: Array, of_alpha: Array) -> Array:
-        """Sign of phi' sin^2 / 4 = plus |beta|^2 + less |alpha|^2, 0 to rounding."""
-        parts = plus * of_beta, less * of_alpha
-        scale = jnp.abs(parts[0]) + jnp.abs(parts[1])
-        total = parts[0] + parts[1]
-        return jnp.where(jnp.abs(total) <= tolerance * scale, 0.0, jnp.sign(total))
-
-    turns = sense(beta_low, alpha_high) * sense(beta_high, alpha_low)
-    vertical = (beta_low <= tolerance * beta_high) | (alpha_low <= tolerance * alpha_high)
-    upright, hanging = (
-        square_of(x) + square_of(dx) / rate**2 <= (4 * eps) ** 2
-        for x, dx in ((beta, d_beta), (alpha, d_alpha))
-    )
+    pairs = (alpha, d_alpha), (beta, d_beta)
+    away = jnp.minimum(*(rate**2 * square_of(x) + square_of(dx) for x, dx in pairs))
+    # phi' sin^2 / 4 at both bounds, 0 to rounding
+    turning = plus * of_beta + less * of_alpha
+    rounding = tolerance * (jnp.abs(plus * of_beta) + jnp.abs(less * of_alpha))
+    turns = jnp.prod(jnp.where(jnp.abs(turning) <= rounding, 0.0, jnp.sign(turning)))
+    vertical = (of_beta[0] <= tolerance * of_beta[1]) | (of_alpha[1] <= tolerance * of_alpha[0])
+    widest = of_beta[1] * of_alpha[0]
+    momentum = jnp.maximum(jnp.abs(plus), jnp.abs(less))
     kind = CLASSES.wave
     for holds, other in (
         (turns < 0, CLASSES.loop),
         (turns == 0, CLASSES.cusp),
         (vertical, CLASSES.through_the_vertical),
-        (size <= tolerance * rate * beta_high * alpha_high, CLASSES.pendulum),
-        (spread <= tolerance * beta_high * alpha_high, CLASSES.steady),
-        (upright | hanging, CLASSES.sleeping),
-        (~ok, CLASSES.undefined),
+        (momentum <= tolerance * rate * widest, CLASSES.pendulum),
+        (spread <= tolerance * widest, CLASSES.steady),
+        (away <= (4 * eps * rate) ** 2, CLASSES.sleeping),
+        (jnp.isnan(motion.unit), CLASSES.undefined),
     ):
         kind = CLASSES.where(holds, other, kind)
     return kind

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import check_shape, check_type, float_arrays, where_defined
+from jrigid._checks import check_type, float_arrays, shaped
 from jrigid._numerics import product
 from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import rotate_inverse
-from jrigid.top._top import SymmetricTop, top_and_state, where_valid
+from jrigid.top._top import SymmetricTop, of_motion, where_valid
 
 
 class Conserved(NamedTuple):
@@ -56,9 +56,8 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     0.5
     """
     check_type("top", top, SymmetricTop)
-    i1, i3, mgl, q, q_dot = float_arrays(top.I1, top.I3, top.mgl, q, q_dot)
-    check_shape("q", q, (3,))
-    check_shape("q_dot", q_dot, (3,))
+    own = {name: (value,) for name, value in vars(top).items()}
+    i1, i3, mgl, q, q_dot = shaped(**own, q=(q, 3), q_dot=(q_dot, 3))
     _, theta, _ = q
     phi_dot, theta_dot, psi_dot = q_dot
     cos, sin = jnp.cos(theta), jnp.sin(theta)
@@ -92,8 +91,7 @@ def conserved(top: SymmetricTop, state: State) -> Conserved:
         energy = 0.5 * product("i,i->", momentum, state.omega) + top.mgl * up[2]
         return Conserved(product("i,i->", momentum, up), momentum[2], energy)
 
-    ok, top, state, _ = top_and_state("state", top, state)
-    return where_defined(ok, constants, top, state)
+    return of_motion(constants, top, state)
 
 
 def _over(momentum: Array, side: Array) -> Array:
@@ -102,9 +100,8 @@ def _over(momentum: Array, side: Array) -> Array:
     return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
 
 
-def _angle_rates(i1: Array, i3: Array, mgl: Array, theta: Array, *momenta: Array) -> AngleRates:
-    del mgl
-    p_phi, p_psi = momenta
+def _angle_rates(*numbers: Array) -> AngleRates:
+    i1, i3, _, theta, p_phi, p_psi = numbers
     # The parts that are large near upright and near upside down, by half the angle.
     sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
     upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
@@ -166,17 +163,15 @@ def effective_potential(
     0.5
     """
 
-    def potential(i1: Array, _: Array, mgl: Array, theta: Array, *momenta: Array) -> Array:
-        p_phi, p_psi = momenta
+    def potential(*numbers: Array) -> Array:
+        i1, _, mgl, theta, p_phi, p_psi = numbers
         sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
         # (p_phi - p_psi cos theta) / sin theta
         across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
         return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
 
-    def at_tilt(theta: Array) -> Array:
-        return where_valid(potential, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
-
-    return jnp.vectorize(at_tilt)(theta)
+    momenta = {"p_phi": p_phi, "p_psi": p_psi}
+    return jnp.vectorize(lambda theta: where_valid(potential, top, theta=theta, **momenta))(theta)
 
 
 def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
@@ -200,8 +195,8 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
     [ 4. -6.  0.  1.]
     """
 
-    def coefficients(i1: Array, i3: Array, mgl: Array, *constants: Array) -> Array:
-        p_phi, p_psi, energy = constants
+    def coefficients(*numbers: Array) -> Array:
+        i1, i3, mgl, p_phi, p_psi, energy = numbers
         alpha = (2 * energy - p_psi * p_psi / i3) / i1
         beta, a, b = 2 * mgl / i1, p_psi / i1, p_phi / i1
         return jnp.stack([beta, -alpha - a * a, 2 * a * b - beta, alpha - b * b])

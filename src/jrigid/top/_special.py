@@ -10,10 +10,10 @@ from jrigid._checks import (
     RESULTS,
     Findings,
     check_option,
-    check_shape,
     check_type,
-    float_arrays,
     harmless,
+    nan_where,
+    shaped,
     where_defined,
 )
 from jrigid._numerics import root_of_positive
@@ -85,7 +85,7 @@ def _steady(
     fast = jnp.where(level, jnp.where(total < 0, -jnp.inf, jnp.inf), fast)
     # At the threshold itself the square is zero to rounding only.
     exists = (square >= -8 * eps * momentum * momentum) & (~still | (mgl == 0))
-    return jnp.where(exists, slow, jnp.nan), jnp.where(exists, fast, jnp.nan)
+    return nan_where(~exists, (slow, fast))
 
 
 def steady_precession(
@@ -122,12 +122,10 @@ def steady_precession(
     >>> print(rates.slow.round(6), rates.fast.round(6), rates.exists)
     0.354249 5.645751 True
     """
-    spin = psi_dot if omega3 is None else omega3
-    if spin is None or (omega3 is not None and psi_dot is not None):
+    if (omega3 is None) == (psi_dot is None):
         raise ValueError("One of the arguments `omega3` and `psi_dot` must be given, and one only.")
-    formula = partial(_steady, of_psi=omega3 is None)
-    spins = {"psi_dot" if omega3 is None else "omega3": spin}
-    slow, fast = where_valid(formula, top, theta=theta, **spins)
+    spin = {"psi_dot": psi_dot} if omega3 is None else {"omega3": omega3}
+    slow, fast = where_valid(partial(_steady, of_psi=omega3 is None), top, theta=theta, **spin)
     return SteadyPrecession(slow, fast, ~jnp.isnan(slow))
 
 
@@ -184,10 +182,9 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
         fall = 2 * mgl * i1 * jnp.sin(theta) / (momentum * momentum)
         return Gyroscopic(mgl / momentum, momentum / i1, fall)
 
-    def where_it_spins(*numbers: Array) -> Gyroscopic:
-        return where_defined(numbers[-1] != 0, fast, *numbers)
-
-    return where_valid(where_it_spins, top, theta=theta, omega3=omega3)
+    return where_valid(
+        lambda *x: where_defined(x[-1] != 0, fast, *x), top, theta=theta, omega3=omega3
+    )
 
 
 def initial_state(
@@ -240,25 +237,22 @@ def initial_state(
         raise ValueError("Argument `psi_dot` must be None where `omega3` is given, but it is not.")
     spin_name, spin = ("omega3", omega3) if psi_dot is None else ("psi_dot", psi_dot)
     spin = 0.0 if spin is None else spin
-    branch = phi_dot if isinstance(phi_dot, str) else None
-    if branch is not None:
-        check_option("phi_dot", branch, ("slow", "fast"))
-    given = {"theta": theta, spin_name: spin, "phi_dot": 0.0 if branch else phi_dot}
+    steady = isinstance(phi_dot, str)
+    given = {"theta": theta, spin_name: spin, "phi_dot": 0.0 if steady else phi_dot}
     given |= {"theta_dot": theta_dot, "phi": phi, "psi": psi}
-    numbers = float_arrays(top.I1, top.I3, top.mgl, *given.values())
+    numbers = shaped(**{name: (value,) for name, value in (vars(top) | given).items()})
     findings = Findings()
     findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(numbers[:3]))
     for name, value in zip(given, numbers[3:], strict=True):
-        check_shape(name, value, ())
         good, message = jnp.isfinite(value), f"Argument `{name}` must be finite, but it is not."
         if name == "theta":
             good, message = (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING), _BAD_TILT
         findings.require(good, RESULTS.invalid_state, message, value)
     i1, i3, mgl, theta, spin, rate, theta_dot, phi, psi = harmless(findings.ok, numbers)
-    if branch is not None:
+    if steady:
+        check_option("phi_dot", phi_dot, ("slow", "fast"))
         slow, fast = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
-        rate = slow if branch == "slow" else fast
-        too_slow = _TOO_SLOW.format(spin_name)
+        rate, too_slow = slow if phi_dot == "slow" else fast, _TOO_SLOW.format(spin_name)
         findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
         findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
         rate = harmless(findings.ok, rate)

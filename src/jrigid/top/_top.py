@@ -12,11 +12,10 @@ from jrigid._checks import (
     all_finite,
     all_positive,
     array_of_shape,
-    check_shape,
     check_type,
-    float_arrays,
     harmless,
     is_unit,
+    shaped,
     where_defined,
 )
 from jrigid._motion import plain_state
@@ -96,16 +95,15 @@ class SymmetricTop(Readable):
         check_type("body", body, MassProperties)
         if gravity is None:
             gravity = jnp.array([0.0, 0.0, -_STANDARD_GRAVITY], body.mass.dtype)
-        mass, inertia, lever, gravity = float_arrays(body.mass, body.inertia, lever, gravity)
-        check_shape("lever", lever, (3,))
-        check_shape("gravity", gravity, (3,))
+        mass, inertia, lever, gravity = shaped(
+            mass=(body.mass,), inertia=(body.inertia, 3, 3), lever=(lever, 3), gravity=(gravity, 3)
+        )
         (a, d, e), (_, b, f), (_, _, c) = inertia
         tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
         size = jnp.maximum(a + b + c, mass * lever[2] ** 2)
         symmetric = jnp.max(jnp.abs(jnp.stack([a - b, d, e, f]))) <= tolerance * size
         findings = Findings()
-        shown = jnp.stack([a, b, d, e, f])
-        findings.require(symmetric, None, _NOT_SYMMETRIC, shown)
+        findings.require(symmetric, None, _NOT_SYMMETRIC, jnp.stack([a, b, d, e, f]))
         for value, message in ((lever, _NOT_ON_AXIS), (gravity, _NOT_VERTICAL)):
             off = jnp.max(jnp.abs(value[:2])) > tolerance * jnp.abs(value[2])
             findings.require(all_finite(value) & ~off, None, message, value)
@@ -123,8 +121,7 @@ class SymmetricTop(Readable):
         >>> print(body.inertia, body.torque.lever)
         [1.  1.  0.5] [0. 0. 2.]
         """
-        zero = jnp.zeros_like(self.mgl)
-        lever = jnp.stack([zero, zero, self.mgl])
+        lever = jnp.pad(self.mgl[None], (2, 0))
         gravity = UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
         return RigidBody(jnp.stack([self.I1, self.I1, self.I3]), gravity)
 
@@ -141,18 +138,16 @@ def _scalar(name: str, value: Any) -> Any:
 def where_valid(formula: Callable[..., Answer], top: SymmetricTop, **scalars: Any) -> Answer:
     """A formula of I1, I3, mgl and scalars, in one dtype; NaN where any is outside its domain."""
     check_type("top", top, SymmetricTop)
-    numbers = float_arrays(top.I1, top.I3, top.mgl, *scalars.values())
-    for name, value in zip(scalars, numbers[3:], strict=True):
-        check_shape(name, value, ())
+    numbers = shaped(**{name: (value,) for name, value in (vars(top) | scalars).items()})
     return where_defined(top.is_valid & all_finite(numbers), formula, *numbers)
 
 
-def top_and_state(
-    name: str, top: SymmetricTop, state: State, *others: Any
-) -> tuple[Bool[Array, ""], SymmetricTop, State, tuple[Array, ...]]:
-    """Whether a top and its state are valid; these and other arrays in one dtype."""
+def of_motion(
+    formula: Callable[[SymmetricTop, State], Answer], top: SymmetricTop, state: State
+) -> Answer:
+    """A formula of a top and its state; NaN where one of them is not valid."""
     check_type("top", top, SymmetricTop)
-    state, numbers = plain_state(name, state, top.I1, top.I3, top.mgl, *others)
-    top = SymmetricTop(*numbers[:3])
+    state, numbers = plain_state("state", state, top.I1, top.I3, top.mgl)
+    top = SymmetricTop(*numbers)
     ok = top.is_valid & all_finite(state) & is_unit(state.attitude)
-    return ok, top, state, numbers[3:]
+    return where_defined(ok, formula, top, state)

@@ -5,7 +5,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -13,14 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    all_positive,
-    array_of_shape,
-    check_shape,
-)
+from jrigid._checks import RESULTS, Findings, all_finite, all_positive, array_of_shape, check_shape
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 
@@ -31,9 +24,7 @@ TorqueFunction = Callable[[Any, Any, Any], Any]
 FINITE = {"rule": ("finite", all_finite)}
 POSITIVE = {"rule": ("positive and finite", all_positive)}
 NOT_NEGATIVE = {"rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0))}
-DIRECTION = {
-    "rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x != 0, axis=-1)))
-}
+NOT_ZERO = {"rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x, axis=-1)))}
 
 
 def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
@@ -48,32 +39,37 @@ def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
             findings.require(holds(value), RESULTS.invalid_torque, message, value)
 
 
-def array(name: str, *shape: int | None) -> Callable[[Any], Array]:
-    """A converter to an array of this shape."""
+def array(name: str, *shape: Any) -> Callable[[Any], Array]:
+    """A converter to an array of this shape, or of one of these shapes."""
     return lambda value: array_of_shape(name, value, *shape)
 
 
-def directions(name: str, *shape: int | None) -> Callable[[Any], Array]:
-    """A converter to vectors of length 1; zero stays zero, which `DIRECTION` refuses."""
+def direction(name: str, *shape: int | None, optional: bool = False) -> dict[str, Any]:
+    """What makes a field one of vectors of length 1; zero stays zero, which is refused."""
 
-    def convert(value: Any) -> Array:
+    def convert(value: Any) -> Array | None:
+        if value is None and optional:
+            return None
         vectors = array_of_shape(name, value, *shape)
         lengths = jnp.vectorize(safe_norm, signature="(n)->()")(vectors)[..., None]
         return vectors / jnp.where(lengths > 0, lengths, 1.0)
 
-    return convert
+    return {"converter": convert, "metadata": NOT_ZERO}
 
 
-def vector_or_function(name: str) -> Callable[[Any], Any]:
-    """A converter to a vector that leaves a function as it is."""
-    return lambda value: value if callable(value) else array_of_shape(name, value, 3)
+def vector_or_function(name: str) -> dict[str, Any]:
+    """What makes a field a vector or a function, which is left as it is."""
+    convert = array(name, 3)
+    return {"converter": lambda x: x if callable(x) else convert(x), "metadata": FINITE}
 
 
-def vector_at(name: str, source: Any, dtype: Any, *arguments: Any) -> Array:
-    """The value of a vector, or of a function with vectors as values."""
-    vector = jnp.asarray(source(*arguments) if callable(source) else source, dtype)
-    check_shape(name, vector, (3,))
-    return vector
+def value_of(
+    name: str, source: Any, state: Any, *arguments: Any, shape: tuple[int, ...] = (3,)
+) -> Array:
+    """The value of an array, or of a function of the arguments, in the dtype of a state."""
+    value = jnp.asarray(source(*arguments) if callable(source) else source, state.omega.dtype)
+    check_shape(name, value, shape)
+    return value
 
 
 def in_dtype_of(state: Any, *parameters: Array) -> list[Array]:
@@ -180,18 +176,11 @@ def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
     """
     if torque is None:
         return Sum(())
-    if isinstance(torque, AbstractTorque):
-        return torque
-    if callable(torque):
-        return Torque(torque)
-    raise ValueError(
-        f"Argument `torque` must be a callable (t, state, args) -> (3,), but it is {torque!r}."
-    )
-
-
-def _terms(torque: Any) -> tuple[AbstractTorque, ...]:
-    torque = as_torque(torque)
-    return torque.terms if isinstance(torque, Sum) else (torque,)
+    if not callable(torque):
+        raise ValueError(
+            f"Argument `torque` must be a callable (t, state, args) -> (3,), but it is {torque!r}."
+        )
+    return torque if isinstance(torque, AbstractTorque) else Torque(torque)
 
 
 class Sum(AbstractTorque):
@@ -221,22 +210,22 @@ class Sum(AbstractTorque):
         Args:
             terms: Torques and plain functions `(t, state, args) -> (3,)`, in any order.
         """
-        self.terms = tuple(x for term in terms for x in _terms(term))
+        torques = [as_torque(term) for term in terms]
+        self.terms = sum((x.terms if isinstance(x, Sum) else (x,) for x in torques), ())
 
-    def _total(self, start: Any, state: Any, method: Callable[[AbstractTorque, Any], Any]) -> Any:
-        """The sum of a method's values, each term given the state as it sees it."""
+    def _views(self, state: Any) -> Iterator[tuple[AbstractTorque, Any]]:
+        """Each term, and the state as it sees it."""
         first = 0
         for term in self.terms:
-            view, count = state, len(term.internal_at_rest(state))
-            if count:
-                own = state.internal[first : first + count]
-                view, first = dataclasses.replace(state, internal=own), first + count
-            start = start + method(term, view)
-        return start
+            view, last = state, first + len(term.internal_at_rest(state))
+            if last > first:
+                view = dataclasses.replace(state, internal=state.internal[first:last])
+            yield term, view
+            first = last
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Sum of the torques [N m], body components."""
-        return self._total(jnp.zeros_like(state.omega), state, lambda x, own: x(t, own, args))
+        return sum((x(t, own, args) for x, own in self._views(state)), jnp.zeros_like(state.omega))
 
     def of_body(self, inertia: InertiaLike) -> "Sum":
         """The torques on a body of this inertia."""
@@ -244,7 +233,7 @@ class Sum(AbstractTorque):
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Sum of the potential energies [J]."""
-        return self._total(zero_like(state), state, lambda x, own: x.potential(t, own, args))
+        return sum((x.potential(t, own, args) for x, own in self._views(state)), zero_like(state))
 
     def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal states of the terms that have one."""
@@ -252,7 +241,7 @@ class Sum(AbstractTorque):
 
     def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
-        return self._total((), state, lambda x, own: x.internal_rate(t, own, args))
+        return sum((x.internal_rate(t, own, args) for x, own in self._views(state)), ())
 
     def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
         """Size of the internal state when the body turns at `rate` [rad/s]."""
@@ -260,12 +249,13 @@ class Sum(AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of all internal parts [kg m^2/s], body components."""
-        zero = jnp.zeros_like(state.omega)
-        return self._total(zero, state, lambda x, own: x.internal_momentum(t, own, args))
+        momenta = (x.internal_momentum(t, own, args) for x, own in self._views(state))
+        return sum(momenta, jnp.zeros_like(state.omega))
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of all internal parts [J]."""
-        return self._total(zero_like(state), state, lambda x, own: x.internal_energy(t, own, args))
+        energies = (x.internal_energy(t, own, args) for x, own in self._views(state))
+        return sum(energies, zero_like(state))
 
     def check(self, findings: Findings) -> None:
         """Note bad parameters of the terms."""
@@ -306,7 +296,7 @@ class Torque(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        return vector_at("torque", self.fn, state.omega.dtype, t, state, args)
+        return value_of("torque", self.fn, state, t, state, args)
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if none was given."""

@@ -11,14 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
-    all_finite,
-    check_inertia_shape,
+    array_of_shape,
     check_shape,
     float_arrays,
-    is_positive_definite,
-    is_symmetric,
+    is_inertia,
     scaled_together,
 )
 from jrigid._numerics import safe_norm
@@ -26,16 +25,15 @@ from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector
 from jrigid.dynamics import angular_momentum
 from jrigid.rotation import rotate, rotate_inverse
 from jrigid.torques._base import (
-    DIRECTION,
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
     AbstractTorque,
     array,
     check_parameters,
-    directions,
+    direction,
     in_dtype_of,
-    vector_at,
+    value_of,
     vector_or_function,
 )
 
@@ -106,8 +104,7 @@ class GravityGradient(AbstractTorque):
 
     def of_body(self, inertia: InertiaLike) -> "GravityGradient":
         """The torque on a body of this inertia: moments or a tensor about its centre of mass."""
-        (inertia,) = float_arrays(inertia)
-        check_inertia_shape(inertia)
+        inertia = array_of_shape("inertia", inertia, *INERTIA)
         return GravityGradient(self.mu, self.position, inertia)
 
     def _seen(self, t: ScalarLike, state: Any) -> tuple[Array, Array, Array]:
@@ -120,7 +117,7 @@ class GravityGradient(AbstractTorque):
             )
         inertia, mu = in_dtype_of(state, self.inertia, self.mu)
         source = state.position if self.position is None else self.position
-        position = vector_at("position", source, mu.dtype, t)
+        position = value_of("position", source, state, t)
         distance = safe_norm(position)
         # mu / r^3 without overflow in float32
         strength = mu / distance / distance / distance
@@ -156,10 +153,10 @@ class MagneticDipole(AbstractTorque):
     """
 
     moment: Float[Array, "3"] = eqx.field(converter=array("moment", 3), metadata=FINITE)
-    field: Any = eqx.field(converter=vector_or_function("field"), metadata=FINITE)
+    field: Any = eqx.field(**vector_or_function("field"))
 
     def _moment_and_field(self, t: ScalarLike, state: Any) -> tuple[Array, Array]:
-        field = vector_at("field", self.field, state.omega.dtype, t, state)
+        field = value_of("field", self.field, state, t, state)
         return self.moment.astype(field.dtype), rotate_inverse(state.attitude, field)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
@@ -173,6 +170,10 @@ class MagneticDipole(AbstractTorque):
         """
         moment, field = self._moment_and_field(t, state)
         return -jnp.sum(moment * field)
+
+
+def _fraction(name: str) -> Any:
+    return eqx.field(default=0.0, converter=array(name, (), (None,)), metadata=NOT_NEGATIVE)
 
 
 class SolarPressure(AbstractTorque):
@@ -206,17 +207,11 @@ class SolarPressure(AbstractTorque):
     """
 
     areas: Float[Array, " n"] = eqx.field(converter=array("areas", None), metadata=NOT_NEGATIVE)
-    normals: Float[Array, "n 3"] = eqx.field(
-        converter=directions("normals", None, 3), metadata=DIRECTION
-    )
+    normals: Float[Array, "n 3"] = eqx.field(**direction("normals", None, 3))
     centers: Float[Array, "n 3"] = eqx.field(converter=array("centers", None, 3), metadata=FINITE)
-    sun: Any = eqx.field(converter=vector_or_function("sun"), metadata=FINITE)
-    specular: Float[Array, "..."] = eqx.field(
-        default=0.0, converter=lambda x: float_arrays(x)[0], metadata=NOT_NEGATIVE
-    )
-    diffuse: Float[Array, "..."] = eqx.field(
-        default=0.0, converter=lambda x: float_arrays(x)[0], metadata=NOT_NEGATIVE
-    )
+    sun: Any = eqx.field(**vector_or_function("sun"))
+    specular: Float[Array, "..."] = _fraction("specular")
+    diffuse: Float[Array, "..."] = _fraction("diffuse")
     pressure: Float[Array, ""] = eqx.field(
         default=_PRESSURE_AT_EARTH, converter=array("pressure"), metadata=NOT_NEGATIVE
     )
@@ -230,12 +225,11 @@ class SolarPressure(AbstractTorque):
 
     def _forces(self, t: ScalarLike, state: Any) -> Array:
         """Force on each plate [N], body components."""
-        sun = vector_at("sun", self.sun, state.omega.dtype, t)
+        sun = value_of("sun", self.sun, state, t)
         distance = safe_norm(sun)
         s = rotate_inverse(state.attitude, sun / jnp.where(distance > 0, distance, 1.0))[None]
-        areas, n, specular, diffuse, pressure = in_dtype_of(
-            state, self.areas, self.normals, self.specular, self.diffuse, self.pressure
-        )
+        n, areas, pressure = in_dtype_of(state, self.normals, self.areas, self.pressure)
+        specular, diffuse = in_dtype_of(state, self.specular, self.diffuse)
         cosine = jnp.sum(n * s, axis=-1)
         cosine = jnp.where(cosine > 0, cosine, 0.0)
         pushed = -pressure * areas * cosine
@@ -255,39 +249,23 @@ class SolarPressure(AbstractTorque):
         """Note bad parameters, and plates that reflect more light than they get."""
         check_parameters(findings, self)
         reflected = sum(float_arrays(self.specular, self.diffuse))
-        findings.require(
-            jnp.all(reflected <= 1 + 1e-6),  # to rounding, of float32 too
-            RESULTS.invalid_torque,
-            "Arguments `specular` and `diffuse` of `SolarPressure` must add up to at most 1, but "
-            "they do not.",
-            reflected,
-        )
-
-
-def _coefficient(value: Any) -> Array:
-    (array,) = float_arrays(value)
-    if array.shape not in ((), (3,), (3, 3)):
-        raise ValueError(
-            "Argument `coefficient` must have shape (), (3,) or (3, 3), "
-            f"but it has shape {array.shape}."
-        )
-    return array
+        message = "Arguments `specular` and `diffuse` must add up to at most 1, but they do not."
+        possible = jnp.all(reflected <= 1 + 1e-6)  # to rounding, of float32 too
+        findings.require(possible, RESULTS.invalid_torque, message, reflected)
 
 
 def _takes_energy(coefficient: Array) -> Array:
     """True where a drag takes energy or nothing: no negative number, axis or eigenvalue."""
     if coefficient.ndim < 2:
-        return all_finite(coefficient) & jnp.all(coefficient >= 0)
+        return jnp.all((coefficient >= 0) & (coefficient < jnp.inf))
     (unit,) = scaled_together(coefficient)
-    rounding = 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype)
-    return is_symmetric(coefficient) & is_positive_definite(unit + rounding)
+    return is_inertia(unit + 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype))
 
 
-_DISSIPATIVE = {
-    "rule": (
-        "finite and not negative (a tensor symmetric and positive semi-definite)",
-        _takes_energy,
-    )
+_WORDS = "finite and not negative (a tensor symmetric and positive semi-definite)"
+_DISSIPATIVE: dict[str, Any] = {
+    "converter": array("coefficient", (), *INERTIA),
+    "metadata": {"rule": (_WORDS, _takes_energy)},
 }
 
 
@@ -307,7 +285,7 @@ class LinearDrag(AbstractTorque):
     [-0.3 -0.  -0.4]
     """
 
-    coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient, metadata=_DISSIPATIVE)
+    coefficient: Float[Array, "..."] = eqx.field(**_DISSIPATIVE)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
@@ -331,7 +309,7 @@ class QuadraticDrag(AbstractTorque):
     [-1.5 -0.  -2. ]
     """
 
-    coefficient: Float[Array, "..."] = eqx.field(converter=_coefficient, metadata=_DISSIPATIVE)
+    coefficient: Float[Array, "..."] = eqx.field(**_DISSIPATIVE)
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
@@ -365,11 +343,7 @@ class CoulombFriction(AbstractTorque):
 
     magnitude: Float[Array, ""] = eqx.field(converter=array("magnitude"), metadata=NOT_NEGATIVE)
     width: Float[Array, ""] = eqx.field(converter=array("width"), metadata=POSITIVE)
-    axis: Float[Array, "3"] | None = eqx.field(
-        default=None,
-        converter=lambda x: None if x is None else directions("axis", 3)(x),
-        metadata=DIRECTION,
-    )
+    axis: Float[Array, "3"] | None = eqx.field(default=None, **direction("axis", 3, optional=True))
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""

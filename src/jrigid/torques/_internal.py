@@ -10,19 +10,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_shape
 from jrigid._types import Scalar, ScalarLike, Vector
 from jrigid.torques._base import (
-    DIRECTION,
-    FINITE,
     NOT_NEGATIVE,
     POSITIVE,
     AbstractTorque,
     TorqueFunction,
     array,
-    directions,
+    direction,
     in_dtype_of,
-    vector_at,
+    value_of,
     vector_or_function,
     zero_like,
 )
@@ -57,8 +54,7 @@ class InternalDamper(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        (sphere,) = state.internal
-        return self.coupling.astype(state.omega.dtype) * (sphere - state.omega)
+        return self.coupling.astype(state.omega.dtype) * (state.internal[0] - state.omega)
 
     def internal_at_rest(self, state: Any) -> tuple[Vector]:
         """The sphere turning with the body."""
@@ -75,13 +71,11 @@ class InternalDamper(AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the sphere [kg m^2/s]."""
-        (sphere,) = state.internal
-        return self.inertia.astype(state.omega.dtype) * sphere
+        return self.inertia.astype(state.omega.dtype) * state.internal[0]
 
     def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Kinetic energy of the sphere [J]."""
-        (sphere,) = state.internal
-        return 0.5 * self.inertia.astype(state.omega.dtype) * jnp.sum(sphere**2)
+        return 0.5 * jnp.sum(state.internal[0] * self.internal_momentum(t, state, args))
 
 
 class Rotor(AbstractTorque):
@@ -103,7 +97,7 @@ class Rotor(AbstractTorque):
     [-0.  -0.  -0.5]
     """
 
-    momentum: Any = eqx.field(converter=vector_or_function("momentum"), metadata=FINITE)
+    momentum: Any = eqx.field(**vector_or_function("momentum"))
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
@@ -114,7 +108,7 @@ class Rotor(AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Angular momentum of the rotor [kg m^2/s], body components."""
-        return vector_at("momentum", self.momentum, state.omega.dtype, t)
+        return value_of("momentum", self.momentum, state, t)
 
 
 class SpinningMass(AbstractTorque):
@@ -141,15 +135,13 @@ class SpinningMass(AbstractTorque):
     """
 
     inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
-    axis: Float[Array, "3"] = eqx.field(converter=directions("axis", 3), metadata=DIRECTION)
+    axis: Float[Array, "3"] = eqx.field(**direction("axis", 3))
     motor_torque: TorqueFunction | None = None
 
     def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
         if self.motor_torque is None:
             return zero_like(state)
-        motor = jnp.asarray(self.motor_torque(t, state, args), state.omega.dtype)
-        check_shape("motor_torque", motor, ())
-        return motor
+        return value_of("motor_torque", self.motor_torque, state, t, state, args, shape=())
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""

@@ -48,8 +48,7 @@ class KeplerOrbit(eqx.Module):
         """Position at a time, space components [m]."""
         a, e = self.semi_major_axis, self.eccentricity
         mean = self.mean_motion * jnp.asarray(t, a.dtype)
-        turn = jnp.asarray(2 * jnp.pi, a.dtype)
-        mean = mean - turn * jax.lax.stop_gradient(jnp.round(mean / turn))
+        mean = mean - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(mean / (2 * jnp.pi)))
         known, fixed = jax.lax.stop_gradient((mean, e))
         # The root of a cubic is near enough at any eccentricity.
         scale = 4 * fixed + 0.5
