@@ -399,6 +399,7 @@ def test_one_scale_factor_of_the_gyro():
     assert "I3/I1" in text
 
 
+@pytest.mark.slow  # two programs of their own
 def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
     """Three factors along the principal axes change (I2 - I3)/I1 and cyclic ones at will."""
     words = told(ASYMMETRIC, "gyro_scales", axes=np.eye(3)).null_directions
@@ -507,6 +508,7 @@ def test_attitudes_rates_directions_and_momenta_together(rng):
     assert abs(float(found.reduced_chi_square) - 1) < 5 * np.sqrt(2 / 800)
 
 
+@pytest.mark.slow  # a program of its own
 def test_attitudes_alone_with_noise_that_is_not_known(rng):
     ts = np.arange(100) * 0.4
     tensor, _, attitudes = rates(ASYMMETRIC, ts)
@@ -526,7 +528,7 @@ def test_attitudes_alone_with_noise_that_is_not_known(rng):
     ("shape", "body", "size"),
     [
         pytest.param("symmetric", SYMMETRIC, 3, marks=pytest.mark.slow),
-        ("flat", ((1.0, 1.7, 2.7), (0.5, 1.0, 0.4)), 4),
+        pytest.param("flat", ((1.0, 1.7, 2.7), (0.5, 1.0, 0.4)), 4, marks=pytest.mark.slow),
         pytest.param("moments", ASYMMETRIC, 2, marks=pytest.mark.slow),
     ],
 )
@@ -793,6 +795,7 @@ def test_117_throws_of_a_phone(rng):
     check_phone(rng, 117, drags=True)
 
 
+@pytest.mark.slow  # a program of its own
 def test_motion_of_one_s_own_and_a_function_of_the_state(rng):
     """A damped pointer seen through one angle: doubling horizons from a start that is off."""
     ts = np.linspace(0.0, 12.0, 120)

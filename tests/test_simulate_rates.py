@@ -268,7 +268,9 @@ def _fading(adjoint):
     return lane
 
 
-@pytest.mark.parametrize("adjoint", [None, diffrax.DirectAdjoint()])
+@pytest.mark.parametrize(
+    "adjoint", [None, pytest.param(diffrax.DirectAdjoint(), marks=pytest.mark.slow)]
+)
 def test_a_lane_that_turns_nan_on_the_way_leaves_shared_gradients_alone(adjoint):
     gradient = quick_jit(_total(_fading(adjoint)))
     first, second = (gradient(0.1, np.array([0.1, 0.2, x])) for x in (0.1, 0.2))

@@ -340,7 +340,7 @@ def _refuse(tree: Tree, bad: Array, findings: Callable[[], list[_Finding]]) -> T
     traced = isinstance(some, jax.core.Tracer)
     if not traced and not some:
         return tree
-    found = findings()
+    found = findings() if traced else eqx.filter_jit(findings)()
     failed = jnp.stack([jax.lax.stop_gradient(x.failed) for x in found])
     if traced:  # of several bad lanes the last message wins
         return eqx.branched_error_if(tree, bad, jnp.argmax(failed), [x.message for x in found])

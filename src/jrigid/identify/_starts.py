@@ -5,6 +5,7 @@ Errors of the samples stand on both sides of these equations and bias what comes
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -73,14 +74,10 @@ def _samples(ts: Any, omegas: Any, *others: Any) -> tuple[Findings, Bool[Array, 
 
 
 def _answer(
-    findings: Findings,
-    throw: bool,
-    inertia: Matrix,
-    singular_values: Array,
-    momentum: Vector | None = None,
+    findings: Findings, inertia: Matrix, singular_values: Array, momentum: Vector | None = None
 ) -> LinearStart:
     start = LinearStart(inertia, singular_values, findings.result, momentum)
-    return settle(nan_where(~findings.ok, start), throw, lambda: findings)
+    return nan_where(~findings.ok, start)
 
 
 def _windows(
@@ -175,10 +172,17 @@ def weak_form(
     >>> print((jnp.diagonal(tensor) / tensor[0, 0]).round(3))
     [1.  1.7 2.3]
     """
+    arrays = float_arrays(ts, omegas)
+    found = _weak_form(*arrays, windows, radians)
+    return settle(found, throw, lambda: _samples(*arrays)[0])
+
+
+@eqx.filter_jit
+def _weak_form(ts: Array, omegas: Array, windows: int, radians: float) -> LinearStart:
     findings, known, (ts, omegas) = _samples(ts, omegas)
     rows, _ = _weak_rows(omegas, ts, known, windows, radians)
     six, values = _null_vector(rows)
-    return _answer(findings, throw, _of_unit_trace(six), values)
+    return _answer(findings, _of_unit_trace(six), values)
 
 
 def momentum(
@@ -216,6 +220,12 @@ def momentum(
     """
     ts, attitudes, omegas = float_arrays(ts, attitudes, omegas)
     check_shape("attitudes", attitudes, (*ts.shape, 4))
+    found = _momentum(ts, attitudes, omegas)
+    return settle(found, throw, lambda: _samples(ts, omegas, attitudes)[0])
+
+
+@eqx.filter_jit
+def _momentum(ts: Array, attitudes: Array, omegas: Array) -> LinearStart:
     findings, known, (ts, omegas, attitudes) = _samples(ts, omegas, attitudes)
     identity = jnp.zeros_like(attitudes).at[:, 0].set(1)
     matrices = jax.vmap(to_matrix)(jnp.where(known[:, None], attitudes, identity))
@@ -228,7 +238,7 @@ def momentum(
     vector, values = _null_vector(rows.reshape(-1, 9))
     trace = vector[0] + vector[1] + vector[2]
     scale = 1 / jnp.where(trace == 0, 1.0, trace)
-    return _answer(findings, throw, _of_unit_trace(vector[:6]), values, vector[6:] * size * scale)
+    return _answer(findings, _of_unit_trace(vector[:6]), values, vector[6:] * size * scale)
 
 
 def gyrostat(
@@ -271,6 +281,12 @@ def gyrostat(
     """
     ts, omegas, rotor = float_arrays(ts, omegas, rotor)
     check_shape("rotor", rotor, (*ts.shape, 3))
+    found = _gyrostat(ts, omegas, rotor, windows, radians)
+    return settle(found, throw, lambda: _samples(ts, omegas, rotor)[0])
+
+
+@eqx.filter_jit
+def _gyrostat(ts: Array, omegas: Array, rotor: Array, windows: int, radians: float) -> LinearStart:
     findings, known, (ts, omegas, rotor) = _samples(ts, omegas, rotor)
     rows, (bump, fall) = _weak_rows(omegas, ts, known, windows, radians)
     given = product("wn,ni->wi", fall, rotor)
@@ -281,7 +297,7 @@ def gyrostat(
     projected = product("ni,n->i", left, -given.reshape(-1) / size)
     told = values > jnp.finfo(values.dtype).eps * 64 * values[0]
     six = product("ij,i->j", right, jnp.where(told, projected / jnp.where(told, values, 1.0), 0.0))
-    return _answer(findings, throw, _tensor(six), values)
+    return _answer(findings, _tensor(six), values)
 
 
 def linear_start(
