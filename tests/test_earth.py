@@ -51,6 +51,7 @@ def test_period_depends_on_the_window(pole):
         assert abs(earth_wobble.linear_fit(part) - days) < 1.5
 
 
+@pytest.mark.slow
 def test_another_start_ends_at_the_same_period(pole, result):
     fit = earth_wobble.fit_wobble(pole, 2000.0)
     assert bool(fit.converged)

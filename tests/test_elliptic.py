@@ -583,7 +583,13 @@ PAIRS_OF = {
 }
 
 
-@pytest.mark.parametrize("name", LEGENDRE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.slow) if x == "ellippiinc" else x  # from Carlson's
+        for x in LEGENDRE
+    ],
+)
 def test_first_derivatives_of_legendre_integrals(name):
     check_gradients(name, 4000, 64)
 

@@ -483,7 +483,7 @@ def all_lanes(inertia, omega):
     return values, slopes, forward
 
 
-@pytest.mark.parametrize("kind", ["moments", "tensor"])
+@pytest.mark.parametrize("kind", ["moments", pytest.param("tensor", marks=pytest.mark.slow)])
 def test_outside_its_domain_a_formula_is_nan_in_that_lane_alone(kind):
     inertia, omega = (np.stack(x) for x in zip(*LANES.values(), strict=True))
     if kind == "tensor":

@@ -74,7 +74,7 @@ def blind_fit():
     )
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize("noise", [0.001, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
 def test_every_body_is_found_blind_at_the_bound(blind_fit, noise, rng):
     trials = 12
     tensors, records = [], []
@@ -274,6 +274,7 @@ def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
         np.testing.assert_array_equal(stated, at)
 
 
+@pytest.mark.slow  # programs of its own
 def test_under_a_torque_a_state_after_the_first_sample_is_refused():
     """The motion under a torque is followed forward only."""
     body = jr.RigidBody(np.array([1.0, 1.7, 2.3]), jr.torques.LinearDrag(0.01))
@@ -437,6 +438,7 @@ def test_a_gyro_of_unknown_handedness_fits_two_bodies():
     assert moments[2] < moments[0] + moments[1]
 
 
+@pytest.mark.slow  # a program of its own
 def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     top = jr.SymmetricTop(1.0, 0.6, 2.0).as_rigid_body()
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
@@ -552,6 +554,7 @@ def test_what_is_known_of_the_tensor_holds(shape, body, size, rng):
     assert np.all(np.abs(np.asarray(found.ratios) - true[1:]) < 4 * errors)
 
 
+@pytest.mark.slow  # notebooks/toutatis.ipynb makes the same fit
 def test_toutatis():
     record = jr.datasets.toutatis_1992()
     apparition = slice(0, 17)  # free motion

@@ -97,7 +97,7 @@ def test_simulate_with_the_exact_solver_is_the_closed_form_in_one_step(inertia):
     np.testing.assert_allclose(found.energy, np.full((2, 2), found.energy[0, 0]), rtol=1e-13)
 
 
-def test_simulate_with_the_exact_solver_has_its_derivatives_events_and_lanes():
+def test_simulate_with_the_exact_solver_has_its_derivatives_and_lanes():
     def final(omega, solver, adjoint=None):
         state = jr.State(STATE.attitude, omega)
         body = jr.RigidBody(MOMENTS)
@@ -125,6 +125,10 @@ def test_simulate_with_the_exact_solver_has_its_derivatives_events_and_lanes():
         np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-12)
     assert np.all(np.isfinite(ends[0]))
     assert np.all(np.isnan(ends[1]))
+
+
+@pytest.mark.slow
+def test_simulate_with_the_exact_solver_has_events():
     event = diffrax.Event(
         lambda _t, y, _args, **_: y.omega[0], optimistix.Newton(1e-12, 1e-12), direction=True
     )

@@ -446,6 +446,7 @@ def test_zeros_that_drift_nowhere_are_stable():
         assert st.STABILITY[about(top.as_rigid_body(), asleep, rate, NONE).stability] == "stable"
 
 
+@pytest.mark.slow  # programs of its own
 def test_a_stiff_part_hides_nothing():
     """Damped fast, a satellite off its equilibrium or orbit is one all the same; so is growth."""
     n, moments = 1.08e-3, jnp.array([1.0, 2.0, 2.5])

@@ -650,7 +650,7 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def derivatives():
-    """Values and derivatives of a case in a dtype, computed once; the second one of float64 only."""
+    """Values and derivatives of a case in a dtype, computed once; in float32 the first alone."""
 
     @functools.cache
     def compute(name, dtype, twice=False):

@@ -37,50 +37,51 @@ def symmetric(entries: Iterable[Array]) -> Matrix:
 
 
 def lane_sum(x: Float[Array, " points"]) -> Scalar:
-    if x.shape[0] < 4 * _LANES:
-        return jnp.sum(x)
     padded = jnp.pad(x, (0, -x.shape[0] % _LANES))
     return jnp.sum(jnp.sum(padded.reshape(-1, _LANES), axis=0))
 
 
-def _outer_sum(weights: Array, positions: Array) -> Matrix:
-    return jnp.sum((weights[:, None] * positions)[:, :, None] * positions[:, None, :], axis=0)
+def _terms(m: Array, r: Array) -> list[Array]:
+    first = [m * r[:, i] for i in range(3)]
+    return [*first, *(first[i] * r[:, j] for i, j in PAIRS)]
 
 
-def _outer_sum_in_lanes(weights: Array, positions: Array) -> Matrix:
+def _at_once(weights: Array, positions: Array, place: Vector) -> list[Array]:
+    return [jnp.sum(x) for x in _terms(weights, positions - place[None, :])]
+
+
+def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
     def add(sums: list[Array], block: tuple[Array, Array]) -> tuple[list[Array], None]:
-        m, r = block
-        return [s + m * r[:, i] * r[:, j] for s, (i, j) in zip(sums, PAIRS, strict=True)], None
+        terms = _terms(block[0], block[1] - place[None, :])
+        return [s + x for s, x in zip(sums, terms, strict=True)], None
 
     whole = weights.shape[0] // _LANES * _LANES
     blocks = weights[:whole].reshape(-1, _LANES), positions[:whole].reshape(-1, _LANES, 3)
-    lanes, _ = jax.lax.scan(add, [jnp.zeros(_LANES, weights.dtype)] * len(PAIRS), blocks)
-    return symmetric(map(jnp.sum, lanes)) + _outer_sum(weights[whole:], positions[whole:])
+    lanes, _ = jax.lax.scan(add, [jnp.zeros(_LANES, weights.dtype)] * 9, blocks)
+    rest = _at_once(weights[whole:], positions[whole:], place)
+    return [jnp.sum(x) + y for x, y in zip(lanes, rest, strict=True)]
 
 
 @jax.custom_jvp
-def _second_moment(weights: Float[Array, " points"], positions: Float[Array, "points 3"]) -> Matrix:
-    """Sum of m r r^T; the rule spares reverse mode the memory of a scan, and NaN from bad values.
+def _moments(weights: Array, positions: Array, place: Vector) -> tuple[Vector, Matrix]:
+    """Sums of m r and of m r r^T, r from a place, in one pass.
 
-    To keep them from the sum itself would cost as much as the sum.
+    The rule spares reverse mode the memory of a scan, and NaN from bad values: to keep them from
+    the sum itself would cost as much as the sum.
     """
-    if weights.shape[0] < 16 * _LANES:
-        return _outer_sum(weights, positions)
-    return jax.lax.platform_dependent(
-        weights, positions, cpu=_outer_sum_in_lanes, default=_outer_sum
-    )
+    on_cpu = _in_lanes if weights.shape[0] >= 16 * _LANES else _at_once
+    sums = jax.lax.platform_dependent(weights, positions, place, cpu=on_cpu, default=_at_once)
+    return jnp.stack(sums[:3]), symmetric(sums[3:])
 
 
-@_second_moment.defjvp
-def _second_moment_jvp(primals: tuple, tangents: tuple) -> tuple[Matrix, Matrix]:
-    dm, dr = tangents
-    m, r = (jnp.where(jnp.isfinite(x), x, 0.0) for x in primals)
+@_moments.defjvp
+def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    m, r, place = primals
+    dm, dr, _ = tangents  # the place is a constant
+    m, r = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (m, r - place[None, :]))
+    first = jnp.sum(dm[:, None] * r + m[:, None] * dr, axis=0)
     half = product("na,nb->ab", 0.5 * dm[:, None] * r + m[:, None] * dr, r)
-    return _second_moment(*primals), half + half.T
-
-
-def _first_moment(weights: Array, positions: Array) -> Vector:
-    return jnp.stack([lane_sum(weights * positions[:, i]) for i in range(3)])
+    return _moments(*primals), (first, half + half.T)
 
 
 @jax.jit
@@ -88,11 +89,12 @@ def _cloud(masses: Array, positions: Array) -> MassProperties:
     """The body, its centre found in two passes: the first is off by the rounding of far places."""
     mass = lane_sum(masses)
     divisor = jnp.where(mass == 0, 1.0, mass)
-    origin = jax.lax.stop_gradient(_first_moment(masses, positions) / divisor)
-    local = positions - origin[None, :]
-    center = _first_moment(masses, local) / divisor
-    second = _second_moment(masses, local) - mass * center[:, None] * center[None, :]
-    return MassProperties.unchecked(mass, origin + center, inertia_of_second_moment(second))
+    near = jnp.stack([lane_sum(masses * positions[:, i]) for i in range(3)]) / divisor
+    origin = jax.lax.stop_gradient(near)
+    first, second = _moments(masses, positions, origin)
+    center = first / divisor
+    inertia = inertia_of_second_moment(second - mass * center[:, None] * center[None, :])
+    return MassProperties.unchecked(mass, origin + center, inertia)
 
 
 @jax.jit
@@ -186,7 +188,8 @@ def inertia_tensor(
 @jax.jit
 def _inertia_about_origin(masses: Array, positions: Array) -> Matrix:
     ok = jnp.all(masses >= 0) & all_finite((masses, positions))
-    return nan_where(~ok, inertia_of_second_moment(_second_moment(masses, positions)))
+    _, second = _moments(masses, positions, jnp.zeros(3, positions.dtype))
+    return nan_where(~ok, inertia_of_second_moment(second))
 
 
 def from_density(
