@@ -12,7 +12,7 @@ if jaxlib.version.__version_info__ < (0, 11):
     quick = (
         "--xla_cpu_use_fusion_emitters=false",
         "--xla_cpu_parallel_codegen_split_count=1",
-        "--xla_disable_hlo_passes=simplify-while-loops,while-loop-invariant-code-motion",
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion",
     )
     os.environ.setdefault("XLA_FLAGS", " ".join(quick))
 
