@@ -115,11 +115,12 @@ def test_an_event_is_located_without_being_asked_and_differentiated_twice():
     np.testing.assert_allclose(curvature, 2 * 1.3 / 8, rtol=1e-6)
 
 
-def test_derivatives_of_an_event_in_reverse_and_in_lanes():
+@pytest.mark.parametrize("adjoint", [None, diffrax.DirectAdjoint()])
+def test_derivatives_of_an_event_in_reverse_and_in_lanes(adjoint):
     event = diffrax.Event([_turned_by(1.3), _turned_by(9.0)])
 
     def when(rate):
-        return _spun(rate, event).final_time
+        return _spun(rate, event, adjoint).final_time
 
     rates = jnp.array([2.0, 0.1, 1.0])  # the second turns by half a radian only
     times, slopes = quick_jit(jax.vmap(jax.value_and_grad(when)))(rates)

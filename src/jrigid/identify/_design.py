@@ -97,7 +97,7 @@ def _planned(
     unknowns, numbers = unknowns.start(tensor, 1e-9)
     options = Options(
         torque_free, any(x.on_attitude for x in stacked) or depends_on_attitude(system), False, 1,
-        "squares", 0, True, None, 0, False, False,
+        "squares", 0, True, None, 0, False,
     )  # fmt: skip
     layout = whole(ts, there, 1, jnp.asarray(t0, ts.dtype))
     point = Point(numbers, attitude, omega)

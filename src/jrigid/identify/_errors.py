@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -95,13 +94,7 @@ def conclude(
         history, pure, input_result, unknowns, args, options, options.noise_known,
         options.free_motion,
     )  # fmt: skip
-    found = nan_where(input_result != RESULTS.successful, found)
-    if not options.throw:
-        return found
-    failed = (status == Status.WRONG_BASIN) | (status == Status.NOT_CONVERGED)
-    code = (status == Status.NOT_CONVERGED).astype(int)
-    messages = [Status[Status.WRONG_BASIN], Status[Status.NOT_CONVERGED]]
-    return eqx.branched_error_if(found, failed, code, messages)
+    return nan_where(input_result != RESULTS.successful, found)
 
 
 def _is_pure(args: Args, rows: Rows, noise: Array) -> Array:

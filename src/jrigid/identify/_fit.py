@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import check_option
+from jrigid._checks import Findings, check_option, settle
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import GATE, conclude
@@ -35,7 +35,7 @@ from jrigid.identify._observations import (
 )
 from jrigid.identify._parameters import LogCholesky
 from jrigid.identify._residuals import Args, Options, evaluation
-from jrigid.identify._result import FitResult
+from jrigid.identify._result import FitResult, Status
 from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
 from jrigid.identify._starts import linear_start
 from jrigid.identify._unknowns import Unknowns, as_tensor, unknowns_of
@@ -164,8 +164,10 @@ def fit(
             jnp.broadcast_to(start_state.attitude, (throws, 4)),
             jnp.broadcast_to(start_state.omega, (throws, 3)),
         )
-    stacked, samples, rate, angle, input_result = _prepare(
-        system, stacked, start_tensor, start_state, on_attitude, throw
+    prepared = _prepare(system, stacked, start_tensor, start_state, on_attitude)
+    given = system, stacked, prepared.samples, start_tensor, start_state
+    stacked, samples, rate, angle, input_result = settle(
+        prepared, throw, lambda: findings_of(*given)
     )
     stated = all(x.sigma is not None or x.covariance is not None for x in stacked)
     noise_known = absolute_sigma and stated
@@ -190,9 +192,25 @@ def fit(
         nodes = segments_needed(angle, samples.ts.shape[1])
     options = Options(
         torque_free and motion is None, on_attitude, shooting,
-        nodes, loss, max_steps, noise_known, motion, doublings, progress, throw,
+        nodes, loss, max_steps, noise_known, motion, doublings, progress,
     )  # fmt: skip
-    return _fit(options, unknowns, stacked, samples, start_tensor, start_state, input_result)
+    found = _fit(options, unknowns, stacked, samples, start_tensor, start_state, input_result)
+    if not throw:
+        return found
+    findings = Findings()
+    for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
+        findings.require(found.status != status, None, Status[status])
+    return findings.guard(found, throw)
+
+
+class _Prepared(NamedTuple):
+    """Observations, what tells the state on the way, the angle it turns, and what is wrong."""
+
+    observations: tuple[AbstractObservation, ...]
+    samples: Samples | None
+    rate: Array
+    angle: Array
+    result: Any
 
 
 @eqx.filter_jit
@@ -202,17 +220,14 @@ def _prepare(
     tensor: Any,
     state: State | None,
     on_attitude: bool,
-    throw: bool,
-) -> tuple[Any, Samples | None, Array, Array, Any]:
-    """Checked observations, what tells the state on the way, and the angle it turns."""
+) -> _Prepared:
     ts, _ = times_of(stacked)
     attitude0 = None if state is None or not on_attitude else state.attitude.astype(ts.dtype)
     samples = samples_of(stacked, attitude0)
     rate = typical_rate(samples, state, ts.dtype)
     findings = findings_of(system, stacked, samples, tensor, state)
-    stacked = findings.guard(stacked, throw) if throw else stacked
     angle = jnp.zeros(()) if samples is None else jnp.max(angle_turned(samples)[:, -1])
-    return stacked, samples, rate, angle, findings.result
+    return _Prepared(stacked, samples, rate, angle, findings.result)
 
 
 class _Phase(NamedTuple):

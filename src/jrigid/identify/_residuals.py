@@ -35,7 +35,6 @@ class Options(NamedTuple):
     motion: Any
     doublings: int
     progress: bool
-    throw: bool
 
 
 class Args(NamedTuple):

@@ -10,7 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jrigid._checks import RESULTS, Findings, check_shape, float_arrays, nan_where, settle
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    check_shape,
+    float_arrays,
+    nan_where,
+    settle,
+    whole_number,
+)
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Matrix, Readable, Real, Vector
 from jrigid.rotation import to_matrix
@@ -173,7 +181,7 @@ def weak_form(
     [1.  1.7 2.3]
     """
     arrays = float_arrays(ts, omegas)
-    found = _weak_form(*arrays, windows, radians)
+    found = _weak_form(*arrays, whole_number("windows", windows), radians)
     return settle(found, throw, lambda: _samples(*arrays)[0])
 
 
@@ -281,7 +289,7 @@ def gyrostat(
     """
     ts, omegas, rotor = float_arrays(ts, omegas, rotor)
     check_shape("rotor", rotor, (*ts.shape, 3))
-    found = _gyrostat(ts, omegas, rotor, windows, radians)
+    found = _gyrostat(ts, omegas, rotor, whole_number("windows", windows), radians)
     return settle(found, throw, lambda: _samples(ts, omegas, rotor)[0])
 
 

@@ -95,7 +95,7 @@ class WithTimes(diffrax.AbstractAdjoint):
         """Run the loop to the end, and back to where a condition changed its sign."""
         del t1
         if isinstance(self.adjoint, diffrax.DirectAdjoint):
-            init_state, others = self._with_known_steps(init_state, saveat, others)
+            init_state, others = self._with_known_steps(init_state, saveat, event, others)
         init_state, saveat = _saving(init_state, saveat, ts=self.taus)
         final, stats = self.adjoint.loop(
             init_state=init_state, saveat=saveat, t1=self.end, event=event, **others
@@ -110,7 +110,7 @@ class WithTimes(diffrax.AbstractAdjoint):
         last = dataclasses.replace(last, ts=tau[None], ys=jtu.tree_map(lambda x: x[None], y))
         return dataclasses.replace(final, save_state=[place, last]), stats
 
-    def _with_known_steps(self, init_state: Any, saveat: Any, others: Any) -> tuple[Any, Any]:
+    def _with_known_steps(self, init_state: Any, saveat: Any, event: Any, others: Any) -> Any:
         """The loop with steps that a first run has found, which has no derivatives.
 
         `DirectAdjoint` computes parts of the loop a second time on its way back. XLA compiles them
@@ -119,8 +119,8 @@ class WithTimes(diffrax.AbstractAdjoint):
         """
         state, saving = _saving(init_state, saveat, steps=others["max_steps"])
         pilot, _ = diffrax.ForwardMode().loop(
-            init_state=constant(state), saveat=saving, t1=constant(self.end), event=None,
-            **constant(others),
+            init_state=constant(state), saveat=saving, t1=constant(self.end),
+            event=event and dataclasses.replace(event, root_finder=None), **constant(others),
         )  # fmt: skip
         ends = jax.lax.stop_gradient(pilot.save_state[0].ts)
         controller = KnownSteps(ends, pilot.result)
