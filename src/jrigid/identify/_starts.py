@@ -180,9 +180,9 @@ def weak_form(
     >>> print((jnp.diagonal(tensor) / tensor[0, 0]).round(3))
     [1.  1.7 2.3]
     """
-    arrays = float_arrays(ts, omegas)
-    found = _weak_form(*arrays, whole_number("windows", windows), radians)
-    return settle(found, throw, lambda: _samples(*arrays)[0])
+    ts, omegas = float_arrays(ts, omegas)
+    found = _weak_form(ts, omegas, whole_number("windows", windows), radians)
+    return settle(found, throw, lambda: _samples(ts, omegas)[0])
 
 
 @eqx.filter_jit
