@@ -23,9 +23,9 @@ Values: TypeAlias = Float[Array, "..."]
 ValuesLike: TypeAlias = Real[ArrayLike, "..."]
 
 
-def elementwise(*values: Any) -> list[Array]:
+def elementwise(*values: Any) -> list[Array] | tuple[Array, ...]:
     """Arrays of one floating point dtype and one shape."""
-    return jnp.broadcast_arrays(*float_arrays(*values))
+    return jnp.broadcast_arrays(*float_arrays(*values))  # a list or, of newer jax, a tuple
 
 
 def _steps(x: Array) -> int:
