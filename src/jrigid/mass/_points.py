@@ -24,7 +24,7 @@ from jrigid.mass._body import MassProperties
 
 # Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU reductions
 # and products of tall thin matrices run below numpy's speed; lanes of partial sums mend both.
-_LANES = 64
+_LANES = 1024
 
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -37,28 +37,28 @@ def symmetric(entries: Iterable[Array]) -> Matrix:
 
 
 def lane_sum(x: Float[Array, " points"]) -> Scalar:
-    padded = jnp.pad(x, (0, -x.shape[0] % _LANES))
-    return jnp.sum(jnp.sum(padded.reshape(-1, _LANES), axis=0))
+    whole = x.shape[0] // _LANES * _LANES
+    return jnp.sum(jnp.sum(x[:whole].reshape(-1, _LANES), axis=0)) + jnp.sum(x[whole:])
 
 
-def _terms(m: Array, r: Array) -> list[Array]:
-    first = [m * r[:, i] for i in range(3)]
-    return [*first, *(first[i] * r[:, j] for i, j in PAIRS)]
+def _terms(m: Array, positions: Array, place: Vector) -> list[Array]:
+    r = [positions[:, i] - place[i] for i in range(3)]
+    first = [m * x for x in r]
+    return [*first, *(first[i] * r[j] for i, j in PAIRS)]
 
 
 def _at_once(weights: Array, positions: Array, place: Vector) -> list[Array]:
-    return [jnp.sum(x) for x in _terms(weights, positions - place[None, :])]
+    return [jnp.sum(x) for x in _terms(weights, positions, place)]
 
 
 def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
-    def add(sums: list[Array], block: tuple[Array, Array]) -> tuple[list[Array], None]:
-        terms = _terms(block[0], block[1] - place[None, :])
-        return [s + x for s, x in zip(sums, terms, strict=True)], None
+    def add(i: Array, sums: list[Array]) -> list[Array]:
+        block = (jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES) for x in (weights, positions))
+        return [s + x for s, x in zip(sums, _terms(*block, place), strict=True)]
 
-    whole = weights.shape[0] // _LANES * _LANES
-    blocks = weights[:whole].reshape(-1, _LANES), positions[:whole].reshape(-1, _LANES, 3)
-    lanes, _ = jax.lax.scan(add, [jnp.zeros(_LANES, weights.dtype)] * 9, blocks)
-    rest = _at_once(weights[whole:], positions[whole:], place)
+    blocks = weights.shape[0] // _LANES
+    lanes = jax.lax.fori_loop(0, blocks, add, [jnp.zeros(_LANES, weights.dtype)] * 9)
+    rest = _at_once(weights[_LANES * blocks :], positions[_LANES * blocks :], place)
     return [jnp.sum(x) + y for x, y in zip(lanes, rest, strict=True)]
 
 
@@ -69,7 +69,7 @@ def _moments(weights: Array, positions: Array, place: Vector) -> tuple[Vector, M
     The rule spares reverse mode the memory of a scan, and NaN from bad values: to keep them from
     the sum itself would cost as much as the sum.
     """
-    on_cpu = _in_lanes if weights.shape[0] >= 16 * _LANES else _at_once
+    on_cpu = _in_lanes if len(weights) >= _LANES else _at_once
     sums = jax.lax.platform_dependent(weights, positions, place, cpu=on_cpu, default=_at_once)
     return jnp.stack(sums[:3]), symmetric(sums[3:])
 
@@ -86,15 +86,19 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
 
 @jax.jit
 def _cloud(masses: Array, positions: Array) -> MassProperties:
-    """The body, its centre found in two passes: the first is off by the rounding of far places."""
+    """The body, in one pass about the midst of some points, in two where the mass is elsewhere."""
     mass = lane_sum(masses)
     divisor = jnp.where(mass == 0, 1.0, mass)
-    near = jnp.stack([lane_sum(masses * positions[:, i]) for i in range(3)]) / divisor
-    origin = jax.lax.stop_gradient(near)
-    first, second = _moments(masses, positions, origin)
+    place = jax.lax.stop_gradient(jnp.mean(positions[:: -(-len(positions) // 64)], axis=0))
+    sums = _moments(masses, positions, place)
+    off = jax.lax.stop_gradient(sums[0]) / divisor
+    far = 2 * mass * jnp.sum(off * off) > jnp.trace(sums[1])  # then digits are lost
+    place = place + jnp.where(far, off, 0.0)
+    again = lambda *_: _moments(masses, positions, place)  # noqa: E731
+    first, second = jax.lax.cond(far, again, lambda *x: x, *sums)
     center = first / divisor
     inertia = inertia_of_second_moment(second - mass * center[:, None] * center[None, :])
-    return MassProperties.unchecked(mass, origin + center, inertia)
+    return MassProperties.unchecked(mass, place + center, inertia)
 
 
 @jax.jit
@@ -103,9 +107,13 @@ def _examined(masses: Array, positions: Array) -> list[tuple[Bool[Array, ""], Ar
 
     Asked of the whole, not of each one, a good answer is quick.
     """
-    fine = jnp.isfinite(masses) & (masses >= 0)
-    finite = jnp.all(jnp.isfinite(positions), axis=1)
-    return [(jnp.all(ok), x[jnp.argmin(ok)]) for ok, x in ((fine, masses), (finite, positions))]
+
+    def first_bad(ok: Array, x: Array) -> Array:
+        each = ok.reshape(len(x), -1)
+        return jax.lax.cond(jnp.all(ok), lambda: x[0], lambda: x[jnp.argmin(jnp.all(each, axis=1))])
+
+    fine, finite = jnp.isfinite(masses) & (masses >= 0), jnp.isfinite(positions)
+    return [(jnp.all(ok), first_bad(ok, x)) for ok, x in ((fine, masses), (finite, positions))]
 
 
 def _cloud_arrays(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array]:
@@ -238,12 +246,9 @@ def from_density(
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
     findings = Findings()
-    findings.require(
-        all_finite((lower, upper)) & jnp.all(lower < upper),
-        None,
-        "Arguments `lower` and `upper` must be finite with `lower` < `upper`, but they are not.",
-        jnp.stack([lower, upper]),
-    )
+    box = jnp.stack([lower, upper])
+    message = "Arguments `lower`, `upper` must be finite with `lower` < `upper`, but they are not."
+    findings.require(all_finite(box) & jnp.all(lower < upper), None, message, box)
     lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)
     positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(grid, half.dtype)

@@ -92,12 +92,8 @@ def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
 def _findings(motion: Motion, rows: Array) -> Findings:
     findings = findings_of(motion)
     least = _INDEPENDENT * jnp.finfo(rows.dtype).eps * jnp.sqrt(jnp.sum(rows**2, axis=1))
-    findings.require(
-        jnp.all(orthonormal(rows)[1] > least),
-        RESULTS.invalid_state,
-        "Arguments `vector` and `vectors` must be finite and linearly independent, but they are "
-        "not.",
-    )
+    message = "Arguments `vector(s)` must be finite and linearly independent, but they are not."
+    findings.require(jnp.all(orthonormal(rows)[1] > least), RESULTS.invalid_state, message)
     return findings
 
 

@@ -247,11 +247,9 @@ def boundary(
     # At a pole, or a jump, or where it is NaN between the ends, there is no root.
     left = jnp.abs(jax.lax.stop_gradient(rising(jax.lax.stop_gradient(place), fixed)))
     findings = Findings()
-    findings.require(
-        ok & (left <= _ROOT * jnp.max(jnp.abs(known))),
-        RESULTS.invalid_state,
+    message = (
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
-        "which must be continuous there, but they are not.",
-        ends,
+        "which must be continuous there, but they are not."
     )
+    findings.require(ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends)
     return findings.guard(lower + (upper - lower) * place, throw)
