@@ -53,8 +53,8 @@ def _at_once(weights: Array, positions: Array, place: Vector) -> list[Array]:
 
 def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
     def add(i: Array, sums: list[Array]) -> list[Array]:
-        block = (jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES) for x in (weights, positions))
-        return [s + x for s, x in zip(sums, _terms(*block, place), strict=True)]
+        m, r = (jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES) for x in (weights, positions))
+        return [s + x for s, x in zip(sums, _terms(m, r, place), strict=True)]
 
     blocks = weights.shape[0] // _LANES
     lanes = jax.lax.fori_loop(0, blocks, add, [jnp.zeros(_LANES, weights.dtype)] * 9)
