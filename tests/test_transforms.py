@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -290,6 +291,17 @@ def exact_step(inertia, state, t):
     return end, rate, term.after(state, t)
 
 
+def unrolled_step(y, t):
+    y, t = number(y), number(t)
+    term = diffrax.ODETerm(lambda t, y, args: jnp.cos(y) * (1 + t))  # noqa: ARG005
+    solver = solvers.Unrolled(diffrax.Tsit5())
+    assert (solver.order(term), solver.error_order(term)) == (5, 5)
+    start = solver.init(term, 0.1 * t, t, y, None)
+    end, error, dense, after, _ = solver.step(term, 0.1 * t, t, y, None, start, made_jump=False)
+    curve = solver.interpolation_cls(t0=0.1 * t, t1=t, **dense)
+    return end, error, after - solver.func(term, t, end, None), curve.evaluate(0.5 * t)
+
+
 CASES = {
     # elliptic
     "elliptic.rf": Case(elliptic.rf, (0.3, 1.2, 2.0)),
@@ -525,6 +537,14 @@ CASES = {
             *methods("solvers.FreeRotation", "vf", "contr", "prod", "after"),
             "solvers.ExactFree",
             *methods("solvers.ExactFree", "order", "init", "step", "func"),
+        ),
+    ),
+    "solvers.Unrolled": Case(
+        unrolled_step,
+        (OMEGA, 0.4),
+        (
+            *methods("solvers.Unrolled", "order", "error_order", "init", "step", "func"),
+            "solvers.Unrolled.interpolation_cls",
         ),
     ),
     "systems.FloatingState": Case(

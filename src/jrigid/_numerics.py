@@ -107,10 +107,10 @@ def materialize(*arrays: Array) -> tuple[Array, ...]:
     look into a loop, and a loop of two trips is not removed.
     """
 
-    def trip(values: tuple[Array, ...], i: Array) -> tuple[tuple[Array, ...], None]:
-        return tuple(jnp.where(i == 2, -x, x) for x in values), None
+    def trip(i: Array, values: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(jnp.where(i == 2, -x, x) for x in values)
 
-    return jax.lax.scan(trip, arrays, jnp.arange(2))[0]
+    return jax.lax.fori_loop(0, 2, trip, arrays)
 
 
 # Without it float32 products run in TF32 (10 bits) on recent GPUs.

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import internal_parts
-from jrigid._numerics import power_of_two, safe_norm
+from jrigid._numerics import materialize, power_of_two, safe_norm
 from jrigid.systems import AbstractSystem, FloatingState
 
 
@@ -24,6 +24,34 @@ def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
     nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
     rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
     return (rates[1:] - rates[:1]) / step[:, None]
+
+
+def rate_along(
+    field: Callable[[Array], Array], y: Array, base: Array, direction: Array
+) -> tuple[Array, Array]:
+    """Rate of the linearised motion from a small displacement, and where that points in the end.
+
+    Called from step to step it is a power iteration, which finds the fastest rate. Twice the
+    Jacobian, since once does not tell the rate of an oscillation.
+
+    Args:
+        field: Rates at a place: of one motion, or of lanes, which are last.
+        y: The place.
+        base: The rates there.
+        direction: Of the displacement, of length 1.
+    """
+    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(y), axis=0))[None]
+
+    def change(direction: Array) -> tuple[Array, Array]:
+        (there,) = materialize(y + nudge * direction)
+        rates = (materialize(field(there))[0] - base) / nudge
+        length = jnp.sqrt(jnp.sum(rates * rates, axis=0))
+        unit = rates / jnp.where(length > 0, length, 1.0)[None]
+        return length, jnp.where((length > 0)[None], unit, direction)
+
+    first, once = change(direction)
+    second, twice = change(once)
+    return jnp.sqrt(first * second), twice
 
 
 def spectral_radius(matrix: Array, rounds: int = 2) -> Array:

@@ -74,6 +74,11 @@ def guard_inputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     return _through(_reverse_only, isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint), tree)
 
 
+def guard_derivative(tree: Any) -> Any:
+    """Guard what a first derivative in reverse mode is made from: there is no second."""
+    return _through(_cotangent, True, tree)
+
+
 def guard_outputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     """Guard what comes out of an integration whose adjoint serves forward mode only."""
     return _through(_forward_only, isinstance(adjoint, diffrax.ForwardMode), tree)

@@ -11,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array
 
 from jrigid._checks import all_finite
+from jrigid._scales import jacobian, rate_along, undamped_rate
 
 # No step is longer than this fraction of the shortest time scale, that of the turning or of the
 # linearised motion: at an equilibrium the error estimate sees nothing, and a step too long to be
@@ -35,6 +36,13 @@ class _Onwards(diffrax.AbstractStepSizeController):
         return self
 
 
+def in_tolerances(atol: Array, rtol: Array, y0: Array, y1: Array, error: Array) -> Array:
+    """An error as a multiple of the tolerances, of one motion, or of lanes, which are last."""
+    y0, y1, error = constant((y0, y1, error))
+    scaled = error / (atol[None] + jnp.maximum(jnp.abs(y0), jnp.abs(y1)) * rtol[None])
+    return jnp.sqrt(jnp.mean(scaled * scaled, axis=0))
+
+
 class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     """A controller whose steps are bounded by the motion's fastest rate, which may rise on the way.
 
@@ -48,8 +56,10 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
         first_step: diffrax would check one that it is given by a callback.
         resolution: Shortest step.
         start_rate: Fastest rate at the start.
-        fastest: `(t, y, args)` -> fastest rate there.
-        norm: Of the error.
+        field: The vector field, not differentiated.
+        rate_of: `(y, rate)` -> the rate that bounds the steps, of that of the linearised motion.
+        damped: Whether the solver may step over what is damped.
+        norm: What diffrax would ask for.
     """
 
     rtol: Array
@@ -58,7 +68,9 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     first_step: Array
     resolution: Array
     start_rate: Array
-    fastest: Callable[[Array, Array, Any], Array]
+    field: Callable[[Array, Array, Any], Array]
+    rate_of: Callable[[Array, Array], Array]
+    damped: bool = eqx.field(static=True)
     norm: Callable[[Any], Array] = optx.rms_norm
 
     @property
@@ -71,17 +83,36 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
         """The end of the first step; the state also carries the rate where the step begins."""
         del dt0
         t1, state = self._by_error.init(terms, t0, t1, y0, self.first_step, args, func, error_order)
-        return t1, (state, self.start_rate)
+        # No motion keeps to this direction.
+        direction = jnp.cos(jnp.arange(y0.size, dtype=y0.dtype))
+        return t1, (state, self.start_rate, direction / jnp.sqrt(jnp.sum(direction**2)))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, *others):
         """By the error, then by the fastest rate; a torque that turns NaN or infinite ends here."""
-        y_error, error_order, (inner_state, rate0) = others
+        y_error, error_order, (inner_state, rate0, direction) = others
+        t, y, args = constant((t1, y1_candidate, args))
+        if self.damped:
+            rate = undamped_rate(jacobian(self.field, t, y, args))
+        else:
+            base = self.field(t, y, args)
+            rate, direction = rate_along(lambda y: self.field(t, y, args), y, base, direction)
+        error = in_tolerances(self.atol, self.rtol, y0, y1_candidate, y_error)
+        state = (inner_state, rate0)
+        *found, state, result = self.judged(
+            t0, t1, error, error_order, state, self.rate_of(y, rate)
+        )
+        return *found, (*state, direction), result
+
+    def judged(self, t0, t1, error, error_order, state, rate):
+        """What becomes of a step with an error in tolerances, by the rate at its end."""
+        inner_state, rate0 = state
+        zero = jnp.zeros_like(error)
         keep, next_t0, next_t1, made_jump, inner_state, result = self._by_error.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner_state
+            t0, t1, zero, zero, None, error * self.atol, error_order, inner_state
         )
         stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
-        rate = jax.lax.stop_gradient(self.fastest(*constant((t1, y1_candidate, args))))
+        rate = jax.lax.stop_gradient(rate)
         # Where a torque jumps, differences see a rate without bound: never down to a standstill.
         shortest = 4 * self.resolution
         longest = jnp.maximum(LARGEST_STEP / rate, shortest)

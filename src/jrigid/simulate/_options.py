@@ -13,7 +13,7 @@ from jrigid._checks import RESULTS, Findings, check_type, is_concrete, whole_num
 from jrigid._motion import check_motion, numbers, resolves, solver_of
 from jrigid._scales import spectral_radius, undamped_rate, units
 from jrigid.simulate._controller import constant
-from jrigid.solvers import ExactFree
+from jrigid.solvers import ExactFree, Unrolled
 from jrigid.systems import AbstractSystem, RigidBody
 
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
@@ -55,13 +55,21 @@ class Options(NamedTuple):
     meter: Any
 
     @property
+    def in_lanes(self) -> bool:
+        """Whether motions under vmap are to run in lanes."""
+        plain = self.event is None and isinstance(self.meter, diffrax.NoProgressMeter)
+        direct = isinstance(self.adjoint, diffrax.DirectAdjoint)
+        return plain and not direct and isinstance(self.solver, Unrolled)
+
+    @property
     def is_implicit(self) -> bool:
         """True of a solver that may step over what is damped."""
         return isinstance(self.solver, diffrax.AbstractImplicitSolver)
 
-    def fastest_of(self, rounds: int) -> Callable[[Array], Array]:
+    @property
+    def fastest_of(self) -> Callable[[Array], Array]:
         """What bounds the steps, of the Jacobian: its fastest rate, or that which nothing damps."""
-        return undamped_rate if self.is_implicit else lambda matrix: spectral_radius(matrix, rounds)
+        return undamped_rate if self.is_implicit else spectral_radius
 
 
 def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Options:
@@ -69,6 +77,7 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
     solver, rtol, atol, adjoint, max_steps, max_step, event, meter = asked
     if not isinstance(solver, ExactFree):
         solver = solver_of(solver, diffrax.Dopri8(), ", or ExactFree()")
+        solver = Unrolled(solver) if isinstance(solver, diffrax.AbstractERK) else solver
     elif not (isinstance(system, RigidBody) and system.is_free):
         raise ValueError(
             "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
@@ -122,7 +131,7 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, ...
     start = t0.astype(since_start.dtype)
     check_motion(findings, system, state0, start, args)
     rate, fastest, scales = jax.lax.stop_gradient(
-        units(system, state0, since_start[-1], start, args, options.fastest_of(2))
+        units(system, state0, since_start[-1], start, args, options.fastest_of)
     )
     findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
     return findings, (rate, fastest, scales)

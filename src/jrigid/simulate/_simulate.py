@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -16,7 +17,6 @@ from jaxtyping import ArrayLike as _ArrayLike
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
 from jrigid._motion import HasRigidBody, harmless_motion, motion_arguments
 from jrigid._numerics import power_of_two
-from jrigid._scales import jacobian
 from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._adjoint import WithTimes, guard_inputs, guard_outputs
@@ -28,8 +28,10 @@ from jrigid.simulate._controller import (
     guarded,
 )
 from jrigid.simulate._event import event_in_si
+from jrigid.simulate._lanes import COUNTS, Ends, Problem
 from jrigid.simulate._options import Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
+from jrigid.simulate._vmap import vmappable
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem
 
@@ -44,7 +46,6 @@ _NOISE = 40.0
 # Below this many eps of the run a step is none. A motion that ends there is looked at so many of
 # them further on, beyond the last step that was tried.
 _RESOLUTION, _AHEAD = 16.0, 8.0
-_COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 def simulate(
@@ -178,25 +179,46 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     run = _measured(findings.ok, usable, options, measures)
     problem_of = _exact if isinstance(options.solver, ExactFree) else _stepped
     terms, y0, to_state, controller = problem_of(run, usable, options)
+    beyond = jnp.searchsorted(run.taus, run.taus, side="right")
+    problem = Problem(terms, controller, y0, usable.args, run.taus, beyond, run.end)
+    event = event_in_si(options.event, run.start, run.stretch, to_state)
+    if options.in_lanes:
+        forward = isinstance(options.adjoint, diffrax.ForwardMode)
+        alone = partial(_alone, options, None)
+        ends = vmappable(alone, options.solver, options.max_steps, problem, forward)
+    else:
+        ends = _alone(options, event, problem)
+    trajectory = _trajectory(findings, inputs, usable, run, to_state, ends, options)
+    return guard_outputs(options.adjoint, trajectory)
+
+
+def _alone(options: Options, event: Any, problem: Problem) -> Ends:
+    """One motion, by diffrax."""
+    terms, controller, y0, args, taus, _, end = problem
+    controller = constant(controller)
+    if not isinstance(options.solver, ExactFree):
+        step_ts = jax.lax.stop_gradient(taus)
+        controller = diffrax.ClipStepSizeController(controller, step_ts=step_ts)
     # Neither first step nor times are handed to diffrax here: it would check them by callbacks.
-    solution = diffrax.diffeqsolve(
+    solution: Any = diffrax.diffeqsolve(
         terms,
-        options.solver,
-        jnp.zeros_like(run.end),
-        jnp.full_like(run.end, jnp.inf),
+        getattr(options.solver, "solver", options.solver),  # its stages as one loop: quick alone
+        jnp.zeros_like(end),
+        jnp.full_like(end, jnp.inf),
         None,
         y0,
-        usable.args,
+        args,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t1=True)]),
         stepsize_controller=controller,
-        adjoint=WithTimes(options.adjoint, run.taus, run.end),
+        adjoint=WithTimes(options.adjoint, taus, end),
         max_steps=options.max_steps,
-        event=event_in_si(options.event, run.start, run.stretch, to_state),
+        event=event,
         throw=False,
         progress_meter=options.meter,
     )
-    trajectory = _trajectory(findings, inputs, usable, run, to_state, solution, options)
-    return guard_outputs(options.adjoint, trajectory)
+    (reached, ends), (ys, end_ys) = solution.ts, solution.ys
+    t, y = jtu.tree_map(lambda x: x[-1], (ends, end_ys))
+    return Ends(reached, ys, t, y, solution.result, {x: solution.stats[x] for x in COUNTS})
 
 
 def _measured(ok: Array, inputs: Inputs, options: Options, measures: tuple[Array, ...]) -> _Run:
@@ -217,19 +239,20 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     """The motion as one array, for a solver with an error estimate."""
     system, state0, _, _, args = inputs
     flat, unravel = ravel_pytree(state0)
-    fastest_of = options.fastest_of(1)
 
     def to_state(y: Any) -> Any:
         return unravel(y * run.scales)
 
+    # Both are powers of two, by which numbers are divided and multiplied exactly; multiplied, soon.
+    second, per_scale = 1 / run.stretch, 1 / (run.scales * run.stretch)
+
     def plain_field(tau: Any, y: Any, args: Any) -> Array:
-        rates = system.vector_field(run.start + tau / run.stretch, to_state(y), args)
-        rates = ravel_pytree(rates)[0] / (run.scales * run.stretch)
+        rates = system.vector_field(run.start + tau * second, to_state(y), args)
+        rates = ravel_pytree(rates)[0] * per_scale
         return jnp.where(run.ok, rates, 0.0)  # no other lane waits for a bad one: it stands still
 
-    def fastest(tau: Any, y: Any, args: Any) -> Array:
-        speed = jnp.sqrt(jnp.sum((to_state(y).omega / run.stretch) ** 2))
-        rate = jnp.maximum(fastest_of(jacobian(field, tau, y, args)), speed)
+    def rate_of(y: Any, rate: Array) -> Array:
+        rate = jnp.maximum(rate, jnp.sqrt(jnp.sum((to_state(y).omega / run.stretch) ** 2)))
         known = run.ok & jnp.isfinite(rate)
         return jnp.maximum(jnp.where(known, rate, 0.0), jnp.finfo(y.dtype).tiny)
 
@@ -252,10 +275,11 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         first_step=jnp.minimum(0.1 * first, stop),
         resolution=run.resolution,
         start_rate=run.fastest,
-        fastest=constant(eqx.filter_closure_convert(fastest, *point)),
+        field=constant(field),
+        rate_of=constant(eqx.filter_closure_convert(rate_of, y0, run.end)),
+        damped=options.is_implicit,
     )
-    controller = diffrax.ClipStepSizeController(watchful, step_ts=jax.lax.stop_gradient(run.taus))
-    return diffrax.ODETerm(vector_field), y0, to_state, controller
+    return diffrax.ODETerm(vector_field), y0, to_state, watchful
 
 
 def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
@@ -279,11 +303,11 @@ def _trajectory(
     usable: Inputs,
     run: _Run,
     to_state: Callable[[Any], Any],
-    solution: Any,
+    ends: Ends,
     options: Options,
 ) -> Trajectory:
     """What became of it, in SI units."""
-    (reached, ends), (ys, end_ys) = solution.ts, solution.ys
+    reached, ys = ends.reached, ends.ys
 
     def state_at(tau: Array, y: Any) -> Any:
         there = jnp.isfinite(tau)
@@ -296,12 +320,12 @@ def _trajectory(
 
     states = jax.vmap(state_at)(reached, ys)
     # Without an event the motion ends at the last of the times.
-    tau, y = last((reached, ys) if options.event is None else (ends, end_ys))
+    tau, y = last((reached, ys)) if options.event is None else (ends.t, ends.y)
     final_state = state_at(tau, y)
-    ending, end_y = constant(last((ends, end_ys)))
+    ending, end_y = constant((ends.t, ends.y))
     tau = jnp.where(jnp.isfinite(tau), tau, ending)
     final_time = usable.t0 + (tau / run.stretch).astype(usable.t0.dtype)
-    result = RESULTS.promote(solution.result)
+    result = RESULTS.promote(ends.result)
     beyond = constant(
         (usable, run.start + ending / run.stretch, to_state(end_y), run.resolution / run.stretch)
     )
@@ -314,9 +338,8 @@ def _trajectory(
     final_state = nan_where(failed, final_state)
     states, final_time = nan_where(~run.ok, (states, final_time))
     states = jtu.tree_map(lambda x: x.reshape(*inputs.ts.shape, *x.shape[1:]), states)
-    stats = {x: solution.stats[x] for x in _COUNTS}
     moved = eqx.partition((usable.system, usable.args), eqx.is_array)
-    return Trajectory(inputs.ts, states, result, stats, final_time, final_state, *moved)
+    return Trajectory(inputs.ts, states, result, ends.stats, final_time, final_state, *moved)
 
 
 def _finite_ahead(inputs: Inputs, t: Array, state: Any, resolution: Array) -> Array:

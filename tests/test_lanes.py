@@ -1,0 +1,189 @@
+"""Many motions at once: the quick road equals the plain one, whatever is around a lane."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import quick_jit
+
+import jrigid as jr
+from jrigid._lanes_last import lanes_last
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+GRAVITY = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
+TOP = jr.RigidBody(np.array([1.0, 2.0, 3.0]), GRAVITY)
+TIMES = np.array([0.0, 1.0, 1.0, 3.0])
+
+
+def _motion(body, omega, ts=TIMES, **options):
+    return jr.simulate(body, jr.State(UPRIGHT, omega), ts, throw=False, **options)
+
+
+def _states(body, omega, ts=TIMES):
+    trajectory = _motion(body, omega, ts)
+    return trajectory.states, trajectory.result, trajectory.stats
+
+
+_TOPS = quick_jit(jax.vmap(lambda omega: _states(TOP, omega)))
+
+
+# Arrays whose last axis are the lanes -------------------------------------------------------
+
+
+@jax.custom_jvp
+def _ruled(x):
+    return jnp.sin(x)
+
+
+_ruled.defjvp(lambda x, dx: (_ruled(*x), dx[0]))
+
+
+def _of_all_kinds(x, i, table):
+    """Operations that go number by number, that move numbers, and that need a rule of vmap."""
+    a, b, c = x
+    rows = jnp.stack([x, 2 * x, jnp.flip(x)], axis=1)
+    mixed = jnp.concatenate([rows.T.reshape(-1)[:4], jnp.where(a > 0, x, -x), jnp.arange(2.0)])
+    by_cond = jax.lax.cond(a > b, lambda x: x**2, lambda x: -x, x)
+    by_loop = jax.lax.while_loop(lambda x: jnp.sum(x) < 10, lambda x: 2 * jnp.abs(x) + 1, x)
+    looked_up = jnp.interp(c, jnp.linspace(-3, 3, 9), table)
+    turned = jnp.linalg.solve(rows @ rows.T + 5 * jnp.eye(3), x)
+    tail = jax.jit(lambda x: _ruled(jnp.sort(x))[i])(x)
+    return {"a": mixed, "b": (by_cond, by_loop, rows), "c": [looked_up, turned, tail, jnp.ones(2)]}
+
+
+def test_a_function_in_lanes_equals_its_vmap(rng):
+    x, i = jnp.asarray(rng.normal(size=(3, 6))), jnp.array([0, 1, 2, 0, 1, 2])
+    table = jnp.asarray(rng.normal(size=9))
+    found = lanes_last(lambda x, i: _of_all_kinds(x, i, table), x, i)
+    wanted = jax.vmap(lambda x, i: _of_all_kinds(x, i, table), -1, -1)(x, i)
+    jax.tree_util.tree_map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, wanted)
+
+
+# Stages written out -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    [(diffrax.Dopri8, 8, 8), (diffrax.Tsit5, 5, 40), (diffrax.Bosh3, 3, 40), (diffrax.Heun, 2, 40)],
+)
+def test_unrolled_takes_the_steps_of_its_method(method, order, steps):
+    """In a pytree, with dense output, at its order."""
+
+    def field(t, y, args):
+        return {"u": args * y["v"], "v": (-y["u"] * jnp.cos(t)[None])}
+
+    def solve(solver, steps):
+        start = {"u": jnp.ones(1), "v": jnp.zeros(1)}
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field), solver, 0.0, 2.0, 2 / steps, start, jnp.array([1.3]),
+            saveat=diffrax.SaveAt(ts=jnp.array([0.77, 2.0])),
+        ).ys["u"][:, 0]  # fmt: skip
+
+    plain, unrolled = solve(method(), 8), solve(jr.solvers.Unrolled(method()), 8)
+    np.testing.assert_allclose(unrolled, plain, rtol=1e-13)
+    ends = [
+        solve(jr.solvers.Unrolled(method()), steps)[1] for steps in (steps, 2 * steps, 64 * steps)
+    ]
+    assert np.log2(abs(ends[0] - ends[2]) / abs(ends[1] - ends[2])) > order - 0.4
+
+
+@pytest.mark.usefixtures("untyped")
+def test_unrolled_is_for_explicit_methods():
+    with pytest.raises(ValueError, match=r"Argument `solver` must be a AbstractERK"):
+        jr.solvers.Unrolled(diffrax.Kvaerno5())
+
+
+# Motions -------------------------------------------------------------------------------------
+
+
+def test_a_lane_is_the_same_to_the_bit_whatever_is_around_it(rng):
+    """Other lanes, their order, their number."""
+    omegas = rng.normal(size=(200, 3))
+    order = rng.permutation(200)
+    all_, again, few = _TOPS(omegas), _TOPS(omegas[order]), _TOPS(omegas[:130])
+    for x, y, z in zip(*map(jax.tree_util.tree_leaves, (all_, again, few)), strict=True):
+        np.testing.assert_array_equal(x[order], y)
+        np.testing.assert_array_equal(x[:130], z)
+
+
+def test_lanes_equal_single_calls(rng):
+    omegas = rng.normal(size=(3, 3)) * np.array([[0.0], [1.0], [10.0]])
+    together, results, stats = _TOPS(omegas)
+    for i, omega in enumerate(omegas):
+        alone = _motion(TOP, omega)
+        np.testing.assert_allclose(together.omega[i], alone.states.omega, atol=1e-10)
+        np.testing.assert_allclose(together.attitude[i], alone.states.attitude, atol=1e-10)
+        assert abs(int(stats["num_steps"][i]) - int(alone.stats["num_steps"])) <= 3
+        assert int(results._value[i]) == 0
+
+
+def test_lanes_that_fail_or_are_slow_change_nothing_in_the_others(rng):
+    omegas = rng.normal(size=(20, 3))
+    states, result, _ = _TOPS(omegas)
+    spoiled = omegas.copy()
+    spoiled[3], spoiled[11] = np.nan, 300.0
+    other_states, other_result, stats = _TOPS(spoiled)
+    keep = np.delete(np.arange(20), [3, 11])
+    np.testing.assert_array_equal(other_states.omega[keep], states.omega[keep])
+    assert np.all(np.isnan(other_states.omega[3]))
+    assert int(other_result._value[3]) == int(jr.RESULTS.invalid_state._value)
+    assert np.all(other_result._value[keep] == result._value[keep])
+    steps = np.asarray(stats["num_steps"])
+    assert steps[11] > 30 * np.median(steps)
+
+
+def test_lanes_may_differ_in_everything_also_twice_over(rng):
+    """Inertia, a parameter of the torque, times, t0, tolerances, args; a vmap in a vmap."""
+
+    def moved(moments, mass, ts, rtol, strength, omega):
+        def push(t, state, args):
+            return args * jnp.sin(t) * state.omega
+
+        lever, gravity = jnp.array([0.1, 0.0, 0.2]), jnp.array([0.0, 0.0, -1.0])
+        weight = jr.torques.UniformGravity(mass, lever, gravity)
+        body = jr.RigidBody(moments, jr.torques.as_torque(push) + weight)
+        trajectory = jr.simulate(
+            body, jr.State(UPRIGHT, omega), ts, strength, t0=ts[0] - 0.5, rtol=rtol, throw=False
+        )
+        return trajectory.states.omega
+
+    moments, omegas = 1 + rng.uniform(size=(2, 3)), rng.normal(size=(3, 3))
+    mass, ts = np.array([1.0, 2.0]), np.array([[0.0, 1.0], [0.3, 2.0], [1.0, 1.5]])
+    rtol, strength = np.array([1e-6, 1e-8, 1e-9]), np.array([0.1, 0.2])
+    inner = jax.vmap(moved, (None, None, 0, 0, None, 0))
+    found = quick_jit(jax.vmap(inner, (0, 0, None, None, 0, None)))(
+        moments, mass, ts, rtol, strength, omegas
+    )
+    for i in range(2):
+        for k in range(3):
+            alone = moved(moments[i], mass[i], ts[k], rtol[k], strength[i], omegas[k])
+            np.testing.assert_allclose(found[i, k], alone, atol=30 * rtol[k])
+
+
+def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
+    """With `lax.cond`, a while loop, a table and a small network inside."""
+    weights = 0.3 * rng.normal(size=(8, 3)), 0.3 * rng.normal(size=(3, 8))
+
+    def torque(t, state, args):
+        hidden = jnp.tanh(weights[0] @ state.omega)
+        wave = jnp.interp(jnp.mod(t, 1.0), jnp.linspace(0, 1, 5), args)
+        series = jax.lax.while_loop(
+            lambda s: s[1] < 6, lambda s: (s[0] + t ** s[1] / 100, s[1] + 1), (0.0 * t, 1)
+        )[0]
+        sign = jax.lax.cond(state.omega[0] > 0, lambda w: -0.1 * w, lambda w: 0.1 * w, state.omega)
+        return weights[1] @ hidden + sign + 0.05 * wave * jnp.ones(3) + 0.01 * series
+
+    body, table = (
+        jr.RigidBody(np.array([1.0, 2.0, 3.0]), torque),
+        np.array([0.0, 1.0, 0.5, -1.0, 0.0]),
+    )
+
+    def final(omega):
+        state = jr.State(UPRIGHT, omega)
+        return jr.simulate(body, state, 1.5, table, rtol=1e-6, throw=False).final_state.omega
+
+    omegas = rng.normal(size=(3, 3))
+    together = quick_jit(jax.vmap(final))(omegas)
+    for omega, found in zip(omegas, together, strict=True):
+        np.testing.assert_allclose(found, final(omega), atol=1e-5)
