@@ -43,13 +43,18 @@ def _of_all_kinds(x, i, table):
     """Operations that go number by number, that move numbers, and that need a rule of vmap."""
     a, b, c = x
     rows = jnp.stack([x, 2 * x, jnp.flip(x)], axis=1)
+    halves = jax.lax.bitcast_convert_type(x, jnp.int32).astype(x.dtype)
     mixed = jnp.concatenate([rows.T.reshape(-1)[:4], jnp.where(a > 0, x, -x), jnp.arange(2.0)])
     by_cond = jax.lax.cond(a > b, lambda x: x**2, lambda x: -x, x)
     by_loop = jax.lax.while_loop(lambda x: jnp.sum(x) < 10, lambda x: 2 * jnp.abs(x) + 1, x)
     looked_up = jnp.interp(c, jnp.linspace(-3, 3, 9), table)
     turned = jnp.linalg.solve(rows @ rows.T + 5 * jnp.eye(3), x)
     tail = jax.jit(lambda x: _ruled(jnp.sort(x))[i])(x)
-    return {"a": mixed, "b": (by_cond, by_loop, rows), "c": [looked_up, turned, tail, jnp.ones(2)]}
+    return {
+        "a": mixed,
+        "b": (by_cond, by_loop, rows),
+        "c": [looked_up, turned, tail, jnp.ones(2), halves],
+    }
 
 
 def test_a_function_in_lanes_equals_its_vmap(rng):

@@ -67,8 +67,8 @@ def _apply(eqn: Any, values: list, batched: list[bool], lanes: int) -> list:
         x = x.reshape((1,) * (len(shape) + 1 - x.ndim) + x.shape)
         return jnp.broadcast_to(x, (*shape, lanes))
 
-    if primitive.name in _NUMBER_BY_NUMBER:
-        shape = eqn.outvars[0].aval.shape
+    shape = eqn.outvars[0].aval.shape
+    if primitive.name in _NUMBER_BY_NUMBER and all(x in ((), shape) for x in shapes):
         values = [spread(x, has, shape) for x, has in zip(values, batched, strict=True)]
         return _bind(primitive, params, *values)
     changed = _changed(primitive.name, len(shapes[0]), lanes, params)

@@ -22,7 +22,8 @@ from jrigid.simulate._controller import in_tolerances
 from jrigid.solvers import Unrolled
 
 # So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
-_WIDTH, _REGISTER = 128, 8
+# Elsewhere than on a CPU many more are needed to keep it busy.
+_WIDTH, _WIDTH_ELSEWHERE, _REGISTER = 128, 2**14, 8
 # Steps between two looks for lanes that are through.
 _STEPS = 8
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -210,7 +211,8 @@ def in_lanes(fixed: Any, each: Any, solver: Unrolled, max_steps: int) -> Ends:
     count = jtu.tree_leaves(each)[0].shape[0]
     table = jtu.tree_map(lambda x: jnp.moveaxis(x, 0, -1), each)
     batch = _Batch(_Steps(solver, max_steps), fixed, table, count)
-    width = min(_WIDTH, -(-count // _REGISTER) * _REGISTER)
+    widest = _WIDTH if jax.default_backend() == "cpu" else _WIDTH_ELSEWHERE
+    width = min(widest, -(-count // _REGISTER) * _REGISTER)
     lanes = batch.take(jnp.minimum(jnp.arange(width), count))
     ends = jtu.tree_map(lambda x: jnp.zeros((count, *x.shape[:-1]), x.dtype), lanes.outcome)
     one = eqx.combine(jtu.tree_map(lambda x: x[0], each), fixed)
