@@ -1,44 +1,47 @@
 """One step of an explicit Runge-Kutta method, its stages written out."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._numerics import materialize
+
+class Step(NamedTuple):
+    """What a step gives."""
+
+    y1: Array
+    error: Array
+    after: Array  # the rate at y1
+    rates: list[Array]  # of all stages
 
 
-def _combined(y: Any, coefficients: Any, ks: list[Array]) -> Array:
-    """`y` and a combination of `ks`, in the order of their numbers; coefficients of 0 cost nothing.
+def _sum(coefficients: Any, rates: list[Array]) -> Array:
+    """In the order of their numbers; a coefficient of 0 costs nothing.
 
-    Neither do they make a NaN of a stage that they do not use.
+    Neither does it make a NaN of a stage that it does not use.
     """
-    used = [(float(a), k) for a, k in zip(coefficients, ks, strict=True) if a]
-    total = sum((k * jnp.asarray(a, k.dtype) for a, k in used[1:]), used[0][1] * used[0][0])
-    return total if y is None else y + total
+    used = [(jnp.asarray(a, k.dtype), k) for a, k in zip(coefficients, rates, strict=True) if a]
+    return sum((k * a for a, k in used[1:]), used[0][1] * used[0][0])
 
 
 def runge_kutta_step(
     tableau: Any, rate: Callable[[float, Array], Array], h: Array, y: Array, before: Array
-) -> tuple[Array, Array, Array, list[Array]]:
+) -> Step:
     """One explicit step with its stages written out, on an array of any shape.
 
     Args:
         tableau: Of diffrax.
-        rate: At a place, by the fraction of the step that has passed.
+        rate: At a place, by the fraction of the step that has passed. XLA's CPU compiler would
+            compute what stages share once for each that shares it: a rate keeps them apart.
         h: The step.
         y: Where it begins.
         before: The rate there.
-
-    Returns:
-        Where it ends, its error, the rate at its end, the increments of all stages.
     """
-    ks = [h * before]
-    after = before
+    rates, place = [before], y
     for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
-        (place,) = materialize(_combined(y, row, ks))
-        (after,) = materialize(rate(float(fraction), place))
-        ks.append(h * after)
-    y1 = _combined(y, tableau.b_sol, ks)
-    return y1, _combined(None, tableau.b_error, ks), after if tableau.fsal else rate(1.0, y1), ks
+        place = y + h * _sum(row, rates)
+        rates.append(rate(float(fraction), place))
+    y1 = place if tableau.ssal else y + h * _sum(tableau.b_sol, rates)
+    after = rates[-1] if tableau.fsal else rate(1.0, y1)
+    return Step(y1, h * _sum(tableau.b_error, rates), after, rates)

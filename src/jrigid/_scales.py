@@ -11,23 +11,23 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import internal_parts
-from jrigid._numerics import materialize, power_of_two, safe_norm
+from jrigid._numerics import power_of_two, safe_norm
 from jrigid.systems import AbstractSystem, FloatingState
 
 
-def jacobian(vector_field: Callable, t: Array, y: Array, args: Any) -> Array:
+def jacobian(vector_field: Callable, t: Array, y: Array, args: Any, scales: Array) -> Array:
     """Jacobian of the vector field by differences, which ask nothing of a torque but its value.
 
-    A row for each component of y: the transpose of the usual one.
+    Of the components in their scales. A row for each of y: the transpose of the usual one.
     """
-    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y))
-    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step)])
+    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y / scales))
+    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step * scales)])
     rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
-    return (rates[1:] - rates[:1]) / step[:, None]
+    return (rates[1:] - rates[:1]) / (step[:, None] * scales[None])
 
 
 def rate_along(
-    field: Callable[[Array], Array], y: Array, base: Array, direction: Array
+    field: Callable[[Array], Array], y: Array, base: Array, direction: Array, scales: Array
 ) -> tuple[Array, Array]:
     """Rate of the linearised motion from a small displacement, and where that points in the end.
 
@@ -38,13 +38,15 @@ def rate_along(
         field: Rates at a place: of one motion, or of lanes, which are last.
         y: The place.
         base: The rates there.
-        direction: Of the displacement, of length 1.
+        direction: Of the displacement, of length 1 in the scales.
+        scales: Of the components.
     """
-    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(y), axis=0))[None]
+    largest = jnp.max(jnp.abs(y / scales), axis=0)
+    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, largest)[None] * scales
 
     def change(direction: Array) -> tuple[Array, Array]:
-        (there,) = materialize(y + nudge * direction)
-        rates = (materialize(field(there))[0] - base) / nudge
+        there = y + nudge * direction
+        rates = (field(there) - base) / nudge
         length = jnp.sqrt(jnp.sum(rates * rates, axis=0))
         unit = rates / jnp.where(length > 0, length, 1.0)[None]
         return length, jnp.where((length > 0)[None], unit, direction)
@@ -107,13 +109,12 @@ def units(
     t0: Array,
     args: Any,
     fastest_of: Callable[[Array], Array] = spectral_radius,
-) -> tuple[Array, Array, Array]:
-    """Rates that measure time [rad/s], and a scale for each component of the state.
+) -> tuple[Array, Array]:
+    """The fastest rate of the motion [rad/s], and a scale for each component of the state.
 
-    The first rate is that of turning: a body at rest turns at the rate its torque would give it
-    within a radian, and one that nothing turns is measured by the length of the run. The second is
-    the fastest rate of the whole motion, an orbit's included: what `fastest_of` says of the
-    Jacobian, by default its spectral radius.
+    The rate is what `fastest_of` says of the Jacobian, by default its spectral radius, and at least
+    that of turning: a body at rest turns at the rate its torque would give it within a radian, and
+    one that nothing turns is measured by the length of the run.
     """
     rates = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
@@ -126,15 +127,14 @@ def units(
 
     def fastest(scales: Array) -> Array:
         def vector_field(t: Array, y: Array, args: Any) -> Array:
-            rates = system.vector_field(t, unravel(y * scales), args)
-            return ravel_pytree(rates)[0] / scales
+            return ravel_pytree(system.vector_field(t, unravel(y), args))[0]
 
-        radius = fastest_of(jacobian(vector_field, t0, flat / scales, args))
+        radius = fastest_of(jacobian(vector_field, t0, flat, args, scales))
         return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
 
     if not isinstance(state0, FloatingState):
         scales = powers(rate, rate)
-        return rate, fastest(scales), scales
+        return fastest(scales), scales
     # First scales of the place alone, to find how fast the motion of the centre of mass changes;
     # then its way in that time, or in the whole run if that is shorter. A run of many orbits is
     # not to be measured by |a| T^2. A body at rest on which no force acts is measured in metres.
@@ -155,4 +155,4 @@ def units(
     time = jnp.minimum(span, 1 / quickest)
     speed = jnp.maximum(velocity, pull * time)
     way = jnp.maximum(position, speed * time)
-    return rate, quickest, powers(*length_and_speed(way, speed, time))
+    return quickest, powers(*length_and_speed(way, speed, time))

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jrigid._checks import INERTIA, array_of_shape, check_type, float_arrays
+from jrigid._numerics import materialize
 from jrigid._runge_kutta import runge_kutta_step
 from jrigid._types import InertiaLike
 from jrigid.dynamics import euler_equations
@@ -190,10 +191,12 @@ class Unrolled(diffrax.AbstractAdaptiveSolver):
         flat, unravel = ravel_pytree(y0)
 
         def rate(fraction: float, place: Array) -> Array:
-            return ravel_pytree(terms.vf(t0 + fraction * (t1 - t0), unravel(place), args))[0]
+            (place,) = materialize(place)
+            rates = terms.vf(t0 + fraction * (t1 - t0), unravel(place), args)
+            return materialize(ravel_pytree(rates)[0])[0]
 
         h, first = terms.contr(t0, t1), ravel_pytree(before)[0]
-        y1, error, after, ks = runge_kutta_step(self.solver.tableau, rate, h, flat, first)
-        y1, error, after = (unravel(x) for x in (y1, error, after))
-        info = {"y0": y0, "y1": y1, "k": jax.vmap(unravel)(jnp.stack(ks))}
+        step = runge_kutta_step(self.solver.tableau, rate, h, flat, first)
+        y1, error, after = (unravel(x) for x in step[:3])
+        info = {"y0": y0, "y1": y1, "k": jax.vmap(unravel)(h * jnp.stack(step.rates))}
         return y1, error, info, after, diffrax.RESULTS.successful

@@ -93,7 +93,7 @@ class WithTimes(diffrax.AbstractAdjoint):
     """
 
     adjoint: diffrax.AbstractAdjoint
-    taus: Array
+    times: Array
     end: Array
 
     def loop(self, *, init_state: Any, saveat: Any, t1: Any, event: Any, **others: Any) -> Any:
@@ -101,7 +101,7 @@ class WithTimes(diffrax.AbstractAdjoint):
         del t1
         if isinstance(self.adjoint, diffrax.DirectAdjoint):
             init_state, others = self._with_known_steps(init_state, saveat, event, others)
-        init_state, saveat = _saving(init_state, saveat, ts=self.taus)
+        init_state, saveat = _saving(init_state, saveat, ts=self.times)
         final, stats = self.adjoint.loop(
             init_state=init_state, saveat=saveat, t1=self.end, event=event, **others
         )
@@ -109,10 +109,10 @@ class WithTimes(diffrax.AbstractAdjoint):
             return final, stats
         names = ("terms", "solver", "t0", "dt0", "stepsize_controller", "max_steps")
         options = {name: others[name] for name in names} | {"saveat": saveat, "t1": self.end}
-        tau, y = where_it_happened(final, event, others["args"], options)
+        t, y = where_it_happened(final, event, others["args"], options)
         place, last = final.save_state
-        place = dataclasses.replace(place, ts=jnp.where(place.ts > tau, jnp.inf, place.ts))
-        last = dataclasses.replace(last, ts=tau[None], ys=jtu.tree_map(lambda x: x[None], y))
+        place = dataclasses.replace(place, ts=jnp.where(place.ts > t, jnp.inf, place.ts))
+        last = dataclasses.replace(last, ts=t[None], ys=jtu.tree_map(lambda x: x[None], y))
         return dataclasses.replace(final, save_state=[place, last]), stats
 
     def _with_known_steps(self, init_state: Any, saveat: Any, event: Any, others: Any) -> Any:

@@ -39,8 +39,9 @@ class _Onwards(diffrax.AbstractStepSizeController):
 def in_tolerances(atol: Array, rtol: Array, y0: Array, y1: Array, error: Array) -> Array:
     """An error as a multiple of the tolerances, of one motion, or of lanes, which are last."""
     y0, y1, error = constant((y0, y1, error))
-    scaled = error / (atol[None] + jnp.maximum(jnp.abs(y0), jnp.abs(y1)) * rtol[None])
-    return jnp.sqrt(jnp.mean(scaled * scaled, axis=0))
+    scaled = error / (atol + jnp.maximum(jnp.abs(y0), jnp.abs(y1)) * rtol[None])
+    norm = jnp.sqrt(jnp.mean(scaled * scaled, axis=0))
+    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
 
 
 class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
@@ -51,11 +52,12 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
 
     Attributes:
         rtol: Relative tolerance of a step.
-        atol: Absolute tolerance of a step.
+        atol: Absolute tolerance of a step, of each component.
         longest: Longest step.
         first_step: diffrax would check one that it is given by a callback.
         resolution: Shortest step.
         start_rate: Fastest rate at the start.
+        scales: Of the components.
         field: The vector field, not differentiated.
         rate_of: `(y, rate)` -> the rate that bounds the steps, of that of the linearised motion.
         damped: Whether the solver may step over what is damped.
@@ -68,6 +70,7 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     first_step: Array
     resolution: Array
     start_rate: Array
+    scales: Array
     field: Callable[[Array, Array, Any], Array]
     rate_of: Callable[[Array, Array], Array]
     damped: bool = eqx.field(static=True)
@@ -75,9 +78,8 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def _by_error(self) -> diffrax.PIDController:
-        return diffrax.PIDController(
-            rtol=self.rtol, atol=self.atol, dtmax=self.longest, factormax=_GROWTH
-        )
+        # It is handed errors in tolerances.
+        return diffrax.PIDController(rtol=0, atol=1, dtmax=self.longest, factormax=_GROWTH)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step; the state also carries the rate where the step begins."""
@@ -92,10 +94,12 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
         y_error, error_order, (inner_state, rate0, direction) = others
         t, y, args = constant((t1, y1_candidate, args))
         if self.damped:
-            rate = undamped_rate(jacobian(self.field, t, y, args))
+            rate = undamped_rate(jacobian(self.field, t, y, args, self.scales))
         else:
             base = self.field(t, y, args)
-            rate, direction = rate_along(lambda y: self.field(t, y, args), y, base, direction)
+            rate, direction = rate_along(
+                lambda y: self.field(t, y, args), y, base, direction, self.scales
+            )
         error = in_tolerances(self.atol, self.rtol, y0, y1_candidate, y_error)
         state = (inner_state, rate0)
         *found, state, result = self.judged(
@@ -108,7 +112,7 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
         inner_state, rate0 = state
         zero = jnp.zeros_like(error)
         keep, next_t0, next_t1, made_jump, inner_state, result = self._by_error.adapt_step_size(
-            t0, t1, zero, zero, None, error * self.atol, error_order, inner_state
+            t0, t1, zero, zero, None, error, error_order, inner_state
         )
         stuck = ~keep & (next_t1 - next_t0 <= self.resolution)
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)

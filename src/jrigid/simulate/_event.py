@@ -1,4 +1,4 @@
-"""Events: conditions in SI units, and where between two steps one changed its sign."""
+"""Events: conditions on states, and where between two steps one changed its sign."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from jrigid._checks import harmless
 _NEWTON_STEPS = 2
 
 
-def event_in_si(event: Any, t0: Array, stretch: Array, to_state: Callable) -> Any:
-    """The event with its conditions called in radians and scaled components."""
+def event_of_states(event: Any, t0: Array, to_state: Callable) -> Any:
+    """The event with its conditions called with the time since `t0` and a state as one array."""
     if event is None:
         return None
 
-    def in_si(condition: Callable) -> Callable:
+    def of_states(condition: Callable) -> Callable:
         def wrapped(t: Array, y: Any, args: Any, **options: Any) -> Any:
-            return condition(t0 + t / stretch, to_state(y), args, **options)
+            return condition(t0 + t, to_state(y), args, **options)
 
         return wrapped
 
-    conditions = jtu.tree_map(in_si, event.cond_fn, is_leaf=callable)
+    conditions = jtu.tree_map(of_states, event.cond_fn, is_leaf=callable)
     return dataclasses.replace(event, cond_fn=conditions)
 
 
@@ -51,9 +51,9 @@ def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[
     )
     early, late = jax.lax.stop_gradient((final.event_tprev, late))
 
-    def distance(tau: Array) -> Array:
-        y = interpolant.evaluate(tau)
-        values = [jnp.asarray(f(tau, y, args, **options), tau.dtype) for f in conditions]
+    def distance(t: Array) -> Array:
+        y = interpolant.evaluate(t)
+        values = [jnp.asarray(f(t, y, args, **options), t.dtype) for f in conditions]
         return jnp.sum(jnp.where(ended, jnp.stack(values), 0.0))
 
     def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -64,10 +64,10 @@ def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[
 
     sign = jnp.sign(jax.lax.stop_gradient(distance(late)))
     bits = jnp.finfo(late.dtype).nmant + 8
-    tau = jax.lax.fori_loop(0, bits, halve, (early, late))[1]
-    level = jax.lax.stop_gradient(distance(tau))
+    t = jax.lax.fori_loop(0, bits, halve, (early, late))[1]
+    level = jax.lax.stop_gradient(distance(t))
     for _ in range(_NEWTON_STEPS):  # these leave the value as it is
-        value, slope = jax.jvp(distance, (tau,), (jnp.ones_like(tau),))
-        tau = tau - jnp.where(slope == 0, 0.0, (value - level) / jnp.where(slope == 0, 1.0, slope))
-    y = jtu.tree_map(lambda x, end: jnp.where(happened, x, end), interpolant.evaluate(tau), final.y)
-    return jnp.where(happened, tau, final.tprev), y
+        value, slope = jax.jvp(distance, (t,), (jnp.ones_like(t),))
+        t = t - jnp.where(slope == 0, 0.0, (value - level) / jnp.where(slope == 0, 1.0, slope))
+    y = jtu.tree_map(lambda x, end: jnp.where(happened, x, end), interpolant.evaluate(t), final.y)
+    return jnp.where(happened, t, final.tprev), y

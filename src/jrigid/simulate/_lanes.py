@@ -1,8 +1,12 @@
-"""Many motions at once, each at its own pace: what `jax.vmap(jrigid.simulate)` runs.
+"""A motion, or many at once, each at its own pace: what `jrigid.simulate` and `jax.vmap` of it run.
 
 Under vmap a loop goes on until its slowest lane is through, and each of its operations goes through
 all lanes and out of the cache. Here few lanes step together, along the last axis; one that is
 through with its motion hands in the result and takes up the next.
+
+XLA's CPU runtime goes through a loop's operations one after the other, at 25 ns each, where all
+that they touch is small (512 bytes); anything larger, or more than eight, costs twice or more. One
+motion is one lane, and nothing in its loop is larger than the state.
 """
 
 from typing import Any, NamedTuple
@@ -15,11 +19,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._lanes_last import lanes_last
-from jrigid._numerics import materialize
 from jrigid._runge_kutta import runge_kutta_step
 from jrigid._scales import rate_along
 from jrigid.simulate._controller import in_tolerances
-from jrigid.solvers import Unrolled
 
 # So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
 # Elsewhere than on a CPU many more are needed to keep it busy.
@@ -30,13 +32,13 @@ COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class Problem(NamedTuple):
-    """A motion, in its own scales, as diffrax is given it."""
+    """A motion as diffrax is given it, from t = 0 on."""
 
     term: Any
     controller: Any
     y0: Array
     args: Any
-    taus: Array
+    times: Array
     beyond: Array  # for each of them the number of the next that is later
     end: Array
 
@@ -46,11 +48,11 @@ class Problem(NamedTuple):
 
     def goal(self, target: Array) -> Array:
         """The next of the times, by its number, or the end."""
-        return jnp.where(target < self.taus.size, self.taus[target], self.end)
+        return jnp.where(target < self.times.size, self.times[target], self.end)
 
-    def tolerances(self) -> tuple[Array, Array]:
-        """Absolute and relative."""
-        return self.controller.atol, self.controller.rtol
+    def measures(self) -> tuple[Array, Array, Array]:
+        """Absolute and relative tolerance, scales."""
+        return self.controller.atol, self.controller.rtol, self.controller.scales
 
 
 class Ends(NamedTuple):
@@ -94,15 +96,15 @@ class _Lanes(NamedTuple):
 class _Steps(NamedTuple):
     """How one motion steps."""
 
-    solver: Unrolled
+    solver: diffrax.AbstractERK
     max_steps: int
 
     def begin(self, problem: Problem) -> tuple[_Clock, Array, Array, Array]:
         """Where it starts."""
-        term, controller, y0, args, taus, beyond, end = problem
+        term, controller, y0, args, times, beyond, end = problem
         zero, order = jnp.zeros_like(end), self.solver.order(None)
         tnext, state = controller.init(term, zero, end, y0, None, args, self.solver.func, order)
-        target = jnp.where(taus[0] > 0, 0, beyond[0])
+        target = jnp.where(times[0] > 0, 0, beyond[0])
         none = jnp.zeros((), jnp.int32)
         tnext, okay = jnp.minimum(tnext, problem.goal(target)), diffrax.RESULTS.successful
         clock = _Clock(zero, tnext, target, state[:-1], okay, none, none)
@@ -121,8 +123,8 @@ class _Steps(NamedTuple):
             clock.t, clock.tnext, error, order, clock.controller, rate
         )
         kept = kept & goes
-        place = jnp.minimum(clock.target, problem.taus.size - 1)
-        hit = kept & (clock.target < problem.taus.size) & (clock.tnext >= problem.taus[place])
+        place = jnp.minimum(clock.target, problem.times.size - 1)
+        hit = kept & (clock.target < problem.times.size) & (clock.tnext >= problem.times[place])
         target = jnp.where(hit, problem.beyond[place], clock.target)
         goal = problem.goal(target)
         # No sliver is left before it.
@@ -163,14 +165,22 @@ class _Batch(NamedTuple):
         number, motion, clock, y, before, direction = lanes
         h = (clock.tnext - clock.t)[None]
 
-        def rate_at(fraction: float, place: Array) -> Array:
-            return self.over_lanes(Problem.field, motion, clock.t + fraction * h[0], place)
+        @jax.jit  # traced once for all stages
+        def rates(t: Array, place: Array) -> Array:
+            # What goes into a branch and what comes out of it has been computed, once.
+            def field(place: Array) -> Array:
+                return self.over_lanes(Problem.field, motion, t, place)
 
-        tableau = self.steps.solver.solver.tableau
-        y1, error, after, _ = runge_kutta_step(tableau, rate_at, h, y, before)
-        y1, error = materialize(y1, jnp.where(jnp.isnan(error), jnp.inf, error))
-        rate, along = rate_along(lambda y: rate_at(1.0, y), y1, after, direction)
-        atol, rtol = self.over_lanes(Problem.tolerances, motion)
+            return jax.lax.cond(some, field, lambda x: x, place)
+
+        def rate_at(fraction: float, place: Array) -> Array:
+            return rates(clock.t + fraction * h[0], place)
+
+        some = jnp.any(number < self.count)
+        step = runge_kutta_step(self.steps.solver.tableau, rate_at, h, y, before)
+        y1, error, after, _ = step
+        atol, rtol, scales = self.over_lanes(Problem.measures, motion)
+        rate, along = rate_along(lambda y: rate_at(1.0, y), y1, after, direction, scales)
         error = in_tolerances(atol, rtol, y, y1, error)
         kept, hit, place, clock = self.over_lanes(self.steps.judge, motion, clock, y1, error, rate)
         pairs = (y1, y), (after, before), (along, direction)
@@ -206,29 +216,29 @@ class _Batch(NamedTuple):
         return jax.lax.cond(some, self.hand_in, lambda x: x, carry)
 
 
-def in_lanes(fixed: Any, each: Any, solver: Unrolled, max_steps: int) -> Ends:
+def in_lanes(fixed: Any, each: Any, solver: diffrax.AbstractERK, max_steps: int) -> Ends:
     """Motions that differ in `each`, whose leaves have a motion to each index in front."""
     count = jtu.tree_leaves(each)[0].shape[0]
     table = jtu.tree_map(lambda x: jnp.moveaxis(x, 0, -1), each)
     batch = _Batch(_Steps(solver, max_steps), fixed, table, count)
     widest = _WIDTH if jax.default_backend() == "cpu" else _WIDTH_ELSEWHERE
-    width = min(widest, -(-count // _REGISTER) * _REGISTER)
+    width = min(widest, -(-count // _REGISTER) * _REGISTER if count > _REGISTER else count)
     lanes = batch.take(jnp.minimum(jnp.arange(width), count))
     ends = jtu.tree_map(lambda x: jnp.zeros((count, *x.shape[:-1]), x.dtype), lanes.outcome)
     one = eqx.combine(jtu.tree_map(lambda x: x[0], each), fixed)
-    saved = jnp.zeros((count, one.taus.size, one.y0.size), one.y0.dtype)
+    saved = jnp.zeros((count, one.times.size, one.y0.size), one.y0.dtype)
     carry = (lanes, jnp.array(min(width, count)), saved, ends)
     *_, saved, ends = jax.lax.while_loop(lambda x: jnp.any(x[0].number < count), batch.look, carry)
     t, y, result, steps, accepted = ends
 
     def finish(motion: Any, saved: Array, t: Array, result: Any) -> tuple[Array, Array, Any]:
         problem = eqx.combine(motion, fixed)
-        first = jnp.searchsorted(problem.taus, problem.taus, side="left")
-        ys = jnp.where(problem.taus[:, None] > 0, saved[first], problem.y0[None])
-        there = problem.taus <= t
+        first = jnp.searchsorted(problem.times, problem.times, side="left")
+        ys = jnp.where(problem.times[:, None] > 0, saved[first], problem.y0[None])
+        there = problem.times <= t
         short = (result == diffrax.RESULTS.successful) & (t < problem.end)
         result = diffrax.RESULTS.where(short, diffrax.RESULTS.max_steps_reached, result)
-        reached = jnp.where(there, problem.taus, jnp.inf)
+        reached = jnp.where(there, problem.times, jnp.inf)
         return reached, jnp.where(there[:, None], ys, jnp.inf), result
 
     reached, ys, result = jax.vmap(finish)(each, saved, t, result)

@@ -56,10 +56,10 @@ class Options(NamedTuple):
 
     @property
     def in_lanes(self) -> bool:
-        """Whether motions under vmap are to run in lanes."""
+        """Whether the motion is to run in lanes, alone in one or under vmap with others."""
         plain = self.event is None and isinstance(self.meter, diffrax.NoProgressMeter)
         direct = isinstance(self.adjoint, diffrax.DirectAdjoint)
-        return plain and not direct and isinstance(self.solver, Unrolled)
+        return plain and not direct and isinstance(self.solver, diffrax.AbstractERK)
 
     @property
     def is_implicit(self) -> bool:
@@ -77,7 +77,7 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
     solver, rtol, atol, adjoint, max_steps, max_step, event, meter = asked
     if not isinstance(solver, ExactFree):
         solver = solver_of(solver, diffrax.Dopri8(), ", or ExactFree()")
-        solver = Unrolled(solver) if isinstance(solver, diffrax.AbstractERK) else solver
+        solver = solver.solver if isinstance(solver, Unrolled) else solver
     elif not (isinstance(system, RigidBody) and system.is_free):
         raise ValueError(
             "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
@@ -130,8 +130,8 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, ...
     findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=flat[jnp.argmax(wrong)])
     start = t0.astype(since_start.dtype)
     check_motion(findings, system, state0, start, args)
-    rate, fastest, scales = jax.lax.stop_gradient(
+    fastest, scales = jax.lax.stop_gradient(
         units(system, state0, since_start[-1], start, args, options.fastest_of)
     )
     findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
-    return findings, (rate, fastest, scales)
+    return findings, (fastest, scales)

@@ -1,4 +1,4 @@
-"""simulate(): the one call of `diffrax.diffeqsolve`."""
+"""simulate(): a motion by lanes, or by the one call of `diffrax.diffeqsolve`."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,7 +16,6 @@ from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
 from jrigid._motion import HasRigidBody, harmless_motion, motion_arguments
-from jrigid._numerics import power_of_two
 from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._adjoint import WithTimes, guard_inputs, guard_outputs
@@ -27,7 +26,7 @@ from jrigid.simulate._controller import (
     constant,
     guarded,
 )
-from jrigid.simulate._event import event_in_si
+from jrigid.simulate._event import event_of_states
 from jrigid.simulate._lanes import COUNTS, Ends, Problem
 from jrigid.simulate._options import Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
@@ -154,17 +153,16 @@ def simulate(
 
 
 class _Run(NamedTuple):
-    """The motion in its own scales."""
+    """When, and in what scales."""
 
     ok: Array
     start: Array  # t0, in the precision of the state
-    stretch: Array  # radians in a second
     scales: Array  # of the components of the state
-    fastest: Array  # rate, per radian
-    taus: Array  # times [rad]
-    end: Array  # of the run [rad]
-    resolution: Array  # the shortest step [rad]
-    longest: Array  # step that the options allow [rad]
+    fastest: Array  # rate
+    times: Array  # since the start
+    end: Array
+    resolution: Array  # the shortest step
+    longest: Array  # step that the options allow
 
 
 # What diffrax moves: the term, its initial value, how to read a state from it, the controller.
@@ -179,9 +177,9 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     run = _measured(findings.ok, usable, options, measures)
     problem_of = _exact if isinstance(options.solver, ExactFree) else _stepped
     terms, y0, to_state, controller = problem_of(run, usable, options)
-    beyond = jnp.searchsorted(run.taus, run.taus, side="right")
-    problem = Problem(terms, controller, y0, usable.args, run.taus, beyond, run.end)
-    event = event_in_si(options.event, run.start, run.stretch, to_state)
+    beyond = jnp.searchsorted(run.times, run.times, side="right")
+    problem = Problem(terms, controller, y0, usable.args, run.times, beyond, run.end)
+    event = event_of_states(options.event, run.start, to_state)
     if options.in_lanes:
         forward = isinstance(options.adjoint, diffrax.ForwardMode)
         alone = partial(_alone, options, None)
@@ -194,15 +192,18 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
 
 def _alone(options: Options, event: Any, problem: Problem) -> Ends:
     """One motion, by diffrax."""
-    terms, controller, y0, args, taus, _, end = problem
+    terms, controller, y0, args, times, _, end = problem
     controller = constant(controller)
     if not isinstance(options.solver, ExactFree):
-        step_ts = jax.lax.stop_gradient(taus)
+        if not isinstance(options.adjoint, diffrax.ForwardMode):  # NaN would reach what lanes share
+            field = jtu.Partial(guarded, terms.vector_field, jax.lax.stop_gradient(y0))
+            terms = diffrax.ODETerm(field)
+        step_ts = jax.lax.stop_gradient(times)
         controller = diffrax.ClipStepSizeController(controller, step_ts=step_ts)
     # Neither first step nor times are handed to diffrax here: it would check them by callbacks.
     solution: Any = diffrax.diffeqsolve(
         terms,
-        getattr(options.solver, "solver", options.solver),  # its stages as one loop: quick alone
+        options.solver,
         jnp.zeros_like(end),
         jnp.full_like(end, jnp.inf),
         None,
@@ -210,7 +211,7 @@ def _alone(options: Options, event: Any, problem: Problem) -> Ends:
         args,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t1=True)]),
         stepsize_controller=controller,
-        adjoint=WithTimes(options.adjoint, taus, end),
+        adjoint=WithTimes(options.adjoint, times, end),
         max_steps=options.max_steps,
         event=event,
         throw=False,
@@ -218,51 +219,37 @@ def _alone(options: Options, event: Any, problem: Problem) -> Ends:
     )
     (reached, ends), (ys, end_ys) = solution.ts, solution.ys
     t, y = jtu.tree_map(lambda x: x[-1], (ends, end_ys))
-    return Ends(reached, ys, t, y, solution.result, {x: solution.stats[x] for x in COUNTS})
+    counts = {x: jnp.asarray(solution.stats[x], jnp.int32) for x in COUNTS}
+    return Ends(reached, ys, t, y, solution.result, counts)
 
 
 def _measured(ok: Array, inputs: Inputs, options: Options, measures: tuple[Array, ...]) -> _Run:
-    rate, fastest, scales = measures
-    since_start = jnp.where(ok, inputs.since_start, 0.0)
-    moving = since_start[-1] > 0  # all times at t0: nothing to integrate
-    stretch = power_of_two(jnp.where(moving, rate, 1.0))  # exact to multiply by
-    taus = since_start * stretch
-    end = jnp.where(moving, taus[-1], 1.0)
-    resolution = _RESOLUTION * jnp.finfo(end.dtype).eps * jax.lax.stop_gradient(end)
-    return _Run(
-        ok, inputs.t0.astype(end.dtype), stretch, scales, fastest / stretch, taus, end, resolution,
-        options.max_step * stretch,
-    )  # fmt: skip
+    fastest, scales = measures
+    times = jnp.where(ok, inputs.since_start, 0.0)
+    eps = jnp.finfo(times.dtype).eps
+    # Where all times are at t0, or a lane is bad, there is one step, which hands the start in.
+    end = jnp.where(times[-1] > 0, times[-1], eps / fastest)
+    resolution = _RESOLUTION * eps * jax.lax.stop_gradient(end)
+    start = inputs.t0.astype(end.dtype)
+    return _Run(ok, start, scales, fastest, times, end, resolution, options.max_step)
 
 
 def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     """The motion as one array, for a solver with an error estimate."""
     system, state0, _, _, args = inputs
-    flat, unravel = ravel_pytree(state0)
+    y0, to_state = ravel_pytree(state0)
 
-    def to_state(y: Any) -> Any:
-        return unravel(y * run.scales)
-
-    # Both are powers of two, by which numbers are divided and multiplied exactly; multiplied, soon.
-    second, per_scale = 1 / run.stretch, 1 / (run.scales * run.stretch)
-
-    def plain_field(tau: Any, y: Any, args: Any) -> Array:
-        rates = system.vector_field(run.start + tau * second, to_state(y), args)
-        rates = ravel_pytree(rates)[0] * per_scale
-        return jnp.where(run.ok, rates, 0.0)  # no other lane waits for a bad one: it stands still
+    def plain_field(t: Any, y: Any, args: Any) -> Array:
+        return ravel_pytree(system.vector_field(run.start + t, to_state(y), args))[0]
 
     def rate_of(y: Any, rate: Array) -> Array:
-        rate = jnp.maximum(rate, jnp.sqrt(jnp.sum((to_state(y).omega / run.stretch) ** 2)))
-        known = run.ok & jnp.isfinite(rate)
-        return jnp.maximum(jnp.where(known, rate, 0.0), jnp.finfo(y.dtype).tiny)
+        unit = to_state(run.scales).omega[0]  # beyond the range of numbers are rates, not squares
+        rate = jnp.maximum(rate, unit * jnp.sqrt(jnp.sum((to_state(y).omega / unit) ** 2)))
+        return jnp.maximum(jnp.where(jnp.isfinite(rate), rate, 0.0), jnp.finfo(y.dtype).tiny)
 
     # What the functions of a user close over becomes visible.
-    y0 = flat / run.scales
-    point = (jnp.zeros_like(run.stretch), y0, args)
-    field: Any = harmless(run.ok, eqx.filter_closure_convert(plain_field, *point))
-    vector_field = field
-    if not isinstance(options.adjoint, diffrax.ForwardMode):  # NaN would go to all that lanes share
-        vector_field = jtu.Partial(guarded, field, jax.lax.stop_gradient(y0))
+    field: Any = eqx.filter_closure_convert(plain_field, jnp.zeros_like(run.end), y0, args)
+    field = harmless(run.ok, field)
 
     stop = jax.lax.stop_gradient(run.end)
     first = jnp.minimum(LARGEST_STEP / run.fastest, run.longest)
@@ -270,31 +257,26 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     noise = _NOISE * jnp.finfo(y0.dtype).eps
     watchful = WatchfulController(
         rtol=jnp.maximum(fraction * options.rtol, noise),
-        atol=jnp.maximum(fraction * options.atol, noise),
+        atol=jnp.maximum(fraction * options.atol, noise) * run.scales,
         longest=run.longest if options.is_implicit else first,  # or only what is on the way bounds
         first_step=jnp.minimum(0.1 * first, stop),
         resolution=run.resolution,
         start_rate=run.fastest,
+        scales=run.scales,
         field=constant(field),
         rate_of=constant(eqx.filter_closure_convert(rate_of, y0, run.end)),
         damped=options.is_implicit,
     )
-    return diffrax.ODETerm(vector_field), y0, to_state, watchful
+    return diffrax.ODETerm(field), y0, to_state, watchful
 
 
 def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
-    """The free body with time in radians, for `ExactFree`: in one step, or those of an event."""
-    state0, stretch = inputs.state0, run.stretch
-
-    def to_state(y: Any) -> Any:
-        return dataclasses.replace(y, omega=y.omega * stretch)
-
-    y0 = dataclasses.replace(state0, omega=state0.omega / stretch)
+    """The free body, for `ExactFree`: in one step, or those of an event."""
     step = jax.lax.stop_gradient(run.end)
     if options.event is not None:
         step = jnp.minimum(step, jnp.minimum(LARGEST_STEP / run.fastest, run.longest))
-    terms = FreeRotation(inputs.system.inertia.astype(y0.omega.dtype))
-    return terms, y0, to_state, SteadyController(step)
+    terms = FreeRotation(inputs.system.inertia.astype(step.dtype))
+    return terms, inputs.state0, lambda y: y, SteadyController(step)
 
 
 def _trajectory(
@@ -306,11 +288,11 @@ def _trajectory(
     ends: Ends,
     options: Options,
 ) -> Trajectory:
-    """What became of it, in SI units."""
+    """What became of it."""
     reached, ys = ends.reached, ends.ys
 
-    def state_at(tau: Array, y: Any) -> Any:
-        there = jnp.isfinite(tau)
+    def state_at(t: Array, y: Any) -> Any:
+        there = jnp.isfinite(t)
         state = to_state(harmless(there, y))
         state = dataclasses.replace(state, attitude=normalize(state.attitude))
         return nan_where(~there, state)
@@ -320,15 +302,12 @@ def _trajectory(
 
     states = jax.vmap(state_at)(reached, ys)
     # Without an event the motion ends at the last of the times.
-    tau, y = last((reached, ys)) if options.event is None else (ends.t, ends.y)
-    final_state = state_at(tau, y)
+    t, y = last((reached, ys)) if options.event is None else (ends.t, ends.y)
+    final_state = state_at(t, y)
     ending, end_y = constant((ends.t, ends.y))
-    tau = jnp.where(jnp.isfinite(tau), tau, ending)
-    final_time = usable.t0 + (tau / run.stretch).astype(usable.t0.dtype)
+    final_time = usable.t0 + jnp.where(jnp.isfinite(t), t, ending).astype(usable.t0.dtype)
     result = RESULTS.promote(ends.result)
-    beyond = constant(
-        (usable, run.start + ending / run.stretch, to_state(end_y), run.resolution / run.stretch)
-    )
+    beyond = constant((usable, run.start + ending, to_state(end_y), run.resolution))
     stopped = (result == RESULTS.dt_min_reached) & ~_finite_ahead(*beyond)
     result = RESULTS.where(stopped, RESULTS.nonfinite_torque, result)
     lost = (result == RESULTS.successful) & ~all_finite(final_state)

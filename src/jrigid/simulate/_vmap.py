@@ -1,4 +1,4 @@
-"""What `jax.vmap` and derivatives make of a motion: lanes, and what diffrax does alone."""
+"""What a motion is to JAX: its value and `jax.vmap` by lanes, its derivatives by diffrax."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,35 +20,41 @@ def vmappable(
     problem: Problem,
     forward: bool,
 ) -> Ends:
-    """`alone(problem)`, by itself; under vmap all motions in lanes; derivatives of `alone`."""
+    """The motion in a lane; under vmap all motions in lanes; derivatives of `alone`."""
 
     def value(problem: Problem) -> Ends:
-        return _value(alone, solver, max_steps, problem)
+        return _value(solver, max_steps, problem)
 
     if forward:
         differentiable = eqx.filter_custom_jvp(value)
         differentiable.def_jvp(lambda x, dx: eqx.filter_jvp(alone, x, dx))
         return differentiable(problem)
     differentiable = eqx.filter_custom_vjp(value)
-    differentiable.def_fwd(lambda _, problem: (value(guard_derivative(problem)), None))
 
-    def backward(_: Any, change: Ends, __: Any, problem: Problem) -> Any:
-        problem, change = guard_derivative((problem, change))
-        ends, pull = eqx.filter_vjp(alone, problem)
-        ends = eqx.filter(ends, eqx.is_inexact_array)
+    def forwards(perturbed: Any, problem: Problem) -> tuple[Ends, Any]:
+        moved, fixed = eqx.partition(guard_derivative(problem), perturbed)
+        ends, pull = eqx.filter_vjp(lambda moved: alone(eqx.combine(moved, fixed)), moved)
+        return ends, (pull, eqx.filter(ends, eqx.is_inexact_array))
+
+    def backwards(residual: Any, change: Ends, *_: Any) -> Any:
+        pull, ends = residual
         zero = jtu.tree_map(jnp.zeros_like, ends)  # of what is not asked for there is None
-        return pull(eqx.combine(eqx.filter(change, eqx.is_array), zero))[0]
+        return pull(guard_derivative(eqx.combine(eqx.filter(change, eqx.is_array), zero)))[0]
 
-    differentiable.def_bwd(backward)
+    differentiable.def_fwd(forwards)
+    differentiable.def_bwd(backwards)
     return differentiable(problem)
 
 
-def _value(alone: Callable[[Problem], Ends], solver: Any, max_steps: int, problem: Problem) -> Ends:
+def _value(solver: Any, max_steps: int, problem: Problem) -> Ends:
     arrays, static = eqx.partition(problem, eqx.is_array)
 
     @jax.custom_batching.custom_vmap
-    def solve(arrays: Any) -> Ends:
-        return alone(eqx.combine(arrays, static))
+    def one(arrays: Any) -> Ends:
+        each, shared = eqx.partition(arrays, jtu.tree_map(lambda x: x is arrays.y0, arrays))
+        each = jtu.tree_map(lambda x: x[None], each)
+        ends = in_lanes(eqx.combine(shared, static), each, solver, max_steps)
+        return jtu.tree_map(lambda x: x[0], ends)
 
     def batch(arrays: Any, batched: Any) -> Ends:
         @jax.custom_batching.custom_vmap
@@ -79,9 +85,9 @@ def _value(alone: Callable[[Problem], Ends], solver: Any, max_steps: int, proble
 
         return many(arrays)
 
-    @solve.def_vmap
+    @one.def_vmap
     def _(_: int, batched: Any, arrays: Any) -> tuple[Ends, Any]:
         ends = batch(arrays, batched[0])
         return ends, jtu.tree_map(lambda _: True, ends)
 
-    return solve(arrays)
+    return one(arrays)

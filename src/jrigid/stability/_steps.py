@@ -147,7 +147,7 @@ def walk(motion: Motion, steps: int, ok: Array) -> Walk:
     """Set up `steps` equal steps over the duration, harmless where the arguments are not ok."""
     motion = harmless_motion(ok, motion)
     system, state0, args, t0, duration, _ = motion
-    *_, scales = jax.lax.stop_gradient(units(system, state0, duration, t0, args))
+    _, scales = jax.lax.stop_gradient(units(system, state0, duration, t0, args))
     return Walk(motion, duration / steps, scales)
 
 
