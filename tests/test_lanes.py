@@ -9,6 +9,7 @@ from helpers import quick_jit
 
 import jrigid as jr
 from jrigid._lanes_last import lanes_last
+from jrigid.simulate import _pull
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 GRAVITY = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
@@ -192,3 +193,54 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
     together = quick_jit(jax.vmap(final))(omegas)
     for omega, found in zip(omegas, together, strict=True):
         np.testing.assert_allclose(found, final(omega), atol=1e-5)
+
+
+# Derivatives ---------------------------------------------------------------------------------
+
+
+def _end(moments, omega, ts=TIMES, adjoint=None):
+    trajectory = _motion(jr.RigidBody(moments, GRAVITY), omega, ts, adjoint=adjoint)
+    states = trajectory.states
+    return jnp.concatenate([states.omega.ravel(), states.attitude.ravel()]), trajectory.result
+
+
+def test_derivatives_in_lanes_are_those_of_single_motions(rng):
+    """In what is each lane's own and in what all share; one lane is bad, one slow, one at rest."""
+    omegas = rng.normal(size=(6, 3)) * np.array([0.0, 1.0, 1.0, 9.0, 1.0, 1.0])[:, None]
+    weights = rng.normal(size=28)
+
+    def loss(moments, omegas):
+        ends, result = jax.vmap(lambda omega: _end(moments, omega))(omegas)
+        good = result == jr.RESULTS.successful
+        return jnp.sum(jnp.where(good[:, None], ends, 0.0) @ weights)
+
+    def jacobian(moments, omega):
+        forward = lambda *x: _end(*x, adjoint=diffrax.ForwardMode())[0]  # noqa: E731
+        return jax.jacfwd(forward, (0, 1))(moments, omega)
+
+    moments = np.array([1.0, 2.0, 3.0])
+    omegas[2, 1] = np.nan
+    found = quick_jit(jax.grad(loss, (0, 1)))(moments, omegas)
+    good = np.array([0, 1, 3, 4, 5])
+    jacobians = quick_jit(jax.vmap(jacobian, (None, 0)))(moments, omegas[good])
+    of_moments, of_omegas = (np.einsum("i,lij->lj", weights, x) for x in jacobians)
+    np.testing.assert_allclose(found[0], of_moments.sum(0), rtol=1e-9)
+    np.testing.assert_allclose(found[1][good], of_omegas, rtol=1e-8, atol=1e-9)
+    assert np.all(found[1][2] == 0)
+    alone = quick_jit(jacobian)(moments, omegas[3])
+    np.testing.assert_allclose(jacobians[0][2], alone[0], atol=1e-8 * np.abs(alone[0]).max())
+
+
+def test_what_is_not_kept_is_run_again(monkeypatch):
+    """The cotangents are the same however few places there are for a long run."""
+    ts = np.array([0.0, 20.0, 20.0, 60.0])
+
+    def gradient(moments):
+        return jax.grad(lambda x: jnp.sum(_end(x, np.array([1.0, 0.3, -0.5]), ts)[0]))(moments)
+
+    moments = np.array([1.0, 2.0, 3.0])
+    kept = jax.jit(gradient)(moments)
+    monkeypatch.setattr(_pull, "_MOST", 6)
+    jax.clear_caches()
+    again = jax.jit(gradient)(moments)
+    np.testing.assert_allclose(again, kept, rtol=1e-11)

@@ -7,7 +7,8 @@ only).
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import diffrax
@@ -67,6 +68,17 @@ def _through(primitive: Primitive, applies: bool, tree: Any) -> Any:
     return jtu.tree_map(
         lambda x: primitive.bind(x) if applies and eqx.is_inexact_array(x) else x, tree
     )
+
+
+@contextmanager
+def forward_only(adjoint: diffrax.AbstractAdjoint) -> Iterator[None]:
+    """Reverse mode through an integration that serves forward mode only fails before its exit."""
+    try:
+        yield
+    except ValueError as error:
+        if isinstance(adjoint, diffrax.ForwardMode) and "Linearization failed" in str(error):
+            raise UnsupportedDerivative(_MESSAGE) from error
+        raise
 
 
 def guard_inputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:

@@ -9,6 +9,8 @@ that they touch is small (512 bytes); anything larger, or more than eight, costs
 motion is one lane, and nothing in its loop is larger than the state.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -21,7 +23,7 @@ from jaxtyping import Array
 from jrigid._lanes_last import lanes_last
 from jrigid._runge_kutta import runge_kutta_step
 from jrigid._scales import rate_along
-from jrigid.simulate._controller import in_tolerances
+from jrigid.simulate._controller import constant, in_tolerances
 
 # So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
 # Elsewhere than on a CPU many more are needed to keep it busy.
@@ -78,9 +80,9 @@ class _Clock(NamedTuple):
     accepted: Array
 
 
-class _Lanes(NamedTuple):
-    number: Array  # of the motion, or how many there are when there are no more
-    motion: Any
+class Place(NamedTuple):
+    """Where a motion is."""
+
     clock: _Clock
     y: Array
     rate: Array
@@ -93,13 +95,19 @@ class _Lanes(NamedTuple):
         return clock.t, self.y, clock.result, clock.steps, clock.accepted
 
 
-class _Steps(NamedTuple):
+class _Lanes(NamedTuple):
+    number: Array  # of the motion, or how many there are when there are no more
+    motion: Any
+    place: Place
+
+
+class Steps(NamedTuple):
     """How one motion steps."""
 
     solver: diffrax.AbstractERK
     max_steps: int
 
-    def begin(self, problem: Problem) -> tuple[_Clock, Array, Array, Array]:
+    def begin(self, problem: Problem) -> Place:
         """Where it starts."""
         term, controller, y0, args, times, beyond, end = problem
         zero, order = jnp.zeros_like(end), self.solver.order(None)
@@ -108,7 +116,7 @@ class _Steps(NamedTuple):
         none = jnp.zeros((), jnp.int32)
         tnext, okay = jnp.minimum(tnext, problem.goal(target)), diffrax.RESULTS.successful
         clock = _Clock(zero, tnext, target, state[:-1], okay, none, none)
-        return clock, y0, problem.field(zero, y0), state[-1]
+        return Place(clock, y0, problem.field(zero, y0), state[-1])
 
     def going(self, problem: Problem, clock: _Clock) -> Array:
         """Whether it is on its way."""
@@ -136,10 +144,10 @@ class _Steps(NamedTuple):
         return kept, hit, place, jtu.tree_map(lambda a, b: jnp.where(goes, a, b), new, clock)
 
 
-class _Batch(NamedTuple):
+class Batch(NamedTuple):
     """All motions, and what has become of them."""
 
-    steps: _Steps
+    steps: Steps
     fixed: Any  # of all of them
     table: Any  # of each of them
     count: int
@@ -152,45 +160,60 @@ class _Batch(NamedTuple):
         """The motions of these numbers, at their start."""
         there = jnp.minimum(number, self.count - 1)
         motion = jtu.tree_map(lambda x: x[..., there], self.table)
-        return _Lanes(number, motion, *self.over_lanes(self.steps.begin, motion))
+        return _Lanes(number, motion, self.over_lanes(self.steps.begin, motion))
+
+    def going(self, motion: Any, place: Place) -> Array:
+        """Which lanes are on their way."""
+        return self.over_lanes(self.steps.going, motion, place.clock)
 
     def through(self, lanes: _Lanes) -> Array:
         """Which lanes are at the end of a motion."""
-        on_the_way = self.over_lanes(self.steps.going, lanes.motion, lanes.clock)
-        return (lanes.number < self.count) & ~on_the_way
+        return (lanes.number < self.count) & ~self.going(lanes.motion, lanes.place)
 
-    def advance(self, carry: tuple[_Lanes, Array]) -> tuple[_Lanes, Array]:
-        """A step in all lanes."""
-        lanes, saved = carry
-        number, motion, clock, y, before, direction = lanes
-        h = (clock.tnext - clock.t)[None]
+    def rates(self, motion: Any, true: Array) -> Callable[[Array, Array], Array]:
+        """The field at a time and a place. `true`: so it is, but the compiler must not know."""
 
         @jax.jit  # traced once for all stages
-        def rates(t: Array, place: Array) -> Array:
-            # What goes into a branch and what comes out of it has been computed, once.
-            def field(place: Array) -> Array:
-                return self.over_lanes(Problem.field, motion, t, place)
+        def rates(t: Array, y: Array) -> Array:
+            # What goes into a branch and what comes out of it has been computed, once. Of what is
+            # on the way in between, on the way back, each number would be copied.
+            @partial(jax.checkpoint, prevent_cse=False)
+            def field(y: Array) -> Array:
+                return self.over_lanes(Problem.field, motion, t, y)
 
-            return jax.lax.cond(some, field, lambda x: x, place)
+            return jax.lax.cond(true, field, lambda y: y, y) if on_cpu() else field(y)
 
-        def rate_at(fraction: float, place: Array) -> Array:
-            return rates(clock.t + fraction * h[0], place)
+        return rates
 
-        some = jnp.any(number < self.count)
-        step = runge_kutta_step(self.steps.solver.tableau, rate_at, h, y, before)
+    def attempt(self, motion: Any, place: Place) -> tuple[Place, Array, Array]:
+        """A step in all lanes; which of them are at a time asked for, and at which."""
+        clock, y, before, direction = place
+        h, rates = clock.tnext - clock.t, self.rates(motion, clock.steps[0] >= 0)
+
+        def rate_at(fraction: float, y: Array) -> Array:
+            return rates(clock.t + fraction * h, y)
+
+        step = runge_kutta_step(self.steps.solver.tableau, rate_at, h[None], y, before)
         y1, error, after, _ = step
         atol, rtol, scales = self.over_lanes(Problem.measures, motion)
-        rate, along = rate_along(lambda y: rate_at(1.0, y), y1, after, direction, scales)
-        error = in_tolerances(atol, rtol, y, y1, error)
-        kept, hit, place, clock = self.over_lanes(self.steps.judge, motion, clock, y1, error, rate)
+        there, base, error = constant((y1, after, in_tolerances(atol, rtol, y, y1, error)))
+        rate, along = rate_along(lambda y: rate_at(1.0, y), there, base, direction, scales)
+        judge = self.steps.judge
+        kept, hit, number, clock = self.over_lanes(judge, motion, clock, there, error, rate)
         pairs = (y1, y), (after, before), (along, direction)
-        y, before, direction = (jnp.where(kept[None], new, old) for new, old in pairs)
+        return Place(clock, *(jnp.where(kept[None], a, b) for a, b in pairs)), hit, number
+
+    def advance(self, carry: tuple[_Lanes, Array]) -> tuple[_Lanes, Array]:
+        """A step in all lanes, and what is asked for saved."""
+        (number, motion, place), saved = carry
+        place, hit, target = self.attempt(motion, place)
 
         def save(saved: Array) -> Array:
-            return saved.at[jnp.where(hit, number, self.count), place].set(y.T, mode="drop")
+            y = jnp.moveaxis(place.y, -1, 0)
+            return saved.at[jnp.where(hit, number, self.count), target].set(y, mode="drop")
 
         saved = jax.lax.cond(jnp.any(hit), save, lambda x: x, saved)
-        return _Lanes(number, motion, clock, y, before, direction), saved
+        return _Lanes(number, motion, place), saved
 
     def hand_in(self, carry: tuple) -> tuple:
         """What has become of motions that are through, and others in their lanes."""
@@ -201,35 +224,67 @@ class _Batch(NamedTuple):
         def put(all_: Array, x: Array) -> Array:
             return all_.at[where].set(jnp.moveaxis(x, -1, 0), mode="drop")
 
-        ends = jtu.tree_map(put, ends, lanes.outcome)
+        ends = jtu.tree_map(put, ends, lanes.place.outcome)
         number = jnp.where(through, cursor + jnp.cumsum(through) - 1, lanes.number)
         fresh = self.take(jnp.minimum(number, self.count))
         lanes = jtu.tree_map(lambda a, b: jnp.where(through, a, b), fresh, lanes)
         return lanes, cursor + jnp.sum(through), saved, ends
 
-    def look(self, carry: tuple) -> tuple:
-        """Some steps, and a look for lanes that are through."""
-        lanes, cursor, saved, ends = carry
-        lanes, saved = jax.lax.fori_loop(0, _STEPS, lambda _, x: self.advance(x), (lanes, saved))
-        carry = lanes, cursor, saved, ends
-        some = jnp.any(self.through(lanes))
-        return jax.lax.cond(some, self.hand_in, lambda x: x, carry)
+    def some_steps(self, carry: tuple[_Lanes, Array]) -> tuple[_Lanes, Array]:
+        """Between two looks for lanes that are through."""
+        return jax.lax.fori_loop(0, _STEPS, lambda _, x: self.advance(x), carry)
+
+    def to_the_end(self, lanes: _Lanes, saved: Array) -> tuple:
+        """All motions, each in its lane: what was saved on the way, what became of them."""
+
+        def more(carry: tuple[_Lanes, Array]) -> Array:
+            return ~jnp.all(self.through(carry[0]) | (carry[0].number == self.count))
+
+        lanes, saved = jax.lax.while_loop(more, self.some_steps, (lanes, saved))
+        outcome = lanes.place.outcome
+        return saved, jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0)[: self.count], outcome)
+
+    def refilled(self, lanes: _Lanes, saved: Array) -> tuple:
+        """The same of more motions than there are lanes."""
+
+        def look(carry: tuple) -> tuple:
+            lanes, cursor, saved, ends = carry
+            lanes, saved = self.some_steps((lanes, saved))
+            some = jnp.any(self.through(lanes))
+            return jax.lax.cond(some, self.hand_in, lambda x: x, (lanes, cursor, saved, ends))
+
+        def more(carry: tuple) -> Array:
+            return jnp.any(carry[0].number < self.count)
+
+        ends = jtu.tree_map(
+            lambda x: jnp.zeros((self.count, *x.shape[:-1]), x.dtype), lanes.place.outcome
+        )
+        carry = lanes, jnp.array(lanes.number.size), saved, ends
+        return jax.lax.while_loop(more, look, carry)[2:]
 
 
-def in_lanes(fixed: Any, each: Any, solver: diffrax.AbstractERK, max_steps: int) -> Ends:
+def on_cpu() -> bool:
+    """Whether that is where it will run."""
+    return jax.default_backend() == "cpu"
+
+
+def width_of(count: int) -> int:
+    """How many lanes so many motions take."""
+    widest = _WIDTH if on_cpu() else _WIDTH_ELSEWHERE
+    return min(widest, -(-count // _REGISTER) * _REGISTER if count > _REGISTER else count)
+
+
+def in_lanes(fixed: Any, each: Any, steps: Steps) -> Ends:
     """Motions that differ in `each`, whose leaves have a motion to each index in front."""
     count = jtu.tree_leaves(each)[0].shape[0]
     table = jtu.tree_map(lambda x: jnp.moveaxis(x, 0, -1), each)
-    batch = _Batch(_Steps(solver, max_steps), fixed, table, count)
-    widest = _WIDTH if jax.default_backend() == "cpu" else _WIDTH_ELSEWHERE
-    width = min(widest, -(-count // _REGISTER) * _REGISTER if count > _REGISTER else count)
+    batch = Batch(steps, fixed, table, count)
+    width = width_of(count)
     lanes = batch.take(jnp.minimum(jnp.arange(width), count))
-    ends = jtu.tree_map(lambda x: jnp.zeros((count, *x.shape[:-1]), x.dtype), lanes.outcome)
     one = eqx.combine(jtu.tree_map(lambda x: x[0], each), fixed)
     saved = jnp.zeros((count, one.times.size, one.y0.size), one.y0.dtype)
-    carry = (lanes, jnp.array(min(width, count)), saved, ends)
-    *_, saved, ends = jax.lax.while_loop(lambda x: jnp.any(x[0].number < count), batch.look, carry)
-    t, y, result, steps, accepted = ends
+    run = batch.refilled if width < count else batch.to_the_end
+    saved, (t, y, result, made, accepted) = run(lanes, saved)
 
     def finish(motion: Any, saved: Array, t: Array, result: Any) -> tuple[Array, Array, Any]:
         problem = eqx.combine(motion, fixed)
@@ -242,5 +297,5 @@ def in_lanes(fixed: Any, each: Any, solver: diffrax.AbstractERK, max_steps: int)
         return reached, jnp.where(there[:, None], ys, jnp.inf), result
 
     reached, ys, result = jax.vmap(finish)(each, saved, t, result)
-    counts = zip(COUNTS, (steps, accepted, steps - accepted), strict=True)
+    counts = zip(COUNTS, (made, accepted, made - accepted), strict=True)
     return Ends(reached, ys, t, y, result, dict(counts))

@@ -56,10 +56,10 @@ class Options(NamedTuple):
 
     @property
     def in_lanes(self) -> bool:
-        """Whether the motion is to run in lanes, alone in one or under vmap with others."""
+        """Whether an explicit method is to run in lanes, alone in one or under vmap with others."""
         plain = self.event is None and isinstance(self.meter, diffrax.NoProgressMeter)
         direct = isinstance(self.adjoint, diffrax.DirectAdjoint)
-        return plain and not direct and isinstance(self.solver, diffrax.AbstractERK)
+        return plain and not direct
 
     @property
     def is_implicit(self) -> bool:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -18,7 +17,7 @@ from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, s
 from jrigid._motion import HasRigidBody, harmless_motion, motion_arguments
 from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
-from jrigid.simulate._adjoint import WithTimes, guard_inputs, guard_outputs
+from jrigid.simulate._adjoint import WithTimes, forward_only, guard_inputs, guard_outputs
 from jrigid.simulate._controller import (
     LARGEST_STEP,
     SteadyController,
@@ -27,10 +26,10 @@ from jrigid.simulate._controller import (
     guarded,
 )
 from jrigid.simulate._event import event_of_states
-from jrigid.simulate._lanes import COUNTS, Ends, Problem
+from jrigid.simulate._lanes import COUNTS, Ends, Problem, Steps
 from jrigid.simulate._options import Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
-from jrigid.simulate._vmap import vmappable
+from jrigid.simulate._vmap import motion_in_lanes
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem
 
@@ -141,7 +140,8 @@ def simulate(
     asked = Options(solver, rtol, atol, adjoint, max_steps, max_step, event, progress)
     options = checked_options(asked, body, state0.omega.dtype)
     inputs = Inputs(body, state0, ts, t0, args)
-    trajectory = _simulate(inputs, options)
+    with forward_only(options.adjoint):
+        trajectory = _simulate(inputs, options)
 
     def findings() -> Findings:
         found, _ = judged(inputs, options)
@@ -180,10 +180,9 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     beyond = jnp.searchsorted(run.times, run.times, side="right")
     problem = Problem(terms, controller, y0, usable.args, run.times, beyond, run.end)
     event = event_of_states(options.event, run.start, to_state)
-    if options.in_lanes:
+    if isinstance(options.solver, diffrax.AbstractERK) and options.in_lanes:
         forward = isinstance(options.adjoint, diffrax.ForwardMode)
-        alone = partial(_alone, options, None)
-        ends = vmappable(alone, options.solver, options.max_steps, problem, forward)
+        ends = motion_in_lanes(problem, Steps(options.solver, options.max_steps), forward)
     else:
         ends = _alone(options, event, problem)
     trajectory = _trajectory(findings, inputs, usable, run, to_state, ends, options)
