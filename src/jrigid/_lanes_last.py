@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 from jax.extend import core
 
 _NUMBER_BY_NUMBER = {
-    "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh",
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh",
     "bitcast_convert_type", "cbrt", "ceil", "convert_element_type", "copy", "cos", "cosh",
     "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow",
     "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg",
@@ -79,6 +79,7 @@ def _apply(eqn: Any, values: list, batched: list[bool], lanes: int) -> list:
     return jax.vmap(lambda *x: _bind(primitive, params, *x), axes, -1)(*values)
 
 
+_OF_SCANS = {"jaxpr", "length", "num_carry", "num_consts", "reverse"}
 # Calls, and where they keep what they call; derivatives are taken elsewhere.
 _CALLS = {
     "jit": "jaxpr",
@@ -90,28 +91,93 @@ _CALLS = {
 }
 
 
-def _evaluate(jaxpr: Any, consts: Any, arguments: list, lanes: int) -> list[tuple[Any, bool]]:
-    known: dict[Any, tuple[Any, bool]] = {}
+def _in_lanes(x: Any, has: bool, lanes: int) -> Any:
+    return x if has else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
 
-    def read(x: Any) -> tuple[Any, bool]:
-        return (x.val, False) if isinstance(x, core.Literal) else known[x]
 
-    known.update(zip(jaxpr.constvars, ((x, False) for x in consts), strict=True))
-    known.update(zip(jaxpr.invars, arguments, strict=True))
-    for eqn in jaxpr.eqns:
-        pairs = [read(x) for x in eqn.invars]
-        values, batched = [x for x, _ in pairs], [b for _, b in pairs]
-        called = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
-        if called is not None and any(batched):
+class _Evaluation:
+    """A jaxpr on values some of which have lanes."""
+
+    def __init__(self, lanes: int):
+        """So many lanes."""
+        self.lanes = lanes
+        self.functions: dict[Any, Any] = {}
+
+    def __call__(self, jaxpr: Any, consts: Any, arguments: Any) -> list[tuple[Any, bool]]:
+        """Values, and whether they have lanes."""
+        known: dict[Any, tuple[Any, bool]] = {}
+
+        def read(x: Any) -> tuple[Any, bool]:
+            return (x.val, False) if isinstance(x, core.Literal) else known[x]
+
+        known.update(zip(jaxpr.constvars, ((x, False) for x in consts), strict=True))
+        known.update(zip(jaxpr.invars, arguments, strict=True))
+        for eqn in jaxpr.eqns:
+            pairs = [read(x) for x in eqn.invars]
+            known.update(zip(eqn.outvars, self.results(eqn, pairs), strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def results(self, eqn: Any, pairs: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+        """Those of an operation."""
+        values, batched = [x for x, _ in pairs], [has for _, has in pairs]
+        name, params = eqn.primitive.name, eqn.params
+        if not any(batched):
+            return [(x, False) for x in _bind(eqn.primitive, params, *values)]
+        if name == "scan" and params.keys() >= _OF_SCANS:
+            return self.scan(params, pairs)
+        if name == "cond" and not batched[0]:
+            return self.cond(params, values, batched)
+        called = params.get(_CALLS.get(name, ""))
+        if called is not None:
+            return self.call(called, values, tuple(batched))
+        return [(x, True) for x in _apply(eqn, values, batched, self.lanes)]
+
+    def call(self, called: Any, values: list, batched: tuple[bool, ...]) -> list[tuple[Any, bool]]:
+        """A function's; one that is called often is traced once."""
+        key = id(called), batched
+        if key not in self.functions:
             closed = isinstance(called, core.ClosedJaxpr)
-            inner, inner_consts = (called.jaxpr, called.consts) if closed else (called, ())
-            results = _evaluate(inner, inner_consts, pairs, lanes)
-        elif any(batched):
-            results = [(x, True) for x in _apply(eqn, values, batched, lanes)]
-        else:
-            results = [(x, False) for x in _bind(eqn.primitive, eqn.params, *values)]
-        known.update(zip(eqn.outvars, results, strict=True))
-    return [read(x) for x in jaxpr.outvars]
+            inner, consts = (called.jaxpr, called.consts) if closed else (called, ())
+            flags: list[bool] = []
+
+            @jax.jit
+            def function(*values: Any) -> list:
+                found = self(inner, consts, zip(values, batched, strict=True))
+                flags[:] = [has for _, has in found]
+                return [x for x, _ in found]
+
+            self.functions[key] = function, flags
+        function, flags = self.functions[key]
+        return list(zip(function(*values), flags, strict=True))
+
+    def whole(self, closed: Any, arguments: Any) -> list:
+        """All results of a branch or a body, in all lanes."""
+        found = self(closed.jaxpr, closed.consts, arguments)
+        return [_in_lanes(*x, self.lanes) for x in found]
+
+    def scan(self, params: dict, pairs: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+        """A loop of a known length."""
+        first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
+        consts, carry, rows = pairs[:first], pairs[first:last], pairs[last:]
+
+        def step(carry: list, values: list) -> tuple[list, list]:
+            row = zip(values, (has for _, has in rows), strict=True)
+            found = self.whole(params["jaxpr"], [*consts, *((x, True) for x in carry), *row])
+            return found[: len(carry)], found[len(carry) :]
+
+        start = [_in_lanes(*x, self.lanes) for x in carry]
+        how = {x: params[x] for x in ("length", "reverse")}
+        end, stacked = jax.lax.scan(step, start, [x for x, _ in rows], **how)
+        return [(x, True) for x in (*end, *stacked)]
+
+    def cond(self, params: dict, values: list, batched: list[bool]) -> list[tuple[Any, bool]]:
+        """A branch that all lanes take."""
+
+        def branch(closed: Any) -> Callable[..., list]:
+            return lambda *values: self.whole(closed, zip(values, batched[1:], strict=True))
+
+        branches = [branch(x) for x in params["branches"]]
+        return [(x, True) for x in jax.lax.switch(values[0], branches, *values[1:])]
 
 
 def lanes_last(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -124,9 +190,5 @@ def lanes_last(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*structure.unflatten(leaves))
 
     jaxpr, results = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    values = _evaluate(jaxpr.jaxpr, jaxpr.consts, [(x, True) for x in leaves], lanes)
-    found = (
-        x if has else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
-        for x, has in values
-    )
+    found = _Evaluation(lanes).whole(jaxpr, [(x, True) for x in leaves])
     return jtu.tree_structure(results).unflatten(found)

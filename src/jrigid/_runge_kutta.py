@@ -3,8 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
+
+from jrigid._as_lanes import on_cpu
 
 
 class Step(NamedTuple):
@@ -23,6 +26,28 @@ def _sum(coefficients: Any, rates: list[Array]) -> Array:
     """
     used = [(jnp.asarray(a, k.dtype), k) for a, k in zip(coefficients, rates, strict=True) if a]
     return sum((k * a for a, k in used[1:]), used[0][1] * used[0][0])
+
+
+def kept_apart(
+    rates: Callable[[Array, Array], Array], true: Array
+) -> Callable[[Array, Array], Array]:
+    """The same rates at a time and a place, for stages written out one after the other.
+
+    Args:
+        rates: At a time and a place.
+        true: So it is, but the compiler must not know. It is no lane's own.
+    """
+    if not on_cpu():
+        return rates
+
+    @jax.jit  # traced once for all stages
+    def apart(t: Array, y: Array) -> Array:
+        # What goes into a branch and what comes out of it has been computed, once. Of what is on
+        # the way in between, each number would be copied for the way back.
+        field = jax.checkpoint(rates, prevent_cse=False)
+        return jax.lax.cond(true, field, lambda _, y: y, t, y)
+
+    return apart
 
 
 def runge_kutta_step(

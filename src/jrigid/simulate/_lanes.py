@@ -10,7 +10,6 @@ motion is one lane, and nothing in its loop is larger than the state.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -20,14 +19,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from jrigid._as_lanes import width_of
 from jrigid._lanes_last import lanes_last
-from jrigid._runge_kutta import runge_kutta_step
+from jrigid._runge_kutta import kept_apart, runge_kutta_step
 from jrigid._scales import rate_along
 from jrigid.simulate._controller import constant, in_tolerances
 
-# So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
-# Elsewhere than on a CPU many more are needed to keep it busy.
-_WIDTH, _WIDTH_ELSEWHERE, _REGISTER = 128, 2**14, 8
 # Steps between two looks for lanes that are through.
 _STEPS = 8
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -172,18 +169,7 @@ class Batch(NamedTuple):
 
     def rates(self, motion: Any, true: Array) -> Callable[[Array, Array], Array]:
         """The field at a time and a place. `true`: so it is, but the compiler must not know."""
-
-        @jax.jit  # traced once for all stages
-        def rates(t: Array, y: Array) -> Array:
-            # What goes into a branch and what comes out of it has been computed, once. Of what is
-            # on the way in between, on the way back, each number would be copied.
-            @partial(jax.checkpoint, prevent_cse=False)
-            def field(y: Array) -> Array:
-                return self.over_lanes(Problem.field, motion, t, y)
-
-            return jax.lax.cond(true, field, lambda y: y, y) if on_cpu() else field(y)
-
-        return rates
+        return kept_apart(lambda t, y: self.over_lanes(Problem.field, motion, t, y), true)
 
     def attempt(self, motion: Any, place: Place) -> tuple[Place, Array, Array]:
         """A step in all lanes; which of them are at a time asked for, and at which."""
@@ -261,17 +247,6 @@ class Batch(NamedTuple):
         )
         carry = lanes, jnp.array(lanes.number.size), saved, ends
         return jax.lax.while_loop(more, look, carry)[2:]
-
-
-def on_cpu() -> bool:
-    """Whether that is where it will run."""
-    return jax.default_backend() == "cpu"
-
-
-def width_of(count: int) -> int:
-    """How many lanes so many motions take."""
-    widest = _WIDTH if on_cpu() else _WIDTH_ELSEWHERE
-    return min(widest, -(-count // _REGISTER) * _REGISTER if count > _REGISTER else count)
 
 
 def in_lanes(fixed: Any, each: Any, steps: Steps) -> Ends:

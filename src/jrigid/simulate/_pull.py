@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from jrigid._as_lanes import width_of
 from jrigid._runge_kutta import runge_kutta_step
-from jrigid.simulate._lanes import Batch, Place, Problem, Steps, width_of
+from jrigid.simulate._lanes import Batch, Place, Problem, Steps
 
 # So many places are kept, within so many bytes: a run of n attempts is run again some
 # log(n) / log(places) times.

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
+from jrigid._as_lanes import in_blocks
 from jrigid._checks import RESULTS, Enumeration, Findings, array_of_shape, settle, whole_number
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.stability._steps import Motion, findings_of, motion_of, orthonormal, verdict, walk
+from jrigid.stability._steps import Motion, Walk, findings_of, motion_of, orthonormal, verdict, walk
 from jrigid.systems import RigidBody
 
 _REGULAR, _CHAOTIC = 3.0, 5.0  # between them MEGNO has not decided
@@ -105,20 +106,19 @@ def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
     return samples, -(-steps // (samples * every)), every
 
 
-@eqx.filter_jit
-def _growth(
-    motion: Motion, plan: tuple[int, int, int], rows: Array
-) -> tuple[LyapunovSpectrum, Megno]:
-    """Orthonormal again after each interval; the indicator is that of the first one."""
-    findings, dtype = _findings(motion, rows), rows.dtype
+def _followed(path: Walk, y: Array, plan: tuple[int, int, int]) -> tuple[Array, ...]:
+    """Where the motion ends, sums of the growth up to each sample, the largest local error.
+
+    Orthonormal again after each interval; the indicator is that of the first one.
+    """
     samples, each, every = plan
-    path = walk(motion, samples * each * every, findings.ok)
+    none = jnp.zeros((), y.dtype)
 
     def interval(carry: tuple, index: Array) -> tuple[tuple, None]:
         y, (totals, weighted, indicator), error = carry
         y, local = path.follow(index * every, every, y)
         rows, lengths = orthonormal(path.tangents(y))
-        logs, number = jnp.log(lengths), (1 + index).astype(dtype)
+        logs, number = jnp.log(lengths), (1 + index).astype(y.dtype)
         weighted = weighted + number * logs[0]
         tally = (totals + logs, weighted, indicator + 2 * weighted / number)
         return (path.with_tangents(y, rows), tally, jnp.maximum(error, local)), None
@@ -127,12 +127,20 @@ def _growth(
         carry, _ = jax.lax.scan(interval, carry, first + jnp.arange(each))
         return carry, carry[1]
 
-    none = jnp.zeros((), dtype)
+    begin = (y, (jnp.zeros(len(path.tangents(y)), y.dtype), none, none), none)
+    (y, _, error), (totals, _, indicator) = jax.lax.scan(sample, begin, each * jnp.arange(samples))
+    return y, totals, indicator, error
+
+
+@eqx.filter_jit
+def _growth(
+    motion: Motion, plan: tuple[int, int, int], rows: Array
+) -> tuple[LyapunovSpectrum, Megno]:
+    findings, (samples, each, every) = _findings(motion, rows), plan
+    path = walk(motion, samples * each * every, findings.ok)
     y = path.with_tangents(path.start, orthonormal(rows)[0])
-    begin = (y, (jnp.zeros(len(rows), dtype), none, none), none)
-    firsts = each * jnp.arange(samples)
-    (y, _, error), (totals, _, indicator) = jax.lax.scan(sample, begin, firsts)
-    counts = (firsts + each).astype(dtype)
+    y, totals, indicator, error = in_blocks(lambda path, y: _followed(path, y, plan), path, y)
+    counts = (each * (1 + jnp.arange(samples))).astype(rows.dtype)
     ts = path.step * every * counts
     answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
     ts, exponents, means, state = verdict(findings, error, answer)

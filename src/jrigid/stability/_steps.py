@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, all_positive, nan_where
 from jrigid._motion import check_motion, harmless_motion, motion_arguments, solver_of
+from jrigid._runge_kutta import kept_apart, runge_kutta_step
 from jrigid._scales import units
 from jrigid.dynamics import State
 from jrigid.rotation import attitude_rate, normalize
@@ -62,8 +63,8 @@ def findings_of(motion: Motion) -> Findings:
 class Walk(NamedTuple):
     """A motion in equal steps.
 
-    Its state is one array in its own scales. Tangents may follow in the same array, each (turn
-    about the body axes, change of the rate, change of the internal state), in the same scales.
+    Its state is one array. Tangents may follow in the same array, each (turn about the body axes,
+    change of the rate, change of the internal state), the changes in the scales of what changes.
     """
 
     motion: Motion
@@ -73,11 +74,11 @@ class Walk(NamedTuple):
     @property
     def start(self) -> Array:
         """The state at the start."""
-        return ravel_pytree(self.motion.state0)[0] / self.scales
+        return ravel_pytree(self.motion.state0)[0]
 
     def state(self, y: Array) -> State:
-        """The state in SI units."""
-        return ravel_pytree(self.motion.state0)[1](y[: self.scales.size] * self.scales)
+        """The state."""
+        return ravel_pytree(self.motion.state0)[1](y[: self.scales.size])
 
     def tangents(self, y: Array) -> Array:
         """The tangents, a row each."""
@@ -89,12 +90,12 @@ class Walk(NamedTuple):
 
     def on_sphere(self, y: Array) -> Array:
         """The same with a quaternion of norm 1."""
-        return jnp.concatenate([normalize(y[:4]) / self.scales[:4], y[4:]])
+        return jnp.concatenate([normalize(y[:4]), y[4:]])
 
     def rates(self, t: Array, y: Array) -> Array:
         """Time derivative of the state."""
         rates = self.motion.system.vector_field(t, self.state(y), self.motion.args)
-        return ravel_pytree(rates)[0] / self.scales
+        return ravel_pytree(rates)[0]
 
     def _together(self, t: Array, y: Array) -> Array:
         """Time derivatives of the state and of its tangents."""
@@ -102,12 +103,14 @@ class Walk(NamedTuple):
         if not tangents.size:
             return self.rates(t, y)
 
+        units = self.scales[4:]  # powers of two
+
         def beside(tangent: Array) -> tuple[Array, Array]:
-            turned = attitude_rate(state.attitude, tangent[:3]) / self.scales[:4]
-            moved = jnp.concatenate([turned, tangent[3:]])
-            rates, change = jax.jvp(lambda y: self.rates(t, y), (alone,), (moved,))
-            turn = self.scales[4] * tangent[3:6] - jnp.cross(state.omega, tangent[:3])
-            return rates, jnp.concatenate([turn, change[4:]])
+            turn, change = tangent[:3], units * tangent[3:]
+            moved = jnp.concatenate([attitude_rate(state.attitude, turn), change])
+            rates, growth = jax.jvp(lambda y: self.rates(t, y), (alone,), (moved,))
+            turning = change[:3] - jnp.cross(state.omega, turn)
+            return rates, jnp.concatenate([turning, growth[4:] * (1 / units)])
 
         if len(tangents) == 1:
             return self.with_tangents(*beside(tangents[0]))
@@ -120,10 +123,19 @@ class Walk(NamedTuple):
         memory = solver.init(term, t, end, y, None)
         return solver.step(term, t, end, y, None, memory, made_jump=False)[:3]
 
-    def advance(self, t: Array, y: Array) -> tuple[Array, Array]:
-        """One step, and the local error of the state."""
-        after, error, _ = self._solve(t, y)
-        return self.on_sphere(after), jnp.max(jnp.abs(error[: self.scales.size]))
+    def advance(self, t: Array, y: Array, true: Array) -> tuple[Array, Array]:
+        """One step, and the local error of the state. `true`: as of `kept_apart`."""
+        if isinstance(self.motion.solver, diffrax.AbstractERK):
+            rates = kept_apart(self._together, true)
+
+            def rate_at(fraction: float, y: Array) -> Array:
+                return rates(t + fraction * self.step, y)
+
+            tableau, before = self.motion.solver.tableau, rate_at(0.0, y)
+            after, error, *_ = runge_kutta_step(tableau, rate_at, self.step, y, before)
+        else:
+            after, error, _ = self._solve(t, y)
+        return self.on_sphere(after), jnp.max(jnp.abs(error[: self.scales.size]) / self.scales)
 
     def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
         """States within one step, by the fraction of it that has passed."""
@@ -137,7 +149,9 @@ class Walk(NamedTuple):
 
         def step(carry: tuple, i: Array) -> tuple[tuple, None]:
             y, error = carry
-            y, local = self.advance(self.motion.t0 + self.step * (first + i).astype(y.dtype), y)
+            number = first + i
+            t = self.motion.t0 + self.step * number.astype(y.dtype)
+            y, local = self.advance(t, y, number >= 0)
             return (y, jnp.maximum(error, local)), None
 
         return jax.lax.scan(step, (y, jnp.zeros((), y.dtype)), jnp.arange(count))[0]

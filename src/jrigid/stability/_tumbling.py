@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
+from jrigid._as_lanes import in_blocks
 from jrigid._checks import (
     INERTIA,
     RESULTS,
@@ -157,7 +158,7 @@ def _section(
 
         def step(search: tuple[_Place, Array]) -> tuple[_Place, Array]:
             (t, y, above, _, error), count = search
-            after, local = path.advance(t, y)
+            after, local = path.advance(t, y, count >= 0)
             later = start.t + path.step * (count + 1).astype(t.dtype)
             higher = value(later, after) >= 0
             crosses = (higher != above) & (direction is None or higher == direction)
@@ -316,7 +317,7 @@ def final_spin(
 def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     findings = findings_of(motion)
     path = walk(motion, steps, findings.ok)
-    y, error = path.follow(0, steps, path.start)
+    y, error = in_blocks(lambda path, y: path.follow(0, steps, y), path, path.start)
     state, inertia = path.state(y), path.motion.system.inertia
     if inertia.ndim == 1:
         axis = jnp.eye(3, dtype=y.dtype)[jnp.argmax(inertia)]

@@ -1,0 +1,148 @@
+"""What `jax.vmap` of a motion calls: lanes, some at a time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._lanes_last import lanes_last
+
+# So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
+# Elsewhere than on a CPU many more are needed to keep it busy.
+_WIDTH, _WIDTH_ELSEWHERE, _REGISTER = 128, 2**14, 8
+
+
+def on_cpu() -> bool:
+    """Whether that is where it will run."""
+    return jax.default_backend() == "cpu"
+
+
+def width_of(count: int) -> int:
+    """How many lanes so many motions take."""
+    widest = _WIDTH if on_cpu() else _WIDTH_ELSEWHERE
+    return min(widest, -(-count // _REGISTER) * _REGISTER if count > _REGISTER else count)
+
+
+def in_blocks(function: Callable[..., Any], problem: Any, *own: Any) -> Any:
+    """`function(problem, *own)`; under vmap some lanes at a time, along the last axis."""
+
+    def of_all(shared: Any, each: Any, *own: Any) -> Any:
+        count = jtu.tree_leaves(own)[0].shape[0]
+        width = width_of(count)
+        numbers = jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)
+
+        def block(numbers: Array) -> Any:
+            here = jtu.tree_map(lambda x: jnp.moveaxis(x[numbers], 0, -1), (each, own))
+            found = lanes_last(lambda each, own: function(eqx.combine(each, shared), *own), *here)
+            return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), found)
+
+        found = jax.lax.map(block, numbers.reshape(-1, width))
+        return jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+    return as_lanes(of_all, problem, *own)
+
+
+def as_lanes(function: Callable[..., Any], problem: Any, *own: Any, tangents: Any = None) -> Any:
+    """`function(problem, nothing, *own)`; under vmap `function(shared, each, *own)` of all lanes.
+
+    The leaves of `each` and of `own` have a lane to each index in front; what is shared has none.
+    With tangents `function` takes one argument more and gives a pair, of which the second depends
+    on it: where only they have another axis it is they alone that are mapped.
+    """
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    leaves, structure = jtu.tree_flatten((arrays, own, tangents))
+    motions = len(leaves) - len(jtu.tree_leaves(tangents))
+
+    def called(problem: Any, each: Any, own: Any, tangents: Any) -> Any:
+        with_tangents = () if tangents is None else (tangents,)
+        return function(eqx.combine(problem, static), each, *own, *with_tangents)
+
+    def single(*leaves: Any) -> Any:
+        problem, *own = structure.unflatten(leaves)
+        nothing = jtu.tree_map(lambda _: None, problem)
+        found = called(problem, nothing, *jtu.tree_map(lambda x: x[None], own))
+        return jtu.tree_map(lambda x: x[0], found)
+
+    def several(*leaves: Any) -> Any:
+        """Tangents of one motion."""
+        problem, own, tangents = structure.unflatten(leaves)
+
+        def push(shared: Any, each: Any, *own: Any) -> Any:
+            shared = eqx.filter(shared, eqx.is_array)
+            along = lambda x: called(shared, each, own[:-1], x)  # noqa: E731
+            return jax.vmap(along, in_axes=1, out_axes=(None, 1))(own[-1])
+
+        return as_lanes(push, eqx.combine(problem, static), *own, tangents=tangents)
+
+    def of_all(leaves: Any, batched: Any) -> Any:
+        count = next(x.shape[0] for x, has in zip(leaves, batched, strict=True) if has)
+        (problem, *own), (has, *own_has) = structure.unflatten(leaves), structure.unflatten(batched)
+        each, shared = eqx.partition(problem, has)
+        own = jtu.tree_map(
+            lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), own, own_has
+        )
+        return called(shared, each, *own)
+
+    def batch(leaves: Any, batched: Any) -> Any:
+        @jax.custom_batching.custom_vmap
+        def lanes(*leaves: Any) -> Any:
+            return of_all(leaves, batched)
+
+        @lanes.def_vmap
+        def _(size: int, again: Any, *leaves: Any) -> tuple[Any, Any]:
+            """Lanes of lanes are lanes."""
+            if not any(again):
+                return _without_axis(of_all(leaves, batched))
+            if not any(again[:motions]):
+                axes = [0 if has else None for has in again]
+                found = jax.vmap(lambda *x: of_all(x, batched), axes, (None, 0))(*leaves)
+                return _of_tangents(found)
+            flags = list(zip(leaves, batched, again, strict=True))
+            count = next(x.shape[1 if out else 0] for x, has, out in flags if has)
+
+            flat = [_flat(*x, size, count) for x in flags]
+            found = batch(flat, [has or out for _, has, out in flags])
+            found = jtu.tree_map(lambda x: x.reshape(size, count, *x.shape[1:]), found)
+            return found, jtu.tree_map(lambda _: True, found)
+
+        return lanes(*leaves)
+
+    alone = jax.custom_batching.custom_vmap(single)
+
+    @alone.def_vmap
+    def _(size: int, batched: Any, *leaves: Any) -> tuple[Any, Any]:
+        if not any(batched):
+            return _without_axis(single(*leaves))
+        if not any(batched[:motions]):
+            spread = [
+                x if has or i < motions else jnp.broadcast_to(x, (size, *x.shape))
+                for i, (x, has) in enumerate(zip(leaves, batched, strict=True))
+            ]
+            return _of_tangents(several(*spread))
+        found = batch(leaves, batched)
+        return found, jtu.tree_map(lambda _: True, found)
+
+    return alone(*leaves)
+
+
+def _without_axis(found: Any) -> tuple[Any, Any]:
+    """What only derivatives of derivatives give an axis to: they are mapped, not lanes."""
+    return found, jtu.tree_map(lambda _: False, found)
+
+
+def _of_tangents(found: tuple[Any, Any]) -> tuple[Any, Any]:
+    motion, tangent = found
+    return found, (jtu.tree_map(lambda _: False, motion), jtu.tree_map(lambda _: True, tangent))
+
+
+def _flat(x: Array, has: bool, out: bool, size: int, count: int) -> Array:
+    """Two axes of lanes as one; none where there is neither."""
+    if not (has or out):
+        return x
+    x = x if out else x[None]
+    x = x if has else x[:, None]
+    return jnp.broadcast_to(x, (size, count, *x.shape[2:])).reshape(-1, *x.shape[2:])
