@@ -6,7 +6,8 @@ I = (1, 2, 3), weight 1, lever (0.3, 0.1, 0.5), rates normal with unit variance.
 `jrigid.simulate`, of a hand-written `diffeqsolve` (Dopri8), heyoka's batch integrator in the same
 variables (quaternion and rates) and in Euler-Poisson's. Then lanes that are not alike: rates over a
 factor of 20, beside the sum of what each of four kinds takes alone; one lane that fails at once and
-one that needs a hundred times the steps. Run it on one core: heyoka is timed on one thread.
+one that needs a hundred times the steps; gradients and Jacobians in the three moments. Run it on
+one core: heyoka is timed on one thread.
 """
 
 import time
@@ -154,6 +155,33 @@ def unlike(lanes):
     return [[*x[:2], x[1] / x[2], x[3]] for x in rows]
 
 
+def derivatives(lanes):
+    """Of the last rates in the three moments, beside the value."""
+    w0 = np.random.default_rng(2).normal(size=(lanes, 3))
+
+    def end(moments, omega, adjoint=None):
+        body = jr.RigidBody(moments, BODY.torque)
+        state = jr.State(UPRIGHT, omega)
+        return jr.simulate(body, state, END, adjoint=adjoint, throw=False).final_state.omega
+
+    def gradient(moments, omega):
+        return jax.grad(lambda x: end(x, omega)[0])(moments)
+
+    def jacobian(moments, omega):
+        return jax.jacfwd(lambda x: end(x, omega, diffrax.ForwardMode()))(moments)
+
+    rows = []
+    for name, starts in (("one", w0[0]), (str(lanes), w0)):
+        value = 1.0
+        for what, function in (("value", end), ("gradient", gradient), ("Jacobian", jacobian)):
+            one = lambda omega, f=function: f(jnp.asarray(MOMENTS), omega)  # noqa: E731
+            program = jax.jit(one if starts.ndim == 1 else jax.vmap(one))
+            compile_ms, least, _ = seconds(program, starts)
+            value = least if what == "value" else value
+            rows.append([f"{name}: {what}", compile_ms, least, least / value])
+    return rows
+
+
 def main(lanes, write):
     text = common.table(
         [f"{lanes} heavy asymmetric tops", "compile ms", "min ms", "ns a step", "energy, median"],
@@ -161,6 +189,8 @@ def main(lanes, write):
     )
     header = [f"{lanes // 5 // 4 * 4} of them", "min ms", "ratio", "to"]
     text += "\n\n" + common.table(header, unlike(lanes // 5 // 4 * 4))
+    header = ["T = 100, rtol 1e-8", "compile ms", "min ms", "in values"]
+    text += "\n\n" + common.table(header, derivatives(lanes // 5 // 4 * 4))
     packages = ["jax", "diffrax", "numpy", *(["heyoka"] if "heyoka" in text else [])]
     common.report("lanes", "Many motions at once", text, packages, write)
 

@@ -25,7 +25,7 @@ from jrigid._runge_kutta import kept_apart, runge_kutta_step
 from jrigid._scales import rate_along
 from jrigid.simulate._controller import constant, in_tolerances
 
-# Steps between two looks for lanes that are through.
+# At most so many steps between two looks for lanes that are through.
 _STEPS = 8
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -153,9 +153,16 @@ class Batch(NamedTuple):
         """A function of one motion and of what is its own, in all lanes."""
         return lanes_last(lambda x, *y: function(eqx.combine(x, self.fixed), *y), *lanes)
 
-    def take(self, number: Array) -> _Lanes:
+    @property
+    def longest_first(self) -> Array:
+        """The order in which the motions begin: none is left for the end, with few beside it."""
+        radians = self.over_lanes(lambda x: x.end * x.controller.start_rate, self.table)
+        return jnp.argsort(-radians)
+
+    def take(self, number: Array, order: Array | None = None) -> _Lanes:
         """The motions of these numbers, at their start."""
         there = jnp.minimum(number, self.count - 1)
+        there = there if order is None else order[there]
         motion = jtu.tree_map(lambda x: x[..., there], self.table)
         return _Lanes(number, motion, self.over_lanes(self.steps.begin, motion))
 
@@ -189,21 +196,9 @@ class Batch(NamedTuple):
         pairs = (y1, y), (after, before), (along, direction)
         return Place(clock, *(jnp.where(kept[None], a, b) for a, b in pairs)), hit, number
 
-    def advance(self, carry: tuple[_Lanes, Array]) -> tuple[_Lanes, Array]:
-        """A step in all lanes, and what is asked for saved."""
-        (number, motion, place), saved = carry
-        place, hit, target = self.attempt(motion, place)
-
-        def save(saved: Array) -> Array:
-            y = jnp.moveaxis(place.y, -1, 0)
-            return saved.at[jnp.where(hit, number, self.count), target].set(y, mode="drop")
-
-        saved = jax.lax.cond(jnp.any(hit), save, lambda x: x, saved)
-        return _Lanes(number, motion, place), saved
-
     def hand_in(self, carry: tuple) -> tuple:
         """What has become of motions that are through, and others in their lanes."""
-        lanes, cursor, saved, ends = carry
+        lanes, cursor, saved, ends, order = carry
         through = self.through(lanes)
         where = jnp.where(through, lanes.number, self.count)
 
@@ -212,16 +207,36 @@ class Batch(NamedTuple):
 
         ends = jtu.tree_map(put, ends, lanes.place.outcome)
         number = jnp.where(through, cursor + jnp.cumsum(through) - 1, lanes.number)
-        fresh = self.take(jnp.minimum(number, self.count))
+        fresh = self.take(jnp.minimum(number, self.count), order)
         lanes = jtu.tree_map(lambda a, b: jnp.where(through, a, b), fresh, lanes)
-        return lanes, cursor + jnp.sum(through), saved, ends
+        return lanes, cursor + jnp.sum(through), saved, ends, order
 
     def some_steps(self, carry: tuple[_Lanes, Array]) -> tuple[_Lanes, Array]:
-        """Between two looks for lanes that are through."""
-        return jax.lax.fori_loop(0, _STEPS, lambda _, x: self.advance(x), carry)
+        """On to where one is at a time asked for, which is saved, but not too far."""
+        (number, motion, place), saved = carry
+        none = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, place.clock.target.dtype)
 
-    def to_the_end(self, lanes: _Lanes, saved: Array) -> tuple:
+        def more(carry: tuple) -> Array:
+            count, _, (hit, _) = carry
+            return (count < _STEPS) & ~jnp.any(hit)
+
+        def on(carry: tuple) -> tuple:
+            count, place, _ = carry
+            place, *found = self.attempt(motion, place)
+            return count + 1, place, tuple(found)
+
+        # Nothing large in this loop: `saved` is not.
+        _, place, (hit, target) = jax.lax.while_loop(more, on, (0, place, none))
+
+        def save(saved: Array) -> Array:
+            y = jnp.moveaxis(place.y, -1, 0)
+            return saved.at[jnp.where(hit, number, self.count), target].set(y, mode="drop")
+
+        return _Lanes(number, motion, place), _when(jnp.any(hit), save, saved)
+
+    def to_the_end(self, width: int, saved: Array) -> tuple:
         """All motions, each in its lane: what was saved on the way, what became of them."""
+        lanes = self.take(jnp.minimum(jnp.arange(width), self.count))
 
         def more(carry: tuple[_Lanes, Array]) -> Array:
             return ~jnp.all(self.through(carry[0]) | (carry[0].number == self.count))
@@ -230,14 +245,16 @@ class Batch(NamedTuple):
         outcome = lanes.place.outcome
         return saved, jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0)[: self.count], outcome)
 
-    def refilled(self, lanes: _Lanes, saved: Array) -> tuple:
+    def refilled(self, width: int, saved: Array) -> tuple:
         """The same of more motions than there are lanes."""
+        order = self.longest_first
+        lanes = self.take(jnp.arange(width), order)
 
         def look(carry: tuple) -> tuple:
-            lanes, cursor, saved, ends = carry
+            lanes, cursor, saved, *others = carry
             lanes, saved = self.some_steps((lanes, saved))
             some = jnp.any(self.through(lanes))
-            return jax.lax.cond(some, self.hand_in, lambda x: x, (lanes, cursor, saved, ends))
+            return _when(some, self.hand_in, (lanes, cursor, saved, *others))
 
         def more(carry: tuple) -> Array:
             return jnp.any(carry[0].number < self.count)
@@ -245,8 +262,18 @@ class Batch(NamedTuple):
         ends = jtu.tree_map(
             lambda x: jnp.zeros((self.count, *x.shape[:-1]), x.dtype), lanes.place.outcome
         )
-        carry = lanes, jnp.array(lanes.number.size), saved, ends
-        return jax.lax.while_loop(more, look, carry)[2:]
+        carry = lanes, jnp.array(width), saved, ends, order
+        _, _, *found, order = jax.lax.while_loop(more, look, carry)
+        return jtu.tree_map(lambda x: x[jnp.argsort(order)], tuple(found))
+
+
+def _when(condition: Array, change: Callable[[Any], Any], x: Any) -> Any:
+    """`change(x)` or `x`. As a loop, in place: of what goes through a branch a copy is made."""
+
+    def once(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        return jnp.zeros_like(carry[0]), change(carry[1])
+
+    return jax.lax.while_loop(lambda carry: carry[0], once, (condition, x))[1]
 
 
 def in_lanes(fixed: Any, each: Any, steps: Steps) -> Ends:
@@ -255,11 +282,10 @@ def in_lanes(fixed: Any, each: Any, steps: Steps) -> Ends:
     table = jtu.tree_map(lambda x: jnp.moveaxis(x, 0, -1), each)
     batch = Batch(steps, fixed, table, count)
     width = width_of(count)
-    lanes = batch.take(jnp.minimum(jnp.arange(width), count))
     one = eqx.combine(jtu.tree_map(lambda x: x[0], each), fixed)
     saved = jnp.zeros((count, one.times.size, one.y0.size), one.y0.dtype)
     run = batch.refilled if width < count else batch.to_the_end
-    saved, (t, y, result, made, accepted) = run(lanes, saved)
+    saved, (t, y, result, made, accepted) = run(width, saved)
 
     def finish(motion: Any, saved: Array, t: Array, result: Any) -> tuple[Array, Array, Any]:
         problem = eqx.combine(motion, fixed)

@@ -21,6 +21,7 @@ _SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
 _CHECKPOINTS = 100
+_RATE_BITS = 16  # of the rate that bounds the steps
 _ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
 
 
@@ -133,5 +134,8 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, ...
     fastest, scales = jax.lax.stop_gradient(
         units(system, state0, since_start[-1], start, args, options.fastest_of)
     )
+    # A compiler rounds differently in different lanes of a vmap; their steps are to be the same.
+    bits = jnp.finfo(fastest.dtype).nexp
+    fastest = jax.lax.reduce_precision(fastest, exponent_bits=bits, mantissa_bits=_RATE_BITS)
     findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
     return findings, (fastest, scales)

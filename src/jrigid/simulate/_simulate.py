@@ -177,7 +177,8 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     run = _measured(findings.ok, usable, options, measures)
     problem_of = _exact if isinstance(options.solver, ExactFree) else _stepped
     terms, y0, to_state, controller = problem_of(run, usable, options)
-    beyond = jnp.searchsorted(run.times, run.times, side="right")
+    fixed = jax.lax.stop_gradient(run.times)
+    beyond = jnp.searchsorted(fixed, fixed, side="right")
     problem = Problem(terms, controller, y0, usable.args, run.times, beyond, run.end)
     event = event_of_states(options.event, run.start, to_state)
     if isinstance(options.solver, diffrax.AbstractERK) and options.in_lanes:
