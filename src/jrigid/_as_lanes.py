@@ -32,19 +32,30 @@ def in_blocks(function: Callable[..., Any], problem: Any, *own: Any) -> Any:
     """`function(problem, *own)`; under vmap some lanes at a time, along the last axis."""
 
     def of_all(shared: Any, each: Any, *own: Any) -> Any:
-        count = jtu.tree_leaves(own)[0].shape[0]
-        width = width_of(count)
-        numbers = jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)
+        def block(each: Any, own: Any) -> Any:
+            whole = lambda each, own: function(eqx.combine(each, shared), *own)  # noqa: E731
+            return lanes_last(whole, each, own)
 
-        def block(numbers: Array) -> Any:
-            here = jtu.tree_map(lambda x: jnp.moveaxis(x[numbers], 0, -1), (each, own))
-            found = lanes_last(lambda each, own: function(eqx.combine(each, shared), *own), *here)
-            return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), found)
-
-        found = jax.lax.map(block, numbers.reshape(-1, width))
-        return jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+        return some_at_a_time(block, jnp.arange(jtu.tree_leaves(own)[0].shape[0]), each, own)
 
     return as_lanes(of_all, problem, *own)
+
+
+def some_at_a_time(function: Callable[..., Any], order: Array, *lanes: Any) -> Any:
+    """`function(*lanes)` of blocks of lanes, which it has last, taken in this order."""
+    count = order.size
+    width = width_of(count)
+    order = order[jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)]
+
+    def block(numbers: Array) -> Any:
+        found = function(*jtu.tree_map(lambda x: jnp.moveaxis(x[numbers], 0, -1), lanes))
+        return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), found)
+
+    def in_place(x: Array) -> Array:
+        x = x.reshape(-1, *x.shape[2:])
+        return jnp.zeros((count, *x.shape[1:]), x.dtype).at[order].set(x)
+
+    return jtu.tree_map(in_place, jax.lax.map(block, order.reshape(-1, width)))
 
 
 def as_lanes(function: Callable[..., Any], problem: Any, *own: Any, tangents: Any = None) -> Any:

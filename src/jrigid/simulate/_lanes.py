@@ -41,6 +41,11 @@ class Problem(NamedTuple):
     beyond: Array  # for each of them the number of the next that is later
     end: Array
 
+    @property
+    def first(self) -> Array:
+        """For each of the times the number of the first that is equal to it."""
+        return jnp.searchsorted(self.times, self.times, side="left")
+
     def field(self, t: Array, y: Array) -> Array:
         """The rates."""
         return self.term.vf(t, y, self.args)
@@ -289,8 +294,7 @@ def in_lanes(fixed: Any, each: Any, steps: Steps) -> Ends:
 
     def finish(motion: Any, saved: Array, t: Array, result: Any) -> tuple[Array, Array, Any]:
         problem = eqx.combine(motion, fixed)
-        first = jnp.searchsorted(problem.times, problem.times, side="left")
-        ys = jnp.where(problem.times[:, None] > 0, saved[first], problem.y0[None])
+        ys = jnp.where(problem.times[:, None] > 0, saved[problem.first], problem.y0[None])
         there = problem.times <= t
         short = (result == diffrax.RESULTS.successful) & (t < problem.end)
         result = diffrax.RESULTS.where(short, diffrax.RESULTS.max_steps_reached, result)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._as_lanes import width_of
+from jrigid._as_lanes import some_at_a_time
 from jrigid._runge_kutta import runge_kutta_step
 from jrigid.simulate._lanes import Batch, Place, Problem, Steps
 
@@ -153,7 +153,7 @@ class _Block(NamedTuple):
 
 def _before(problem: Problem) -> Array:
     """For each of the times the number of the first of those that come next before it, or -1."""
-    first = jnp.searchsorted(problem.times, problem.times, side="left")
+    first = problem.first
     return jnp.where(first > 0, first[first - 1], -1)
 
 
@@ -177,31 +177,20 @@ def pull_in_lanes(
     All but what is shared has a motion to each index in front. `reached`: where each ended, after
     how many attempts.
     """
-    count = moved.y0.shape[0]
-    width = width_of(count)
+
+    def block(rest: Any, moved: Any, changes: Any, reached: Any) -> Any:
+        (last, ys), (t, made), table = changes, reached, eqx.combine(rest, moved)
+        ys, target = Batch(steps, shared, table, t.size).over_lanes(_firsts, table, ys, t)
+        return _Block(steps, shared, rest, moved, ys, jnp.max(made)).pull(last, target)
+
     # Motions of the same length go together: none waits for another.
-    order = jnp.argsort(reached[1])[jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)]
-
-    def block(numbers: Array) -> Any:
-        here = jtu.tree_map(lambda x: x[numbers], (rest, moved, changes, reached))
-        rest_, moved_, (last, ys), (t, made) = jtu.tree_map(lambda x: jnp.moveaxis(x, 0, -1), here)
-        table = eqx.combine(rest_, moved_)
-        ys, target = Batch(steps, shared, table, width).over_lanes(_firsts, table, ys, t)
-        pulled = _Block(steps, shared, rest_, moved_, ys, jnp.max(made)).pull(last, target)
-        return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), pulled)
-
-    pulled = jax.lax.map(block, order.reshape(-1, width))
-
-    def in_order(x: Array) -> Array:
-        x = x.reshape(-1, *x.shape[2:])
-        return jnp.zeros((count, *x.shape[1:]), x.dtype).at[order].set(x)
-
-    return jtu.tree_map(in_order, pulled)
+    order = jnp.argsort(reached[1])
+    return some_at_a_time(block, order, rest, moved, changes, reached)
 
 
 def _firsts(problem: Problem, change: Array, t: Array) -> tuple[Array, Array]:
     """Changes at equal times with the first of them; the first of the last that were reached."""
-    first = jnp.searchsorted(problem.times, problem.times, side="left")
+    first = problem.first
     there = problem.times <= t
     change = jnp.zeros_like(change).at[first].add(jnp.where(there[:, None], change, 0.0))
     count = jnp.sum(there)
