@@ -79,18 +79,19 @@ def test_unrolled_takes_the_steps_of_its_method(method, order, steps):
     def field(t, y, args):
         return {"u": args * y["v"], "v": (-y["u"] * jnp.cos(t)[None])}
 
-    def solve(solver, steps):
-        start = {"u": jnp.ones(1), "v": jnp.zeros(1)}
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(field), solver, 0.0, 2.0, 2 / steps, start, jnp.array([1.3]),
-            saveat=diffrax.SaveAt(ts=jnp.array([0.77, 2.0])),
-        ).ys["u"][:, 0]  # fmt: skip
+    def solves(solver):
+        def solve(steps):
+            start = {"u": jnp.ones(1), "v": jnp.zeros(1)}
+            return diffrax.diffeqsolve(
+                diffrax.ODETerm(field), solver, 0.0, 2.0, 2 / steps, start, jnp.array([1.3]),
+                saveat=diffrax.SaveAt(ts=jnp.array([0.77, 2.0])),
+            ).ys["u"][:, 0]  # fmt: skip
 
-    plain, unrolled = solve(method(), 8), solve(jr.solvers.Unrolled(method()), 8)
-    np.testing.assert_allclose(unrolled, plain, rtol=1e-13)
-    ends = [
-        solve(jr.solvers.Unrolled(method()), steps)[1] for steps in (steps, 2 * steps, 64 * steps)
-    ]
+        return quick_jit(solve)
+
+    unrolled = solves(jr.solvers.Unrolled(method()))
+    np.testing.assert_allclose(unrolled(8.0), solves(method())(8.0), rtol=1e-13)
+    ends = [unrolled(many * float(steps))[1] for many in (1, 2, 64)]
     assert np.log2(abs(ends[0] - ends[2]) / abs(ends[1] - ends[2])) > order - 0.4
 
 
@@ -161,9 +162,10 @@ def test_lanes_may_differ_in_everything_also_twice_over(rng):
     found = quick_jit(jax.vmap(inner, (0, 0, None, None, 0, None)))(
         moments, mass, ts, rtol, strength, omegas
     )
+    single = quick_jit(moved)
     for i in range(2):
         for k in range(3):
-            alone = moved(moments[i], mass[i], ts[k], rtol[k], strength[i], omegas[k])
+            alone = single(moments[i], mass[i], ts[k], rtol[k], strength[i], omegas[k])
             np.testing.assert_allclose(found[i, k], alone, atol=30 * rtol[k])
 
 
@@ -198,8 +200,9 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
 # Derivatives ---------------------------------------------------------------------------------
 
 
-def _end(moments, omega, ts=TIMES, adjoint=None):
-    trajectory = _motion(jr.RigidBody(moments, GRAVITY), omega, ts, adjoint=adjoint)
+def _end(moments, omega, adjoint=None):
+    body, options = jr.RigidBody(moments, GRAVITY), {"solver": diffrax.Tsit5(), "rtol": 1e-6}
+    trajectory = _motion(body, omega, adjoint=adjoint, **options)
     states = trajectory.states
     return jnp.concatenate([states.omega.ravel(), states.attitude.ravel()]), trajectory.result
 
@@ -235,12 +238,16 @@ def test_what_is_not_kept_is_run_again(monkeypatch):
     """The cotangents are the same however few places there are for a long run."""
     ts = np.array([0.0, 20.0, 20.0, 60.0])
 
-    def gradient(moments):
-        return jax.grad(lambda x: jnp.sum(_end(x, np.array([1.0, 0.3, -0.5]), ts)[0]))(moments)
+    def gradient(max_steps):  # each of them is traced
+        options = {"solver": diffrax.Bosh3(), "rtol": 1e-3, "max_steps": max_steps}
 
-    moments = np.array([1.0, 2.0, 3.0])
-    kept = jax.jit(gradient)(moments)
+        def total(moments):
+            body, omega = jr.RigidBody(moments, GRAVITY), np.array([1.0, 0.3, -0.5])
+            return jnp.sum(_motion(body, omega, ts, **options).states.omega)
+
+        return quick_jit(jax.grad(total))(np.array([1.0, 2.0, 3.0]))
+
+    kept = gradient(100_000)
     monkeypatch.setattr(_pull, "_MOST", 6)
-    jax.clear_caches()
-    again = jax.jit(gradient)(moments)
+    again = gradient(100_001)
     np.testing.assert_allclose(again, kept, rtol=1e-11)
