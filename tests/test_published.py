@@ -288,7 +288,7 @@ def test_jeod_run_10a_gravity_gradient_cylinder(case):
     """
     system, state0 = case()
     ts = np.array(list(RUN_10A_END))
-    states = jr.simulate(system, state0, ts, rtol=1e-12).states
+    states = jr.simulate(system, state0, ts, rtol=1e-14).states
     for i, row in enumerate(RUN_10A_END.values()):
         omega, rotation = jeod_state(row)
         # Ten times the disagreement after eight hours: 6e-11 deg, 2e-16 rad/s, 4e-6 m.

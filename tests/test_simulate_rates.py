@@ -312,7 +312,7 @@ def test_a_bad_lane_does_not_keep_the_others_waiting():
 
     result, steps = quick_jit(jax.vmap(lane))(np.array([[0.0, 0, 0], [np.nan, 0, 0]]))
     assert [int(c) for c in result._value] == [0, int(jr.RESULTS.invalid_state._value)]
-    assert steps[1] < 20 < steps[0] < 200
+    assert 3 * steps[1] < 10 < steps[0] < 200
 
 
 @pytest.mark.parametrize("which", ["rtol", "atol"])

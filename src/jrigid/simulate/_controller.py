@@ -1,5 +1,6 @@
 """How `simulate` steps: the vector field guarded, the controller that watches its rates."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,10 +14,11 @@ from jaxtyping import Array
 from jrigid._checks import all_finite
 from jrigid._scales import jacobian, rate_along, undamped_rate
 
-# No step is longer than this fraction of the shortest time scale, that of the turning or of the
+# No step is longer than so many of the shortest time scale, that of the turning or of the
 # linearised motion: at an equilibrium the error estimate sees nothing, and a step too long to be
-# stable leaves the value right and the derivative wrong.
-LARGEST_STEP = 0.4
+# accurate leaves the value right and the derivative wrong. Between these bounds it is where the
+# term of the exponential that a method of its order leaves out is so many tolerances.
+SMALLEST_BOUND, _LARGEST_BOUND, _TOLERANCES = 0.4, 1.2, 30.0
 # A step is taken back if it turns out, at its end, to have been longer than this many of those.
 _TOO_LONG = 2.0
 # So is one in which the rate changes by this factor, until the change is confined to a step of
@@ -36,6 +38,12 @@ class _Onwards(diffrax.AbstractStepSizeController):
         return self
 
 
+def largest_step(order: int, rtol: Array) -> Array:
+    """How many radians of the fastest rate a step of this order may span."""
+    radians = (math.factorial(order + 1) * _TOLERANCES * rtol) ** (1 / order)
+    return jnp.clip(radians, SMALLEST_BOUND, _LARGEST_BOUND)
+
+
 def in_tolerances(atol: Array, rtol: Array, y0: Array, y1: Array, error: Array) -> Array:
     """An error as a multiple of the tolerances, of one motion, or of lanes, which are last."""
     y0, y1, error = constant((y0, y1, error))
@@ -53,8 +61,8 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     Attributes:
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, of each component.
-        longest: Longest step.
-        first_step: diffrax would check one that it is given by a callback.
+        radians: Longest step by the fastest rate.
+        limit: Longest step.
         resolution: Shortest step.
         start_rate: Fastest rate at the start.
         scales: Of the components.
@@ -66,8 +74,8 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
 
     rtol: Array
     atol: Array
-    longest: Array
-    first_step: Array
+    radians: Array
+    limit: Array
     resolution: Array
     start_rate: Array
     scales: Array
@@ -77,14 +85,22 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
     norm: Callable[[Any], Array] = optx.rms_norm
 
     @property
+    def _start(self) -> Array:
+        """The longest step by the rate at the start."""
+        return jnp.minimum(self.radians / self.start_rate, self.limit)
+
+    @property
     def _by_error(self) -> diffrax.PIDController:
+        # What an implicit solver steps over bounds it only where it is on the way.
+        longest = self.limit if self.damped else self._start
         # It is handed errors in tolerances.
-        return diffrax.PIDController(rtol=0, atol=1, dtmax=self.longest, factormax=_GROWTH)
+        return diffrax.PIDController(rtol=0, atol=1, dtmax=longest, factormax=_GROWTH)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step; the state also carries the rate where the step begins."""
-        del dt0
-        t1, state = self._by_error.init(terms, t0, t1, y0, self.first_step, args, func, error_order)
+        del dt0  # diffrax would check one that it is given by a callback
+        first = 0.1 * self._start
+        t1, state = self._by_error.init(terms, t0, t1, y0, first, args, func, error_order)
         # No motion keeps to this direction.
         direction = jnp.cos(jnp.arange(y0.size, dtype=y0.dtype))
         return t1, (state, self.start_rate, direction / jnp.sqrt(jnp.sum(direction**2)))
@@ -119,7 +135,7 @@ class WatchfulController(_Onwards, diffrax.AbstractAdaptiveStepSizeController):
         rate = jax.lax.stop_gradient(rate)
         # Where a torque jumps, differences see a rate without bound: never down to a standstill.
         shortest = 4 * self.resolution
-        longest = jnp.maximum(LARGEST_STEP / rate, shortest)
+        longest = jnp.maximum(self.radians / rate, shortest)
         # Changes below the rate at the start are of no account: a body speeds up from rest.
         before, after = (jnp.maximum(r, self.start_rate) for r in (rate0, rate))
         jumped = (after > _JUMP * before) | (before > _JUMP * after)

@@ -9,6 +9,7 @@ that they touch is small (512 bytes); anything larger, or more than eight, costs
 motion is one lane, and nothing in its loop is larger than the state.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,6 +36,7 @@ class Problem(NamedTuple):
 
     term: Any
     controller: Any
+    finer: dict[str, Array]  # what of the controller is other where derivatives are taken
     y0: Array
     args: Any
     times: Array
@@ -45,6 +47,11 @@ class Problem(NamedTuple):
     def first(self) -> Array:
         """For each of the times the number of the first that is equal to it."""
         return jnp.searchsorted(self.times, self.times, side="left")
+
+    @property
+    def finely(self) -> "Problem":
+        """In steps for derivatives."""
+        return self._replace(controller=dataclasses.replace(self.controller, **self.finer))
 
     def field(self, t: Array, y: Array) -> Array:
         """The rates."""
@@ -111,7 +118,7 @@ class Steps(NamedTuple):
 
     def begin(self, problem: Problem) -> Place:
         """Where it starts."""
-        term, controller, y0, args, times, beyond, end = problem
+        term, controller, _, y0, args, times, beyond, end = problem
         zero, order = jnp.zeros_like(end), self.solver.order(None)
         tnext, state = controller.init(term, zero, end, y0, None, args, self.solver.func, order)
         target = jnp.where(times[0] > 0, 0, beyond[0])

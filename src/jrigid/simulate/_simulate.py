@@ -19,11 +19,12 @@ from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._adjoint import WithTimes, forward_only, guard_inputs, guard_outputs
 from jrigid.simulate._controller import (
-    LARGEST_STEP,
+    SMALLEST_BOUND,
     SteadyController,
     WatchfulController,
     constant,
     guarded,
+    largest_step,
 )
 from jrigid.simulate._event import event_of_states
 from jrigid.simulate._lanes import COUNTS, Ends, Problem, Steps
@@ -33,12 +34,12 @@ from jrigid.simulate._vmap import motion_in_lanes
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem
 
-# One step commits this fraction of rtol. The error of the energy adds up over the turns and that
-# of the phase over the energy's: what is promised of the state after thousands of turns, and of
-# its derivatives through a near-separatrix, asks for much more than rtol at each step.
-_STEP_FRACTION = 1e-3
-# Beyond this many radians the phase error, quadratic in time, asks for a smaller fraction still.
-_LONG_RADIANS = 2e4
+# One step commits this fraction of rtol. Where a motion is unstable its derivatives ask for much
+# more than its values.
+_OF_VALUES, _OF_DERIVATIVES = 0.3, 1e-3
+# The error of the energy adds up over the turns and that of the phase over the energy's: in a long
+# run one step may commit no more than so much of rtol for each radian.
+_RADIANS = 20.0
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
 # Below this many eps of the run a step is none. A motion that ends there is looked at so many of
@@ -87,11 +88,12 @@ def simulate(
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
             phi [rad] the relative error of energy and space angular momentum stays below
             rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
-            floor of 100 eps (1 + phi). Each step is held to a thousandth of rtol for that. What
-            counts is the fastest part of the motion: for a body in flight that turns slowly, or
-            not at all, phi is the angle of its orbit, and errors of position and velocity are
-            relative to their initial magnitudes (to those they reach in the run, or in a radian,
-            where they start at zero).
+            floor of 100 eps (1 + phi). One step is held to a third of rtol for that, to less in
+            long runs, and to a thousandth where derivatives are taken, whose value is closer for
+            it. What counts is the fastest part of the motion: for a body in flight that turns
+            slowly, or not at all, phi is the angle of its orbit, and errors of position and
+            velocity are relative to their initial magnitudes (to those they reach in the run, or in
+            a radian, where they start at zero).
         atol: The same for components near zero, as a fraction of the scale of their variable (the
             initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`,
@@ -179,7 +181,11 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     terms, y0, to_state, controller = problem_of(run, usable, options)
     fixed = jax.lax.stop_gradient(run.times)
     beyond = jnp.searchsorted(fixed, fixed, side="right")
-    problem = Problem(terms, controller, y0, usable.args, run.times, beyond, run.end)
+    finer = {}
+    if isinstance(controller, WatchfulController):
+        radians = jnp.full_like(controller.radians, SMALLEST_BOUND)
+        finer = _tolerances(run, options, _OF_DERIVATIVES) | {"radians": radians}
+    problem = Problem(terms, controller, finer, y0, usable.args, run.times, beyond, run.end)
     event = event_of_states(options.event, run.start, to_state)
     if isinstance(options.solver, diffrax.AbstractERK) and options.in_lanes:
         forward = isinstance(options.adjoint, diffrax.ForwardMode)
@@ -192,7 +198,7 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
 
 def _alone(options: Options, event: Any, problem: Problem) -> Ends:
     """One motion, by diffrax."""
-    terms, controller, y0, args, times, _, end = problem
+    terms, controller, _, y0, args, times, _, end = problem.finely
     controller = constant(controller)
     if not isinstance(options.solver, ExactFree):
         if not isinstance(options.adjoint, diffrax.ForwardMode):  # NaN would reach what lanes share
@@ -251,15 +257,9 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     field: Any = eqx.filter_closure_convert(plain_field, jnp.zeros_like(run.end), y0, args)
     field = harmless(run.ok, field)
 
-    stop = jax.lax.stop_gradient(run.end)
-    first = jnp.minimum(LARGEST_STEP / run.fastest, run.longest)
-    fraction = _STEP_FRACTION * jnp.minimum(1, _LONG_RADIANS / (stop * run.fastest))
-    noise = _NOISE * jnp.finfo(y0.dtype).eps
     watchful = WatchfulController(
-        rtol=jnp.maximum(fraction * options.rtol, noise),
-        atol=jnp.maximum(fraction * options.atol, noise) * run.scales,
-        longest=run.longest if options.is_implicit else first,  # or only what is on the way bounds
-        first_step=jnp.minimum(0.1 * first, stop),
+        **_tolerances(run, options, _OF_VALUES),
+        limit=run.longest,
         resolution=run.resolution,
         start_rate=run.fastest,
         scales=run.scales,
@@ -270,11 +270,22 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     return diffrax.ODETerm(field), y0, to_state, watchful
 
 
+def _tolerances(run: _Run, options: Options, fraction: float) -> dict[str, Any]:
+    """What holds the steps of a controller, by the fraction of rtol that one may commit."""
+    least, radians = _NOISE * jnp.finfo(run.end.dtype).eps, run.end * run.fastest
+    share = jax.lax.stop_gradient(jnp.minimum(fraction, _RADIANS / radians))
+    return {
+        "rtol": jnp.maximum(share * options.rtol, least),
+        "atol": jnp.maximum(share * options.atol, least) * run.scales,
+        "radians": largest_step(options.solver.order(None), share * options.rtol),
+    }
+
+
 def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     """The free body, for `ExactFree`: in one step, or those of an event."""
     step = jax.lax.stop_gradient(run.end)
     if options.event is not None:
-        step = jnp.minimum(step, jnp.minimum(LARGEST_STEP / run.fastest, run.longest))
+        step = jnp.minimum(step, jnp.minimum(SMALLEST_BOUND / run.fastest, run.longest))
     terms = FreeRotation(inputs.system.inertia.astype(step.dtype))
     return terms, inputs.state0, lambda y: y, SteadyController(step)
 

@@ -19,8 +19,10 @@ from jrigid.simulate._pull import pull_in_lanes
 def motion_in_lanes(problem: Problem, steps: Steps, forward: bool) -> Ends:
     """A motion in a lane, many under vmap, with derivatives in forward mode or in reverse."""
     times, end = problem.times, problem.end
-    controller, fixed_times, fixed_end = constant((problem.controller, times, end))
-    problem = problem._replace(controller=controller, times=fixed_times, end=fixed_end)
+    controller, finer, fixed_times, fixed_end = constant(
+        (problem.controller, problem.finer, times, end)
+    )
+    problem = problem._replace(controller=controller, finer=finer, times=fixed_times, end=fixed_end)
     ends = _forward(problem, steps) if forward else _reversible(problem, steps)
     return _at_their_times(problem, ends, times, end)
 
@@ -52,7 +54,7 @@ def _reversible(problem: Problem, steps: Steps) -> Ends:
 
     def forwards(perturbed: Any, problem: Problem) -> tuple[Ends, Any]:
         del perturbed
-        ends = _solved(guard_derivative(problem), steps)
+        ends = _solved(guard_derivative(problem).finely, steps)
         return ends, (ends.t, ends.stats["num_steps"])
 
     def backwards(reached: Any, change: Ends, perturbed: Any, problem: Problem) -> Any:
@@ -61,7 +63,7 @@ def _reversible(problem: Problem, steps: Steps) -> Ends:
         last = jnp.zeros_like(problem.y0) if change.y is None else change.y
         changes = last, zeros if change.ys is None else change.ys
         pull = partial(pull_in_lanes, steps)
-        moved, rest = _moved(problem, perturbed)
+        moved, rest = _moved(problem.finely, perturbed)
         return as_lanes(pull, rest, moved, changes, reached)
 
     solved.def_fwd(forwards)
@@ -83,7 +85,7 @@ def _forward(problem: Problem, steps: Steps) -> Ends:
     def _(primals: Any, tangents: Any) -> tuple[Ends, Ends]:
         (problem,), (tangent,) = primals, tangents
         perturbed = jtu.tree_map(lambda x: x is not None, tangent, is_leaf=lambda x: x is None)
-        moved, rest = _moved(problem, perturbed)
+        moved, rest = _moved(problem.finely, perturbed)
         tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, moved))
         return as_lanes(push, rest, moved, tangents=tangent)
 
