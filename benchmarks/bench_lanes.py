@@ -6,10 +6,14 @@ I = (1, 2, 3), weight 1, lever (0.3, 0.1, 0.5), rates normal with unit variance.
 `jrigid.simulate`, of a hand-written `diffeqsolve` (Dopri8), heyoka's batch integrator in the same
 variables (quaternion and rates) and in Euler-Poisson's. Then lanes that are not alike: rates over a
 factor of 20, beside the sum of what each of four kinds takes alone; one lane that fails at once and
-one that needs a hundred times the steps; gradients and Jacobians in the three moments. Run it on
-one core: heyoka is timed on one thread.
+one that needs a hundred times the steps; gradients and Jacobians in the three moments; two devices
+of one process. Run it on one core: heyoka is timed on one thread.
 """
 
+import os
+import pathlib
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -182,6 +186,26 @@ def derivatives(lanes):
     return rows
 
 
+def sharded(lanes):
+    """On one device and on two of this process, which may use two cores."""
+    os.sched_setaffinity(0, range(2))
+    w0, run = np.random.default_rng(0).normal(size=(lanes, 3)), ours(1e-8)
+    mesh, spec = jax.sharding.Mesh(np.array(jax.devices()), "lanes"), jax.P("lanes")
+    both = jax.shard_map(run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    print(*(seconds(function, w0)[1] for function in (run, jax.jit(both))))
+
+
+def on_two_devices(lanes):
+    """What a process with two devices says."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import bench_lanes; bench_lanes.sharded({lanes})"],
+        env=os.environ | {"JAX_NUM_CPU_DEVICES": "2"}, cwd=pathlib.Path(__file__).parent,
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    one, two = map(float, done.stdout.split())
+    return [["one device", one, 1.0], ["two devices, by `jax.shard_map`", two, two / one]]
+
+
 def main(lanes, write):
     text = common.table(
         [f"{lanes} heavy asymmetric tops", "compile ms", "min ms", "ns a step", "energy, median"],
@@ -191,6 +215,8 @@ def main(lanes, write):
     text += "\n\n" + common.table(header, unlike(lanes // 5 // 4 * 4))
     header = ["T = 100, rtol 1e-8", "compile ms", "min ms", "in values"]
     text += "\n\n" + common.table(header, derivatives(lanes // 5 // 4 * 4))
+    header = [f"{lanes} of them, rtol 1e-8", "min ms", "in those of one"]
+    text += "\n\n" + common.table(header, on_two_devices(lanes))
     packages = ["jax", "diffrax", "numpy", *(["heyoka"] if "heyoka" in text else [])]
     common.report("lanes", "Many motions at once", text, packages, write)
 

@@ -1,5 +1,10 @@
 """Many motions at once: the quick road equals the plain one, whatever is around a lane."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -195,6 +200,41 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
     together = quick_jit(jax.vmap(final))(omegas)
     for omega, found in zip(omegas, together, strict=True):
         np.testing.assert_allclose(found, final(omega), atol=1e-5)
+
+
+SHARDED = """
+import diffrax, jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+import jrigid as jr
+
+def end(drag, omega):
+    torque = jr.torques.LinearDrag(drag * jnp.ones(3))
+    body, start = jr.RigidBody(np.array([1.0, 2.0, 3.0]), torque), jr.State(np.eye(4)[0], omega)
+    options = {"solver": diffrax.Bosh3(), "rtol": 1e-4, "throw": False}
+    return jnp.sum(jr.simulate(body, start, 1.0, **options).final_state.omega)
+
+lanes = jax.vmap(jax.value_and_grad(end), (None, 0))
+mesh, spec = jax.sharding.Mesh(np.array(jax.devices()), "lanes"), jax.P("lanes")
+split = jax.shard_map(
+    lanes, mesh=mesh, in_specs=(jax.P(), spec), out_specs=spec, check_vma=False
+)
+omegas = np.arange(12.0).reshape(4, 3)
+pairs = zip(jax.jit(lanes)(0.1, omegas), jax.jit(split)(0.1, omegas), strict=True)
+print(len(jax.devices()), all(np.array_equal(a, b) for a, b in pairs))
+"""
+
+
+def test_lanes_over_the_devices_of_a_process():
+    environment = os.environ | {
+        "JAX_NUM_CPU_DEVICES": "2",
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_backend_optimization_level=0",
+        "PYTHONPATH": str(Path(jr.__file__).parents[1]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["2", "True"], done.stderr
 
 
 # Derivatives ---------------------------------------------------------------------------------

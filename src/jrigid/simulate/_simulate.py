@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -9,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.extend import core
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 from jaxtyping import ArrayLike as _ArrayLike
@@ -240,6 +242,21 @@ def _measured(ok: Array, inputs: Inputs, options: Options, measures: tuple[Array
     return _Run(ok, start, scales, fastest, times, end, resolution, options.max_step)
 
 
+def _opened(function: Callable[..., Array], *example: Any) -> Callable[..., Array]:
+    """The same function with the arrays that it closes over as leaves.
+
+    equinox's would compare arguments with the example, between devices to no avail.
+    """
+    arrays, others = eqx.partition(example, eqx.is_array)
+    plain = jax.make_jaxpr(lambda *arrays: function(*eqx.combine(arrays, others)))(*arrays)
+    return jtu.Partial(partial(_evaluated, plain.jaxpr), plain.consts)
+
+
+def _evaluated(jaxpr: Any, consts: list[Any], *arguments: Any) -> Array:
+    arrays = jtu.tree_leaves(eqx.filter(arguments, eqx.is_array))
+    return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, consts))(*arrays)[0]
+
+
 def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
     """The motion as one array, for a solver with an error estimate."""
     system, state0, _, _, args = inputs
@@ -254,7 +271,7 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         return jnp.maximum(jnp.where(jnp.isfinite(rate), rate, 0.0), jnp.finfo(y.dtype).tiny)
 
     # What the functions of a user close over becomes visible.
-    field: Any = eqx.filter_closure_convert(plain_field, jnp.zeros_like(run.end), y0, args)
+    field = _opened(plain_field, run.end, y0, args)
     field = harmless(run.ok, field)
 
     watchful = WatchfulController(
@@ -264,7 +281,7 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         start_rate=run.fastest,
         scales=run.scales,
         field=constant(field),
-        rate_of=constant(eqx.filter_closure_convert(rate_of, y0, run.end)),
+        rate_of=constant(_opened(rate_of, y0, run.end)),
         damped=options.is_implicit,
     )
     return diffrax.ODETerm(field), y0, to_state, watchful

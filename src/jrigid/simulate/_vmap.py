@@ -19,10 +19,8 @@ from jrigid.simulate._pull import pull_in_lanes
 def motion_in_lanes(problem: Problem, steps: Steps, forward: bool) -> Ends:
     """A motion in a lane, many under vmap, with derivatives in forward mode or in reverse."""
     times, end = problem.times, problem.end
-    controller, finer, fixed_times, fixed_end = constant(
-        (problem.controller, problem.finer, times, end)
-    )
-    problem = problem._replace(controller=controller, finer=finer, times=fixed_times, end=fixed_end)
+    fixed = constant({x: getattr(problem, x) for x in ("controller", "finer", "times", "end")})
+    problem = problem._replace(**fixed)
     ends = _forward(problem, steps) if forward else _reversible(problem, steps)
     return _at_their_times(problem, ends, times, end)
 
