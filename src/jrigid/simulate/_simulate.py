@@ -271,8 +271,7 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         return jnp.maximum(jnp.where(jnp.isfinite(rate), rate, 0.0), jnp.finfo(y.dtype).tiny)
 
     # What the functions of a user close over becomes visible.
-    field = _opened(plain_field, run.end, y0, args)
-    field = harmless(run.ok, field)
+    field = harmless(run.ok, _opened(plain_field, run.end, y0, args))
 
     watchful = WatchfulController(
         **_tolerances(run, options, _OF_VALUES),
