@@ -36,9 +36,10 @@ from jrigid.simulate._vmap import motion_in_lanes
 from jrigid.solvers import ExactFree, FreeRotation
 from jrigid.systems import AbstractSystem
 
-# One step commits this fraction of rtol. Where a motion is unstable its derivatives ask for much
-# more than its values.
-_OF_VALUES, _OF_DERIVATIVES = 0.3, 1e-3
+# One step commits this fraction of rtol, less with methods of lower order than 8, whose estimates
+# are as large as their errors. Where a motion is unstable its derivatives ask for much more than
+# its values.
+_OF_VALUES, _OF_LOWER_ORDERS, _OF_DERIVATIVES = 0.3, 0.03, 1e-3
 # The error of the energy adds up over the turns and that of the phase over the energy's: in a long
 # run one step may commit no more than so much of rtol for each radian.
 _RADIANS = 20.0
@@ -91,11 +92,11 @@ def simulate(
             phi [rad] the relative error of energy and space angular momentum stays below
             rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
             floor of 100 eps (1 + phi). One step is held to a third of rtol for that, to less in
-            long runs, and to a thousandth where derivatives are taken, whose value is closer for
-            it. What counts is the fastest part of the motion: for a body in flight that turns
-            slowly, or not at all, phi is the angle of its orbit, and errors of position and
-            velocity are relative to their initial magnitudes (to those they reach in the run, or in
-            a radian, where they start at zero).
+            long runs or by a method of lower order, and to a thousandth where derivatives are
+            taken, whose value is closer for it. What counts is the fastest part of the motion: for
+            a body in flight that turns slowly, or not at all, phi is the angle of its orbit, and
+            errors of position and velocity are relative to their initial magnitudes (to those they
+            reach in the run, or in a radian, where they start at zero).
         atol: The same for components near zero, as a fraction of the scale of their variable (the
             initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`,
@@ -272,9 +273,9 @@ def _stepped(run: _Run, inputs: Inputs, options: Options) -> _Problem:
 
     # What the functions of a user close over becomes visible.
     field = harmless(run.ok, _opened(plain_field, run.end, y0, args))
-
+    fraction = _OF_VALUES if options.solver.order(None) >= 8 else _OF_LOWER_ORDERS
     watchful = WatchfulController(
-        **_tolerances(run, options, _OF_VALUES),
+        **_tolerances(run, options, fraction),
         limit=run.longest,
         resolution=run.resolution,
         start_rate=run.fastest,
@@ -316,7 +317,7 @@ def _trajectory(
     options: Options,
 ) -> Trajectory:
     """What became of it."""
-    reached, ys = ends.reached, ends.ys
+    reached, ys, last = ends.reached, ends.ys, (ends.t, ends.y)
 
     def state_at(t: Array, y: Any) -> Any:
         there = jnp.isfinite(t)
@@ -324,12 +325,9 @@ def _trajectory(
         state = dataclasses.replace(state, attitude=normalize(state.attitude))
         return nan_where(~there, state)
 
-    def last(tree: Any) -> Any:
-        return jtu.tree_map(lambda x: x[-1], tree)
-
     states = jax.vmap(state_at)(reached, ys)
     # Without an event the motion ends at the last of the times.
-    t, y = last((reached, ys)) if options.event is None else (ends.t, ends.y)
+    t, y = jtu.tree_map(lambda x: x[-1], (reached, ys)) if options.event is None else last
     final_state = state_at(t, y)
     ending, end_y = constant((ends.t, ends.y))
     final_time = usable.t0 + jnp.where(jnp.isfinite(t), t, ending).astype(usable.t0.dtype)
