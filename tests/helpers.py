@@ -1,10 +1,16 @@
 """Tolerances by dtype, and motions that several test files share."""
 
+import os
+import subprocess
+import sys
 from functools import wraps
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+import jrigid as jr
 
 # A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot show.
 TENSOR = np.array([[2.0, -0.3, 0.2], [-0.3, 2.5, 0.4], [0.2, 0.4, 1.7]])
@@ -49,6 +55,21 @@ def quick_jit(function):
         return plain(*args)
 
     return call
+
+
+def in_a_process(script, **environment):
+    """What a script prints and complains of in a process of its own, quickly compiled."""
+    # The compiler's time is not the point.
+    own = {
+        "XLA_FLAGS": "--xla_backend_optimization_level=0",
+        "PYTHONPATH": str(Path(jr.__file__).parents[1]),
+    }
+    environment = os.environ | own | environment
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
 
 
 def both_ways(function, x):

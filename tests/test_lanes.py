@@ -1,16 +1,11 @@
 """Many motions at once: the quick road equals the plain one, whatever is around a lane."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import quick_jit
+from helpers import in_a_process, quick_jit
 
 import jrigid as jr
 from jrigid._lanes_last import lanes_last
@@ -225,16 +220,8 @@ print(len(jax.devices()), all(np.array_equal(a, b) for a, b in pairs))
 
 
 def test_lanes_over_the_devices_of_a_process():
-    environment = os.environ | {
-        "JAX_NUM_CPU_DEVICES": "2",
-        "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_backend_optimization_level=0",
-        "PYTHONPATH": str(Path(jr.__file__).parents[1]),
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True
-    )
-    assert done.stdout.split() == ["2", "True"], done.stderr
+    said, complained = in_a_process(SHARDED, JAX_NUM_CPU_DEVICES="2", JAX_PLATFORMS="cpu")
+    assert said.split() == ["2", "True"], complained
 
 
 # Derivatives ---------------------------------------------------------------------------------

@@ -1,17 +1,12 @@
 """simulate(): what it refuses and says, events, and what its compiled function holds."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import ATTITUDE, MOMENTS, OMEGA, quick_jit
+from helpers import ATTITUDE, MOMENTS, OMEGA, in_a_process, quick_jit
 
 import jrigid as jr
 
@@ -78,21 +73,15 @@ print(*(counts.get("/jax/compilation_cache/" + x, 0) for x in ("cache_hits", "ca
 
 def test_a_second_process_with_the_persistent_cache_compiles_nothing(tmp_path):
     environment = {
-        **os.environ,
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         "JAX_EXPLAIN_CACHE_MISSES": "0",
-        "XLA_FLAGS": "--xla_backend_optimization_level=0",  # the compiler's time is not the point
-        "PYTHONPATH": str(Path(jr.__file__).parents[1]),
     }
     for process in (1, 2):
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT], env=environment, check=True,
-            capture_output=True, text=True,
-        )  # fmt: skip
-        hits, misses = map(int, done.stdout.split())
-        assert "host callbacks" not in done.stderr
+        said, complained = in_a_process(SCRIPT, **environment)
+        hits, misses = map(int, said.split())
+        assert "host callbacks" not in complained
         assert misses > 0 if process == 1 else (misses == 0 and hits > 0)
 
 
