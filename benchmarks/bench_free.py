@@ -36,16 +36,26 @@ CHECKED = 50
 
 def final(x, t):
     """State (7,) at time t of the body with moments x[:3] and angular velocity x[3:]."""
-    state = jr.free_rotation(x[:3], jr.State(ATTITUDE, x[3:]), t, throw=False)
+    return final_of(x[:3], x[3:], t)
+
+
+def final_of(inertia, omega, t):
+    state = jr.free_rotation(inertia, jr.State(ATTITUDE, omega), t, throw=False)
     return jnp.concatenate([state.attitude, state.omega], axis=-1)
 
 
 INPUTS = np.concatenate([np.tile(MOMENTS, (BODIES, 1)), OMEGAS], axis=1)
+AXES = np.linalg.qr(np.random.default_rng(2).normal(size=(BODIES, 3, 3)))[0]
+TENSORS = np.einsum("nik,k,njk->nij", AXES, MOMENTS, AXES)
 STARTS = np.concatenate([np.tile(ATTITUDE, (BODIES, 1)), OMEGAS], axis=1)
 
 
 def loss(x, t):
     return jnp.sum(jax.vmap(final, (0, None))(x, t) ** 3)
+
+
+def loss_of_tensors(tensors, omegas, t):
+    return jnp.sum(jax.vmap(final_of, (0, 0, None))(tensors, omegas, t) ** 3)
 
 
 def hessian_vector(x, t):
@@ -88,6 +98,10 @@ def main(write: bool) -> None:
     add("value, 10^6 turns", many, INPUTS, LONG)
     add("Jacobian, six columns", jax.vmap(jax.jacfwd(final), (0, None)), INPUTS, END)
     add("reverse gradient", jax.grad(loss), INPUTS, END)
+    gradient = jax.grad(loss_of_tensors, (0, 1))
+    kinds = {"(3, 3) tensors": TENSORS, "spheres as tensors": 0 * AXES + np.eye(3)}
+    for name, tensors in kinds.items():
+        add(f"reverse gradient, {name}", gradient, tensors, OMEGAS, END)
     add("Hessian-vector product", hessian_vector, INPUTS, END)
     for tolerance in (1e-9, 1e-15):
         run, ms = peers.by_heyoka(rates, STARTS, END, tolerance)

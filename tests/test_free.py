@@ -311,6 +311,27 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
     np.testing.assert_allclose(reverse, exact, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize("gap", [0.0, 2.0**-40, 2.0**-17, 2.0**-13])
+def test_derivatives_in_a_tensor_after_a_long_time_near_the_separatrix(gap, of_tensor):
+    """There a gap's effect grows with the square of the time: what is near must know."""
+    tensor, t, n = np.diag([1.0, 1.0 + gap, 1.5]), 1000.0, np.ones((3, 3))
+    omega, turn = np.array([0.75, -0.625, 2.0**-10]), np.zeros(3)
+
+    def motion(s):
+        ((q, w),) = free_reference.free_motion(tensor + s * n, np.eye(4)[0], omega, [t])
+        return np.array([*q, *w])
+
+    with mp.workdps(40):
+        h = 2.0**-34
+        exact = np.array((8 * (motion(h) - motion(-h)) - motion(2 * h) + motion(-2 * h)), float)
+    exact /= 12 * h
+    value, forward, reverse, _ = map(np.asarray, of_tensor(tensor, omega, n, turn, t))
+    exact[:4] *= np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
+    bound = 1e-6 * np.linalg.norm(exact)
+    np.testing.assert_allclose(forward, exact, rtol=0, atol=bound)
+    np.testing.assert_allclose(reverse, exact, rtol=0, atol=bound)
+
+
 def test_second_derivatives_in_a_tensor_of_distinct_moments(of_tensor):
     tensor, t = TENSORS["generic"], 9.0
     omega, turn = np.array([0.5, -0.75, 0.25]), np.array([0.25, 0.5, -1.0])

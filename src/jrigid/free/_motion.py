@@ -1,14 +1,15 @@
 """free_rotation(): the state of a free body at any times, for moments or a tensor."""
 
+import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
+from equinox.internal import unvmap_any
 from jaxtyping import Array, ArrayLike
 
+from jrigid._as_lanes import as_lanes, some_at_a_time
 from jrigid._checks import (
     INERTIA,
     RESULTS,
@@ -20,7 +21,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._motion import exact_motion, plain_state
-from jrigid._numerics import gauss_legendre, product, safe_norm
+from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, Real, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import ExactStates, State
@@ -29,8 +30,12 @@ from jrigid.rotation import multiply, normalize
 
 Tree = TypeVar("Tree")
 
-# Moments whose gap turns the motion by less than this [rad] are near.
-_NEAR = 1e-2
+# Moments whose gap turns the motion by less than this [rad] are near: wider ones interpolate to
+# 1e-13, and so much is lost in a quotient.
+_NEAR = 2e-3
+# Where to look besides: how many times further apart, and the weight of what is found there.
+_NODES = (-4.0, -3.0, -2.0, 2.0, 3.0, 4.0)
+_LOOKS = [(0.0, 1.0), *((x, math.prod(y / (y - x) for y in _NODES if y != x)) for x in _NODES)]
 
 
 def free_rotation(
@@ -158,39 +163,84 @@ def _of_tensor_jvp(primals: tuple, tangents: tuple) -> tuple:
     moments, axes = eigh(tensor, distinct=True)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     omega, omega_change = (product("ji,j->i", axes, x) for x in (omega, omega_change))
-    value, tangent = jax.jvp(
-        _of_moments, (moments, omega, t), (jnp.diagonal(inside), omega_change, t_change)
-    )
-    axis = jnp.eye(3, dtype=moments.dtype)
-    apart = 0.5 * (jnp.roll(axis, -1, axis=0) - jnp.roll(axis, 1, axis=0))
+    value, slopes = _with_slopes(moments, omega, t)
     elements = jnp.stack([inside[1, 2], inside[2, 0], inside[0, 1]])
-    slopes = jax.vmap(partial(_slope_off_diagonal, moments, omega, t))(axis, apart)
-    tangent = jtu.tree_map(lambda x, y: x + product("k,kn->n", elements, y), tangent, slopes)
-    return from_principal_axes(axes, *value), from_principal_axes(axes, *tangent)
+    changes = jnp.concatenate([jnp.diagonal(inside), omega_change, t_change[None], elements])
+    found = value, product("k,kn->n", changes, slopes)
+    return tuple(from_principal_axes(axes, x[:4], x[4:]) for x in found)
 
 
-def _slope_off_diagonal(
-    moments: Array, omega: Array, t: Array, axis: Array, apart: Array
-) -> tuple[Array, Array]:
-    """Derivative of the motion with respect to an element off the diagonal of a diagonal tensor.
+@jax.custom_jvp
+def _with_slopes(*arguments: Array) -> tuple[Array, Array]:
+    """What `_looks` gives, for many lanes with close moments first, a few at a time."""
 
-    It is the effect of turning the body's axes about `axis`, divided by the gap of the two moments
-    that `apart` (halves of opposite sign) moves apart. Both vanish with the gap: near there the
-    mean derivative of the effect replaces the quotient.
+    def of_all(_: Any, __: Any, *lanes: Array) -> Any:
+        order = jnp.argsort(~jax.vmap(lambda *x: jnp.any(_wider(*x)))(*lanes))
+        return some_at_a_time(jax.vmap(_looks, -1, -1), order, *lanes)
+
+    return as_lanes(of_all, None, *arguments)
+
+
+@_with_slopes.defjvp
+def _with_slopes_jvp(primals: tuple, tangents: tuple) -> tuple:
+    # Lanes some at a time have no reverse mode.
+    return _with_slopes(*primals), jax.jvp(_looks, primals, tangents)[1]
+
+
+def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
+    """The motion with a diagonal tensor, as seven numbers, and its derivatives (10, 7).
+
+    They are those in the moments, which ascend, in `omega` and t, and in the elements 23, 31 and
+    12. Of these each is the effect of turning the body's axes divided by the gap of two moments.
+    Both vanish together: across a near gap the quotient is interpolated from wider ones, which
+    costs six looks more at the motion, unless no lane asks for it.
     """
+    directions = jnp.eye(7, dtype=t.dtype)
 
-    def effect(moments: Array) -> tuple[Array, Array]:
-        (p, w), (dp, dw) = jax.jvp(
-            lambda omega: _of_moments(moments, omega, t), (omega,), (jnp.cross(axis, omega),)
+    def motion(x: Array) -> Array:
+        return jnp.concatenate(_of_moments(x[:3], x[3:6], x[6]))
+
+    def slopes_at(moments: Array) -> tuple[Array, Array, Array]:
+        place = jnp.concatenate([moments, omega, t[None]])
+        slope = lambda x: jax.jvp(motion, (place,), (x,))  # noqa: E731
+        value, columns = jax.vmap(slope, out_axes=(None, 0))(directions)
+        gaps = jnp.roll(moments, -1) - jnp.roll(moments, -2)
+        quotients = jax.vmap(_turned, (0, 0, None, None, None))(
+            directions[:3, :3], jnp.where(gaps == 0, 1.0, gaps), omega, value, columns[3:6]
         )
-        vector = jnp.cross(axis, p[1:]) - dp[1:]
-        return jnp.concatenate([-dp[:1], vector]), jnp.cross(axis, w) - dw
+        return value, columns, quotients
 
-    gap, size = 2 * jnp.sum(apart * moments), jnp.sum(jnp.abs(apart) * moments)
-    near = jnp.abs(gap) * (1 + safe_norm(omega) * jnp.abs(t)) < _NEAR * size
-    nodes, _ = gauss_legendre(2, moments.dtype)  # error of 1e-12 when near
-    between = moments[None, :] + (nodes[:, None] - 1) * gap * apart[None, :]
-    slopes = jax.vmap(lambda moments: jax.jvp(effect, (moments,), (apart,))[1])(between)
-    safe = jnp.where(near, 1.0, gap)
-    quotients = jtu.tree_map(lambda x: x / safe, effect(moments))
-    return jtu.tree_map(lambda x, y: jnp.where(near, jnp.mean(x, axis=0), y), slopes, quotients)
+    def look(node: Array, weight: Array, known: tuple[Array, ...]) -> tuple[Array, ...]:
+        wider, value, slopes = known
+        here = node == 0
+        found, columns, quotients = slopes_at(moments + node * wider)
+        wider = jnp.where(here, _wider(moments, omega, t, jnp.max(jnp.abs(columns[:3, :4]))), wider)
+        low, _, high = wider != 0
+        near = jnp.stack([high, low & high, low])[:, None]
+        shares = jnp.where(near == here, 0.0, weight * quotients)
+        new = jnp.concatenate([jnp.where(here, columns, 0.0), shares])
+        return wider, jnp.where(here, found, value), slopes + new
+
+    def visit(known: tuple[Array, ...], of_node: Array) -> tuple[tuple[Array, ...], None]:
+        node, weight = of_node
+        asked = (node == 0) | unvmap_any(known[0] != 0)
+        unchanged = lambda _, __, known: known  # noqa: E731
+        return jax.lax.cond(asked, look, unchanged, node, weight, known), None
+
+    nothing = jnp.zeros(3, t.dtype), jnp.zeros(7, t.dtype), jnp.zeros((10, 7), t.dtype)
+    (_, *found), _ = jax.lax.scan(visit, nothing, jnp.asarray(_LOOKS, t.dtype))
+    return tuple(found)
+
+
+def _wider(moments: Array, omega: Array, t: Array, slope: Array | float = 0.0) -> Array:
+    """How moments are moved to widen the gaps that are near, zero where none is."""
+    reach = _NEAR / (1 / moments[:2] + safe_norm(omega) * jnp.abs(t) / moments[:2] + slope)
+    low, high = jnp.where(moments[1:] - moments[:2] < reach, reach, 0.0)
+    return jnp.stack([-low, jnp.zeros_like(t), high])
+
+
+def _turned(axis: Array, gap: Array, omega: Array, value: Array, columns: Array) -> Array:
+    """The effect of turning the body's axes, divided by a gap."""
+    turned = jnp.cross(axis, value[1:].reshape(2, 3)).reshape(6)
+    change = product("k,kn->n", jnp.cross(axis, omega), columns)
+    return jnp.concatenate([-change[:1], turned - change[1:]]) / gap
