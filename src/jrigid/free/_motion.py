@@ -228,8 +228,8 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         return jax.lax.cond(asked, look, unchanged, node, weight, known), None
 
     nothing = jnp.zeros(3, t.dtype), jnp.zeros(7, t.dtype), jnp.zeros((10, 7), t.dtype)
-    (_, *found), _ = jax.lax.scan(visit, nothing, jnp.asarray(_LOOKS, t.dtype))
-    return tuple(found)
+    (_, value, slopes), _ = jax.lax.scan(visit, nothing, jnp.asarray(_LOOKS, t.dtype))
+    return value, slopes
 
 
 def _wider(moments: Array, omega: Array, t: Array, slope: Array | float = 0.0) -> Array:
