@@ -71,7 +71,13 @@ def test_a_function_in_lanes_equals_its_vmap(rng):
 
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
-    [(diffrax.Dopri8, 8, 8), (diffrax.Tsit5, 5, 40), (diffrax.Bosh3, 3, 40), (diffrax.Heun, 2, 40)],
+    [
+        (jr.solvers.Verner9, 9, 4),
+        (diffrax.Dopri8, 8, 8),
+        (diffrax.Tsit5, 5, 40),
+        (diffrax.Bosh3, 3, 40),
+        (diffrax.Heun, 2, 40),
+    ],
 )
 def test_unrolled_takes_the_steps_of_its_method(method, order, steps):
     """In a pytree, with dense output, at its order."""

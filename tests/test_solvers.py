@@ -1,7 +1,4 @@
-"""The exact flow as a diffrax solver: alone, backward, differentiated, and as a stage."""
-
-import dataclasses
-from typing import ClassVar
+"""The diffrax solvers: the exact flow, alone and as a stage, splitting, methods of high order."""
 
 import diffrax
 import jax
@@ -156,50 +153,164 @@ def test_the_exact_solver_is_for_free_bodies(untyped):
         jr.simulate(jr.RigidBody(MOMENTS), STATE, 1.0, solver=diffrax.Euler())
 
 
-class Strang(diffrax.AbstractSolver):
-    """Half a kick by the torque, free motion, half a kick: symplectic, of order two."""
-
-    torque: object
-    term_structure: ClassVar = FreeRotation
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        del terms
-        return 2
-
-    def init(self, terms, t0, t1, y0, args):
-        return ExactFree().init(terms, t0, t1, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        def kick(t, y, h):
-            change = jr.euler_equations(MOMENTS, y.omega, self.torque(t, y, args))
-            free = jr.euler_equations(MOMENTS, y.omega)
-            return dataclasses.replace(y, omega=y.omega + h * (change - free))
-
-        half = 0.5 * (t1 - t0)
-        y = kick(t0, y0, half)
-        y, *_ = ExactFree().step(terms, t0, t1, y, args, solver_state, made_jump)
-        y1 = kick(t1, y, half)
-        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
+# Verner's method ----------------------------------------------------------------------------
 
 
-def test_a_splitting_scheme_with_an_exact_stage_is_of_order_two_and_keeps_the_energy():
-    torque = jr.torques.UniformGravity(1.0, np.array([0.1, 0.0, 0.4]), np.array([0.0, 0.0, -1.0]))
-    body = jr.RigidBody(MOMENTS, torque)
-    exact = quick_jit(lambda s: jr.simulate(body, s, 10.0, rtol=1e-12, throw=False).states)(STATE)
+def test_verners_weights_integrate_polynomials_of_their_degrees():
+    """The conditions of quadrature of the method, of its estimate and of its dense output."""
+    tableau = jr.solvers.Verner9.tableau
+    assert tableau.fsal
+    c = np.concatenate([[0.0], tableau.c])
+    for weights, degree in ((tableau.b_sol, 8), (tableau.b_sol - tableau.b_error, 7)):
+        for k in range(degree + 1):
+            assert np.sum(weights * c**k) == pytest.approx(1 / (k + 1), abs=1e-15)
+    assert abs(np.sum(tableau.b_error * c**8)) > 1e-6
+    for theta in (0.0, 0.3, 0.71, 1.0):
+        for k in range(6):
+            dense = jr.solvers.Verner9.interpolation_cls(
+                t0=0.0, t1=1.0, y0=jnp.zeros(()), y1=None, k=jnp.asarray(c**k)
+            )
+            end = theta ** (k + 1) / (k + 1)
+            assert float(dense.evaluate(theta)) == pytest.approx(end, abs=1e-15)
+
+
+def test_verners_dense_output_has_the_order_it_claims():
+    """A local error of order 7: 2.0**7 by halving the step, on the free body."""
 
     @quick_jit
-    def error(steps):
-        h = 10.0 / steps
-        found = solve(MOMENTS, 0.0, 10.0, h, diffrax.SaveAt(t1=True), Strang(torque),
-                      max_steps=4096, throw=False).ys  # fmt: skip
-        energy = body.energy(10.0, jax.tree.map(lambda x: x[0], found), None)
-        return jnp.linalg.norm(found.omega[0] - exact.omega), energy - body.energy(0.0, STATE, None)
+    def error(h):
+        found = solve(MOMENTS, 0.0, h, h, diffrax.SaveAt(ts=0.37 * h[None]), jr.solvers.Verner9())
+        exact = jr.free_rotation(MOMENTS, STATE, 0.37 * h, throw=False)
+        return jnp.linalg.norm(found.ys.omega[0] - exact.omega)
 
-    coarse, fine = error(100.0), error(200.0)
-    assert coarse[0] / fine[0] == pytest.approx(4.0, rel=0.05)
-    assert coarse[1] / fine[1] == pytest.approx(4.0, rel=0.05)
-    assert abs(fine[1]) < 3e-4
+    assert np.log2(error(0.2) / error(0.1)) > 6.8
+
+
+# Splitting ----------------------------------------------------------------------------------
+
+WEIGHT = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
+TOP = jr.RigidBody(MOMENTS, WEIGHT)
+
+
+def split(body, ts, order, step, state=STATE, **options):
+    solver = jr.solvers.Splitting(order)
+    return jr.simulate(body, state, ts, solver=solver, max_step=step, throw=False, **options)
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("inertia", [MOMENTS, TENSOR], ids=["moments", "tensor"])
+def test_splitting_is_of_its_order_and_keeps_what_is_to_be_kept(order, inertia):
+    body = jr.RigidBody(inertia, WEIGHT)
+    exact = jr.simulate(body, STATE, 8.0, rtol=1e-13).final_state
+
+    @quick_jit
+    def found(step):
+        motion = split(body, jnp.array([0.0, 8.0]), order, step)
+        return motion.final_state, motion.energy, motion.angular_momentum, motion.stats["num_steps"]
+
+    errors = []
+    for steps in (40, 80):
+        state, energy, momentum, taken = found(8.0 / steps)
+        assert int(taken) == steps
+        assert abs(np.linalg.norm(state.attitude) - 1) < 1e-15
+        assert abs(momentum[1, 2] - momentum[0, 2]) < 1e-14  # about the vertical
+        errors.append([np.linalg.norm(state.omega - exact.omega), abs(energy[1] - energy[0])])
+    state_order, energy_order = np.log2(np.array(errors[0]) / errors[1])
+    assert state_order == pytest.approx(order, abs=0.4)
+    assert energy_order > order - 0.6
+
+
+def test_splitting_is_its_own_inverse_and_its_dense_output_a_shorter_step():
+    solver, body = jr.solvers.Splitting(4), TOP
+
+    @quick_jit
+    def there_and_back(state):
+        def run(state, t0, t1, dt0, ts):
+            found = diffrax.diffeqsolve(
+                solver.terms(body), solver, t0, t1, dt0, state, saveat=diffrax.SaveAt(ts=ts),
+                stepsize_controller=diffrax.ConstantStepSize(), max_steps=64, throw=False,
+            )  # fmt: skip
+            return found.ys
+
+        there = run(state, 0.0, 4.0, 0.125, jnp.array([0.0625, 4.0]))
+        between, end = (jax.tree.map(lambda x, i=i: x[i], there) for i in (0, 1))
+        back = run(end, 4.0, 0.0, -0.125, jnp.array([0.0]))
+        once = run(state, 0.0, 0.0625, 0.0625, jnp.array([0.0625]))
+        return back, between, once
+
+    back, between, once = there_and_back(STATE)
+    np.testing.assert_allclose(back.omega[0], STATE.omega, atol=1e-13)
+    np.testing.assert_allclose(back.attitude[0], STATE.attitude, atol=1e-13)
+    np.testing.assert_allclose(between.omega, once.omega[0], atol=1e-15)
+
+
+def test_splitting_follows_a_potential_that_moves():
+    def pushed(t, state, args):
+        return args * (1 + jnp.sin(t)) * WEIGHT(t, state, None)
+
+    body, force = jr.RigidBody(MOMENTS, pushed), jnp.asarray(1.3)
+    exact = jr.simulate(body, STATE, 5.0, force, t0=1.0, rtol=1e-12).final_state
+    solver = jr.solvers.Splitting(6)
+    found = jr.simulate(body, STATE, 5.0, force, t0=1.0, solver=solver, max_step=0.05).final_state
+    np.testing.assert_allclose(found.omega, exact.omega, atol=1e-8)
+
+
+def test_the_energy_of_splitting_walks_at_random_for_its_rounding():
+    """10^5 steps of nine free motions: eps times the root of their number, and no more."""
+
+    @quick_jit
+    def energies(state):
+        ts = jnp.linspace(0.0, 2e3, 101)
+        return split(TOP, ts, 6, 0.02, state).energy
+
+    energy = np.asarray(energies(STATE))
+    walk = np.finfo(float).eps * np.sqrt(9e5)
+    assert np.max(np.abs(energy / energy[0] - 1)) < 5 * walk
+
+
+@pytest.mark.parametrize("mode", ["reverse", "forward", "direct"])
+def test_derivatives_of_splitting_are_those_of_the_motion(mode):
+    adjoint = {"forward": diffrax.ForwardMode(), "direct": diffrax.DirectAdjoint()}.get(mode)
+    derivative = jax.jacfwd if mode == "forward" else jax.grad
+
+    def end(moments, **options):
+        return jr.simulate(jr.RigidBody(moments, WEIGHT), STATE, 3.0, throw=False,
+                           adjoint=adjoint, **options).final_state.omega[0]  # fmt: skip
+
+    exact = quick_jit(derivative(end))(MOMENTS)
+    options = {"solver": jr.solvers.Splitting(6), "max_step": 0.05}
+    found = quick_jit(derivative(lambda moments: end(moments, **options)))(MOMENTS)
+    np.testing.assert_allclose(found, exact, atol=1e-6)
+
+
+def test_splitting_has_events_and_lanes():
+    def level(t, state, args, **_):
+        return jr.rotation.rotate(state.attitude, jnp.array([0.0, 0.0, 1.0]))[2]
+
+    event = diffrax.Event(level)
+    exact = jr.simulate(TOP, STATE, 30.0, event=event)
+
+    @quick_jit
+    @jax.vmap
+    def ends(omega):
+        motion = split(TOP, 30.0, 6, 0.05, jr.State(STATE.attitude, omega), event=event)
+        return motion.final_time, motion.result == jr.RESULTS.event_occurred
+
+    times, happened = ends(jnp.stack([STATE.omega, STATE.omega * jnp.nan]))
+    assert float(times[0]) == pytest.approx(float(exact.final_time), abs=1e-7)
+    np.testing.assert_array_equal(happened, [True, False])
+
+
+@pytest.mark.usefixtures("untyped")
+def test_splitting_says_what_it_is_for():
+    with pytest.raises(ValueError, match="`order` must be 2, 4 or 6, but it is 3"):
+        jr.solvers.Splitting(3)
+    solver = jr.solvers.Splitting()
+    with pytest.raises(ValueError, match="its step given as `max_step`"):
+        jr.simulate(TOP, STATE, 1.0, solver=solver)
+    dragged = jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1))
+    with pytest.raises(ValueError, match="where the torque depends on the angular velocity"):
+        jr.simulate(dragged, STATE, 1.0, solver=solver, max_step=0.1)
+    damped = jr.RigidBody(MOMENTS, jr.torques.InternalDamper(0.1, 0.1))
+    with pytest.raises(ValueError, match="moving parts"):
+        jr.simulate(damped, STATE, 1.0, solver=solver, max_step=0.1)

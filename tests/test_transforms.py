@@ -291,11 +291,22 @@ def exact_step(inertia, state, t):
     return end, rate, term.after(state, t)
 
 
-def unrolled_step(y, t):
+def splitting_step(inertia, state, t):
+    t, solver = number(t), solvers.Splitting(2)
+    body = jr.RigidBody(inertia, lambda t, state, args: state.attitude[1:] * (1 + t))  # noqa: ARG005
+    terms = solver.terms(body)
+    assert solver.order(terms) == 2
+    start = solver.init(terms, 0.0, t, state, None)
+    end, _, dense, *_ = solver.step(terms, 0.0, t, state, None, start, made_jump=False)
+    curve = solver.interpolation_cls(t0=0.0 * t, t1=t, **dense)
+    return end, curve.evaluate(0.5 * t), solver.func(terms, 0.0, state, None)
+
+
+def unrolled_step(method, y, t):
     y, t = number(y), number(t)
     term = diffrax.ODETerm(lambda t, y, args: jnp.cos(y) * (1 + t))  # noqa: ARG005
-    solver = solvers.Unrolled(diffrax.Tsit5())
-    assert (solver.order(term), solver.error_order(term)) == (5, 5)
+    solver = solvers.Unrolled(method)
+    assert solver.order(term) == solver.error_order(term) == method.order(term)
     start = solver.init(term, 0.1 * t, t, y, None)
     end, error, dense, after, _ = solver.step(term, 0.1 * t, t, y, None, start, made_jump=False)
     curve = solver.interpolation_cls(t0=0.1 * t, t1=t, **dense)
@@ -539,8 +550,18 @@ CASES = {
             *methods("solvers.ExactFree", "order", "init", "step", "func"),
         ),
     ),
+    "solvers.Splitting": Case(
+        free_state(splitting_step).function,
+        (MOMENTS, ATTITUDE, OMEGA, 0.3),
+        methods("solvers.Splitting", "order", "terms", "init", "step", "func"),
+    ),
+    "solvers.Verner9": Case(
+        functools.partial(unrolled_step, solvers.Verner9()),
+        (OMEGA, 0.4),
+        methods("solvers.Verner9", "order", "term_structure"),
+    ),
     "solvers.Unrolled": Case(
-        unrolled_step,
+        functools.partial(unrolled_step, diffrax.Tsit5()),
         (OMEGA, 0.4),
         (
             *methods("solvers.Unrolled", "order", "error_order", "init", "step", "func"),

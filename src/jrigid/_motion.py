@@ -173,6 +173,16 @@ def solver_of(solver: Any, default: diffrax.AbstractSolver, or_else: str = "") -
     return default if solver is None else solver
 
 
+def depends_on(function: Callable[[Array], Any], x: Array) -> bool:
+    """Whether a function looks at its argument, as far as its program shows."""
+    program = jax.make_jaxpr(function)(x).jaxpr
+    reached = {program.invars[0]}
+    for equation in program.eqns:
+        if any(x in reached for x in equation.invars if not hasattr(x, "val")):
+            reached.update(equation.outvars)
+    return any(x in reached for x in program.outvars if not hasattr(x, "val"))
+
+
 def exact_motion(check: Callable, flow: Callable, throw: bool, *motion: Any) -> ExactStates:
     """A motion in closed form at times of any shape; a bad value is an error or NaN and a code.
 

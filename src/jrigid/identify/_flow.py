@@ -8,11 +8,11 @@ nearer than a ten-millionth are taken that far apart, in the derivatives alone.
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jrigid._motion import depends_on
 from jrigid._numerics import product
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid.dynamics import State
@@ -98,15 +98,9 @@ def forced_flow(
 
 def depends_on_attitude(system: AbstractSystem) -> bool:
     """Whether the torque looks at the attitude, as far as its program shows."""
-    arrays, rest = eqx.partition(system, eqx.is_inexact_array)
 
-    def torque(q: Array, w: Array, arrays: Any) -> Array:
-        system = eqx.combine(arrays, rest)
-        return system.torque_on(jnp.zeros(()), system.with_parts(State(q, w)), None)
+    def torque(q: Array) -> Array:
+        state = system.with_parts(State(q, jnp.zeros(3)))
+        return system.torque_on(jnp.zeros(()), state, None)
 
-    program = jax.make_jaxpr(torque)(jnp.array([1.0, 0, 0, 0]), jnp.zeros(3), arrays).jaxpr
-    reached = {program.invars[0]}
-    for equation in program.eqns:
-        if any(x in reached for x in equation.invars if not hasattr(x, "val")):
-            reached.update(equation.outvars)
-    return any(x in reached for x in program.outvars if not hasattr(x, "val"))
+    return depends_on(torque, jnp.array([1.0, 0, 0, 0]))

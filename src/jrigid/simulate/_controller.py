@@ -28,6 +28,9 @@ _CONFINED = 1e-6
 # After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
 _GROWTH = 1e16
 
+# A step may be longer by this fraction, so that rounding does not make one more of them.
+_RAGGED = 1e-6
+
 
 class _Onwards(diffrax.AbstractStepSizeController):
     """A controller for time that grows."""
@@ -166,6 +169,36 @@ class SteadyController(_Onwards):
         """The end of the next one."""
         del t0
         return True, t1, t1 + self.step, False, None, diffrax.RESULTS.successful
+
+
+class EvenSteps(_Onwards):
+    """Equal steps from each of the times asked for to the next.
+
+    Attributes:
+        times: Asked for.
+        end: Of the motion.
+        longest: That a step may be.
+    """
+
+    times: Array
+    end: Array
+    longest: Array
+
+    def _next(self, t: Array) -> Array:
+        number = jnp.searchsorted(self.times, t, side="right")
+        target = jnp.append(self.times, self.end)[number]
+        count = jnp.ceil((target - t) / self.longest * (1 - _RAGGED))
+        return jnp.where(count > 1, t + (target - t) / count, target)
+
+    def init(self, terms, t0, *_):
+        """The end of the first step."""
+        del terms
+        return self._next(t0), None
+
+    def adapt_step_size(self, t0, t1, *_):
+        """The end of the next one."""
+        del t0
+        return True, t1, self._next(t1), False, None, diffrax.RESULTS.successful
 
 
 class KnownSteps(_Onwards):

@@ -13,7 +13,7 @@ from jrigid._checks import RESULTS, Findings, check_type, is_concrete, whole_num
 from jrigid._motion import check_motion, numbers, resolves, solver_of
 from jrigid._scales import spectral_radius, undamped_rate, units
 from jrigid.simulate._controller import constant
-from jrigid.solvers import ExactFree, Unrolled
+from jrigid.solvers import ExactFree, Splitting, Unrolled, Verner9
 from jrigid.systems import AbstractSystem, RigidBody
 
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
@@ -76,8 +76,14 @@ class Options(NamedTuple):
 def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Options:
     """The options with their defaults, or ValueError."""
     solver, rtol, atol, adjoint, max_steps, max_step, event, meter = asked
-    if not isinstance(solver, ExactFree):
-        solver = solver_of(solver, diffrax.Dopri8(), ", or ExactFree()")
+    if isinstance(solver, Splitting):
+        if max_step is None or not isinstance(system, RigidBody):
+            raise ValueError(
+                "Argument `solver` must not be Splitting for anything but a RigidBody, its step "
+                "given as `max_step`, but it is."
+            )
+    elif not isinstance(solver, ExactFree):
+        solver = solver_of(solver, Verner9(), ", or ExactFree() or Splitting()")
         solver = solver.solver if isinstance(solver, Unrolled) else solver
     elif not (isinstance(system, RigidBody) and system.is_free):
         raise ValueError(

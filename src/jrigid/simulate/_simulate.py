@@ -16,12 +16,13 @@ from jaxtyping import Array
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
-from jrigid._motion import HasRigidBody, harmless_motion, motion_arguments
+from jrigid._motion import HasRigidBody, depends_on, harmless_motion, motion_arguments
 from jrigid._types import Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._adjoint import WithTimes, forward_only, guard_inputs, guard_outputs
 from jrigid.simulate._controller import (
     SMALLEST_BOUND,
+    EvenSteps,
     SteadyController,
     WatchfulController,
     constant,
@@ -33,16 +34,16 @@ from jrigid.simulate._lanes import COUNTS, Ends, Problem, Steps
 from jrigid.simulate._options import Inputs, Options, checked_options, judged
 from jrigid.simulate._trajectory import Trajectory
 from jrigid.simulate._vmap import motion_in_lanes
-from jrigid.solvers import ExactFree, FreeRotation
-from jrigid.systems import AbstractSystem
+from jrigid.solvers import ExactFree, FreeRotation, Splitting
+from jrigid.systems import AbstractSystem, RigidBody
 
 # One step commits this fraction of rtol, less with methods of lower order than 8, whose estimates
 # are as large as their errors. Where a motion is unstable its derivatives ask for much more than
 # its values.
-_OF_VALUES, _OF_LOWER_ORDERS, _OF_DERIVATIVES = 0.3, 0.03, 1e-3
+_OF_VALUES, _OF_LOWER_ORDERS, _OF_DERIVATIVES = 0.5, 0.03, 1e-3
 # The error of the energy adds up over the turns and that of the phase over the energy's: in a long
 # run one step may commit no more than so much of rtol for each radian.
-_RADIANS = 20.0
+_RADIANS = 50.0
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
 # Below this many eps of the run a step is none. A motion that ends there is looked at so many of
@@ -84,14 +85,15 @@ def simulate(
             from 0, as the seconds of 1970 are.
         args: Passed to torques and forces.
         t0: Time of `state0` [s].
-        solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default. An implicit
-            one (`diffrax.Kvaerno5()`) steps over what drag or a damper kills within a radian of its
-            own rate. For a `RigidBody` without torque `jrigid.solvers.ExactFree()` gives the
-            closed form.
+        solver: A diffrax solver with an error estimate; `jrigid.solvers.Verner9()` by default. An
+            implicit one (`diffrax.Kvaerno5()`) steps over what drag or a damper kills within a
+            radian of its own rate. For a `RigidBody` without torque `jrigid.solvers.ExactFree()`
+            gives the closed form, for one in a potential `jrigid.solvers.Splitting()` symplectic
+            steps of the length `max_step`.
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
             phi [rad] the relative error of energy and space angular momentum stays below
             rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
-            floor of 100 eps (1 + phi). One step is held to a third of rtol for that, to less in
+            floor of 100 eps (1 + phi). One step is held to half of rtol for that, to less in
             long runs or by a method of lower order, and to a thousandth where derivatives are
             taken, whose value is closer for it. What counts is the fastest part of the motion: for
             a body in flight that turns slowly, or not at all, phi is the angle of its orbit, and
@@ -180,7 +182,8 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     usable = guard_inputs(options.adjoint, harmless_motion(findings.ok, inputs))
     options, measures = harmless(findings.ok, (options, measures))
     run = _measured(findings.ok, usable, options, measures)
-    problem_of = _exact if isinstance(options.solver, ExactFree) else _stepped
+    kinds = {ExactFree: _exact, Splitting: _split}
+    problem_of = kinds.get(type(options.solver), _stepped)
     terms, y0, to_state, controller = problem_of(run, usable, options)
     fixed = jax.lax.stop_gradient(run.times)
     beyond = jnp.searchsorted(fixed, fixed, side="right")
@@ -203,7 +206,7 @@ def _alone(options: Options, event: Any, problem: Problem) -> Ends:
     """One motion, by diffrax."""
     terms, controller, _, y0, args, times, _, end = problem.finely
     controller = constant(controller)
-    if not isinstance(options.solver, ExactFree):
+    if isinstance(terms, diffrax.ODETerm):
         if not isinstance(options.adjoint, diffrax.ForwardMode):  # NaN would reach what lanes share
             field = jtu.Partial(guarded, terms.vector_field, jax.lax.stop_gradient(y0))
             terms = diffrax.ODETerm(field)
@@ -305,6 +308,27 @@ def _exact(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         step = jnp.minimum(step, jnp.minimum(SMALLEST_BOUND / run.fastest, run.longest))
     terms = FreeRotation(inputs.system.inertia.astype(step.dtype))
     return terms, inputs.state0, lambda y: y, SteadyController(step)
+
+
+def _split(run: _Run, inputs: Inputs, options: Options) -> _Problem:
+    """A body in a potential, for `Splitting`: equal steps that no other lane shares."""
+    system, state0, _, _, args = inputs
+
+    def torque(t: Any, y: Any, args: Any) -> Array:
+        return system.torque_on(run.start + t, y, args)
+
+    looks_at_omega = depends_on(
+        lambda omega: torque(run.end, dataclasses.replace(state0, omega=omega), args), state0.omega
+    )
+    if looks_at_omega or jtu.tree_leaves(state0.internal):
+        raise ValueError(
+            "Argument `solver` must not be Splitting where the torque depends on the angular "
+            "velocity or the body has moving parts, but it is."
+        )
+    seen = harmless(run.ok, _opened(torque, run.end, state0, args))
+    terms: Any = options.solver.terms(RigidBody(system.inertia, seen))
+    controller = EvenSteps(constant(run.times), constant(run.end), run.longest)
+    return terms, state0, lambda y: y, controller
 
 
 def _trajectory(
