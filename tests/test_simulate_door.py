@@ -54,24 +54,44 @@ def test_the_compiled_function_holds_no_callback(event, mode):
 SCRIPT = """
 import jax
 jax.config.update("jax_enable_x64", True)
-counts = {}
+counts = {{}}
 def count(name, **_):
     counts[name] = counts.get(name, 0) + 1
 jax.monitoring.register_event_listener(count)
 import jax.numpy as jnp
 import jrigid as jr
+{work}
+print(*(counts.get("/jax/compilation_cache/" + x, 0) for x in ("cache_hits", "cache_misses")))
+"""
 
+WORK = {
+    "motions": """
 def final(omega):
     state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
     return jr.simulate(jr.RigidBody(jnp.array([1.0, 2.0, 3.0])), state0, 1.0).states.omega[0]
 
 omega = jnp.array([0.3, -0.5, 0.8])
 jax.block_until_ready((final(omega), jax.grad(final)(omega)))
-print(*(counts.get("/jax/compilation_cache/" + x, 0) for x in ("cache_hits", "cache_misses")))
-"""
+jax.block_until_ready(jax.vmap(final)(jnp.stack([omega, -omega])))
+""",
+    "closed forms": """
+state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.3, -0.5, 0.8]))
+turn = lambda inertia: jr.free_rotation(inertia, state, 1.0, throw=False).omega[0]
+jax.block_until_ready(jax.vmap(jax.grad(turn))(jnp.stack([jnp.eye(3), 2 * jnp.eye(3)])))
+jax.block_until_ready(jr.top_motion(jr.SymmetricTop(1.0, 2.0, 0.3), state, 1.0).omega)
+""",
+    "a fit": """
+record = jr.datasets.gyro_example()
+readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+jax.block_until_ready(jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings).inertia)
+""",
+}
 
 
-def test_a_second_process_with_the_persistent_cache_compiles_nothing(tmp_path):
+@pytest.mark.parametrize(
+    "work", ["motions", "closed forms", pytest.param("a fit", marks=pytest.mark.slow)]
+)
+def test_a_second_process_with_the_persistent_cache_compiles_nothing(work, tmp_path):
     environment = {
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -79,7 +99,7 @@ def test_a_second_process_with_the_persistent_cache_compiles_nothing(tmp_path):
         "JAX_EXPLAIN_CACHE_MISSES": "0",
     }
     for process in (1, 2):
-        said, complained = in_a_process(SCRIPT, **environment)
+        said, complained = in_a_process(SCRIPT.format(work=WORK[work]), **environment)
         hits, misses = map(int, said.split())
         assert "host callbacks" not in complained
         assert misses > 0 if process == 1 else (misses == 0 and hits > 0)
