@@ -2,6 +2,7 @@
 
 import diffrax
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -201,6 +202,65 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
     together = quick_jit(jax.vmap(final))(omegas)
     for omega, found in zip(omegas, together, strict=True):
         np.testing.assert_allclose(found, final(omega), atol=1e-5)
+
+
+def _library():
+    """Every torque of the library, on an orbit where it takes one."""
+    t, up = jr.torques, np.array([0.0, 0.6, 0.8])
+    orbit = t.KeplerOrbit(0.5, 1.3, 0.2)
+    plates, centers = np.array([[1.0, 0, 0], [0, 0.6, 0.8]]), np.array([[0, 0.1, 0.2], [0.3, 0, 0]])
+    towards = lambda t: jnp.stack([jnp.cos(t), jnp.sin(t), 0 * t])  # noqa: E731
+    return {
+        "constant": t.Constant(0.1 * up),
+        "gravity": GRAVITY,
+        "gravity gradient": t.GravityGradient(0.5, orbit),
+        "dipole": t.MagneticDipole(0.2 * up, lambda t, _: orbit(t)),
+        "sunlight": t.SolarPressure(np.ones(2), plates, centers, towards, 0.3, 0.2, 0.1),
+        "linear drag": t.LinearDrag(np.array([0.1, 0.2, 0.3])),
+        "quadratic drag": t.QuadraticDrag(0.1),
+        "friction": t.CoulombFriction(0.1, 0.5, up),
+        "damper": t.InternalDamper(0.2, 0.1),
+        "rotor": t.Rotor(lambda t: jnp.sin(t) * up),
+        "wheel": t.SpinningMass(0.2, up, lambda t, *_: 0.1 * jnp.cos(t)),
+    }
+
+
+@pytest.mark.parametrize("name", _library())
+def test_every_torque_of_the_library_is_the_same_in_lanes(name, rng):
+    body = jr.RigidBody(TOP.inertia, _library()[name])
+
+    def rates(t, q, w):
+        state = body.with_parts(jr.State(jr.rotation.normalize(q), w))
+        return jax.flatten_util.ravel_pytree(body.vector_field(t, state, None))[0]
+
+    lanes = jnp.asarray(rng.normal(size=8)), rng.normal(size=(4, 8)), rng.normal(size=(3, 8))
+    found = quick_jit(lambda *x: lanes_last(rates, *x))(*lanes)
+    wanted = quick_jit(jax.vmap(rates, -1, -1))(*lanes)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-14)
+
+
+def test_all_torques_at_once_move_a_body_as_a_solver_of_diffrax_does(rng):
+    """Lanes of the fast road beside `diffeqsolve` by hand, within what is promised."""
+    body = jr.RigidBody(TOP.inertia, jr.torques.Sum(_library().values()))
+    omegas = rng.normal(size=(3, 3))
+
+    def by_hand(omega):
+        state = body.with_parts(jr.State(UPRIGHT, omega))
+        controller = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(body.vector_field), diffrax.Tsit5(), 0.0, 2.0, 0.01, state,
+            stepsize_controller=controller, throw=False,
+        ).ys  # fmt: skip
+
+    def ours(omega):
+        state = jr.State(UPRIGHT, omega)
+        options = {"solver": diffrax.Bosh3(), "rtol": 1e-6, "throw": False}
+        return jr.simulate(body, state, 2.0, **options).final_state
+
+    found, wanted = (quick_jit(jax.vmap(x))(omegas) for x in (ours, by_hand))
+    wanted = jax.tree_util.tree_map(lambda x: x[:, 0], wanted)
+    for x, y in zip(*map(jax.tree_util.tree_leaves, (found, wanted)), strict=True):
+        np.testing.assert_allclose(x, y, atol=5e-5)  # 10 rtol (1 + phi)
 
 
 SHARDED = """
