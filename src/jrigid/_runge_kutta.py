@@ -45,7 +45,7 @@ def kept_apart(
         # What goes into a branch and what comes out of it has been computed, once. Of what is on
         # the way in between, each number would be copied for the way back.
         field = jax.checkpoint(rates, prevent_cse=False)
-        return jax.lax.cond(true, field, lambda _, y: y, t, y)
+        return jax.lax.cond(true, field, lambda _, y: jnp.zeros_like(y), t, y)
 
     return apart
 
