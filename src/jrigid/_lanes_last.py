@@ -6,6 +6,7 @@ goes number by number, or takes arrays apart and puts them together, leaves the 
 are; all else is left to `vmap`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,14 @@ _AS_THEY_ARE = {
     "concatenate", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod",
     "reduce_sum", "rev", "split", "squeeze", "stack", "unstack",
 }  # fmt: skip
+# Of so few terms these are written out, to be computed with what is around them.
+_FEW = 8
+_FOLDS = {
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_prod": jax.lax.mul,
+    "reduce_sum": jax.lax.add,
+}
 
 
 def _changed(name: str, ndim: int, lanes: int, params: dict) -> dict | None:
@@ -74,6 +83,9 @@ def _apply(eqn: Any, values: list, batched: list[bool], lanes: int) -> list:
     changed = _changed(primitive.name, len(shapes[0]), lanes, params)
     if changed is not None:
         values = [spread(*each) for each in zip(values, batched, shapes, strict=True)]
+        fold = _FOLDS.get(primitive.name)
+        if fold is not None and values[0].ndim == 2 and 0 < values[0].shape[0] <= _FEW:
+            return [functools.reduce(fold, values[0])]
         return _bind(primitive, changed, *values)
     axes = [-1 if has else None for has in batched]
     return jax.vmap(lambda *x: _bind(primitive, params, *x), axes, -1)(*values)

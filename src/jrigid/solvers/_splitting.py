@@ -85,11 +85,12 @@ class Splitting(diffrax.AbstractSolver):
     r"""Symplectic steps for a body in a potential: kicks by the torque between exact free motions.
 
     Steps are of one length. They preserve the symplectic form and are their own inverse backward in
-    time, so the energy does not drift: its error is some constant times step^order, whatever the
-    time, until rounding adds up, as a random walk. So do a momentum along an axis about which the
-    potential is symmetric, and |q| = 1, to rounding. `simulate(body, ..., solver=Splitting(),
+    time, so the energy does not drift: its error stays of the order of step^order, whatever the
+    time, until rounding adds up as a random walk. A momentum about an axis of symmetry of the
+    potential and |q| = 1 are kept to rounding. `simulate(body, ..., solver=Splitting(),
     max_step=h)` divides the time from each output to the next into equal steps no longer than h; of
-    `rtol` it knows nothing. The torque may depend on attitude and time alone.
+    `rtol` it knows nothing. A torque may depend on attitude and time alone: any other is an error
+    there.
 
     In `diffrax.diffeqsolve` it solves the pair of terms `Splitting.terms(body)` by constant steps;
     its dense output is a shorter step.
@@ -117,6 +118,9 @@ class Splitting(diffrax.AbstractSolver):
 
         Args:
             order: 2, 4 or 6, for one, five or nine free motions a step.
+
+        Raises:
+            ValueError: Another order.
         """
         if order not in _HALVES:
             raise ValueError(f"Argument `order` must be 2, 4 or 6, but it is {order!r}.")
