@@ -311,6 +311,20 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
     np.testing.assert_allclose(reverse, exact, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize("t", [1e2, 1e3, 1e4, 1e5])
+def test_derivatives_in_a_tensor_at_a_long_spin_about_one_of_two_equal_axes(t):
+    """I = (1, 1, 1.5), omega along x: domega_y / dI_xy = -t^2 / 6 is by far the largest."""
+
+    def end(s):
+        tensor = jnp.diag(jnp.array([1.0, 1.0, 1.5])) + s * jnp.zeros((3, 3)).at[
+            [0, 1], [1, 0]
+        ].set(1)
+        return state_at(tensor, jnp.eye(4)[0], jnp.array([1.0, 0.0, 0.0]), t)[4:]
+
+    slope = quick_jit(lambda s: jax.jvp(end, (s,), (1.0,))[1])(0.0)
+    assert np.max(np.abs(slope)) == pytest.approx(t * t / 6, rel=1e-8)
+
+
 @pytest.mark.parametrize("gap", [0.0, 2.0**-40, 2.0**-17, 2.0**-13])
 def test_derivatives_in_a_tensor_after_a_long_time_near_the_separatrix(gap, of_tensor):
     """There a gap's effect grows with the square of the time: what is near must know."""

@@ -52,8 +52,9 @@ def _of_all_kinds(x, i, table):
     looked_up = jnp.interp(c, jnp.linspace(-3, 3, 9), table)
     turned = jnp.linalg.solve(rows @ rows.T + 5 * jnp.eye(3), x)
     tail = jax.jit(lambda x: _ruled(jnp.sort(x))[i])(x)
+    sums = jnp.sum(x, axis=()), jnp.max(x), jnp.sum(rows, axis=0), jnp.prod(x[:0])
     return {
-        "a": mixed,
+        "a": (mixed, sums),
         "b": (by_cond, by_loop, rows),
         "c": [looked_up, turned, tail, jnp.ones(2), halves],
     }

@@ -84,7 +84,8 @@ def _apply(eqn: Any, values: list, batched: list[bool], lanes: int) -> list:
     if changed is not None:
         values = [spread(*each) for each in zip(values, batched, shapes, strict=True)]
         fold = _FOLDS.get(primitive.name)
-        if fold is not None and values[0].ndim == 2 and 0 < values[0].shape[0] <= _FEW:
+        few = values[0].ndim == 2 and 0 < values[0].shape[0] <= _FEW
+        if fold is not None and few and params["axes"] == (0,):
             return [functools.reduce(fold, values[0])]
         return _bind(primitive, changed, *values)
     axes = [-1 if has else None for has in batched]

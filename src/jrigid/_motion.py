@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array
 
 from jrigid._checks import (
@@ -176,11 +177,8 @@ def solver_of(solver: Any, default: diffrax.AbstractSolver, or_else: str = "") -
 def depends_on(function: Callable[[Array], Any], x: Array) -> bool:
     """Whether a function looks at its argument, as far as its program shows."""
     program = jax.make_jaxpr(function)(x).jaxpr
-    reached = {program.invars[0]}
-    for equation in program.eqns:
-        if any(x in reached for x in equation.invars if not hasattr(x, "val")):
-            reached.update(equation.outvars)
-    return any(x in reached for x in program.outvars if not hasattr(x, "val"))
+    _, (used, *_) = dce_jaxpr(program, [True] * len(program.outvars))
+    return used
 
 
 def exact_motion(check: Callable, flow: Callable, throw: bool, *motion: Any) -> ExactStates:

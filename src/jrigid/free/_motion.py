@@ -32,10 +32,15 @@ Tree = TypeVar("Tree")
 
 # Moments whose gap turns the motion by less than this [rad] are near: wider ones interpolate to
 # 1e-13, and so much is lost in a quotient.
-_NEAR = 2e-3
+_NEAR = {8: 2e-3, 4: 3e-2}
 # Where to look besides: how many times further apart, and the weight of what is found there.
 _NODES = (-4.0, -3.0, -2.0, 2.0, 3.0, 4.0)
-_LOOKS = [(0.0, 1.0), *((x, math.prod(y / (y - x) for y in _NODES if y != x)) for x in _NODES)]
+_LOOKS = [
+    *((0.0, 0.0), (1.0, 0.0)),
+    *((x, math.prod(y / (y - x) for y in _NODES if y != x)) for x in _NODES),
+]
+# The second look is at a gap of this, over the square of the radians: no motion changes within it.
+_PROBE = 1e-2
 
 
 def free_rotation(
@@ -193,7 +198,8 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     They are those in the moments, which ascend, in `omega` and t, and in the elements 23, 31 and
     12. Of these each is the effect of turning the body's axes divided by the gap of two moments.
     Both vanish together: across a near gap the quotient is interpolated from wider ones, which
-    costs six looks more at the motion, unless no lane asks for it.
+    costs seven looks more at the motion, unless no lane asks for it. How near is near depends on
+    how fast the motion changes with a gap, which the first two looks tell.
     """
     directions = jnp.eye(7, dtype=t.dtype)
 
@@ -210,16 +216,21 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         )
         return value, columns, quotients
 
+    def steepest(slopes: Array) -> Array:  # of the attitude
+        return jax.lax.stop_gradient(jnp.max(jnp.abs(slopes[:, :4])))
+
     def look(node: Array, weight: Array, known: tuple[Array, ...]) -> tuple[Array, ...]:
-        wider, value, slopes = known
-        here = node == 0
+        wider, steep, value, slopes, total = known
+        first, second = node == 0, node == 1
         found, columns, quotients = slopes_at(moments + node * wider)
-        wider = jnp.where(here, _wider(moments, omega, t, jnp.max(jnp.abs(columns[:3, :4]))), wider)
-        low, _, high = wider != 0
-        near = jnp.stack([high, low & high, low])[:, None]
-        shares = jnp.where(near == here, 0.0, weight * quotients)
-        new = jnp.concatenate([jnp.where(here, columns, 0.0), shares])
-        return wider, jnp.where(here, found, value), slopes + new
+        near = _near_pairs(wider)
+        steep = jnp.where(first, steepest(columns[:3]), steep)
+        steep = jnp.where(second, steep + steepest(jnp.where(near, quotients, 0.0)), steep)
+        probe, reach = (_wider(moments, omega, t, steep, probing=x) for x in (True, False))
+        wider = jnp.where(first, probe, jnp.where(second, reach, wider))
+        slopes = jnp.where(first, jnp.concatenate([columns, quotients]), slopes)
+        total = total + jnp.where(weight == 0, 0.0, weight * quotients)
+        return wider, steep, jnp.where(first, found, value), slopes, total
 
     def visit(known: tuple[Array, ...], of_node: Array) -> tuple[tuple[Array, ...], None]:
         node, weight = of_node
@@ -227,15 +238,26 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         unchanged = lambda _, __, known: known  # noqa: E731
         return jax.lax.cond(asked, look, unchanged, node, weight, known), None
 
-    nothing = jnp.zeros(3, t.dtype), jnp.zeros(7, t.dtype), jnp.zeros((10, 7), t.dtype)
-    (_, value, slopes), _ = jax.lax.scan(visit, nothing, jnp.asarray(_LOOKS, t.dtype))
-    return value, slopes
+    nothing = [jnp.zeros(shape, t.dtype) for shape in (3, (), 7, (10, 7), (3, 7))]
+    known, _ = jax.lax.scan(visit, tuple(nothing), jnp.asarray(_LOOKS, t.dtype))
+    wider, _, value, slopes, total = known
+    return value, slopes.at[7:].set(jnp.where(_near_pairs(wider), total, slopes[7:]))
 
 
-def _wider(moments: Array, omega: Array, t: Array, slope: Array | float = 0.0) -> Array:
+def _near_pairs(wider: Array) -> Array:
+    """Of which pairs of moments, 23, 31 and 12, the gap is near."""
+    low, _, high = wider != 0
+    return jnp.stack([high, low & high, low])[:, None]
+
+
+def _wider(
+    moments: Array, omega: Array, t: Array, steep: Array | float = 0.0, *, probing: bool = False
+) -> Array:
     """How moments are moved to widen the gaps that are near, zero where none is."""
-    reach = _NEAR / (1 / moments[:2] + safe_norm(omega) * jnp.abs(t) / moments[:2] + slope)
-    low, high = jnp.where(moments[1:] - moments[:2] < reach, reach, 0.0)
+    low, phase = moments[:2], safe_norm(omega) * jnp.abs(t)
+    reach = _NEAR[t.dtype.itemsize] / ((1 + phase) / low + steep)
+    distance = _PROBE * low / (1 + phase * phase) if probing else reach
+    low, high = jnp.where(moments[1:] - moments[:2] < reach, distance, 0.0)
     return jnp.stack([-low, jnp.zeros_like(t), high])
 
 

@@ -28,8 +28,8 @@ _CONFINED = 1e-6
 # After a step clipped to a sliver by one of the times asked for, the next is full-sized again.
 _GROWTH = 1e16
 
-# A step may be longer by this fraction, so that rounding does not make one more of them.
-_RAGGED = 1e-6
+# Equal steps are one fewer where so little of one would be left, which rounding may have made.
+_RAGGED = 1e-3
 
 
 class _Onwards(diffrax.AbstractStepSizeController):
@@ -187,7 +187,7 @@ class EvenSteps(_Onwards):
     def _next(self, t: Array) -> Array:
         number = jnp.searchsorted(self.times, t, side="right")
         target = jnp.append(self.times, self.end)[number]
-        count = jnp.ceil((target - t) / self.longest * (1 - _RAGGED))
+        count = jnp.ceil((target - t) / self.longest - _RAGGED)
         return jnp.where(count > 1, t + (target - t) / count, target)
 
     def init(self, terms, t0, *_):

@@ -143,7 +143,10 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        x = jnp.asarray(2 * (t0 - self.t0) / (self.t1 - self.t0) - 1)
+        # A step of no length, which a loop takes that is through, has no slope.
+        step = jnp.asarray(self.t1 - self.t0)
+        none = step == 0
+        x = 2 * jnp.where(none, 0.0, t0 - self.t0) / jnp.where(none, 1.0, step) - 1
         polynomials = [jnp.ones_like(x), x]
         for _ in range(6):
             polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
@@ -156,11 +159,10 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
 
 
 class Verner9(diffrax.AbstractERK):
-    """Verner's method of order 9, error estimate of order 8: for tight tolerances.
+    """Verner's method of order 9, error estimate of order 8.
 
-    16 evaluations a step, since the last stage is the first of the next step. In float64 it takes
-    the place of `diffrax.Dopri8` where `rtol` is below 1e-11 or so; its dense output, of order 6
-    with a continuous slope, takes no evaluation more.
+    16 evaluations a step, since the last stage is the first of the next step: the default of
+    `jrigid.simulate`. Its dense output, of order 6 with a continuous slope, takes none more.
 
     Gradients: those of the method.
     Source: J. H. Verner, Numer. Algorithms 53 (2010) 383, the "most efficient" pair of orders 9
