@@ -172,8 +172,8 @@ class Verner9(diffrax.AbstractERK):
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.01, 1.0, 0.0]))
     >>> motion = jr.simulate(body, state0, 100.0, solver=jr.solvers.Verner9(), rtol=1e-13)
-    >>> print(motion.energy.round(6))
-    1.00005
+    >>> print(abs(motion.energy - 1.00005) < 1e-12)
+    True
     """
 
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
