@@ -327,8 +327,7 @@ def _split(run: _Run, inputs: Inputs, options: Options) -> _Problem:
         )
     seen = harmless(run.ok, _opened(torque, run.end, state0, args))
     terms: Any = options.solver.terms(RigidBody(system.inertia, seen))
-    controller = EvenSteps(constant(run.times), constant(run.end), run.longest)
-    return terms, state0, lambda y: y, controller
+    return terms, state0, lambda y: y, EvenSteps(run.times, run.end, run.longest)
 
 
 def _trajectory(

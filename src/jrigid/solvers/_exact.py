@@ -14,6 +14,7 @@ from jrigid._types import InertiaLike
 from jrigid.dynamics import euler_equations
 from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, multiply
+from jrigid.solvers._dense import Dense
 
 
 class FreeRotation(diffrax.AbstractTerm):
@@ -61,7 +62,7 @@ class FreeRotation(diffrax.AbstractTerm):
         return dataclasses.replace(y, attitude=multiply(y.attitude, turn), omega=omega)
 
 
-class _ExactInterpolation(diffrax.AbstractLocalInterpolation):
+class _ExactInterpolation(Dense):
     """Dense output that is the exact motion."""
 
     t0: Any
@@ -70,12 +71,9 @@ class _ExactInterpolation(diffrax.AbstractLocalInterpolation):
     inertia: Any
     direction: Any
 
-    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Any:
-        """The state at t0, or its change from t0 to t1."""
-        del left
-        if t1 is not None:
-            return jtu.tree_map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        return FreeRotation(self.inertia).after(self.y0, self.direction * (t0 - self.t0))
+    def at(self, t: Any) -> Any:
+        """The state at t."""
+        return FreeRotation(self.inertia).after(self.y0, self.direction * (t - self.t0))
 
 
 class ExactFree(diffrax.AbstractSolver):

@@ -14,6 +14,7 @@ import numpy as np
 from jrigid._checks import check_type
 from jrigid.dynamics import angular_momentum, euler_equations
 from jrigid.rotation import normalize
+from jrigid.solvers._dense import Dense
 from jrigid.solvers._exact import FreeRotation
 from jrigid.systems import RigidBody
 
@@ -34,7 +35,7 @@ class _Rest(eqx.Module):
     value: Any = eqx.field(static=True)
 
 
-class _ShorterStep(diffrax.AbstractLocalInterpolation):
+class _ShorterStep(Dense):
     """Dense output that is a step as far as is asked for."""
 
     t0: Any
@@ -43,13 +44,10 @@ class _ShorterStep(diffrax.AbstractLocalInterpolation):
     arrays: Any
     rest: _Rest
 
-    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Any:
-        """The state at t0, or its change from t0 to t1."""
-        del left
-        if t1 is not None:
-            return jtu.tree_map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+    def at(self, t: Any) -> Any:
+        """The state at t."""
         solver, terms, args = eqx.combine(self.arrays, self.rest.value)
-        return solver._moved(terms, self.t0, t0, self.y0, args)
+        return solver._moved(terms, self.t0, t, self.y0, args)
 
 
 def _kick(body: RigidBody, t: Any, y: Any, args: Any) -> Any:

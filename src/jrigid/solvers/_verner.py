@@ -9,6 +9,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from jrigid.solvers._dense import Dense
+
 # fmt: off
 # When the stages are, from the second; the last is the end of the step.
 _C = [
@@ -129,7 +131,7 @@ _TABLEAU = diffrax.ButcherTableau(
 )
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class _Interpolation(Dense):
     """Dense output of order 6, with a continuous slope, from the stages alone."""
 
     t0: Any
@@ -138,24 +140,21 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     y1: Any
     k: Any
 
-    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Any:
-        """The state at t0, or its change from t0 to t1."""
-        del left
-        if t1 is not None:
-            return jtu.tree_map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+    def at(self, t: Any) -> Any:
+        """The state at t."""
         # A step of no length, which a loop takes that is through, has no slope.
         step = jnp.asarray(self.t1 - self.t0)
         none = step == 0
-        x = 2 * jnp.where(none, 0.0, t0 - self.t0) / jnp.where(none, 1.0, step) - 1
+        x = 2 * jnp.where(none, 0.0, t - self.t0) / jnp.where(none, 1.0, step) - 1
         polynomials = [jnp.ones_like(x), x]
         for _ in range(6):
             polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
         weights = jnp.asarray(_DENSE, x.dtype) @ jnp.stack(polynomials)
 
-        def at(y0: Array, k: Array) -> Array:
+        def moved(y0: Array, k: Array) -> Array:
             return y0 + jnp.tensordot(weights.astype(y0.dtype), k[_DENSE_STAGES], 1)
 
-        return jtu.tree_map(at, self.y0, self.k)
+        return jtu.tree_map(moved, self.y0, self.k)
 
 
 class Verner9(diffrax.AbstractERK):
