@@ -762,15 +762,6 @@ def test_points_that_are_undefined_are_marked():
         _ = st.stability_map(lambda x: x, {"x": axes["x"]}).extent
 
 
-def test_progress_of_a_map_is_printed(monkeypatch, capsys):
-    from jrigid.stability import _maps
-
-    clock = iter(np.arange(0, 1000, 10.0))
-    monkeypatch.setattr(_maps.time, "monotonic", lambda: next(clock))
-    st.stability_map(lambda x: x, {"x": np.arange(4.0)}, block_size=2, progress=True)
-    assert "4 of 4 points" in capsys.readouterr().out
-
-
 def test_a_boundary_at_an_end_and_lanes_without_one():
     edges = jax.vmap(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p, throw=False))
     found = edges(jnp.array([1.0, 1.5, 2.0, 3.0]))

@@ -57,7 +57,7 @@ NOTHING_TO_CALL = {
     "identify.LogCholesky", "stability.Linearization", "stability.Modes",
     "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
-    "stability.StabilityMap", "stability.STABILITY", "stability.ORDER", "stability.REGIONS",
+    "stability.STABILITY", "stability.ORDER", "stability.REGIONS",
     "stability.SIDES", "free.REGIMES",
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.

@@ -37,6 +37,8 @@ from jrigid.mass import tensor_function as tensor_function
 from jrigid.mass import to_center_of_mass as to_center_of_mass
 from jrigid.simulate import Trajectory as Trajectory
 from jrigid.simulate import simulate as simulate
+from jrigid.sweep import SweepResult as SweepResult
+from jrigid.sweep import sweep as sweep
 from jrigid.systems import AbstractSystem as AbstractSystem
 from jrigid.systems import FloatingBody as FloatingBody
 from jrigid.systems import FloatingState as FloatingState

@@ -22,7 +22,6 @@ from jrigid.stability._lyapunov import LyapunovSpectrum as LyapunovSpectrum
 from jrigid.stability._lyapunov import Megno as Megno
 from jrigid.stability._lyapunov import lyapunov_spectrum as lyapunov_spectrum
 from jrigid.stability._lyapunov import megno as megno
-from jrigid.stability._maps import StabilityMap as StabilityMap
 from jrigid.stability._maps import boundary as boundary
 from jrigid.stability._maps import stability_map as stability_map
 from jrigid.stability._tumbling import SIDES as SIDES

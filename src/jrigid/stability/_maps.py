@@ -1,81 +1,36 @@
 """Maps of stability over any parameters, in blocks, and the boundaries between their regions."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool
+from jaxtyping import Array, ArrayLike
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    array_of_shape,
-    float_arrays,
-    shaped,
-    whole_number,
-)
+from jrigid._checks import Findings, all_finite, array_of_shape, shaped
 from jrigid._types import Scalar, ScalarLike
+from jrigid.sweep import SweepResult, sweep
 
-_Code = type(RESULTS.successful)  # an item of any enumeration
 # Part of the larger end value that a function may have left at a root; at a pole it has more.
 _ROOT = 1e-3
-
-
-class StabilityMap(NamedTuple):
-    """Values of a function on a grid.
-
-    Attributes:
-        values: As the function returned them, with the axes of the grid in front; numpy arrays.
-        valid: Where all numbers are finite and no code is `undefined`: a mask of the shape of the
-            grid.
-        axes: Names and points of the axes, in their order.
-    """
-
-    values: Any
-    valid: np.ndarray
-    axes: dict[str, np.ndarray]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the axes."""
-        return tuple(self.axes)
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Of a map over two axes, for matplotlib's `imshow(values.T, origin="lower", extent=...)`.
-
-        Raises:
-            ValueError: The map is over more or fewer axes.
-        """
-        if len(self.axes) != 2:
-            raise ValueError(f"Property `extent` is for two axes, but there are {len(self.axes)}.")
-        ends: list[float] = []
-        for x in self.axes.values():
-            half = 0.5 * (x[-1] - x[0]) / max(x.size - 1, 1)
-            ends += [float(x[0] - half), float(x[-1] + half)]
-        return ends[0], ends[1], ends[2], ends[3]
 
 
 def stability_map(
     function: Callable[..., Any],
     axes: Mapping[str, ArrayLike],
     *,
-    block_size: int = 2**16,
+    block_size: int | None = None,
     progress: bool = False,
-) -> StabilityMap:
+) -> SweepResult:
     """Evaluate a function of some parameters on the grid they span.
 
-    The grid is cut into blocks of one size, which are evaluated one after the other by one compiled
-    and vmapped call, so that memory is that of a block and of the result. The call is kept for the
-    next map of the same function with blocks of the same size.
+    This is `jrigid.sweep` in memory and on this machine, which also keeps what it has done, or
+    sends it elsewhere. The compiled call is kept for the next map of the same function with blocks
+    of the same shape.
 
     Args:
         function: A pure function (as for `jax.jit`: what it closes over must not change) of one
@@ -83,9 +38,8 @@ def stability_map(
             chaos, a region, a tree of several. With `throw=False` inside where it takes it, so
             that points that fail are NaN.
         axes: Name and points of each axis, two or more as a rule; the last one runs fastest.
-        block_size: Points of a block. Large for what is cheap; for long integrations some hundreds,
-            since a block takes as long as its slowest lane.
-        progress: Print how many points are done, every few seconds.
+        block_size: Points of a block, 65,536 at most by default.
+        progress: Show how many points are done.
 
     Returns:
         Values on the grid, and where they are valid.
@@ -105,71 +59,7 @@ def stability_map(
     >>> print(grid.values.shape, grid.labels, (grid.values > 0).sum())
     (4, 4) ('second', 'third') 1
     """
-    points = {name: np.asarray(x) for name, x in axes.items()}
-    for name, x in points.items():
-        if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
-            raise ValueError(
-                f"Argument `axes` must hold arrays of numbers of shape (n,), but {name!r} has "
-                f"shape {x.shape} and type {x.dtype}."
-            )
-    if not points:
-        raise ValueError("Argument `axes` must name at least one axis, but it is empty.")
-    shape = tuple(x.size for x in points.values())
-    total = math.prod(shape)
-    size = min(whole_number("block_size", block_size), total)
-    # One dtype, that of all axes taken together.
-    arrays = float_arrays(*points.values())
-    whole: Any = None
-    printed = time.monotonic()
-    for start in range(0, total, size):
-        first = jnp.array(np.unravel_index(start, shape), jnp.int32)
-        block = _block(function, tuple(points), size, arrays, first)
-        if whole is None:
-            whole = jtu.tree_map(lambda x: np.empty((total, *x.shape[1:]), x.dtype), block)
-        stop = min(start + size, total)
-        for leaf, part in zip(jtu.tree_leaves(whole), jtu.tree_leaves(block), strict=True):
-            leaf[start:stop] = np.asarray(part)[: stop - start]
-        if progress and time.monotonic() - printed > 5:
-            printed = time.monotonic()
-            print(f"{stop} of {total} points", flush=True)
-    values, valid = jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), whole)
-    return StabilityMap(values, valid, dict(zip(points, map(np.asarray, arrays), strict=True)))
-
-
-def _defined(values: Any) -> Bool[Array, ""]:
-    """Whether all numbers are finite and no code is `undefined`."""
-    leaves = jtu.tree_leaves(values, is_leaf=lambda x: isinstance(x, _Code))
-    codes = [x for x in leaves if isinstance(x, _Code)]
-    if not codes and not any(eqx.is_inexact_array(x) for x in leaves):
-        raise ValueError(
-            "Argument `function` must return floats, NaN where it is undefined, or codes, but it "
-            "returns nothing that could say so."
-        )
-    defined = all_finite(leaves)
-    for code in codes:
-        undefined = getattr(code._enumeration, "undefined", None)
-        defined = defined if undefined is None else defined & (code != undefined)
-    return defined
-
-
-@eqx.filter_jit
-def _block(
-    function: Callable, names: tuple[str, ...], size: int, axes: tuple[Array, ...], first: Array
-) -> tuple[Any, Array]:
-    """One block of the grid: values at `size` points that follow a first one; if defined."""
-    # Digits of the index in the grid's own bases: no number beyond 32 bits is needed.
-    carry = jnp.arange(size, dtype=jnp.int32)
-    point = {}
-    for name, x, digit in zip(names[::-1], axes[::-1], first[::-1], strict=True):
-        index = carry + digit
-        carry = index // x.size
-        point[name] = x[index % x.size]
-
-    def evaluate(point: dict[str, Array]) -> tuple[Any, Array]:
-        values = jtu.tree_map(jnp.asarray, function(**point))
-        return values, _defined(values)
-
-    return jax.vmap(evaluate)(point)
+    return sweep(function, axes, block_size=block_size, progress=progress)
 
 
 def place_of_root(

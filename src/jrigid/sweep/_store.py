@@ -1,0 +1,222 @@
+"""A directory that keeps what is done: a zarr array for each value, a chunk for each block."""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import shutil
+import uuid
+import warnings
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.extend.core as jex
+import jax.tree_util as jtu
+import numpy as np
+
+from jrigid.sweep._grid import Grid, Leaf
+from jrigid.sweep._result import extra
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None
+
+_WITHOUT = re.compile(r"0x[0-9a-f]+")  # addresses differ from run to run
+_KEY = "jrigid"
+_UNITS = {"Conventions": "CF-1.11"}
+
+
+def _constants(jaxpr: Any) -> Iterator[Any]:
+    """Arrays that a traced function holds, also in what it calls."""
+    if isinstance(jaxpr, jex.ClosedJaxpr):
+        yield from jaxpr.consts
+        jaxpr = jaxpr.jaxpr
+    for eqn in jaxpr.eqns:
+        yield from (x.val for x in eqn.invars if isinstance(x, jex.Literal))
+        for value in jtu.tree_leaves(list(eqn.params.values()), is_leaf=_is_jaxpr):
+            if _is_jaxpr(value):
+                yield from _constants(value)
+
+
+def _is_jaxpr(value: Any) -> bool:
+    return isinstance(value, jex.ClosedJaxpr | jex.Jaxpr)
+
+
+def _digest(*values: Any) -> str:
+    digest = hashlib.sha256()
+    for value in values:
+        if not isinstance(value, str):
+            value = np.asarray(value)
+            digest.update(f"{value.dtype} {value.shape} ".encode())
+            value = value.tobytes().hex()
+        digest.update(value.encode())
+    return digest.hexdigest()[:32]
+
+
+def identity(function: Any, grid: Grid, jaxpr: Any) -> dict[str, Any]:
+    """What must be the same for a sweep to go on: the traced function, points, blocks, versions.
+
+    The function is told by its jaxpr, with all that it calls and the constants in it; neither its
+    name nor the file it stands in matter.
+    """
+    text = _WITHOUT.sub("", str(jaxpr))
+    arrays = jtu.tree_leaves(eqx.filter(function, eqx.is_array))
+    packages = ("jax", "jaxlib", "jrigid")
+    return {
+        "function": _digest(text, *_constants(jaxpr), *arrays),
+        "points": {
+            name: _digest(*jtu.tree_leaves(x))
+            for name, x in (("point", grid.points),) * grid.listed or grid.points.items()
+        },
+        "shape": list(grid.shape),
+        "block": list(grid.block),
+        "versions": {name: version(name) for name in packages},
+    }
+
+
+def known_block(path: Path) -> tuple[int, ...] | None:
+    """The block of a store that is there already."""
+    try:
+        return tuple(json.loads((path / "zarr.json").read_text())["attributes"][_KEY]["block"])
+    except FileNotFoundError:
+        return None
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise ValueError(_NO_STORE.format(path)) from error
+
+
+_NO_STORE = (
+    "Argument `store` must be a new directory or one that a sweep has written, but {} is not. "
+    "(Choose another, or remove it.)"
+)
+
+
+class Store:
+    """The arrays in a directory, in blocks.
+
+    `valid` is written last: where a block of it is, the block is done.
+    """
+
+    def __init__(self, path: Path, grid: Grid, leaves: list[Leaf]):
+        """Nothing is opened before it is used."""
+        self.path, self.grid, self.leaves = path, grid, leaves
+        self._arrays: dict[str, Any] = {}
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """The zarr arrays of the leaves, in their order, and `valid`."""
+        if not self._arrays:
+            group = extra("zarr").open_group(self.path, mode="r+", use_consolidated=False)
+            names = [*(x.name for x in self.leaves), "valid"]
+            # A block that is all NaN is one that is done.
+            kept = {"write_empty_chunks": True}
+            self._arrays = {name: group[name].with_config(kept) for name in names}
+        return self._arrays
+
+    def create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
+        """Write what describes the arrays; all of it appears at once."""
+        zarr, grid = extra("zarr"), self.grid
+        partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
+        checked = [extra("zarr.codecs").Crc32cCodec()]
+        try:
+            group = zarr.create_group(partial, zarr_format=3, attributes=_UNITS | {_KEY: about})
+
+            def create(name: str, shape: Any, chunks: Any, dtype: Any, fill: Any, **more: Any):
+                return group.create_array(
+                    name, shape=shape, chunks=chunks, dtype=dtype, fill_value=fill, **more,
+                    compressors=checked, config={"write_empty_chunks": True},
+                )  # fmt: skip
+
+            for name, x in grid.axes.items():
+                array = create(
+                    name, x.shape, x.shape, x.dtype, 0,
+                    dimension_names=[name], attributes=attributes.get(name, {}),
+                )  # fmt: skip
+                array[...] = x
+            valid = Leaf("valid", (), np.dtype(bool), False, ())
+            for leaf in (*self.leaves, valid):
+                create(
+                    leaf.name, (*grid.shape, *leaf.shape), (*grid.block, *leaf.shape), leaf.dtype,
+                    leaf.fill, dimension_names=leaf.dimensions(grid.names, len(leaf.shape)),
+                    attributes=leaf.flags | attributes.get(leaf.name, {}),
+                )  # fmt: skip
+            with warnings.catch_warnings():
+                # So that xarray opens it in one look; the format's next version will have it.
+                warnings.simplefilter("ignore")
+                zarr.consolidate_metadata(partial)
+            os.rename(partial, self.path)
+        except OSError as error:
+            raise OSError(f"The store {self.path} cannot be written: {error}.") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def _chunk(self, name: str, number: int) -> Path:
+        place = [*np.unravel_index(number, self.grid.blocks)]
+        own = next((len(x.shape) for x in self.leaves if x.name == name), 0)
+        return self.path.joinpath(name, "c", *map(str, place + [0] * own))
+
+    def has(self, number: int) -> bool:
+        """Whether a block is there."""
+        return self._chunk("valid", number).exists()
+
+    def count(self, number: int) -> int | None:
+        """How many valid points a block has; None where one of its chunks is lost or spoilt."""
+        if not self.has(number):
+            return None
+        region, found = self.grid.region(number), np.zeros(0)
+        try:
+            for name, array in self.arrays.items():
+                self._chunk(name, number).stat()
+                found = array[region]
+        except (FileNotFoundError, ValueError, RuntimeError):
+            self._chunk("valid", number).unlink(missing_ok=True)
+            return None
+        return int(np.sum(found))
+
+    def write(self, number: int, values: list[np.ndarray]) -> None:
+        """Keep a block, its mask last."""
+        region = self.grid.region(number)
+        for array, value in zip(self.arrays.values(), values, strict=True):
+            array[region] = value
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """No other process may write; what one left half-written is removed."""
+        directory = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                if fcntl is not None:
+                    fcntl.flock(directory, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                text = f"Another process is writing to the store {self.path}."
+                raise RuntimeError(text) from error
+            for partial in self.path.glob("**/*.partial"):
+                partial.unlink(missing_ok=True)
+            yield
+        finally:
+            os.close(directory)
+
+    def tell(self, failures: Any) -> None:
+        """Say in the attributes which blocks failed."""
+        place = self.path / "zarr.json"
+        known = json.loads(place.read_text())
+        said = [x._asdict() for x in failures]
+        if known["attributes"][_KEY].setdefault("failures", []) != said:
+            known["attributes"][_KEY]["failures"] = said
+            new = place.with_suffix(".partial")
+            new.write_text(json.dumps(known))
+            new.replace(place)
+
+    def differences(self, about: dict[str, Any]) -> list[str]:
+        """What of a function, grid and versions is not what the directory was made for."""
+        text = (self.path / "zarr.json").read_text()
+        known = json.loads(text)["attributes"][_KEY]
+        return [
+            f"{key} ({known.get(key)} there, {value} here)"
+            for key, value in about.items()
+            if known.get(key) != value
+        ]

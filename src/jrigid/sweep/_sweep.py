@@ -1,0 +1,240 @@
+"""A function at very many points: in blocks, here or elsewhere, kept and gone on with."""
+
+import dataclasses
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jrigid._checks import whole_number
+from jrigid.sweep._drive import meter, outcomes
+from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
+from jrigid.sweep._refine import Tiles, corners_of
+from jrigid.sweep._result import Failure, SweepResult
+from jrigid.sweep._store import Store, identity, known_block
+from jrigid.sweep._work import Surroundings, Work, compute, evaluated, here, packed, x64
+
+# Blocks that an executor has at a time.
+_AHEAD = 1024
+# A sweep is cut into so many blocks or more, unless they got smaller, or larger, than these.
+_BLOCKS, _LEAST, _MOST = 64, 256, 2**16
+_TILE = 1024
+
+
+def sweep(
+    function: Callable[..., Any],
+    axes: Mapping[str, ArrayLike] | None = None,
+    *,
+    points: Any = None,
+    store: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    block_size: int | None = None,
+    attributes: Mapping[str, Mapping[str, Any]] | None = None,
+    refine: Callable[[Any], Any] | None = None,
+    progress: bool = True,
+) -> SweepResult:
+    """Evaluate a function of some parameters on the grid they span, or at each of many points.
+
+    The points are cut into blocks of one shape, each of which is one call of one compiled and
+    vmapped function, so that what comes out does not depend on where a block was computed, when, or
+    beside which. Memory is that of some blocks, and of the result where there is no store.
+
+    Args:
+        function: A pure function (as for `jax.jit`: what it closes over must not change) of one
+            number for each axis, given by name, or of one of the points; it returns an array, a
+            code, or a tree of them. With `throw=False` inside where it takes it, so that points
+            that fail are NaN.
+        axes: Name and points of each axis; the last one runs fastest.
+        points: In place of axes: any tree of arrays that have the points in front.
+        store: A directory that keeps what is done (zarr, version 3; extra `jrigid[sweep]`), and
+            that the same call goes on from, whatever ended it. `xarray.open_zarr` opens it at any
+            time, NaN where nothing is yet.
+        executor: What computes the blocks, in place of the devices of this process: anything with
+            the interface of `concurrent.futures.Executor`, such as `Client.get_executor()` of
+            `dask.distributed`, or a `ProcessPoolExecutor` that spawns. Workers need jrigid and, if
+            there is a store, the directory.
+        block_size: Points of a block. By default 65,536, or less where there would be less than 64
+            blocks; that of the store if there is one. For long motions some thousands, so that an
+            end in between loses little.
+        attributes: By name of an axis or value what is to be said of it, as `{"units": "rad/s"}`.
+        refine: `values -> class` of one point, an integer, boolean or code: only blocks that hold a
+            change of class are computed, found from the corners of all and followed from block to
+            block. The blocks are tiles, of 1,024 points by default. What lies within one tile and
+            shows at no corner is missed.
+        progress: Show how many points are done.
+
+    Returns:
+        Values, where they are valid, and which blocks failed three times; refined, also the class
+        of every point, and values where a class changes.
+
+    Raises:
+        ValueError: Axes that are not arrays of numbers, a function that returns integers or
+            booleans only, which cannot say that they are undefined (return floats, NaN where they
+            are), one that cannot be sent to a worker, a store of another sweep.
+        OSError: The store cannot be written.
+        RuntimeError: Another process writes to the store, or a worker died and took the executor
+            along.
+        ImportError: The extra is missing, or jrigid on a worker.
+
+    Gradients: none; differentiate the function.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> def flips(second, offset):
+    ...     inertia = jnp.stack([1.0, second, 2.0])
+    ...     return jr.stability.flip_time(inertia, jnp.stack([offset, 1.0, 0.0]))
+    >>> axes = {"second": jnp.linspace(1.1, 1.9, 5), "offset": jnp.array([1e-3, 1e-2])}
+    >>> result = jr.sweep(flips, axes, progress=False)
+    >>> print(result.values.shape, result.valid.all())
+    (5, 2) True
+    """
+    grid = grid_of(axes, points)
+    if refine is not None and grid.listed:
+        raise ValueError("Argument `refine` is for a grid of `axes`, not for a list of points.")
+    path = None if store is None else Path(store).absolute()
+    grid = _cut(grid, block_size, path, refine)
+    corner = np.zeros(len(grid.shape), np.int32)
+    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, grid, corner)
+    own = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[len(grid.shape) :], x.dtype), values)
+    leaves = leaves_of(own, (*grid.axes, "valid"))
+    about = {name: dict(x) for name, x in (attributes or {}).items()}
+    unknown = about.keys() - {*grid.axes, *(x.name for x in leaves)}
+    if unknown:
+        raise ValueError(
+            f"Argument `attributes` must name axes or values, but {sorted(unknown)} are neither."
+        )
+    work = Work(function, grid, leaves, path)
+    kept: Any = _Memory(grid, leaves) if path is None else Store(path, grid, leaves)
+    structure, classes = jtu.tree_structure(values), None
+    done = lambda numbers: _compute(work, kept, numbers, executor, progress)  # noqa: E731
+    with _opened(kept, lambda: identity(function, grid, jaxpr), about):
+        if refine is None:
+            failures = done(range(math.prod(grid.blocks)))
+        else:
+            corners = sweep(function, corners_of(grid), executor=executor, progress=False).values
+            tiles = Tiles(grid, kept, structure, refine)
+            failures, classes = tiles.refined(corners, done)
+        kept.tell(failures)
+    *arrays, valid = kept.arrays.values()
+    filled = jtu.tree_unflatten(structure, arrays)
+    return SweepResult(filled, valid, grid.axes, failures, about, path and str(path), classes)
+
+
+def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any) -> Grid:
+    """The points in blocks, those of a store if there is one and nothing else was asked for."""
+    if size is None:
+        block = path and known_block(path)
+        if block and len(block) == len(grid.shape):
+            return dataclasses.replace(grid, block=block)
+    if refine is not None:
+        return grid.tiled(_TILE if size is None else whole_number("block_size", size))
+    if size is None:
+        size = min(max(math.prod(grid.shape) // _BLOCKS, _LEAST), _MOST)
+    return grid.cut(whole_number("block_size", size))
+
+
+class _Memory:
+    """Arrays that are filled block by block, as a `Store`."""
+
+    def __init__(self, grid: Grid, leaves: list[Leaf]):
+        """Nothing known yet."""
+        self.grid = grid
+        self.arrays = {
+            x.name: np.full((*grid.shape, *x.shape), x.fill, x.dtype) for x in leaves
+        } | {"valid": np.zeros(grid.shape, bool)}
+
+    def count(self, _: int) -> None:
+        """No block is there yet."""
+
+    def write(self, number: int, values: list[np.ndarray]) -> None:
+        """Keep a block, its mask last."""
+        for array, value in zip(self.arrays.values(), values, strict=True):
+            array[self.grid.region(number)] = value
+
+    def tell(self, _: Any) -> None:
+        """The result says which blocks failed."""
+
+
+@contextmanager
+def _opened(
+    store: Any, identity: Callable[[], dict[str, Any]], attributes: dict[str, dict]
+) -> Iterator[None]:
+    """A store that is this sweep's, new or gone on with, and that no other process writes to."""
+    if isinstance(store, _Memory):
+        yield
+        return
+    about = identity()
+    if not store.path.exists():
+        store.create(about, attributes)
+    known_block(store.path)
+    with store.locked():
+        differences = store.differences(about)
+        if differences:
+            raise ValueError(
+                f"Argument `store` must be new or that of the same sweep, but {store.path} is of "
+                f"another: {'; '.join(differences)}. (Choose another directory, or remove it.)"
+            )
+        yield
+
+
+def _compute(
+    work: Work, kept: Any, numbers: Iterable[int], executor: Executor | None, progress: bool
+) -> tuple[Failure, ...]:
+    """Compute the blocks that are not kept yet, and say which failed."""
+    grid, failures, valid, waiting = work.grid, [], 0, []
+    for number in numbers:
+        count = kept.count(number)
+        if count is None:
+            waiting.append(number)
+        else:
+            valid += count
+    size = lambda number: math.prod(x.stop - x.start for x in grid.region(number))  # noqa: E731
+    total = math.prod(grid.shape)
+    done = total - sum(map(size, waiting))
+    with meter(total, done, progress) as advance, _submitting(work, executor) as (submit, ahead):
+        for outcome in outcomes(submit, waiting, ahead):
+            valid += outcome.count
+            advance(size(outcome.number))
+            if outcome.values is not None:
+                kept.write(outcome.number, outcome.values)
+            if outcome.error is not None:
+                region = grid.region(outcome.number)
+                first, last = zip(*((x.start, x.stop - 1) for x in region), strict=True)
+                failures.append(Failure(first, last, outcome.error))
+    if failures:
+        warnings.warn(
+            f"{len(failures)} of {math.prod(grid.blocks)} blocks failed three times, and their "
+            f"points are not valid; see `failures`. The last of them: {failures[-1].error}",
+            stacklevel=3,
+        )
+    elif not valid:
+        warnings.warn(
+            f"None of the {total} points is valid: the function returned NaN, infinity or an "
+            "undefined code at each.",
+            stacklevel=3,
+        )
+    return tuple(failures)
+
+
+@contextmanager
+def _submitting(work: Work, executor: Executor | None) -> Iterator[tuple[Callable, int]]:
+    """How to have a block computed, and how many may wait for it."""
+    if executor is None:
+        worker, threads = here(work)
+        with ThreadPoolExecutor(threads) as pool:
+            yield lambda number: pool.submit(worker, number), threads + 2
+        return
+    share = getattr(executor, "_max_workers", None)  # of a pool on this machine
+    cores = share and max(1, (os.cpu_count() or 1) // share)
+    surroundings = Surroundings(os.getpid(), x64(), cores)
+    payload = packed(work)
+    yield lambda number: executor.submit(compute, surroundings, payload, number), _AHEAD
