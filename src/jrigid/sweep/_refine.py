@@ -1,6 +1,7 @@
 """Which blocks of a map hold a boundary between two classes."""
 
 import itertools
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -43,6 +44,8 @@ class Tiles:
     ) -> tuple[tuple[Failure, ...], np.ndarray]:
         """Compute all blocks that hold a change of class; which failed, and all classes."""
         grid = self.grid
+        for number in range(math.prod(grid.blocks)):
+            self.kept.leave(number)
         lattice = self._classes(corners, tuple(n + 1 for n in grid.blocks))
         place = [np.arange(n) // width for n, width in zip(grid.shape, grid.block, strict=True)]
         self.classes = lattice[np.ix_(*place)]

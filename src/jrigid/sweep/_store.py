@@ -8,7 +8,7 @@ import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -79,20 +79,53 @@ def identity(function: Any, grid: Grid, jaxpr: Any) -> dict[str, Any]:
     }
 
 
+def _told(path: Path) -> dict[str, Any]:
+    """What a directory says that it was made for."""
+    try:
+        return json.loads((path / "zarr.json").read_text())["attributes"][_KEY]
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise ValueError(
+            "Argument `store` must be a new directory or one that a sweep has written, but "
+            f"{path} is not. (Choose another, or remove it.)"
+        ) from error
+
+
 def known_block(path: Path) -> tuple[int, ...] | None:
     """The block of a store that is there already."""
-    try:
-        return tuple(json.loads((path / "zarr.json").read_text())["attributes"][_KEY]["block"])
-    except FileNotFoundError:
-        return None
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise ValueError(_NO_STORE.format(path)) from error
+    return tuple(_told(path)["block"]) if path.exists() else None
 
 
-_NO_STORE = (
-    "Argument `store` must be a new directory or one that a sweep has written, but {} is not. "
-    "(Choose another, or remove it.)"
-)
+class Memory:
+    """Arrays that are filled block by block, as a `Store`."""
+
+    def __init__(self, grid: Grid, leaves: list[Leaf]):
+        """Nothing is touched before it is written."""
+        self.grid, self.fills = grid, [*(x.fill for x in leaves), False]
+        self.arrays = {x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves}
+        self.arrays["valid"] = np.zeros(grid.shape, bool)
+
+    @contextlib.contextmanager
+    def opened(self, *_: Any) -> Iterator[None]:
+        """It is no one else's."""
+        yield
+
+    def count(self, _: int) -> None:
+        """No block is there yet."""
+
+    def write(self, number: int, values: list[np.ndarray]) -> None:
+        """Keep a block."""
+        region = self.grid.region(number)
+        for array, value in zip(self.arrays.values(), values, strict=True):
+            array[region] = value
+
+    def leave(self, number: int) -> None:
+        """Nothing will be known of a block."""
+        region = self.grid.region(number)
+        for array, fill in zip(self.arrays.values(), self.fills, strict=True):
+            array[region] = fill
+
+    def tell(self, _: Any) -> None:
+        """The result says which blocks failed."""
 
 
 class Store:
@@ -117,7 +150,7 @@ class Store:
             self._arrays = {name: group[name].with_config(kept) for name in names}
         return self._arrays
 
-    def create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
+    def _create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
         """Write what describes the arrays; all of it appears at once."""
         zarr, grid = extra("zarr"), self.grid
         partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
@@ -184,7 +217,30 @@ class Store:
             array[region] = value
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def opened(
+        self, identity: Callable[[], dict[str, Any]], attributes: dict[str, dict]
+    ) -> Iterator[None]:
+        """New or gone on with, if it is of the same sweep."""
+        about = identity()
+        if not self.path.exists():
+            self._create(about, attributes)
+        known = _told(self.path)
+        with self._locked():
+            differences = [
+                f"{key} ({known.get(key)} there, {value} here)"
+                for key, value in about.items()
+                if known.get(key) != value
+            ]
+            if differences:
+                raise ValueError(
+                    f"Argument `store` must be new or that of the same sweep, but {self.path} is "
+                    f"of another: {'; '.join(differences)}. (Choose another directory, or remove "
+                    "it.)"
+                )
+            yield
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
         """No other process may write; what one left half-written is removed."""
         directory = os.open(self.path, os.O_RDONLY)
         try:
@@ -200,6 +256,9 @@ class Store:
         finally:
             os.close(directory)
 
+    def leave(self, _: int) -> None:
+        """Where no chunk is nothing is known."""
+
     def tell(self, failures: Any) -> None:
         """Say in the attributes which blocks failed."""
         place = self.path / "zarr.json"
@@ -210,13 +269,3 @@ class Store:
             new = place.with_suffix(".partial")
             new.write_text(json.dumps(known))
             new.replace(place)
-
-    def differences(self, about: dict[str, Any]) -> list[str]:
-        """What of a function, grid and versions is not what the directory was made for."""
-        text = (self.path / "zarr.json").read_text()
-        known = json.loads(text)["attributes"][_KEY]
-        return [
-            f"{key} ({known.get(key)} there, {value} here)"
-            for key, value in about.items()
-            if known.get(key) != value
-        ]

@@ -21,13 +21,14 @@ from jrigid.sweep._drive import meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import Tiles, corners_of
 from jrigid.sweep._result import Failure, SweepResult
-from jrigid.sweep._store import Store, identity, known_block
+from jrigid.sweep._store import Memory, Store, identity, known_block
 from jrigid.sweep._work import Surroundings, Work, compute, evaluated, here, packed, x64
 
 # Blocks that an executor has at a time.
 _AHEAD = 1024
 # A sweep is cut into so many blocks or more, unless they got smaller, or larger, than these.
-_BLOCKS, _LEAST, _MOST = 64, 256, 2**16
+_BLOCKS, _LEAST, _MOST = 64, 256, 2**18
+_BYTES = 2**24  # of what a block returns
 _TILE = 1024
 
 
@@ -63,9 +64,8 @@ def sweep(
             the interface of `concurrent.futures.Executor`, such as `Client.get_executor()` of
             `dask.distributed`, or a `ProcessPoolExecutor` that spawns. Workers need jrigid and, if
             there is a store, the directory.
-        block_size: Points of a block. By default 65,536, or less where there would be less than 64
-            blocks; that of the store if there is one. For long motions some thousands, so that an
-            end in between loses little.
+        block_size: Points of a block. By default a 64th of all, within 256 and 2^18 and 16 MB of
+            what comes out; that of the store if there is one.
         attributes: By name of an axis or value what is to be said of it, as `{"units": "rad/s"}`.
         refine: `values -> class` of one point, an integer, boolean or code: only blocks that hold a
             change of class are computed, found from the corners of all and followed from block to
@@ -101,11 +101,11 @@ def sweep(
     if refine is not None and grid.listed:
         raise ValueError("Argument `refine` is for a grid of `axes`, not for a list of points.")
     path = None if store is None else Path(store).absolute()
-    grid = _cut(grid, block_size, path, refine)
     corner = np.zeros(len(grid.shape), np.int32)
-    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, grid, corner)
+    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, grid.cut(1), corner)
     own = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[len(grid.shape) :], x.dtype), values)
     leaves = leaves_of(own, (*grid.axes, "valid"))
+    grid = _cut(grid, block_size, path, refine, leaves)
     about = {name: dict(x) for name, x in (attributes or {}).items()}
     unknown = about.keys() - {*grid.axes, *(x.name for x in leaves)}
     if unknown:
@@ -113,10 +113,10 @@ def sweep(
             f"Argument `attributes` must name axes or values, but {sorted(unknown)} are neither."
         )
     work = Work(function, grid, leaves, path)
-    kept: Any = _Memory(grid, leaves) if path is None else Store(path, grid, leaves)
+    kept: Any = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
     structure, classes = jtu.tree_structure(values), None
     done = lambda numbers: _compute(work, kept, numbers, executor, progress)  # noqa: E731
-    with _opened(kept, lambda: identity(function, grid, jaxpr), about):
+    with kept.opened(lambda: identity(function, grid, jaxpr), about):
         if refine is None:
             failures = done(range(math.prod(grid.blocks)))
         else:
@@ -129,7 +129,7 @@ def sweep(
     return SweepResult(filled, valid, grid.axes, failures, about, path and str(path), classes)
 
 
-def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any) -> Grid:
+def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]) -> Grid:
     """The points in blocks, those of a store if there is one and nothing else was asked for."""
     if size is None:
         block = path and known_block(path)
@@ -138,52 +138,10 @@ def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any) -> Grid:
     if refine is not None:
         return grid.tiled(_TILE if size is None else whole_number("block_size", size))
     if size is None:
-        size = min(max(math.prod(grid.shape) // _BLOCKS, _LEAST), _MOST)
+        bytes_of_point = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaves)
+        most = max(min(_MOST, _BYTES // bytes_of_point), _LEAST)
+        size = min(max(math.prod(grid.shape) // _BLOCKS, _LEAST), most)
     return grid.cut(whole_number("block_size", size))
-
-
-class _Memory:
-    """Arrays that are filled block by block, as a `Store`."""
-
-    def __init__(self, grid: Grid, leaves: list[Leaf]):
-        """Nothing known yet."""
-        self.grid = grid
-        self.arrays = {
-            x.name: np.full((*grid.shape, *x.shape), x.fill, x.dtype) for x in leaves
-        } | {"valid": np.zeros(grid.shape, bool)}
-
-    def count(self, _: int) -> None:
-        """No block is there yet."""
-
-    def write(self, number: int, values: list[np.ndarray]) -> None:
-        """Keep a block, its mask last."""
-        for array, value in zip(self.arrays.values(), values, strict=True):
-            array[self.grid.region(number)] = value
-
-    def tell(self, _: Any) -> None:
-        """The result says which blocks failed."""
-
-
-@contextmanager
-def _opened(
-    store: Any, identity: Callable[[], dict[str, Any]], attributes: dict[str, dict]
-) -> Iterator[None]:
-    """A store that is this sweep's, new or gone on with, and that no other process writes to."""
-    if isinstance(store, _Memory):
-        yield
-        return
-    about = identity()
-    if not store.path.exists():
-        store.create(about, attributes)
-    known_block(store.path)
-    with store.locked():
-        differences = store.differences(about)
-        if differences:
-            raise ValueError(
-                f"Argument `store` must be new or that of the same sweep, but {store.path} is of "
-                f"another: {'; '.join(differences)}. (Choose another directory, or remove it.)"
-            )
-        yield
 
 
 def _compute(
@@ -200,13 +158,17 @@ def _compute(
     size = lambda number: math.prod(x.stop - x.start for x in grid.region(number))  # noqa: E731
     total = math.prod(grid.shape)
     done = total - sum(map(size, waiting))
-    with meter(total, done, progress) as advance, _submitting(work, executor) as (submit, ahead):
+    with (
+        meter(total, done, progress) as advance,
+        _submitting(work, kept, executor) as (submit, ahead),
+    ):
         for outcome in outcomes(submit, waiting, ahead):
             valid += outcome.count
             advance(size(outcome.number))
             if outcome.values is not None:
                 kept.write(outcome.number, outcome.values)
             if outcome.error is not None:
+                kept.leave(outcome.number)
                 region = grid.region(outcome.number)
                 first, last = zip(*((x.start, x.stop - 1) for x in region), strict=True)
                 failures.append(Failure(first, last, outcome.error))
@@ -226,10 +188,10 @@ def _compute(
 
 
 @contextmanager
-def _submitting(work: Work, executor: Executor | None) -> Iterator[tuple[Callable, int]]:
+def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tuple[Callable, int]]:
     """How to have a block computed, and how many may wait for it."""
     if executor is None:
-        worker, threads = here(work)
+        worker, threads = here(work, kept)
         with ThreadPoolExecutor(threads) as pool:
             yield lambda number: pool.submit(worker, number), threads + 2
         return

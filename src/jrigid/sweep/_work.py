@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid.sweep._grid import Grid, Leaf, on_block
-from jrigid.sweep._store import Store
+from jrigid.sweep._store import Memory, Store
 
 # The compiled function is kept for the next sweep of the same one in the same blocks.
 evaluated = eqx.filter_jit(on_block)
@@ -56,28 +56,28 @@ class Outcome(NamedTuple):
 class Worker:
     """Computes blocks on all devices of a process; from several threads at once."""
 
-    def __init__(self, work: Work):
-        """Send the points to each device."""
-        self.work = work
-        self.store = None if work.store is None else Store(work.store, work.grid, work.leaves)
+    def __init__(self, work: Work, kept: Store | Memory | None):
+        """Send the points to each device; without a place to keep blocks, return them."""
+        self.work, self.kept = work, kept
         self.grids = [jax.device_put(work.grid, x) for x in jax.local_devices()]
         self.x64 = x64()  # a thread does not know what is around
         # The first call of a device compiles, which a second thread would do again.
         self.first = {device: threading.Lock() for device in range(len(self.grids))}
 
     def __call__(self, number: int) -> Outcome:
-        """Compute a block, and keep it in the store if there is one."""
-        if self.store is not None and self.store.has(number):
-            return Outcome(number, self.store.count(number) or 0)
+        """Compute a block, and keep it if there is where."""
+        known = self.kept and self.kept.count(number)
+        if known is not None:
+            return Outcome(number, known)
         try:
             values = self._computed(number)
         except Exception as error:
             return Outcome(number, error=in_words(error))
         count = int(np.sum(values[-1]))
-        if self.store is None:
+        if self.kept is None:
             return Outcome(number, count, values)
         try:
-            self.store.write(number, values)
+            self.kept.write(number, values)
         except OSError as error:
             return Outcome(number, error=str(error), lost=True)
         return Outcome(number, count)
@@ -139,22 +139,21 @@ def packed(work: Work) -> bytes:
 
 def compute(surroundings: Surroundings, work: bytes, number: int) -> Outcome:
     """Compute a block, in whatever process this is."""
-    if surroundings.driver != os.getpid():
-        _settle_in(surroundings)
-    return _worker(work)(number)
+    with _one_at_a_time:
+        if surroundings.driver != os.getpid():
+            _settle_in(surroundings)
+        worker = _unpacked(work)
+    return worker(number)
 
 
 _one_at_a_time = threading.Lock()
 
 
-def _worker(work: bytes) -> Worker:
-    with _one_at_a_time:
-        return _unpacked(work)
-
-
 @functools.lru_cache(maxsize=1)
 def _unpacked(work: bytes) -> Worker:
-    return Worker(pickle.loads(work))
+    known: Work = pickle.loads(work)
+    store = known.store
+    return Worker(known, None if store is None else Store(store, known.grid, known.leaves))
 
 
 @functools.lru_cache(maxsize=1)
@@ -222,10 +221,10 @@ def _take_cores(count: int | None) -> None:
             os.sched_setaffinity(int(thread), set(taken))
 
 
-def here(work: Work) -> tuple[Callable[[int], Outcome], int]:
+def here(work: Work, kept: Store | Memory) -> tuple[Callable[[int], Outcome], int]:
     """A worker in this process, and in how many threads it is to be called."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     devices = jax.local_devices()
     # Of two threads one writes while the other computes.
     threads = max(cores or 1, 2) if devices[0].platform == "cpu" else 2 * len(devices)
-    return Worker(work), max(threads, len(devices))
+    return Worker(work, kept), max(threads, len(devices))
