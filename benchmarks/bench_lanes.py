@@ -1,6 +1,7 @@
 """Ten thousand heavy asymmetric tops to T = 100: the error of the energy against time.
 
     taskset -c 0 python benchmarks/bench_lanes.py [--write] [--lanes N]
+    python benchmarks/bench_lanes.py --memory 100000
 
 I = (1, 2, 3), weight 1, lever (0.3, 0.1, 0.5), rates normal with unit variance. `jax.vmap` of
 `jrigid.simulate`, of a hand-written `diffeqsolve` (Dopri8), heyoka's batch integrator in the same
@@ -12,6 +13,7 @@ of one process. Run it on one core: heyoka is timed on one thread.
 
 import os
 import pathlib
+import resource
 import subprocess
 import sys
 import time
@@ -206,6 +208,22 @@ def on_two_devices(lanes):
     return [["one device", one, 1.0], ["two devices, by `jax.shard_map`", two, two / one]]
 
 
+def memory(lanes):
+    """Seconds and peak memory [MiB] of the gradients of so many motions, in three moments each."""
+    w0 = np.random.default_rng(2).normal(size=(lanes, 3))
+
+    def end(moments, omega):
+        body, state = jr.RigidBody(moments, BODY.torque), jr.State(UPRIGHT, omega)
+        return jr.simulate(body, state, END, throw=False).final_state.omega[0]
+
+    start = time.perf_counter()
+    found = jax.jit(jax.vmap(jax.grad(end)))(np.tile(MOMENTS, (lanes, 1)), w0)
+    assert jnp.isfinite(found).all()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    seconds = time.perf_counter() - start
+    print(f"{lanes} gradients: {seconds:.0f} s with compilation, peak {peak:.0f} MiB")
+
+
 def main(lanes, write):
     text = common.table(
         [f"{lanes} heavy asymmetric tops", "compile ms", "min ms", "ns a step", "energy, median"],
@@ -224,5 +242,9 @@ def main(lanes, write):
 if __name__ == "__main__":
     parser = common.arguments(__doc__)
     parser.add_argument("--lanes", type=int, default=10_000)
+    parser.add_argument("--memory", type=int, help="peak memory of so many gradients, alone")
     options = parser.parse_args()
-    main(options.lanes, options.write)
+    if options.memory:
+        memory(options.memory)
+    else:
+        main(options.lanes, options.write)

@@ -53,6 +53,8 @@ def outcomes(
 
 def _outcome(number: int, future: Future) -> Outcome:
     """What became of a block, also where its worker could not say so."""
+    if future.cancelled():
+        return Outcome(number, error="The executor gave the block up.")
     error = future.exception()
     if error is None:
         outcome: Outcome = future.result()
@@ -81,12 +83,17 @@ def meter(total: int, done: int, shown: bool) -> Iterator[Callable[[int], Any]]:
     if not shown:
         yield lambda _: None
         return
-    with contextlib.suppress(ModuleNotFoundError):
-        import tqdm
-
-        with tqdm.tqdm(total=total, initial=done, unit="pt", unit_scale=True) as bar:
+    try:
+        from tqdm import tqdm
+    except ModuleNotFoundError:
+        yield _lines(total, done)
+    else:
+        with tqdm(total=total, initial=done, unit="pt", unit_scale=True) as bar:
             yield bar.update
-        return
+
+
+def _lines(total: int, done: int) -> Callable[[int], None]:
+    """Says how many points are done, every few seconds."""
     said = time.monotonic()
 
     def say(points: int) -> None:
@@ -96,4 +103,4 @@ def meter(total: int, done: int, shown: bool) -> Iterator[Callable[[int], Any]]:
             said = time.monotonic()
             print(f"{done} of {total} points", file=sys.stderr, flush=True)
 
-    yield say
+    return say

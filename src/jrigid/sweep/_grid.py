@@ -94,6 +94,10 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
 
 def _list_of(points: Any) -> Grid:
     points = jtu.tree_map(jnp.asarray, points)
+    if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in jtu.tree_leaves(points)):
+        raise ValueError(
+            "Argument `points` must hold numbers, but it has keys: make them of seeds."
+        )
     lengths = {x.shape[:1] for x in jtu.tree_leaves(points)}
     if len(lengths) != 1 or lengths <= {(), (0,)}:
         raise ValueError(
@@ -178,37 +182,36 @@ class Leaf(eqx.Module):
             }
         return {"_FillValue": int(self.fill)} if self.dtype.kind in "iu" else {}
 
-    def dimensions(self, axes: tuple[str, ...], beyond: int) -> tuple[str, ...]:
+    def dimensions(self, axes: tuple[str, ...]) -> tuple[str, ...]:
         """Names of the dimensions: the axes, then its own."""
-        return (*axes, *(f"{self.name}_{k}" for k in range(beyond)))
+        return (*axes, *(f"{self.name}_{k}" for k in range(len(self.shape))))
 
 
-def leaves_of(values: Any, taken: tuple[str, ...] = ()) -> list[Leaf]:
-    """The arrays of what a function returns at one point, in their order, by names of their own."""
-    found, names = [], set(taken)
+VALID = Leaf("valid", (), np.dtype(bool), False, ())
+
+
+def leaves_of(values: Any, axes: tuple[str, ...]) -> list[Leaf]:
+    """The arrays of what a function returned on axes, by names that no axis has; `valid` last."""
+    found: list[Leaf] = []
+    names = {*axes, VALID.name}
     paths, _ = jtu.tree_flatten_with_path(values, is_leaf=lambda x: isinstance(x, _Code))
     for path, value in paths:
-        name = jtu.keystr(path, simple=True, separator=".") or "value"
+        name = jtu.keystr(path, simple=True, separator=".").replace("/", ".") or "value"
         while name in names:
             name += "_"
         names.add(name)
         codes: tuple[str, ...] = ()
-        undefined = None
         if isinstance(value, _Code):
             codes = tuple(vars(value._enumeration)["_name_to_item"])
-            undefined = codes.index("undefined") if "undefined" in codes else -1
             value = value._value
         dtype = np.dtype(value.dtype)
-        found.append(Leaf(name, value.shape, dtype, fill_of(dtype, undefined), codes))
-    return found
-
-
-def fill_of(dtype: np.dtype, code: int | None = None) -> Any:
-    """What stands where nothing is known."""
-    if code is not None:
-        return code
-    if jnp.issubdtype(dtype, jnp.inexact):
-        return np.nan
-    if dtype.kind == "b":
-        return False
-    return np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+        if codes:
+            fill: Any = codes.index("undefined") if "undefined" in codes else -1
+        elif jnp.issubdtype(dtype, jnp.inexact):
+            fill = np.nan
+        elif dtype.kind == "b":
+            fill = False
+        else:
+            fill = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+        found.append(Leaf(name, value.shape[len(axes) :], dtype, fill, codes))
+    return [*found, VALID]

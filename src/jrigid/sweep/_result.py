@@ -43,7 +43,7 @@ class SweepResult(NamedTuple):
     failures: tuple[Failure, ...] = ()
     attributes: dict[str, dict] = {}  # noqa: RUF012
     store: str | None = None
-    classes: np.ndarray | None = None
+    classes: Any = None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -79,12 +79,10 @@ class SweepResult(NamedTuple):
         else:
             coordinates = {k: (k, x, self.attributes.get(k)) for k, x in self.axes.items()}
             dataset = xarray.Dataset(coords=coordinates)
-            leaves = leaves_of(self.values, (*self.axes, "valid"))
-            for leaf, array in zip(leaves, jtu.tree_leaves(self.values), strict=True):
-                dimensions = leaf.dimensions(self.labels, array.ndim - len(self.axes))
+            arrays = [*jtu.tree_leaves(self.values), self.valid]
+            for leaf, array in zip(leaves_of(self.values, self.labels), arrays, strict=True):
                 about = leaf.flags | self.attributes.get(leaf.name, {})
-                dataset[leaf.name] = dimensions, array, about
-            dataset["valid"] = self.labels, np.asarray(self.valid)
+                dataset[leaf.name] = leaf.dimensions(self.labels), array, about
         if self.classes is not None:
             dataset["classes"] = self.labels, self.classes
         return dataset

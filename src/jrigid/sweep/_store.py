@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.extend.core as jex
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from jrigid.sweep._grid import Grid, Leaf
+from jrigid.sweep._grid import VALID, Grid, Leaf
 from jrigid.sweep._result import extra
 
 try:
@@ -28,7 +30,8 @@ except ModuleNotFoundError:  # on Windows
 
 _WITHOUT = re.compile(r"0x[0-9a-f]+")  # addresses differ from run to run
 _KEY = "jrigid"
-_UNITS = {"Conventions": "CF-1.11"}
+_CONVENTIONS = {"Conventions": "CF-1.11"}
+_KEPT = {"write_empty_chunks": True}  # a block that is all NaN is one that is done
 
 
 def _constants(jaxpr: Any) -> Iterator[Any]:
@@ -50,11 +53,12 @@ def _is_jaxpr(value: Any) -> bool:
 def _digest(*values: Any) -> str:
     digest = hashlib.sha256()
     for value in values:
+        if eqx.is_array(value) and jnp.issubdtype(value.dtype, jax.dtypes.extended):
+            value = jax.random.key_data(value)
         if not isinstance(value, str):
             value = np.asarray(value)
             digest.update(f"{value.dtype} {value.shape} ".encode())
-            value = value.tobytes().hex()
-        digest.update(value.encode())
+        digest.update(value.encode() if isinstance(value, str) else value.tobytes())
     return digest.hexdigest()[:32]
 
 
@@ -100,9 +104,8 @@ class Memory:
 
     def __init__(self, grid: Grid, leaves: list[Leaf]):
         """Nothing is touched before it is written."""
-        self.grid, self.fills = grid, [*(x.fill for x in leaves), False]
+        self.grid, self.fills = grid, [x.fill for x in leaves]
         self.arrays = {x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves}
-        self.arrays["valid"] = np.zeros(grid.shape, bool)
 
     @contextlib.contextmanager
     def opened(self, *_: Any) -> Iterator[None]:
@@ -141,42 +144,30 @@ class Store:
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """The zarr arrays of the leaves, in their order, and `valid`."""
+        """The zarr arrays of the leaves, in their order."""
         if not self._arrays:
             group = extra("zarr").open_group(self.path, mode="r+", use_consolidated=False)
-            names = [*(x.name for x in self.leaves), "valid"]
-            # A block that is all NaN is one that is done.
-            kept = {"write_empty_chunks": True}
-            self._arrays = {name: group[name].with_config(kept) for name in names}
+            self._arrays = {x.name: group[x.name].with_config(_KEPT) for x in self.leaves}
         return self._arrays
 
     def _create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
         """Write what describes the arrays; all of it appears at once."""
         zarr, grid = extra("zarr"), self.grid
         partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
-        checked = [extra("zarr.codecs").Crc32cCodec()]
+        parts = [(x, n.shape, n.shape, n.dtype, 0, [x], {}) for x, n in grid.axes.items()]
+        for x in self.leaves:
+            shape, block = (*grid.shape, *x.shape), (*grid.block, *x.shape)
+            parts.append((x.name, shape, block, x.dtype, x.fill, x.dimensions(grid.names), x.flags))
         try:
-            group = zarr.create_group(partial, zarr_format=3, attributes=_UNITS | {_KEY: about})
-
-            def create(name: str, shape: Any, chunks: Any, dtype: Any, fill: Any, **more: Any):
-                return group.create_array(
-                    name, shape=shape, chunks=chunks, dtype=dtype, fill_value=fill, **more,
-                    compressors=checked, config={"write_empty_chunks": True},
+            group = zarr.create_group(partial, attributes=_CONVENTIONS | {_KEY: about})
+            for name, shape, block, dtype, fill, dimensions, flags in parts:
+                group.create_array(
+                    name, shape=shape, chunks=block, dtype=dtype, fill_value=fill,
+                    dimension_names=dimensions, attributes=flags | attributes.get(name, {}),
+                    compressors=[extra("zarr.codecs").Crc32cCodec()],
                 )  # fmt: skip
-
             for name, x in grid.axes.items():
-                array = create(
-                    name, x.shape, x.shape, x.dtype, 0,
-                    dimension_names=[name], attributes=attributes.get(name, {}),
-                )  # fmt: skip
-                array[...] = x
-            valid = Leaf("valid", (), np.dtype(bool), False, ())
-            for leaf in (*self.leaves, valid):
-                create(
-                    leaf.name, (*grid.shape, *leaf.shape), (*grid.block, *leaf.shape), leaf.dtype,
-                    leaf.fill, dimension_names=leaf.dimensions(grid.names, len(leaf.shape)),
-                    attributes=leaf.flags | attributes.get(leaf.name, {}),
-                )  # fmt: skip
+                group[name].with_config(_KEPT)[...] = x
             with warnings.catch_warnings():
                 # So that xarray opens it in one look; the format's next version will have it.
                 warnings.simplefilter("ignore")
@@ -187,26 +178,21 @@ class Store:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
-    def _chunk(self, name: str, number: int) -> Path:
-        place = [*np.unravel_index(number, self.grid.blocks)]
-        own = next((len(x.shape) for x in self.leaves if x.name == name), 0)
-        return self.path.joinpath(name, "c", *map(str, place + [0] * own))
-
-    def has(self, number: int) -> bool:
-        """Whether a block is there."""
-        return self._chunk("valid", number).exists()
+    def _chunk(self, leaf: Leaf, number: int) -> Path:
+        place = [*np.unravel_index(number, self.grid.blocks), *(0 for _ in leaf.shape)]
+        return self.path.joinpath(leaf.name, "c", *map(str, place))
 
     def count(self, number: int) -> int | None:
         """How many valid points a block has; None where one of its chunks is lost or spoilt."""
-        if not self.has(number):
+        done = self._chunk(VALID, number)
+        if not done.exists():
             return None
-        region, found = self.grid.region(number), np.zeros(0)
         try:
-            for name, array in self.arrays.items():
-                self._chunk(name, number).stat()
-                found = array[region]
+            for leaf in self.leaves:
+                self._chunk(leaf, number).stat()  # zarr takes a chunk that is lost for one of NaN
+                found = self.arrays[leaf.name][self.grid.region(number)]
         except (FileNotFoundError, ValueError, RuntimeError):
-            self._chunk("valid", number).unlink(missing_ok=True)
+            done.unlink(missing_ok=True)
             return None
         return int(np.sum(found))
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike
@@ -103,8 +102,7 @@ def sweep(
     path = None if store is None else Path(store).absolute()
     corner = np.zeros(len(grid.shape), np.int32)
     jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, grid.cut(1), corner)
-    own = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[len(grid.shape) :], x.dtype), values)
-    leaves = leaves_of(own, (*grid.axes, "valid"))
+    leaves = leaves_of(values, grid.names)
     grid = _cut(grid, block_size, path, refine, leaves)
     about = {name: dict(x) for name, x in (attributes or {}).items()}
     unknown = about.keys() - {*grid.axes, *(x.name for x in leaves)}
