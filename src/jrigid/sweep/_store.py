@@ -154,7 +154,9 @@ class Store:
         """Write what describes the arrays; all of it appears at once."""
         zarr, grid = extra("zarr"), self.grid
         partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
-        parts = [(x, n.shape, n.shape, n.dtype, 0, [x], {}) for x, n in grid.axes.items()]
+        parts: list[Any] = [
+            (x, n.shape, n.shape, n.dtype, 0, [x], {}) for x, n in grid.axes.items()
+        ]
         for x in self.leaves:
             shape, block = (*grid.shape, *x.shape), (*grid.block, *x.shape)
             parts.append((x.name, shape, block, x.dtype, x.fill, x.dimensions(grid.names), x.flags))

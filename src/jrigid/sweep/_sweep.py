@@ -63,8 +63,9 @@ def sweep(
             the interface of `concurrent.futures.Executor`, such as `Client.get_executor()` of
             `dask.distributed`, or a `ProcessPoolExecutor` that spawns. Workers need jrigid and, if
             there is a store, the directory.
-        block_size: Points of a block. By default a 64th of all, within 256 and 2^18 and 16 MB of
-            what comes out; that of the store if there is one.
+        block_size: About how many points a block has: axes are cut whole, and evenly. By default a
+            64th of all, within 256 and 2^18 and 16 MB of what comes out; that of a store if it has
+            one.
         attributes: By name of an axis or value what is to be said of it, as `{"units": "rad/s"}`.
         refine: `values -> class` of one point, an integer, boolean or code: only blocks that hold a
             change of class are computed, found from the corners of all and followed from block to
@@ -146,18 +147,15 @@ def _compute(
     work: Work, kept: Any, numbers: Iterable[int], executor: Executor | None, progress: bool
 ) -> tuple[Failure, ...]:
     """Compute the blocks that are not kept yet, and say which failed."""
-    grid, failures, valid, waiting = work.grid, [], 0, []
-    for number in numbers:
-        count = kept.count(number)
-        if count is None:
-            waiting.append(number)
-        else:
-            valid += count
+    grid, failures = work.grid, []
+    known = {number: kept.count(number) for number in numbers}
+    waiting = [number for number, count in known.items() if count is None]
+    valid = sum(count or 0 for count in known.values())
     size = lambda number: math.prod(x.stop - x.start for x in grid.region(number))  # noqa: E731
-    total = math.prod(grid.shape)
+    total = sum(map(size, known))
     done = total - sum(map(size, waiting))
     with (
-        meter(total, done, progress) as advance,
+        meter(total, done, progress and done < total) as advance,
         _submitting(work, kept, executor) as (submit, ahead),
     ):
         for outcome in outcomes(submit, waiting, ahead):
