@@ -6,7 +6,7 @@ import house
 import pytest
 
 # Code lines outside identify. It may only fall, but for a new part of the package.
-_BUDGET = 5600 + 1170 + 730  # and lanes of motions with their derivatives and solvers, and sweeps
+_BUDGET = 5600 + 1170 + 840  # and lanes of motions with their derivatives and solvers, and sweeps
 
 
 def package(module):

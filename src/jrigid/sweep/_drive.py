@@ -42,9 +42,8 @@ def outcomes(
                 waiting.append(outcome.number)
     except BrokenExecutor as error:
         raise RuntimeError(
-            "A worker of the executor died, and with it the executor. (Without jrigid it would, "
-            "too.) What a store has is kept, and the same call with a new executor goes on from "
-            "there."
+            "A worker of the executor died, and with it the executor. What a store has is kept, "
+            "and the same call with a new executor goes on from there."
         ) from error
     finally:
         for future in running:
@@ -56,25 +55,19 @@ def _outcome(number: int, future: Future) -> Outcome:
     if future.cancelled():
         return Outcome(number, error="The executor gave the block up.")
     error = future.exception()
-    if error is None:
-        outcome: Outcome = future.result()
-        if outcome.lost:
-            raise OSError(
-                f"The store cannot be written: {outcome.error}. What is finished is kept, and the "
-                "same call goes on from there."
-            )
-        return outcome
     if isinstance(error, BrokenExecutor):
         raise error
-    missing: BaseException | None = error
-    while missing is not None:
-        if isinstance(missing, ImportError):
-            raise ImportError(
-                f"A worker lacks a package: {missing}. (Workers need jrigid, and what the function "
-                "imports, in the versions that are here.)"
-            ) from error
-        missing = missing.__cause__ or missing.__context__
-    return Outcome(number, error=in_words(error))
+    if isinstance(error, ImportError):
+        raise ImportError(
+            f"A worker lacks a package: {error}. (Workers need jrigid, and what the function "
+            "imports, in the versions that are here.)"
+        ) from error
+    if error is not None:
+        return Outcome(number, error=in_words(error))
+    outcome: Outcome = future.result()
+    if outcome.final is not None:
+        raise outcome.final(outcome.error)
+    return outcome
 
 
 @contextlib.contextmanager

@@ -1,9 +1,9 @@
 """Points in blocks of one shape, and a function on a block of them."""
 
 import dataclasses
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,29 +17,25 @@ from jrigid._checks import RESULTS, all_finite, float_arrays
 _Code = type(RESULTS.successful)  # an item of any enumeration
 
 
-class Grid(eqx.Module):
+class Grid(NamedTuple):
     """The points that some axes span, or a list of points, in blocks of one shape.
 
     Attributes:
-        names: Of the axes; a list has one, `point`.
+        points: A dict of axes, or any tree with the points in front; numpy arrays.
+        names: Of the axes; None of a list.
         shape: How many points along each.
         block: How many of them a block has.
-        points: A dict of axes, or any tree with the points in front.
-        listed: Whether it is a list.
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    block: tuple[int, ...] = eqx.field(static=True)
     points: Any
-    listed: bool = eqx.field(static=True)
+    names: tuple[str, ...] | None
+    shape: tuple[int, ...]
+    block: tuple[int, ...]
 
     @property
     def axes(self) -> dict[str, np.ndarray]:
-        """Coordinates along each axis; numbers from 0 of a list."""
-        if self.listed:
-            return {"point": np.arange(self.shape[0])}
-        return {name: np.asarray(self.points[name]) for name in self.names}
+        """Coordinates along each axis; of a list `point`, numbers from 0."""
+        return {"point": np.arange(self.shape[0])} if self.names is None else self.points
 
     @property
     def blocks(self) -> tuple[int, ...]:
@@ -56,10 +52,25 @@ class Grid(eqx.Module):
         ends = zip(self.corner(number), self.shape, self.block, strict=True)
         return tuple(slice(first, min(first + width, n)) for first, n, width in ends)
 
+    def inside(self, number: int) -> tuple[slice, ...]:
+        """Which of the points of a block are not beyond the end of an axis."""
+        return tuple(slice(0, x.stop - x.start) for x in self.region(number))
+
+    def part(self, number: int) -> Any:
+        """The points of a block; beyond the end of an axis its last one again."""
+        region = self.region(number)
+
+        def cut(x: np.ndarray, places: slice, width: int) -> np.ndarray:
+            return x[np.minimum(np.arange(places.start, places.start + width), places.stop - 1)]
+
+        if self.names is None:
+            return jtu.tree_map(lambda x: cut(x, region[0], self.block[0]), self.points)
+        return tuple(map(cut, self.points.values(), region, self.block))
+
     def tiled(self, size: int) -> "Grid":
         """The same points in blocks of about so many that are as long along each axis."""
         side = max(round(size ** (1 / len(self.shape))), 2)
-        return dataclasses.replace(self, block=tuple(min(side, n) for n in self.shape))
+        return self._replace(block=tuple(min(side, n) for n in self.shape))
 
     def cut(self, size: int) -> "Grid":
         """The same points in blocks of about so many, cut along the first axes first."""
@@ -68,7 +79,7 @@ class Grid(eqx.Module):
             pieces = -(-n // max(min(size, n), 1))
             block.insert(0, -(-n // pieces))
             size //= block[0]
-        return dataclasses.replace(self, block=tuple(block))
+        return self._replace(block=tuple(block))
 
 
 def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
@@ -79,6 +90,8 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
         return _list_of(points)
     arrays = {name: np.asarray(x) for name, x in axes.items()}
     for name, x in arrays.items():
+        if not name.isidentifier() or name == VALID.name:
+            raise ValueError(f"Argument `axes` must name arguments, but {name!r} can be none.")
         if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
             raise ValueError(
                 f"Argument `axes` must hold arrays of numbers of shape (n,), but {name!r} has "
@@ -88,24 +101,26 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
         raise ValueError("Argument `axes` must name at least one axis, but it is empty.")
     shape = tuple(x.size for x in arrays.values())
     # One dtype, that of all axes taken together.
-    values = dict(zip(arrays, float_arrays(*arrays.values()), strict=True))
-    return Grid(tuple(arrays), shape, shape, values, False)
+    values = map(np.asarray, float_arrays(*arrays.values()))
+    return Grid(dict(zip(arrays, values, strict=True)), tuple(arrays), shape, shape)
 
 
 def _list_of(points: Any) -> Grid:
-    points = jtu.tree_map(jnp.asarray, points)
-    if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in jtu.tree_leaves(points)):
+    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(points)]
+    if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in leaves):
         raise ValueError(
-            "Argument `points` must hold numbers, but it has keys: make them of seeds."
+            "Argument `points` must hold numbers, but it has keys. (Pass integers, and call "
+            "`jax.random.key` in the function.)"
         )
-    lengths = {x.shape[:1] for x in jtu.tree_leaves(points)}
+    lengths = {x.shape[:1] for x in leaves}
     if len(lengths) != 1 or lengths <= {(), (0,)}:
         raise ValueError(
             "Argument `points` must hold arrays with the same number of points in front, but they "
-            f"have the shapes {[x.shape for x in jtu.tree_leaves(points)]}."
+            f"have the shapes {[x.shape for x in leaves]}."
         )
     (shape,) = lengths
-    return Grid(("point",), shape, shape, points, True)
+    arrays = jtu.tree_unflatten(jtu.tree_structure(points), map(np.asarray, leaves))
+    return Grid(arrays, None, shape, shape)
 
 
 def _defined(values: Any) -> Bool[Array, ""]:
@@ -124,21 +139,18 @@ def _defined(values: Any) -> Bool[Array, ""]:
     return defined
 
 
-def on_block(function: Callable[..., Any], grid: Grid, corner: Any) -> tuple[Any, Array]:
-    """Values at the points of a block, and where they are defined.
-
-    Beyond the end of an axis its last point is taken again, so that all blocks are of one shape.
-    """
-    # Digits of the index in the block's own bases: no number beyond 32 bits is needed.
-    carry = jnp.arange(math.prod(grid.block), dtype=jnp.int32)
-    indices = {}
-    for k in reversed(range(len(grid.block))):
-        index = corner[k] + carry % grid.block[k]
-        indices[grid.names[k]] = jnp.minimum(index, grid.shape[k] - 1)
-        carry = carry // grid.block[k]
+def on_block(
+    function: Callable[..., Any], names: tuple[str, ...] | None, part: Any
+) -> tuple[Any, Array]:
+    """Values at the points of a block, and where they are defined."""
+    if names is None:
+        points, shape = part, jtu.tree_leaves(part)[0].shape[:1]
+    else:
+        spread, shape = jnp.meshgrid(*part, indexing="ij"), tuple(x.size for x in part)
+        points = {name: x.reshape(-1) for name, x in zip(names, spread, strict=True)}
 
     def evaluate(point: Any) -> tuple[Any, Array]:
-        values = function(point) if grid.listed else function(**point)
+        values = function(point) if names is None else function(**point)
         for leaf in jtu.tree_leaves(values):
             if not eqx.is_array_like(leaf):
                 raise ValueError(
@@ -147,19 +159,15 @@ def on_block(function: Callable[..., Any], grid: Grid, corner: Any) -> tuple[Any
         values = jtu.tree_map(jnp.asarray, values)
         return values, _defined(values)
 
-    if grid.listed:
-        points = jtu.tree_map(lambda x: x[indices["point"]], grid.points)
-    else:
-        points = {name: grid.points[name][indices[name]] for name in grid.names}
     found = jax.vmap(evaluate)(points)
-    return jtu.tree_map(lambda x: x.reshape(*grid.block, *x.shape[1:]), found)
+    return jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
 class Leaf(eqx.Module):
     """One array of what a function returns: its name, its own shape, what its numbers mean.
 
     Attributes:
-        name: The path in the tree, joined by dots; `value` where there is nothing but it.
+        name: The path in the tree, joined by underscores; `value` where there is nothing but it.
         shape: Without the axes of the grid.
         dtype: Its numpy dtype.
         fill: Where nothing is known: NaN; of codes `undefined`, of integers the least.
@@ -190,16 +198,13 @@ class Leaf(eqx.Module):
 VALID = Leaf("valid", (), np.dtype(bool), False, ())
 
 
-def leaves_of(values: Any, axes: tuple[str, ...]) -> list[Leaf]:
+def leaves_of(values: Any, axes: Iterable[str]) -> list[Leaf]:
     """The arrays of what a function returned on axes, by names that no axis has; `valid` last."""
     found: list[Leaf] = []
     names = {*axes, VALID.name}
+    beyond = len(names) - 1
     paths, _ = jtu.tree_flatten_with_path(values, is_leaf=lambda x: isinstance(x, _Code))
     for path, value in paths:
-        name = jtu.keystr(path, simple=True, separator=".").replace("/", ".") or "value"
-        while name in names:
-            name += "_"
-        names.add(name)
         codes: tuple[str, ...] = ()
         if isinstance(value, _Code):
             codes = tuple(vars(value._enumeration)["_name_to_item"])
@@ -213,5 +218,10 @@ def leaves_of(values: Any, axes: tuple[str, ...]) -> list[Leaf]:
             fill = False
         else:
             fill = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
-        found.append(Leaf(name, value.shape[len(axes) :], dtype, fill, codes))
+        name = re.sub(r"\W", "_", jtu.keystr(path, simple=True, separator="_")) or "value"
+        leaf = Leaf(name, value.shape[beyond:], dtype, fill, codes)
+        while names & {leaf.name, *leaf.dimensions(())}:
+            leaf = dataclasses.replace(leaf, name=leaf.name + "_")
+        names |= {leaf.name, *leaf.dimensions(())}
+        found.append(leaf)
     return [*found, VALID]

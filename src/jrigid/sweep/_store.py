@@ -3,12 +3,13 @@
 import contextlib
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,9 @@ try:
 except ModuleNotFoundError:  # on Windows
     fcntl = None
 
-_WITHOUT = re.compile(r"0x[0-9a-f]+")  # addresses differ from run to run
+_ADDRESS = re.compile(r"0x[0-9a-f]+")  # addresses differ from run to run
 _KEY = "jrigid"
 _CONVENTIONS = {"Conventions": "CF-1.11"}
-_KEPT = {"write_empty_chunks": True}  # a block that is all NaN is one that is done
 
 
 def _constants(jaxpr: Any) -> Iterator[Any]:
@@ -62,24 +62,31 @@ def _digest(*values: Any) -> str:
     return digest.hexdigest()[:32]
 
 
-def identity(function: Any, grid: Grid, jaxpr: Any) -> dict[str, Any]:
-    """What must be the same for a sweep to go on: the traced function, points, blocks, versions.
+def _checksum(numbers: Any) -> bytes:
+    return extra("google_crc32c").value(numbers).to_bytes(4, "little")
 
-    The function is told by its jaxpr, with all that it calls and the constants in it; neither its
-    name nor the file it stands in matter.
+
+def fingerprint(function: Any, jaxpr: Any) -> dict[str, Any]:
+    """What a function and its surroundings compute: its jaxpr, with all that it calls and holds.
+
+    The file it stands in does not matter.
     """
-    text = _WITHOUT.sub("", str(jaxpr))
+    text = _ADDRESS.sub("", str(jaxpr))
     arrays = jtu.tree_leaves(eqx.filter(function, eqx.is_array))
-    packages = ("jax", "jaxlib", "jrigid")
     return {
         "function": _digest(text, *_constants(jaxpr), *arrays),
-        "points": {
-            name: _digest(*jtu.tree_leaves(x))
-            for name, x in (("point", grid.points),) * grid.listed or grid.points.items()
-        },
+        "versions": {name: version(name) for name in ("jax", "jaxlib", "jrigid")},
+    }
+
+
+def identity(grid: Grid, leaves: list[Leaf]) -> dict[str, Any]:
+    """What else must be the same for a sweep to go on: points, blocks, what comes out."""
+    points = {"point": grid.points} if grid.names is None else grid.points
+    return {
+        "points": {name: _digest(*jtu.tree_leaves(x)) for name, x in points.items()},
         "shape": list(grid.shape),
         "block": list(grid.block),
-        "versions": {name: version(name) for name in packages},
+        "values": [[x.name, list(x.shape), str(x.dtype), list(x.codes)] for x in leaves],
     }
 
 
@@ -94,9 +101,13 @@ def _told(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def _is_new(path: Path) -> bool:
+    return not path.exists() or (path.is_dir() and not any(path.iterdir()))
+
+
 def known_block(path: Path) -> tuple[int, ...] | None:
     """The block of a store that is there already."""
-    return tuple(_told(path)["block"]) if path.exists() else None
+    return None if _is_new(path) else tuple(_told(path)["block"])
 
 
 class Memory:
@@ -112,14 +123,18 @@ class Memory:
         """It is no one else's."""
         yield
 
-    def count(self, _: int) -> None:
+    def has(self, _: int) -> bool:
         """No block is there yet."""
+        return False
+
+    def count(self, _: int) -> None:
+        """So none of its points is known to be valid."""
 
     def write(self, number: int, values: list[np.ndarray]) -> None:
         """Keep a block."""
-        region = self.grid.region(number)
+        region, inside = self.grid.region(number), self.grid.inside(number)
         for array, value in zip(self.arrays.values(), values, strict=True):
-            array[region] = value
+            array[region] = value[inside]
 
     def leave(self, number: int) -> None:
         """Nothing will be known of a block."""
@@ -141,13 +156,19 @@ class Store:
         """Nothing is opened before it is used."""
         self.path, self.grid, self.leaves = path, grid, leaves
         self._arrays: dict[str, Any] = {}
+        self._axes: dict[str, Any] = {}
 
     @property
     def arrays(self) -> dict[str, Any]:
         """The zarr arrays of the leaves, in their order."""
         if not self._arrays:
-            group = extra("zarr").open_group(self.path, mode="r+", use_consolidated=False)
-            self._arrays = {x.name: group[x.name].with_config(_KEPT) for x in self.leaves}
+            try:
+                group = extra("zarr").open_group(self.path, mode="r+", use_consolidated=False)
+                self._arrays = {x.name: group[x.name] for x in self.leaves}
+                self._axes = {name: group[name] for name in self.grid.axes}
+            except (KeyError, ValueError) as error:
+                text = f"The store {self.path} is spoilt: its description is not whole ({error!r})."
+                raise OSError(text) from error
         return self._arrays
 
     def _create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
@@ -159,7 +180,9 @@ class Store:
         ]
         for x in self.leaves:
             shape, block = (*grid.shape, *x.shape), (*grid.block, *x.shape)
-            parts.append((x.name, shape, block, x.dtype, x.fill, x.dimensions(grid.names), x.flags))
+            parts.append(
+                (x.name, shape, block, x.dtype, x.fill, x.dimensions(tuple(grid.axes)), x.flags)
+            )
         try:
             group = zarr.create_group(partial, attributes=_CONVENTIONS | {_KEY: about})
             for name, shape, block, dtype, fill, dimensions, flags in parts:
@@ -168,15 +191,14 @@ class Store:
                     dimension_names=dimensions, attributes=flags | attributes.get(name, {}),
                     compressors=[extra("zarr.codecs").Crc32cCodec()],
                 )  # fmt: skip
-            for name, x in grid.axes.items():
-                group[name].with_config(_KEPT)[...] = x
             with warnings.catch_warnings():
                 # So that xarray opens it in one look; the format's next version will have it.
                 warnings.simplefilter("ignore")
                 zarr.consolidate_metadata(partial)
             os.rename(partial, self.path)
         except OSError as error:
-            raise OSError(f"The store {self.path} cannot be written: {error}.") from error
+            if not (self.path / "zarr.json").exists():  # of another process, a moment ago
+                raise OSError(f"The store {self.path} cannot be written: {error}.") from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
@@ -184,33 +206,57 @@ class Store:
         place = [*np.unravel_index(number, self.grid.blocks), *(0 for _ in leaf.shape)]
         return self.path.joinpath(leaf.name, "c", *map(str, place))
 
+    def has(self, number: int) -> bool:
+        """Whether a block is done."""
+        return self._chunk(VALID, number).exists()
+
     def count(self, number: int) -> int | None:
         """How many valid points a block has; None where one of its chunks is lost or spoilt."""
-        done = self._chunk(VALID, number)
-        if not done.exists():
+        if not self.has(number):
             return None
+        for leaf in self.leaves:
+            numbers = self._read(leaf, number)
+            if numbers is None:
+                self._chunk(VALID, number).unlink(missing_ok=True)
+                return None
+        valid = np.frombuffer(numbers, bool).reshape(self.grid.block)  # the last leaf
+        return int(np.count_nonzero(valid[self.grid.inside(number)]))
+
+    def _read(self, leaf: Leaf, number: int) -> bytes | None:
+        """The numbers of a chunk, if it is whole."""
         try:
-            for leaf in self.leaves:
-                self._chunk(leaf, number).stat()  # zarr takes a chunk that is lost for one of NaN
-                found = self.arrays[leaf.name][self.grid.region(number)]
-        except (FileNotFoundError, ValueError, RuntimeError):
-            done.unlink(missing_ok=True)
+            content = self._chunk(leaf, number).read_bytes()
+        except FileNotFoundError:
             return None
-        return int(np.sum(found))
+        numbers, known = content[:-4], content[-4:]
+        size = leaf.dtype.itemsize * math.prod((*self.grid.block, *leaf.shape))
+        return numbers if len(numbers) == size and known == _checksum(numbers) else None
 
     def write(self, number: int, values: list[np.ndarray]) -> None:
-        """Keep a block, its mask last."""
-        region = self.grid.region(number)
-        for array, value in zip(self.arrays.values(), values, strict=True):
-            array[region] = value
+        """Keep a block, its mask last.
+
+        As zarr would, but without a copy: the numbers, little end first, and their checksum.
+        """
+        for leaf, value in zip(self.leaves, values, strict=True):
+            numbers = (
+                np.ascontiguousarray(value, leaf.dtype.newbyteorder("<")).reshape(-1).view(np.uint8)
+            )
+            chunk = self._chunk(leaf, number)
+            partial = chunk.with_name(f"{chunk.name}.{uuid.uuid4().hex}.partial")
+            chunk.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with partial.open("wb") as file:
+                    file.write(numbers.data)
+                    file.write(_checksum(numbers))
+                partial.replace(chunk)
+            except OSError:
+                partial.unlink(missing_ok=True)
+                raise
 
     @contextlib.contextmanager
-    def opened(
-        self, identity: Callable[[], dict[str, Any]], attributes: dict[str, dict]
-    ) -> Iterator[None]:
+    def opened(self, about: dict[str, Any], attributes: dict[str, dict]) -> Iterator[None]:
         """New or gone on with, if it is of the same sweep."""
-        about = identity()
-        if not self.path.exists():
+        if _is_new(self.path):
             self._create(about, attributes)
         known = _told(self.path)
         with self._locked():
@@ -225,7 +271,19 @@ class Store:
                     f"of another: {'; '.join(differences)}. (Choose another directory, or remove "
                     "it.)"
                 )
+            self._mend_axes()
             yield
+
+    def _mend_axes(self) -> None:
+        """Coordinates that are lost or spoilt are known."""
+        _ = self.arrays
+        for name, x in self.grid.axes.items():
+            try:
+                same = np.array_equal(self._axes[name][...], x)
+            except ValueError:
+                same = False
+            if not same:
+                self._axes[name][...] = x
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -238,7 +296,7 @@ class Store:
             except BlockingIOError as error:
                 text = f"Another process is writing to the store {self.path}."
                 raise RuntimeError(text) from error
-            for partial in self.path.glob("**/*.partial"):
+            for partial in self.path.glob("**/c/**/*.partial"):
                 partial.unlink(missing_ok=True)
             yield
         finally:

@@ -1,16 +1,15 @@
 """A function at very many points: in blocks, here or elsewhere, kept and gone on with."""
 
-import dataclasses
 import math
 import os
+import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike
@@ -18,10 +17,10 @@ from jaxtyping import ArrayLike
 from jrigid._checks import whole_number
 from jrigid.sweep._drive import meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
-from jrigid.sweep._refine import Tiles, corners_of
+from jrigid.sweep._refine import corners_of, refined
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
-from jrigid.sweep._work import Surroundings, Work, compute, evaluated, here, packed, x64
+from jrigid.sweep._work import Call, Surroundings, Work, here, packed, settings, traced
 
 # Blocks that an executor has at a time.
 _AHEAD = 1024
@@ -98,34 +97,53 @@ def sweep(
     (5, 2) True
     """
     grid = grid_of(axes, points)
-    if refine is not None and grid.listed:
+    if refine is not None and grid.names is None:
         raise ValueError("Argument `refine` is for a grid of `axes`, not for a list of points.")
     path = None if store is None else Path(store).absolute()
-    corner = np.zeros(len(grid.shape), np.int32)
-    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, grid.cut(1), corner)
-    leaves = leaves_of(values, grid.names)
+    values, about = traced(function, grid.names, grid.cut(1).part(0))
+    leaves = leaves_of(values, grid.axes)
     grid = _cut(grid, block_size, path, refine, leaves)
-    about = {name: dict(x) for name, x in (attributes or {}).items()}
-    unknown = about.keys() - {*grid.axes, *(x.name for x in leaves)}
+    said = {name: dict(x) for name, x in (attributes or {}).items()}
+    unknown = said.keys() - {*grid.axes, *(x.name for x in leaves)}
     if unknown:
         raise ValueError(
             f"Argument `attributes` must name axes or values, but {sorted(unknown)} are neither."
         )
-    work = Work(function, grid, leaves, path)
+    work = Work(function, grid, leaves, path, about, settings())
     kept: Any = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
-    structure, classes = jtu.tree_structure(values), None
-    done = lambda numbers: _compute(work, kept, numbers, executor, progress)  # noqa: E731
-    with kept.opened(lambda: identity(function, grid, jaxpr), about):
+    structure, classes, valid = jtu.tree_structure(values), None, 0
+
+    def done(numbers: Iterable[int]) -> tuple[Failure, ...]:
+        nonlocal valid
+        failures, count = _compute(work, kept, numbers, executor, progress)
+        valid += count
+        return failures
+
+    with kept.opened(about | identity(grid, leaves), said):
         if refine is None:
             failures = done(range(math.prod(grid.blocks)))
         else:
-            corners = sweep(function, corners_of(grid), executor=executor, progress=False).values
-            tiles = Tiles(grid, kept, structure, refine)
-            failures, classes = tiles.refined(corners, done)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                corners = sweep(function, corners_of(grid), executor=executor, progress=False)
+            failures, classes = refined(grid, kept, structure, refine, corners, done)
+            valid += int(np.sum(corners.valid))
         kept.tell(failures)
+    if failures:
+        warnings.warn(
+            f"{len(failures)} of {math.prod(grid.blocks)} blocks failed three times, and their "
+            f"points are not valid; see `failures`. The last of them: {failures[-1].error}",
+            stacklevel=2,
+        )
+    elif not valid:
+        warnings.warn(
+            f"None of the {math.prod(grid.shape)} points is valid: the function returned NaN, "
+            "infinity or an undefined code at each.",
+            stacklevel=2,
+        )
     *arrays, valid = kept.arrays.values()
     filled = jtu.tree_unflatten(structure, arrays)
-    return SweepResult(filled, valid, grid.axes, failures, about, path and str(path), classes)
+    return SweepResult(filled, valid, grid.axes, failures, said, path and str(path), classes)
 
 
 def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]) -> Grid:
@@ -133,7 +151,13 @@ def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: l
     if size is None:
         block = path and known_block(path)
         if block and len(block) == len(grid.shape):
-            return dataclasses.replace(grid, block=block)
+            tiles = all(x == min(max(block), n) for x, n in zip(block, grid.shape, strict=True))
+            if refine is not None and not tiles:
+                raise ValueError(
+                    f"Argument `refine` needs a store in tiles, but the blocks of {path} are "
+                    f"{block}: choose another."
+                )
+            return grid._replace(block=block)
     if refine is not None:
         return grid.tiled(_TILE if size is None else whole_number("block_size", size))
     if size is None:
@@ -145,22 +169,21 @@ def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: l
 
 def _compute(
     work: Work, kept: Any, numbers: Iterable[int], executor: Executor | None, progress: bool
-) -> tuple[Failure, ...]:
-    """Compute the blocks that are not kept yet, and say which failed."""
+) -> tuple[tuple[Failure, ...], int]:
+    """Compute the blocks that are not kept yet; say which failed, and how many points are valid."""
     grid, failures = work.grid, []
     known = {number: kept.count(number) for number in numbers}
+    sizes = {n: math.prod(x.stop - x.start for x in grid.region(n)) for n in known}
     waiting = [number for number, count in known.items() if count is None]
-    valid = sum(count or 0 for count in known.values())
-    size = lambda number: math.prod(x.stop - x.start for x in grid.region(number))  # noqa: E731
-    total = sum(map(size, known))
-    done = total - sum(map(size, waiting))
+    valid, total = sum(count or 0 for count in known.values()), sum(sizes.values())
+    done = total - sum(sizes[number] for number in waiting)
     with (
-        meter(total, done, progress and done < total) as advance,
+        meter(total, done, progress and bool(waiting)) as advance,
         _submitting(work, kept, executor) as (submit, ahead),
     ):
         for outcome in outcomes(submit, waiting, ahead):
             valid += outcome.count
-            advance(size(outcome.number))
+            advance(sizes[outcome.number])
             if outcome.values is not None:
                 kept.write(outcome.number, outcome.values)
             if outcome.error is not None:
@@ -168,19 +191,7 @@ def _compute(
                 region = grid.region(outcome.number)
                 first, last = zip(*((x.start, x.stop - 1) for x in region), strict=True)
                 failures.append(Failure(first, last, outcome.error))
-    if failures:
-        warnings.warn(
-            f"{len(failures)} of {math.prod(grid.blocks)} blocks failed three times, and their "
-            f"points are not valid; see `failures`. The last of them: {failures[-1].error}",
-            stacklevel=3,
-        )
-    elif not valid:
-        warnings.warn(
-            f"None of the {total} points is valid: the function returned NaN, infinity or an "
-            "undefined code at each.",
-            stacklevel=3,
-        )
-    return tuple(failures)
+    return tuple(failures), valid
 
 
 @contextmanager
@@ -189,10 +200,20 @@ def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tu
     if executor is None:
         worker, threads = here(work, kept)
         with ThreadPoolExecutor(threads) as pool:
-            yield lambda number: pool.submit(worker, number), threads + 2
+            yield lambda n: pool.submit(worker, n, work.grid.part(n)), threads + 2
         return
+    processes = getattr(executor, "_mp_context", None)
+    if processes is not None and processes.get_start_method() == "fork":
+        raise ValueError(
+            "Argument `executor` must not fork, beside the threads of jax, but it does: pass it "
+            '`mp_context=multiprocessing.get_context("spawn")`.'
+        )
     share = getattr(executor, "_max_workers", None)  # of a pool on this machine
     cores = share and max(1, (os.cpu_count() or 1) // share)
-    surroundings = Surroundings(os.getpid(), x64(), cores)
-    payload = packed(work)
-    yield lambda number: executor.submit(compute, surroundings, payload, number), _AHEAD
+    surroundings, payload = Surroundings(os.getpid(), cores, work.settings), packed(work)
+
+    def submit(number: int) -> Future:
+        call = Call(surroundings, payload, number, work.grid.part(number))
+        return executor.submit(pickle.loads, pickle.dumps(call))
+
+    yield submit, _AHEAD

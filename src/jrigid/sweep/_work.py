@@ -9,21 +9,44 @@ import pickle
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from jrigid._as_lanes import on_cpu
 from jrigid.sweep._grid import Grid, Leaf, on_block
-from jrigid.sweep._store import Memory, Store
+from jrigid.sweep._store import Memory, Store, fingerprint
 
 # The compiled function is kept for the next sweep of the same one in the same blocks.
 evaluated = eqx.filter_jit(on_block)
+
+
+# What decides besides a function what is traced, and is known to one thread of one process.
+_SETTINGS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_default_prng_impl": jax.default_prng_impl,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+}
+
+
+def settings() -> tuple[Any, ...]:
+    """Those of jax here and now."""
+    return tuple(getattr(jax.config, name) for name in _SETTINGS)
+
+
+@contextlib.contextmanager
+def under(values: tuple[Any, ...]) -> Iterator[None]:
+    """With the settings of elsewhere."""
+    with contextlib.ExitStack() as stack:
+        for context, value in zip(_SETTINGS.values(), values, strict=True):
+            stack.enter_context(context(value))
+        yield
 
 
 class Work(NamedTuple):
@@ -33,6 +56,8 @@ class Work(NamedTuple):
     grid: Grid
     leaves: list[Leaf]
     store: Path | None
+    about: dict[str, Any]
+    settings: tuple[Any, ...]
 
 
 class Outcome(NamedTuple):
@@ -41,57 +66,57 @@ class Outcome(NamedTuple):
     Attributes:
         number: Which block.
         count: How many points are valid.
-        values: Of the block, its mask last; None where a store has them.
+        values: Of the block, its mask last; None where they are kept already.
         error: What went wrong, in words: an exception need not survive the way between processes.
-        lost: Whether the store could not be written.
+        final: What to raise, if no other trial or block can do better.
     """
 
     number: int
     count: int = 0
     values: list[np.ndarray] | None = None
     error: str | None = None
-    lost: bool = False
+    final: type[Exception] | None = None
 
 
 class Worker:
     """Computes blocks on all devices of a process; from several threads at once."""
 
     def __init__(self, work: Work, kept: Store | Memory | None):
-        """Send the points to each device; without a place to keep blocks, return them."""
-        self.work, self.kept = work, kept
-        self.grids = [jax.device_put(work.grid, x) for x in jax.local_devices()]
-        self.x64 = x64()  # a thread does not know what is around
+        """Without a place to keep blocks they are returned."""
+        self.work, self.kept, self.devices = work, kept, jax.local_devices()
         # The first call of a device compiles, which a second thread would do again.
-        self.first = {device: threading.Lock() for device in range(len(self.grids))}
+        self.first = {device: threading.Lock() for device in self.devices}
 
-    def __call__(self, number: int) -> Outcome:
+    def __call__(self, number: int, part: Any) -> Outcome:
         """Compute a block, and keep it if there is where."""
-        known = self.kept and self.kept.count(number)
-        if known is not None:
-            return Outcome(number, known)
         try:
-            values = self._computed(number)
+            values = self._computed(number, part)
         except Exception as error:
             return Outcome(number, error=in_words(error))
-        count = int(np.sum(values[-1]))
+        count = int(np.count_nonzero(values[-1][self.work.grid.inside(number)]))
         if self.kept is None:
             return Outcome(number, count, values)
         try:
             self.kept.write(number, values)
         except OSError as error:
-            return Outcome(number, error=str(error), lost=True)
+            text = f"The store cannot be written: {error}. What is finished is kept, and the same "
+            return Outcome(number, error=text + "call goes on from there.", final=OSError)
         return Outcome(number, count)
 
-    def _computed(self, number: int) -> list[np.ndarray]:
-        grid = self.work.grid
-        device = number % len(self.grids)
-        corner = np.array(grid.corner(number), np.int32)
-        with self.first.get(device, contextlib.nullcontext()), jax.enable_x64(self.x64):
-            found = evaluated(self.work.function, self.grids[device], corner)
+    def _computed(self, number: int, part: Any) -> list[np.ndarray]:
+        device = self.devices[number % len(self.devices)]
+        with under(self.work.settings), self.first.get(device, contextlib.nullcontext()):
+            part = jax.device_put(part, device)
+            found = evaluated(self.work.function, self.work.grid.names, part)
         self.first.pop(device, None)
-        region = grid.region(number)
-        inside = tuple(slice(0, x.stop - x.start) for x in region)
-        return [np.asarray(x)[inside] for x in jtu.tree_leaves(found)]
+        return [np.asarray(x) for x in jtu.tree_leaves(found)]
+
+
+def traced(function: Callable[..., Any], names: Any, part: Any) -> tuple[Any, dict[str, Any]]:
+    """What a function returns for the first of some points, as shapes, and its fingerprint."""
+    one = jtu.tree_map(lambda x: x[:1], part)
+    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, names, one)
+    return values, fingerprint(function, jaxpr)
 
 
 def in_words(error: BaseException) -> str:
@@ -101,34 +126,44 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {text.strip()}"
 
 
-def x64() -> bool:
-    """Whether numbers have 64 bits here."""
-    return jnp.zeros(()).dtype == np.float64
-
-
 class Surroundings(NamedTuple):
     """What a process must be told before it has a backend.
 
     Attributes:
         driver: The process that has the work.
-        x64: Whether numbers have 64 bits.
         cores: How many a worker may have, if that is known.
+        settings: Of jax.
     """
 
     driver: int
-    x64: bool
     cores: int | None
+    settings: tuple[Any, ...]
+
+
+class Call:
+    """Bytes that compute a block where `pickle.loads` reads them.
+
+    So that an executor's own machinery needs no jrigid: where it is missing it says so.
+    """
+
+    def __init__(self, *arguments: Any):
+        """Of `compute`."""
+        self.arguments = arguments
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How to be read."""
+        return compute, self.arguments
 
 
 def packed(work: Work) -> bytes:
-    """The work as bytes, or ValueError."""
+    """The work without its points as bytes, or ValueError."""
     try:
         from cloudpickle import dumps
     except ModuleNotFoundError:
         from pickle import dumps
-    grid = jtu.tree_map(np.asarray, work.grid)
     try:
-        return dumps(work._replace(grid=grid))
+        axes = None if work.grid.names is None else dict.fromkeys(work.grid.names)
+        return dumps(work._replace(grid=work.grid._replace(points=axes)))
     except Exception as error:
         raise ValueError(
             "Argument `function` must be one that other processes can be sent, but it is not: "
@@ -137,13 +172,17 @@ def packed(work: Work) -> bytes:
         ) from error
 
 
-def compute(surroundings: Surroundings, work: bytes, number: int) -> Outcome:
+def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> Outcome:
     """Compute a block, in whatever process this is."""
-    with _one_at_a_time:
+    with _one_at_a_time, under(surroundings.settings):
         if surroundings.driver != os.getpid():
-            _settle_in(surroundings)
+            _settle_in(surroundings.cores)
         worker = _unpacked(work)
-    return worker(number)
+        about = worker.work.about
+        if surroundings.driver != os.getpid() and about != _about_here(work, part):
+            text = f"A worker has another function or other versions than {about}: start it anew."
+            return Outcome(number, error=text, final=RuntimeError)
+    return worker(number, part)
 
 
 _one_at_a_time = threading.Lock()
@@ -156,14 +195,25 @@ def _unpacked(work: bytes) -> Worker:
     return Worker(known, None if store is None else Store(store, known.grid, known.leaves))
 
 
+_seen: dict[bytes, dict[str, Any]] = {}
+
+
+def _about_here(work: bytes, part: Any) -> dict[str, Any]:
+    """The fingerprint that the function has in this process: its module may be an older one."""
+    if work not in _seen:
+        known = _unpacked(work).work
+        _seen.clear()
+        _seen[work] = traced(known.function, known.grid.names, part)[1]
+    return _seen[work]
+
+
 @functools.lru_cache(maxsize=1)
-def _settle_in(surroundings: Surroundings) -> None:
+def _settle_in(cores: int | None) -> None:
     """Once in a process, before its backend starts: what it may use, and when it ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    _take_cores(surroundings.cores or _threads_of_dask())
-    jax.config.update("jax_enable_x64", surroundings.x64)
+    _take_cores(cores or _threads_of_dask())
     if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", str(_own_directory() / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -186,10 +236,16 @@ def _threads_of_dask() -> int | None:
         return None
 
 
+@functools.cache
 def _own_directory() -> Path:
-    path = Path(tempfile.gettempdir()) / f"jrigid-{os.getuid() if hasattr(os, 'getuid') else 0}"
-    path.mkdir(mode=0o700, exist_ok=True)
-    return path
+    """One that all workers of a user have on this machine, and nobody else can write to."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    path = Path(tempfile.gettempdir()) / f"jrigid-{user}"
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    found = path.lstat()
+    safe = path.is_dir() and (user == 0 or found.st_uid == user) and not found.st_mode & 0o022
+    return path if safe else Path(tempfile.mkdtemp())
 
 
 _held: list[int] = []
@@ -221,10 +277,9 @@ def _take_cores(count: int | None) -> None:
             os.sched_setaffinity(int(thread), set(taken))
 
 
-def here(work: Work, kept: Store | Memory) -> tuple[Callable[[int], Outcome], int]:
+def here(work: Work, kept: Store | Memory) -> tuple[Worker, int]:
     """A worker in this process, and in how many threads it is to be called."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     devices = jax.local_devices()
     # Of two threads one writes while the other computes.
-    threads = max(cores or 1, 2) if devices[0].platform == "cpu" else 2 * len(devices)
-    return Worker(work, kept), max(threads, len(devices))
+    return Worker(work, kept), max(cores or 1, 2) if on_cpu() else 2 * len(devices)
