@@ -216,7 +216,7 @@ def executors(count=400):
 
 
 def many(count):
-    """Seconds of so many blocks of four points to a store, in process."""
+    """Seconds of so many blocks of four points to a store, in process, and of a look at them."""
     with tempfile.TemporaryDirectory() as path:
         start = time.perf_counter()
         x = np.linspace(0, 1, 4 * count)
@@ -224,13 +224,13 @@ def many(count):
         first = time.perf_counter() - start
         start = time.perf_counter()
         jr.sweep(empty, {"x": x}, store=f"{path}/s", progress=False)
-        return [[f"{count} blocks", first, time.perf_counter() - start]]
+        return [[f"{count:,} blocks", first, time.perf_counter() - start]]
 
 
 if __name__ == "__main__":
     parser = common.arguments(__doc__)
     parser.add_argument("--alone", help="one case, as JSON")
-    parser.add_argument("--many", type=int, default=20_000)
+    parser.add_argument("--many", type=int, default=100_000)
     options = parser.parse_args()
     if options.alone:
         alone(options.alone)
@@ -239,7 +239,7 @@ if __name__ == "__main__":
         common.table(["10^8 points", "min s", "median s", "peak MiB"], linear()),
         common.table(["a block of 4,096 points, one core", "min ms", "median ms"], a_block()),
         common.table(["an empty block", "min ms", "median ms"], executors()),
-        common.table(["to a store", "first s", "looked at again s"], many(options.many)),
+        common.table(["to a store", "first s", "looked at again s"], many(20_000) + many(options.many)),
     ]
     packages = ("jax", "numpy", "numba", "zarr", "distributed")
     common.report("sweep", "Sweeps", "\n\n".join(text), packages, options.write)
