@@ -45,13 +45,25 @@ def killed(mode, store, what, count):
     elif what == "driver":
         driver.kill()
     else:
-        workers = psutil.Process(driver.pid).children(recursive=True)
-        workers = [x for x in workers if "resource_tracker" not in " ".join(x.cmdline())]
-        workers[-1].kill()
+        while driver.poll() is None and not (found := workers_of(driver)):
+            time.sleep(0.002)
+        if driver.poll() is None:
+            found[-1].kill()
     driver.communicate(timeout=120)
     left = psutil.wait_procs(of_session(driver.pid), timeout=20)[1]
     assert not left, "a worker outlives its driver"
     return driver.returncode
+
+
+def workers_of(driver):
+    found = []
+    try:
+        for process in psutil.Process(driver.pid).children(recursive=True):
+            if "spawn_main" in " ".join(process.cmdline()):
+                found.append(process)
+    except psutil.Error:  # one that has just ended
+        return []
+    return found
 
 
 def of_session(leader):
