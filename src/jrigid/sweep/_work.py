@@ -180,7 +180,10 @@ def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> 
         worker = _unpacked(work)
         about = worker.work.about
         if surroundings.driver != os.getpid() and about != _about_here(work, part):
-            text = f"A worker has another function or other versions than {about}: start it anew."
+            text = (
+                f"A worker has not the function and versions {about} of the driver, or another "
+                "kind of device: start it anew."
+            )
             return Outcome(number, error=text, final=RuntimeError)
     return worker(number, part)
 
@@ -244,7 +247,7 @@ def _own_directory() -> Path:
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)
     found = path.lstat()
-    safe = path.is_dir() and (user == 0 or found.st_uid == user) and not found.st_mode & 0o022
+    safe = path.is_dir() and found.st_uid == user and not found.st_mode & 0o022
     return path if safe else Path(tempfile.mkdtemp())
 
 
