@@ -239,7 +239,7 @@ if __name__ == "__main__":
         common.table(["10^8 points", "min s", "median s", "peak MiB"], linear()),
         common.table(["a block of 4,096 points, one core", "min ms", "median ms"], a_block()),
         common.table(["an empty block", "min ms", "median ms"], executors()),
-        common.table(["to a store", "first s", "looked at again s"], many(20_000) + many(options.many)),
+        common.table(["to a store", "first s", "again s"], many(20_000) + many(options.many)),
     ]
     packages = ("jax", "numpy", "numba", "zarr", "distributed")
     common.report("sweep", "Sweeps", "\n\n".join(text), packages, options.write)

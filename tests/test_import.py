@@ -12,7 +12,8 @@ import jax, diffrax, equinox
 before, start = set(sys.modules), time.process_time()
 import jrigid
 took = time.process_time() - start
-print(*sorted({name.partition(".")[0] for name in set(sys.modules) - before}), took)
+new = {name.partition(".")[0] for name in set(sys.modules) - before}
+print(*sorted(new - sys.stdlib_module_names), took)
 """
 
 

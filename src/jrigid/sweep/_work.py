@@ -2,8 +2,6 @@
 
 import contextlib
 import functools
-import multiprocessing
-import multiprocessing.connection
 import os
 import pickle
 import sys
@@ -213,6 +211,8 @@ def _about_here(work: bytes, part: Any) -> dict[str, Any]:
 @functools.lru_cache(maxsize=1)
 def _settle_in(cores: int | None) -> None:
     """Once in a process, before its backend starts: what it may use, and when it ends."""
+    import multiprocessing
+
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -224,7 +224,9 @@ def _settle_in(cores: int | None) -> None:
 
 def _end_with(sentinel: Any) -> None:
     """A pool's worker would wait for a driver that was killed for ever."""
-    multiprocessing.connection.wait([sentinel])
+    from multiprocessing import connection
+
+    connection.wait([sentinel])
     os._exit(1)
 
 
