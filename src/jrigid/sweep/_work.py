@@ -16,7 +16,6 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
-from jrigid._as_lanes import on_cpu
 from jrigid.sweep._grid import Grid, Leaf, on_block
 from jrigid.sweep._store import Memory, Store, fingerprint
 
@@ -82,8 +81,9 @@ class Worker:
     def __init__(self, work: Work, kept: Store | Memory | None):
         """Without a place to keep blocks they are returned."""
         self.work, self.kept, self.devices = work, kept, jax.local_devices()
-        # The first call of a device compiles, which a second thread would do again.
-        self.first = {device: threading.Lock() for device in self.devices}
+        # Two at a time on a device would compile twice, and on a CPU can wait for each other for
+        # ever: both run in the same few threads of XLA.
+        self.free = {device: threading.Lock() for device in self.devices}
 
     def __call__(self, number: int, part: Any) -> Outcome:
         """Compute a block, and keep it if there is where."""
@@ -103,10 +103,9 @@ class Worker:
 
     def _computed(self, number: int, part: Any) -> list[np.ndarray]:
         device = self.devices[number % len(self.devices)]
-        with under(self.work.settings), self.first.get(device, contextlib.nullcontext()):
+        with under(self.work.settings), self.free[device]:
             part = jax.device_put(part, device)
             found = evaluated(self.work.function, self.work.grid.names, part)
-        self.first.pop(device, None)
         return [np.asarray(x) for x in jtu.tree_leaves(found)]
 
 
@@ -284,7 +283,5 @@ def _take_cores(count: int | None) -> None:
 
 def here(work: Work, kept: Store | Memory) -> tuple[Worker, int]:
     """A worker in this process, and in how many threads it is to be called."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    devices = jax.local_devices()
     # Of two threads one writes while the other computes.
-    return Worker(work, kept), max(cores or 1, 2) if on_cpu() else 2 * len(devices)
+    return Worker(work, kept), 2 * len(jax.local_devices())
