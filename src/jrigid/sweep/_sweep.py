@@ -20,7 +20,7 @@ from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import corners_of, refined
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
-from jrigid.sweep._work import Call, Surroundings, Work, here, packed, settings, traced
+from jrigid.sweep._work import Call, Surroundings, Work, Worker, packed, settings, traced
 
 # Blocks that an executor has at a time.
 _AHEAD = 1024
@@ -198,7 +198,8 @@ def _compute(
 def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tuple[Callable, int]]:
     """How to have a block computed, and how many may wait for it."""
     if executor is None:
-        worker, threads = here(work, kept)
+        worker = Worker(work, kept)
+        threads = 2 * len(worker.devices)  # of two one writes while the other computes
         with ThreadPoolExecutor(threads) as pool:
             yield lambda n: pool.submit(worker, n, work.grid.part(n)), threads + 2
         return

@@ -171,12 +171,13 @@ def packed(work: Work) -> bytes:
 
 def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> Outcome:
     """Compute a block, in whatever process this is."""
+    elsewhere = surroundings.driver != os.getpid()
     with _one_at_a_time, under(surroundings.settings):
-        if surroundings.driver != os.getpid():
+        if elsewhere:
             _settle_in(surroundings.cores)
         worker = _unpacked(work)
         about = worker.work.about
-        if surroundings.driver != os.getpid() and about != _about_here(work, part):
+        if elsewhere and about != _about_here(work, part):
             text = (
                 f"A worker has not the function and versions {about} of the driver, or another "
                 "kind of device: start it anew."
@@ -279,9 +280,3 @@ def _take_cores(count: int | None) -> None:
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(ProcessLookupError):
             os.sched_setaffinity(int(thread), set(taken))
-
-
-def here(work: Work, kept: Store | Memory) -> tuple[Worker, int]:
-    """A worker in this process, and in how many threads it is to be called."""
-    # Of two threads one writes while the other computes.
-    return Worker(work, kept), 2 * len(jax.local_devices())
