@@ -229,7 +229,7 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     found = jr.identify.fit(
         body,
         jr.identify.Observed(seen, pole.tau, values, np.array([1.0, 1.0, 1e-9])),
-        shape="top",
+        shape=jr.identify.Top(),
         free=lambda body: (body.torque.seasons, body.torque.drift),
         start=start_of(guess),
         motion=motion,

@@ -40,7 +40,7 @@ def trial(seed: Array) -> dict[str, Any]:
     found = jr.identify.fit(
         jr.RigidBody(jnp.ones(3)),
         jr.identify.Rates(TIMES, rates, NOISE),
-        shape="moments",
+        shape=jr.identify.Moments(),
         throw=False,
     )
     return {"ratios": found.ratios, "errors": found.ratios_errors, "status": found.status}

@@ -40,7 +40,7 @@ def recover(readings: Float[Array, "times 3"]) -> tuple[Array, Array, Array]:
     found = jr.identify.fit(
         jr.RigidBody(jnp.ones(3)),
         jr.identify.Rates(TIMES, readings, 1.0),
-        shape="top",
+        shape=jr.identify.Top(),
         absolute_sigma=False,
         throw=False,
     )

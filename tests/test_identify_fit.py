@@ -1,6 +1,7 @@
 """fit(): bodies found again from noisy records, honest errors, and what no record tells."""
 
 import functools
+import re
 
 import equinox as eqx
 import jax
@@ -27,6 +28,7 @@ BODIES = {
     "near separatrix": ((1.0, 1.7, 2.3), (0.02, 1.0, 0.01)),
 }
 ASYMMETRIC, SYMMETRIC = BODIES["asymmetric"], BODIES["symmetric"]
+FLAT = (1.0, 1.7, 2.7), (0.5, 1.0, 0.4)
 BLIND = jr.RigidBody(np.ones(3))
 TS = np.arange(200) * 0.3  # ten turns, twenty samples each
 
@@ -57,8 +59,7 @@ def spread_of_elements(result):
     def one(result):
         slopes = jax.jacfwd(result.unknowns.inertia)(result.numbers)
         slopes = jnp.stack([slopes[i, j] for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))])
-        size = result.numbers.size
-        return slopes @ result.covariance[:size, :size] @ slopes.T
+        return slopes @ result.numbers_covariance @ slopes.T
 
     return np.asarray(one(result) if result.numbers.ndim == 1 else jax.vmap(one)(result))
 
@@ -269,7 +270,7 @@ def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
     np.testing.assert_allclose(rows, found.residuals, atol=1e-9)
     for state, at in ((state0, t0), (at_zero, np.zeros(()))):
         (_, covariance), _ = bound(found.inertia, state.omega, ts, at)
-        np.testing.assert_allclose(covariance, found.ratios_covariance, rtol=1e-5)
+        np.testing.assert_allclose(covariance, found.ratios_covariance, rtol=1e-3)
         stated = told_and_information(found.inertia, state.omega, ts, 0.02, at)[0].t0
         np.testing.assert_array_equal(stated, at)
 
@@ -314,7 +315,7 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
     assert float(least) == pytest.approx(float(found.ratios_covariance[1, 1]), rel=0.1)
     told, information = told_and_information(tensor, omega, TS, 0.02, np.zeros(()))
     assert bool(told.status == Status.OK)
-    np.testing.assert_allclose(told.ratios_covariance[1, 1], least, rtol=1e-9)
+    np.testing.assert_allclose(told.ratios_covariance[1, 1], least, rtol=1e-4)
     inverse = np.linalg.inv(np.asarray(information))
     np.testing.assert_allclose(inverse, told.covariance, rtol=1e-6, atol=1e-12)
     for k in range(3):
@@ -329,26 +330,32 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
 # What data can tell: the list of what is and is not determined
 
 
+def picked(gyro, name, sigma):
+    array = getattr(gyro, name)
+    return array if sigma is None else identify.prior(array, sigma)
+
+
 @functools.cache
-def program(nuisances, prior):
-    """Compiled once for each set of nuisances."""
-    if not nuisances:
+def program(name=None, prior=None, factors=None):
+    """Compiled once for each error of the gyro that is sought."""
+    if name is None:
         return lambda tensor, omega: told_and_information(tensor, omega, TS, 0.01, np.zeros(()))[0]
+    gyro = identify.Gyro(scale=np.ones(factors) if factors else 1.0)
     return quick_jit(
         lambda tensor, omega: identify.identifiability(
             jr.RigidBody(tensor),
             jr.State(UNTURNED, omega),
-            identify.Rates(TS, None, 0.01),
-            nuisances={nuisances: prior},
+            identify.Record(gyro, TS, None, 0.01),
+            free=lambda _, gyro: picked(gyro, name, prior),
         )
     )
 
 
-def told(body, nuisances=None, prior=None, axes=TURN):
+def told(body, name=None, prior=None, factors=None, axes=TURN):
     moments, direction = body
     tensor = axes @ np.diag(moments) @ axes.T
     omega = axes @ np.array(direction) / np.linalg.norm(direction)
-    return program(nuisances, prior)((tensor + tensor.T) / 2, omega)
+    return program(name, prior, factors)((tensor + tensor.T) / 2, omega)
 
 
 def test_free_motion_tells_everything_but_the_scale():
@@ -384,9 +391,9 @@ def test_pure_spin_and_a_sphere_do_not_tell_ratios(body, rng):
 
 
 def test_bias_of_the_gyro():
-    found = told(ASYMMETRIC, "gyro_bias")
+    found = told(ASYMMETRIC, "bias")
     assert found.null_directions == ("overall scale",)
-    found = told(SYMMETRIC, "gyro_bias")
+    found = told(SYMMETRIC, "bias")
     assert bool(found.status == Status.UNIDENTIFIABLE)
     (text,) = found.null_directions[1:]
     assert "I3/I1" in text
@@ -394,8 +401,8 @@ def test_bias_of_the_gyro():
 
 
 def test_one_scale_factor_of_the_gyro():
-    assert told(ASYMMETRIC, "gyro_scale").null_directions == ("overall scale",)
-    (text,) = told(SYMMETRIC, "gyro_scale").null_directions[1:]
+    assert told(ASYMMETRIC, "scale").null_directions == ("overall scale",)
+    (text,) = told(SYMMETRIC, "scale").null_directions[1:]
     assert "gyro scale" in text
     assert "I3/I1" in text
 
@@ -403,10 +410,10 @@ def test_one_scale_factor_of_the_gyro():
 @pytest.mark.slow  # two programs of their own
 def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
     """Three factors along the principal axes change (I2 - I3)/I1 and cyclic ones at will."""
-    words = told(ASYMMETRIC, "gyro_scales", axes=np.eye(3)).null_directions
+    words = told(ASYMMETRIC, "scale", factors=3, axes=np.eye(3)).null_directions
     assert len(words) > 1
-    assert all("gyro scale factors" in text for text in words[1:])
-    words = told(ASYMMETRIC, "gyro_matrix").null_directions
+    assert all("gyro scale" in text for text in words[1:])
+    words = told(ASYMMETRIC, "matrix").null_directions
     assert len(words) > 1
     assert all("gyro matrix" in text for text in words[1:])
 
@@ -415,19 +422,19 @@ def test_bias_and_scale_inflate_the_bound_as_measured_before():
     """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5), by order."""
     for body, least in ((ASYMMETRIC, 1.2), (BODIES["nearly symmetric"], 10.0)):
         plain, bias, factor = (
-            float(told(body, n).ratios_errors[1]) for n in (None, "gyro_bias", "gyro_scale")
+            float(told(body, n).ratios_errors[1]) for n in (None, "bias", "scale")
         )
         assert bias > least * plain
         assert factor > least * plain
     # What is known beforehand of the bias helps
-    known = told(BODIES["nearly symmetric"], "gyro_bias", 1e-4)
+    known = told(BODIES["nearly symmetric"], "bias", 1e-4)
     assert float(known.ratios_errors[1]) < 3 * plain
 
 
 def test_a_gyro_of_unknown_handedness_fits_two_bodies():
     _, omegas, _ = rates(ASYMMETRIC)
-    found = told(ASYMMETRIC, "gyro_handedness")
-    assert "mirror body fits equally: handedness of the gyro" in found.null_directions
+    found = told(ASYMMETRIC)
+    assert "with one axis of the gyro reversed the same record is that of a body" in str(found)
     # One axis reversed: the mirror body, physical, moves so.
     axes = np.asarray(found.axes)
     mirror = axes @ np.diag(np.asarray(found.mirror)) @ axes.T
@@ -442,14 +449,14 @@ def test_a_gyro_of_unknown_handedness_fits_two_bodies():
 def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     top = jr.SymmetricTop(1.0, 0.6, 2.0).as_rigid_body()
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
-    options = {"shape": "top", "free": lambda body: body.torque.mass}
+    options = {"shape": identify.Top(), "free": lambda body: body.torque.mass}
 
     told_of = quick_jit(lambda state: identify.identifiability(top, state, plan, **options))
 
     def words(tilt):
         return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
 
-    assert words(0.5).null_directions == ("heading about the vertical",)
+    assert words(0.5).null_directions[1:] == ("heading about the vertical",)
     sleeping = words(0.0)
     assert bool(sleeping.status == Status.UNIDENTIFIABLE)
     assert "spin is pure: ratios not determined" in sleeping.null_directions
@@ -529,24 +536,26 @@ def test_attitudes_alone_with_noise_that_is_not_known(rng):
 @pytest.mark.parametrize(
     ("shape", "body", "size"),
     [
-        pytest.param("symmetric", SYMMETRIC, 3, marks=pytest.mark.slow),
-        pytest.param("flat", ((1.0, 1.7, 2.7), (0.5, 1.0, 0.4)), 4, marks=pytest.mark.slow),
-        pytest.param("moments", ASYMMETRIC, 2, marks=pytest.mark.slow),
+        pytest.param(identify.Symmetric(), SYMMETRIC, 3, marks=pytest.mark.slow),
+        pytest.param(
+            identify.Flat(), ((1.0, 1.7, 2.7), (0.5, 1.0, 0.4)), 4, marks=pytest.mark.slow
+        ),
+        pytest.param(identify.Moments(), ASYMMETRIC, 2, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_known_of_the_tensor_holds(shape, body, size, rng):
-    axes = np.eye(3) if shape == "moments" else TURN
+    axes = np.eye(3) if isinstance(shape, identify.Moments) else TURN
     tensor, omegas, _ = rates(body, axes=axes)
     readings = identify.Rates(TS, omegas + 0.01 * rng.normal(size=omegas.shape), 0.01)
     found = identify.fit(BLIND, readings, shape=shape)
     assert found.numbers.size == size
     np.testing.assert_allclose(found.inertia, 3 * tensor / np.trace(tensor), atol=0.02)
     moments = np.asarray(found.moments)
-    if shape == "symmetric":
+    if isinstance(shape, identify.Symmetric):
         assert moments[1] == pytest.approx(moments[0], rel=1e-12)
-    if shape == "flat":
+    if isinstance(shape, identify.Flat):
         assert moments[2] == pytest.approx(moments[0] + moments[1], rel=1e-12)
-    if shape == "moments":
+    if isinstance(shape, identify.Moments):
         off = np.asarray(found.inertia) - np.diag(np.diagonal(found.inertia))
         assert np.abs(off).max() < 1e-14
     true = np.sort(body[0]) / np.min(body[0])
@@ -566,7 +575,7 @@ def test_toutatis():
             identify.Attitudes(times, record.attitudes[apparition], 6 * degree),
             identify.Rates(times, record.omegas[apparition], 6 * degree / 86400),
         ),
-        shape="moments",
+        shape=identify.Moments(),
         loss="robust",
     )
     # An independent refit of the same record: 3.19 +- 0.19 and 3.15 +- 0.17
@@ -662,12 +671,15 @@ def test_heavy_top_from_its_gyro_alone(rng):
     found = identify.fit(
         guess,
         identify.Rates(ts, values, 0.02),
-        shape="top",
+        shape=identify.Top(),
         free=lambda body: body.torque.mass,
         start=jr.State(jr.rotation.exp(jnp.array([0.4, 0.0, 0.0])), np.zeros(3)),
     )
     assert bool(found.status == Status.OK)
-    assert found.null_directions == ("heading about the vertical",)
+    assert found.null_directions == (
+        "overall scale, which what is sought of the torque follows",
+        "heading about the vertical",
+    )
     transverse, _, axial = np.diagonal(found.inertia)
     assert axial / transverse == pytest.approx(0.6, abs=4 * 0.0005)
     ((value, error),) = found.leaves.values()
@@ -733,7 +745,7 @@ def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
     _, omegas, _ = rates(ASYMMETRIC, SHORT)
     values = omegas + 1e-4 * rng.normal(size=omegas.shape)
     found = fit_of_rates(SHORT, values * degrees, 1e-4 * degrees)
-    assert bool(found.status == Status.WRONG_BASIN)
+    assert bool(found.status == Status.MISFIT)
     assert "degrees a second" in str(found)
     found = short_fit(values)
     assert bool(found.status == Status.OK)
@@ -784,7 +796,7 @@ def check_phone(rng, count, drags):
     assert np.all(np.abs(np.asarray(found.ratios) - true) < 4 * errors)
     assert np.all(errors < 0.01)
     if drags:
-        for (value, error), c in zip(found.leaves.values(), drag, strict=True):
+        for value, error, c in zip(*found.leaves["torque.coefficient"], drag, strict=True):
             assert abs(value - c) < 4 * error
 
 
@@ -816,7 +828,7 @@ def test_motion_of_one_s_own_and_a_function_of_the_state(rng):
         identify.Observed(spin_of, ts[:1], np.array([[2.0]]), 1e-3, on_attitude=False),
     )
     found = identify.fit(
-        guess, observations, shape="top", free=lambda b: b.torque.coefficient,
+        guess, observations, shape=identify.Top(), free=lambda b: b.torque.coefficient,
         start=jr.State(UNTURNED, np.array([0.25, 0.05, 2.0])), doublings=3,
         motion=steps_of_one_s_own,
     )  # fmt: skip
@@ -859,7 +871,9 @@ def test_too_few_samples_and_wrong_options(untyped):
     for options, message in (
         ({"shape": "cube"}, "shape"),
         ({"scale": "mass"}, "scale"),
-        ({"nuisances": "gyro_drift"}, "nuisances"),
+        ({"unmodelled": "some"}, "unmodelled"),
+        ({"unmodelled": -1.0}, "unmodelled"),
+        ({"unmodelled": [1.0, 0.0, 1.0]}, "unmodelled"),
         ({"loss": "huber"}, "loss"),
         ({"start": 3.0}, "start"),
         ({"free": lambda body: body.torque}, "free"),
@@ -888,20 +902,22 @@ def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, rng):
     _, omegas, _ = rates(ASYMMETRIC)
     records = omegas + 0.05 * rng.normal(size=(60, *omegas.shape))
     found = blind_fit(records, 0.01)  # five times the noise that is stated
-    assert bool(jnp.all(found.status == Status.WRONG_BASIN))
+    assert bool(jnp.all(found.status == Status.MISFIT))
+    honest = blind_fit(records, 0.05)
+    np.testing.assert_allclose(found.ratios_errors, honest.ratios_errors, rtol=0.15)
     _, omegas, _ = rates(ASYMMETRIC, SHORT)
-    with pytest.raises(RuntimeError, match="chi-square is too large"):
-        short_fit(omegas + 5e-4 * rng.normal(size=omegas.shape))
+    found = short_fit(omegas + 5e-4 * rng.normal(size=omegas.shape))
+    assert bool(found.status == Status.MISFIT)
+    assert re.search(r"residuals are [45](\.\d)? times the stated noise", str(found))
 
 
 def test_what_cannot_be_weighed_is_refused():
     _, omegas, _ = rates(ASYMMETRIC)
     relative = {"absolute_sigma": False}
     readings = identify.Rates(TS, omegas, 0.01)
+    free = lambda _, gyro: identify.prior(gyro.scale, 0.02)  # noqa: E731
     with pytest.raises(ValueError, match="known beforehand"):
-        identify.fit(BLIND, readings, nuisances={"gyro_scale": 0.02}, **relative)
-    with pytest.raises(ValueError, match="loss"):
-        identify.fit(BLIND, readings, loss="robust", **relative)
+        identify.fit(BLIND, readings, free=free, **relative)
     turns = np.broadcast_to(UNTURNED, (200, 4))
     with pytest.raises(ValueError, match="each kind"):
         identify.fit(BLIND, (readings, identify.Attitudes(TS, turns)))
@@ -944,7 +960,9 @@ def test_the_torque_of_a_gravity_gradient_follows_the_body(rng):
     values = np.asarray(jr.simulate(body, start, ts).states.omega) + 0.01 * rng.normal(size=(60, 3))
     near = np.array([1.0, 1.4, 1.9])
     guess = jr.RigidBody(near, jr.torques.GravityGradient(0.09, orbit))
-    found = identify.fit(guess, identify.Rates(ts, values, 0.01), start=start, shape="moments")
+    found = identify.fit(
+        guess, identify.Rates(ts, values, 0.01), start=start, shape=identify.Moments()
+    )
     errors = np.asarray(found.ratios_errors)
     assert np.all(np.abs(np.asarray(found.ratios) - [1.7, 2.3]) < 4 * errors)
 

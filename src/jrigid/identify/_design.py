@@ -1,12 +1,12 @@
 """What a planned record would tell, the likelihood along a line, and residuals for other losses."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
@@ -15,23 +15,25 @@ from jrigid._numerics import product
 from jrigid._types import Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
+from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
-from jrigid.identify._inputs import refuse
+from jrigid.identify._inputs import refuse, sizes_of
 from jrigid.identify._layout import Layout, first_and_last, times_of, whole
-from jrigid.identify._observations import AbstractObservation, known, of_throws, whitened
-from jrigid.identify._parameters import LogCholesky
+from jrigid.identify._records import of_throws, samples_of
 from jrigid.identify._residuals import (
     Args,
     Options,
-    by_kind,
     evaluation,
     in_any_order,
-    whole_motion,
+    predictions,
+    residual_of,
 )
 from jrigid.identify._result import FitResult
-from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
-from jrigid.identify._unknowns import as_tensor, unknowns_of
+from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
+from jrigid.identify._smoother import Found, Point, Rows, minimise
+from jrigid.identify._stages import ACCURACY, schedule, weigher
+from jrigid.identify._unknowns import unknowns_of
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
 
@@ -52,15 +54,8 @@ class Bound(NamedTuple):
 class _Plan(NamedTuple):
     options: Options
     args: Args
-    point: Point
-    rows: Rows
+    found: Found
     layout: Layout
-
-
-def _with_values(observation: AbstractObservation, values: Array) -> AbstractObservation:
-    """With other values, where there are times."""
-    values = jnp.where(jnp.isfinite(observation.ts)[..., None], values, jnp.nan)
-    return eqx.tree_at(lambda x: x.values, observation, values)
 
 
 def _planned(
@@ -68,78 +63,74 @@ def _planned(
     state: State,
     observations: Any,
     t0: Any,
-    free: Any,
-    nuisances: Sequence[str] | Mapping[str, Any],
+    free: Callable[..., Any] | None,
     scale: str,
-    shape: str | LogCholesky,
+    shape: AbstractShape | None,
 ) -> _Plan:
     """Derivatives of a record that is what the body and the state say."""
     check_type("system", system, RigidBody)
     check_type("state", state, State)
     check_shape("inertia", system.inertia, *INERTIA)
-    stacked = of_throws(observations)
-    torque_free = system.is_free
-    refuse(system, stacked, scale, torque_free)
-    stacked = tuple(_with_values(x, jnp.ones_like(x.values)) for x in stacked)
-    if any(x.sigma is None and x.covariance is None for x in stacked):
+    shape = Tensor() if shape is None else shape
+    check_type("shape", shape, AbstractShape)
+    records = tuple(x.with_values(jnp.ones_like(x.values)) for x in of_throws(observations))
+    refuse(system, records, scale, shape)
+    if not all(x.states_noise for x in records):
         raise ValueError(
             "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
             "not."
         )
-    ts, there = times_of(stacked)
+    one = jnp.ones((), records[0].ts.dtype)
+    samples = tuple(samples_of(x, one) for x in records)
+    ts, there = times_of(samples)
     throws = ts.shape[0]
     attitude = jnp.broadcast_to(state.attitude.astype(ts.dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(ts.dtype), (throws, 3))[:, None]
     rate = jax.lax.stop_gradient(jnp.sqrt(jnp.mean(jnp.sum(omega**2, axis=-1))))
     rate = jnp.where(rate > 0, rate, 1.0)
-    unknowns = unknowns_of(system, free, nuisances, shape, scale, rate)
-    tensor = as_tensor(system.inertia.astype(ts.dtype))
-    unknowns, numbers = unknowns.start(tensor, 1e-9)
+    sensors = tuple(x.sensor for x in records)
+    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
     options = Options(
-        torque_free, any(x.on_attitude for x in stacked) or depends_on_attitude(system), False, 1,
-        "squares", 0, True, None, 0, False,
-    )  # fmt: skip
+        system.is_free, on_attitude, False, 1, False, False, True, "none", None, 0, 0, False
+    )
     layout = whole(ts, there, 1, jnp.asarray(t0, ts.dtype))
-    point = Point(numbers, attitude, omega)
+    unknowns = unknowns_of(
+        (system,), sensors, sizes_of(samples), free, (shape,),
+        scale != "trace" and not shape.absolute, rate,
+    )  # fmt: skip
+    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(ts.dtype))[None], 1e-9)
+    point = Point(numbers, unknowns.own_start(throws, ts.dtype), attitude, omega)
+    args = Args(unknowns, samples, jnp.zeros(throws, int), jnp.ones(6, ts.dtype))
     # Values as they would be seen: a residual of zero.
-    found, _ = unknowns.system_and_gyro(numbers)
-    plain = options._replace(on_attitude=True)
-    weights = tuple(jnp.ones((*x.ts.shape, 1), ts.dtype) for x in stacked)
-    local = jnp.ones(6, ts.dtype)
-    args = Args(unknowns, stacked, weights, local, jnp.ones((), ts.dtype))
-    states = whole_motion(plain, args, layout, point)
-    seen = []
-    for x, part in by_kind(stacked, states):
-        values = jax.vmap(jax.vmap(lambda t, q, w, x=x: x.predict(t, State(q, w), found)))(
-            x.ts, part.attitude, part.omega
-        )
-        seen.append(_with_values(x, jax.lax.stop_gradient(values)))
-    args = args._replace(observations=tuple(seen))
-    one = jnp.ones((), ts.dtype)
-    stage = Stage(0 * one, 2 * one, jnp.asarray(False), jnp.asarray(1))
-    rows, _ = evaluation(options)(point, args, layout, stage)
-    if not torque_free:  # which is followed forward only
+    seen = predictions(options._replace(on_attitude=True), args, layout, point)
+    samples = tuple(
+        samples_of(x.with_values(jax.lax.stop_gradient(values)), one)
+        for x, values in zip(records, seen, strict=True)
+    )
+    args = args._replace(samples=samples)
+    rows, links = evaluation(options, args, layout)(point)
+    if not system.is_free:  # which is followed forward only
         rows = nan_where(jnp.any(layout.start > first_and_last(ts, there)[0][:, None]), rows)
-    return _Plan(options, args, point, rows, layout)
+    yes = jnp.asarray(True)
+    found = Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan))
+    return _Plan(options, args, found, layout)
 
 
 def _information(rows: Rows) -> Array:
     """Of the numbers and of each throw's state."""
-    jg, jl = rows.of_numbers, rows.of_state
+    jg, jl = rows.of_border, rows.of_state
     throws, locals_ = jl.shape[0], jl.shape[-1]
     gg = product("tri,trj->ij", jg, jg)
     gl = product("tri,trl->itl", jg, jl).reshape(gg.shape[0], throws * locals_)
     ll = product("trk,trl->tkl", jl, jl)
     eye = jnp.eye(throws, dtype=jl.dtype)
     blocks = (eye[:, None, :, None] * ll[:, :, None, :]).reshape(2 * (throws * locals_,))
-    return jnp.concatenate(
-        [jnp.concatenate([gg, gl], axis=1), jnp.concatenate([gl.T, blocks], axis=1)]
-    )
+    return jnp.block([[gg, gl], [gl.T, blocks]])
 
 
 def _inverse(rows: Rows) -> Array:
     """Of the information, from the derivatives themselves: their squares lose digits."""
-    jg, jl = rows.of_numbers, rows.of_state
+    jg, jl = rows.of_border, rows.of_state
     throws, count, locals_ = jl.shape
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
@@ -159,10 +150,9 @@ def fisher_information(
     observations: Any,
     *,
     t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Any = None,
-    nuisances: Sequence[str] | Mapping[str, Any] = (),
+    free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: str | LogCholesky = "tensor",
+    shape: AbstractShape | None = None,
 ) -> Float[Array, "all all"]:
     """Fisher information of a planned record, about what `fit` would seek in it.
 
@@ -173,13 +163,12 @@ def fisher_information(
             may be None.
         t0: Time of the state [s], or of that of each throw; under a torque not later than the first
             observation, or all is NaN.
-        free: As for `fit`, and so on.
-        nuisances: Errors of the gyro that will be sought too; with a prior, if given.
+        free: As for `fit`, and so on; nothing of each throw.
         scale: "trace", "known" or "rotor".
         shape: What is known of the tensor.
 
     Returns:
-        The information about the numbers sought (the shape's, the scale's, leaves, nuisances) and
+        The information about the numbers sought (the shape's, the scale's, what is picked) and
         the states at `t0` (rate, then, if it matters, a small turn, of each throw).
 
     Gradients: in the state, the times and the noise; in the tensor they are not to be relied on.
@@ -191,9 +180,7 @@ def fisher_information(
     >>> print(jr.identify.fisher_information(body, start, plan).shape)
     (8, 8)
     """
-    return _information(
-        _planned(system, state, observations, t0, free, nuisances, scale, shape).rows
-    )
+    return _information(_planned(system, state, observations, t0, free, scale, shape).found.rows)
 
 
 def cramer_rao(
@@ -202,10 +189,9 @@ def cramer_rao(
     observations: Any,
     *,
     t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Any = None,
-    nuisances: Sequence[str] | Mapping[str, Any] = (),
+    free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: str | LogCholesky = "tensor",
+    shape: AbstractShape | None = None,
 ) -> Bound:
     """The least errors that a planned record allows: the inverse of `fisher_information`.
 
@@ -214,8 +200,7 @@ def cramer_rao(
         state: State at `t0`.
         observations: The plan.
         t0: Time of the state [s].
-        free: Leaves of the system.
-        nuisances: Errors of the gyro.
+        free: What is sought beside the inertia.
         scale: "trace", "known" or "rotor".
         shape: What is known of the tensor.
 
@@ -234,9 +219,9 @@ def cramer_rao(
     >>> print(f"{jax.jit(error)(jnp.array([0.5, 1.0, 0.3])):.5f}")
     0.00378
     """
-    plan = _planned(system, state, observations, t0, free, nuisances, scale, shape)
-    covariance = _inverse(plan.rows)
-    numbers, unknowns = plan.point.numbers, plan.args.unknowns
+    plan = _planned(system, state, observations, t0, free, scale, shape)
+    covariance = _inverse(plan.found.rows)
+    numbers, unknowns = plan.found.point.numbers, plan.args.unknowns
 
     def ratios(numbers: Array) -> Array:
         moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
@@ -253,10 +238,9 @@ def identifiability(
     observations: Any,
     *,
     t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Any = None,
-    nuisances: Sequence[str] | Mapping[str, Any] = (),
+    free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: str | LogCholesky = "tensor",
+    shape: AbstractShape | None = None,
 ) -> FitResult:
     """What a planned record would tell: a `FitResult` before there is a record.
 
@@ -268,8 +252,7 @@ def identifiability(
         state: State at `t0`.
         observations: The plan.
         t0: Time of the state [s].
-        free: Leaves of the system.
-        nuisances: Errors of the gyro.
+        free: What is sought beside the inertia.
         scale: "trace", "known" or "rotor".
         shape: What is known of the tensor.
 
@@ -282,15 +265,16 @@ def identifiability(
     >>> plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
     >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
-    >>> told = jr.identify.identifiability(top, start, plan, nuisances="gyro_scale")
+    >>> free = lambda body, gyro: gyro.scale
+    >>> told = jr.identify.identifiability(top, start, plan, free=free)
     >>> print(told.null_directions)
     ('overall scale', 'I3/I1 against gyro scale')
     """
-    plan = _planned(system, state, observations, t0, free, nuisances, scale, shape)
-    seen = tuple(known(x).astype(plan.rows.residual.dtype) for x in plan.args.observations)
+    plan = _planned(system, state, observations, t0, free, scale, shape)
+    kept = tuple(jnp.any(x.weight > 0, axis=-1).astype(x.ts.dtype) for x in plan.args.samples)
     return conclude(
-        plan.options, plan.args._replace(weights=seen), plan.point, plan.rows, seen,
-        jnp.asarray(True), jnp.full(1, jnp.nan), plan.layout, RESULTS.successful,
+        plan.options, plan.args, plan.layout, plan.found, kept, jnp.ones(len(kept)), jnp.zeros(3),
+        RESULTS.successful,
     )  # fmt: skip
 
 
@@ -326,28 +310,32 @@ def profile(
     return _profile(result, function, values)
 
 
-@eqx.filter_jit
+@quick_jit
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
-    args, options = result.problem, result.options
+    args, options = result.problem, result.options._replace(shooting=False, dense=False, nodes=1)
     slope = jax.grad(lambda x: function(result.unknowns.inertia(x)))(result.numbers)
-    size = result.numbers.size
-    error = jnp.sqrt(slope @ result.covariance[:size, :size] @ slope)
-    ts, there = times_of(args.observations)
+    error = jnp.sqrt(slope @ result.numbers_covariance @ slope)
+    ts, there = times_of(args.samples)
     layout = whole(ts, there, 1, result.t0)
-    point = Point(result.numbers, result.state.attitude[:, None], result.state.omega[:, None])
-    one = jnp.ones(1, ts.dtype)
-    stages = Stage(0 * one, 2 * one, jnp.asarray([False]), jnp.asarray([100]))
-    evaluate = evaluation(options._replace(shooting=False, nodes=1))
-
-    noise = jnp.ones((), ts.dtype) if options.noise_known else result.reduced_chi_square
+    start = result.state
+    point = Point(result.numbers, result.own_numbers, start.attitude[:, None], start.omega[:, None])
+    last = jtu.tree_map(lambda x: x[0, -1], schedule(options, ts.dtype))
+    kept = tuple(x.astype(ts.dtype) for x in result.kept)
+    weigh = weigher(options, args, layout, kept, result.scales, last)
+    no, noise = jnp.asarray(False), result.inflation
 
     def at(value: Array) -> Array:
         held = args.unknowns.holding(function, value, 1e-3 * error / jnp.sqrt(noise))
-        _, rows, settled, *_ = levenberg_marquardt(
-            evaluate, args._replace(unknowns=held), point, layout, stages,
-            lambda _: ACCURACY * noise, jnp.asarray(0), jnp.zeros(1, ts.dtype),
-        )  # fmt: skip
-        return jnp.where(settled, (rows.cost - result.chi_square) / noise, jnp.nan)
+        evaluate = evaluation(options, args._replace(unknowns=held), layout)
+        shapes = jax.eval_shape(evaluate, point)
+        rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        begin = Found(point, rows, links, ~no, no, jnp.asarray(0), jnp.full(1, jnp.nan))
+        white = jnp.zeros((*links.gap.shape, links.gap.shape[-1]), ts.dtype)
+        found = minimise(
+            evaluate, weigh, white, begin, lambda _: ACCURACY * noise, jnp.asarray(100)
+        )
+        growth = weigh(found.rows)[1] - result.chi_square
+        return jnp.where(found.settled, growth / noise, jnp.nan)
 
     return jax.lax.map(at, values)
 
@@ -390,24 +378,27 @@ def residuals(
     """
     check_type("system", system, RigidBody)
     check_type("state", state, State)
-    stacked = of_throws(observations)
-    ts, _ = times_of(stacked)
+    records = of_throws(observations)
+    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
+    ts, _ = times_of(samples)
     throws = ts.shape[0]
     begin = jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
     attitude = jnp.broadcast_to(state.attitude, (throws, 4))
     omega = jnp.broadcast_to(state.omega, (throws, 3))
-    torque_free = system.is_free
 
     def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
-        if torque_free:
+        if system.is_free:
             return free_rotation(system.inertia, State(q, w), times, t0=begin).states
         return in_any_order(
             lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
             times,
         )
 
-    states = jax.vmap(motion)(attitude, omega, ts, begin)
-    blocks = []
-    for x, part in by_kind(stacked, states):
-        blocks.append(whitened(x, part, lambda w: w, system).reshape(throws, -1))
+    states, start, blocks = jax.vmap(motion)(attitude, omega, ts, begin), 0, []
+    for record, x in zip(records, samples, strict=True):
+        part = slice(start, start + x.ts.shape[1])
+        start = part.stop
+        seen = State(states.attitude[:, None, part], states.omega[:, None, part])
+        rows = jax.vmap(lambda x, y, s=record.sensor: residual_of(s, system, x, y, jnp.ones(1)))
+        blocks.append(rows(x, seen).reshape(throws, -1))
     return jnp.concatenate(blocks, axis=1)

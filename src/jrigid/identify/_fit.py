@@ -1,67 +1,79 @@
 """fit(): inertia, and what else is asked for, from what was observed."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
-from jrigid._checks import Findings, check_option, settle
+from jrigid._checks import Findings, check_option, check_type, settle
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
-from jrigid.identify._errors import GATE, conclude
+from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
-from jrigid.identify._inputs import findings_of, local_scales, refuse, start_of, typical_rate
+from jrigid.identify._inputs import (
+    findings_of,
+    noise_of,
+    refuse,
+    sizes_of,
+    start_of,
+    systems_of,
+    typical_rate,
+)
 from jrigid.identify._layout import (
     Layout,
-    Samples,
+    Told,
     angle_turned,
     node_states,
-    samples_of,
     segments,
     segments_needed,
     times_of,
+    told_by,
     whole,
 )
-from jrigid.identify._observations import (
-    AbstractObservation,
-    Attitudes,
-    Rates,
-    known,
-    of_throws,
-)
-from jrigid.identify._parameters import LogCholesky
+from jrigid.identify._records import Record, of_throws, samples_of
 from jrigid.identify._residuals import Args, Options, evaluation
 from jrigid.identify._result import FitResult, Status
-from jrigid.identify._shooting import ACCURACY, Point, Rows, Stage, levenberg_marquardt
-from jrigid.identify._starts import linear_start
-from jrigid.identify._unknowns import Unknowns, as_tensor, unknowns_of
+from jrigid.identify._sensors import AbstractSensor
+from jrigid.identify._shapes import AbstractShape, Tensor
+from jrigid.identify._smoother import Found, Point, minimise
+from jrigid.identify._stages import (
+    FAINT,
+    Stage,
+    evidence_of,
+    first_level,
+    link_whitener,
+    misfit,
+    next_level,
+    rejected,
+    scales_of,
+    schedule,
+    weigher,
+)
+from jrigid.identify._starts import linear_starts
+from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
-_LOSSES = ("squares", "robust")
-# Weights of the links, in units of the noise; and a slower way for fits that went wrong.
-_WEIGHTS = (1.0, 10.0, 100.0, 1e3, 1e4)
-_SLOW_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
-_IN_A_STAGE = 15
-_REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
-_SPOILT = 0.25  # fraction of samples rejected that gives a throw up
+_LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
 _HISTORY = 1024
 
 
 def fit(
-    system: RigidBody,
+    system: RigidBody | Sequence[RigidBody],
     observations: Any,
     *,
-    free: Any = None,
-    nuisances: Sequence[str] | Mapping[str, Any] = (),
+    free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: str | LogCholesky = "tensor",
+    shape: AbstractShape | None = None,
     start: tuple[Any, State | None] | State | None = None,
+    unmodelled: Any = 0.0,
     loss: str = "squares",
     absolute_sigma: bool = True,
+    bodies: Sequence[int] | None = None,
     motion: Callable[..., State] | None = None,
     doublings: int = 8,
     max_steps: int = 400,
@@ -76,33 +88,33 @@ def fit(
 
     Args:
         system: The body: its torque, and what is known beforehand of the tensor (see `scale` and
-            `shape`); the tensor itself is only a start, and none is needed for a free body.
-        observations: A `Rates`, `Attitudes`, `Directions`, `AngularMomenta` or `Observed`; a tuple
-            of several of one motion; or a list with one entry (a tuple, or a single one) for each
-            throw of the same body. Observations with an axis of throws in front of their times do
-            as well as a list.
-        free: Further parameters that are sought: a function of the system that picks arrays
-            (`lambda body: body.torque.coefficient`), or a filter, a tree of booleans as for
-            `equinox.filter`.
-        nuisances: Errors of the gyro that are sought too: "gyro_bias", "gyro_scale" (one factor),
-            "gyro_scales" (one for each axis), "gyro_misalignment" (a small turn from the axes of
-            everything else), "gyro_matrix", "gyro_handedness". In a mapping each may have a
-            standard deviation known beforehand.
+            `shape`); the tensor itself is only a start, and none is needed for a free body. A
+            sequence has one for each throw, of the same kind: its own record of a wheel, say.
+        observations: A `Record` (`Rates`, `Attitudes`, ...); a tuple of several of one motion; or a
+            list with one entry (a tuple, or a single one) for each throw. Records with an axis of
+            throws in front of their times do as well as a list.
+        free: What is sought beside the inertia: a function of the system and the sensors that picks
+            arrays of theirs, `lambda body, gyro: (body.torque.coefficient, gyro.bias)`; of those
+            `prior(array, sigma)` is known beforehand, `each(array)` sought anew in each throw.
+            Drags and what else cannot be negative are kept positive.
         scale: What sets the scale of the tensor. "trace": nothing does, it keeps the trace of the
             system's; "known": a torque or a momentum whose size is known; "rotor": the known
             momentum of a `torques.Rotor`.
-        shape: What is known of the tensor. "tensor": nothing, any real body; "moments": the
-            principal axes, those of the system's; "symmetric": two moments are equal; "top": they
-            are, and the axis is body axis 3; "flat": all mass in a plane; "fixed": all of it. Or a
-            `LogCholesky`: ten numbers of the body about a fixed point, of which any are frozen.
+        shape: What is known of the tensor: `Tensor()`, nothing, any real body; `Moments()`,
+            `Symmetric()`, `Top()`, `Flat()`, `Fixed()`, a `LogCholesky` of ten numbers about a
+            fixed point, or one's own.
         start: Where to start: a `State` at each throw's first sample (`t0` of what is returned), of
             one throw or with an axis of throws in front; or (inertia or None, State or None).
             Needed where the attitude matters and was not observed: an attitude nearer than about
             half a turn will do.
+        unmodelled: A torque that no model has, white, of this level s [N m sqrt(s)] (its spectral
+            density is s^2), for all body axes or for each; or "estimate", or "estimate per axis".
         loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard deviations
             are left out, throws with more than a quarter of such samples altogether, and the rest
             is fitted by squares.
         absolute_sigma: False: the noise stated is relative, its level is that of the residuals.
+        bodies: Which body each throw is of, counted from 0, where there are several; they share
+            sensors and what else `free` picks.
         motion: `(system, state, ts, t0) -> State` in place of the exact flow or `simulate`; it must
             allow forward mode.
         doublings: Where no start can be made from the observations, the first 2^-doublings of the
@@ -133,68 +145,40 @@ def fit(
     >>> print(found.null_directions)
     ('overall scale',)
     """
-    check_option("loss", loss, _LOSSES)
-    if not isinstance(system, RigidBody):
-        raise ValueError(
-            "Argument `system` must be a RigidBody (of a body in flight, rotation about its centre "
-            f"of mass), but it is {type(system).__name__}."
-        )
-    stacked = of_throws(observations)
-    start_tensor, start_state = start_of(start)
-    torque_free = system.is_free
-    refuse(system, stacked, scale, torque_free)
-    throws = stacked[0].ts.shape[0]
-    on_attitude = any(x.on_attitude for x in stacked) or depends_on_attitude(system)
-    if on_attitude and start_state is None and not any(isinstance(x, Attitudes) for x in stacked):
-        raise ValueError(
-            "Argument `start` must hold a State whose attitude the fit can start from, since the "
-            "motion or an observation depends on the attitude and none was observed, but it does "
-            "not."
-        )
-    observed = any(isinstance(x, Rates | Attitudes) for x in stacked)
-    internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
-    shooting = observed and motion is None and not internal
-    if not shooting and start_state is None:
-        raise ValueError(
-            "Argument `start` must hold a State to start from, since neither rates nor attitudes "
-            "were observed, or they do not tell the whole state, but it does not."
-        )
-    if start_state is not None:
-        start_state = State(
-            jnp.broadcast_to(start_state.attitude, (throws, 4)),
-            jnp.broadcast_to(start_state.omega, (throws, 3)),
-        )
-    prepared = _prepare(system, stacked, start_tensor, start_state, on_attitude)
-    given = system, stacked, prepared.samples, start_tensor, start_state
-    stacked, samples, rate, angle, input_result = settle(
-        prepared, throw, lambda: findings_of(*given)
-    )
-    stated = all(x.sigma is not None or x.covariance is not None for x in stacked)
-    noise_known = absolute_sigma and stated
-    if not stated and len(stacked) > 1:
-        raise ValueError(
-            "Argument `observations` must state the noise of each kind where there are several, "
-            "but one has neither `sigma` nor `covariance`: they cannot be weighed."
-        )
-    if not noise_known and loss == "robust":
-        raise ValueError(
-            "Argument `loss` must be 'squares' where the noise is not stated or only relative, but "
-            "it is 'robust': nothing says what is too far off."
-        )
-    unknowns = unknowns_of(system, free, nuisances, shape, scale, rate)
-    if not noise_known and any(prior is not None for prior in unknowns.priors):
-        raise ValueError(
-            "Argument `nuisances` must not state what is known beforehand where the noise of the "
-            "record is not stated or only relative, but it does: the two cannot be weighed."
-        )
-    nodes = 1
-    if shooting and samples is not None:
-        nodes = segments_needed(angle, samples.ts.shape[1])
-    options = Options(
-        torque_free and motion is None, on_attitude, shooting,
-        nodes, loss, max_steps, noise_known, motion, doublings, progress,
+    check_option("loss", loss, ("squares", "robust"))
+    records = of_throws(observations)
+    throws = records[0].ts.shape[0]
+    systems = systems_of(system, throws)
+    shape = Tensor() if shape is None else shape
+    check_type("shape", shape, AbstractShape)
+    refuse(systems[0], records, scale, shape)
+    level_kind, level = _level(unmodelled)
+    tensor, state = start_of(start, throws)
+    options = _options(
+        systems[0], records, state, motion, level_kind, loss == "robust", absolute_sigma,
+        doublings, max_steps, progress,
     )  # fmt: skip
-    found = _fit(options, unknowns, stacked, samples, start_tensor, start_state, input_result)
+    each_body = jnp.zeros(throws, int) if bodies is None else jnp.asarray(bodies)
+    count = 1 if bodies is None else 1 + max(bodies)
+    given = systems, records, tensor, state, options.on_attitude
+    prepared = settle(_prepare(*given), throw, lambda: findings_of(*given))
+    length = 0.0 if options.dense else _LENGTHS[options.free_motion]
+    if options.shooting and prepared.told is not None:
+        nodes = segments_needed(prepared.angle, prepared.told.ts.shape[1], length)
+        options = options._replace(nodes=nodes)
+    unknowns = unknowns_of(
+        systems, tuple(x.sensor for x in records), prepared.sizes, free, (shape,) * count,
+        scale != "trace" and not shape.absolute, prepared.rate,
+    )  # fmt: skip
+    if not options.noise_known and any(x.sigma is not None for x in unknowns.sought):
+        raise ValueError(
+            "Argument `free` must not state what is known beforehand where the noise of the record "
+            "is not stated or only relative, but it does: the two cannot be weighed."
+        )
+    found = _fit(
+        options, length, unknowns, records, prepared, each_body, tensor, state,
+        jnp.asarray(level, prepared.rate.dtype),
+    )  # fmt: skip
     if not throw:
         return found
     findings = Findings()
@@ -203,238 +187,248 @@ def fit(
     return findings.guard(found, throw)
 
 
-class _Prepared(NamedTuple):
-    """Observations, what tells the state on the way, the angle it turns, and what is wrong."""
+def _level(unmodelled: Any) -> tuple[str, Any]:
+    """What is to be done about the unmodelled torque, and its level for each axis."""
+    if isinstance(unmodelled, str):
+        check_option("unmodelled", unmodelled, ("estimate", "estimate per axis"))
+        return unmodelled, np.zeros(3)
+    level = np.asarray(unmodelled, float)
+    if level.shape not in ((), (3,)) or not np.all(np.isfinite(level)) or np.any(level < 0):
+        raise ValueError(
+            "Argument `unmodelled` must be a level that is not negative, one for each body axis, "
+            f"'estimate' or 'estimate per axis', but it is {unmodelled!r}."
+        )
+    level = np.broadcast_to(level, 3)
+    if np.any(level > 0) and not np.all(level > 0):
+        raise ValueError(
+            "Argument `unmodelled` must be positive for all axes or for none, but it is "
+            f"{unmodelled!r}."
+        )
+    return ("known" if np.any(level > 0) else "none"), level
 
-    observations: tuple[AbstractObservation, ...]
-    samples: Samples | None
+
+def _options(
+    system: RigidBody,
+    records: tuple[Record, ...],
+    state: State | None,
+    motion: Any,
+    level: str,
+    robust: bool,
+    absolute_sigma: bool,
+    doublings: int,
+    max_steps: int,
+    progress: bool,
+) -> Options:
+    """How the fit goes, as far as that is known beforehand; ValueError if it cannot."""
+    sensors = [x.sensor for x in records]
+    by_attitude = any(_tells(x, "attitude") for x in records)
+    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
+    if on_attitude and state is None and not by_attitude:
+        raise ValueError(
+            "Argument `start` must hold a State whose attitude the fit can start from, since the "
+            "motion or an observation depends on the attitude and none was observed, but it does "
+            "not."
+        )
+    internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
+    observed = by_attitude or any(_tells(x, "rates") for x in records)
+    shooting = observed and motion is None and not internal
+    if not shooting and state is None:
+        raise ValueError(
+            "Argument `start` must hold a State to start from, since neither rates nor attitudes "
+            "were observed, or they do not tell the whole state, but it does not."
+        )
+    if level != "none" and not shooting:
+        raise ValueError(
+            "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, a "
+            "part moves inside the body or `motion` is given, but it is not."
+        )
+    stated = all(x.states_noise for x in records)
+    if not stated and len(records) > 1:
+        raise ValueError(
+            "Argument `observations` must state the noise of each kind where there are several, "
+            "but one has neither `sigma` nor `covariance`: they cannot be weighed."
+        )
+    return Options(
+        system.is_free and motion is None, on_attitude, shooting, 1, level != "none", robust,
+        absolute_sigma and stated, level, motion, doublings, max_steps, progress,
+    )  # fmt: skip
+
+
+def _tells(record: Record, what: str) -> bool:
+    """Whether a sensor tells of rates, or attitudes, by itself."""
+    return getattr(type(record.sensor), what) is not getattr(AbstractSensor, what)
+
+
+class _Prepared(NamedTuple):
+    """What tells the state on the way, sizes of rates and values, and what is wrong."""
+
+    told: Told | None
     rate: Array
+    sizes: tuple[Array, ...]
     angle: Array
     result: Any
 
 
 @eqx.filter_jit
 def _prepare(
-    system: Any,
-    stacked: tuple[AbstractObservation, ...],
-    tensor: Any,
-    state: State | None,
-    on_attitude: bool,
+    systems: Any, records: tuple[Record, ...], tensor: Any, state: State | None, on_attitude: bool
 ) -> _Prepared:
-    ts, _ = times_of(stacked)
-    attitude0 = None if state is None or not on_attitude else state.attitude.astype(ts.dtype)
-    samples = samples_of(stacked, attitude0)
-    rate = typical_rate(samples, state, ts.dtype)
-    findings = findings_of(system, stacked, samples, tensor, state)
-    angle = jnp.zeros(()) if samples is None else jnp.max(angle_turned(samples)[:, -1])
-    return _Prepared(stacked, samples, rate, angle, findings.result)
-
-
-class _Phase(NamedTuple):
-    """One pass: segments, stages, whether only for fits that went wrong, and after a rejection."""
-
-    layout: Layout
-    stages: Stage
-    again: Array
-    reject: Array
-
-
-def _schedule(stages: list[tuple[float, float, int]], robust: bool, length: int, dtype: Any) -> Any:
-    """Stages (weight of the links, horizon, steps), filled up to a length with none."""
-    filled = stages + [(0.0, 2.0, 0)] * (length - len(stages))
-    weight, horizon, steps = (jnp.asarray(x) for x in zip(*filled, strict=True))
-    return Stage(
-        weight.astype(dtype), horizon.astype(dtype), jnp.full(length, robust), steps.astype(int)
-    )
+    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
+    dtype = samples[0].ts.dtype
+    attitude0 = None if state is None or not on_attitude else state.attitude.astype(dtype)
+    told = told_by(records, samples, attitude0)
+    rate = typical_rate(told, state, dtype)
+    findings = findings_of(systems, records, tensor, state, on_attitude)
+    angle = jnp.zeros(()) if told is None else jnp.max(angle_turned(told)[:, -1])
+    return _Prepared(told, rate, sizes_of(samples), angle, findings.result)
 
 
 @quick_jit
 def _fit(
     options: Options,
+    length: float,
     unknowns: Unknowns,
-    stacked: tuple[AbstractObservation, ...],
-    samples: Samples | None,
-    start_tensor: Any,
-    start_state: State | None,
-    input_result: Any,
+    records: tuple[Record, ...],
+    prepared: _Prepared,
+    bodies: Array,
+    tensor: Any,
+    state: State | None,
+    level: Array,
 ) -> FitResult:
-    ts, there = times_of(stacked)
-    dtype = ts.dtype
-    throws, nodes = ts.shape[0], options.nodes
-    tensor = start_tensor
-    if tensor is None:
-        tensor = as_tensor(unknowns.original.inertia.astype(dtype))
-        sought = unknowns.shape != "fixed" and unknowns.ten is None
-        if samples is not None and sought and options.motion is None:
-            by_torque = unknowns.scaled and not options.free_motion
-            trace = None if by_torque else jnp.trace(tensor)
-            tensor = _linear_start(options, unknowns, samples, trace)
-    unknowns, numbers = unknowns.start(tensor.astype(dtype))
-    rounder = unknowns.rounder(tensor.astype(dtype), numbers)
+    """Lane after lane under vmap: none waits for the slowest."""
+    arrays, rest = eqx.partition(
+        (unknowns, records, prepared, bodies, tensor, state, level), eqx.is_array
+    )
 
-    single = whole(ts, there, nodes)
-    if options.shooting and samples is not None:
-        cut, opening = segments(ts, there, samples, nodes)
-        omega, attitude = node_states(samples, opening, cut.start)
-    else:
-        cut, attitude = single, None
-        assert start_state is not None
-        omega = jnp.broadcast_to(start_state.omega.astype(dtype)[..., None, :], (throws, nodes, 3))
-        attitude = jnp.broadcast_to(
-            start_state.attitude.astype(dtype)[..., None, :], (throws, nodes, 4)
+    @jax.custom_batching.sequential_vmap
+    def one(arrays: Any) -> FitResult:
+        return _fitted(options, length, *eqx.combine(arrays, rest))
+
+    return one(arrays)
+
+
+def _fitted(
+    options: Options,
+    length: float,
+    unknowns: Unknowns,
+    records: tuple[Record, ...],
+    prepared: _Prepared,
+    bodies: Array,
+    tensor: Any,
+    state: State | None,
+    level: Array,
+) -> FitResult:
+    told, rate = prepared.told, prepared.rate
+    guess = 0.02 * prepared.sizes[0]
+    samples = tuple(samples_of(x, guess) for x in records)
+    ts, there = times_of(samples)
+    noise = noise_of(records, samples, rate)
+    throws, dtype = ts.shape[0], ts.dtype
+    starts = linear_starts(options, unknowns, told, bodies, tensor)
+    unknowns, numbers = unknowns.start(starts[0])
+    other = unknowns.start(starts[1], 0.1)[1]
+    single = whole(ts, there, options.nodes)
+    cut, attitude, omega = single, None, None
+    if options.shooting and told is not None:
+        cut, opening = segments(ts, there, told, options.nodes, length)
+        omega, attitude = node_states(told, opening, cut.start)
+    elif state is not None:
+        omega, attitude = (
+            jnp.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
+            for x in (state.omega, state.attitude)
         )
+    assert omega is not None
     if attitude is None:
-        attitude = jnp.zeros((throws, nodes, 4), dtype).at[..., 0].set(1)
-    point = Point(numbers, attitude, omega)
+        attitude = jnp.zeros((throws, options.nodes, 4), dtype).at[..., 0].set(1)
+    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
+    args = Args(unknowns, samples, bodies, noise)
+    way = _search(options, args, single, cut, point, other, level)
+    layout = cut if options.dense or not options.free_motion else single
+    return conclude(options, args, layout, way.found, way.kept, way.scales, way.level,
+                    prepared.result)  # fmt: skip
 
-    of_rates, of_angles, guess = local_scales(stacked, unknowns.rate)
-    local = jnp.concatenate([jnp.full(3, of_rates), jnp.full(3, of_angles)])
-    weights = tuple(known(x).astype(dtype) for x in stacked)
-    args = Args(unknowns, stacked, weights, local, guess)
-    evaluate = evaluation(options)
 
-    robust = options.loss == "robust"
-    links = [(w, 2.0, _IN_A_STAGE) for w in _WEIGHTS]
-    free = [(0.0, 2.0, options.max_steps)]
-    if not options.shooting:  # the beginning first, then each time twice as much
-        early = [2.0**-k for k in range(options.doublings, 0, -1)]
-        free = [(0.0, part, _IN_A_STAGE) for part in early] + free
-    slow = [(w, 2.0, 2 * _IN_A_STAGE) for w in _SLOW_WEIGHTS]
-    length = max(len(slow), len(free))
+class _Way(NamedTuple):
+    """Where a search stands."""
 
-    def phase_of(layout: Layout, stages: list, soft: bool, again: bool, reject: bool) -> _Phase:
-        flags = (jnp.asarray(x) for x in (again, reject))
-        return _Phase(layout, _schedule(stages, soft, length, dtype), *flags)
+    found: Found
+    kept: tuple[Array, ...]  # 1 or 0 for each sample
+    scales: Array  # of the residuals of each record, in units of the noise
+    level: Array  # of the unmodelled torque
+    done: Array  # the level has come to rest
 
-    phases = [phase_of(single, free, robust, False, False)]
-    if options.shooting:
-        phases = [phase_of(cut, links, robust, False, False), *phases]
-        if options.free_motion:
-            phases += [
-                phase_of(cut, slow, robust, True, False),
-                phase_of(single, free, robust, True, False),
-            ]
-    if robust:
-        phases.append(phase_of(single, free[-1:], False, False, True))
 
-    def accuracy(rows: Rows) -> Array:
-        if options.noise_known:
-            return jnp.asarray(ACCURACY, dtype)
-        return ACCURACY * rows.cost / jnp.maximum(jnp.sum(rows.residual != 0), 1).astype(dtype)
+def _search(
+    options: Options,
+    args: Args,
+    single: Layout,
+    cut: Layout,
+    point: Point,
+    other: Array,
+    level: Array,
+) -> _Way:
+    """Through all stages; if that ends wrong, once more, more slowly, from other numbers."""
+    stages = schedule(options, point.omega.dtype)
 
-    def run(
-        point: Point, kept: tuple[Array, ...], phase: _Phase, steps: Array, history: Array
-    ) -> tuple:
-        now = args._replace(weights=kept)
-        return levenberg_marquardt(
-            evaluate, now, point, phase.layout, phase.stages, accuracy, steps, history,
-            options.progress,
+    def run(way: _Way, stage: Stage) -> _Way:
+        layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
+        found, kept, scales, level, done = way
+        if options.robust:
+            scales = scales_of(options, args, found, kept)
+            fewer = rejected(args, found.rows, kept, scales)
+            kept = jtu.tree_map(lambda a, b: jnp.where(stage.reject, a, b), fewer, kept)
+        weigh = weigher(options, args, layout, kept, scales, stage)
+        if options.level == "known":
+            level = first * (known / first) ** stage.weight
+        white = link_whitener(options, args, layout, found.point.numbers, stage.weight, level)
+
+        def enough(cost: Array) -> Array:
+            count = jnp.maximum(sum(jnp.sum(w) for w in kept), 1.0)
+            return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
+
+        found = found._replace(fresh=found.fresh | stage.fresh)
+        evaluate = evaluation(options, args, layout)
+        found = minimise(evaluate, weigh, white, found, enough, stage.steps)
+        if options.progress:
+            jax.debug.print(
+                "fit: {} steps, links {}, record {}: chi-square {}",
+                found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
+            )  # fmt: skip
+        if options.level.startswith("estimate"):
+            weights, _ = weigh(found.rows)
+            seen = evidence_of(layout, found, weights, white)
+            new, still = next_level(options, level, FAINT * first, seen)
+            level = jnp.where(stage.last, level, new)
+            done = done | still
+        return _Way(found, kept, scales, level, done)
+
+    def one(way: _Way, stage: Stage) -> tuple[_Way, None]:
+        skip = (stage.steps == 0) | (way.done & ~stage.last)
+        return jax.lax.cond(skip, lambda way, _: way, run, way, stage), None
+
+    dtype = point.omega.dtype
+    first, known = first_level(args, cut, point.numbers), level
+    shapes = eqx.filter_eval_shape(evaluation(options, args, cut), point)
+    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    no, none = jnp.asarray(False), jnp.asarray(0)
+    begin = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
+    kept = tuple(jnp.any(x.weight > 0, axis=-1).astype(dtype) for x in args.samples)
+    begin = _Way(begin, kept, jnp.ones(len(kept), dtype), 10 * first, no)
+
+    def attempt(carry: tuple[Array, _Way, Array]) -> tuple[Array, _Way, Array]:
+        tried, best, wrong = carry
+        numbers = jnp.where(tried > 0, other, point.numbers)
+        start = begin.found._replace(
+            point=point._replace(numbers=numbers), steps=best.found.steps,
+            history=best.found.history,
         )  # fmt: skip
+        now = jtu.tree_map(lambda x: x[tried], stages)
+        end, _ = jax.lax.scan(one, begin._replace(found=start), now)
+        off = misfit(options, args, end.found, end.kept)
+        best = jtu.tree_map(lambda a, b: jnp.where(off < wrong, a, b), end, best)
+        return tried + 1, best, jnp.minimum(off, wrong)
 
-    counts = [x.ts.shape[1] for x in stacked]
-    widths = [w.shape[-1] for w in weights]
-
-    def rejecting(rows: Rows) -> tuple[Array, ...]:
-        found, at = [], 0
-        for weight, count, width in zip(weights, counts, widths, strict=True):
-            part = rows.residual[:, at : at + count * width].reshape(throws, count, width)
-            at += count * width
-            soft = jnp.sum(part * part, axis=-1)  # s / (1 + s / c)
-            square = soft / jnp.maximum(1 - soft / (4.0 * width), 1e-6)
-            good = square < width + _REJECTED
-            seen = jnp.any(weight > 0, axis=-1)
-            rejected = jnp.sum(seen & ~good, axis=1).astype(dtype)
-            bad = rejected > _SPOILT * jnp.sum(seen, axis=1).astype(dtype)
-            good = (good & ~bad[:, None]).astype(dtype)
-            found.append(weight * good[..., None])
-        # A throw given up by one kind of observation is given up by all.
-        left = jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in found])
-        had = jnp.stack([jnp.any(w > 0, axis=(1, 2)) for w in weights])
-        spoilt = jnp.any(had & ~left, axis=0)
-        alive = (~spoilt).astype(dtype)[:, None, None]
-        return tuple(w * alive for w in found)
-
-    total = sum(jnp.sum(w) for w in weights)
-
-    def went_wrong(rows: Rows, settled: Array) -> Array:
-        if not options.noise_known or robust:
-            return ~settled
-        freedom = jnp.maximum(total - numbers.size - 3 * throws, 1.0)
-        return rows.cost > freedom * (1 + GATE * jnp.sqrt(2 / freedom))
-
-    none, blank = jnp.asarray(0), jnp.full(_HISTORY, jnp.nan, dtype)
-    if options.free_motion:  # all phases through one loop, compiled once
-        stack = jtu.tree_map(lambda *x: jnp.stack(x), *phases)
-        shapes = eqx.filter_eval_shape(lambda p: run(p, weights, phases[0], none, blank)[1], point)
-        empty = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-        def step(carry: tuple, phase: _Phase) -> tuple[tuple, None]:
-            now, kept, rows, settled, steps, history, wrong = carry
-            if robust:
-                new = rejecting(rows)
-                kept = tuple(jnp.where(phase.reject, a, b) for a, b in zip(new, kept, strict=True))
-            # A second attempt, for those that need it, begins at a body further from flat.
-            linked = phase.stages.weight[0] > 0
-            wrong = jnp.where(phase.again & linked, went_wrong(rows, settled), wrong)
-            skip = phase.again & ~wrong
-            begin = jtu.tree_map(
-                lambda x, y: jnp.where(phase.again & linked & wrong, x, y),
-                point._replace(numbers=rounder),
-                now,
-            )
-            stages = phase.stages._replace(steps=jnp.where(skip, 0, phase.stages.steps))
-            found = run(begin, kept, phase._replace(stages=stages), steps, history)
-            now, rows, settled, steps, history = jtu.tree_map(
-                lambda new, old: jnp.where(skip, old, new),
-                found,
-                (now, rows, settled, steps, history),
-            )
-            return (now, kept, rows, settled, steps, history, wrong), None
-
-        no = jnp.asarray(False)
-        carry = (point, weights, empty, no, none, blank, no)
-        (point, weights_kept, rows, settled, steps, history, _), _ = jax.lax.scan(
-            step, carry, stack
-        )
-    else:
-        weights_kept, steps, history = weights, none, blank
-        rows, settled = None, jnp.asarray(False)
-        for phase in phases:
-            if rows is not None and robust:
-                new = rejecting(rows)
-                weights_kept = tuple(
-                    jnp.where(phase.reject, a, b) for a, b in zip(new, weights_kept, strict=True)
-                )
-            if phase.layout is single:  # the whole motion is integrated, from the first node
-                first = single._replace(
-                    start=single.start[:, :1], end=single.end[:, :1], linked=single.linked[:, :1]
-                )
-                phase = phase._replace(layout=first)
-                point = Point(point.numbers, point.attitude[:, :1], point.omega[:, :1])
-            point, rows, settled, steps, history = run(point, weights_kept, phase, steps, history)
-    assert rows is not None
-    final = args._replace(weights=weights_kept)
-    return conclude(
-        options, final, point, rows, weights, settled, history, single, input_result,
-    )  # fmt: skip
-
-
-def _linear_start(
-    options: Options, unknowns: Unknowns, samples: Samples, trace: Array | None
-) -> Array:
-    """A tensor from linear equations in it: the weak form, or, by attitudes, the momentum."""
-    by_attitude = options.free_motion and samples.attitude is not None and samples.ts.shape[1] < 40
-    torque = None
-    if not options.free_motion:
-        torque_of = unknowns.original.torque_on
-
-        def at(t: Array, q: Array, w: Array) -> Array:
-            return jnp.asarray(torque_of(t, State(q, w), None), w.dtype)
-
-        unit = jnp.zeros((*samples.ts.shape, 4), samples.ts.dtype).at[..., 0].set(1)
-        attitude = unit if samples.attitude is None else samples.attitude
-        torque = jax.vmap(jax.vmap(at))(samples.ts, attitude, samples.omega)
-    return linear_start(
-        samples.ts, samples.there, samples.omega,
-        samples.attitude if by_attitude else None, torque, trace,
-    )  # fmt: skip
+    attempts = stages.weight.shape[0]
+    carry = none, begin, jnp.asarray(jnp.inf, dtype)
+    _, way, _ = jax.lax.while_loop(lambda x: (x[0] < attempts) & (x[2] > 0), attempt, carry)
+    return way

@@ -1,68 +1,87 @@
 """What a fit does with its arguments: options at trace time, values at run time."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, all_finite, is_inertia, is_unit
+from jrigid._checks import RESULTS, Findings, all_finite, check_option, is_inertia, is_unit
 from jrigid._numerics import safe_norm
 from jrigid.dynamics import State
-from jrigid.identify._layout import Samples
-from jrigid.identify._observations import (
-    AbstractObservation,
-    AngularMomenta,
-    Attitudes,
-    Directions,
-    Rates,
-    known,
-)
-from jrigid.identify._unknowns import as_tensor
+from jrigid.identify._layout import Told, told_by
+from jrigid.identify._records import Record, Samples, check_records, samples_of
+from jrigid.identify._sensors import MomentumSensor
+from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, SpinningMass, Sum
 
-
-def start_of(start: Any) -> tuple[Any, State | None]:
-    """The tensor to start from, if one is given, and the state."""
-    if start is None:
-        return None, None
-    if isinstance(start, State):
-        return None, start
-    if isinstance(start, tuple) and len(start) == 2:
-        inertia, state = start
-        if isinstance(inertia, RigidBody):
-            inertia = inertia.inertia
-        if state is None or isinstance(state, State):
-            return None if inertia is None else as_tensor(jnp.asarray(inertia)), state
-    raise ValueError(
-        "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
-        f"None), but it is {start!r}."
-    )
+_GUESS = 0.02  # of the size of values, for a noise that is not known
 
 
-def refuse(system: Any, stacked: tuple[AbstractObservation, ...], scale: str, free: bool) -> None:
-    momenta = any(isinstance(x, AngularMomenta) for x in stacked)
-    if scale == "trace" or not isinstance(system, RigidBody):
-        return
-    if scale == "rotor":
-        terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
-        if not any(isinstance(x, Rotor | SpinningMass) for x in terms):
+def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
+    """One body, or one for each throw."""
+    systems = tuple(system) if isinstance(system, Sequence) else (system,)
+    for x in systems:
+        if not isinstance(x, RigidBody):
             raise ValueError(
-                "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but "
-                "it is: nothing sets the scale of the tensor."
+                "Argument `system` must be a RigidBody (of a body in flight, rotation about its "
+                f"centre of mass), but it is {type(x).__name__}."
             )
-    elif free and not momenta:
+    if len(systems) not in (1, throws):
+        raise ValueError(
+            f"Argument `system` must hold one body for each of {throws} throws, but it holds "
+            f"{len(systems)}."
+        )
+    return systems
+
+
+def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
+    """The tensor to start from, if one is given, and the state of each throw."""
+    inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)
+    if isinstance(inertia, RigidBody):
+        inertia = inertia.inertia
+    if state is not None and not isinstance(state, State):
+        raise ValueError(
+            "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
+            f"None), but it is {start!r}."
+        )
+    if state is not None:
+        attitude = jnp.broadcast_to(state.attitude, (throws, 4))
+        state = State(attitude, jnp.broadcast_to(state.omega, (throws, 3)))
+    return None if inertia is None else as_tensor(jnp.asarray(inertia)), state
+
+
+def refuse(
+    system: RigidBody, records: tuple[Record, ...], scale: str, shape: AbstractShape
+) -> None:
+    """ValueError for a scale that nothing tells, and numbers that hold it without one."""
+    check_option("scale", scale, ("trace", "known", "rotor"))
+    if shape.absolute and shape.names and scale == "trace":
+        raise ValueError(
+            "Argument `scale` must be 'known' or 'rotor' where `shape` is a "
+            f"{type(shape).__name__}, whose numbers hold the scale, but it is 'trace'."
+        )
+    terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
+    if scale == "rotor" and not any(isinstance(x, Rotor | SpinningMass) for x in terms):
+        raise ValueError(
+            "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it "
+            "is: nothing sets the scale of the tensor."
+        )
+    momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
+    if scale == "known" and system.is_free and not momenta and not shape.absolute:
         raise ValueError(
             "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
             "motion tells ratios of the moments, never their scale."
         )
 
 
-def typical_rate(samples: Samples | None, state: State | None, dtype: Any) -> Array:
-    if samples is not None:
-        shown = jnp.where(samples.there[..., None], samples.omega, 0.0)
-        count = jnp.sum(samples.there)
+def typical_rate(told: Told | None, state: State | None, dtype: Any) -> Array:
+    """Rms of the rates, 1 where there are none."""
+    if told is not None:
+        shown = jnp.where(told.there[..., None], told.omega, 0.0)
+        count = jnp.sum(told.there)
     else:
         assert state is not None
         shown = state.omega.astype(dtype)
@@ -72,124 +91,71 @@ def typical_rate(samples: Samples | None, state: State | None, dtype: Any) -> Ar
     return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
 
 
+def sizes_of(samples: tuple[Samples, ...]) -> tuple[Array, ...]:
+    """Rms of the values of each record; 1 where they are zero."""
+
+    def size(x: Samples) -> Array:
+        seen = jnp.any(x.weight > 0, axis=-1)
+        square = jnp.sum(jnp.where(seen[..., None], x.values, 0.0) ** 2)
+        mean = square / jnp.maximum(jnp.sum(seen), 1).astype(square.dtype)
+        return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+
+    return tuple(map(size, samples))
+
+
+def noise_of(records: tuple[Record, ...], samples: tuple[Samples, ...], rate: Array) -> Array:
+    """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
+
+    def median(x: Samples) -> Array:
+        white = jnp.diagonal(x.whitener, axis1=-2, axis2=-1)
+        return jnp.nanmedian(jnp.where(x.weight > 0, 1 / white, jnp.nan))
+
+    pairs = [(x, median(y)) for x, y in zip(records, samples, strict=True)]
+    rates = [s for x, s in pairs if not x.sensor.on_attitude and x.sensor.width == 3]
+    angles = [s for x, s in pairs if x.sensor.unit_length]
+    guess = _GUESS * rate
+    of_rates = rates[0] if rates else (angles[0] * rate if angles else guess)
+    of_angles = angles[0] if angles else of_rates / rate
+    noise = jnp.repeat(jnp.stack([of_rates, of_angles]), 3)
+    return jnp.where(jnp.isfinite(noise), noise, guess)
+
+
 def findings_of(
-    system: Any,
-    stacked: tuple[AbstractObservation, ...],
-    samples: Samples | None,
+    systems: tuple[RigidBody, ...],
+    records: tuple[Record, ...],
     tensor: Any,
     state: State | None,
+    on_attitude: bool,
 ) -> Findings:
+    """What is wrong with the values of the arguments."""
+    del on_attitude
     findings = Findings()
-    findings.require(is_inertia(system.inertia), RESULTS.invalid_inertia)
-    system.torque.check(findings)
+    for system in systems:
+        system.check(findings)
     if tensor is not None:
         findings.require(is_inertia(tensor), RESULTS.invalid_inertia)
     if state is not None:
         findings.require(all_finite(state), RESULTS.invalid_state)
         findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
-    for x in stacked:
+    check_records(findings, records)
+    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
+    told = told_by(records, samples, None)
+    if told is not None and told.attitude is None:
         findings.require(
-            jnp.any(known(x)),
+            _between(told) < jnp.pi,
             RESULTS.invalid_state,
-            f"Argument `values` of `{type(x).__name__}` must hold values, but all are NaN.",
-        )
-    numbers = jnp.sum(jnp.stack([jnp.sum(known(x)) for x in stacked]))
-    findings.require(
-        numbers >= 12,
-        RESULTS.invalid_state,
-        "Argument `observations` must hold more numbers than a body and its state have, but it "
-        "holds too few.",
-    )
-    for x in stacked:
-        seen = jnp.any(known(x), axis=-1)
-        running = jax.lax.cummax(jnp.where(seen, x.ts, -jnp.inf), axis=1)
-        before = jnp.concatenate([jnp.full_like(running[:, :1], -jnp.inf), running[:, :-1]], axis=1)
-        findings.require(
-            jnp.all(~seen | (x.ts > before)),
-            RESULTS.invalid_times,
-            f"Argument `ts` of `{type(x).__name__}` must be increasing, each time once, but it is "
-            "not.",
-        )
-        findings.require(
-            ~jnp.any(jnp.isnan(x.ts) & jnp.all(jnp.isfinite(x.values), axis=-1)),
-            RESULTS.invalid_times,
-            f"Argument `ts` of `{type(x).__name__}` must be finite where there are values, but it "
-            "is not.",
-        )
-        if x.sigma is not None:
-            good = jnp.all(~known(x) | ((x.sigma > 0) & jnp.isfinite(x.sigma)))
-        elif x.covariance is not None:
-            noise = x.covariance
-            swapped = jnp.swapaxes(noise, -1, -2)
-            eye = jnp.broadcast_to(jnp.eye(noise.shape[-1], dtype=noise.dtype), noise.shape)
-            filled = jnp.where(seen[..., None, None], noise, eye)
-            positive = jnp.all(jnp.isfinite(jnp.linalg.cholesky(filled)))
-            good = positive & jnp.all(
-                ~seen[..., None, None] | (jnp.abs(noise - swapped) <= 1e-6 * jnp.abs(noise))
-            )
-        else:
-            good = jnp.asarray(True)
-        findings.require(
-            good,
-            RESULTS.invalid_state,
-            f"Arguments `sigma` and `covariance` of `{type(x).__name__}` must be positive, but one "
-            "is not.",
-        )
-        if isinstance(x, Attitudes):
-            norm = jnp.sum(jnp.where(seen[..., None], x.values, 0.5) ** 2, axis=-1)
-            findings.require(
-                jnp.all(jnp.abs(norm - 1) < 1e-3),
-                RESULTS.invalid_attitude,
-                "Argument `values` of `Attitudes` must be unit quaternions, but one is not.",
-            )
-        if isinstance(x, Directions):
-            shown = jnp.where(seen[..., None], x.values, 1 / 3**0.5)
-            findings.require(
-                jnp.all(jnp.abs(jnp.sum(shown**2, axis=-1) - 1) < 0.5),
-                RESULTS.invalid_state,
-                "Argument `values` of `Directions` must be unit vectors, but one is not.",
-            )
-    if samples is not None and any(isinstance(x, Rates) for x in stacked):
-        turned = _between(samples)
-        findings.require(
-            turned < jnp.pi,
-            RESULTS.invalid_state,
-            "Argument `values` of `Rates` must be in radians a second and sampled more than twice "
-            "a turn, but the body turns more between samples: are the rates in degrees a second?",
+            "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a "
+            "turn, but the body turns more between samples: are the rates in degrees a second?",
         )
     return findings
 
 
-def _between(samples: Samples) -> Array:
+def _between(told: Told) -> Array:
     """Angle turned between neighbouring samples, as a median."""
-    if samples.ts.shape[1] < 2:
-        return jnp.zeros((), samples.ts.dtype)
-    ok = samples.there[:, 1:] & samples.there[:, :-1]
-    step = jnp.where(ok, jnp.diff(samples.ts, axis=1), jnp.nan)
-    speed = jnp.sqrt(jnp.sum(samples.omega[:, 1:] ** 2, axis=-1))
+    if told.ts.shape[1] < 2:
+        return jnp.zeros((), told.ts.dtype)
+    ok = told.there[:, 1:] & told.there[:, :-1]
+    step = jnp.where(ok, jnp.diff(told.ts, axis=1), jnp.nan)
+    speed = jnp.sqrt(jnp.sum(told.omega[:, 1:] ** 2, axis=-1))
     median = jnp.nanmedian(jnp.where(ok, step * speed, jnp.nan))
     return jnp.where(jnp.isnan(median), 0.0, median)
-
-
-def local_scales(
-    stacked: tuple[AbstractObservation, ...], rate: Array
-) -> tuple[Array, Array, Array]:
-    """Noise of rates [rad/s] and of attitudes [rad], and a guess of a sample's if it is unknown."""
-
-    def median(x: AbstractObservation) -> Array:
-        if x.sigma is not None:
-            noise = x.sigma
-        elif x.covariance is not None:
-            noise = jnp.sqrt(jnp.diagonal(x.covariance, axis1=-2, axis2=-1))
-        else:
-            return jnp.full((), 0.02, rate.dtype) * (rate if isinstance(x, Rates) else 1.0)
-        found = jnp.nanmedian(jnp.where(known(x), noise, jnp.nan))
-        fallback = 0.02 * rate if isinstance(x, Rates) else jnp.full((), 0.02, rate.dtype)
-        return jnp.where(jnp.isnan(found), fallback, found)
-
-    of_rates = [median(x) for x in stacked if isinstance(x, Rates)]
-    of_angles = [median(x) for x in stacked if isinstance(x, Attitudes | Directions)]
-    guess = 0.02 * rate
-    rates = of_rates[0] if of_rates else (of_angles[0] * rate if of_angles else guess)
-    angles = of_angles[0] if of_angles else rates / rate
-    return rates, angles, guess

@@ -8,10 +8,10 @@ from jaxtyping import Array
 
 from jrigid._checks import is_concrete
 from jrigid._numerics import safe_norm
-from jrigid.identify._observations import AbstractObservation, Attitudes, Rates, known
+from jrigid.identify._records import Record, Samples
 from jrigid.rotation import conjugate, exp, log, multiply, normalize
 
-_SEGMENT = 3.0  # radians, below half a turn
+MOST_NODES = 2000  # of a throw, where each sample has one
 
 
 class Layout(NamedTuple):
@@ -28,7 +28,7 @@ class Layout(NamedTuple):
     since: Array  # fraction of the record at each sample
 
 
-class Samples(NamedTuple):
+class Told(NamedTuple):
     """Rates, and attitudes if there are any, that tell where the segments start: (throws, n)."""
 
     ts: Array
@@ -37,10 +37,10 @@ class Samples(NamedTuple):
     attitude: Array | None
 
 
-def times_of(observations: tuple[AbstractObservation, ...]) -> tuple[Array, Array]:
-    """Times of the samples of all kinds, side by side, and which are there."""
-    there = jnp.concatenate([jnp.any(known(x), axis=-1) for x in observations], axis=1)
-    ts = jnp.concatenate([x.ts for x in observations], axis=1)
+def times_of(samples: tuple[Samples, ...]) -> tuple[Array, Array]:
+    """Times of the samples of all records, side by side, and which are there."""
+    there = jnp.concatenate([jnp.any(x.weight > 0, axis=-1) for x in samples], axis=1)
+    ts = jnp.concatenate([x.ts for x in samples], axis=1)
     first, _ = first_and_last(ts, there)
     return jnp.where(there, ts, first[:, None]), there
 
@@ -92,26 +92,28 @@ def _carried(attitude: Array, omega: Array, late: Array) -> Array:
     return turn(attitude, omega, late)
 
 
-def samples_of(
-    observations: tuple[AbstractObservation, ...], attitude0: Array | None
-) -> Samples | None:
+def told_by(
+    records: tuple[Record, ...], samples: tuple[Samples, ...], attitude0: Array | None
+) -> Told | None:
     """What tells the state on the way: a gyro, or attitudes; None if there is neither."""
-    rates = next((x for x in observations if isinstance(x, Rates)), None)
-    attitudes = next((x for x in observations if isinstance(x, Attitudes)), None)
-    if attitudes is not None:
-        q_there = jnp.all(known(attitudes), axis=-1)
-        unit = jnp.zeros_like(attitudes.values).at[..., 0].set(1)
-        q = jnp.where(q_there[..., None], attitudes.values, unit)
-        q = jax.vmap(jax.vmap(normalize))(q)
-        q_ts = jnp.where(q_there, attitudes.ts, 0.0)
-        if rates is None:
-            return Samples(q_ts, q_there, jax.vmap(_slopes)(q_ts, q_there, q), q)
-    if rates is None:
+
+    def first(name: str) -> tuple[Array, Array, Array] | None:
+        for record, x in zip(records, samples, strict=True):
+            seen = jax.vmap(jax.vmap(getattr(record.sensor, name)))(x.values)
+            if seen is not None:
+                there = jnp.all((x.weight > 0) & (x.sign == 0), axis=-1)
+                return jnp.where(there, x.ts, 0.0), there, seen
         return None
-    there = jnp.all(known(rates), axis=-1)
-    omega = jnp.where(there[..., None], rates.values, 0.0)
-    ts = jnp.where(there, rates.ts, 0.0)
+
+    rates, attitudes = first("rates"), first("attitude")
+    if rates is None:
+        if attitudes is None:
+            return None
+        return Told(*attitudes[:2], jax.vmap(_slopes)(*attitudes), attitudes[2])
+    ts, there, omega = rates
+    omega = jnp.where(there[..., None], omega, 0.0)
     if attitudes is not None:
+        q_ts, q_there, q = attitudes
         latest = jax.vmap(lambda t, a, b: jax.vmap(lambda t: _nearest_before(a, b, t))(t))(
             ts, q_ts, q_there
         )
@@ -121,11 +123,11 @@ def samples_of(
             [jnp.ones_like(there[:, :1]), latest[:, 1:] != latest[:, :-1]], axis=1
         )
         found = jax.vmap(_reckoned)(ts, there, omega, q[:, 0], _carried(seen, omega, late), fresh)
-        return Samples(ts, there, omega, found)
+        return Told(ts, there, omega, found)
     if attitude0 is None:
-        return Samples(ts, there, omega, None)
+        return Told(ts, there, omega, None)
     none = jnp.zeros((*ts.shape, 4), ts.dtype).at[..., 0].set(1), jnp.zeros(ts.shape, bool)
-    return Samples(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0, *none))
+    return Told(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0, *none))
 
 
 def _reckoned(
@@ -146,7 +148,7 @@ def _reckoned(
     return jax.lax.scan(turn, start, (ts, omega, there, seen, fresh))[1]
 
 
-def angle_turned(samples: Samples) -> Array:
+def angle_turned(told: Told) -> Array:
     """Radians turned up to each sample, from the rates there."""
 
     def throw(ts: Array, there: Array, omega: Array) -> Array:
@@ -163,7 +165,7 @@ def angle_turned(samples: Samples) -> Array:
         zero = jnp.zeros_like(ts[0])
         return jax.lax.scan(add, (zero, zero, zero, jnp.asarray(False)), (ts, speed, there))[1]
 
-    return jax.vmap(throw)(samples.ts, samples.there, samples.omega)
+    return jax.vmap(throw)(told.ts, told.there, told.omega)
 
 
 def whole(ts: Array, there: Array, nodes: int, t0: Array | None = None) -> Layout:
@@ -176,14 +178,21 @@ def whole(ts: Array, there: Array, nodes: int, t0: Array | None = None) -> Layou
     return Layout(ts, jnp.zeros(ts.shape, int), start, start, zero > 0, since)
 
 
-def segments(ts: Array, there: Array, samples: Samples, nodes: int) -> tuple[Layout, Array]:
-    """Segments of about half a turn; and the sample at which each starts."""
-    angles = angle_turned(samples)
+def segments(
+    ts: Array, there: Array, told: Told, nodes: int, length: float
+) -> tuple[Layout, Array]:
+    """Segments of so many radians, or, of length 0, one a sample; and where each starts.
+
+    They are longer where the nodes do not suffice.
+    """
+    count = jnp.cumsum(told.there, axis=1).astype(ts.dtype)
+    measure = angle_turned(told) if length else count - 0.5
     whole_ = whole(ts, there, nodes)
 
-    def throw(angle: Array, times: Array, ok: Array) -> tuple[Array, ...]:
-        length = jnp.maximum(_SEGMENT, angle[-1] / max(nodes - 1, 1))
-        part = jnp.floor(angle / length * (1 - 1e-12)).astype(int)
+    def throw(measure: Array, times: Array, ok: Array) -> tuple[Array, ...]:
+        most = max(nodes - 1, 1) if length else nodes
+        part = jnp.maximum(length or 1.0, measure[-1] / most)
+        part = jnp.floor(measure / part * (1 - 1e-12)).astype(int)
         count = part.size
 
         def rank(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
@@ -200,7 +209,7 @@ def segments(ts: Array, there: Array, samples: Samples, nodes: int) -> tuple[Lay
         opening = jnp.where(used, opening, 0)
         return opening, used, times[opening]
 
-    opening, used, start = jax.vmap(throw)(angles, samples.ts, samples.there)
+    opening, used, start = jax.vmap(throw)(measure, told.ts, told.there)
     # The first node stands at the first sample of any kind.
     start = start.at[:, 0].set(whole_.start[:, 0])
     reach = jnp.where(used, start, jnp.inf)
@@ -215,22 +224,24 @@ def segments(ts: Array, there: Array, samples: Samples, nodes: int) -> tuple[Lay
     return Layout(ts, node, start, end, linked, whole_.since), opening
 
 
-def node_states(samples: Samples, opening: Array, start: Array) -> tuple[Array, Array | None]:
+def node_states(told: Told, opening: Array, start: Array) -> tuple[Array, Array | None]:
     """States at the nodes, as observed."""
-    omega = jax.vmap(lambda w, i: w[i])(samples.omega, opening)
-    if samples.attitude is None:
+    omega = jax.vmap(lambda w, i: w[i])(told.omega, opening)
+    if told.attitude is None:
         return omega, None
-    at = jax.vmap(lambda q, i: q[i])(samples.attitude, opening)
-    late = start - jax.vmap(lambda t, i: t[i])(samples.ts, opening)
+    at = jax.vmap(lambda q, i: q[i])(told.attitude, opening)
+    late = start - jax.vmap(lambda t, i: t[i])(told.ts, opening)
     return omega, _carried(at, omega, late)
 
 
-def segments_needed(angle: Array, n: int) -> int:
+def segments_needed(angle: Array, n: int, length: float) -> int:
     """How many nodes a throw needs; if the angle is not known yet, for the worst case."""
+    if not length:
+        return min(n, MOST_NODES)
     most = n // 2 + 2
     if not is_concrete(angle) or not float(angle) >= 0:
         return most
     needed = 2
-    while needed < float(angle) / _SEGMENT + 2:
+    while needed < float(angle) / length + 2:
         needed *= 2
     return min(needed, most)

@@ -55,11 +55,15 @@ def block_bootstrap(
     what is longer: for noise with a longer memory the spread comes out too small.
 
     Args:
-        jacobian: Of the residuals, as fitted.
+        jacobian: Of the residuals, as fitted: `found.rows()` gives both, for one record of one
+            throw.
         residuals: At the optimum, equally spaced in time.
         block: Length of a block in samples.
         key: Random key.
         samples: Number of redrawn records.
+
+    Raises:
+        ValueError: A block as long as the record, which could be dealt in one way only.
 
     Returns:
         Parameter shifts; their standard deviation estimates the standard error.
@@ -71,6 +75,10 @@ def block_bootstrap(
     (1000, 1)
     """
     times, outputs, params = jacobian.shape
+    if not 1 <= block < times:
+        raise ValueError(
+            f"Argument `block` must be at least 1 and less than {times}, but it is {block}."
+        )
     gain = _influence(jacobian.reshape(times * outputs, params))
     centred = residuals - jnp.mean(residuals, axis=0, keepdims=True)
     blocks = -(-times // block)

@@ -1,39 +1,29 @@
 """Numbers without bounds for the inertia of a real body: physical by construction."""
 
-from collections.abc import Sequence
-from typing import Any
-
-import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import (
     INERTIA,
-    RESULTS,
-    Findings,
     all_finite,
     array_of_shape,
-    check_option,
     check_type,
     is_positive_definite,
     is_symmetric,
     where_defined,
 )
 from jrigid._numerics import product
-from jrigid._types import InertiaLike, Matrix, Readable, Real, Scalar, Vector
+from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
 from jrigid.mass import MassProperties
 
-LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 
-
-def _second_moments(tensor: Matrix) -> Matrix:
+def second_moments(tensor: Matrix) -> Matrix:
     """Sigma = (trace I / 2) 1 - I, the integral of r r^T over the mass."""
     half = 0.5 * jnp.trace(tensor)
     return half * jnp.eye(3, dtype=tensor.dtype) - tensor
 
 
-def _tensor(second_moments: Matrix) -> Matrix:
+def from_second_moments(second_moments: Matrix) -> Matrix:
     """I = (trace Sigma) 1 - Sigma."""
     trace = jnp.trace(second_moments)
     return trace * jnp.eye(3, dtype=second_moments.dtype) - second_moments
@@ -71,7 +61,7 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
         zero, one = jnp.zeros_like(p[0]), jnp.ones_like(p[0])
         rows = [[one, zero, zero], [p[3], jnp.exp(p[1]), zero], [p[4], p[5], jnp.exp(p[2])]]
         lower = jnp.exp(p[0]) * jnp.stack([jnp.stack(row) for row in rows])
-        return _tensor(product("ik,jk->ij", lower, lower))
+        return from_second_moments(product("ik,jk->ij", lower, lower))
 
     return where_defined(all_finite(parameters), tensor, parameters)
 
@@ -97,7 +87,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     """
     inertia = array_of_shape("inertia", inertia, *INERTIA)
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-    second = _second_moments(0.5 * (tensor + tensor.T))
+    second = second_moments(0.5 * (tensor + tensor.T))
     solid = all_finite(tensor) & is_symmetric(tensor) & is_positive_definite(second)
 
     def numbers(second: Matrix) -> Array:
@@ -142,7 +132,7 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
         upper = jnp.stack([jnp.stack(row) for row in rows])
         mass = jnp.exp(2 * alpha)
         # About the centre of mass the column t drops out.
-        return mass, jnp.stack(t), mass * _tensor(product("ik,jk->ij", upper, upper))
+        return mass, jnp.stack(t), mass * from_second_moments(product("ik,jk->ij", upper, upper))
 
     return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
 
@@ -164,7 +154,7 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     [ 1.0397 -1.2425 -0.5493 -0.1438]
     """
     check_type("body", body, MassProperties)
-    second = _second_moments(body.inertia)
+    second = second_moments(body.inertia)
     solid = (body.mass > 0) & all_finite(body) & is_positive_definite(second)
 
     def numbers(mass: Scalar, center_of_mass: Vector, second: Matrix) -> Array:
@@ -177,75 +167,3 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
         )
 
     return where_defined(solid, numbers, body.mass, body.center_of_mass, second)
-
-
-class LogCholesky(Readable):
-    """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
-
-    The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
-    the lever of any `torques.UniformGravity` of the system, all follow from the ten numbers. Motion
-    under gravity tells the inertia about the point over the mass times the lever, eight numbers:
-    freeze two at least, such as "alpha", half the logarithm of the mass, and a length. A rotor or
-    a torque of known size tells one more.
-
-    Attributes:
-        parameters: (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) to start from.
-        frozen: Names of those that are known.
-
-    Raises:
-        RuntimeError: A flat body.
-
-    Gradients: as `body_from_log_cholesky`.
-    Source: as `body_from_log_cholesky`.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> arm = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0])).translated(jnp.array([0.0, 0.0, 1.5]))
-    >>> print(jr.identify.LogCholesky(arm, frozen=("alpha", "t1", "t2")).sought)
-    ('d1', 'd2', 'd3', 's12', 's23', 's13', 't3')
-    """
-
-    parameters: Float[Array, "10"]
-    frozen: tuple[str, ...] = eqx.field(static=True)
-
-    def __init__(self, body: MassProperties, frozen: Sequence[str] = ()):
-        self.frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
-        for name in self.frozen:
-            check_option("frozen", name, LOG_CHOLESKY)
-        if not self.sought:
-            raise ValueError("Argument `frozen` must leave a number to seek, but it does not.")
-        parameters = log_cholesky_from_body(body)
-        findings = Findings()
-        findings.require(
-            all_finite(parameters),
-            RESULTS.unphysical_inertia,
-            "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not.",
-            body.inertia,
-        )
-        self.parameters = findings.guard(parameters, throw=True)
-
-    @property
-    def sought(self) -> tuple[str, ...]:
-        """Names of the numbers that are not frozen."""
-        return tuple(name for name in LOG_CHOLESKY if name not in self.frozen)
-
-    @property
-    def units(self) -> Array:
-        """Sizes of the numbers sought: 1, or for those in metres that of the body."""
-        body = body_from_log_cholesky(self.parameters)
-        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
-        lengths = {"s12", "s23", "s13", "t1", "t2", "t3"}
-        one = jnp.ones_like(square)
-        return jnp.stack([jnp.sqrt(square) if name in lengths else one for name in self.sought])
-
-    @property
-    def start(self) -> Array:
-        """The numbers sought, as they were given."""
-        return self.parameters[self._indices()]
-
-    def body(self, numbers: Array) -> MassProperties:
-        """The body, of other numbers for those that are sought."""
-        whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
-        return body_from_log_cholesky(whole)
-
-    def _indices(self) -> Any:
-        return np.array([LOG_CHOLESKY.index(name) for name in self.sought])

@@ -4,22 +4,24 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
+from jrigid._numerics import product
 from jrigid.dynamics import State
 from jrigid.identify._flow import forced_flow, free_flow
 from jrigid.identify._layout import Layout
-from jrigid.identify._observations import AbstractObservation, whitened
-from jrigid.identify._shooting import Links, Point, Rows, Stage
+from jrigid.identify._records import Samples
+from jrigid.identify._smoother import Links, Point, Rows
 from jrigid.identify._unknowns import Unknowns
 from jrigid.rotation import conjugate, exp, multiply, normalize
 from jrigid.simulate import simulate
 
 RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
+_SURE = 6.0  # standard deviations beyond a limit, where nothing more is learnt
 
 
 class Options(NamedTuple):
@@ -27,22 +29,25 @@ class Options(NamedTuple):
 
     free_motion: bool
     on_attitude: bool
-    shooting: bool
+    shooting: bool  # from a state of each segment, or from one of each throw
     nodes: int
-    loss: str
-    max_steps: int
+    dense: bool  # a node at each sample
+    robust: bool
     noise_known: bool
+    level: str  # of the unmodelled torque: "none", "known" or "sought"
     motion: Any
     doublings: int
+    max_steps: int
     progress: bool
 
 
 class Args(NamedTuple):
+    """A record as it is fitted."""
+
     unknowns: Unknowns
-    observations: tuple[AbstractObservation, ...]
-    weights: tuple[Array, ...]  # of each number of each residual, 0 or 1
-    local: Array  # noise of the local numbers, for the links
-    unit: Array  # of residuals whose noise is not known
+    samples: tuple[Samples, ...]
+    bodies: Array  # of each throw
+    noise: Array  # of rates [rad/s] and turns [rad], (6,), for the links
 
 
 def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
@@ -53,165 +58,202 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
     return State(states.attitude[back], states.omega[back])
 
 
-def by_kind(
-    observations: tuple[AbstractObservation, ...], states: State
-) -> list[tuple[AbstractObservation, State]]:
-    """Each kind of observation with its states, which stand side by side."""
-    found, at = [], 0
-    for x in observations:
-        end = at + x.ts.shape[1]
-        found.append((x, State(states.attitude[:, at:end], states.omega[:, at:end])))
-        at = end
-    return found
+def _flow(options: Options, system: Any, before: State, start: Array, end: Array) -> State:
+    """States a short time later, or earlier, each of its own start."""
+    if not options.free_motion:
+        one = lambda q, w, a, b: forced_flow(  # noqa: E731
+            system, State(q, w), a, b, options.on_attitude
+        )
+        return jax.vmap(one)(before.attitude, before.omega, start, end)
+    turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(before.omega, end - start)
+    if options.on_attitude:
+        turn = jax.vmap(multiply)(before.attitude, turn)
+    return State(turn, omega)
+
+
+def _integrated(options: Options, system: Any, first: State, ts: Array, t0: Array) -> State:
+    """A throw from its first state, by `simulate`, or by the motion that was given."""
+    first = State(normalize(first.attitude), first.omega)
+
+    def motion(times: Array) -> State:
+        if options.motion is not None:
+            return options.motion(system, first, times, t0)
+        return simulate(
+            system, first, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
+            adjoint=diffrax.ForwardMode(), max_steps=100_000,
+        ).states  # fmt: skip
+
+    return in_any_order(motion, ts)
+
+
+class _Throw(NamedTuple):
+    """What is a throw's own: (nodes, ...), (samples, ...)."""
+
+    layout: Layout
+    samples: tuple[Samples, ...]
+    leaves: tuple[Array, ...]
+    body: Array
+    first: Array  # 1 for the first throw
+
+
+def _picked(state: State, index: Any) -> State:
+    return jtu.tree_map(lambda x: x[index], state)
 
 
 def _sample_states(
-    options: Options, args: Args, layout: Layout, point: Point
-) -> tuple[State, State]:
-    """States at the samples and at the links' ends."""
-    system, _ = args.unknowns.system_and_gyro(point.numbers)
-    throws, nodes = layout.start.shape
-    count = layout.ts.shape[1]
-
-    def pick(x: Array) -> Array:
-        return jax.vmap(lambda values, node: values[node])(x, layout.node)
-
-    if options.free_motion:
-        inertia = args.unknowns.inertia(point.numbers)
-        span = jnp.concatenate([layout.ts - pick(layout.start), layout.end - layout.start], axis=1)
-        omega = jnp.concatenate([pick(point.omega), point.omega], axis=1)
-        turn, omega = jax.vmap(lambda w, t: free_flow(inertia, w, t))(
-            omega.reshape(-1, 3), span.reshape(-1)
-        )
-        turn, omega = turn.reshape(throws, -1, 4), omega.reshape(throws, -1, 3)
-        if options.on_attitude:
-            before = jnp.concatenate([pick(point.attitude), point.attitude], axis=1)
-            turn = jax.vmap(jax.vmap(multiply))(before, turn)
-        states = State(turn, omega)
-    elif nodes == 1:
-        states = _integrated(options, system, layout, point)
-        return states, State(point.attitude, point.omega)
+    options: Options, system: Any, sensors: Any, nodes: State, throw: _Throw
+) -> tuple[list[Any], State]:
+    """For each sensor, states (lags, n) that it looks at and their weights; states at link ends."""
+    layout, dtype, first = throw.layout, throw.layout.ts.dtype, 0
+    samples, lags, weights = [], [], []
+    for sensor, x in zip(sensors, throw.samples, strict=True):
+        late, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
+        samples.append(jnp.tile(jnp.arange(first, first + x.ts.size), late.size))
+        lags.append(jnp.repeat(late.astype(dtype), x.ts.size))
+        weights.append(weight.astype(dtype))
+        first += x.ts.size
+    sample = jnp.concatenate(samples)
+    times, node = layout.ts[sample] - jnp.concatenate(lags), layout.node[sample]
+    if options.shooting or options.free_motion:
+        begin = jnp.concatenate([layout.start[node], layout.start])
+        end = jnp.concatenate([times, layout.end])
+        before = jtu.tree_map(lambda x: jnp.concatenate([x[node], x]), nodes)
+        states = _flow(options, system, before, begin, end)
+        ends = _picked(states, slice(sample.size, None))
     else:
-        begin = jnp.concatenate([pick(layout.start), layout.start], axis=1)
-        end = jnp.concatenate([layout.ts, layout.end], axis=1)
-        omega = jnp.concatenate([pick(point.omega), point.omega], axis=1)
-        attitude = jnp.concatenate([pick(point.attitude), point.attitude], axis=1)
-        states = jax.vmap(
-            jax.vmap(lambda q, w, a, b: forced_flow(system, State(q, w), a, b, options.on_attitude))
-        )(attitude, omega, begin, end)
-    return (
-        jtu.tree_map(lambda x: x[:, :count], states),
-        jtu.tree_map(lambda x: x[:, count:], states),
-    )
+        whole = _integrated(options, system, _picked(nodes, 0), layout.ts, layout.start[0])
+        states, ends = _picked(whole, sample), nodes
+        if any(x.memory() is not None for x in sensors):
+            states = _flow(options, system, states, layout.ts[sample], times)
+    found, first = [], 0
+    for x, weight in zip(samples, weights, strict=True):
+        part = _picked(states, slice(first, first + x.size))
+        lanes = [y.reshape(weight.size, -1, y.shape[-1]) for y in (part.attitude, part.omega)]
+        found.append((State(*lanes), weight))
+        first += x.size
+    return found, ends
 
 
-def _integrated(options: Options, system: Any, layout: Layout, point: Point) -> State:
-    """Every throw from its first state, by `simulate`, or by the motion that was given."""
-
-    def throw(q: Array, w: Array, ts: Array, t0: Array) -> State:
-        state = State(normalize(q), w)
-
-        def motion(times: Array) -> State:
-            if options.motion is not None:
-                return options.motion(system, state, times, t0)
-            return simulate(
-                system, state, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
-                adjoint=diffrax.ForwardMode(), max_steps=100_000,
-            ).states  # fmt: skip
-
-        return in_any_order(motion, ts)
-
-    return jax.vmap(throw)(point.attitude[:, 0], point.omega[:, 0], layout.ts, layout.start[:, 0])
+def _shown(sensor: Any, system: Any, t: Array, states: State, weight: Array) -> Array:
+    """What a sensor shows at a time, of states (lags, ...) and their weights."""
+    shown = jax.vmap(lambda q, w: sensor.predict(t, State(q, w), system))
+    values = shown(states.attitude, states.omega)
+    return product("l,lk->k", weight, values) if weight.size > 1 else values[0]
 
 
-def whole_motion(options: Options, args: Args, layout: Layout, point: Point) -> State:
-    """States at the samples."""
-    return _sample_states(options, args, layout, point)[0]
+def predictions(options: Options, args: Args, layout: Layout, point: Point) -> list[Array]:
+    """Values of each record (throws, n, k) as its sensor would show them; nothing of each throw."""
+    system, *sensors = args.unknowns.parts(point.numbers, point.own[0], args.unknowns.leaves, 0)
+
+    def throw(attitude: Array, omega: Array, data: _Throw) -> list[Array]:
+        seen, _ = _sample_states(options, system, sensors, State(attitude, omega), data)
+        of_sample: Any = jax.vmap(_shown, in_axes=(None, None, 0, 1, None))
+        triples = zip(sensors, data.samples, seen, strict=True)
+        return [of_sample(sensor, system, x.ts, *y) for sensor, x, y in triples]
+
+    data = _Throw(layout, args.samples, (), args.bodies, jnp.zeros(args.bodies.shape))
+    return jax.vmap(throw)(point.attitude, point.omega, data)
 
 
-def evaluation(options: Options) -> Callable[[Point, Args, Layout, Stage], tuple[Rows, Links]]:
-    """Residuals and links, with their derivatives in the numbers and the states of the nodes."""
+def residual_of(sensor: Any, system: Any, x: Samples, states: State, weight: Array) -> Array:
+    """Of one sensor in one throw, (n, d), in units of its noise; zero where nothing was seen."""
 
-    def evaluate(point: Point, args: Args, layout: Layout, stage: Stage) -> tuple[Rows, Links]:
-        throws, nodes = layout.start.shape
-        dtype = point.omega.dtype
+    def one(t: Array, value: Array, white: Array, sign: Array, q: Array, w: Array) -> Array:
+        predicted = _shown(sensor, system, t, State(q, w), weight)
+        if predicted.shape != value.shape:
+            raise ValueError(
+                f"Argument `function` of `{type(sensor).__name__}` must return shape "
+                f"{value.shape}, but it returns {predicted.shape}."
+            )
+        row = white @ sensor.difference(value, predicted)
+        if sensor.largest() is None:
+            return row
+        # A saturated number says "at least": the square is -2 log of its probability.
+        beyond = jnp.where(sign != 0, jnp.clip(sign * row, -1e3, _SURE), 0.0)
+        likely = jax.scipy.special.log_ndtr(beyond)
+        return jnp.where(sign != 0, -sign * jnp.sqrt(-2 * likely), row)
+
+    of_sample = jax.vmap(one, in_axes=(0, 0, 0, 0, 1, 1))
+    rows = of_sample(x.ts, x.values, x.whitener, x.sign, states.attitude, states.omega)
+    return rows * x.weight
+
+
+def evaluation(
+    options: Options, args: Args, layout: Layout
+) -> Callable[[Point], tuple[Rows, Links]]:
+    """Residuals and links, with their derivatives in the border and the states of the nodes.
+
+    Rows stand in the order of the records, then what is known beforehand: of the throw, and, beside
+    the first throw, of all; last the numbers themselves, which hold a fit near its start while
+    little of the record takes part.
+    """
+    unknowns = args.unknowns
+    held = unknowns.slices["scale"].stop
+
+    def residuals(
+        numbers: Array, own: Array, move: Array, point: Point, leaves: Any, throw: _Throw
+    ) -> tuple[Array, Array]:
+        """Of one throw."""
+        system, *sensors = unknowns.parts(numbers, own, leaves, throw.body)
+        attitude = point.attitude
+        if options.on_attitude:
+            attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
+        nodes = State(attitude, point.omega + move[:, :3])
+        states, ends = _sample_states(options, system, sensors, nodes, throw)
+        rows = [
+            residual_of(sensor, system, x, *seen).reshape(-1)
+            for sensor, x, seen in zip(sensors, throw.samples, states, strict=True)
+        ]
+        shared = jnp.concatenate([unknowns.prior_rows(numbers), numbers[held:]])
+        rows += [unknowns.own_prior_rows(own), throw.first * shared]
+        gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
+        if options.on_attitude:
+            following = jnp.roll(point.attitude, -1, axis=0)
+            turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(following, ends.attitude)
+            side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
+            gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
+        return jnp.concatenate(rows), jnp.where(throw.layout.linked[:, None], gap, 0.0)
+
+    def evaluate(point: Point) -> tuple[Rows, Links]:
+        dtype, size = point.omega.dtype, point.numbers.size
+        throws, own = point.own.shape
         locals_ = 6 if options.on_attitude else 3
-        size = point.numbers.size
+        directions = jnp.eye(own + size + locals_, dtype=dtype)
+        first = jnp.zeros(throws, dtype).at[0].set(1)
+        data = _Throw(layout, args.samples, (), args.bodies, first)
+        axes = tuple(0 if own else None for own in unknowns.stacked)
+        of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
 
-        def residuals(numbers: Array, move: Array) -> tuple[tuple[Array, ...], Array, Array]:
-            attitude = point.attitude
-            if options.on_attitude:
-                attitude = jax.vmap(jax.vmap(lambda q, v: multiply(q, exp(v))))(
-                    attitude, move[..., 3:]
-                )
-            moved = Point(numbers, attitude, point.omega + move[..., :3])
-            states, ends = _sample_states(options, args, layout, moved)
-            system, gyro = args.unknowns.system_and_gyro(numbers)
-            blocks = []
-            kinds = by_kind(args.observations, states)
-            for (x, part), weight in zip(kinds, args.weights, strict=True):
-                rows = whitened(x, part, gyro, system)
-                unit = args.unit if x.sigma is None and x.covariance is None else 1.0
-                blocks.append(rows * weight / unit)
-            now = State(point.attitude, point.omega)
-            following = jtu.tree_map(lambda s: jnp.roll(s, -1, axis=1), now)
-            gap = ends.omega - following.omega
-            if options.on_attitude:
-                turn = jax.vmap(jax.vmap(lambda a, b: multiply(conjugate(a), b)))(
-                    following.attitude, ends.attitude
-                )
-                side = jnp.where(turn[..., :1] < 0, -1.0, 1.0)
-                gap = jnp.concatenate([gap, 2 * side * turn[..., 1:]], axis=-1)
-            noise = args.local[None, None, :locals_]
-            gap = jnp.where(layout.linked[..., None], gap / noise, 0.0)
-            # While little of the record takes part, nuisances must not imitate the motion.
-            held = numbers[args.unknowns.slices["leaves"].start :]
-            held = jnp.where(stage.horizon < 1, held, 0.0)
-            prior = jnp.concatenate([args.unknowns.prior_rows(numbers), held])
-            return tuple(blocks), gap, prior
+        def throw(point: Point, leaves: Any, data: _Throw) -> tuple[Any, Any]:
+            still = jnp.zeros((point.omega.shape[0], locals_), dtype)
 
-        still = jnp.zeros((throws, nodes, locals_), dtype)
-        directions = jnp.eye(size + locals_, dtype=dtype)
+            def along(direction: Array) -> Any:
+                of_own, of_numbers, of_state = jnp.split(direction, [own, own + size])
+                changes = of_numbers, of_own, jnp.broadcast_to(of_state, still.shape)
+                moving = lambda n, o, m: residuals(n, o, m, point, leaves, data)  # noqa: E731
+                return jax.jvp(moving, (point.numbers, point.own, still), changes)
 
-        def along(direction: Array) -> Any:
-            changes = direction[:size], jnp.broadcast_to(direction[size:], still.shape)
-            return jax.jvp(residuals, (point.numbers, still), changes)
+            return jax.vmap(along, out_axes=(None, -1))(directions)
 
-        (blocks, gap, prior), (d_blocks, d_gap, d_prior) = jax.vmap(along, out_axes=(None, -1))(
-            directions
+        (rows, gap), (d_rows, d_gap) = jax.vmap(throw, in_axes=(of_throws, axes, 0))(
+            point, unknowns.leaves, data
         )
-        flat, slopes, nodes_of, cost, at = [], [], [], jnp.zeros((), dtype), 0
-        for x, slope in zip(blocks, d_blocks, strict=True):
-            count, width = x.shape[1:]
-            within = layout.since[:, at : at + count] <= stage.horizon
-            within = within.astype(dtype)
-            at += count
-            square = jnp.sum(x * x, axis=-1)
-            soft = 4.0 * width
-            weight = jnp.where(stage.robust, 1 / (1 + square / soft), 1.0) * within
-            loss = jnp.where(stage.robust, soft * jnp.log1p(square / soft), square)
-            cost = cost + jnp.sum(loss * within)
-            root = jnp.sqrt(weight)[..., None]
-            flat.append((root * x).reshape(throws, -1))
-            slopes.append((root[..., None] * slope).reshape(throws, -1, size + locals_))
-            node = layout.node[:, at - count : at]
-            nodes_of.append(jnp.repeat(node, width, axis=1))
-        # What is known beforehand stands with the first throw, whose state it does not touch.
-        padded = jnp.zeros((throws, prior.size), dtype).at[0].set(prior)
-        flat.append(padded)
-        slopes.append(jnp.zeros((throws, prior.size, size + locals_), dtype).at[0].set(d_prior))
-        nodes_of.append(jnp.zeros((throws, prior.size), int))
-        cost = cost + jnp.sum(prior * prior)
-        jacobian = jnp.concatenate(slopes, axis=1)
-        rows = Rows(
-            jnp.concatenate(flat, axis=1),
-            jacobian[..., :size],
-            jacobian[..., size:],
-            jnp.concatenate(nodes_of, axis=1),
-            cost,
+        border = own + size
+        node = [
+            jnp.repeat(part, x.weight.shape[-1], axis=1)
+            for part, x in zip(_split(layout.node, args.samples), args.samples, strict=True)
+        ]
+        node = jnp.concatenate(node, axis=1)
+        node = jnp.pad(node, ((0, 0), (0, rows.shape[1] - node.shape[1])))
+        return (
+            Rows(rows, d_rows[..., :border], d_rows[..., border:], node),
+            Links(gap, d_gap[..., :border], d_gap[..., border:]),
         )
-        of_next = -jnp.eye(locals_, dtype=dtype) / args.local[:locals_, None]
-        of_next = jnp.where(layout.linked[..., None, None], of_next[None, None], 0.0)
-        return rows, Links(gap, d_gap[..., :size], d_gap[..., size:], of_next)
 
-    return eqx.filter_jit(evaluate)  # traced once
+    return evaluate
+
+
+def _split(side_by_side: Array, samples: tuple[Samples, ...]) -> list[Array]:
+    """Of each record, (throws, n), of what stands side by side."""
+    ends = np.cumsum([x.ts.shape[-1] for x in samples])
+    return jnp.split(side_by_side, ends[:-1], axis=1)

@@ -1,14 +1,21 @@
 """FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._checks import Enumeration
-from jrigid._types import Matrix, Scalar, Vector
+from jrigid._numerics import product
+from jrigid._spectral import eigh
+from jrigid._types import Scalar, Vector
 from jrigid.dynamics import State
+from jrigid.identify._compile import quick_jit
 from jrigid.identify._unknowns import Unknowns
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
@@ -22,10 +29,14 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "The fit describes the record, but the record does not tell all that was asked: see "
         "`null_directions`."
     )
+    MISFIT = (
+        "The fit follows the record, but what is left is no noise of the size stated: a torque "
+        "that the model has not, or a sensor's error (see `unmodelled`, `free`), or the noise is "
+        "not as stated. The errors are those of what is left."
+    )
     WRONG_BASIN = (
-        "The fit does not describe the record: chi-square is too large for the noise that was "
-        "stated. It ended in a wrong minimum, or the model or the noise is wrong. With "
-        "`throw=False` it can be looked at."
+        "The fit does not describe the record: it ended in a wrong minimum, or the model is wrong. "
+        "With `throw=False` it can be looked at."
     )
     AT_BOUNDARY = (
         "The fit has run into the boundary of real bodies: all mass in a plane or on a line. The "
@@ -37,76 +48,80 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     BAD_INPUT = "The observations, or another argument, are not usable."
 
 
-STATUSES = ("OK", "UNIDENTIFIABLE", "WRONG_BASIN", "AT_BOUNDARY", "NOT_CONVERGED", "BAD_INPUT")
 # An error above this, in natural units, and a direction is not told.
 LARGEST_ERROR = 0.3
 
 
 def _errors(covariance: Array) -> Array:
-    return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+    return jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
 class FitResult(eqx.Module):
     """Inertia, state and nuisances with errors; what is a number in one fit is a lane's under vmap.
 
-    `print` shows it in words. Errors are standard errors; if no noise was stated, its level is that
-    of the residuals.
+    `print` shows it in words. Errors are standard errors; if no noise was stated, or it does not
+    explain what is left, their level is that of the residuals. Of several bodies this is the first:
+    see `bodies`.
 
     Attributes:
         status: A `jrigid.identify.Status`.
-        inertia: The tensor, in the axes of the sensor or body [kg m^2]; with `scale="trace"` of the
-            trace of the system's.
-        moments: Principal moments, ascending.
-        axes: Principal axes, columns, body from principal.
-        moments_covariance: Of the moments.
-        axes_errors: Errors of the turn about each principal axis [rad].
-        ratios: I2/I1 and I3/I1.
-        ratios_covariance: Of the ratios.
+        numbers: The numbers sought for all throws: see `names`.
+        own_numbers: Those sought in each throw (throws, own).
+        numbers_covariance: Of `numbers`.
+        sensor_covariance: The part of it that the sensors' noise makes.
+        local_covariance: Of each throw's state at `t0` (rate, then, if it matters, a small turn of
+            the attitude about the body axes) and own numbers, beside given numbers.
+        follow: How these follow the numbers, with the sign turned (throws, local, numbers).
+        scores: What each throw adds to the gradient of half the squares, zero in sum.
+        inflation: Of covariances, beyond what the noise stated makes.
         state: State at `t0`, not at time 0, with an axis of throws in front: see `start`.
         t0: Time of each throw's state [s]: that of its first sample, in a fit.
-        numbers: The global numbers sought: see `names`.
-        covariance: Of `numbers`, then of the states: for each throw the rate, and, if it matters,
-            a small turn of the attitude about the body axes.
         residuals: Whitened, (throws, rows); zero where nothing was seen.
         jacobian: Their derivatives in the numbers and in the state of the throw.
         chi_square: Sum of their squares.
         degrees_of_freedom: Residuals less what was sought.
+        unexplained: Of the square of what was observed, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed, descending.
         directions: In the numbers, columns for the singular values.
         state_singular_values: Of the derivatives in each throw's state, of unit columns; a zero is
             a change of the state that the record does not show.
-        kept: For each kind of observation, which samples were (throws, n).
+        level: Of the unmodelled torque about each body axis [N m sqrt(s)].
+        level_errors: Of the level; of one that was not sought, what the record could tell.
+        scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
+        kept: For each record, which samples were (throws, n).
         spoilt: Throws that a robust fit gave up.
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         input_result: `jrigid.RESULTS` of the input.
         unknowns: What the numbers mean: `unknowns.inertia(numbers)` is the tensor, to carry
-            `covariance` over to anything that follows from it.
+            `numbers_covariance` over to anything that follows from it.
         problem: The record as it was fitted.
         options: How it was fitted.
-        noise_known: Whether errors follow from the noise stated, not from the residuals.
-        free_motion: Whether the motion is that of a body without torque.
+        index: Which body this is.
     """
 
     status: Any
-    inertia: Matrix
-    moments: Vector
-    axes: Matrix
-    moments_covariance: Matrix
-    axes_errors: Vector
-    ratios: Float[Array, " 2"]
-    ratios_covariance: Float[Array, "2 2"]
+    numbers: Float[Array, " numbers"]
+    own_numbers: Float[Array, "throws own"]
+    numbers_covariance: Float[Array, "numbers numbers"]
+    sensor_covariance: Float[Array, "numbers numbers"]
+    local_covariance: Float[Array, "throws local local"]
+    follow: Float[Array, "throws local numbers"]
+    scores: Float[Array, "throws numbers"]
+    inflation: Scalar
     state: State
     t0: Float[Array, " throws"]
-    numbers: Float[Array, " numbers"]
-    covariance: Float[Array, "all all"]
     residuals: Float[Array, "throws rows"]
     jacobian: Float[Array, "throws rows unknowns"]
     chi_square: Scalar
     degrees_of_freedom: Int[Array, ""]
+    unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
-    state_singular_values: Float[Array, "throws state"]
+    state_singular_values: Float[Array, "throws local"]
+    level: Vector
+    level_errors: Vector
+    scales: Float[Array, " records"]
     kept: tuple[Array, ...]
     spoilt: Bool[Array, " throws"]
     history: Float[Array, " steps"]
@@ -115,8 +130,7 @@ class FitResult(eqx.Module):
     unknowns: Unknowns
     problem: Any
     options: Any = eqx.field(static=True)
-    noise_known: bool = eqx.field(static=True)
-    free_motion: bool = eqx.field(static=True)
+    index: int = eqx.field(static=True, default=0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -124,9 +138,92 @@ class FitResult(eqx.Module):
         return self.unknowns.names()
 
     @property
+    def bodies(self) -> tuple["FitResult", ...]:
+        """The result for each body."""
+        return tuple(dataclasses.replace(self, index=i) for i in range(len(self.unknowns.shapes)))
+
+    @property
+    def inertia(self) -> Float[Array, "*fits 3 3"]:
+        """The tensor, body axes [kg m^2]; with `scale="trace"` of the trace of the system's."""
+        return _derived(self).inertia
+
+    @property
+    def moments(self) -> Float[Array, "*fits 3"]:
+        """Principal moments, ascending."""
+        return _derived(self).moments
+
+    @property
+    def axes(self) -> Float[Array, "*fits 3 3"]:
+        """Principal axes, columns, body from principal."""
+        return _derived(self).axes
+
+    @property
+    def ratios(self) -> Float[Array, "*fits 2"]:
+        """I2/I1 and I3/I1."""
+        return self.moments[..., 1:] / self.moments[..., :1]
+
+    @property
+    def moments_covariance(self) -> Float[Array, "*fits 3 3"]:
+        """Of the moments."""
+        return _derived(self).moments_covariance
+
+    @property
+    def ratios_covariance(self) -> Float[Array, "*fits 2 2"]:
+        """Of the ratios."""
+        return _derived(self).ratios_covariance
+
+    @property
+    def axes_errors(self) -> Float[Array, "*fits 3"]:
+        """Errors of the turn about each principal axis [rad]."""
+        return _derived(self).axes_errors
+
+    def spread(self, function: Callable[[Array], Array]) -> Array:
+        """Covariance of a function of the tensor, to a vector; of a single fit.
+
+        By its values one standard error away along each axis of the numbers' covariance, times the
+        root of their count: right where the function is linear, and where it has kinks, as sorted
+        moments have where two are equal, it follows them.
+
+        Args:
+            function: Of the tensor.
+        """
+        size = self.numbers.size
+        values, axes = jnp.linalg.eigh(self.numbers_covariance)
+        steps = product("ij,j->ji", axes, jnp.sqrt(jnp.maximum(values, 0.0) * size))
+        here = function(self.unknowns.inertia(self.numbers, self.index))
+
+        def move(step: Array) -> Array:
+            return function(self.unknowns.inertia(self.numbers + step, self.index)) - here
+
+        moves = jax.vmap(move)(jnp.concatenate([steps, -steps]))
+        return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
+
+    @property
+    def covariance(self) -> Float[Array, "*fits all all"]:
+        """Of `numbers`, then of each throw's state and own numbers."""
+        return _on_lanes(_covariance, self)
+
+    @property
+    def clustered_covariance(self) -> Float[Array, "*fits numbers numbers"]:
+        """Of `numbers`, by how much throws scatter, whatever the noise; of few throws too small."""
+        return _on_lanes(_clustered, self)
+
+    @property
     def system(self) -> RigidBody:
-        """The body that was found."""
-        return self.unknowns.system_and_gyro(self.numbers)[0]  # pyright: ignore
+        """The body that was found, that of the first throw."""
+        return self.parts()[0]
+
+    def parts(self, index: int = 0) -> tuple[Any, ...]:
+        """System and sensors of a throw, as they were found.
+
+        Args:
+            index: Which throw.
+        """
+        unknowns = self.unknowns
+        pairs = zip(unknowns.leaves, unknowns.stacked, strict=True)
+        leaves = tuple(x[index] if own else x for x, own in pairs)
+        body = self.problem.bodies[index]
+        return unknowns.parts(self.numbers, self.own_numbers[index], leaves, body)
 
     def start(self, index: int = 0) -> tuple[State, Float[Array, "*fits"]]:
         """The state of a throw and its time [s], which whoever moves the state needs.
@@ -153,17 +250,19 @@ class FitResult(eqx.Module):
         Raises:
             ValueError: The shape that was sought was another one.
         """
-        if self.unknowns.ten is None:
+        shape = self.unknowns.shapes[0]
+        body = shape.body(self.numbers[: len(shape.names)])
+        if body is None:
             raise ValueError(
                 "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
                 "to follow, but it was not."
             )
-        return self.unknowns.ten.body(self.numbers[self.unknowns.slices["shape"]])
+        return body
 
     @property
     def errors(self) -> Float[Array, "*fits numbers"]:
         """Standard errors of `numbers`."""
-        return _errors(self.covariance)[..., : self.numbers.shape[-1]]
+        return _errors(self.numbers_covariance)
 
     @property
     def correlation(self) -> Float[Array, "*fits all all"]:
@@ -182,26 +281,79 @@ class FitResult(eqx.Module):
         freedom = jnp.maximum(self.degrees_of_freedom, 1).astype(self.chi_square.dtype)
         return self.chi_square / freedom
 
+    def rows(
+        self, record: int = 0, throw: int = 0
+    ) -> tuple[Float[Array, "n outputs unknowns"], Float[Array, "n outputs"]]:
+        """Derivatives and whitened residuals of a record in a throw, of a single fit.
+
+        Args:
+            record: Which record.
+            throw: Which throw.
+        """
+        sizes = [x.weight.shape[1:] for x in self.problem.samples]
+        start = sum(n * d for n, d in sizes[:record])
+        n, d = sizes[record]
+        part = slice(start, start + n * d)
+        jacobian = self.jacobian[throw, part].reshape(n, d, -1)
+        return jacobian, self.residuals[throw, part].reshape(n, d)
+
+    def left(self, record: int = 0) -> Float[Array, "throws n outputs"]:
+        """What is left of a record: predicted less observed, in its own units; of a single fit.
+
+        Args:
+            record: Which record.
+        """
+        white = self.problem.samples[record].whitener
+        throws = range(white.shape[0])
+        rows = jnp.stack([self.rows(record, throw)[1] for throw in throws])
+        return jnp.linalg.solve(white, rows[..., None])[..., 0]
+
     @property
-    def nuisances(self) -> dict[str, tuple[Array, Array]]:
-        """Value and error of each nuisance: biases in rad/s, scales as logarithms, turns in rad."""
-        found = {}
-        for name in self.unknowns.nuisances:
-            s = self.unknowns.slices[name]
-            if s.stop > s.start:
-                unit = self.unknowns.rate[..., None] if name == "gyro_bias" else 1.0
-                found[name] = unit * self.numbers[..., s], unit * self.errors[..., s]
-        return found
+    def chi_square_by_throw(self) -> Float[Array, "*fits throws"]:
+        """Mean square of the residuals of each throw."""
+        seen = jnp.maximum(jnp.sum(self.residuals != 0, axis=-1), 1)
+        return jnp.sum(self.residuals**2, axis=-1) / seen.astype(self.residuals.dtype)
+
+    @property
+    def whiteness(self) -> tuple[float, float]:
+        """Correlation of neighbouring residuals, and how many standard deviations that is from 0.
+
+        Of a single fit. Near 0 for noise; what a model leaves out changes slowly and brings it near
+        1.
+        """
+        square = product_ = count = 0.0
+        throws = range(self.residuals.shape[0])
+        for record in range(len(self.problem.samples)):
+            part = np.stack([np.asarray(self.rows(record, i)[1]) for i in throws])
+            both = (part[:, 1:] != 0) & (part[:, :-1] != 0)
+            product_ += float(np.sum(part[:, 1:] * part[:, :-1]))
+            square += float(np.sum(both * (part[:, 1:] ** 2 + part[:, :-1] ** 2) / 2))
+            count += int(both.sum())
+        like = product_ / max(square, 1e-300)
+        return like, abs(like) * count**0.5
 
     @property
     def leaves(self) -> dict[str, tuple[Array, Array]]:
-        """Value and error of each leaf of the system that was free, of a single fit."""
-        found = {}
-        s = self.unknowns.slices["leaves"]
-        values = self.unknowns.leaf_values(self.numbers)
-        errors = self.unknowns.leaf_units() * self.errors[s]
-        for name, value, error in zip(self.names[s], values, errors, strict=True):
-            found[name] = value, error
+        """Value and error of each array that `free` picked, of a single fit, by name.
+
+        Of one that is sought anew in each throw, of each throw.
+        """
+        found, start = {}, self.follow.shape[1] - self.own_numbers.shape[-1]
+        end = 0
+        for x in self.unknowns.sought:
+            if x.own:
+                numbers = self.own_numbers[:, end : end + x.size]
+                part = slice(start + end, start + end + x.size)
+                cause = self.follow[:, part]
+                covariance = self.local_covariance[:, part, part]
+                covariance = covariance + product(
+                    "tlg,gh,tmh->tlm", cause, self.numbers_covariance, cause
+                )
+                found[x.name] = jax.vmap(x.with_errors)(numbers, covariance)
+                end += x.size
+            else:
+                s = self.unknowns.slices[x.name]
+                found[x.name] = x.with_errors(self.numbers[s], self.numbers_covariance[s, s])
         return found
 
     @property
@@ -231,3 +383,66 @@ class FitResult(eqx.Module):
         from jrigid.identify._words import report
 
         return report(self)
+
+
+class _Derived(NamedTuple):
+    """What follows from the numbers and their covariance."""
+
+    inertia: Array
+    moments: Array
+    axes: Array
+    moments_covariance: Array
+    ratios_covariance: Array
+    axes_errors: Array
+
+
+@quick_jit
+def _derived(result: FitResult) -> _Derived:
+    """Of one fit, or of each lane of many."""
+
+    def one(result: FitResult) -> _Derived:
+        tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
+        tensor = tensor_of(result.numbers)
+        moments, axes = eigh(tensor)
+        inside = product("ki,kln,lj->ijn", axes, jax.jacfwd(tensor_of)(result.numbers), axes)
+        floor = jnp.finfo(moments.dtype).eps * moments[2]
+
+        def turn(i: int, j: int) -> Array:
+            gap = moments[i] - moments[j]
+            return inside[i, j] / jnp.where(jnp.abs(gap) > floor, gap, floor)
+
+        turns = jnp.stack([turn(1, 2), turn(2, 0), turn(0, 1)])
+        square = product("in,nm,im->i", turns, result.numbers_covariance, turns)
+
+        def both(tensor: Array) -> Array:
+            moments = eigh(tensor)[0]
+            return jnp.concatenate([moments, moments[1:] / moments[0]])
+
+        spread = result.spread(both)
+        return _Derived(tensor, moments, axes, spread[:3, :3], spread[3:, 3:], jnp.sqrt(square))
+
+    return _on_lanes(one, result)
+
+
+def _on_lanes(function: Callable[[FitResult], Any], result: FitResult) -> Any:
+    for _ in range(result.numbers.ndim - 1):
+        function = eqx.filter_vmap(function)
+    return function(result)
+
+
+def _covariance(result: FitResult) -> Array:
+    numbers, follow = result.numbers_covariance, result.follow
+    throws, local, size = follow.shape
+    across = -product("tlg,gh->tlh", follow, numbers).reshape(throws * local, size)
+    blocks = product("tlg,gh,smh->tlsm", follow, numbers, follow)
+    eye = jnp.eye(throws, dtype=numbers.dtype)
+    blocks = blocks + eye[:, None, :, None] * result.local_covariance[:, :, None, :]
+    blocks = blocks.reshape(throws * local, throws * local)
+    return jnp.block([[numbers, across.T], [across, blocks]])
+
+
+def _clustered(result: FitResult) -> Array:
+    throws = result.scores.shape[0]
+    inverse = result.numbers_covariance / result.inflation
+    spread = product("tg,th->gh", result.scores, result.scores) * throws / max(throws - 1, 1)
+    return inverse @ spread @ inverse

@@ -21,9 +21,13 @@ from jrigid._checks import (
 )
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Matrix, Readable, Real, Vector
+from jrigid.dynamics import State
+from jrigid.identify._layout import Told
+from jrigid.identify._shapes import LogCholesky, as_tensor
 from jrigid.rotation import to_matrix
 
 _LEAST_SAMPLES = 8  # to a window
+_FEW_ATTITUDES = 40  # fewer than these do without the weak form
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
 _FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
 
@@ -308,20 +312,68 @@ def _gyrostat(ts: Array, omegas: Array, rotor: Array, windows: int, radians: flo
     return _answer(findings, _tensor(six), values)
 
 
-def linear_start(
+def linear_starts(
+    options: Any, unknowns: Any, told: Told | None, bodies: Array, given: Array | None
+) -> tuple[Array, Array]:
+    """Tensors of each body (bodies, 3, 3) to start from, and others for a second attempt."""
+    dtype, count = unknowns.rate.dtype, len(unknowns.shapes)
+    known = as_tensor(unknowns.original(0)[0].inertia.astype(dtype))
+    sought = any(x.names and not isinstance(x, LogCholesky) for x in unknowns.shapes)
+    if given is not None or told is None or not sought or options.motion is not None:
+        tensor = known if given is None else given.astype(dtype)
+        first = jnp.broadcast_to(tensor, (count, 3, 3))
+        return first, _rounder(first)
+    torques = None if options.free_motion else _torques(unknowns, told)
+    attitudes = told.attitude if options.free_motion and told.ts.shape[1] < _FEW_ATTITUDES else None
+    trace = None if unknowns.scaled and not options.free_motion else jnp.trace(known)
+
+    def start(body: Array) -> tuple[Array, Array]:
+        there = told.there & (bodies == body)[:, None]
+        return _linear_start(told.ts, there, told.omega, attitudes, torques, trace, known)
+
+    firsts, leaning = jax.vmap(start)(jnp.arange(count))
+    return (leaning, _rounder(leaning)) if trace is not None else (firsts, leaning)
+
+
+def _rounder(tensors: Array) -> Array:
+    """Of bodies half way to a sphere."""
+    sphere = lambda x: jnp.trace(x) / 3 * jnp.eye(3, dtype=x.dtype)  # noqa: E731
+    return jax.vmap(lambda x: 0.5 * (x + sphere(x)))(tensors)
+
+
+def _torques(unknowns: Any, told: Told) -> Array:
+    """As they are at the samples, by what is known of the system beforehand."""
+    unit = jnp.zeros((*told.ts.shape, 4), told.ts.dtype).at[..., 0].set(1)
+    attitude = unit if told.attitude is None else told.attitude
+    throws = [unknowns.original(i)[0] for i in range(told.ts.shape[0] * any(unknowns.stacked))]
+
+    def of_throw(system: Any, ts: Array, q: Array, w: Array) -> Array:
+        at = lambda t, q, w: jnp.asarray(system.torque_on(t, State(q, w), None), w.dtype)  # noqa: E731
+        return jax.vmap(at)(ts, q, w)
+
+    seen = told.ts, attitude, told.omega
+    if throws:
+        parts = zip(throws, *seen, strict=True)
+        return jnp.stack([of_throw(*x) for x in parts])
+    system = unknowns.original(0)[0]
+    return jax.vmap(lambda *x: of_throw(system, *x))(*seen)
+
+
+def _linear_start(
     ts: Array,
     known: Array,
     omegas: Array,
     attitudes: Array | None,
     torques: Array | None,
     trace: Array | None,
+    like: Array,
     windows: int = 128,
-) -> Matrix:
-    """Tensor from throws of one body, samples (throws, n): of a given trace, or, None, of any.
+) -> tuple[Array, Array]:
+    """Tensors from throws of one body, samples (throws, n): of a given trace, or, None, of any.
 
     By attitudes, if there are any, R I omega is constant in each throw of a free body; else the
-    weak form, torques as they are at the samples. Where the record says little the tensor leans to
-    a sphere.
+    weak form, torques as they are at the samples. The first is the least-squares solution; the
+    second leans to a sphere where the record says little.
     """
     shown = known[..., None]
     omegas = jnp.where(shown, omegas, 0.0)
@@ -353,24 +405,30 @@ def linear_start(
     size = jnp.where(size > 0, size, 1.0)
     rows, right = rows / size, right / size
     sphere = jnp.asarray([1.0, 1, 1, 0, 0, 0], rows.dtype) / 3
-    basis = jnp.eye(6, dtype=rows.dtype)
-    start = jnp.zeros(6, rows.dtype)
-    if trace is not None:  # five directions without a trace
+    basis, start = jnp.eye(6, dtype=rows.dtype), jnp.zeros(6, rows.dtype)
+    if trace is None:  # the sphere that does best, or one like the system's own
+        along = product("ri,i->r", rows, sphere)
+        square = jnp.sum(along * along)
+        trace = jnp.sum(along * right) / jnp.where(square > 0, square, 1.0)
+        trace = jnp.where(trace > 0, trace, jnp.trace(like))
+    else:  # five directions
         third, half = 1 / 6**0.5, 1 / 2**0.5
         flat = [[third, third, -2 * third, 0, 0, 0], [half, -half, 0, 0, 0, 0]]
         basis = jnp.concatenate([jnp.asarray(flat, rows.dtype), basis[3:]])
-        start = trace * sphere
+    start = trace * sphere
     wanted = right - product("ri,i->r", rows, start)
     u, values, vt = jnp.linalg.svd(product("ri,ki->rk", rows, basis), full_matrices=False)
     along = product("rk,r->k", u, wanted)
     # The misfit of the best answer is how far rows can be trusted.
-    best = jnp.where(values > 64 * jnp.finfo(values.dtype).eps * values[0], 1.0, 0.0) * along
-    misfit = safe_norm(wanted - product("rk,k->r", u, best))
-    floor = (
-        misfit / jnp.maximum(safe_norm(wanted), 1e-300) * values[0]
-        if trace is None
-        else (2 * misfit / trace)
-    )
+    told = values > 64 * jnp.finfo(values.dtype).eps * values[0]
+    best = jnp.where(told, along, 0.0)
+    floor = 2 * safe_norm(wanted - product("rk,k->r", u, best)) / trace
+
+    def tensor(weights: Array) -> Array:
+        return _tensor(start + product("k,kj,ji->i", weights, vt, basis))
+
     square = values * values + floor * floor
-    faded = values * along / jnp.where(square > 0, square, 1.0)
-    return _tensor(start + product("k,kj,ji->i", faded, vt, basis))
+    leaning = tensor(values * along / jnp.where(square > 0, square, 1.0))
+    plain = tensor(best / jnp.where(told, values, 1.0))
+    good = jnp.all(jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(plain), plain, 0.0)) > 0)
+    return jnp.where(good, plain, leaning), leaning

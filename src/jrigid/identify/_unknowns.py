@@ -1,11 +1,14 @@
-"""The numbers a fit seeks: shape and scale of the inertia, leaves of the system, the gyro's errors.
+"""The numbers a fit seeks: of the shape and scale of the inertia, and arrays picked by `free`.
 
-They are one flat vector; `Unknowns.system_and_gyro` turns it into a body and a sensor.
+They are one flat vector for all throws, and one more for each throw; `Unknowns.parts` turns them
+into a system and sensors.
 """
 
+import abc
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,244 +16,326 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import check_option
-from jrigid._numerics import product
-from jrigid._spectral import eigh
-from jrigid.identify._parameters import LogCholesky
+from jrigid._types import Readable
+from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.mass import MassProperties
-from jrigid.rotation import hat
-from jrigid.systems import AbstractSystem
 from jrigid.torques import Sum, UniformGravity
 
-SHAPES = {"tensor": 5, "moments": 2, "symmetric": 3, "top": 1, "flat": 4, "fixed": 0}
-SCALES = ("trace", "known", "rotor")
-NUISANCES = {
-    "gyro_bias": 3,  # in units of the record's rms rate
-    "gyro_scale": 1,  # common to the three axes
-    "gyro_scales": 3,
-    "gyro_misalignment": 3,  # a small turn of the gyro from the axes of everything else
-    "gyro_matrix": 9,
-    "gyro_handedness": 0,  # a discrete one: see `FitResult.mirror`
-}
-# Second moments of a mass are kept this fraction of their trace from flat, at the start.
-_FLATTEST = 1e-3
-# ... and where the fit is said to have run into a boundary.
-BOUNDARY = 1e-7
+_LEAST = 1e-3  # of its unit, for a positive number to start from
 
 
-def second_moments(tensor: Array) -> Array:
-    """Sigma of unit trace: 1 - 2 I / trace I."""
-    return jnp.eye(3, dtype=tensor.dtype) - 2 * tensor / jnp.trace(tensor)
+class _Pick(NamedTuple):
+    """An array that `free` picked: its place among the arrays, and how it is sought."""
+
+    index: int
+    sigma: Any = None
+    own: bool = False
 
 
-def as_tensor(inertia: Array) -> Array:
-    """A tensor, of moments or itself."""
-    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+def prior(array: Any, sigma: Any) -> Any:
+    """Within `free`: an array that is sought, known beforehand to within `sigma` of its value.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> record = jr.datasets.gyro_example()
+    >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+    >>> found = jr.identify.fit(
+    ...     jr.RigidBody(jnp.ones(3)), readings,
+    ...     free=lambda body, gyro: jr.identify.prior(gyro.bias, 1e-3))
+    >>> print(found.names[5:])
+    ('gyro.bias[0]', 'gyro.bias[1]', 'gyro.bias[2]')
+    """
+    return jtu.tree_map(lambda x: x._replace(sigma=sigma), array, is_leaf=_is_pick)
 
 
-def real_body(tensor: Array, flattest: float) -> Array:
-    """The nearest shape of a body with extent in three directions: Sigma of unit trace."""
-    values, axes = eigh(second_moments(tensor))
-    values = jnp.maximum(values, flattest)
-    values = values / jnp.sum(values)
-    return product("ik,k,jk->ij", axes, values, axes)
+def each(array: Any) -> Any:
+    """Within `free`: an array that is sought anew in each throw; `each(prior(array, sigma))` too.
+
+    >>> import jrigid as jr
+    >>> free = lambda body, gyro: jr.identify.each(gyro.bias)
+    """
+    return jtu.tree_map(lambda x: x._replace(own=True), array, is_leaf=_is_pick)
+
+
+def _is_pick(x: Any) -> bool:
+    return isinstance(x, _Pick)
+
+
+class AbstractSought(Readable):
+    """An array that is sought, by numbers without bounds; `unit` is its natural size."""
+
+    index: int = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    own: bool = eqx.field(static=True)
+    base: Array
+    unit: Array
+    sigma: Array | None
+
+    @property
+    def size(self) -> int:
+        """Of the numbers."""
+        return self.base.size
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One for each number."""
+        whole = self.base.ndim == 0
+        return (self.name,) if whole else tuple(f"{self.name}[{j}]" for j in range(self.size))
+
+    @abc.abstractmethod
+    def start(self) -> Array:
+        """The numbers at the start."""
+
+    @abc.abstractmethod
+    def value(self, x: Array) -> Array:
+        """The array."""
+
+    def with_errors(self, x: Array, covariance: Array) -> tuple[Array, Array]:
+        """The array and its standard errors."""
+        slopes = jax.jacfwd(self.value)(x)
+        square = jnp.einsum("...n,nm,...m->...", slopes, covariance, slopes)
+        return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
+
+    def prior_rows(self, x: Array) -> Array:
+        """What is known of it beforehand, as residuals."""
+        if self.sigma is None:
+            return jnp.zeros(0, x.dtype)
+        return ((self.value(x) - self.base) / self.sigma).reshape(-1)
+
+
+class _Any(AbstractSought):
+    """Of either sign."""
+
+    def start(self) -> Array:
+        return jnp.zeros(self.size, self.unit.dtype)
+
+    def value(self, x: Array) -> Array:
+        return self.base + self.unit * x.reshape(self.base.shape)
+
+
+class _Positive(AbstractSought):
+    """Positive: linear in the number where it is large, exponential where it is small."""
+
+    def start(self) -> Array:
+        return jnp.log(jnp.expm1(jnp.maximum(self.base / self.unit, _LEAST))).reshape(-1)
+
+    def value(self, x: Array) -> Array:
+        return self.unit * jax.nn.softplus(x.reshape(self.base.shape))
+
+
+class _Definite(AbstractSought):
+    """A symmetric, positive definite tensor: L L^T, the logarithms of L's diagonal first."""
+
+    @property
+    def size(self) -> int:
+        return 6
+
+    def start(self) -> Array:
+        eye = _LEAST * jnp.eye(3, dtype=self.unit.dtype)
+        lower = jnp.linalg.cholesky(self.base / jnp.max(self.unit) + eye)
+        sides = jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])
+        return jnp.concatenate([jnp.log(jnp.diagonal(lower)), sides])
+
+    def value(self, x: Array) -> Array:
+        zero, size = jnp.zeros_like(x[0]), jnp.exp(x[:3])
+        rows = [[size[0], zero, zero], [x[3], size[1], zero], [x[4], x[5], size[2]]]
+        lower = jnp.stack([jnp.stack(row) for row in rows])
+        return jnp.max(self.unit) * (lower @ lower.T)
+
+
+def _field(tree: Any, path: Sequence[Any]) -> Any:
+    """The metadata of the field where a path ends."""
+    metadata: Any = {}
+    for key in path:
+        if isinstance(key, jtu.GetAttrKey):
+            fields = {x.name: x.metadata for x in dataclasses.fields(tree)}
+            metadata = fields[key.name]
+            tree = getattr(tree, key.name)
+        else:
+            tree = tree[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
+    return metadata
+
+
+def _named(tree: Any, path: Sequence[Any]) -> str:
+    """`torque.coefficient` of a system, `gyro.bias` of a sensor."""
+    part, *inner = path
+    text = jtu.keystr(tuple(inner)).lstrip(".")
+    if part.idx == 0:
+        return text
+    sensors = [type(x).__name__.lower() for x in tree[1:]]
+    name = sensors[part.idx - 1]
+    return f"{name if sensors.count(name) == 1 else f'{name}{part.idx}'}.{text}"
+
+
+def _picks(parts: tuple[Any, ...], free: Callable[..., Any] | None) -> list[_Pick]:
+    """What `free` picks among the arrays of the system and the sensors, in their order."""
+    if free is None:
+        return []
+    arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
+    flat, tree = jtu.tree_flatten(arrays)
+    marked = eqx.combine(tree.unflatten([_Mark(i) for i in range(len(flat))]), rest)
+    marked = jtu.tree_map(lambda x: _Pick(x.index) if isinstance(x, _Mark) else x, marked)
+    accepts = inspect.signature(free).parameters.values()
+    if any(x.kind == x.VAR_POSITIONAL for x in accepts):
+        count = len(parts)
+    else:
+        count = min(len(parts), len(accepts))
+    chosen = jtu.tree_leaves(free(*marked[:count]), is_leaf=_is_pick)
+    paths = [path for path, _ in jtu.tree_leaves_with_path(arrays)]
+    known = {x.index: x for x in chosen if _is_pick(x)}
+    known = {i: x for i, x in known.items() if not jtu.keystr(paths[i]).startswith("[0].inertia")}
+    if not known or not all(map(_is_pick, chosen)):
+        raise ValueError(
+            "Argument `free` must be a function of the system and the sensors that picks floating "
+            "point arrays of theirs, beside the inertia, which is always sought, but it is not."
+        )
+    return [known[i] for i in sorted(known)]
+
+
+class _Mark:
+    """In the place of an array."""
+
+    def __init__(self, index: int):
+        self.index = index
 
 
 class Unknowns(eqx.Module):
-    """What is sought, in what numbers, around what system."""
+    """What is sought, in what numbers, around what system and sensors."""
 
-    system: Any  # arrays
-    functions: Any = eqx.field(static=True)
-    shape: str = eqx.field(static=True)
+    given: tuple[Any, ...]  # arrays of system and sensors, some with an axis of throws in front
+    rest: tuple[Any, ...] = eqx.field(static=True)  # what is no array
+    stacked: tuple[bool, ...] = eqx.field(static=True)  # which arrays have
+    sought: tuple[AbstractSought, ...]
+    shapes: tuple[AbstractShape, ...]  # of each body
     scaled: bool = eqx.field(static=True)
-    leaves: tuple[int, ...] = eqx.field(static=True)
-    nuisances: tuple[str, ...] = eqx.field(static=True)
-    priors: tuple[Array | None, ...]
-    chart: Array
     trace: Array
     rate: Array  # rms of the rates [rad/s]
     held: Any = eqx.field(static=True, default=None)  # a function of the tensor that is held
     constraint: tuple[Array, Array] | None = None  # at a value, to within a unit
-    ten: LogCholesky | None = None  # in place of a shape
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where each part is in the flat vector."""
-        of_shape = SHAPES[self.shape] if self.ten is None else len(self.ten.sought)
-        sizes = {"shape": of_shape, "scale": int(self.scaled)}
-        flat = jtu.tree_leaves(self.system)
-        sizes["leaves"] = sum(flat[i].size for i in self.leaves)
-        sizes.update({name: NUISANCES[name] for name in self.nuisances})
-        found, at = {}, 0
-        for name, size in sizes.items():
-            found[name] = slice(at, at + size)
-            at += size
+        """Where each part is in the vector for all throws."""
+        parts = {"shape": sum(len(x.names) for x in self.shapes)}
+        parts["scale"] = len(self.shapes) * self.scaled
+        parts.update({x.name: x.size for x in self.sought if not x.own})
+        found, end = {}, 0
+        for name, size in parts.items():
+            found[name] = slice(end, end + size)
+            end += size
         return found
 
     @property
     def size(self) -> int:
-        """Of the flat vector."""
+        """Of the vector for all throws."""
         return max(s.stop for s in self.slices.values())
 
     @property
-    def original(self) -> Any:
-        """The system as it was given."""
-        return eqx.combine(self.system, self.functions)
+    def own(self) -> tuple[AbstractSought, ...]:
+        """What is sought in each throw."""
+        return tuple(x for x in self.sought if x.own)
 
     def names(self) -> tuple[str, ...]:
         """One for each number."""
-        found: list[str] = []
-        paths = jtu.tree_leaves_with_path(self.system)
-        for name, s in self.slices.items():
-            if name == "leaves":
-                for i in self.leaves:
-                    path, leaf = paths[i]
-                    text = jtu.keystr(path).lstrip(".")
-                    parts = [text] if leaf.ndim == 0 else [f"{text}[{j}]" for j in range(leaf.size)]
-                    found.extend(parts)
-            elif name == "shape" and self.ten is not None:
-                found.extend(self.ten.sought)
-            elif s.stop - s.start == 1:
-                found.append(name)
-            else:
-                found.extend(f"{name}[{j}]" for j in range(s.stop - s.start))
-        return tuple(found)
+        several = len(self.shapes) > 1
+        end = [f" of body {i}" if several else "" for i in range(len(self.shapes))]
+        found = [name + end[i] for i, x in enumerate(self.shapes) for name in x.names]
+        found += ["scale" + x for x in end] * self.scaled
+        return (*found, *(name for x in self.sought if not x.own for name in x.names))
 
-    def leaf_units(self) -> Array:
-        """Sizes of the free leaves at the start, one for each number."""
-        flat = jtu.tree_leaves(self.system)
-        units = [jnp.zeros(0, self.rate.dtype)]
-        for i in self.leaves:
-            size = jnp.max(jnp.abs(flat[i])).astype(self.rate.dtype)
-            units.append(jnp.full(flat[i].size, jnp.where(size > 0, size, 1.0)))
-        return jax.lax.stop_gradient(jnp.concatenate(units))
+    def inertia(self, numbers: Array, body: int | Array = 0) -> Array:
+        """The tensor of a body."""
+        dtype, end, found = numbers.dtype, 0, []
+        for i, shape in enumerate(self.shapes):
+            start, end = end, end + len(shape.names)
+            tensor = shape.inertia(numbers[start:end]).astype(dtype)
+            if not shape.absolute:
+                tensor = self.trace * tensor / jnp.trace(tensor)
+            if self.scaled:
+                tensor = tensor * jnp.exp(numbers[self.slices["scale"]][i])
+            found.append(tensor)
+        return found[0] if len(found) == 1 else jnp.stack(found)[body]
+
+    def start(self, tensors: Array, flattest: float = 1e-3) -> tuple["Unknowns", Array]:
+        """Numbers for the bodies' tensors; the frames of their shapes are chosen for them."""
+        known = as_tensor(self.original(0)[0].inertia.astype(tensors.dtype))
+        pairs = [
+            shape.start(tensor, known, flattest)
+            for shape, tensor in zip(self.shapes, tensors, strict=True)
+        ]
+        factors = jnp.trace(tensors, axis1=-2, axis2=-1) / self.trace
+        scales = jnp.log(jnp.where(factors > 0, factors, 1.0))[: len(pairs) * self.scaled]
+        shared = [x.start() for x in self.sought if not x.own]
+        numbers = [*(x for _, x in pairs), scales, *shared]
+        unknowns = eqx.tree_at(
+            lambda u: u.shapes, self, tuple(shape for shape, _ in pairs),
+            is_leaf=lambda x: x is None,
+        )  # fmt: skip
+        return unknowns, jnp.concatenate([x.astype(tensors.dtype) for x in numbers])
+
+    def own_start(self, throws: int, dtype: Any) -> Array:
+        """Numbers of each throw."""
+        parts = [jnp.zeros(0, dtype), *(x.start().astype(dtype) for x in self.own)]
+        return jnp.tile(jnp.concatenate(parts), (throws, 1))
+
+    @property
+    def leaves(self) -> tuple[Array, ...]:
+        """The arrays of the system and the sensors."""
+        return tuple(jtu.tree_leaves(self.given))
+
+    def original(self, throw: int) -> tuple[Any, ...]:
+        """System and sensors of a throw as they were given."""
+        pairs = zip(self.leaves, self.stacked, strict=True)
+        return self._built([x[throw] if own else x for x, own in pairs])
+
+    def _built(self, leaves: Sequence[Array]) -> tuple[Any, ...]:
+        arrays = jtu.tree_unflatten(jtu.tree_structure(self.given), leaves)
+        return eqx.combine(arrays, self.rest)
+
+    def parts(
+        self, numbers: Array, own: Array, leaves: tuple[Array, ...], body: int | Array
+    ) -> tuple[Any, ...]:
+        """System and sensors of a throw: of its own numbers, the arrays given for it, its body."""
+        leaves_, ends = list(leaves), {True: 0, False: self.size}
+        ends[False] = self.slices["scale"].stop
+        for x in self.sought:
+            start = ends[x.own]
+            ends[x.own] = start + x.size
+            value = x.value((own if x.own else numbers)[start : ends[x.own]])
+            leaves_[x.index] = value.astype(numbers.dtype)
+        system, *sensors = self._built(leaves_)
+        mass = None
+        if len(self.shapes) == 1:
+            mass = self.shapes[0].body(numbers[: len(self.shapes[0].names)])
+        torque = _of_body(system.torque, mass)
+        inertia = self.inertia(numbers, body)
+        return eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque)), *sensors
 
     def natural_units(self, numbers: Array) -> Array:
-        """Units in which an error is large or small: of a leaf its size, at the start or found."""
-        s = self.slices["leaves"]
-        units = self.leaf_units()
-        sizes = jnp.abs(self.leaf_values(numbers)) / units
-        found = jnp.ones_like(numbers).at[s].set(jnp.maximum(sizes, 1.0))
-        if self.ten is not None:
-            found = found.at[self.slices["shape"]].set(self.ten.units.astype(found.dtype))
-        return found
-
-    def leaf_values(self, numbers: Array) -> Array:
-        """The free leaves, side by side."""
-        flat = jtu.tree_leaves(self.system)
-        start = [flat[i].reshape(-1).astype(numbers.dtype) for i in self.leaves]
-        start = jnp.concatenate([jnp.zeros(0, numbers.dtype), *start])
-        return start + self.leaf_units() * numbers[self.slices["leaves"]]
-
-    def inertia(self, numbers: Array) -> Array:
-        """The tensor."""
-        s = self.slices
-        p = numbers[s["shape"]]
-        template = self.original.inertia.astype(numbers.dtype)
-        if self.ten is not None:
-            tensor = self.ten.body(p).about(jnp.zeros(3, p.dtype))
-        elif self.shape == "fixed":
-            tensor = as_tensor(template)
-        else:
-            sigma = _shape(self.shape, p)
-            sigma = product("ik,kl,jl->ij", self.chart, sigma, self.chart)
-            sigma = sigma / jnp.trace(sigma)
-            tensor = 0.5 * self.trace * (jnp.eye(3, dtype=sigma.dtype) - sigma)
-        return jnp.exp(numbers[s["scale"]][0]) * tensor if self.scaled else tensor
-
-    def start(self, tensor: Array, flattest: float = _FLATTEST) -> tuple["Unknowns", Array]:
-        """Numbers for a tensor, of the shape that is sought; the frame is chosen for it."""
-        if self.ten is not None:
-            start = self.ten.start.astype(tensor.dtype)
-            return self, jnp.zeros(self.size, start.dtype).at[self.slices["shape"]].set(start)
-        chart, sigma = self.chart, real_body(tensor, flattest)
-        p = jnp.zeros(SHAPES[self.shape], sigma.dtype)
-        if self.shape == "tensor":
-            chart = jnp.eye(3, dtype=sigma.dtype)
-            lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
-            p = jnp.stack(
-                [
-                    jnp.log(lower[1, 1]),
-                    jnp.log(lower[2, 2]),
-                    lower[1, 0],
-                    lower[2, 0],
-                    lower[2, 1],
-                ]
-            )
-        elif self.shape in ("moments", "top"):
-            sigma = product("ki,kl,li->i", chart, sigma, chart)
-            if self.shape == "moments":
-                p = jnp.log(sigma[1:] / sigma[0])
-            else:
-                p = jnp.log(2 * sigma[2:] / (sigma[0] + sigma[1]))
-        elif self.shape in ("symmetric", "flat"):
-            values, chart = eigh(sigma)
-            if self.shape == "flat":  # the largest second moment first
-                chart, values = chart[:, ::-1], values[::-1]
-                p = p.at[0].set(0.5 * jnp.log(values[1] / values[0]))
-            else:  # the odd one out last
-                last = values[2] - values[1] > values[1] - values[0]
-                chart = jnp.where(last, chart, chart[:, ::-1])
-                values = jnp.where(last, values, values[::-1])
-                p = p.at[0].set(jnp.log(2 * values[2] / (values[0] + values[1])))
-        numbers = jnp.zeros(self.size, sigma.dtype).at[self.slices["shape"]].set(p)
-        if self.scaled:
-            factor = jnp.trace(tensor) / self.trace
-            log_scale = jnp.log(jnp.where(factor > 0, factor, 1.0))
-            numbers = numbers.at[self.slices["scale"]].set(log_scale)
-        unknowns = eqx.tree_at(lambda u: u.chart, self, chart)
-        return unknowns, numbers
-
-    def rounder(self, tensor: Array, numbers: Array) -> Array:
-        """Numbers for a body half way to a sphere: another place to start from."""
-        if self.ten is not None or self.shape not in ("tensor", "moments", "top"):
-            return numbers
-        sphere = jnp.eye(3, dtype=tensor.dtype) * jnp.trace(tensor) / 3
-        return self.start(0.5 * (tensor + sphere), 0.1)[1]
-
-    def system_and_gyro(self, numbers: Array) -> tuple[AbstractSystem, Callable[[Array], Array]]:
-        """The body, and what its gyro makes of an angular velocity."""
-        values, tree = jtu.tree_flatten(self.system)
-        found, at = self.leaf_values(numbers), 0
-        for i in self.leaves:
-            size = values[i].size
-            values[i] = found[at : at + size].reshape(values[i].shape)
-            at += size
-        system = eqx.combine(jtu.tree_unflatten(tree, values), self.functions)
-        inertia = self.inertia(numbers)
-        body = None if self.ten is None else self.ten.body(numbers[self.slices["shape"]])
-        torque = _of_body(system.torque, body)
-        system = eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque))
-        return system, self.gyro(numbers)
-
-    def gyro(self, numbers: Array) -> Callable[[Array], Array]:
-        """What the gyro makes of an angular velocity."""
-        s = self.slices
-        matrix = jnp.eye(3, dtype=numbers.dtype)
-        bias = jnp.zeros(3, numbers.dtype)
-        if "gyro_scale" in s:
-            matrix = matrix * jnp.exp(numbers[s["gyro_scale"]][0])
-        if "gyro_scales" in s:
-            matrix = matrix * jnp.exp(numbers[s["gyro_scales"]])[:, None]
-        if "gyro_matrix" in s:
-            matrix = matrix + numbers[s["gyro_matrix"]].reshape(3, 3)
-        if "gyro_misalignment" in s:
-            turn = jnp.eye(3, dtype=numbers.dtype) - hat(numbers[s["gyro_misalignment"]])
-            matrix = product("ij,jk->ik", matrix, turn)
-        if "gyro_bias" in s:
-            bias = self.rate * numbers[s["gyro_bias"]]
-        return lambda omega: product("ij,j->i", matrix, omega) + bias
+        """Units in which an error is large or small: for what is picked, its size."""
+        units = [x.units() for x in self.shapes] + [jnp.ones(len(self.shapes) * self.scaled)]
+        for x in self.sought:
+            if isinstance(x, _Any) and not x.own:
+                size = jnp.abs(x.value(numbers[self.slices[x.name]])) / x.unit
+                units.append(jnp.maximum(size, 1.0).reshape(-1))
+            elif not x.own:
+                units.append(jnp.ones(x.size))
+        return jnp.concatenate([x.astype(numbers.dtype) for x in units])
 
     def prior_rows(self, numbers: Array) -> Array:
-        """What is known of the nuisances beforehand, as residuals."""
+        """What is known beforehand of the numbers for all throws, as residuals."""
         rows = [jnp.zeros(0, numbers.dtype)]
-        for name, prior in zip(self.nuisances, self.priors, strict=True):
-            if prior is not None and NUISANCES[name]:
-                unit = self.rate if name == "gyro_bias" else 1.0
-                rows.append(unit * numbers[self.slices[name]] / prior)
+        rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.sought if not x.own]
         if self.held is not None and self.constraint is not None:
             value, unit = self.constraint
             rows.append(((self.held(self.inertia(numbers)) - value) / unit)[None])
+        return jnp.concatenate(rows)
+
+    def own_prior_rows(self, own: Array) -> Array:
+        """What is known beforehand of a throw's own numbers."""
+        rows, end = [jnp.zeros(0, own.dtype)], 0
+        for x in self.own:
+            rows.append(x.prior_rows(own[end : end + x.size]))
+            end += x.size
         return jnp.concatenate(rows)
 
     def holding(self, function: Any, value: Array, unit: Array) -> "Unknowns":
@@ -268,103 +353,54 @@ def _of_body(torque: Any, body: MassProperties | None) -> Any:
     return torque
 
 
-def _shape(shape: str, p: Array) -> Array:
-    """Sigma, in the frame of the chart and of any trace."""
-    one, zero = jnp.ones((), p.dtype), jnp.zeros((), p.dtype)
-    if shape == "moments":
-        return jnp.diag(jnp.stack([one, jnp.exp(p[0]), jnp.exp(p[1])]))
-    if shape == "top":
-        return jnp.diag(jnp.stack([one, one, jnp.exp(p[0])]))
-    if shape == "symmetric":
-        axis = jnp.stack([p[1], p[2], one])
-        axis = axis / jnp.sqrt(1 + p[1] ** 2 + p[2] ** 2)
-        dyad = axis[:, None] * axis[None, :]
-        return jnp.eye(3, dtype=p.dtype) + (jnp.exp(p[0]) - 1) * dyad
-    if shape == "flat":
-        rows = [[one, zero, zero], [p[1], jnp.exp(p[0]), zero], [p[2], p[3], zero]]
-    else:
-        rows = [[one, zero, zero], [p[2], jnp.exp(p[0]), zero], [p[3], p[4], jnp.exp(p[1])]]
-    lower = jnp.stack([jnp.stack(row) for row in rows])
-    return product("ik,jk->ij", lower, lower)
-
-
-class _Mark:
-    """In the place of an array, to see which a function picks."""
-
-    def __init__(self, index: int):
-        self.index = index
-
-
-def _free_leaves(system: AbstractSystem, free: Any) -> tuple[int, ...]:
-    """Indices, among the arrays of the system, of the leaves that `free` chooses."""
-    arrays, _ = eqx.partition(system, eqx.is_inexact_array)
-    flat = jtu.tree_leaves(arrays)
-    if free is None:
-        return ()
-    if callable(free) and not isinstance(free, eqx.Module):
-        marks = [_Mark(i) for i in range(len(flat))]
-        marked = jtu.tree_unflatten(jtu.tree_structure(arrays), marks)
-        chosen = jtu.tree_leaves(free(eqx.combine(marked, system)))
-        if not chosen or not all(isinstance(x, _Mark) for x in chosen):
-            raise ValueError(
-                "Argument `free` must choose floating point arrays of the system, but it does not."
-            )
-        found = tuple(sorted({x.index for x in chosen}))
-    else:
-        chosen_tree = eqx.filter(arrays, free)
-        kept = {id(x) for x in jtu.tree_leaves(chosen_tree)}
-        found = tuple(i for i, x in enumerate(flat) if id(x) in kept)
-    paths = [jtu.keystr(path) for path, _ in jtu.tree_leaves_with_path(arrays)]
-    found = tuple(i for i in found if not paths[i].endswith(".inertia"))
-    if not found:
-        raise ValueError(
-            "Argument `free` must choose floating point arrays of the system beside the inertia, "
-            "which is always sought, but it does not."
-        )
-    return found
-
-
 def unknowns_of(
-    system: AbstractSystem,
-    free: Any,
-    nuisances: Sequence[str] | Mapping[str, Any],
-    shape: str | LogCholesky,
-    scale: str,
+    systems: Sequence[Any],
+    sensors: tuple[Any, ...],
+    sizes: Sequence[Array],
+    free: Callable[..., Any] | None,
+    shapes: tuple[AbstractShape, ...],
+    scaled: bool,
     rate: Array,
 ) -> Unknowns:
-    """Check the options and set up the numbers."""
-    ten = shape if isinstance(shape, LogCholesky) else None
-    if ten is None:
-        check_option("shape", shape, tuple(SHAPES))
-    elif scale == "trace":
+    """Set up the numbers.
+
+    Args:
+        systems: One, or one for each throw.
+        sensors: Those of the records.
+        sizes: Rms of the values of each.
+        free: What is sought beside the inertia.
+        shapes: Of each body.
+        scaled: Whether the tensor's scale is sought.
+        rate: Rms of the rates.
+    """
+    dtype, parts = rate.dtype, (systems[0], *sensors)
+    arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
+    flat, tree = jtu.tree_flatten(arrays)
+    others = [jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array)) for x in systems]
+    if any(len(x) != len(flat) for x in others):
         raise ValueError(
-            "Argument `scale` must be 'known' or 'rotor' where `shape` is a LogCholesky, whose "
-            "numbers hold the scale, but it is 'trace'."
+            "Argument `system` must hold bodies of the same kind for all throws, but it does not."
         )
-    check_option("scale", scale, SCALES)
-    if isinstance(nuisances, str):
-        nuisances = (nuisances,)
-    priors = dict(nuisances) if isinstance(nuisances, Mapping) else dict.fromkeys(nuisances)
-    for name in priors:
-        check_option("nuisances", name, tuple(NUISANCES))
-    dtype = rate.dtype
-    arrays, functions = eqx.partition(system, eqx.is_inexact_array)
-    inertia, eye = as_tensor(system.inertia.astype(dtype)), jnp.eye(3, dtype=dtype)
-    return Unknowns(
-        arrays,
-        functions,
-        shape if isinstance(shape, str) else "tensor",
-        ten is None and scale != "trace" and shape != "fixed",
-        _free_leaves(system, free),
-        tuple(priors),
-        tuple(None if p is None else jnp.asarray(p, dtype) for p in priors.values()),
-        eigh(inertia)[1] if shape == "moments" and system.inertia.ndim == 2 else eye,
-        jnp.trace(inertia),
-        rate,
-        ten=ten,
+    stacked = tuple(any(x[i] is not leaf for x in others) for i, leaf in enumerate(flat))
+    leaves = tuple(
+        jnp.stack([x[i] for x in others]) if own else leaf
+        for i, (leaf, own) in enumerate(zip(flat, stacked, strict=True))
     )
-
-
-def is_near_flat(tensor: Array) -> Array:
-    """Whether a fit has run into the boundary of real bodies."""
-    return eigh(second_moments(tensor))[0][0] < BOUNDARY
+    units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
+    units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
+    paths = [path for path, _ in jtu.tree_leaves_with_path(arrays)]
+    sought = []
+    for pick in _picks(parts, free):
+        base, path = flat[pick.index].astype(dtype), paths[pick.index]
+        of_system = path[0].idx == 0  # type: ignore[union-attr]
+        largest = jnp.max(jnp.abs(base))
+        unit = jnp.where(largest > 0, largest, 1.0) if of_system else units[pick.index]
+        unit = jax.lax.stop_gradient(jnp.broadcast_to(unit, base.shape).astype(dtype))
+        sigma = None if pick.sigma is None else jnp.asarray(pick.sigma, dtype)
+        kind = _Any
+        if _field(parts, path).get("positive"):
+            kind = _Definite if base.shape == (3, 3) else _Positive
+        sought.append(kind(pick.index, _named(parts, path), pick.own, base, unit, sigma))
+    inertia = as_tensor(systems[0].inertia.astype(dtype))
+    given = tree.unflatten(leaves)
+    return Unknowns(given, rest, stacked, tuple(sought), shapes, scaled, jnp.trace(inertia), rate)

@@ -20,10 +20,14 @@ from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 TorqueFunction = Callable[[Any, Any, Any], Any]
 
 
-# What a parameter must be, in words and as a test: the metadata of its field.
+# What a parameter must be, in words and as a test: the metadata of its field. `positive` asks a
+# search to keep to one side of zero.
 FINITE = {"rule": ("finite", all_finite)}
-POSITIVE = {"rule": ("positive and finite", all_positive)}
-NOT_NEGATIVE = {"rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0))}
+POSITIVE = {"rule": ("positive and finite", all_positive), "positive": True}
+NOT_NEGATIVE = {
+    "rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0)),
+    "positive": True,
+}
 NOT_ZERO = {"rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x, axis=-1)))}
 
 

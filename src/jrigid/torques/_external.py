@@ -265,7 +265,7 @@ def _takes_energy(coefficient: Array) -> Array:
 _WORDS = "finite and not negative (a tensor symmetric and positive semi-definite)"
 _DISSIPATIVE: dict[str, Any] = {
     "converter": array("coefficient", (), *INERTIA),
-    "metadata": {"rule": (_WORDS, _takes_energy)},
+    "metadata": {"rule": (_WORDS, _takes_energy), "positive": True},
 }
 
 

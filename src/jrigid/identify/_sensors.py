@@ -1,0 +1,369 @@
+"""What sensors show of the motion, and the errors they make: objects with arrays to seek."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import array_of_shape, check_option
+from jrigid._numerics import product, safe_norm
+from jrigid._types import Readable
+from jrigid.dynamics import State, angular_momentum
+from jrigid.rotation import (
+    conjugate,
+    exp,
+    log,
+    multiply,
+    normalize,
+    rotate,
+    rotate_inverse,
+    to_matrix,
+)
+from jrigid.systems import AbstractSystem
+
+# Gauss and Laguerre's rule: the mean over a memory that fades as exp(-u), to u^5.
+_FADING = np.polynomial.laguerre.laggauss(3)
+
+
+def _vector(name: str, *shapes: tuple[int, ...]) -> Any:
+    """A field that holds an array of one of these shapes, or None."""
+
+    def convert(value: Any) -> Array | None:
+        return None if value is None else array_of_shape(name, value, *shapes)
+
+    return convert
+
+
+class AbstractSensor(Readable):
+    """What a sensor makes of time, state and body; its arrays are its errors, known or sought.
+
+    A subclass gives `predict`, and says more where the defaults do not hold. `fit(..., free=...)`
+    picks arrays of sensors as it does of the system.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> class SpinMeter(jr.identify.AbstractSensor):
+    ...     offset: float = 0.0
+    ...     width = 1
+    ...     on_attitude = False
+    ...
+    ...     def predict(self, t, state, system):
+    ...         return state.omega[2:] + self.offset
+    >>> record = jr.identify.Record(SpinMeter(), jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
+    """
+
+    width: ClassVar[int | None] = 3  # of a value; None: any
+    degrees: ClassVar[int | None] = None  # of freedom of a value, its width if None
+    unit_length: ClassVar[bool] = False  # of values, to within a thousandth (attitudes) or a half
+    on_attitude: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The value that a state shows."""
+
+    def difference(self, value: Array, predicted: Array) -> Array:
+        """Predicted less observed, one number for each degree of freedom."""
+        return predicted - value
+
+    def memory(self) -> tuple[Array, Array] | None:
+        """How long before a time the motion is shown at it [s], and with what weights."""
+        return None
+
+    def largest(self) -> Array | None:
+        """Values of this size stand for it and anything beyond: the sensor is saturated."""
+        return None
+
+    def units(self, rate: Array, size: Array) -> "AbstractSensor":
+        """Sizes of its errors [as they are], where they are zero: of a body that turns at `rate`.
+
+        Args:
+            rate: Of the record, rms [rad/s].
+            size: Of the values, rms.
+        """
+        del rate, size
+        return self
+
+    def rates(self, value: Array) -> Array | None:
+        """The body's rates that a value tells of by itself, or None."""
+        del value
+        return None
+
+    def attitude(self, value: Array) -> Array | None:
+        """The attitude that a value tells of by itself, or None."""
+        del value
+        return None
+
+
+class Gyro(AbstractSensor):
+    """Angular velocity in the axes of the sensor, which are the body axes unless it is turned.
+
+    The reading is matrix scale R(misalignment)^-1 omega + bias + drift t, late by `delay` and a
+    first-order filter, and ends at `limit`.
+
+    Attributes:
+        bias: [rad/s].
+        drift: Of the bias, about t = 0 of the record's clock [rad/s^2].
+        scale: One factor (), or one an axis (3,).
+        misalignment: Rotation vector, from the body's axes to the sensor's [rad].
+        matrix: Whatever else is linear (3, 3); `diag(1, 1, -1)` is a left-handed gyro.
+        delay: Of its clock behind that of the record [s]; None: none.
+        time_constant: Of a first-order filter [s], a small part of a turn; None: none.
+        limit: Readings of this size are saturated and say "at least" [rad/s], () or (3,).
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> gyro = jr.identify.Gyro(bias=jnp.array([0.1, 0.0, 0.0]))
+    >>> still = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    >>> print(gyro.predict(0.0, still, jr.RigidBody(jnp.ones(3))))
+    [0.1 0.  0. ]
+    """
+
+    on_attitude: ClassVar[bool] = False
+    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
+    drift: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("drift", (3,)))
+    scale: Float[Array, "..."] = eqx.field(default=1.0, converter=_vector("scale", (), (3,)))
+    misalignment: Float[Array, "3"] = eqx.field(
+        default=(0.0,) * 3, converter=_vector("misalignment", (3,))
+    )
+    matrix: Float[Array, "3 3"] = eqx.field(
+        default=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        converter=_vector("matrix", (3, 3)),
+    )
+    delay: Float[Array, ""] | None = eqx.field(default=None, converter=_vector("delay", ()))
+    time_constant: Float[Array, ""] | None = eqx.field(
+        default=None, converter=_vector("time_constant", ()), metadata={"positive": True}
+    )
+    limit: Float[Array, "..."] | None = eqx.field(
+        default=None, converter=_vector("limit", (), (3,))
+    )
+
+    def _matrix(self, dtype: Any) -> Array:
+        turn = to_matrix(exp(self.misalignment.astype(dtype)))
+        scale = jnp.broadcast_to(self.scale, (3,)).astype(dtype)
+        return product("ij,j,kj->ik", self.matrix.astype(dtype), scale, turn)
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The reading [rad/s], without delay and limit."""
+        del system
+        dtype = state.omega.dtype
+        offset = self.bias.astype(dtype) + self.drift.astype(dtype) * jnp.asarray(t, dtype)
+        return product("ij,j->i", self._matrix(dtype), state.omega) + offset
+
+    def memory(self) -> tuple[Array, Array] | None:
+        """Its delay, and the fading memory of its filter."""
+        if self.delay is None and self.time_constant is None:
+            return None
+        lags, weights = jnp.zeros(1), jnp.ones(1)
+        if self.time_constant is not None:
+            lags, weights = (jnp.asarray(x, self.time_constant.dtype) for x in _FADING)
+            lags = lags * self.time_constant
+        if self.delay is not None:
+            lags = lags.astype(self.delay.dtype) + self.delay
+        return lags, weights.astype(lags.dtype)
+
+    def largest(self) -> Array | None:
+        """The limit."""
+        return None if self.limit is None else jnp.broadcast_to(self.limit, (3,))
+
+    def units(self, rate: Array, size: Array) -> "Gyro":
+        """Biases in units of the rate, times in radians turned."""
+        del size
+        one, second = jnp.ones((), rate.dtype), 1 / rate
+        late = None if self.delay is None else second
+        slow = None if self.time_constant is None else second
+        return Gyro(
+            rate * jnp.ones(3), rate**2 * jnp.ones(3), jnp.broadcast_to(one, self.scale.shape),
+            jnp.ones(3, rate.dtype), jnp.ones((3, 3), rate.dtype), late, slow, self.limit,
+        )  # fmt: skip
+
+    def rates(self, value: Array) -> Array:
+        """The reading, less what is known of the errors."""
+        inverse = jnp.linalg.inv(self._matrix(value.dtype))
+        return product("ij,j->i", inverse, value - self.bias.astype(value.dtype))
+
+
+class Accelerometer(AbstractSensor):
+    """Specific force at a lever from the centre of mass of a thrown body.
+
+    In free fall nothing else is felt: alpha x r + omega x (omega x r) + bias.
+
+    Attributes:
+        lever: r, from the centre of mass to the sensor, body components [m].
+        bias: [m/s^2].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> sensor = jr.identify.Accelerometer(jnp.array([0.1, 0.0, 0.0]))
+    >>> spin = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 10.0]))
+    >>> print(sensor.predict(0.0, spin, jr.RigidBody(jnp.ones(3))))
+    [-10.   0.   0.]
+    """
+
+    on_attitude: ClassVar[bool] = False
+    lever: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("lever", (3,)))
+    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The specific force [m/s^2]."""
+        omega = state.omega
+        lever, bias = self.lever.astype(omega.dtype), self.bias.astype(omega.dtype)
+        rate = system.vector_field(t, system.with_parts(state), None).omega
+        return jnp.cross(rate, lever) + jnp.cross(omega, jnp.cross(omega, lever)) + bias
+
+    def units(self, rate: Array, size: Array) -> "Accelerometer":
+        """The lever that gives values of this size, and the values."""
+        return Accelerometer(size / rate**2 * jnp.ones(3), size * jnp.ones(3))
+
+
+class Magnetometer(AbstractSensor):
+    """A field that is the same everywhere in space, seen in body axes: R^T field + bias.
+
+    Attributes:
+        field: Space components, in whatever unit the values have.
+        bias: In the same unit, body components: of what turns with the body.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> north = jr.identify.Magnetometer(jnp.array([20.0, 0.0, -40.0]))
+    """
+
+    field: Float[Array, "3"] = eqx.field(converter=_vector("field", (3,)))
+    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The field in the body, in its own unit."""
+        del t, system
+        dtype = state.omega.dtype
+        return rotate_inverse(state.attitude, self.field.astype(dtype)) + self.bias.astype(dtype)
+
+    def units(self, rate: Array, size: Array) -> "Magnetometer":
+        """The size of the values."""
+        del rate
+        return Magnetometer(size * jnp.ones(3), size * jnp.ones(3))
+
+
+class AttitudeSensor(AbstractSensor):
+    """Attitudes, unit quaternions from body to space: a star tracker, or pictures.
+
+    The residual is the rotation vector from the observed to the predicted attitude, about the body
+    axes; q and -q are the same.
+
+    Attributes:
+        misalignment: Rotation vector, from the body's axes to those whose attitude is seen [rad].
+    """
+
+    width: ClassVar[int | None] = 4
+    degrees: ClassVar[int | None] = 3
+    unit_length: ClassVar[bool] = True
+    misalignment: Float[Array, "3"] = eqx.field(
+        default=(0.0,) * 3, converter=_vector("misalignment", (3,))
+    )
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The attitude."""
+        del t, system
+        return multiply(state.attitude, exp(self.misalignment.astype(state.attitude.dtype)))
+
+    def difference(self, value: Array, predicted: Array) -> Array:
+        """Rotation vector from the observed to the predicted attitude, body axes."""
+        return log(multiply(conjugate(value), predicted))
+
+    def units(self, rate: Array, size: Array) -> "AttitudeSensor":
+        """A radian."""
+        del size
+        return AttitudeSensor(jnp.ones(3, rate.dtype))
+
+    def attitude(self, value: Array) -> Array:
+        """The attitude, less the misalignment."""
+        return normalize(multiply(value, exp(-self.misalignment.astype(value.dtype))))
+
+
+class DirectionSensor(AbstractSensor):
+    """Unit vectors: of something at rest in space seen from the body, or the other way round.
+
+    The residual is along two axes across the observed direction; its length is the chord.
+
+    Attributes:
+        of: What is seen: a vector in space axes (a star, the Sun), or, with `seen_from="space"`, a
+            vector in body axes (a mark on the body).
+        seen_from: "body" or "space": the axes of the values.
+    """
+
+    degrees: ClassVar[int | None] = 2
+    unit_length: ClassVar[bool] = True
+    of: Float[Array, "3"] = eqx.field(converter=_vector("of", (3,)))
+    seen_from: str = eqx.field(static=True, default="body")
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for axes that are none."""
+        check_option("seen_from", self.seen_from, ("body", "space"))
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The direction."""
+        del t, system
+        of = self.of.astype(state.omega.dtype)
+        turn = rotate_inverse if self.seen_from == "body" else rotate
+        return turn(state.attitude, of / safe_norm(of))
+
+    def difference(self, value: Array, predicted: Array) -> Array:
+        """Chord from the observed to the predicted direction, along two axes across the former."""
+        value = value / safe_norm(value)
+        x, y, z = value
+        sign = jnp.where(z < 0, -1.0, 1.0)
+        a = -1 / (sign + z)
+        first = jnp.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x])
+        second = jnp.stack([x * y * a, sign + y * y * a, -y])
+        half = jnp.maximum(0.5 * (1 + jnp.sum(value * predicted)), 1e-6)
+        chord = predicted / jnp.sqrt(half)
+        return jnp.stack([jnp.sum(first * chord), jnp.sum(second * chord)])
+
+
+class MomentumSensor(AbstractSensor):
+    """Angular momenta [kg m^2/s], internal parts included; they set the scale of the inertia.
+
+    Attributes:
+        axes: "space" or "body": the axes of the values.
+    """
+
+    axes: str = eqx.field(static=True, default="space")
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for axes that are none."""
+        check_option("axes", self.axes, ("space", "body"))
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """The momentum."""
+        if self.axes == "space":
+            return system.angular_momentum(t, state, None)
+        inner = system.torque.internal_momentum(t, state, None)
+        return angular_momentum(system.inertia.astype(state.omega.dtype), state.omega) + inner
+
+
+class FunctionSensor(AbstractSensor):
+    """Any function of time, state and system.
+
+    Attributes:
+        function: `(t, state, system) -> (k,)`. Define it once: a new function is compiled anew.
+        looks_at_attitude: Whether the function looks at the attitude.
+    """
+
+    width: ClassVar[int | None] = None
+    function: Callable[[Any, Any, Any], Any]
+    looks_at_attitude: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for what is no function."""
+        if not callable(self.function):
+            raise ValueError(
+                "Argument `function` must be a callable (t, state, system) -> (k,), "
+                f"but it is {self.function!r}."
+            )
+
+    @property
+    def on_attitude(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the function looks at the attitude."""
+        return self.looks_at_attitude
+
+    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+        """What the function gives."""
+        return jnp.asarray(self.function(t, state, system), state.omega.dtype)

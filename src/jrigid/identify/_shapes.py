@@ -1,0 +1,313 @@
+"""What is known of a tensor beforehand: shapes of inertia, each with the numbers that are left."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import RESULTS, Findings, all_finite, check_option
+from jrigid._numerics import product
+from jrigid._spectral import eigh
+from jrigid._types import Readable
+from jrigid.identify._parameters import (
+    body_from_log_cholesky,
+    from_second_moments,
+    log_cholesky_from_body,
+    second_moments,
+)
+from jrigid.mass import MassProperties
+
+LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
+# Second moments of the mass, of their trace, below which a fit has run into a boundary.
+BOUNDARY = 1e-7
+
+
+def as_tensor(inertia: Array) -> Array:
+    """A tensor, of moments or itself."""
+    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+def real_body(tensor: Array, flattest: float) -> Array:
+    """The nearest shape of a body with extent in three directions: second moments of trace 1."""
+    values, axes = eigh(2 * second_moments(tensor) / jnp.trace(tensor))
+    values = jnp.maximum(values, flattest)
+    return product("ik,k,jk->ij", axes, values / jnp.sum(values), axes)
+
+
+def is_near_flat(tensor: Array) -> Array:
+    """Whether a fit has run into the boundary of real bodies."""
+    return eigh(2 * second_moments(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
+
+
+def _lower(rows: Sequence[Sequence[Array]]) -> Array:
+    """L L^T."""
+    lower = jnp.stack([jnp.stack(list(row)) for row in rows])
+    return product("ik,jk->ij", lower, lower)
+
+
+class AbstractShape(Readable):
+    """What is known of a tensor: a few numbers without bounds, and the tensor that they make.
+
+    A subclass says how many numbers there are, where to start and what tensor they make. With
+    `absolute` that tensor is the body's, [kg m^2]; otherwise its trace does not matter, and `fit`
+    sets it.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> class Ballast(jr.identify.AbstractShape):  # an unknown mass at a known place
+    ...     empty: jnp.ndarray
+    ...     place: jnp.ndarray
+    ...     absolute = True
+    ...     names = ("log mass",)
+    ...
+    ...     def start(self, tensor, known, flattest):
+    ...         return self, jnp.zeros(1)
+    ...
+    ...     def inertia(self, numbers):
+    ...         return self.empty + jr.inertia_tensor(jnp.exp(numbers), self.place[None])
+    >>> loaded = Ballast(jnp.eye(3), jnp.array([0.1, 0.0, 0.0])).inertia(jnp.zeros(1))
+    >>> print(jnp.diagonal(loaded))
+    [1.   1.01 1.01]
+    """
+
+    absolute: ClassVar[bool] = False
+    names: eqx.AbstractClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple[Any, Array]:
+        """The shape, in a frame chosen for a tensor, and its numbers there.
+
+        Args:
+            tensor: Where to start.
+            known: The system's own tensor, which may be known in part.
+            flattest: Least second moment of the mass, of the trace of the three.
+        """
+
+    @abc.abstractmethod
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor."""
+
+    def units(self) -> Array:
+        """Sizes of the numbers in which an error is large or small."""
+        return jnp.ones(len(self.names))
+
+    def body(self, numbers: Array) -> MassProperties | None:
+        """The body about its fixed point, of a shape that tells the mass and where it is."""
+        del numbers
+        return None
+
+
+def _names(count: int) -> tuple[str, ...]:
+    return tuple(f"shape[{i}]" for i in range(count)) if count > 1 else ("shape",) * count
+
+
+class Tensor(AbstractShape):
+    """Nothing is known: any real body, by five numbers.
+
+    The second moments of the mass are L L^T with L11 = 1: log L22, log L33, L21, L31, L32.
+    """
+
+    names: ClassVar[tuple[str, ...]] = _names(5)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Tensor", Array]:
+        """The numbers of the nearest real body."""
+        del known
+        sigma = real_body(tensor, flattest)
+        lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
+        sizes = jnp.log(jnp.stack([lower[1, 1], lower[2, 2]]))
+        return self, jnp.concatenate([sizes, jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])])
+
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor, of whatever trace."""
+        p, one, zero = numbers, jnp.ones_like(numbers[0]), jnp.zeros_like(numbers[0])
+        rows = [[one, zero, zero], [p[2], jnp.exp(p[0]), zero], [p[3], p[4], jnp.exp(p[1])]]
+        return from_second_moments(_lower(rows))
+
+
+class _InFrame(AbstractShape):
+    """A shape in axes of its own."""
+
+    frame: Float[Array, "3 3"] | None = None
+
+    @abc.abstractmethod
+    def sigma(self, numbers: Array) -> Array:
+        """Second moments in the frame, of whatever trace."""
+
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor, of whatever trace."""
+        frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
+        return from_second_moments(product("ik,kl,jl->ij", frame, self.sigma(numbers), frame))
+
+
+class Moments(_InFrame):
+    """The principal axes are known, those of the system's tensor: two numbers."""
+
+    names: ClassVar[tuple[str, ...]] = _names(2)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Moments", Array]:
+        """Logarithms of ratios of second moments, in the system's axes."""
+        eye = jnp.eye(3, dtype=tensor.dtype)
+        frame = jnp.where(jnp.all(known * (1 - eye) == 0), eye, eigh(known)[1])
+        values = product("ki,kl,li->i", frame, real_body(tensor, flattest), frame)
+        return Moments(frame), jnp.log(values[1:] / values[0])
+
+    def sigma(self, numbers: Array) -> Array:
+        """Diagonal."""
+        return jnp.diag(jnp.exp(jnp.concatenate([jnp.zeros_like(numbers[:1]), numbers])))
+
+
+class Symmetric(_InFrame):
+    """Two moments are equal, about an axis that is sought: three numbers."""
+
+    names: ClassVar[tuple[str, ...]] = _names(3)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Symmetric", Array]:
+        """The odd moment's axis as axis 3 of the frame."""
+        del known
+        values, frame = eigh(real_body(tensor, flattest))
+        last = values[2] - values[1] > values[1] - values[0]
+        frame = jnp.where(last, frame, frame[:, ::-1])
+        values = jnp.where(last, values, values[::-1])
+        size = jnp.log(2 * values[2] / (values[0] + values[1]))
+        return Symmetric(frame), jnp.stack([size, jnp.zeros_like(size), jnp.zeros_like(size)])
+
+    def sigma(self, numbers: Array) -> Array:
+        """Of an axis near axis 3."""
+        axis = jnp.append(numbers[1:], jnp.ones_like(numbers[0]))
+        dyad = axis[:, None] * axis[None, :] / jnp.sum(axis * axis)
+        return jnp.eye(3, dtype=numbers.dtype) + (jnp.exp(numbers[0]) - 1) * dyad
+
+
+class Top(_InFrame):
+    """Two moments are equal, and the axis is body axis 3: one number."""
+
+    names: ClassVar[tuple[str, ...]] = _names(1)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Top", Array]:
+        """Of the body's own axes."""
+        del known
+        values = jnp.diagonal(real_body(tensor, flattest))
+        return self, jnp.log(2 * values[2:] / (values[0] + values[1]))
+
+    def sigma(self, numbers: Array) -> Array:
+        """Diagonal."""
+        one = jnp.ones_like(numbers[0])
+        return jnp.diag(jnp.stack([one, one, jnp.exp(numbers[0])]))
+
+
+class Flat(_InFrame):
+    """All mass is in a plane, which is sought: four numbers."""
+
+    names: ClassVar[tuple[str, ...]] = _names(4)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Flat", Array]:
+        """The largest second moment first, the thickness last."""
+        del known
+        values, frame = eigh(real_body(tensor, flattest))
+        numbers = jnp.zeros(4, values.dtype).at[0].set(0.5 * jnp.log(values[1] / values[2]))
+        return Flat(frame[:, ::-1]), numbers
+
+    def sigma(self, numbers: Array) -> Array:
+        """L L^T, the third column of L zero."""
+        p, one, zero = numbers, jnp.ones_like(numbers[0]), jnp.zeros_like(numbers[0])
+        return _lower([[one, zero, zero], [p[1], jnp.exp(p[0]), zero], [p[2], p[3], zero]])
+
+
+class Fixed(AbstractShape):
+    """All of the tensor is known, the system's; nothing of it is sought.
+
+    Attributes:
+        known: The tensor [kg m^2]; `fit` sets it.
+    """
+
+    absolute: ClassVar[bool] = True
+    names: ClassVar[tuple[str, ...]] = ()
+    known: Float[Array, "3 3"] | None = None
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Fixed", Array]:
+        """No numbers."""
+        del flattest
+        return Fixed(known), jnp.zeros(0, tensor.dtype)
+
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor that is known."""
+        assert self.known is not None
+        return self.known.astype(numbers.dtype)
+
+
+class LogCholesky(AbstractShape):
+    """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
+
+    The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
+    the lever of any `torques.UniformGravity` of the system, all follow from the ten numbers. Motion
+    under gravity tells the inertia about the point over the mass times the lever, eight numbers:
+    freeze two at least, such as "alpha", half the logarithm of the mass, and a length. A rotor or
+    a torque of known size tells one more.
+
+    Attributes:
+        parameters: (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) to start from.
+        frozen: Names of those that are known.
+
+    Raises:
+        RuntimeError: A flat body.
+
+    Gradients: as `body_from_log_cholesky`.
+    Source: as `body_from_log_cholesky`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> arm = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0])).translated(jnp.array([0.0, 0.0, 1.5]))
+    >>> print(jr.identify.LogCholesky(arm, frozen=("alpha", "t1", "t2")).names)
+    ('d1', 'd2', 'd3', 's12', 's23', 's13', 't3')
+    """
+
+    absolute: ClassVar[bool] = True
+    parameters: Float[Array, "10"]
+    frozen: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, body: MassProperties, frozen: Sequence[str] = ()):
+        self.frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
+        for name in self.frozen:
+            check_option("frozen", name, LOG_CHOLESKY)
+        if not self.names:
+            raise ValueError("Argument `frozen` must leave a number to seek, but it does not.")
+        parameters = log_cholesky_from_body(body)
+        findings = Findings()
+        findings.require(
+            all_finite(parameters),
+            RESULTS.unphysical_inertia,
+            "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not.",
+            body.inertia,
+        )
+        self.parameters = findings.guard(parameters, throw=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Names of the numbers that are not frozen."""
+        return tuple(name for name in LOG_CHOLESKY if name not in self.frozen)
+
+    def units(self) -> Array:
+        """1, or, of numbers in metres, the size of the body."""
+        body = body_from_log_cholesky(self.parameters)
+        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
+        of_length = np.array([name[0] in "st" for name in self.names])
+        return jnp.where(of_length, jnp.sqrt(square), 1.0)
+
+    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["LogCholesky", Array]:
+        """The numbers sought, as they were given."""
+        del known, flattest
+        return self, self.parameters[self._indices()].astype(tensor.dtype)
+
+    def inertia(self, numbers: Array) -> Array:
+        """The tensor about the fixed point [kg m^2]."""
+        return self.body(numbers).about(jnp.zeros(3, numbers.dtype))
+
+    def body(self, numbers: Array) -> MassProperties:
+        """The body, of other numbers for those that are sought."""
+        whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
+        return body_from_log_cholesky(whole)
+
+    def _indices(self) -> Any:
+        return np.array([LOG_CHOLESKY.index(name) for name in self.names])

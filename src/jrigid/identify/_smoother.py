@@ -1,0 +1,323 @@
+"""Least squares over a chain of states with links between: Levenberg-Marquardt, and a smoother.
+
+A wobble of n turns pins its rate so well that the sum of squares over the whole record has a
+valley only 0.3 / n wide. Multiple shooting gives each segment a state of its own and links that
+ask, more and more strongly, that the end of each be the start of the next. Links kept at a finite
+weight are a statement about physics: an unknown torque pushed the body between the nodes, and what
+is minimised is then the smoother of Rauch, Tung and Striebel with unknown parameters.
+
+The normal equations are block-tridiagonal with a border (Bock 1983; Nocedal & Wright, Numerical
+Optimization, 2nd ed., section 10.3, for the damping), so that a step costs a time proportional to
+the record. The border of a throw holds its own numbers first, then those of all throws.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._numerics import product
+from jrigid.rotation import exp, multiply, normalize
+
+_FIRST_DAMPING = 1e-3
+_LEAST_DAMPING = 1e-12
+_STUCK = 1e8
+
+
+class Point(NamedTuple):
+    """Where a fit stands: numbers of all throws, of each, and the state at each node."""
+
+    numbers: Array
+    own: Array  # (throws, n)
+    attitude: Array  # (throws, nodes, 4)
+    omega: Array
+
+
+class Rows(NamedTuple):
+    """Whitened residuals and derivatives: (throws, rows), in the border and the state of a node."""
+
+    residual: Array
+    of_border: Array
+    of_state: Array
+    node: Array
+
+
+class Links(NamedTuple):
+    """End of a segment less the next one's start, (throws, nodes, local), and derivatives."""
+
+    gap: Array
+    of_border: Array
+    of_state: Array
+
+
+class Blocks(NamedTuple):
+    """Normal equations: of the states, of each with the next, of the border, and right sides."""
+
+    state: Array
+    next: Array
+    side: Array
+    border: Array
+    of_state: Array
+    of_border: Array
+
+
+class Reduced(NamedTuple):
+    """The equations of first states, throws' own numbers and numbers, (throws, l + m + g, ...)."""
+
+    matrix: Array
+    right: Array
+    solved: Array  # of the later states
+    log_determinant: Array  # of what was eliminated
+
+
+def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Blocks:
+    """Normal equations of weighted rows and whitened links.
+
+    Args:
+        rows: Of the record.
+        links: Between the segments; the next state enters with minus one.
+        weight: Of each row (throws, rows).
+        whitener: Of each link (throws, nodes, local, local), zero where there is none.
+    """
+    nodes = links.gap.shape[1]
+
+    def throw(r: Array, jb: Array, js: Array, node: Array, w: Array) -> tuple[Array, ...]:
+        def at_nodes(x: Array) -> Array:
+            return jax.ops.segment_sum(x, node, nodes)
+
+        ws, wb = w[:, None] * js, w[:, None] * jb
+        return (
+            at_nodes(ws[:, :, None] * js[:, None, :]),
+            at_nodes(ws[:, :, None] * jb[:, None, :]),
+            product("ri,rj->ij", wb, jb),
+            at_nodes(ws * r[:, None]),
+            product("ri,r->i", wb, r),
+        )
+
+    h, hb, bb, b, cb = jax.vmap(throw)(*rows, weight)
+
+    def white(x: Array) -> Array:
+        return product("tsij,tsjk->tsik", whitener, x)
+
+    def later(x: Array) -> Array:
+        """What the link before adds to a node."""
+        return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
+
+    c, g, f = white(links.gap[..., None])[..., 0], white(links.of_border), white(links.of_state)
+    h = h + product("tsai,tsaj->tsij", f, f) + later(product("tsai,tsaj->tsij", whitener, whitener))
+    hb = hb + product("tsai,tsaj->tsij", f, g) - later(product("tsai,tsaj->tsij", whitener, g))
+    bb = bb + product("tsai,tsaj->tij", g, g)
+    b = b + product("tsai,tsa->tsi", f, c) - later(product("tsai,tsa->tsi", whitener, c))
+    cb = cb + product("tsai,tsa->ti", g, c)
+    return Blocks(h, -product("tsai,tsaj->tsij", f, whitener), hb, bb, b, cb)
+
+
+def _damped(matrix: Array, damping: Array) -> Array:
+    diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
+    more = jnp.where(diagonal > 0, damping * diagonal, 1.0)
+    eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
+    return matrix + more[..., None] * eye
+
+
+def _solve(matrix: Array, columns: Array) -> tuple[Array, Array]:
+    """Of a matrix positive definite but for rounding, of any scale; and its log determinant."""
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
+    size = jnp.where(size > 0, size, 1.0)
+    scaled = matrix / size[:, None] / size[None, :]
+    eye = jnp.eye(size.size, dtype=size.dtype)
+    lower = jnp.linalg.cholesky(scaled + 4 * jnp.finfo(size.dtype).eps * eye)
+    solved = jax.scipy.linalg.cho_solve((lower, True), columns / size[:, None])
+    return solved / size[:, None], 2 * jnp.sum(jnp.log(size * jnp.diagonal(lower)))
+
+
+def reduced(blocks: Blocks, damping: Array) -> Reduced:
+    """Eliminate all states but the first, from the last one on."""
+    h, u, hb, bb, b, cb = blocks
+    local, h = h.shape[-1], _damped(h, damping)
+
+    def backward(carry: tuple, node: tuple) -> tuple[tuple, tuple]:
+        less, border, right = carry
+        h, u, hb, b = node
+        columns = jnp.concatenate([u.T, hb - border, (b - right)[:, None]], axis=1)
+        solved, log_determinant = _solve(h - less, columns)
+        down = product("ji,jk->ik", columns[:, :local], solved)
+        schur = product("ij,ik->jk", columns[:, local:-1], solved[:, local:])
+        carry = down[:, :local], down[:, local:-1], down[:, -1]
+        return carry, (solved, schur, log_determinant)
+
+    def throw(h: Array, u: Array, hb: Array, bb: Array, b: Array, cb: Array) -> tuple[Array, ...]:
+        empty = jnp.zeros_like(h[0]), jnp.zeros_like(hb[0]), jnp.zeros_like(b[0])
+        later = h[1:], u[:-1], hb[1:], b[1:]
+        (less, border, right), (solved, schur, logs) = jax.lax.scan(
+            backward, empty, later, reverse=True
+        )
+        side, schur = hb[0] - border, jnp.sum(schur, axis=0)
+        matrix = jnp.block([[h[0] - less, side], [side.T, bb - schur[:, :-1]]])
+        return matrix, jnp.concatenate([b[0] - right, cb - schur[:, -1]]), solved, jnp.sum(logs)
+
+    found = jax.vmap(throw)(h, u, hb, bb, b, cb)
+    return Reduced(*found[:3], jnp.sum(found[3]))
+
+
+class Eliminated(NamedTuple):
+    """What is left for the numbers, and how a throw's first state and own numbers follow them."""
+
+    numbers: Array  # (g, g), without damping
+    right: Array  # (throws, g): what each throw adds to the right side
+    follow: Array  # (throws, l + m, g)
+    still: Array  # (throws, l + m), where the numbers stay
+    log_determinant: Array
+
+
+def eliminated(left: Reduced, count: int) -> Eliminated:
+    """Eliminate the first states and throws' own numbers, `count` of them."""
+
+    def throw(matrix: Array, right: Array) -> tuple[Array, ...]:
+        columns = jnp.concatenate([matrix[:count, count:], right[:count, None]], axis=1)
+        solved, log_determinant = _solve(matrix[:count, :count], columns)
+        schur = product("ij,ik->jk", matrix[:count, count:], solved)
+        numbers = matrix[count:, count:] - schur[:, :-1]
+        return numbers, right[count:] - schur[:, -1], solved[:, :-1], solved[:, -1], log_determinant
+
+    numbers, right, follow, still, logs = jax.vmap(throw)(left.matrix, left.right)
+    logs = jnp.sum(logs) + left.log_determinant
+    return Eliminated(jnp.sum(numbers, axis=0), right, follow, still, logs)
+
+
+def step_of(blocks: Blocks, own: int, damping: Array) -> tuple[tuple[Array, Array, Array], Array]:
+    """Move of the numbers, the throws' own, and the states; and what it gains, -gradient . move."""
+    local = blocks.state.shape[-1]
+    damped = blocks._replace(border=_damped(blocks.border, damping))
+    left = reduced(damped, damping)
+    rest = eliminated(left, local + own)
+    right = jnp.sum(rest.right, axis=0)
+    numbers = -right
+    if right.size:
+        numbers = -_solve(rest.numbers, right[:, None])[0][:, 0]
+    firsts = -rest.still - product("tij,j->ti", rest.follow, numbers)
+
+    def moves(solved: Array, first: Array) -> Array:
+        border = jnp.concatenate([first[local:], numbers])
+
+        def forward(before: Array, node: Array) -> tuple[Array, Array]:
+            move = -node[:, -1] - product("ij,j->i", node[:, :local], before)
+            move = move - product("ij,j->i", node[:, local:-1], border)
+            return move, move
+
+        later = jax.lax.scan(forward, first[:local], solved)[1]
+        return jnp.concatenate([first[None, :local], later])
+
+    states, owns = jax.vmap(moves)(left.solved, firsts), firsts[:, local:]
+    gain = -jnp.sum(blocks.of_state * states) - jnp.sum(blocks.of_border[:, :own] * owns)
+    gain = gain - jnp.sum(jnp.sum(blocks.of_border[:, own:], axis=0) * numbers)
+    return (numbers, owns, states), gain
+
+
+def moved(point: Point, move: tuple[Array, Array, Array]) -> Point:
+    """A point after a move; turns are about the body's axes."""
+    numbers, own, states = move
+    attitude = point.attitude
+    if states.shape[-1] == 6:
+        turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
+        attitude = turn(attitude, states[..., 3:])
+    return Point(point.numbers + numbers, point.own + own, attitude, point.omega + states[..., :3])
+
+
+class Found(NamedTuple):
+    """Where a minimisation stands, with the rows and links there."""
+
+    point: Point
+    rows: Rows
+    links: Links
+    fresh: Array  # nothing is known yet: rows and links are to be evaluated
+    settled: Array
+    steps: Array
+    history: Array  # sum of squares of the record after each step
+
+
+class _Carry(NamedTuple):
+    found: Found
+    weight: Array
+    cost: Array
+    move: tuple[Array, Array, Array]
+    gain: Array
+    damping: Array
+    growth: Array
+    since: Array
+
+
+def minimise(
+    evaluate: Callable[[Point], tuple[Rows, Links]],
+    weigh: Callable[[Rows], tuple[Array, Array]],
+    whitener: Array,
+    found: Found,
+    enough: Callable[[Array], Array],
+    steps: Array,
+) -> Found:
+    """The minimum of a sum of squares by Levenberg and Marquardt, from a point with its rows.
+
+    Args:
+        evaluate: Rows and links at a point.
+        weigh: Weights of rows, and the sum of squares, or what stands for it.
+        whitener: Of the links.
+        found: Where to start.
+        enough: What a step that is not worth taking would gain, from the sum of squares.
+        steps: How many are allowed.
+    """
+    own = found.point.own.shape[-1]
+
+    def costs(rows: Rows, links: Links) -> tuple[Array, Array, Array]:
+        weight, record = weigh(rows)
+        gap = product("tsij,tsj->tsi", whitener, links.gap)
+        return weight, record, record + jnp.sum(gap * gap)
+
+    def next_step(rows: Rows, links: Links, weight: Array, damping: Array) -> tuple[Any, Array]:
+        return step_of(blocks_of(rows, links, weight, whitener), own, damping)
+
+    def going(carry: _Carry) -> Array:
+        return ~carry.found.settled & (carry.since < steps)
+
+    def settled(gain: Array, damping: Array, cost: Array) -> Array:
+        small = (gain <= enough(cost)) & (damping <= 1e-2)
+        return small | (damping > _STUCK) | ~(gain > 1e-6 * enough(cost))
+
+    def body(carry: _Carry) -> _Carry:
+        old = carry.found
+        trial = moved(old.point, carry.move)
+        rows, links = evaluate(trial)
+        weight, record, cost = costs(rows, links)
+        sound = jnp.isfinite(cost) & jnp.all(jnp.isfinite(rows.of_border))
+        better = sound & (cost <= carry.cost)
+        point, rows, links, weight, cost = jtu.tree_map(
+            lambda new, old: jnp.where(better, new, old),
+            (trial, rows, links, weight, cost),
+            (old.point, old.rows, old.links, carry.weight, carry.cost),
+        )
+        # Nielsen's rule: by how well the gain was foretold, and ever faster while it is not.
+        told = jnp.where(old.fresh, 0.5, carry.cost - cost)
+        told = told / jnp.where(carry.gain > 0, carry.gain, 1.0)
+        ease = jnp.clip(1 - (2 * told - 1) ** 3, 0.1, 2.0)
+        damping = carry.damping * jnp.where(better, ease, carry.growth)
+        damping = jnp.maximum(damping, _LEAST_DAMPING)
+        growth = jnp.where(better, 2.0, 2 * carry.growth)
+        move, gain = next_step(rows, links, weight, damping)
+        history = old.history.at[old.steps].set(record, mode="drop")
+        end = settled(gain, damping, cost)
+        now = Found(point, rows, links, jnp.asarray(False), end, old.steps + 1, history)
+        return _Carry(now, weight, cost, move, gain, damping, growth, carry.since + 1)
+
+    weight, _, cost = costs(found.rows, found.links)
+    damping = jnp.asarray(_FIRST_DAMPING, cost.dtype)
+    move, gain = next_step(found.rows, found.links, weight, damping)
+    move = jtu.tree_map(lambda x: jnp.where(found.fresh, 0.0, x), move)
+    gain = jnp.where(found.fresh, 1.0, gain)
+    cost = jnp.where(found.fresh, jnp.inf, cost)
+    # The first step is worth a try at any gain: nothing says yet that the point is a minimum.
+    growth = jnp.asarray(2.0, cost.dtype)
+    found = found._replace(settled=jnp.isnan(cost))
+    carry = _Carry(found, weight, cost, move, gain, damping, growth, jnp.asarray(0))
+    end = jax.lax.while_loop(going, body, carry)
+    return end.found._replace(settled=end.found.settled & jnp.isfinite(end.cost))
