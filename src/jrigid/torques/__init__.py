@@ -23,3 +23,4 @@ from jrigid.torques._internal import InternalDamper as InternalDamper
 from jrigid.torques._internal import Rotor as Rotor
 from jrigid.torques._internal import SpinningMass as SpinningMass
 from jrigid.torques._orbit import KeplerOrbit as KeplerOrbit
+from jrigid.torques._sampled import Sampled as Sampled
