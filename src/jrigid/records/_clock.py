@@ -11,6 +11,8 @@ _LATE = 20  # intervals that a row may come too late; a clock that goes back fur
 _COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])  # when micro- and milliseconds in 32 bits wrap [s]
 _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
+_OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
+_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
 _SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
 
 
@@ -63,7 +65,7 @@ def repair(
     >>> print(clock.rows, clock.breaks)
     [0 1 3 4 5 6 7] (5,)
     >>> print(*clock.notes, sep="; ")
-    1 row with the time of the row before dropped; 1 gap, of 2 s after 0.4 s
+    1 gap, of 2 s after 0.4 s; 1 row with the time of the row before dropped
     """
     check_option("clock", clock, (None, "recorded", "uniform"))
     check_shape("times", np.asarray(times), (None,))
@@ -138,7 +140,10 @@ def _evened(t: np.ndarray, breaks: list[int], asked: bool, notes: list[str]) -> 
             continue
         line, interval = _line(piece, asked)
         jitter = piece - line
+        steps = np.diff(piece)
+        uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
         rounded = digit > _COARSE * interval and np.max(np.abs(jitter)) < _ROUND * digit
+        rounded = rounded and uneven
         if asked or rounded:
             piece = line
             jitters.append(float(np.sqrt(np.mean(jitter**2))))
@@ -167,8 +172,14 @@ def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
     counts = [np.arange(t.size)]
     if lost:
         steps = np.diff(t)
-        usual = np.median(steps) or np.mean(steps)
-        counts.append(np.append(0, np.cumsum(np.maximum(np.rint(steps / usual), 1))))
+        usual = float(np.median(steps)) or float(np.mean(steps))
+        count, phase = [0], t[0]
+        for x in t[1:]:
+            ahead = max(1, round((x - phase) / usual))
+            count.append(count[-1] + ahead)
+            phase += ahead * usual
+            phase += _LOCK * (x - phase)
+        counts.append(np.array(count))
     fits = []
     for count in counts:
         use = np.ones(t.size, bool)

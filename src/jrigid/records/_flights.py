@@ -1,5 +1,6 @@
 """Throws: where nothing touches the body."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +14,13 @@ _SOUND = 0.9  # of the rows of a window that its own guess must explain to be tr
 _SLOPE = 0.02  # [s] over which rates are differentiated
 _LEVER = 0.2  # [m] how far from the mass centre an accelerometer usually is
 _FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
-_TURN = 0.05  # [s] over which a momentum must stay the same
+_TURN = 0.1  # [s] over which a momentum must stay the same
 _KEPT = 0.06  # of a momentum that may come or go in that time: noise, drag of the air
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _SHARE = 0.2  # how far moments usually are from equal, of a trace of 1
+_LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
+_FAR = 5.0  # times the usual residual of flights, where that is below the tolerance
+_TIGHTEST = 0.1  # of the tolerance
 _HOLE = 2  # rows just beyond the tolerance that do not end a flight
 
 
@@ -28,6 +32,7 @@ class _Law(NamedTuple):
     tolerance: np.ndarray
     usual: float  # size of the unknowns
     reach: int  # rows to either side that an equation looks at
+    sound: Callable[[np.ndarray], bool]  # whether unknowns may be those of a body
 
 
 def flights(
@@ -112,7 +117,7 @@ def _law_of_forces(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: 
     model = np.swapaxes(np.cross(slope[:, None], axes) + inward, 1, 2)
     absolute, relative = _FORCE
     tolerance = absolute + relative * np.linalg.norm(forces, axis=1)
-    return _Law(model, forces.copy(), tolerance, _LEVER, reach)
+    return _Law(model, forces.copy(), tolerance, _LEVER, reach, lambda _: True)
 
 
 def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
@@ -133,7 +138,13 @@ def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
     spin = np.linalg.norm(rates, axis=1)
     change = np.where(spin[:, None, None] > _SPIN, change / (spin[:, None, None] / 3), np.nan)
     model = np.swapaxes(change[:, 1:], 1, 2)
-    return _Law(model, -change[:, 0], np.full(t.size, _KEPT), _SHARE, reach)
+
+    def of_a_body(x: np.ndarray) -> bool:
+        """Moments positive, none more than the others together, but for noise."""
+        moments = np.linalg.eigvalsh(tensors[0] + np.tensordot(x, tensors[1:], 1))
+        return bool(moments[0] > 0 and moments[2] < _LARGEST)
+
+    return _Law(model, -change[:, 0], np.full(t.size, _KEPT), _SHARE, reach, of_a_body)
 
 
 def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
@@ -149,10 +160,13 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
         b = (wanted[rows] / law.tolerance[rows, None])[known[rows]].ravel()
         return np.linalg.solve(a.T @ a + np.eye(unknowns) / law.usual**2, a.T @ b)
 
-    def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
-        beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1) / law.tolerance[rows]
-        good = known[rows] & (beside < 1)
-        for first, last in _runs(known[rows] & ~good & (beside < 2)):
+    def beside(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        return np.linalg.norm(model[rows] @ x - wanted[rows], axis=1) / law.tolerance[rows]
+
+    def explained(x: np.ndarray, rows: slice = slice(None), tightened: float = 1.0) -> np.ndarray:
+        off = beside(x, rows) / tightened
+        good = known[rows] & (off < 1)
+        for first, last in _runs(known[rows] & ~good & (off < 2)):
             inside = first > 0 and last < good.size and good[first - 1] and good[last]
             good[first:last] = inside and last - first <= _HOLE
         return good
@@ -167,13 +181,17 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
     for first in range(0, known.size - size, max(size // 2, known.size // _GUESSES)):
         window = slice(first, first + size)
         x = solve(window)
-        if explained(x, window).mean() >= _SOUND:
+        if law.sound(x) and explained(x, window).mean() >= _SOUND:
             free = in_runs(explained(x))
             best = free if free.sum() > best.sum() else best
     for _ in range(2):
         free = in_runs(explained(solve(best)))
         best = free if free.sum() >= best.sum() else best
-    return best
+    if not best.any():
+        return best
+    x = solve(best)
+    typical = np.median(beside(x)[best])
+    return in_runs(explained(x, tightened=min(1.0, max(_TIGHTEST, _FAR * float(typical)))))
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:

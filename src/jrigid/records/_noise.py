@@ -57,10 +57,7 @@ class Noise(Readable):
     notes: tuple[str, ...]
 
 
-def allan(
-    values: Float[np.ndarray, "rows columns"] | list[Float[np.ndarray, "rows_ columns"]],
-    interval: float,
-) -> Allan:
+def allan(values: Float[np.ndarray, "rows columns"] | list[np.ndarray], interval: float) -> Allan:
     r"""Overlapping Allan deviations of even readings.
 
     $\sigma^2(m \tau) = \langle (\theta_{k+2m} - 2 \theta_{k+m} + \theta_k)^2 \rangle / (2 m^2

@@ -29,7 +29,7 @@ def read(
     clock: str | None = None,
     log: int = 1,
 ) -> Reading:
-    """Read a file of sensors: phyphox, Sensor Logger, Betaflight, or anyone's columns by names.
+    r"""Read a file of sensors: phyphox, Sensor Logger, Betaflight, or anyone's columns by names.
 
     A folder or a zip may hold a file for each sensor. Units are those that `unit` says, else those
     that the file says (headers, or the format), else recognised where only one makes sense: times
@@ -56,11 +56,11 @@ def read(
 
     >>> import io
     >>> import jrigid as jr
-    >>> rows = "".join(f"{10 * i},0,{18 * i},180\\n" for i in range(4))
-    >>> text = io.StringIO("t_ms,gx (deg/s),gy (deg/s),gz (deg/s)\\n" + rows)
+    >>> rows = "".join(f"{10 * i},0,{18 * i},180\n" for i in range(4))
+    >>> text = io.StringIO("t_ms,gx (deg/s),gy (deg/s),gz (deg/s)\n" + rows)
     >>> print(jr.records.read(text))
     4 readings over 0.03 s, one in 10 ms
-      rates: 3.281 rad/s at most
+      rates: 3.28 rad/s at most
       - times taken as ms: the header says so
       - rates (g) taken as deg/s: the header says so
 
@@ -148,7 +148,7 @@ def _stated(sensor: Sensor, kind: str, units: dict[str, str], notes: list[str]) 
     if kind in units:
         unit, why = plain_unit(units[kind]), "`unit` says so"
         if sensor.unit not in (None, unit):
-            why += f", though {sensor.unit} {'is the file’s'}"
+            why += f", though the file says {sensor.unit}"
         factor = _factor(kind, unit)
     elif sensor.unit is not None:
         unit, why = sensor.unit, sensor.source

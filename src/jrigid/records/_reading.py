@@ -1,6 +1,7 @@
 """What a file of sensors says, in SI units on one clock."""
 
 import dataclasses
+import itertools
 
 import equinox as eqx
 import numpy as np
@@ -62,7 +63,7 @@ class Reading(Readable):
     def pieces(self) -> list["Reading"]:
         """The stretches between breaks: within each of them no time is missing."""
         ends = [0, *self.breaks, self.times.size]
-        return [self[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [self[a:b] for a, b in itertools.pairwise(ends)]
 
     def with_notes(self, *notes: str) -> "Reading":
         """The same with more notes."""

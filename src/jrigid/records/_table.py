@@ -1,6 +1,7 @@
 """Text with columns: separators, decimal commas, headers, and what the names of columns mean."""
 
 import csv
+import itertools
 import re
 from typing import NamedTuple
 
@@ -99,7 +100,10 @@ def parse(text: str, name: str) -> Table:
     held = [d for d in "\t;," if sum(d in x for x in few) > len(few) / 2]
     separator = held[0] if held else ","
     rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
-    head = next((i for i, pair in enumerate(_pairs(rows)) if _is_header(*pair)), None)
+    head = next(
+        (i for i, pair in enumerate(itertools.pairwise(rows[:_MOST_ABOVE])) if _is_header(*pair)),
+        None,
+    )
     if head is None:
         raise ValueError(
             "Argument `path` must be a file with the names of its columns in a line above its "
@@ -124,13 +128,9 @@ def parse(text: str, name: str) -> Table:
         (commas, "read with decimal commas"),
     ):
         if count:
-            notes.append(f"{count} lines {what}")
+            notes.append(f"{count} line{'s' if count > 1 else ''} {what}")
     above = {row[0]: separator.join(row[1:]) for row in rows[:head]}
     return Table(name, headers, np.array(body, float).reshape(-1, width), above, notes)
-
-
-def _pairs(rows: list[list[str]]) -> list[tuple[list[str], list[str]]]:
-    return list(zip(rows[:_MOST_ABOVE], rows[1 : _MOST_ABOVE + 1], strict=False))
 
 
 def _is_header(names: list[str], numbers: list[str]) -> bool:
