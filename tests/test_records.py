@@ -445,7 +445,7 @@ def test_a_reading_is_cut_and_printed():
     assert reading[3:8].rates.shape == (5, 3)
     assert reading.interval == pytest.approx(0.01)
     text = str(reading)
-    assert text.startswith("10 readings over 1.04 s, one in 10 ms\n  rates: 1.73 rad/s at most")
+    assert text.startswith("10 readings over 1.04 s, one in 10 ms\n  rates: 1.732 rad/s at most")
     assert "pieces without a break: 2" in text
     assert "- 1 gap, of 0.96 s after 0.04 s" in text
     with pytest.raises(ValueError, match="must be consecutive"):
@@ -705,7 +705,7 @@ def test_a_random_walk_rises_with_the_root_of_time(rng):
 
 
 def test_flicker_is_level(rng):
-    """Noise of two-sided spectral density B^2 / (2 pi f) has the Allan deviation 0.664 B at all times."""
+    """Of two-sided spectral density B^2 / (2 pi f): 0.664 B over all averaging times."""
     size, instability = 2**19, 0.02
     frequency = np.fft.rfftfreq(size, 1.0)
     density = np.zeros_like(frequency)

@@ -13,6 +13,7 @@ _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line thro
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
 _OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
 _LOCK = 0.05  # of a stamp's lateness that the count of readings follows
+_NEXT = 8  # stamps that tell a late reading from a lost one
 _SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
 
 
@@ -174,11 +175,13 @@ def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
         steps = np.diff(t)
         usual = float(np.median(steps)) or float(np.mean(steps))
         count, phase = [0], t[0]
-        for x in t[1:]:
-            ahead = max(1, round((x - phase) / usual))
-            count.append(count[-1] + ahead)
-            phase += ahead * usual
-            phase += _LOCK * (x - phase)
+        for row in range(1, t.size):
+            # lost is a reading only where all of the next stamps are late, not this one alone
+            ahead = t[row : row + _NEXT] - usual * np.arange(min(_NEXT, t.size - row)) - phase
+            ticks = max(1, round(float(ahead.min()) / usual))
+            count.append(count[-1] + ticks)
+            phase += ticks * usual
+            phase += _LOCK * (t[row] - phase)
         counts.append(np.array(count))
     fits = []
     for count in counts:

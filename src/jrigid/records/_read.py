@@ -17,8 +17,8 @@ _COUNTS = 4100.0  # beyond, numbers are neither rad/s nor deg/s but counts of a 
 _GRAVITY = {"g": (0.8, 1.25), "m/s^2": (7.8, 12.3)}  # the median of |specific force| at hand
 _TICKS = {"s": 1.25e-4, "ms": 0.125, "us": 125.0, "ns": 1.25e5}  # least step of 8 Hz to 8 kHz
 _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from 0
-_TURN = 0.05  # [s] over which the turning of gravity is compared with the rates
-_LIKE = 0.5  # correlation of the two from which their ratio is believed
+_TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
+_LIKE = 0.4  # correlation of the two from which their ratio is believed
 
 
 def read(
@@ -235,7 +235,7 @@ def _rates(
     if unit is None:
         raise ValueError(
             "Argument `unit` must say the unit of the rates, but it does not, and neither does the "
-            f"file; numbers up to {most:.4g} do not tell."
+            f"file; numbers up to {most:.6g} do not tell."
         )
     notes.append(f"rates ({sensor.label}) taken as {unit}: {why}")
     return UNITS["rates"][unit] * rates
