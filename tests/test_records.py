@@ -186,7 +186,7 @@ def test_blackbox_viewer_puts_its_settings_above():
     np.testing.assert_allclose(reading.specific_forces[:, 2], GRAVITY)
     # the bits of 2.0
     np.testing.assert_allclose(reading.rates[4], 2 * np.array([4, -90, 180]) * DEGREE, rtol=1e-9)
-    said(reading, "times taken as us: their median step is 500")
+    said(reading, "times (time) taken as us: their median step is 500")
 
 
 def variable_byte(value):
@@ -337,7 +337,7 @@ def test_times_are_recognised_by_their_step(step, unit, factor):
     rows = np.column_stack([step * np.arange(6), ROWS[:, 1:]])
     reading = read(table(["t", "gx", "gy", "gz"], rows), unit="rad/s")
     np.testing.assert_allclose(reading.times, factor * rows[:, 0], rtol=1e-9)
-    said(reading, f"times taken as {unit}: their median step is")
+    said(reading, f"times (t) taken as {unit}: their median step is")
 
 
 def test_times_of_an_epoch_count_from_the_first_reading():

@@ -10,9 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jrigid.records._table import UNITS, Table, kind_of, parse, split_unit
+from jrigid.records._table import Table, kind_of, parse
+from jrigid.records._units import UNITS, split_unit
 
 _BLACKBOX = b"H Product:Blackbox"  # how the log of a flight controller begins
+# Unit, who states it, and a factor to SI where the unit alone is not enough.
+Scale = tuple[str | None, str, float | None]
+Named = Mapping[str, str | Sequence[str]]
 MEASURED = ("rates", "specific_forces", "magnetic_fields")
 # Sensor Logger: what is in the file of a sensor, and in which unit (None: it depends).
 _SENSOR_LOGGER = {
@@ -36,9 +40,7 @@ class Sensor(NamedTuple):
     time: int | None
     columns: list[int]
     rows: np.ndarray
-    unit: str | None = None
-    factor: float | None = None
-    source: str = ""
+    scale: Scale = (None, "", None)
 
     @property
     def times(self) -> np.ndarray:
@@ -111,11 +113,10 @@ def _blackbox(path: pathlib.Path, log: int) -> Table:
     return Table(path.stem, names, np.array(values, float).reshape(-1, len(names)), about, notes)
 
 
-def sensors_of(table: Table, named: Mapping[str, str | Sequence[str]]) -> list[Sensor]:
+def sensors_of(table: Table, named: Named) -> list[Sensor]:
     """The sensors of a table: those named, then those recognised."""
     logger = "seconds_elapsed" in table.headers
-    time = table.column(str(named["times"])) if "times" in named else None
-    sensors = []
+    found: list[tuple[str | None, str, list[int], Scale]] = []
     for kind in MEASURED:
         if kind in named:
             if isinstance(named[kind], str) or len(named[kind]) != 3:
@@ -124,50 +125,39 @@ def sensors_of(table: Table, named: Mapping[str, str | Sequence[str]]) -> list[S
                     f"{named[kind]!r}."
                 )
             three = [table.column(name) for name in named[kind]]
-            sensors.append(_sensor(table, time, kind, three, ", ".join(named[kind])))
+            found.append((kind, ", ".join(named[kind]), three, (None, "", None)))
     for stem, three in table.triples().items():
-        kind, scale = kind_of(stem or table.name), (None, None, "")
+        label = stem.strip() or table.name
+        kind, scale = kind_of(label), (None, "", None)
         if logger and not stem:
             kind, unit = _SENSOR_LOGGER.get(table.name.lower(), (None, None))
-            scale = unit, None, "so Sensor Logger writes it"
+            scale = unit, "so Sensor Logger writes it", None
         elif logger and kind == "specific_forces":
             kind = "linear"  # of watches and headphones, which have columns of gravity too
-        elif stem in ("gyroADC", "accSmooth"):
-            scale = _betaflight(stem, table.about)
-        if kind and kind != "times":
-            sensors.append(_sensor(table, time, kind, three, stem or table.name, *scale))
+        elif label in ("gyroADC", "accSmooth"):
+            scale = _betaflight(label, table.about)
+        found.append((kind, label, three, scale))
+    sensors = []
+    for kind, label, three, scale in found:
+        unit = split_unit(table.headers[three[0]])[1]
+        if unit is not None:  # a unit in the header beats that of the format
+            scale = unit, "the header says so", None
+        time = table.column(str(named["times"])) if "times" in named else table.before(three[0])
+        rows = np.flatnonzero(np.isfinite(table.values[:, three]).all(axis=1))
+        if kind not in (None, "times"):
+            sensors.append(Sensor(str(kind), label, table, time, three, rows, scale))
     return sensors
 
 
-def _sensor(
-    table: Table,
-    time: int | None,
-    kind: str,
-    three: list[int],
-    label: str,
-    unit: str | None = None,
-    factor: float | None = None,
-    source: str = "",
-) -> Sensor:
-    """The rows where all three are numbers; a unit in the header beats that of the format."""
-    stated = split_unit(table.headers[three[0]])[1]
-    if stated is not None:
-        unit, factor, source = stated, None, "the header says so"
-    if time is None:
-        time = table.times_before(three[0])
-    rows = np.flatnonzero(np.isfinite(table.values[:, three]).all(axis=1))
-    return Sensor(kind, label.strip(), table, time, three, rows, unit, factor, source)
-
-
-def _betaflight(stem: str, about: dict[str, str]) -> tuple[str | None, float | None, str]:
+def _betaflight(stem: str, about: dict[str, str]) -> Scale:
     """Unit and scale of the raw numbers of a blackbox log."""
     if stem == "gyroADC":
         text = about.get("gyro_scale", about.get("gyro.scale", "1"))
         bits = int(text, 0) if text.startswith("0x") or text.isdigit() else 0
         # a float written as the integer of the same bits
         scale = struct.unpack("f", struct.pack("I", bits))[0] if bits > 1 << 20 else float(text)
-        return "deg/s", scale * UNITS["rates"]["deg/s"], "so Betaflight logs its gyro"
+        return "deg/s", "so Betaflight logs its gyro", scale * UNITS["rates"]["deg/s"]
     if "acc_1G" in about:
         one = float(about["acc_1G"])
-        return "counts", UNITS["specific_forces"]["g"] / one, f"acc_1G is {one:g}"
-    return None, None, ""
+        return "counts", f"acc_1G is {one:g}", UNITS["specific_forces"]["g"] / one
+    return None, "", None

@@ -7,20 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jrigid.records._units import split_unit
+
 _MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have their settings there
 
-# Units by what is measured, in SI. Spelled as `plain_unit` returns them.
-UNITS: dict[str, dict[str, float]] = {
-    "times": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
-    "rates": dict.fromkeys(("rad/s", "rads", "rad_s"), 1.0)
-    | dict.fromkeys(("deg/s", "°/s", "dps", "deg_s", "degs", "degrees/s"), np.pi / 180)
-    | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi},
-    "specific_forces": dict.fromkeys(("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0)
-    | {"g": 9.80665, "mg": 9.80665e-3},
-    "magnetic_fields": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "g": 1e-4, "gauss": 1e-4},
-}
-_UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
-_SUFFIX = re.compile(r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE)
 _AXIS = re.compile(r"^(.*?)[\s_.\-]*(?:\[([012])\]|([xyz]))$", re.IGNORECASE)
 # What a column measures, by words in its name; the first that fits.
 _KINDS = {
@@ -42,8 +32,8 @@ class Table(NamedTuple):
     about: dict[str, str]
     notes: list[str]
 
-    def times_before(self, column: int) -> int | None:
-        """The column of times nearest before a column, or the first."""
+    def before(self, column: int) -> int | None:
+        """The column of times nearest before a column, or the first one."""
         times = [j for j, x in enumerate(self.headers) if kind_of(split_unit(x)[0]) == "times"]
         times = [j for j in times if np.isfinite(self.values[:, j]).any()]
         return max((j for j in times if j < column), default=min(times, default=None))
@@ -67,20 +57,6 @@ class Table(NamedTuple):
             f"Argument `columns` must name columns of the file, but {wanted!r} is none of "
             f"{', '.join(self.headers)}."
         )
-
-
-def split_unit(header: str) -> tuple[str, str | None]:
-    """A header without its unit, and the unit: `gyro x (deg/s)`, `t [ms]`, `gyro_x_dps`."""
-    match = _UNIT.search(header) or _SUFFIX.search(header)
-    if not match or not match.start():
-        return header, None
-    return header[: match.start()], plain_unit(match[1])
-
-
-def plain_unit(unit: str) -> str:
-    """A unit in the spelling of `UNITS`."""
-    unit = re.sub("[\u00b5\u03bc\ufffd]", "u", unit.strip()).lower().replace(" ", "")
-    return unit.replace("²", "^2").replace("**", "^").replace("sec", "s")
 
 
 def kind_of(name: str) -> str | None:
