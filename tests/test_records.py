@@ -187,6 +187,10 @@ def test_blackbox_viewer_puts_its_settings_above():
     # the bits of 2.0
     np.testing.assert_allclose(reading.rates[4], 2 * np.array([4, -90, 180]) * DEGREE, rtol=1e-9)
     said(reading, "times (time) taken as us: their median step is 500")
+    names = ("gyroADC[2]", "gyroADC[0]", "gyroADC[1]")
+    turned = read(above + header + "".join(blackbox_csv().splitlines(True)[1:]),
+                  columns={"rates": names})  # fmt: skip
+    np.testing.assert_array_equal(turned.rates, reading.rates[:, [2, 0, 1]])
 
 
 def variable_byte(value):

@@ -76,13 +76,13 @@ def flights(
     if rates is None or (by == "forces" and forces is None):
         needed = "rates" if rates is None else "specific forces"
         raise ValueError(f"Argument `reading` must have {needed}, but it has none.")
-    by = by or ("momentum" if forces is None else "forces")
+    by = "momentum" if forces is None else by or "forces"
     interval = reading.interval
     size = max(4, round(_WINDOW / interval)) if interval > 0 else 0
     if reading.times.size <= size:
         return []
     with np.errstate(invalid="ignore"):  # NaN where the accelerometer is silent: contact
-        if by == "forces":
+        if by == "forces" and forces is not None:
             law = _law_of_forces(reading.times, rates, forces, max(1, round(_SLOPE / 2 / interval)))
         else:
             law = _law_of_momentum(reading.times, rates, max(1, round(_TURN / 2 / interval)))
@@ -149,7 +149,8 @@ def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
 
 def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
     """Rows that the best unknowns explain: those that explain the longest part in long runs."""
-    known = np.isfinite(law.wanted).all(axis=1) & np.isfinite(law.model).all(axis=(1, 2))
+    equations = np.concatenate([law.wanted[..., None], law.model], axis=2)
+    known = np.isfinite(equations.reshape(len(equations), -1)).all(axis=1)
     model = np.where(known[:, None, None], law.model, 0.0)
     wanted = np.where(known[:, None], law.wanted, 0.0)
     unknowns = model.shape[2]

@@ -125,17 +125,16 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
                     f"{named[kind]!r}."
                 )
             three = [table.column(name) for name in named[kind]]
-            found.append((kind, ", ".join(named[kind]), three, (None, "", None)))
+            scale = _betaflight(named[kind][0].partition("[")[0], table.about)
+            found.append((kind, ", ".join(named[kind]), three, scale))
     for stem, three in table.triples().items():
         label = stem.strip() or table.name
-        kind, scale = kind_of(label), (None, "", None)
+        kind, scale = kind_of(label), _betaflight(label, table.about)
         if logger and not stem:
             kind, unit = _SENSOR_LOGGER.get(table.name.lower(), (None, None))
             scale = unit, "so Sensor Logger writes it", None
         elif logger and kind == "specific_forces":
             kind = "linear"  # of watches and headphones, which have columns of gravity too
-        elif label in ("gyroADC", "accSmooth"):
-            scale = _betaflight(label, table.about)
         found.append((kind, label, three, scale))
     sensors = []
     for kind, label, three, scale in found:
@@ -150,14 +149,14 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
 
 
 def _betaflight(stem: str, about: dict[str, str]) -> Scale:
-    """Unit and scale of the raw numbers of a blackbox log."""
-    if stem == "gyroADC":
+    """Unit and scale of the raw numbers of a blackbox log; nothing for other names."""
+    if stem in ("gyroADC", "gyroUnfilt"):
         text = about.get("gyro_scale", about.get("gyro.scale", "1"))
         bits = int(text, 0) if text.startswith("0x") or text.isdigit() else 0
         # a float written as the integer of the same bits
         scale = struct.unpack("f", struct.pack("I", bits))[0] if bits > 1 << 20 else float(text)
         return "deg/s", "so Betaflight logs its gyro", scale * UNITS["rates"]["deg/s"]
-    if "acc_1G" in about:
+    if stem == "accSmooth" and "acc_1G" in about:
         one = float(about["acc_1G"])
         return "counts", f"acc_1G is {one:g}", UNITS["specific_forces"]["g"] / one
     return None, "", None
