@@ -15,7 +15,7 @@ _SLOPE = 0.02  # [s] over which rates are differentiated
 _LEVER = 0.2  # [m] how far from the mass centre an accelerometer usually is
 _FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
 _TURN = 0.1  # [s] over which a momentum must stay the same
-_KEPT = 0.06  # of a momentum that may come or go in that time: noise, drag of the air
+_KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _SHARE = 0.2  # how far moments usually are from equal, of a trace of 1
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
@@ -144,13 +144,17 @@ def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
         moments = np.linalg.eigvalsh(tensors[0] + np.tensordot(x, tensors[1:], 1))
         return bool(moments[0] > 0 and moments[2] < _LARGEST)
 
-    return _Law(model, -change[:, 0], np.full(t.size, _KEPT), _SHARE, reach, of_a_body)
+    # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
+    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
+    relative, times_noise = _KEPT
+    tolerance = relative + times_noise * noise / np.maximum(spin, _SPIN)
+    return _Law(model, -change[:, 0], tolerance, _SHARE, reach, of_a_body)
 
 
 def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
     """Rows that the best unknowns explain: those that explain the longest part in long runs."""
     equations = np.concatenate([law.wanted[..., None], law.model], axis=2)
-    known = np.isfinite(equations.reshape(len(equations), -1)).all(axis=1)
+    known = np.isfinite(equations.sum(axis=(1, 2)))
     model = np.where(known[:, None, None], law.model, 0.0)
     wanted = np.where(known[:, None], law.wanted, 0.0)
     unknowns = model.shape[2]
