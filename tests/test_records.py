@@ -141,7 +141,11 @@ def test_forces_without_a_unit_are_recognised_by_gravity(tmp_path, size, unit):
 
 def test_the_calibrated_gyro_is_taken(tmp_path):
     raw = {"GyroscopeUncalibrated": 0 * ROWS + ROWS[:, :1], "Gyroscope": ROWS}
-    reading = jr.records.read(sensor_logger(tmp_path / "log", **raw))
+    folder = sensor_logger(tmp_path / "log", **raw)
+    with zipfile.ZipFile(tmp_path / "log.zip", "w") as archive:
+        for name in raw:
+            archive.write(folder / f"{name}.csv", f"2026-01-01/{name}.csv")
+    reading = jr.records.read(tmp_path / "log.zip")
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
 
 
@@ -430,6 +434,13 @@ def test_a_file_that_has_been_through_much(tmp_path):
     said(reading, "1 line of headers in the middle skipped")
 
 
+def test_a_byte_order_mark_in_an_open_text():
+    text = "\ufeff" + table(
+        ["gx (rad/s)", "gy (rad/s)", "gz (rad/s)", "t (s)"], ROWS[:, [1, 2, 3, 0]]
+    )
+    np.testing.assert_allclose(read(text).rates, ROWS[:, 1:])
+
+
 def test_latin_1_does_not_stop_a_reading(tmp_path):
     header = "t (s),mag x (µT),mag y (µT),mag z (µT)\n"
     path = tmp_path / "old.csv"
@@ -494,6 +505,13 @@ def test_a_counter_that_wraps(tick):
     assert "wrapped at row 50" in clock.notes[0]
 
 
+def test_a_lone_repeated_stamp_is_no_rounding():
+    clock = jr.records.repair(np.array([0.0, 0.1, 0.1, 0.2, 0.3, 0.4, 2.4, 2.5]))
+    np.testing.assert_array_equal(clock.rows, [0, 1, 3, 4, 5, 6, 7])
+    np.testing.assert_array_equal(clock.times, [0.0, 0.1, 0.2, 0.3, 0.4, 2.4, 2.5])
+    assert clock.breaks == (5,)
+
+
 def test_gaps_are_breaks_and_are_not_filled():
     times = np.delete(np.arange(300) * 0.01, np.r_[50:60, 200:250, 270:272])
     clock = jr.records.repair(times)
@@ -524,6 +542,14 @@ def test_late_stamps_of_an_even_clock_with_readings_lost(rng):
     late = clock.times - true
     assert np.std(late) < 0.1e-3
     assert "as asked" in clock.notes[-1]
+
+
+def test_stamps_far_out_do_not_tilt_the_line(rng):
+    true = 0.01 * np.arange(1000)
+    times = true + 1e-4 * rng.normal(size=1000)
+    times[-60:] += 0.004
+    late = jr.records.repair(times, clock="uniform").times - true
+    assert np.abs(late).max() < 1e-4
 
 
 def test_times_that_say_nothing():
@@ -664,6 +690,18 @@ def test_short_flights_breaks_and_silence(rng):
     assert jr.records.flights(reading[:5]) == jr.records.flights(reading[:0]) == []
 
 
+def test_a_gyro_at_rest_keeps_its_bias_but_does_not_fly(rng):
+    rates = 0.05 + 1e-4 * rng.normal(size=(500, 3))
+    assert jr.records.flights(jr.records.Reading(np.arange(500) / 100, rates)) == []
+
+
+def test_a_loud_gyro_sees_flights_by_the_momentum(rng):
+    reading = thrown(rng, 400.0, [[2.0, 2.6]], np.array([4.0, -9.0, 3.0]), np.zeros(3), gyro=0.1)
+    [flight] = jr.records.flights(reading, by="momentum")
+    assert 1.95 < flight.times[0] < 2.04
+    assert 2.55 < flight.times[-1] < 2.6
+
+
 def test_what_flights_needs():
     times = np.arange(100) / 100
     with pytest.raises(ValueError, match="Argument `reading` must have rates"):
@@ -756,6 +794,14 @@ def test_noise_from_the_rests_around_a_motion(rng):
     assert 29.99 < second.times[0] < 31
 
 
+def test_a_hand_that_trembles_is_no_rest_where_there_is_one(rng):
+    times = np.arange(3000) / 100
+    rates = 0.002 * rng.normal(size=(3000, 3))
+    rates[1000:] += 0.02 * np.sin(60 * times[1000:, None])
+    [rest] = jr.records.rests(jr.records.Reading(times, rates))
+    assert 9 < rest.times[-1] < 10.01
+
+
 def test_bias_instability_of_white_noise_and_flicker(rng):
     """Where N / sqrt(t) meets a level of 0.664 B, the least is a little above the level."""
     size, instability = 2**18, 0.002
@@ -793,5 +839,7 @@ def test_no_rest(rng):
         jr.records.noise(moving)
     with pytest.raises(ValueError, match="must have rates"):
         jr.records.rests(jr.records.Reading(times))
+    shaken = jr.records.Reading(times, 2 * np.sin(130 * times[:, None] + np.arange(3.0)))
+    assert jr.records.rests(shaken) == []
     steady = jr.records.Reading(times, np.tile([0.0, 0.0, 3.0], (2000, 1)))  # on a turntable
     assert jr.records.rests(steady) == []

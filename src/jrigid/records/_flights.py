@@ -19,9 +19,6 @@ _KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the 
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _SHARE = 0.2  # how far moments usually are from equal, of a trace of 1
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
-_FAR = 5.0  # times the usual residual of flights, where that is below the tolerance
-_TIGHTEST = 0.1  # of the tolerance
-_HOLE = 2  # rows just beyond the tolerance that do not end a flight
 
 
 class _Law(NamedTuple):
@@ -91,8 +88,8 @@ def flights(
         free = _consensus(law, size, max(2, round(least / interval)))
     found = []
     for first, last in _runs(free):
-        if by == "momentum":  # such an equation holds for all that it looks at
-            first, last = first - law.reach, last + law.reach
+        if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
+            first, last = first - 4 * law.reach // 5, last + 4 * law.reach // 5
         a, b = reading.times[[first, last - 1]] + [margin, -margin]
         rows = np.flatnonzero((reading.times >= a) & (reading.times <= b))
         if rows.size and b - a >= least - 2 * margin:
@@ -165,16 +162,9 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
         b = (wanted[rows] / law.tolerance[rows, None])[known[rows]].ravel()
         return np.linalg.solve(a.T @ a + np.eye(unknowns) / law.usual**2, a.T @ b)
 
-    def beside(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
-        return np.linalg.norm(model[rows] @ x - wanted[rows], axis=1) / law.tolerance[rows]
-
-    def explained(x: np.ndarray, rows: slice = slice(None), tightened: float = 1.0) -> np.ndarray:
-        off = beside(x, rows) / tightened
-        good = known[rows] & (off < 1)
-        for first, last in _runs(known[rows] & ~good & (off < 2)):
-            inside = first > 0 and last < good.size and good[first - 1] and good[last]
-            good[first:last] = inside and last - first <= _HOLE
-        return good
+    def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
+        return known[rows] & (beside < law.tolerance[rows])
 
     def in_runs(good: np.ndarray) -> np.ndarray:
         kept = np.zeros_like(good)
@@ -189,14 +179,8 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
         if law.sound(x) and explained(x, window).mean() >= _SOUND:
             free = in_runs(explained(x))
             best = free if free.sum() > best.sum() else best
-    for _ in range(2):
-        free = in_runs(explained(solve(best)))
-        best = free if free.sum() >= best.sum() else best
-    if not best.any():
-        return best
-    x = solve(best)
-    typical = np.median(beside(x)[best])
-    return in_runs(explained(x, tightened=min(1.0, max(_TIGHTEST, _FAR * float(typical)))))
+    again = in_runs(explained(solve(best)))
+    return again if again.sum() >= best.sum() else best
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:

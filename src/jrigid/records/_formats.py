@@ -67,9 +67,7 @@ def tables_of(path: Any, log: int) -> tuple[list[Table], dict[str, str]]:
         files = {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
     elif path.suffix.lower() == ".zip":
         with zipfile.ZipFile(path) as archive:
-            # phyphox puts its own affairs into a folder `meta`, macOS into `__MACOSX`
             names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
-            names = [n for n in names if not {"meta", "__MACOSX"} & {*n.split("/")[:-1]}]
             files = {pathlib.PurePath(n).stem: archive.read(n) for n in names}
     else:
         files = {path.stem: path.read_bytes()}
@@ -86,7 +84,7 @@ def tables_of(path: Any, log: int) -> tuple[list[Table], dict[str, str]]:
         try:
             tables.append(parse(text, name))
         except ValueError:
-            if not several:  # of several files some, as annotations, hold no numbers
+            if not several:  # of several files some, as annotations or phyphox's `meta`, hold none
                 raise
     return tables, about
 
