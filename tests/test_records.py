@@ -256,6 +256,8 @@ def test_logs_in_one_blackbox_file_and_one_that_breaks_off(tmp_path):
     np.testing.assert_allclose(second.rates[1, 0], 180 * DEGREE)  # its own gyro_scale
     said(first, "log 1 of 2")
     said(second, "the log breaks off")
+    with pytest.raises(ValueError, match="must be of a log that can be decoded, but: Invalid log"):
+        jr.records.read(path, log=3)
 
 
 def test_a_blackbox_log_through_a_decoder_that_stands_in(tmp_path, monkeypatch):
@@ -661,7 +663,7 @@ def test_flights_by_the_momentum(case, rng):
 @pytest.mark.parametrize("seed", range(4))
 def test_no_flight_in_a_hand(seed):
     rng = np.random.default_rng(seed)
-    reading = thrown(rng, 100.0, [], np.ones(3), np.array([0.05, 0.02, 0.0]), total=6.0)
+    reading = thrown(rng, 200.0, [], np.ones(3), np.array([0.05, 0.02, 0.0]), total=6.0)
     assert jr.records.flights(reading) == []
     assert jr.records.flights(reading, by="momentum") == []
 

@@ -86,21 +86,21 @@ def flights(
         for row in (0, *reading.breaks, reading.times.size):
             law.wanted[max(row - law.reach, 0) : row + law.reach] = np.nan
         free = _consensus(law, size, max(2, round(least / interval)))
-    found = []
+    flown = []
     for first, last in _runs(free):
         if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
             first, last = first - 4 * law.reach // 5, last + 4 * law.reach // 5
         a, b = reading.times[[first, last - 1]] + [margin, -margin]
         rows = np.flatnonzero((reading.times >= a) & (reading.times <= b))
         if rows.size and b - a >= least - 2 * margin:
-            found.append(reading[int(rows[0]) : int(rows[-1]) + 1])
+            flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
     what = {"forces": "specific forces", "momentum": "momentum"}[by]
     return [
         flight.with_notes(
-            f"flight {i} of {len(found)}, {flight.times[0]:.6g} s to {flight.times[-1]:.6g} s: "
+            f"flight {i} of {len(flown)}, {flight.times[0]:.6g} s to {flight.times[-1]:.6g} s: "
             f"no contact by the {what}"
         )
-        for i, flight in enumerate(found, 1)
+        for i, flight in enumerate(flown, 1)
     ]
 
 

@@ -2,11 +2,12 @@
 
 import importlib
 import io
+import os
 import pathlib
 import struct
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from jrigid.records._units import UNITS, split_unit
 _BLACKBOX = b"H Product:Blackbox"  # how the log of a flight controller begins
 # Unit, who states it, and a factor to SI where the unit alone is not enough.
 Scale = tuple[str | None, str, float | None]
+Source = str | os.PathLike[str] | io.TextIOBase
 Named = Mapping[str, str | Sequence[str]]
 MEASURED = ("rates", "specific_forces", "magnetic_fields")
 # Sensor Logger: what is in the file of a sensor, and in which unit (None: it depends).
@@ -58,7 +60,7 @@ class Sensor(NamedTuple):
         return self.table.values[self.rows][:, self.columns]
 
 
-def tables_of(path: Any, log: int) -> tuple[list[Table], dict[str, str]]:
+def tables_of(path: Source, log: int) -> tuple[list[Table], dict[str, str]]:
     """All tables behind a path, and what a recording says about itself."""
     if isinstance(path, io.TextIOBase):
         return [parse(path.read(), str(getattr(path, "name", "text")))], {}
@@ -96,7 +98,12 @@ def _blackbox(path: pathlib.Path, log: int) -> Table:
     except ModuleNotFoundError as error:
         raise ImportError('This needs orangebox: pip install "jrigid[records]".') from error
     # A parser for each log: one that goes on to another keeps the headers of the last.
-    parser = orangebox.Parser.load(str(path), log, allow_invalid_header=True)
+    try:
+        parser = orangebox.Parser.load(str(path), log, allow_invalid_header=True)
+    except RuntimeError as error:
+        raise ValueError(
+            f"Arguments `path` and `log` must be of a log that can be decoded, but: {error}"
+        ) from error
     names, frames, notes = parser.field_names, [], []
     if parser.reader.log_count > 1:
         notes.append(f"log {log} of {parser.reader.log_count}")
@@ -114,7 +121,7 @@ def _blackbox(path: pathlib.Path, log: int) -> Table:
 def sensors_of(table: Table, named: Named) -> list[Sensor]:
     """The sensors of a table: those named, then those recognised."""
     logger = "seconds_elapsed" in table.headers
-    found: list[tuple[str | None, str, list[int], Scale]] = []
+    candidates: list[tuple[str | None, str, list[int], Scale]] = []
     for kind in MEASURED:
         if kind in named:
             if isinstance(named[kind], str) or len(named[kind]) != 3:
@@ -124,7 +131,7 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
                 )
             three = [table.column(name) for name in named[kind]]
             scale = _betaflight(named[kind][0].partition("[")[0], table.about)
-            found.append((kind, ", ".join(named[kind]), three, scale))
+            candidates.append((kind, ", ".join(named[kind]), three, scale))
     for stem, three in table.triples().items():
         label = stem.strip() or table.name
         kind, scale = kind_of(label), _betaflight(label, table.about)
@@ -133,9 +140,9 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
             scale = unit, "so Sensor Logger writes it", None
         elif logger and kind == "specific_forces":
             kind = "linear"  # of watches and headphones, which have columns of gravity too
-        found.append((kind, label, three, scale))
+        candidates.append((kind, label, three, scale))
     sensors = []
-    for kind, label, three, scale in found:
+    for kind, label, three, scale in candidates:
         unit = split_unit(table.headers[three[0]])[1]
         if unit is not None:  # a unit in the header beats that of the format
             scale = unit, "the header says so", None

@@ -126,14 +126,14 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
         return []
     quantile, factor = _FLOOR
     loudest = min(_STILL, factor * float(np.quantile(spreads, quantile)))
-    found = []
+    quiet_parts = []
     for piece, spread, mean in windows:
         quiet = (spread <= loudest) & (np.linalg.norm(mean, axis=1) < _BIAS)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(int)))
         for first, last in zip(edges[::2] * size, edges[1::2] * size, strict=True):
             if piece.times[last - 1] - piece.times[first] >= least - reading.interval:
-                found.append(piece[int(first) : int(last)])
-    return found
+                quiet_parts.append(piece[int(first) : int(last)])
+    return quiet_parts
 
 
 def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noise:
@@ -150,8 +150,8 @@ def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noi
     >>> import numpy as np
     >>> import jrigid as jr
     >>> rates = 0.02 + 0.01 * np.random.default_rng(0).normal(size=(6000, 3))
-    >>> found = jr.records.noise(jr.records.Reading(np.arange(6000) / 100, rates))
-    >>> print(found.bias.round(3), found.sigma.round(3), found.density.round(4))
+    >>> gyro = jr.records.noise(jr.records.Reading(np.arange(6000) / 100, rates))
+    >>> print(gyro.bias.round(3), gyro.sigma.round(3), gyro.density.round(4))
     [0.02 0.02 0.02] [0.01 0.01 0.01] [0.001 0.001 0.001]
     """
     pieces = reading.pieces() if at_rest else rests(reading, least=least)
@@ -160,27 +160,27 @@ def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noi
         raise ValueError(
             f"Argument `reading` must have rates at rest for {least:g} s, but it has none."
         )
-    found = allan(parts, reading.interval)
-    least_at = np.argmin(found.deviations, axis=0)
-    steps = np.diff(np.log(found.times))[:, None]
-    slopes = np.diff(np.log(np.maximum(found.deviations, np.finfo(float).tiny)), axis=0) / steps
+    curve = allan(parts, reading.interval)
+    least_at = np.argmin(curve.deviations, axis=0)
+    steps = np.diff(np.log(curve.times))[:, None]
+    slopes = np.diff(np.log(np.maximum(curve.deviations, np.finfo(float).tiny)), axis=0) / steps
     density = []
     for axis, until in enumerate(least_at):
         white = np.abs(slopes[: max(until, 1), axis] + 0.5) < 0.1
         white = white if white.any() else np.ones_like(white)
-        scaled = found.deviations[: white.size, axis] * np.sqrt(found.times[: white.size])
+        scaled = curve.deviations[: white.size, axis] * np.sqrt(curve.times[: white.size])
         density.append(float(np.median(scaled[white])))
     total = sum(len(x) for x in parts) * reading.interval
     notes = [f"{len(parts)} rest{'s' if len(parts) > 1 else ''}, {total:.4g} s in all"]
-    if (least_at == found.times.size - 1).any():
+    if (least_at == curve.times.size - 1).any():
         notes.append("the rest is too short for the bias instability: an upper bound")
     return Noise(
         reading.interval,
         np.concatenate(parts).mean(axis=0),
-        found.deviations[0],
+        curve.deviations[0],
         np.array(density),
-        found.deviations.min(axis=0) / _FLICKER,
-        found.times[least_at],
-        found,
+        curve.deviations.min(axis=0) / _FLICKER,
+        curve.times[least_at],
+        curve,
         tuple(notes),
     )

@@ -1,13 +1,11 @@
 """A file becomes a reading: which sensors, which units, whose clock; and all of it said."""
 
-import io
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from jrigid.records._clock import Clock, repair
-from jrigid.records._formats import MEASURED, Named, Sensor, sensors_of, tables_of
+from jrigid.records._formats import MEASURED, Named, Sensor, Source, sensors_of, tables_of
 from jrigid.records._reading import Reading
 from jrigid.records._table import Table
 from jrigid.records._units import UNITS, Units, split_unit
@@ -16,10 +14,10 @@ _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from
 
 
 def read(
-    path: str | os.PathLike[str] | io.TextIOBase,
+    path: Source,
     *,
     unit: str | Mapping[str, str] | None = None,
-    columns: Mapping[str, str | Sequence[str]] | None = None,
+    columns: Named | None = None,
     clock: str | None = None,
     log: int = 1,
 ) -> Reading:
@@ -97,9 +95,9 @@ def read(
         factor = units.stated("rates", gyro.label, *gyro.scale)
         factor = factor or units.of_rates(gyro.label, own.times, raw, forces)
         rates = factor * raw
-    rest = _others(main, main.rows[own.rows], chosen, named)
+    others = _others(main, main.rows[own.rows], chosen, named)
     said = tuple(dict.fromkeys(notes))
-    return Reading(own.times, rates, forces, fields, rest, own.breaks, said)
+    return Reading(own.times, rates, forces, fields, others, own.breaks, said)
 
 
 def _choose(tables: list[Table], named: Named) -> dict[str, Sensor]:
@@ -173,7 +171,7 @@ def _others(
     """The other columns with numbers, and those asked for by a name, in SI by their header."""
     table = main.table
     taken = {j for s in chosen.values() if s.table is table for j in (*s.columns, s.time)}
-    rest = {
+    others = {
         header: table.values[rows, j]
         for j, header in enumerate(table.headers)
         if header and j not in taken and np.isfinite(table.values[rows, j]).any()
@@ -183,6 +181,6 @@ def _others(
             column = table.column(str(header))
             unit = split_unit(table.headers[column])[1]
             factor = next((known[unit] for known in UNITS.values() if unit in known), 1.0)
-            rest.pop(table.headers[column], None)
-            rest[name] = factor * table.values[rows, column]
-    return rest
+            others.pop(table.headers[column], None)
+            others[name] = factor * table.values[rows, column]
+    return others
