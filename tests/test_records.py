@@ -86,6 +86,10 @@ def test_accelerations_without_gravity_are_no_specific_forces():
     reading = read(header + "\n" + scientific(np.hstack([ROWS, ROWS[:, 1:]])))
     assert reading.specific_forces is None
     said(reading, "no specific force")
+    header += "".join(f',"Acceleration {a} (m/s^2)"' for a in "xyz")
+    reading = read(header + "\n" + scientific(np.hstack([ROWS, ROWS[:, 1:], 2 * ROWS[:, 1:]])))
+    np.testing.assert_allclose(reading.specific_forces, 2 * ROWS[:, 1:])
+    assert "Linear Acceleration x (m/s^2)" in reading.columns
 
 
 # Sensor Logger ------------------------------------------------------------------------------------
@@ -380,6 +384,10 @@ def test_the_unit_is_recognised_by_how_gravity_turns(unit, rng):
     reading = read(text)
     np.testing.assert_allclose(reading.rates, rates, atol=1e-9)
     said(reading, f"taken as {unit}: so gravity turns")
+    # headers and callers may be wrong
+    for stated in ("rad/s", "deg/s"):
+        reading = read(text, unit=stated)
+        assert any("yet gravity turns" in x for x in reading.notes) == (stated != unit)
     # no word where gravity turns otherwise than the rates say
     rows[:, 1:4] = rows[::-1, [2, 3, 1]]
     with pytest.raises(ValueError, match="must say the unit of the rates"):

@@ -93,7 +93,10 @@ def read(
     if "rates" in chosen:
         gyro, raw = chosen["rates"], onto["rates"]
         factor = units.stated("rates", gyro.label, *gyro.scale)
-        factor = factor or units.of_rates(gyro.label, own.times, raw, forces)
+        if factor is None:
+            factor = units.of_rates(gyro.label, own.times, raw, forces)
+        elif forces is not None:
+            units.doubt(own.times, raw, forces, factor)
         rates = factor * raw
     others = _others(main, main.rows[own.rows], chosen, named)
     said = tuple(dict.fromkeys(notes))
@@ -107,6 +110,8 @@ def _choose(tables: list[Table], named: Named) -> dict[str, Sensor]:
         old = chosen.get(sensor.kind)
         if old is None or ("uncal" in old.label.lower() and sensor.kind not in named):
             chosen[sensor.kind] = sensor
+    for part in ("linear", "gravity") if "specific_forces" in chosen else ():
+        chosen.pop(part, None)
     return chosen
 
 

@@ -116,6 +116,14 @@ class Units:
             )
         return self._taken("rates", label, unit, source)
 
+    def doubt(
+        self, times: np.ndarray, rates: np.ndarray, forces: np.ndarray, factor: float
+    ) -> None:
+        """A note where gravity turns in another unit than the stated one: headers can be wrong."""
+        unit = _by_turning_gravity(times, rates, forces)
+        if unit is not None and not 0.2 < factor / UNITS["rates"][unit] < 5:
+            self.notes.append(f"yet gravity turns in the body as if the rates were in {unit}")
+
 
 def _by_turning_gravity(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str | None:
     """The unit in which gravity turns as the rates say, df/dt = -omega x f; None if unclear."""
