@@ -177,6 +177,7 @@ def test_blackbox_decode_writes_degrees_and_counts():
     assert reading.specific_forces is None
     said(reading, "left out: their unit is not stated")
     np.testing.assert_array_equal(reading.columns["motor[0]"], 158 + np.arange(5))
+    np.testing.assert_array_equal(reading.columns["accSmooth[2]"], 2048)
     assert "flightModeFlags (flags)" not in reading.columns
 
 
@@ -451,6 +452,26 @@ def test_a_byte_order_mark_in_an_open_text():
     np.testing.assert_allclose(read(text).rates, ROWS[:, 1:])
 
 
+def test_rows_without_a_time_and_sensors_that_never_meet():
+    rows = np.array([[0.0, 1, 2, 3], [np.nan, 1, 2, 3], [0.2, 1, 2, 3]])
+    header = ["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"]
+    reading = read(table(header, rows))
+    np.testing.assert_array_equal(reading.times, [0.0, 0.2])
+    said(reading, "1 row without a time dropped")
+    late = np.column_stack([rows, 9.0 + rows[:, :1], rows[:, 1:]])
+    reading = read(table([*header, "t", "ax", "ay", "az"], late), unit={"times": "s"})
+    assert reading.specific_forces is None
+    assert np.isnan(read(table([*header, "t", "ax (g)", "ay (g)", "az (g)"], late),
+                         unit={"times": "s"}).specific_forces).all()  # fmt: skip
+
+
+def test_an_attitude_is_no_rate():
+    names = ["t (s)", *(f"ROTATION VECTOR {a}" for a in "XYZ"), *(f"gyro {a} (dps)" for a in "XYZ")]
+    reading = read(table(names, np.column_stack([ROWS, ROWS[:, 1:]])))
+    np.testing.assert_allclose(reading.rates, ROWS[:, 1:] * DEGREE)
+    assert "ROTATION VECTOR X" in reading.columns
+
+
 def test_latin_1_does_not_stop_a_reading(tmp_path):
     header = "t (s),mag x (µT),mag y (µT),mag z (µT)\n"
     path = tmp_path / "old.csv"
@@ -702,6 +723,9 @@ def test_short_flights_breaks_and_silence(rng):
 
 def test_a_gyro_at_rest_keeps_its_bias_but_does_not_fly(rng):
     rates = 0.05 + 1e-4 * rng.normal(size=(500, 3))
+    assert jr.records.flights(jr.records.Reading(np.arange(500) / 100, rates)) == []
+    rates[200:250] = np.arange(50)[:, None]  # and some that are exactly zero
+    rates[:200] = 0.0
     assert jr.records.flights(jr.records.Reading(np.arange(500) / 100, rates)) == []
 
 

@@ -29,7 +29,8 @@ class _Law(NamedTuple):
     tolerance: np.ndarray
     usual: float  # size of the unknowns
     reach: int  # rows to either side that an equation looks at
-    sound: Callable[[np.ndarray], bool]  # whether unknowns may be those of a body
+    # By the unknowns, for some rows: what the tolerance is in parts of; 0 if they are of no body.
+    scale: Callable[[np.ndarray, slice], np.ndarray | float]
 
 
 def flights(
@@ -78,7 +79,7 @@ def flights(
     size = max(4, round(_WINDOW / interval)) if interval > 0 else 0
     if reading.times.size <= size:
         return []
-    with np.errstate(invalid="ignore"):  # NaN where the accelerometer is silent: contact
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN where nothing is known
         if by == "forces" and forces is not None:
             law = _law_of_forces(reading.times, rates, forces, max(1, round(_SLOPE / 2 / interval)))
         else:
@@ -86,10 +87,10 @@ def flights(
         for row in (0, *reading.breaks, reading.times.size):
             law.wanted[max(row - law.reach, 0) : row + law.reach] = np.nan
         free = _consensus(law, size, max(2, round(least / interval)))
+    if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
+        free = np.convolve(free, np.ones(2 * (4 * law.reach // 5) + 1), mode="same") > 0.5
     flown = []
     for first, last in _runs(free):
-        if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
-            first, last = first - 4 * law.reach // 5, last + 4 * law.reach // 5
         a, b = reading.times[[first, last - 1]] + [margin, -margin]
         rows = np.flatnonzero((reading.times >= a) & (reading.times <= b))
         if rows.size and b - a >= least - 2 * margin:
@@ -114,7 +115,7 @@ def _law_of_forces(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: 
     model = np.swapaxes(np.cross(slope[:, None], axes) + inward, 1, 2)
     absolute, relative = _FORCE
     tolerance = absolute + relative * np.linalg.norm(forces, axis=1)
-    return _Law(model, forces.copy(), tolerance, _LEVER, reach, lambda _: True)
+    return _Law(model, forces.copy(), tolerance, _LEVER, reach, lambda *_: 1.0)
 
 
 def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
@@ -136,16 +137,19 @@ def _law_of_momentum(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
     change = np.where(spin[:, None, None] > _SPIN, change / (spin[:, None, None] / 3), np.nan)
     model = np.swapaxes(change[:, 1:], 1, 2)
 
-    def of_a_body(x: np.ndarray) -> bool:
-        """Moments positive, none more than the others together, but for noise."""
-        moments = np.linalg.eigvalsh(tensors[0] + np.tensordot(x, tensors[1:], 1))
-        return bool(moments[0] > 0 and moments[2] < _LARGEST)
+    def scale(x: np.ndarray, rows: slice) -> np.ndarray | float:
+        """The momentum, in parts of the sphere's; moments are positive and none exceeds others."""
+        tensor = tensors[0] + np.tensordot(x, tensors[1:], 1)
+        moments = np.linalg.eigvalsh(tensor)
+        if moments[0] <= 0 or moments[2] > _LARGEST:
+            return 0.0
+        return np.linalg.norm(rates[rows] @ tensor, axis=1) / (spin[rows] / 3)
 
     # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
     noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
     relative, times_noise = _KEPT
     tolerance = relative + times_noise * noise / np.maximum(spin, _SPIN)
-    return _Law(model, -change[:, 0], tolerance, _SHARE, reach, of_a_body)
+    return _Law(model, -change[:, 0], tolerance, _SHARE, reach, scale)
 
 
 def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
@@ -164,7 +168,7 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
 
     def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
-        return known[rows] & (beside < law.tolerance[rows])
+        return known[rows] & (beside < law.tolerance[rows] * law.scale(x, rows))
 
     def in_runs(good: np.ndarray) -> np.ndarray:
         kept = np.zeros_like(good)
@@ -176,7 +180,7 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
     for first in range(0, known.size - size, max(size // 2, known.size // _GUESSES)):
         window = slice(first, first + size)
         x = solve(window)
-        if law.sound(x) and explained(x, window).mean() >= _SOUND:
+        if explained(x, window).mean() >= _SOUND:
             free = in_runs(explained(x))
             best = free if free.sum() > best.sum() else best
     again = in_runs(explained(solve(best)))

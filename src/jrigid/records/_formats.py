@@ -134,7 +134,9 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
             candidates.append((kind, ", ".join(named[kind]), three, scale))
     for stem, three in table.triples().items():
         label = stem.strip() or table.name
-        kind, scale = kind_of(label), _betaflight(label, table.about)
+        if len(label) == 1:
+            label = ", ".join(split_unit(table.headers[j])[0] for j in three)
+        kind, scale = kind_of(stem or table.name), _betaflight(label, table.about)
         if logger and not stem:
             kind, unit = _SENSOR_LOGGER.get(table.name.lower(), (None, None))
             scale = unit, "so Sensor Logger writes it", None
@@ -148,7 +150,7 @@ def sensors_of(table: Table, named: Named) -> list[Sensor]:
             scale = unit, "the header says so", None
         time = table.column(str(named["times"])) if "times" in named else table.before(three[0])
         rows = np.flatnonzero(np.isfinite(table.values[:, three]).all(axis=1))
-        if kind not in (None, "times"):
+        if kind not in (None, "times") and rows.size:
             sensors.append(Sensor(str(kind), label, table, time, three, rows, scale))
     return sensors
 

@@ -54,7 +54,7 @@ def read(
     4 readings over 0.03 s, one in 10 ms
       rates: 3.28 rad/s at most
       - times (t_ms) taken as ms: the header says so
-      - rates (g) taken as deg/s: the header says so
+      - rates (gx, gy, gz) taken as deg/s: the header says so
 
     Source: phyphox-android, `DataExport.java`; awesome-sensor-logger, `UNITS.md` and
     `COORDINATES.md`; betaflight/blackbox-tools, `units.h` and `parser.c`.
@@ -75,8 +75,8 @@ def read(
     notes += [f"{t.name}: {x}" if several else x for t in tables for x in t.notes]
 
     times = {kind: _seconds(sensor, units) for kind, sensor in chosen.items()}
-    origin = min(t.min() for t in times.values())
-    if origin > _EPOCH:
+    origin = min(np.nanmin(t, initial=np.inf) for t in times.values())
+    if _EPOCH < origin < np.inf:
         notes.append(f"times count from {origin:.6f} s of the file's clock")
         times = {kind: t - origin for kind, t in times.items()}
     clocks: dict[str, Clock] = {}
@@ -98,7 +98,10 @@ def read(
         elif forces is not None:
             units.doubt(own.times, raw, forces, factor)
         rates = factor * raw
-    others = _others(main, main.rows[own.rows], chosen, named)
+    missing = {"specific_forces", "linear", "gravity"} if forces is None else set()
+    missing |= {"magnetic_fields"} if fields is None else set()
+    used = [s for kind, s in chosen.items() if kind not in missing]
+    others = _others(main, main.rows[own.rows], used, named)
     said = tuple(dict.fromkeys(notes))
     return Reading(own.times, rates, forces, fields, others, own.breaks, said)
 
@@ -171,11 +174,11 @@ def _forces(
 
 
 def _others(
-    main: Sensor, rows: np.ndarray, chosen: dict[str, Sensor], named: Named
+    main: Sensor, rows: np.ndarray, used: list[Sensor], named: Named
 ) -> dict[str, np.ndarray]:
     """The other columns with numbers, and those asked for by a name, in SI by their header."""
     table = main.table
-    taken = {j for s in chosen.values() if s.table is table for j in (*s.columns, s.time)}
+    taken = {main.time, *(j for s in used if s.table is table for j in (*s.columns, s.time))}
     others = {
         header: table.values[rows, j]
         for j, header in enumerate(table.headers)

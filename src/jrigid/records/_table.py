@@ -17,7 +17,7 @@ _KINDS = {
     "times": r"^t$|^ts$|time|^second|^zeit|^millis|^micros",
     "gravity": r"gravity",
     "linear": r"lin|user|without g",  # acceleration with gravity taken away
-    "rates": r"gyr|rot|angular|angvel|omega|winkel|^[wg]$|^rate",
+    "rates": r"gyr|rot(?!.*vec)|angular|angvel|omega|winkel|^[wg]$|^rate",
     "specific_forces": r"acc|specific|beschl|^[af]$",
     "magnetic_fields": r"mag|^[mb]$",
 }

@@ -93,7 +93,8 @@ class Units:
 
     def of_forces(self, label: str, forces: np.ndarray) -> float | None:
         """The factor of specific forces that nobody states, by gravity; None where it is unlike."""
-        size = float(np.nanmedian(np.linalg.norm(forces, axis=1)))
+        sizes = np.linalg.norm(forces, axis=1)
+        size = float(np.median(sizes[np.isfinite(sizes)])) if np.isfinite(sizes).any() else np.nan
         for unit, (least, most) in _GRAVITY.items():
             if least < size < most:
                 return self._taken("specific_forces", label, unit, f"their median is {size:.3g}")
