@@ -6,7 +6,8 @@ import house
 import pytest
 
 # Code lines outside identify. It may only fall, but for a new part of the package.
-_BUDGET = 5600 + 1170 + 840  # and lanes of motions with their derivatives and solvers, and sweeps
+# Lanes of motions with their derivatives and solvers, sweeps, records.
+_BUDGET = 5600 + 1170 + 840 + 900
 
 
 def package(module):

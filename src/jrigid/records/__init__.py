@@ -1,0 +1,12 @@
+"""Records of sensors: files read, units and clocks put right and said, flights and noise found."""
+
+from jrigid.records._clock import Clock as Clock
+from jrigid.records._clock import repair as repair
+from jrigid.records._flights import flights as flights
+from jrigid.records._noise import Allan as Allan
+from jrigid.records._noise import Noise as Noise
+from jrigid.records._noise import allan as allan
+from jrigid.records._noise import noise as noise
+from jrigid.records._noise import rests as rests
+from jrigid.records._read import read as read
+from jrigid.records._reading import Reading as Reading

@@ -1,0 +1,197 @@
+"""Clocks that repeat, run backwards, skip or round."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jrigid._checks import check_option, check_shape
+
+_LATE = 20  # intervals that a row may come too late; a clock that goes back further was reset
+_COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])  # when micro- and milliseconds in 32 bits wrap [s]
+_ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
+_COARSE = 0.02  # of the interval: a coarser digit is worth a repair
+_OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
+_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
+_NEXT = 8  # stamps that tell a late reading from a lost one
+_SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
+
+
+class Clock(NamedTuple):
+    """Times put right.
+
+    Attributes:
+        times: [s], increasing.
+        rows: Rows of the input that they belong to.
+        breaks: Where, in `times`, a piece begins: after a gap or a reset.
+        notes: What was done, in words.
+    """
+
+    times: Float[np.ndarray, " kept"]
+    rows: Int[np.ndarray, " kept"]
+    breaks: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def repair(
+    times: Float[np.ndarray, " rows"],
+    values: Float[np.ndarray, "rows columns"] | None = None,
+    *,
+    clock: str | None = None,
+    gap: float = 5.0,
+) -> Clock:
+    """Times made increasing, and what was wrong with them in words.
+
+    Rows without a time are dropped. A counter of 32 bits that wrapped is unwrapped; a clock that
+    goes back by more than 20 intervals was reset, and what follows is put one interval later, after
+    a break. Rows that are a little late are sorted in, repeated ones dropped. A step of more than
+    `gap` intervals is a break; nothing is filled in. Times rounded to a coarse digit are put on the
+    line through them.
+
+    Args:
+        times: As recorded [s].
+        values: What was read, to tell a row written twice from two readings in one tick.
+        clock: `"recorded"` leaves times as they are, rounded or not. `"uniform"` puts each piece on
+            a line, fitted robustly and with readings lost on the way; right where the sensor's
+            clock is even and only the stamps are late. None does so where the deviations are
+            those of rounding.
+        gap: Steps longer than so many intervals are gaps.
+
+    Raises:
+        ValueError: Wrong shapes or options.
+
+    >>> import numpy as np
+    >>> import jrigid as jr
+    >>> clock = jr.records.repair(np.array([0.0, 0.1, 0.1, 0.2, 0.3, 0.4, 2.4, 2.5]))
+    >>> print(clock.rows, clock.breaks)
+    [0 1 3 4 5 6 7] (5,)
+    >>> print(*clock.notes, sep="; ")
+    1 gap, of 2 s after 0.4 s; 1 row with the time of the row before dropped
+    """
+    check_option("clock", clock, (None, "recorded", "uniform"))
+    check_shape("times", np.asarray(times), (None,))
+    notes: list[str] = []
+    rows = np.flatnonzero(np.isfinite(times))
+    _count(notes, times.size - rows.size, "without a time dropped")
+    t = np.array(times[rows], float)
+    forward = np.diff(t)
+    forward = forward[forward > 0]
+    if not forward.size:
+        rows = rows[:1]
+        return Clock(t[:1], rows, (), (*notes, "all rows are of one time"))
+    interval = float(np.median(forward))
+    resets = _resets(t, interval, notes)
+    order = np.argsort(t, kind="stable")
+    _count(notes, int(np.sum(np.diff(t) < 0)), "out of order sorted in")
+    t, rows = t[order], rows[order]
+
+    equal = np.concatenate([[False], np.diff(t) == 0])
+    if values is not None:
+        same = np.concatenate([[False], np.all(np.diff(values[rows], axis=0) == 0, axis=1)]) & equal
+        _count(notes, int(same.sum()), "written twice dropped")
+        t, rows, equal = t[~same], rows[~same], equal[~same]
+    coarse = equal.mean() > _SEVERAL and clock != "recorded"
+    if not coarse:
+        _count(notes, int(equal.sum()), "with the time of the row before dropped")
+        t, rows = t[~equal], rows[~equal]
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > gap * interval) + 1
+    if gaps.size:
+        longest = gaps[np.argmax(steps[gaps - 1])]
+        many = f"{gaps.size} gaps, the longest" if gaps.size > 1 else "1 gap,"
+        notes.append(f"{many} of {steps[longest - 1]:.3g} s after {t[longest - 1]:.6g} s")
+    breaks = sorted({*gaps.tolist(), *np.searchsorted(t, resets).tolist()})
+    if clock != "recorded":
+        t = _evened(t, breaks, clock == "uniform", notes)
+    unequal = np.concatenate([[True], np.diff(t) > 0])
+    _count(notes, int(np.sum(~unequal)), "with the time of the row before dropped")
+    kept = np.cumsum(unequal)
+    return Clock(t[unequal], rows[unequal], tuple(int(kept[b]) - 1 for b in breaks), tuple(notes))
+
+
+def _count(notes: list[str], count: int, what: str) -> None:
+    if count:
+        notes.append(f"{count} row{'s' if count > 1 else ''} {what}")
+
+
+def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
+    """Undo wraps and resets in place; the times at which a reset clock goes on."""
+    resets = []
+    for row in np.flatnonzero(np.diff(t) < 0) + 1:
+        back = t[row - 1] - t[row]
+        wrapped = _COUNTERS[np.abs(_COUNTERS - back - interval) < _LATE * interval]
+        if wrapped.size:
+            t[row:] += wrapped[0]
+            notes.append(f"the clock wrapped at row {row}, after 2^32 ticks: unwrapped")
+        elif back > _LATE * interval:
+            t[row:] += back + interval
+            resets.append(float(t[row]))
+            notes.append(
+                f"the clock went back by {back:.3g} s at row {row}: a break of unknown length"
+            )
+    return resets
+
+
+def _evened(t: np.ndarray, breaks: list[int], asked: bool, notes: list[str]) -> np.ndarray:
+    """Each piece on the line through it, where that is asked for or all it does is to round."""
+    pieces, jitters, intervals, digit = [], [], [], _digit(t)
+    for piece in np.split(t, breaks):
+        if piece.size < 4 or np.ptp(np.diff(piece)) < 1e-9 * np.ptp(piece):
+            pieces.append(piece)
+            continue
+        line, interval = _line(piece, asked)
+        jitter = piece - line
+        steps = np.diff(piece)
+        uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
+        rounded = digit > _COARSE * interval and np.max(np.abs(jitter)) < _ROUND * digit
+        rounded = rounded and uneven
+        if asked or rounded:
+            piece = line
+            jitters.append(float(np.sqrt(np.mean(jitter**2))))
+            intervals.append(interval)
+        pieces.append(piece)
+    if jitters:
+        why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"
+        notes.append(
+            f"times put on an even clock of {1e3 * np.mean(intervals):.5g} ms: {why}, "
+            f"{1e3 * max(jitters):.3g} ms rms beside it"
+        )
+    return np.concatenate(pieces)
+
+
+def _digit(t: np.ndarray) -> float:
+    """The decimal digit that times end with [s]."""
+    for digit in (1.0, 0.1, 0.01, 1e-3, 1e-4):
+        ticks = (t - t[0]) / digit
+        if np.max(np.abs(ticks - np.round(ticks))) < 1e-3:
+            return digit
+    return 0.0
+
+
+def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
+    """A robust line through times, counted one by one or, if that fits better, with some `lost`."""
+    counts = [np.arange(t.size)]
+    if lost:
+        steps = np.diff(t)
+        usual = float(np.median(steps)) or float(np.mean(steps))
+        count, phase = [0], t[0]
+        for row in range(1, t.size):
+            # lost is a reading only where all of the next stamps are late, not this one alone
+            ahead = t[row : row + _NEXT] - usual * np.arange(min(_NEXT, t.size - row)) - phase
+            ticks = max(1, round(float(ahead.min()) / usual))
+            count.append(count[-1] + ticks)
+            phase += ticks * usual
+            phase += _LOCK * (t[row] - phase)
+        counts.append(np.array(count))
+    fits = []
+    for count in counts:
+        use = np.ones(t.size, bool)
+        line, slope = t, 0.0
+        for _ in range(3):  # outliers are left out, twice
+            slope, start = np.polyfit(count[use], t[use], 1)
+            line = start + slope * count
+            beside = np.abs(t - line)
+            use = beside <= 4 * np.median(beside) + 1e-12 * np.ptp(t)
+        fits.append((float(np.median(np.abs(t - line))), line, float(slope)))
+    _, line, slope = min(fits, key=lambda fit: fit[0])
+    return line, slope
