@@ -19,7 +19,7 @@ def test_an_alias_is_shown_by_its_name():
     assert shown.endswith("-> Scalar")
     assert "InertiaLike" in ALIASES
     assert all(str(getattr(_types, name)) == name for name in ALIASES)
-    assert "values: Optional[Real[ArrayLike, '*throws n 3']]" in str(
+    assert "values: Optional[Real[ArrayLike, '*throws n k']]" in str(
         inspect.signature(jr.identify.Rates)
     )
 

@@ -160,6 +160,12 @@ def shaped(**arguments: tuple[Any, ...]) -> tuple[Array, ...]:
     return arrays
 
 
+def demand(ok: bool, message: str) -> None:
+    """Raise ValueError with a message unless something holds."""
+    if not ok:
+        raise ValueError(message)
+
+
 def check_option(name: str, value: Any, options: Sequence[Any]) -> None:
     """Raise ValueError unless `value` is one of `options`."""
     if value not in options:

@@ -16,23 +16,23 @@ from jrigid._types import Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify._compile import quick_jit
-from jrigid.identify._errors import conclude
+from jrigid.identify._errors import conclude, in_rows
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse, sizes_of
-from jrigid.identify._layout import Layout, first_and_last, times_of, whole
-from jrigid.identify._records import of_throws, samples_of
-from jrigid.identify._residuals import (
-    Args,
+from jrigid.identify._layout import Layout, first_and_last, whole
+from jrigid.identify._problem import (
     Options,
+    Problem,
     evaluation,
     in_any_order,
     predictions,
-    residual_of,
+    whitened,
 )
+from jrigid.identify._records import Samples, of_throws, samples_of
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
 from jrigid.identify._smoother import Found, Point, Rows, minimise
-from jrigid.identify._stages import ACCURACY, schedule, weigher
+from jrigid.identify._stages import ACCURACY, Way, schedule, weigher
 from jrigid.identify._unknowns import unknowns_of
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
@@ -51,13 +51,6 @@ class Bound(NamedTuple):
     ratios_covariance: Float[Array, "2 2"]
 
 
-class _Plan(NamedTuple):
-    options: Options
-    args: Args
-    found: Found
-    layout: Layout
-
-
 def _planned(
     system: RigidBody,
     state: State,
@@ -66,7 +59,7 @@ def _planned(
     free: Callable[..., Any] | None,
     scale: str,
     shape: AbstractShape | None,
-) -> _Plan:
+) -> tuple[Problem, Found, Layout]:
     """Derivatives of a record that is what the body and the state say."""
     check_type("system", system, RigidBody)
     check_type("state", state, State)
@@ -81,44 +74,43 @@ def _planned(
             "not."
         )
     one = jnp.ones((), records[0].ts.dtype)
-    samples = tuple(samples_of(x, one) for x in records)
-    ts, there = times_of(samples)
-    throws = ts.shape[0]
-    attitude = jnp.broadcast_to(state.attitude.astype(ts.dtype), (throws, 4))[:, None]
-    omega = jnp.broadcast_to(state.omega.astype(ts.dtype), (throws, 3))[:, None]
+    samples, sensors = samples_of(records, one), tuple(x.sensor for x in records)
+    (throws, _), dtype = samples.ts.shape, samples.ts.dtype
+    attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
+    omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
     rate = jax.lax.stop_gradient(jnp.sqrt(jnp.mean(jnp.sum(omega**2, axis=-1))))
-    rate = jnp.where(rate > 0, rate, 1.0)
-    sensors = tuple(x.sensor for x in records)
-    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
-    options = Options(
-        system.is_free, on_attitude, False, 1, False, False, True, "none", None, 0, 0, False
-    )
-    layout = whole(ts, there, 1, jnp.asarray(t0, ts.dtype))
+    scaled = scale != "trace" and not shape.absolute
     unknowns = unknowns_of(
-        (system,), sensors, sizes_of(samples), free, (shape,),
-        scale != "trace" and not shape.absolute, rate,
+        (system,), sensors, sizes_of(samples), free, (shape,), scaled,
+        jnp.where(rate > 0, rate, 1.0),
     )  # fmt: skip
-    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(ts.dtype))[None], 1e-9)
-    point = Point(numbers, unknowns.own_start(throws, ts.dtype), attitude, omega)
-    args = Args(unknowns, samples, jnp.zeros(throws, int), jnp.ones(6, ts.dtype))
+    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
+    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
+    layout = whole(samples, 1, jnp.asarray(t0, dtype))
+    bodies, noise = jnp.zeros(throws, int), jnp.ones(6, dtype)
+    problem = Problem(Options(system.is_free, True), unknowns, samples, bodies, noise)
     # Values as they would be seen: a residual of zero.
-    seen = predictions(options._replace(on_attitude=True), args, layout, point)
-    samples = tuple(
-        samples_of(x.with_values(jax.lax.stop_gradient(values)), one)
-        for x, values in zip(records, seen, strict=True)
-    )
-    args = args._replace(samples=samples)
-    rows, links = evaluation(options, args, layout)(point)
+    seen = predictions(problem, layout, point)
+    pairs = zip(records, seen, strict=True)
+    records = tuple(x.with_values(jax.lax.stop_gradient(y)) for x, y in pairs)
+    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
+    options = Options(system.is_free, on_attitude)
+    problem = Problem(options, unknowns, samples_of(records, one), bodies, noise)
+    rows, links = evaluation(problem, layout)(point)
     if not system.is_free:  # which is followed forward only
-        rows = nan_where(jnp.any(layout.start > first_and_last(ts, there)[0][:, None]), rows)
+        first = first_and_last(samples.ts, samples.seen)[0]
+        rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
     yes = jnp.asarray(True)
-    found = Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan))
-    return _Plan(options, args, found, layout)
+    return (
+        problem,
+        Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan)),
+        layout,
+    )
 
 
 def _information(rows: Rows) -> Array:
     """Of the numbers and of each throw's state."""
-    jg, jl = rows.of_border, rows.of_state
+    jg, jl, _ = in_rows(rows, 0)
     throws, locals_ = jl.shape[0], jl.shape[-1]
     gg = product("tri,trj->ij", jg, jg)
     gl = product("tri,trl->itl", jg, jl).reshape(gg.shape[0], throws * locals_)
@@ -130,7 +122,7 @@ def _information(rows: Rows) -> Array:
 
 def _inverse(rows: Rows) -> Array:
     """Of the information, from the derivatives themselves: their squares lose digits."""
-    jg, jl = rows.of_border, rows.of_state
+    jg, jl, _ = in_rows(rows, 0)
     throws, count, locals_ = jl.shape
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
@@ -180,7 +172,7 @@ def fisher_information(
     >>> print(jr.identify.fisher_information(body, start, plan).shape)
     (8, 8)
     """
-    return _information(_planned(system, state, observations, t0, free, scale, shape).found.rows)
+    return _information(_planned(system, state, observations, t0, free, scale, shape)[1].rows)
 
 
 def cramer_rao(
@@ -219,9 +211,9 @@ def cramer_rao(
     >>> print(f"{jax.jit(error)(jnp.array([0.5, 1.0, 0.3])):.5f}")
     0.00378
     """
-    plan = _planned(system, state, observations, t0, free, scale, shape)
-    covariance = _inverse(plan.found.rows)
-    numbers, unknowns = plan.found.point.numbers, plan.args.unknowns
+    problem, found, _ = _planned(system, state, observations, t0, free, scale, shape)
+    covariance = _inverse(found.rows)
+    numbers, unknowns = found.point.numbers, problem.unknowns
 
     def ratios(numbers: Array) -> Array:
         moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
@@ -270,12 +262,11 @@ def identifiability(
     >>> print(told.null_directions)
     ('overall scale', 'I3/I1 against gyro scale')
     """
-    plan = _planned(system, state, observations, t0, free, scale, shape)
-    kept = tuple(jnp.any(x.weight > 0, axis=-1).astype(x.ts.dtype) for x in plan.args.samples)
-    return conclude(
-        plan.options, plan.args, plan.layout, plan.found, kept, jnp.ones(len(kept)), jnp.zeros(3),
-        RESULTS.successful,
-    )  # fmt: skip
+    problem, found, layout = _planned(system, state, observations, t0, free, scale, shape)
+    dtype, no = layout.ts.dtype, jnp.asarray(False)
+    scales = jnp.ones(len(problem.samples.values), dtype)
+    way = Way(found, problem.samples.seen.astype(dtype), scales, jnp.zeros(3, dtype), no)
+    return conclude(problem, layout, way, RESULTS.successful)
 
 
 def profile(
@@ -312,28 +303,29 @@ def profile(
 
 @quick_jit
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
-    args, options = result.problem, result.options._replace(shooting=False, dense=False, nodes=1)
+    problem, start = result.problem, result.state
+    options = problem.options._replace(shooting=False, level="none", nodes=1)
     slope = jax.grad(lambda x: function(result.unknowns.inertia(x)))(result.numbers)
-    error = jnp.sqrt(slope @ result.numbers_covariance @ slope)
-    ts, there = times_of(args.samples)
-    layout = whole(ts, there, 1, result.t0)
-    start = result.state
-    point = Point(result.numbers, result.own_numbers, start.attitude[:, None], start.omega[:, None])
-    last = jtu.tree_map(lambda x: x[0, -1], schedule(options, ts.dtype))
-    kept = tuple(x.astype(ts.dtype) for x in result.kept)
-    weigh = weigher(options, args, layout, kept, result.scales, last)
-    no, noise = jnp.asarray(False), result.inflation
+    noise, dtype = result.inflation, result.numbers.dtype
+    unit = 1e-3 * jnp.sqrt(slope @ result.numbers_covariance @ slope / noise)
+    layout = whole(problem.samples, 1, result.t0)
+    states = start.attitude[:, None], start.omega[:, None]
+    point = Point(result.numbers, result.own_numbers, *states)
+    last = jtu.tree_map(lambda x: x[0, -1], schedule(options, dtype))
+    no, kept = jnp.asarray(False), result.kept.astype(dtype)
 
     def at(value: Array) -> Array:
-        held = args.unknowns.holding(function, value, 1e-3 * error / jnp.sqrt(noise))
-        evaluate = evaluation(options, args._replace(unknowns=held), layout)
+        held = problem.unknowns.holding(function, value, unit)
+        parts = problem.samples, problem.bodies, problem.noise
+        now = Problem(options, held, *parts)
+        weigh = weigher(now, layout, kept, result.scales, last)
+        evaluate = evaluation(now, layout)
         shapes = jax.eval_shape(evaluate, point)
         rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         begin = Found(point, rows, links, ~no, no, jnp.asarray(0), jnp.full(1, jnp.nan))
-        white = jnp.zeros((*links.gap.shape, links.gap.shape[-1]), ts.dtype)
-        found = minimise(
-            evaluate, weigh, white, begin, lambda _: ACCURACY * noise, jnp.asarray(100)
-        )
+        white = jnp.zeros((*links.gap.shape, links.gap.shape[-1]), dtype)
+        enough = lambda _: ACCURACY * noise  # noqa: E731
+        found = minimise(evaluate, weigh, white, begin, enough, jnp.asarray(100))
         growth = weigh(found.rows)[1] - result.chi_square
         return jnp.where(found.settled, growth / noise, jnp.nan)
 
@@ -379,26 +371,26 @@ def residuals(
     check_type("system", system, RigidBody)
     check_type("state", state, State)
     records = of_throws(observations)
-    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
-    ts, _ = times_of(samples)
-    throws = ts.shape[0]
+    sensors = [x.sensor for x in records]
+    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
+    ts, throws = samples.ts, samples.ts.shape[0]
     begin = jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
     attitude = jnp.broadcast_to(state.attitude, (throws, 4))
     omega = jnp.broadcast_to(state.omega, (throws, 3))
 
-    def motion(q: Array, w: Array, times: Array, begin: Array) -> State:
+    def throw(q: Array, w: Array, samples: Samples, begin: Array) -> Array:
         if system.is_free:
-            return free_rotation(system.inertia, State(q, w), times, t0=begin).states
-        return in_any_order(
-            lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
-            times,
-        )
+            states = free_rotation(system.inertia, State(q, w), samples.ts, t0=begin).states
+        else:
+            states = in_any_order(
+                lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
+                samples.ts,
+            )
+        shown = []
+        for sensor, part in zip(sensors, samples.parts, strict=True):
+            one = lambda t, q, w, sensor=sensor: sensor.predict(t, State(q, w), system)  # noqa: E731
+            seen = samples.ts[part], states.attitude[part], states.omega[part]
+            shown.append(jax.vmap(one)(*seen))
+        return whitened(sensors, samples, shown).reshape(-1)
 
-    states, start, blocks = jax.vmap(motion)(attitude, omega, ts, begin), 0, []
-    for record, x in zip(records, samples, strict=True):
-        part = slice(start, start + x.ts.shape[1])
-        start = part.stop
-        seen = State(states.attitude[:, None, part], states.omega[:, None, part])
-        rows = jax.vmap(lambda x, y, s=record.sensor: residual_of(s, system, x, y, jnp.ones(1)))
-        blocks.append(rows(x, seen).reshape(throws, -1))
-    return jnp.concatenate(blocks, axis=1)
+    return jax.vmap(throw)(attitude, omega, samples, begin)

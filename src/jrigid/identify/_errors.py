@@ -11,18 +11,17 @@ from jrigid._checks import RESULTS, nan_where
 from jrigid._numerics import product
 from jrigid.dynamics import State
 from jrigid.identify._layout import Layout
-from jrigid.identify._records import Samples
-from jrigid.identify._residuals import Args, Options
+from jrigid.identify._problem import Problem
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._smoother import Blocks, Found, Links, Rows, blocks_of, eliminated, reduced
 from jrigid.identify._stages import (
-    FAINT,
     GATE,
+    Way,
     evidence_of,
     first_level,
     is_at_boundary,
+    is_faint,
     link_whitener,
-    parts_of,
     schedule,
     weigher,
 )
@@ -35,21 +34,19 @@ _EXPLAINED = 0.1  # of the square of the record, beyond which a misfit is none o
 
 def condensed(rows: Rows, links: Links) -> Rows:
     """Rows in the first state of each throw: along the links, as if nothing came between."""
-    border = rows.of_border.shape[-1]
+    border, local = rows.of_border.shape[-1], links.gap.shape[-1]
 
     def throw(rows: Rows, links: Links) -> Rows:
-        local = links.gap.shape[-1]
-        first = jnp.concatenate([jnp.zeros((local, border)), jnp.eye(local)], axis=1)
-        first = first.astype(rows.residual.dtype)
+        first = jnp.eye(local, border + local, border, dtype=links.gap.dtype)
 
         def follow(state: Array, link: Links) -> tuple[Array, Array]:
             after = product("ij,jk->ik", link.of_state, state)
             return after.at[:, :border].add(link.of_border), state
 
         _, states = jax.lax.scan(follow, first, links)
-        through = product("rl,rlk->rk", rows.of_state, states[rows.node])
-        of_border = rows.of_border + through[:, :border]
-        return Rows(rows.residual, of_border, through[:, border:], jnp.zeros_like(rows.node))
+        through = product("ndl,nlk->ndk", rows.of_state, states[rows.node])
+        of_border = rows.of_border + through[..., :border]
+        return Rows(rows.residual, of_border, through[..., border:], jnp.zeros_like(rows.node))
 
     return jax.vmap(throw)(rows, links)
 
@@ -69,13 +66,24 @@ class Told(NamedTuple):
     of_state: Array
 
 
-def told_by_rows(rows: Rows, own: int, units: Array) -> Told:
-    """By singular values of weighted rows in first states: their squares would lose digits."""
-    jg = product("trg,g->trg", rows.of_border[..., own:], units)
+def in_rows(rows: Rows, own: int) -> tuple[Array, Array, Array]:
+    """Derivatives (throws, rows, ...) in the numbers, and in what is a throw's; and residuals."""
     jl = jnp.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
+    parts = rows.of_border[..., own:], jl, rows.residual[..., None]
+    jg, jl, r = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in parts)
+    return jg, jl, r[..., 0]
+
+
+def told_by_rows(rows: Rows, own: int, units: Array) -> tuple[Told, Array]:
+    """By singular values of weighted rows in first states: their squares would lose digits.
+
+    And what each throw adds to the gradient of half the squares in the numbers.
+    """
+    jg, jl, residual = in_rows(rows, own)
+    jg = product("trg,g->trg", jg, units)
     size, eps = jg.shape[-1], jnp.finfo(jg.dtype).eps
 
-    def throw(jg: Array, jl: Array) -> tuple[Array, Array, Array, Array]:
+    def throw(jg: Array, jl: Array, residual: Array) -> tuple[Array, ...]:
         scale = jnp.sqrt(jnp.sum(jl * jl, axis=0))
         scale = jnp.where(scale > 0, scale, 1.0)
         u, s, vt = jnp.linalg.svd(jl / scale[None, :], full_matrices=False)
@@ -86,10 +94,12 @@ def told_by_rows(rows: Rows, own: int, units: Array) -> Told:
         of_told = jnp.where(told[None, :], half, 0.0)
         follow = product("lk,rk,rg->lg", of_told, u, jg)
         rest = jg - product("rk,sk,sg->rg", u, u, jg)
-        return jnp.linalg.qr(rest, mode="r") if size else rest[:0], half, follow, s
+        r = jnp.linalg.qr(rest, mode="r") if size else rest[:0]
+        return r, half, follow, s, product("rg,r->g", rest, residual) / units
 
-    r, half, follow, of_state = jax.vmap(throw)(jg, jl)
-    return _told(r.reshape(-1, size), product("tik,tjk->tij", half, half), follow, of_state, units)
+    r, half, follow, of_state, scores = jax.vmap(throw)(jg, jl, residual)
+    local = product("tik,tjk->tij", half, half)
+    return _told(r.reshape(-1, size), local, follow, of_state, units), scores
 
 
 def told_by_equations(blocks: Blocks, own: int, units: Array) -> tuple[Told, Array]:
@@ -124,69 +134,50 @@ def _told(r: Array, local: Array, follow: Array, of_state: Array, units: Array) 
     return Told(values, vt.T, covariance, local, follow, of_state)
 
 
-def conclude(
-    options: Options,
-    args: Args,
-    layout: Layout,
-    found: Found,
-    kept: tuple[Array, ...],
-    scales: Array,
-    level: Array,
-    input_result: Any,
-) -> FitResult:
+def conclude(problem: Problem, layout: Layout, way: Way, input_result: Any) -> FitResult:
     """The result of a fit at a minimum."""
-    unknowns, numbers, own = args.unknowns, found.point.numbers, found.point.own.shape[-1]
-    units = unknowns.natural_units(numbers)
-    end = jtu.tree_map(lambda x: x[0, -1], schedule(options, numbers.dtype))
-    weight, _ = weigher(options, args, layout, kept, scales, end)(found.rows)
-    root = jnp.sqrt(weight)[..., None]
-    of_border, of_state = root * found.rows.of_border, root * found.rows.of_state
-    rows = Rows(root[..., 0] * found.rows.residual, of_border, of_state, found.rows.node)
+    found, kept, scales, level = way.found, way.kept, way.scales, way.level
+    numbers, own = found.point.numbers, found.point.own.shape[-1]
+    units = problem.unknowns.natural_units(numbers)
+    end = jtu.tree_map(lambda x: x[0, -1], schedule(problem.options, numbers.dtype))
+    weight, _ = weigher(problem, layout, kept, scales, end)(found.rows)
+    root, rows = jnp.sqrt(weight), found.rows
+    rows = Rows(
+        root[..., None] * rows.residual, root[..., None, None] * rows.of_border,
+        root[..., None, None] * rows.of_state, rows.node,
+    )  # fmt: skip
     rows = condensed(rows, found.links)
-    told = sensor = told_by_rows(rows, own, units)
-    scores, level_errors = _scores(rows, own, sensor.follow), jnp.zeros_like(level)
-    kicks = jnp.zeros((), numbers.dtype)
-    if options.dense:
-        white = link_whitener(options, args, layout, numbers, end.weight, level)
+    sensor, scores = told_by_rows(rows, own, units)
+    told, kicks, level_errors = sensor, jnp.zeros((), numbers.dtype), jnp.zeros_like(level)
+    if problem.options.dense:
+        white = link_whitener(problem, layout, numbers, end.weight, level)
         blocks = blocks_of(found.rows, found.links, weight, white)
         told, scores = told_by_equations(blocks, own, units)
-        seen = evidence_of(layout, found, weight, white)
-        level_errors = seen.errors(options, level)
-        # Links this hard are those of no torque at all.
-        level = jnp.where(level <= 1.01 * FAINT * first_level(args, layout, numbers), 0.0, level)
+        information = evidence_of(problem, found, weight, white).information
+        level_errors = 0.5 * level / jnp.sqrt(information)
+        level = jnp.where(is_faint(level, first_level(problem, layout, numbers)), 0.0, level)
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
-    seen = _judged(options, args, found, kept, scales, told, kicks)
-    pure = _is_pure(options, args, found, kept, seen.inflation)
-    largest = jnp.sqrt(seen.inflation) / jnp.min(told.values, initial=jnp.inf)
-    status = _status(options, args, found, seen, told, pure | (largest > LARGEST_ERROR), pure)
+    seen = _judged(problem, way, told, kicks)
+    pure = _is_pure(problem, found, kept, seen.inflation)
+    status = _status(problem, found, seen, told, pure)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
-    had = jnp.any(jnp.stack([jnp.any(x.weight > 0, axis=(1, 2)) for x in args.samples]), axis=0)
-    spoilt = had & ~jnp.any(jnp.stack([jnp.any(w > 0, axis=1) for w in kept]), axis=0)
-    first = State(found.point.attitude[:, 0], found.point.omega[:, 0])
-    count = sum(x.weight[0].size for x in args.samples)  # then what was known beforehand
+    count = kept.shape[1]
     jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
     result = FitResult(
         status=status, numbers=numbers, own_numbers=found.point.own,
         numbers_covariance=seen.inflation * told.covariance,
         sensor_covariance=seen.inflation * sensor.covariance,
         local_covariance=seen.inflation * told.local, follow=told.follow, scores=scores,
-        inflation=seen.inflation, state=first, t0=layout.start[:, 0],
-        residuals=rows.residual[:, :count], jacobian=jacobian[:, :count],
+        inflation=seen.inflation,
+        state=State(found.point.attitude[:, 0], found.point.omega[:, 0]),
+        t0=layout.start[:, 0], residuals=rows.residual[:, :count], jacobian=jacobian[:, :count],
         chi_square=seen.chi_square, degrees_of_freedom=seen.freedom, unexplained=seen.unexplained,
         singular_values=told.values, directions=told.directions,
         state_singular_values=sensor.of_state, level=level, level_errors=level_errors,
-        scales=scales, kept=tuple(w > 0 for w in kept), spoilt=spoilt, history=found.history,
-        pure_spin=pure, input_result=input_result, unknowns=unknowns, problem=args,
-        options=options,
+        scales=scales, kept=kept > 0, history=found.history, pure_spin=pure,
+        input_result=input_result, problem=problem,
     )  # fmt: skip
     return nan_where(input_result != RESULTS.successful, result)
-
-
-def _scores(rows: Rows, own: int, follow: Array) -> Array:
-    """What each throw adds to the gradient of half the squares in the numbers."""
-    jl = jnp.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    free = rows.of_border[..., own:] - product("trl,tlg->trg", jl, follow)
-    return product("trg,tr->tg", free, rows.residual)
 
 
 class _Judged(NamedTuple):
@@ -194,111 +185,86 @@ class _Judged(NamedTuple):
 
     chi_square: Array
     freedom: Array
-    noise: Array  # chi-square for each degree of freedom
     inflation: Array  # of the covariance
     unexplained: Array  # of the square of the record
     misfit: Array  # whether that is no noise
 
 
-def _judged(
-    options: Options,
-    args: Args,
-    found: Found,
-    kept: tuple[Array, ...],
-    scales: Array,
-    told: Told,
-    kicks: Array,
-) -> _Judged:
+def _judged(problem: Problem, way: Way, told: Told, kicks: Array) -> _Judged:
     """Of the residuals, and the squares of the kicks between nodes."""
-    dtype = found.point.numbers.dtype
-    squares = signal = turns = pairs = jnp.zeros((), dtype)
-    count, of_state = jnp.asarray(0), told.of_state
-    parts = parts_of(args, found.rows.residual)
-    for x, part, keep in zip(args.samples, parts, kept, strict=True):
-        weight = jnp.where(x.sign == 0, x.weight * keep[..., None], 0.0)
-        squares = squares + jnp.sum(weight * part * part)
-        count = count + jnp.sum(weight > 0)
-        signal = signal + jnp.sum(weight * _signal(x, weight) ** 2)
-        both = weight[:, 1:] * weight[:, :-1]
-        turns = turns + jnp.sum(both * part[:, 1:] * part[:, :-1])
-        pairs = pairs + jnp.sum(both)
-    alive = jnp.any(jnp.stack([jnp.any(w > 0, axis=1) for w in kept]), axis=0)[:, None]
-    shown = (of_state > _TOLD * of_state[:, :1]) & alive
-    prior = found.rows.residual[:, sum(x.shape[1] * x.shape[2] for x in parts) :]
-    held = args.unknowns.size - args.unknowns.slices["scale"].stop
-    prior = prior[:, : prior.shape[1] - held]
-    known = prior.shape[1] - args.unknowns.prior_rows(found.point.numbers).size
-    freedom = count - found.point.numbers.size - jnp.sum(shown)
-    freedom = freedom + prior.shape[1] + (prior.shape[0] - 1) * known
-    chi_square = squares + jnp.sum(prior**2) + kicks
-    noise = chi_square / jnp.maximum(freedom, 1).astype(dtype)
-    mean = squares / jnp.maximum(count, 1).astype(dtype)
-    like = turns / jnp.where(pairs > 0, pairs, 1.0) / jnp.where(mean > 0, mean, 1.0)
-    if options.noise_known:
-        gate = 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1).astype(dtype))
-        misfit = (noise > gate) | (jnp.max(scales) > 2)
-        excess = squares + kicks - count.astype(dtype)
+    found, kept, samples, count = way.found, way.kept, problem.samples, way.kept.shape[1]
+    rows, dtype = found.rows.residual[:, :count], kicks.dtype
+    weight = jnp.where(samples.sign == 0, samples.weight, 0.0) * kept[..., None]
+    squares, number = jnp.sum(weight * rows * rows), jnp.sum(weight)
+    signal = jnp.sum(weight * _signal(problem, weight) ** 2)
+    turns = pairs = jnp.zeros((), dtype)
+    for part in samples.parts:
+        both = weight[:, part][:, 1:] * weight[:, part][:, :-1]
+        turns += jnp.sum(both * rows[:, part][:, 1:] * rows[:, part][:, :-1])
+        pairs += jnp.sum(both)
+    alive = jnp.any(kept > 0, axis=1)[:, None]
+    shown = jnp.sum((told.of_state > _TOLD * told.of_state[:, :1]) & alive)
+    known = found.rows.residual[:, count : found.rows.residual.shape[1] - problem.held]
+    count = jnp.sum(known != 0) - found.point.numbers.size - shown
+    freedom = number + count.astype(dtype)
+    chi_square = squares + jnp.sum(known**2) + kicks
+    noise, mean = chi_square / jnp.maximum(freedom, 1.0), squares / jnp.maximum(number, 1.0)
+    if problem.options.noise_known:
+        gate = 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1))
+        misfit, excess = (noise > gate) | (jnp.max(way.scales) > 2), squares + kicks - number
+        inflation = jnp.where(misfit, jnp.maximum(noise, 1.0), 1.0)
     else:
+        like = turns / jnp.maximum(pairs, 1) / jnp.where(mean > 0, mean, 1.0)
         misfit = (like > _COLOURED) & (like * jnp.sqrt(pairs) > _WHITE)
-        excess = squares
-    inflate = jnp.where(misfit, jnp.maximum(noise, 1.0), 1.0) if options.noise_known else noise
+        excess, inflation = squares, noise
     unexplained = excess / jnp.where(signal > 0, signal, 1.0)
-    return _Judged(chi_square, freedom, noise, inflate, unexplained, misfit)
+    return _Judged(chi_square, freedom.astype(int), inflation, unexplained, misfit)
 
 
-def _signal(x: Samples, weight: Array) -> Array:
+def _signal(problem: Problem, weight: Array) -> Array:
     """What there is to explain of values, in units of their noise: a radian, or the variation."""
-    white = jnp.diagonal(x.whitener, axis1=-2, axis2=-1)
-    if x.values.shape != x.weight.shape:
-        return white
-    total = jnp.sum(weight * white**2, axis=1, keepdims=True)
-    mean = jnp.sum(weight * white**2 * x.values, axis=1, keepdims=True)
-    return white * (x.values - mean / jnp.where(total > 0, total, 1.0))
+    white, parts = jnp.diagonal(problem.samples.whitener, axis1=-2, axis2=-1), []
+    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
+        w, white_ = weight[:, part], white[:, part]
+        if values.shape[-1] < w.shape[-1]:
+            values = jnp.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
+        if values.shape != w.shape:  # quaternions
+            parts.append(white_)
+            continue
+        total = jnp.sum(w * white_**2, axis=1, keepdims=True)
+        mean = jnp.sum(w * white_**2 * values, axis=1, keepdims=True)
+        parts.append(white_ * (values - mean / jnp.where(total > 0, total, 1.0)))
+    return jnp.concatenate(parts, axis=1)
 
 
-def _is_pure(
-    options: Options, args: Args, found: Found, kept: tuple[Array, ...], noise: Array
-) -> Array:
+def _is_pure(problem: Problem, found: Found, kept: Array, noise: Array) -> Array:
     """Whether a constant rate in each throw describes a gyro's record as well.
 
     Where the rates do not vary the Fisher information at the estimate is no guide: a motion fitted
     to the noise seems to tell what the true one does not. The best of many wobbles gains something
     from any noise, the more the longer the record.
     """
-    sensors = args.unknowns.original(0)[1:]
-    sought = any(x.names for x in args.unknowns.shapes)
-    if options.on_attitude or not sought or not all(x.width == 3 for x in sensors):
+    sensors = problem.unknowns.original(0)[1:]
+    sought = any(x.names for x in problem.unknowns.shapes)
+    if not sought or any(x.on_attitude or x.width != 3 for x in sensors):
         return jnp.asarray(False)
-    constant = fitted = jnp.zeros((), noise.dtype)
-    count = 0
-    for x, part, keep in zip(args.samples, parts_of(args, found.rows.residual), kept, strict=True):
-        weight = jnp.where(x.sign == 0, x.weight * keep[..., None], 0.0)
-        constant = constant + jnp.sum(weight * _signal(x, weight) ** 2)
-        fitted = fitted + jnp.sum(weight * part**2)
-        count = count + jnp.sum(weight)
-    chance = 5 + GATE * 10**0.5 + 4 * jnp.log(jnp.maximum(count, 1.0))  # of the shape's five
+    weight = jnp.where(problem.samples.sign == 0, problem.samples.weight, 0.0) * kept[..., None]
+    constant = jnp.sum(weight * _signal(problem, weight) ** 2)
+    fitted = jnp.sum(weight * found.rows.residual[:, : kept.shape[1]] ** 2)
+    chance = 5 + GATE * 10**0.5 + 4 * jnp.log(jnp.maximum(jnp.sum(weight), 1.0))  # of five numbers
     return constant - fitted < noise * chance
 
 
-def _status(
-    options: Options,
-    args: Args,
-    found: Found,
-    seen: _Judged,
-    told: Told,
-    untold: Array,
-    pure: Array,
-) -> Any:
+def _status(problem: Problem, found: Found, seen: _Judged, told: Told, pure: Array) -> Any:
     """How the fit ended; the last word counts."""
-    del options
     # A fit that creeps along a direction which the record does not tell is as good as any.
+    largest = jnp.sqrt(seen.inflation) / jnp.min(told.values, initial=jnp.inf)
     status = Status.where(found.settled, Status.OK, Status.NOT_CONVERGED)
-    status = Status.where(untold, Status.UNIDENTIFIABLE, status)
-    status = Status.where(is_at_boundary(args, found), Status.AT_BOUNDARY, status)
+    status = Status.where(largest > LARGEST_ERROR, Status.UNIDENTIFIABLE, status)
+    status = Status.where(is_at_boundary(problem, found), Status.AT_BOUNDARY, status)
     status = Status.where(pure, Status.UNIDENTIFIABLE, status)
     lost = Status.where(found.settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
     wrong = Status.where(seen.unexplained > _EXPLAINED, lost, Status.MISFIT)
     status = Status.where(seen.misfit, wrong, status)
     sound = jnp.all(jnp.isfinite(told.covariance)) & (seen.freedom > 0)
-    sound = sound & jnp.isfinite(seen.chi_square)
-    return Status.where(sound, status, Status.NOT_CONVERGED)
+    return Status.where(sound & jnp.isfinite(seen.chi_square), status, Status.NOT_CONVERGED)

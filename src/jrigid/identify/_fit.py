@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from jrigid._checks import Findings, check_option, check_type, settle
+from jrigid._checks import Findings, check_option, check_type, demand, settle
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import conclude
@@ -22,6 +22,7 @@ from jrigid.identify._inputs import (
     sizes_of,
     start_of,
     systems_of,
+    tells,
     typical_rate,
 )
 from jrigid.identify._layout import (
@@ -31,19 +32,17 @@ from jrigid.identify._layout import (
     node_states,
     segments,
     segments_needed,
-    times_of,
     told_by,
     whole,
 )
+from jrigid.identify._problem import Options, Problem, evaluation
 from jrigid.identify._records import Record, of_throws, samples_of
-from jrigid.identify._residuals import Args, Options, evaluation
 from jrigid.identify._result import FitResult, Status
-from jrigid.identify._sensors import AbstractSensor
 from jrigid.identify._shapes import AbstractShape, Tensor
 from jrigid.identify._smoother import Found, Point, minimise
 from jrigid.identify._stages import (
-    FAINT,
     Stage,
+    Way,
     evidence_of,
     first_level,
     link_whitener,
@@ -59,6 +58,7 @@ from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
 _LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
+_GUESS = 0.02  # of the values' size, for a noise that is not known
 _HISTORY = 1024
 
 
@@ -151,34 +151,42 @@ def fit(
     systems = systems_of(system, throws)
     shape = Tensor() if shape is None else shape
     check_type("shape", shape, AbstractShape)
+    check_option("loss", loss, ("squares", "robust"))
     refuse(systems[0], records, scale, shape)
-    level_kind, level = _level(unmodelled)
     tensor, state = start_of(start, throws)
-    options = _options(
-        systems[0], records, state, motion, level_kind, loss == "robust", absolute_sigma,
-        doublings, max_steps, progress,
+    kind, level = _level(unmodelled)
+    stated = all(x.states_noise for x in records)
+    demand(
+        stated or len(records) == 1,
+        "Argument `observations` must state the noise of each kind where there are several, but "
+        "one has neither `sigma` nor `covariance`: they cannot be weighed.",
+    )
+    options = Options(
+        systems[0].is_free and motion is None,
+        any(x.sensor.on_attitude for x in records) or depends_on_attitude(systems[0]),
+        level=kind, robust=loss == "robust", noise_known=absolute_sigma and stated, motion=motion,
+        doublings=doublings, max_steps=max_steps, progress=progress,
     )  # fmt: skip
+    options = options._replace(shooting=_shoots(options, systems[0], records, state))
     each_body = jnp.zeros(throws, int) if bodies is None else jnp.asarray(bodies)
-    count = 1 if bodies is None else 1 + max(bodies)
     given = systems, records, tensor, state, options.on_attitude
-    prepared = settle(_prepare(*given), throw, lambda: findings_of(*given))
+    prepared = settle(_prepare(*given), throw, lambda: findings_of(*given[:-1]))
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and prepared.told is not None:
-        nodes = segments_needed(prepared.angle, prepared.told.ts.shape[1], length)
-        options = options._replace(nodes=nodes)
+        count = prepared.told.ts.shape[1]
+        options = options._replace(nodes=segments_needed(prepared.angle, count, length))
     unknowns = unknowns_of(
-        systems, tuple(x.sensor for x in records), prepared.sizes, free, (shape,) * count,
+        systems, tuple(x.sensor for x in records), prepared.sizes, free,
+        (shape,) * (1 if bodies is None else 1 + max(bodies)),
         scale != "trace" and not shape.absolute, prepared.rate,
     )  # fmt: skip
-    if not options.noise_known and any(x.sigma is not None for x in unknowns.sought):
-        raise ValueError(
-            "Argument `free` must not state what is known beforehand where the noise of the record "
-            "is not stated or only relative, but it does: the two cannot be weighed."
-        )
-    found = _fit(
-        options, length, unknowns, records, prepared, each_body, tensor, state,
-        jnp.asarray(level, prepared.rate.dtype),
-    )  # fmt: skip
+    demand(
+        options.noise_known or all(x.sigma is None for x in unknowns.sought),
+        "Argument `free` must not state what is known beforehand where the noise of the record is "
+        "not stated or only relative, but it does: the two cannot be weighed.",
+    )
+    level = jnp.asarray(level, prepared.rate.dtype)
+    found = _fit(options, length, unknowns, records, prepared, each_body, tensor, state, level)
     if not throw:
         return found
     findings = Findings()
@@ -193,70 +201,39 @@ def _level(unmodelled: Any) -> tuple[str, Any]:
         check_option("unmodelled", unmodelled, ("estimate", "estimate per axis"))
         return unmodelled, np.zeros(3)
     level = np.asarray(unmodelled, float)
-    if level.shape not in ((), (3,)) or not np.all(np.isfinite(level)) or np.any(level < 0):
-        raise ValueError(
-            "Argument `unmodelled` must be a level that is not negative, one for each body axis, "
-            f"'estimate' or 'estimate per axis', but it is {unmodelled!r}."
-        )
-    level = np.broadcast_to(level, 3)
-    if np.any(level > 0) and not np.all(level > 0):
-        raise ValueError(
-            "Argument `unmodelled` must be positive for all axes or for none, but it is "
-            f"{unmodelled!r}."
-        )
-    return ("known" if np.any(level > 0) else "none"), level
+    good = level.shape in ((), (3,)) and (np.all(level == 0) or np.all(level > 0))
+    demand(
+        bool(good and np.all(np.isfinite(level))),
+        "Argument `unmodelled` must be 0, a positive level, one for each body axis, 'estimate' or "
+        f"'estimate per axis', but it is {unmodelled!r}.",
+    )
+    return ("known" if np.any(level > 0) else "none"), np.broadcast_to(level, 3)
 
 
-def _options(
-    system: RigidBody,
-    records: tuple[Record, ...],
-    state: State | None,
-    motion: Any,
-    level: str,
-    robust: bool,
-    absolute_sigma: bool,
-    doublings: int,
-    max_steps: int,
-    progress: bool,
-) -> Options:
-    """How the fit goes, as far as that is known beforehand; ValueError if it cannot."""
-    sensors = [x.sensor for x in records]
-    by_attitude = any(_tells(x, "attitude") for x in records)
-    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
-    if on_attitude and state is None and not by_attitude:
-        raise ValueError(
-            "Argument `start` must hold a State whose attitude the fit can start from, since the "
-            "motion or an observation depends on the attitude and none was observed, but it does "
-            "not."
-        )
+def _shoots(
+    options: Options, system: RigidBody, records: tuple[Record, ...], state: State | None
+) -> bool:
+    """Whether each segment has a state of its own; ValueError for a fit that cannot be begun."""
+    by_attitude = any(tells(x, "attitude") for x in records)
+    demand(
+        not options.on_attitude or state is not None or by_attitude,
+        "Argument `start` must hold a State whose attitude the fit can start from, since the "
+        "motion or an observation depends on the attitude and none was observed, but it does not.",
+    )
     internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
-    observed = by_attitude or any(_tells(x, "rates") for x in records)
-    shooting = observed and motion is None and not internal
-    if not shooting and state is None:
-        raise ValueError(
-            "Argument `start` must hold a State to start from, since neither rates nor attitudes "
-            "were observed, or they do not tell the whole state, but it does not."
-        )
-    if level != "none" and not shooting:
-        raise ValueError(
-            "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, a "
-            "part moves inside the body or `motion` is given, but it is not."
-        )
-    stated = all(x.states_noise for x in records)
-    if not stated and len(records) > 1:
-        raise ValueError(
-            "Argument `observations` must state the noise of each kind where there are several, "
-            "but one has neither `sigma` nor `covariance`: they cannot be weighed."
-        )
-    return Options(
-        system.is_free and motion is None, on_attitude, shooting, 1, level != "none", robust,
-        absolute_sigma and stated, level, motion, doublings, max_steps, progress,
-    )  # fmt: skip
-
-
-def _tells(record: Record, what: str) -> bool:
-    """Whether a sensor tells of rates, or attitudes, by itself."""
-    return getattr(type(record.sensor), what) is not getattr(AbstractSensor, what)
+    observed = by_attitude or any(tells(x, "rates") for x in records)
+    shooting = observed and options.motion is None and not internal
+    demand(
+        shooting or state is not None,
+        "Argument `start` must hold a State to start from, since neither rates nor attitudes were "
+        "observed, or they do not tell the whole state, but it does not.",
+    )
+    demand(
+        shooting or not options.dense,
+        "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, a part "
+        "moves inside the body or `motion` is given, but it is not.",
+    )
+    return shooting
 
 
 class _Prepared(NamedTuple):
@@ -273,32 +250,20 @@ class _Prepared(NamedTuple):
 def _prepare(
     systems: Any, records: tuple[Record, ...], tensor: Any, state: State | None, on_attitude: bool
 ) -> _Prepared:
-    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
-    dtype = samples[0].ts.dtype
+    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
+    dtype = samples.ts.dtype
     attitude0 = None if state is None or not on_attitude else state.attitude.astype(dtype)
     told = told_by(records, samples, attitude0)
     rate = typical_rate(told, state, dtype)
-    findings = findings_of(systems, records, tensor, state, on_attitude)
+    findings = findings_of(systems, records, tensor, state)
     angle = jnp.zeros(()) if told is None else jnp.max(angle_turned(told)[:, -1])
     return _Prepared(told, rate, sizes_of(samples), angle, findings.result)
 
 
 @quick_jit
-def _fit(
-    options: Options,
-    length: float,
-    unknowns: Unknowns,
-    records: tuple[Record, ...],
-    prepared: _Prepared,
-    bodies: Array,
-    tensor: Any,
-    state: State | None,
-    level: Array,
-) -> FitResult:
+def _fit(options: Options, length: float, *given: Any) -> FitResult:
     """Lane after lane under vmap: none waits for the slowest."""
-    arrays, rest = eqx.partition(
-        (unknowns, records, prepared, bodies, tensor, state, level), eqx.is_array
-    )
+    arrays, rest = eqx.partition(given, eqx.is_array)
 
     @jax.custom_batching.sequential_vmap
     def one(arrays: Any) -> FitResult:
@@ -318,117 +283,97 @@ def _fitted(
     state: State | None,
     level: Array,
 ) -> FitResult:
-    told, rate = prepared.told, prepared.rate
-    guess = 0.02 * prepared.sizes[0]
-    samples = tuple(samples_of(x, guess) for x in records)
-    ts, there = times_of(samples)
-    noise = noise_of(records, samples, rate)
-    throws, dtype = ts.shape[0], ts.dtype
+    told = prepared.told
+    samples = samples_of(records, _GUESS * prepared.sizes[0])
+    throws, dtype = samples.ts.shape[0], samples.ts.dtype
     starts = linear_starts(options, unknowns, told, bodies, tensor)
     unknowns, numbers = unknowns.start(starts[0])
     other = unknowns.start(starts[1], 0.1)[1]
-    single = whole(ts, there, options.nodes)
-    cut, attitude, omega = single, None, None
+    single = cut = whole(samples, options.nodes)
+    attitude = jnp.zeros((throws, options.nodes, 4), dtype).at[..., 0].set(1)
     if options.shooting and told is not None:
-        cut, opening = segments(ts, there, told, options.nodes, length)
-        omega, attitude = node_states(told, opening, cut.start)
-    elif state is not None:
+        cut, opening = segments(samples, told, options.nodes, length)
+        omega, seen = node_states(told, opening, cut.start)
+        attitude = attitude if seen is None else seen
+    else:
+        assert state is not None
         omega, attitude = (
             jnp.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
             for x in (state.omega, state.attitude)
         )
-    assert omega is not None
-    if attitude is None:
-        attitude = jnp.zeros((throws, options.nodes, 4), dtype).at[..., 0].set(1)
     point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
-    args = Args(unknowns, samples, bodies, noise)
-    way = _search(options, args, single, cut, point, other, level)
+    noise = noise_of(records, samples, prepared.rate)
+    problem = Problem(options, unknowns, samples, bodies, noise)
+    way = _search(problem, single, cut, point, other, level)
     layout = cut if options.dense or not options.free_motion else single
-    return conclude(options, args, layout, way.found, way.kept, way.scales, way.level,
-                    prepared.result)  # fmt: skip
-
-
-class _Way(NamedTuple):
-    """Where a search stands."""
-
-    found: Found
-    kept: tuple[Array, ...]  # 1 or 0 for each sample
-    scales: Array  # of the residuals of each record, in units of the noise
-    level: Array  # of the unmodelled torque
-    done: Array  # the level has come to rest
+    return conclude(problem, layout, way, prepared.result)
 
 
 def _search(
-    options: Options,
-    args: Args,
-    single: Layout,
-    cut: Layout,
-    point: Point,
-    other: Array,
-    level: Array,
-) -> _Way:
+    problem: Problem, single: Layout, cut: Layout, point: Point, other: Array, known: Array
+) -> Way:
     """Through all stages; if that ends wrong, once more, more slowly, from other numbers."""
-    stages = schedule(options, point.omega.dtype)
+    options, dtype = problem.options, point.omega.dtype
+    stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
 
-    def run(way: _Way, stage: Stage) -> _Way:
-        layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
-        found, kept, scales, level, done = way
-        if options.robust:
-            scales = scales_of(options, args, found, kept)
-            fewer = rejected(args, found.rows, kept, scales)
-            kept = jtu.tree_map(lambda a, b: jnp.where(stage.reject, a, b), fewer, kept)
-        weigh = weigher(options, args, layout, kept, scales, stage)
-        if options.level == "known":
-            level = first * (known / first) ** stage.weight
-        white = link_whitener(options, args, layout, found.point.numbers, stage.weight, level)
-
-        def enough(cost: Array) -> Array:
-            count = jnp.maximum(sum(jnp.sum(w) for w in kept), 1.0)
-            return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
-
-        found = found._replace(fresh=found.fresh | stage.fresh)
-        evaluate = evaluation(options, args, layout)
-        found = minimise(evaluate, weigh, white, found, enough, stage.steps)
-        if options.progress:
-            jax.debug.print(
-                "fit: {} steps, links {}, record {}: chi-square {}",
-                found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
-            )  # fmt: skip
-        if options.level.startswith("estimate"):
-            weights, _ = weigh(found.rows)
-            seen = evidence_of(layout, found, weights, white)
-            new, still = next_level(options, level, FAINT * first, seen)
-            level = jnp.where(stage.last, level, new)
-            done = done | still
-        return _Way(found, kept, scales, level, done)
-
-    def one(way: _Way, stage: Stage) -> tuple[_Way, None]:
+    def one(way: Way, stage: Stage) -> tuple[Way, None]:
         skip = (stage.steps == 0) | (way.done & ~stage.last)
-        return jax.lax.cond(skip, lambda way, _: way, run, way, stage), None
+        run = lambda way: _stage(problem, single, cut, way, stage, first, known)  # noqa: E731
+        return jax.lax.cond(skip, lambda way: way, run, way), None
 
-    dtype = point.omega.dtype
-    first, known = first_level(args, cut, point.numbers), level
-    shapes = eqx.filter_eval_shape(evaluation(options, args, cut), point)
+    shapes = eqx.filter_eval_shape(evaluation(problem, cut), point)
     rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, none = jnp.asarray(False), jnp.asarray(0)
-    begin = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
-    kept = tuple(jnp.any(x.weight > 0, axis=-1).astype(dtype) for x in args.samples)
-    begin = _Way(begin, kept, jnp.ones(len(kept), dtype), 10 * first, no)
+    found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
+    scales = jnp.ones(len(problem.samples.values), dtype)
+    begin = Way(found, problem.samples.seen.astype(dtype), scales, 10 * first, no)
 
-    def attempt(carry: tuple[Array, _Way, Array]) -> tuple[Array, _Way, Array]:
+    def attempt(carry: tuple[Array, Way, Array]) -> tuple[Array, Way, Array]:
         tried, best, wrong = carry
-        numbers = jnp.where(tried > 0, other, point.numbers)
-        start = begin.found._replace(
-            point=point._replace(numbers=numbers), steps=best.found.steps,
-            history=best.found.history,
-        )  # fmt: skip
+        numbers, before = jnp.where(tried > 0, other, point.numbers), best.found
+        start = found._replace(
+            point=point._replace(numbers=numbers), steps=before.steps, history=before.history
+        )
         now = jtu.tree_map(lambda x: x[tried], stages)
         end, _ = jax.lax.scan(one, begin._replace(found=start), now)
-        off = misfit(options, args, end.found, end.kept)
+        off = misfit(problem, end.found, end.kept)
         best = jtu.tree_map(lambda a, b: jnp.where(off < wrong, a, b), end, best)
         return tried + 1, best, jnp.minimum(off, wrong)
 
-    attempts = stages.weight.shape[0]
+    going = lambda x: (x[0] < stages.weight.shape[0]) & (x[2] > 0)  # noqa: E731
     carry = none, begin, jnp.asarray(jnp.inf, dtype)
-    _, way, _ = jax.lax.while_loop(lambda x: (x[0] < attempts) & (x[2] > 0), attempt, carry)
-    return way
+    return jax.lax.while_loop(going, attempt, carry)[1]
+
+
+def _stage(
+    problem: Problem, single: Layout, cut: Layout, way: Way, stage: Stage, first: Array,
+    known: Array,
+) -> Way:  # fmt: skip
+    """One minimisation, and what follows from it."""
+    options, (found, kept, scales, level, done) = problem.options, way
+    layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
+    if options.robust:
+        scales = scales_of(problem, found, kept)
+        fewer = rejected(problem, found.rows, kept, scales)
+        kept = jnp.where(stage.reject, fewer, kept)
+    if options.level == "known":
+        level = first * (known / first) ** stage.weight
+    weigh = weigher(problem, layout, kept, scales, stage)
+    white = link_whitener(problem, layout, found.point.numbers, stage.weight, level)
+
+    def enough(cost: Array) -> Array:
+        count = jnp.maximum(jnp.sum(kept[..., None] * problem.samples.weight), 1.0)
+        return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
+
+    found = found._replace(fresh=found.fresh | stage.fresh)
+    found = minimise(evaluation(problem, layout), weigh, white, found, enough, stage.steps)
+    if options.progress:
+        jax.debug.print(
+            "fit: {} steps, links {}, record {}: chi-square {}",
+            found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
+        )  # fmt: skip
+    if options.level.startswith("estimate"):
+        seen = evidence_of(problem, found, weigh(found.rows)[0], white)
+        new, still = next_level(level, first, seen)
+        level, done = jnp.where(stage.last, level, new), done | still
+    return Way(found, kept, scales, level, done)

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_option, is_inertia, is_unit
+from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
 from jrigid._numerics import safe_norm
 from jrigid.dynamics import State
 from jrigid.identify._layout import Told, told_by
 from jrigid.identify._records import Record, Samples, check_records, samples_of
-from jrigid.identify._sensors import MomentumSensor
+from jrigid.identify._sensors import AbstractSensor, MomentumSensor
 from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, SpinningMass, Sum
@@ -24,16 +24,16 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
     """One body, or one for each throw."""
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
-        if not isinstance(x, RigidBody):
-            raise ValueError(
-                "Argument `system` must be a RigidBody (of a body in flight, rotation about its "
-                f"centre of mass), but it is {type(x).__name__}."
-            )
-    if len(systems) not in (1, throws):
-        raise ValueError(
-            f"Argument `system` must hold one body for each of {throws} throws, but it holds "
-            f"{len(systems)}."
+        demand(
+            isinstance(x, RigidBody),
+            "Argument `system` must be a RigidBody (of a body in flight, rotation about its centre "
+            f"of mass), but it is {type(x).__name__}.",
         )
+    demand(
+        len(systems) in (1, throws),
+        f"Argument `system` must hold one body for each of {throws} throws, but it holds "
+        f"{len(systems)}.",
+    )
     return systems
 
 
@@ -42,12 +42,12 @@ def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)
     if isinstance(inertia, RigidBody):
         inertia = inertia.inertia
-    if state is not None and not isinstance(state, State):
-        raise ValueError(
-            "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
-            f"None), but it is {start!r}."
-        )
-    if state is not None:
+    demand(
+        state is None or isinstance(state, State),
+        "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
+        f"None), but it is {start!r}.",
+    )
+    if isinstance(state, State):
         attitude = jnp.broadcast_to(state.attitude, (throws, 4))
         state = State(attitude, jnp.broadcast_to(state.omega, (throws, 3)))
     return None if inertia is None else as_tensor(jnp.asarray(inertia)), state
@@ -58,23 +58,23 @@ def refuse(
 ) -> None:
     """ValueError for a scale that nothing tells, and numbers that hold it without one."""
     check_option("scale", scale, ("trace", "known", "rotor"))
-    if shape.absolute and shape.names and scale == "trace":
-        raise ValueError(
-            "Argument `scale` must be 'known' or 'rotor' where `shape` is a "
-            f"{type(shape).__name__}, whose numbers hold the scale, but it is 'trace'."
-        )
+    demand(
+        not (shape.absolute and shape.names and scale == "trace"),
+        f"Argument `scale` must be 'known' or 'rotor' where `shape` is a {type(shape).__name__}, "
+        "whose numbers hold the scale, but it is 'trace'.",
+    )
     terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
-    if scale == "rotor" and not any(isinstance(x, Rotor | SpinningMass) for x in terms):
-        raise ValueError(
-            "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it "
-            "is: nothing sets the scale of the tensor."
-        )
+    demand(
+        scale != "rotor" or any(isinstance(x, Rotor | SpinningMass) for x in terms),
+        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it is: "
+        "nothing sets the scale of the tensor.",
+    )
     momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
-    if scale == "known" and system.is_free and not momenta and not shape.absolute:
-        raise ValueError(
-            "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
-            "motion tells ratios of the moments, never their scale."
-        )
+    demand(
+        scale != "known" or not system.is_free or momenta or shape.absolute,
+        "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
+        "motion tells ratios of the moments, never their scale.",
+    )
 
 
 def typical_rate(told: Told | None, state: State | None, dtype: Any) -> Array:
@@ -91,33 +91,33 @@ def typical_rate(told: Told | None, state: State | None, dtype: Any) -> Array:
     return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
 
 
-def sizes_of(samples: tuple[Samples, ...]) -> tuple[Array, ...]:
+def sizes_of(samples: Samples) -> tuple[Array, ...]:
     """Rms of the values of each record; 1 where they are zero."""
-
-    def size(x: Samples) -> Array:
-        seen = jnp.any(x.weight > 0, axis=-1)
-        square = jnp.sum(jnp.where(seen[..., None], x.values, 0.0) ** 2)
+    sizes = []
+    for part, values in zip(samples.parts, samples.values, strict=True):
+        seen = samples.seen[:, part]
+        square = jnp.sum(jnp.where(seen[..., None], values, 0.0) ** 2)
         mean = square / jnp.maximum(jnp.sum(seen), 1).astype(square.dtype)
-        return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+        sizes.append(jnp.sqrt(jnp.where(mean > 0, mean, 1.0)))
+    return tuple(sizes)
 
-    return tuple(map(size, samples))
 
-
-def noise_of(records: tuple[Record, ...], samples: tuple[Samples, ...], rate: Array) -> Array:
+def noise_of(records: tuple[Record, ...], samples: Samples, rate: Array) -> Array:
     """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
-
-    def median(x: Samples) -> Array:
-        white = jnp.diagonal(x.whitener, axis1=-2, axis2=-1)
-        return jnp.nanmedian(jnp.where(x.weight > 0, 1 / white, jnp.nan))
-
-    pairs = [(x, median(y)) for x, y in zip(records, samples, strict=True)]
-    rates = [s for x, s in pairs if not x.sensor.on_attitude and x.sensor.width == 3]
-    angles = [s for x, s in pairs if x.sensor.unit_length]
-    guess = _GUESS * rate
-    of_rates = rates[0] if rates else (angles[0] * rate if angles else guess)
+    white, rates, angles = jnp.diagonal(samples.whitener, axis1=-2, axis2=-1), [], []
+    sigma = jnp.where(samples.weight > 0, 1 / jnp.where(white > 0, white, 1.0), jnp.nan)
+    for record, part in zip(records, samples.parts, strict=True):
+        median = jnp.nanmedian(sigma[:, part])
+        rates += [median] * tells(record, "rates")
+        angles += [median] * record.sensor.unit_length
+    of_rates = rates[0] if rates else (angles[0] * rate if angles else _GUESS * rate)
     of_angles = angles[0] if angles else of_rates / rate
     noise = jnp.repeat(jnp.stack([of_rates, of_angles]), 3)
-    return jnp.where(jnp.isfinite(noise), noise, guess)
+    return jnp.where(jnp.isfinite(noise), noise, _GUESS * rate)
+
+
+def tells(record: Record, what: str) -> bool:
+    return getattr(type(record.sensor), what) is not getattr(AbstractSensor, what)
 
 
 def findings_of(
@@ -125,10 +125,8 @@ def findings_of(
     records: tuple[Record, ...],
     tensor: Any,
     state: State | None,
-    on_attitude: bool,
 ) -> Findings:
     """What is wrong with the values of the arguments."""
-    del on_attitude
     findings = Findings()
     for system in systems:
         system.check(findings)
@@ -138,7 +136,7 @@ def findings_of(
         findings.require(all_finite(state), RESULTS.invalid_state)
         findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
     check_records(findings, records)
-    samples = tuple(samples_of(x, jnp.ones((), x.values.dtype)) for x in records)
+    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
     told = told_by(records, samples, None)
     if told is not None and told.attitude is None:
         findings.require(

@@ -37,14 +37,6 @@ class Told(NamedTuple):
     attitude: Array | None
 
 
-def times_of(samples: tuple[Samples, ...]) -> tuple[Array, Array]:
-    """Times of the samples of all records, side by side, and which are there."""
-    there = jnp.concatenate([jnp.any(x.weight > 0, axis=-1) for x in samples], axis=1)
-    ts = jnp.concatenate([x.ts for x in samples], axis=1)
-    first, _ = first_and_last(ts, there)
-    return jnp.where(there, ts, first[:, None]), there
-
-
 def first_and_last(ts: Array, there: Array) -> tuple[Array, Array]:
     """Times of the first and last samples of each throw; zero for one without samples."""
     first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1)
@@ -92,17 +84,16 @@ def _carried(attitude: Array, omega: Array, late: Array) -> Array:
     return turn(attitude, omega, late)
 
 
-def told_by(
-    records: tuple[Record, ...], samples: tuple[Samples, ...], attitude0: Array | None
-) -> Told | None:
+def told_by(records: tuple[Record, ...], samples: Samples, attitude0: Array | None) -> Told | None:
     """What tells the state on the way: a gyro, or attitudes; None if there is neither."""
 
     def first(name: str) -> tuple[Array, Array, Array] | None:
-        for record, x in zip(records, samples, strict=True):
-            seen = jax.vmap(jax.vmap(getattr(record.sensor, name)))(x.values)
+        for record, values, part in zip(records, samples.values, samples.parts, strict=True):
+            seen = jax.vmap(jax.vmap(getattr(record.sensor, name)))(values)
             if seen is not None:
-                there = jnp.all((x.weight > 0) & (x.sign == 0), axis=-1)
-                return jnp.where(there, x.ts, 0.0), there, seen
+                weight, sign = samples.weight[:, part], samples.sign[:, part]
+                there = jnp.all((weight > 0) & (sign == 0), axis=-1)
+                return jnp.where(there, samples.ts[:, part], 0.0), there, seen
         return None
 
     rates, attitudes = first("rates"), first("attitude")
@@ -168,9 +159,10 @@ def angle_turned(told: Told) -> Array:
     return jax.vmap(throw)(told.ts, told.there, told.omega)
 
 
-def whole(ts: Array, there: Array, nodes: int, t0: Array | None = None) -> Layout:
+def whole(samples: Samples, nodes: int, t0: Array | None = None) -> Layout:
     """One segment a throw, in the first of so many nodes; its state at t0, or the first sample."""
-    first, last = first_and_last(ts, there)
+    ts = samples.ts
+    first, last = first_and_last(ts, samples.seen)
     zero = jnp.zeros((ts.shape[0], nodes), ts.dtype)
     start = zero.at[:, 0].set(first if t0 is None else t0)
     span = jnp.where(last > first, last - first, 1.0)
@@ -178,16 +170,14 @@ def whole(ts: Array, there: Array, nodes: int, t0: Array | None = None) -> Layou
     return Layout(ts, jnp.zeros(ts.shape, int), start, start, zero > 0, since)
 
 
-def segments(
-    ts: Array, there: Array, told: Told, nodes: int, length: float
-) -> tuple[Layout, Array]:
+def segments(samples: Samples, told: Told, nodes: int, length: float) -> tuple[Layout, Array]:
     """Segments of so many radians, or, of length 0, one a sample; and where each starts.
 
     They are longer where the nodes do not suffice.
     """
+    ts, whole_ = samples.ts, whole(samples, nodes)
     count = jnp.cumsum(told.there, axis=1).astype(ts.dtype)
     measure = angle_turned(told) if length else count - 0.5
-    whole_ = whole(ts, there, nodes)
 
     def throw(measure: Array, times: Array, ok: Array) -> tuple[Array, ...]:
         most = max(nodes - 1, 1) if length else nodes

@@ -1,16 +1,18 @@
 """What was seen of a rotating body: a sensor, times, values and their noise, one throw or many."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, Findings, check_type, float_arrays, is_concrete
+from jrigid._checks import RESULTS, Findings, check_type, demand, float_arrays, is_concrete
 from jrigid._types import Readable, Real, VectorLike
 from jrigid.identify._sensors import (
     AbstractSensor,
@@ -20,6 +22,10 @@ from jrigid.identify._sensors import (
     Gyro,
     MomentumSensor,
 )
+
+Times = Real[_ArrayLike, "*throws n"]
+Values = Real[_ArrayLike, "*throws n k"] | None
+Noise = Real[_ArrayLike, "..."] | None
 
 
 class Record(Readable):
@@ -57,14 +63,9 @@ class Record(Readable):
     covariance: Float[Array, "..."] | None
 
     def __init__(
-        self,
-        sensor: AbstractSensor,
-        ts: Real[_ArrayLike, "*throws n"],
-        values: Real[_ArrayLike, "*throws n k"] | None,
-        sigma: Real[_ArrayLike, "..."] | None = None,
-        *,
-        covariance: Real[_ArrayLike, "..."] | None = None,
-    ):
+        self, sensor: AbstractSensor, ts: Times, values: Values, sigma: Noise = None, *,
+        covariance: Noise = None,
+    ):  # fmt: skip
         """Values of a sensor with noise `sigma` or `covariance`."""
         check_type("sensor", sensor, AbstractSensor)
         name, width = type(sensor).__name__, sensor.width
@@ -74,41 +75,39 @@ class Record(Readable):
             (ts,) = float_arrays(ts)
             values = jnp.ones((*ts.shape, width), ts.dtype) / width**0.5
         ts, values = float_arrays(ts, values)
-        if ts.ndim not in (1, 2) or values.shape[:-1] != ts.shape or values.ndim != ts.ndim + 1:
-            raise ValueError(
-                f"Arguments `ts` and `values` of `{name}` must have shapes (n,) and (n, k), but "
-                f"they have shapes {ts.shape} and {values.shape}."
-            )
-        if width is not None and values.shape[-1] != width:
-            raise ValueError(
-                f"Argument `values` of `{name}` must have {width} columns, but it has "
-                f"{values.shape[-1]}."
-            )
-        if sigma is not None and covariance is not None:
-            raise ValueError(
-                f"Arguments `sigma` and `covariance` of `{name}` must not both be given, but they "
-                "are."
-            )
+        demand(
+            ts.ndim in (1, 2) and values.ndim == ts.ndim + 1 and values.shape[:-1] == ts.shape,
+            f"Arguments `ts` and `values` of `{name}` must have shapes (n,) and (n, k), but they "
+            f"have shapes {ts.shape} and {values.shape}.",
+        )
+        demand(
+            width in (None, values.shape[-1]),
+            f"Argument `values` of `{name}` must have {width} columns, but it has "
+            f"{values.shape[-1]}.",
+        )
+        demand(
+            sigma is None or covariance is None,
+            f"Arguments `sigma` and `covariance` of `{name}` must not both be given, but they are.",
+        )
         self.sensor, self.ts, self.values = sensor, ts, values
-        k, n = self.degrees, ts.shape[-1]
-        self.sigma = self.covariance = None
+        k, n, self.sigma, self.covariance = self.degrees, ts.shape[-1], None, None
         if sigma is not None:
             (sigma,) = float_arrays(sigma)
-            if sigma.shape in ((n,), ts.shape) and sigma.shape != (k,):
-                sigma = sigma[..., None]
-            elif sigma.shape not in ((), (k,), (n, k), (*ts.shape, k)):
-                raise ValueError(
-                    f"Argument `sigma` of `{name}` must have shape (), ({k},), ({n},) or "
-                    f"({n}, {k}), but it has shape {sigma.shape}."
-                )
+            demand(
+                sigma.shape in ((), (k,), (n,), ts.shape, (n, k), (*ts.shape, k)),
+                f"Argument `sigma` of `{name}` must have shape (), ({k},), ({n},) or ({n}, {k}), "
+                f"but it has shape {sigma.shape}.",
+            )
+            of_samples = sigma.shape in ((n,), ts.shape) and sigma.shape != (k,)
+            sigma = sigma[..., None] if of_samples else sigma
             self.sigma = jnp.broadcast_to(sigma, (*ts.shape, k))
         if covariance is not None:
             (covariance,) = float_arrays(covariance)
-            if covariance.shape not in ((k, k), (n, k, k), (*ts.shape, k, k)):
-                raise ValueError(
-                    f"Argument `covariance` of `{name}` must have shape ({k}, {k}) or "
-                    f"({n}, {k}, {k}), but it has shape {covariance.shape}."
-                )
+            demand(
+                covariance.shape in ((k, k), (n, k, k), (*ts.shape, k, k)),
+                f"Argument `covariance` of `{name}` must have shape ({k}, {k}) or ({n}, {k}, {k}), "
+                f"but it has shape {covariance.shape}.",
+            )
             self.covariance = jnp.broadcast_to(covariance, (*ts.shape, k, k))
 
     @property
@@ -137,13 +136,7 @@ class Record(Readable):
         return eqx.tree_at(lambda x: x.values, self, values)
 
 
-def Rates(
-    ts: Real[_ArrayLike, "*throws n"],
-    values: Real[_ArrayLike, "*throws n 3"] | None,
-    sigma: Real[_ArrayLike, "..."] | None = None,
-    *,
-    covariance: Real[_ArrayLike, "..."] | None = None,
-) -> Record:
+def Rates(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
     """The record of a perfect `Gyro`: angular velocities along its axes [rad/s].
 
     >>> import jrigid as jr
@@ -151,16 +144,10 @@ def Rates(
     >>> print(jr.identify.Rates(record.times, record.omegas, record.sigma).values.shape)
     (200, 3)
     """
-    return Record(Gyro(), ts, values, sigma, covariance=covariance)
+    return Record(Gyro(), ts, values, sigma, **noise)
 
 
-def Attitudes(
-    ts: Real[_ArrayLike, "*throws n"],
-    values: Real[_ArrayLike, "*throws n 4"] | None,
-    sigma: Real[_ArrayLike, "..."] | None = None,
-    *,
-    covariance: Real[_ArrayLike, "..."] | None = None,
-) -> Record:
+def Attitudes(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
     """The record of an `AttitudeSensor`: unit quaternions, noise in radians about body axes.
 
     >>> import jrigid as jr
@@ -168,18 +155,13 @@ def Attitudes(
     >>> print(jr.identify.Attitudes(record.times, record.attitudes, 0.1).values.shape)
     (18, 4)
     """
-    return Record(AttitudeSensor(), ts, values, sigma, covariance=covariance)
+    return Record(AttitudeSensor(), ts, values, sigma, **noise)
 
 
 def Directions(
-    ts: Real[_ArrayLike, "*throws n"],
-    values: Real[_ArrayLike, "*throws n 3"] | None,
-    sigma: Real[_ArrayLike, "..."] | None = None,
-    *,
-    of: VectorLike,
-    seen_from: str = "body",
-    covariance: Real[_ArrayLike, "..."] | None = None,
-) -> Record:
+    ts: Times, values: Values, sigma: Noise = None, *, of: VectorLike, seen_from: str = "body",
+    **noise: Any,
+) -> Record:  # fmt: skip
     """The record of a `DirectionSensor`: unit vectors, noise in radians across them.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -187,112 +169,122 @@ def Directions(
     >>> seen = jr.identify.Directions(jnp.arange(5.0), jnp.tile(star, (5, 1)), 1e-3, of=star)
     """
     sensor = DirectionSensor(float_arrays(of)[0], seen_from)
-    return Record(sensor, ts, values, sigma, covariance=covariance)
+    return Record(sensor, ts, values, sigma, **noise)
 
 
 def AngularMomenta(
-    ts: Real[_ArrayLike, "*throws n"],
-    values: Real[_ArrayLike, "*throws n 3"] | None,
-    sigma: Real[_ArrayLike, "..."] | None = None,
-    *,
-    axes: str = "space",
-    covariance: Real[_ArrayLike, "..."] | None = None,
+    ts: Times, values: Values, sigma: Noise = None, *, axes: str = "space", **noise: Any
 ) -> Record:
     """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`."""
-    return Record(MomentumSensor(axes), ts, values, sigma, covariance=covariance)
+    return Record(MomentumSensor(axes), ts, values, sigma, **noise)
 
 
 def Observed(
-    function: Callable[[Any, Any, Any], Any],
-    ts: Real[_ArrayLike, "*throws n"],
-    values: Real[_ArrayLike, "*throws n k"],
-    sigma: Real[_ArrayLike, "..."] | None = None,
-    *,
-    on_attitude: bool = True,
-    covariance: Real[_ArrayLike, "..."] | None = None,
-) -> Record:
+    function: Callable[[Any, Any, Any], Any], ts: Times, values: Values, sigma: Noise = None, *,
+    on_attitude: bool = True, **noise: Any,
+) -> Record:  # fmt: skip
     """The record of a `FunctionSensor`: any function `(t, state, system) -> (k,)`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> spin = jr.identify.Observed(
     ...     lambda t, state, system: state.omega[2:], jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
     """
-    sensor = FunctionSensor(function, on_attitude)
-    return Record(sensor, ts, values, sigma, covariance=covariance)
+    return Record(FunctionSensor(function, on_attitude), ts, values, sigma, **noise)
 
 
 class Samples(NamedTuple):
-    """A record as a fit reads it: finite, (throws, n, ...), of weight zero where nothing is.
+    """All records as a fit reads them, side by side: finite, of weight zero where nothing is.
 
-    `whitener` (throws, n, d, d) turns a residual into units of its noise; `sign` (throws, n, d) is
-    that of a saturated number, 0 elsewhere.
+    Residuals have as many numbers as the widest record's, D. `whitener` (throws, n, D, D) turns one
+    into units of its noise; `sign` (throws, n, D) is that of a saturated number, 0 elsewhere.
     """
 
-    ts: Array
-    values: Array
+    ts: Array  # (throws, n)
+    values: tuple[Array, ...]  # of each record
     whitener: Array
-    weight: Array
+    weight: Array  # (throws, n, D)
     sign: Array
 
+    @property
+    def seen(self) -> Array:
+        """Which samples are there."""
+        return jnp.any(self.weight > 0, axis=-1)
 
-def samples_of(record: Record, guess: Array) -> Samples:
-    """A record as a fit reads it; a noise that is not known is `guess`."""
+    @property
+    def parts(self) -> list[slice]:
+        """Where each record's samples are."""
+        ends = np.cumsum([0, *(x.shape[-2] for x in self.values)])
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+def samples_of(records: Sequence[Record], guess: Array) -> Samples:
+    """Records as a fit reads them; a noise that is not known is `guess`."""
+    width = max(x.degrees for x in records)
+    each = [_normalised(x, guess) for x in records]
+
+    def wide(x: Array, axes: int) -> Array:
+        pad = [(0, 0)] * (x.ndim - axes) + [(0, width - x.shape[-1])] * axes
+        return jnp.pad(x, pad)
+
+    ts, values, whitener, weight, sign = zip(*each, strict=True)
+    columns = [jnp.concatenate([wide(x, 1) for x in y], axis=1) for y in (weight, sign)]
+    whitener = jnp.concatenate([wide(x, 2) for x in whitener], axis=1)
+    ts, there = jnp.concatenate(ts, axis=1), jnp.any(columns[0] > 0, axis=-1)
+    first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1, keepdims=True)
+    ts = jnp.where(there, ts, jnp.where(jnp.isfinite(first), first, 0.0))
+    return Samples(ts, values, whitener, *columns)
+
+
+def _normalised(record: Record, guess: Array) -> tuple[Array, ...]:
     known, dtype = record.known, record.values.dtype
-    seen = jnp.any(known, axis=-1)
-    first = jnp.where(seen, record.ts, jnp.inf)
-    first = jnp.min(first, axis=-1, keepdims=True)
-    ts = jnp.where(seen, record.ts, jnp.where(jnp.isfinite(first), first, 0.0))
+    seen = jnp.any(known, axis=-1, keepdims=True)
     harmless = jnp.zeros_like(record.values)
     if record.sensor.unit_length:
         harmless = harmless.at[..., 0].set(1)
-    component = jnp.isfinite(record.values) if record.sensor.degrees is None else seen[..., None]
-    values = jnp.where(component & seen[..., None], record.values, harmless)
+    there = seen & jnp.isfinite(record.values) if record.sensor.degrees is None else seen
+    values = jnp.where(there, record.values, harmless)
     eye = jnp.eye(record.degrees, dtype=dtype)
     eye = jnp.broadcast_to(eye, (*known.shape, record.degrees))
     if record.covariance is not None:
-        noise = jnp.where(seen[..., None, None], record.covariance, eye)
-        lower = jnp.linalg.cholesky(noise)
+        lower = jnp.linalg.cholesky(jnp.where(seen[..., None], record.covariance, eye))
         whitener = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
     else:
         sigma = jnp.broadcast_to(guess, known.shape) if record.sigma is None else record.sigma
         whitener = eye / jnp.where(known, sigma, 1.0)[..., None].astype(dtype)
     largest, sign = record.sensor.largest(), jnp.zeros(known.shape, dtype)
     if largest is not None:
-        beyond = jnp.abs(values) >= largest.astype(dtype) * (1 - 1e-6)
-        sign = jnp.where(beyond & known, jnp.sign(values), 0.0)
-    return Samples(ts, values, whitener, known.astype(dtype), sign)
+        beyond = known & (jnp.abs(values) >= largest.astype(dtype) * (1 - 1e-6))
+        sign = jnp.where(beyond, jnp.sign(values), 0.0)
+    return record.ts, values, whitener, known.astype(dtype), sign
 
 
 def of_throws(observations: Any) -> tuple[Record, ...]:
     """Records with an axis of throws in front: a list's, padded with NaN, or of length one."""
     if isinstance(observations, list):
         throws = [_as_tuple(x) for x in observations]
-        if not throws:
-            raise ValueError("Argument `observations` must not be empty, but it is.")
+        demand(bool(throws), "Argument `observations` must not be empty, but it is.")
         kinds = [[jtu.tree_structure(x.sensor) for x in throw] for throw in throws]
-        if any(kind != kinds[0] for kind in kinds):
-            raise ValueError(
-                "Argument `observations` must hold records of the same sensors for each throw, but "
-                "it does not."
-            )
+        demand(
+            all(kind == kinds[0] for kind in kinds),
+            "Argument `observations` must hold records of the same sensors for each throw, but it "
+            "does not.",
+        )
         return tuple(_stacked(parts) for parts in zip(*throws, strict=True))
     single = _as_tuple(observations)
     shapes = {x.ts.shape[:-1] for x in single}
-    if len(shapes) > 1:
-        raise ValueError(
-            f"Arguments `observations` must have the same throws, but they have {shapes}."
-        )
+    text = f"Arguments `observations` must have the same throws, but they have {shapes}."
+    demand(len(shapes) == 1, text)
     return tuple(_stacked([x]) for x in single) if shapes == {()} else single
 
 
 def _as_tuple(observations: Any) -> tuple[Record, ...]:
     if isinstance(observations, Record):
         observations = (observations,)
-    if not isinstance(observations, Sequence) or not observations:
-        raise ValueError(
-            "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, "
-            f"or a list with one entry for each throw, but it is {observations!r}."
-        )
+    demand(
+        isinstance(observations, Sequence) and len(observations) > 0,
+        "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, or a "
+        f"list with one entry for each throw, but it is {observations!r}.",
+    )
     for x in observations:
         check_type("observations", x, Record)
     return tuple(observations)
@@ -305,34 +297,29 @@ def _stacked(parts: Sequence[Record]) -> Record:
 
     def column(name: str) -> Array | None:
         leaves = [getattr(x, name) for x in parts]
-        if any((leaf is None) != (leaves[0] is None) for leaf in leaves):
-            raise ValueError(
-                "Argument `observations` must state the noise for all throws or for none, but it "
-                "does for some."
-            )
+        demand(
+            len({leaf is None for leaf in leaves}) == 1,
+            "Argument `observations` must state the noise for all throws or for none, but it does "
+            "for some.",
+        )
         if leaves[0] is None:
             return None
         pads = [[(0, longest - x.shape[0])] + [(0, 0)] * (x.ndim - 1) for x in leaves]
         pairs = zip(leaves, pads, strict=True)
         return jnp.stack([jnp.pad(x, pad, constant_values=jnp.nan) for x, pad in pairs])
 
-    if any(x.ts.ndim != 1 for x in parts):
-        raise ValueError(
-            "Argument `observations` must hold times of shape (n,) for each throw of a list, but "
-            "it does not."
-        )
-    if not all(_same(x.sensor, parts[0].sensor) for x in parts):
-        raise ValueError(
-            "Argument `observations` must have the same sensor in every throw of a list, but it "
-            "has not: `jr.identify.each` seeks an error anew in each throw."
-        )
-    columns = tuple(column(name) for name in names)
-    return eqx.tree_at(
-        lambda x: tuple(getattr(x, name) for name in names),
-        parts[0],
-        columns,
-        is_leaf=lambda x: x is None,
+    demand(
+        all(x.ts.ndim == 1 for x in parts),
+        "Argument `observations` must hold times of shape (n,) for each throw of a list, but it "
+        "does not.",
     )
+    demand(
+        all(_same(x.sensor, parts[0].sensor) for x in parts),
+        "Argument `observations` must have the same sensor in every throw of a list, but it has "
+        "not: `jr.identify.each` seeks an error anew in each throw.",
+    )
+    pick = lambda x: tuple(getattr(x, name) for name in names)  # noqa: E731
+    return eqx.tree_at(pick, parts[0], tuple(map(column, names)), is_leaf=lambda x: x is None)
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -16,6 +16,7 @@ from jrigid._spectral import eigh
 from jrigid._types import Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
+from jrigid.identify._problem import Problem
 from jrigid.identify._unknowns import Unknowns
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
@@ -76,7 +77,7 @@ class FitResult(eqx.Module):
         inflation: Of covariances, beyond what the noise stated makes.
         state: State at `t0`, not at time 0, with an axis of throws in front: see `start`.
         t0: Time of each throw's state [s]: that of its first sample, in a fit.
-        residuals: Whitened, (throws, rows); zero where nothing was seen.
+        residuals: Whitened, records side by side; zero where nothing was seen.
         jacobian: Their derivatives in the numbers and in the state of the throw.
         chi_square: Sum of their squares.
         degrees_of_freedom: Residuals less what was sought.
@@ -88,15 +89,11 @@ class FitResult(eqx.Module):
         level: Of the unmodelled torque about each body axis [N m sqrt(s)].
         level_errors: Of the level; of one that was not sought, what the record could tell.
         scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
-        kept: For each record, which samples were (throws, n).
-        spoilt: Throws that a robust fit gave up.
+        kept: Which samples were, records side by side.
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         input_result: `jrigid.RESULTS` of the input.
-        unknowns: What the numbers mean: `unknowns.inertia(numbers)` is the tensor, to carry
-            `numbers_covariance` over to anything that follows from it.
-        problem: The record as it was fitted.
-        options: How it was fitted.
+        problem: The record as it was fitted, and how.
         index: Which body this is.
     """
 
@@ -111,8 +108,8 @@ class FitResult(eqx.Module):
     inflation: Scalar
     state: State
     t0: Float[Array, " throws"]
-    residuals: Float[Array, "throws rows"]
-    jacobian: Float[Array, "throws rows unknowns"]
+    residuals: Float[Array, "throws samples degrees"]
+    jacobian: Float[Array, "throws samples degrees unknowns"]
     chi_square: Scalar
     degrees_of_freedom: Int[Array, ""]
     unexplained: Scalar
@@ -122,15 +119,22 @@ class FitResult(eqx.Module):
     level: Vector
     level_errors: Vector
     scales: Float[Array, " records"]
-    kept: tuple[Array, ...]
-    spoilt: Bool[Array, " throws"]
+    kept: Bool[Array, "throws samples"]
     history: Float[Array, " steps"]
     pure_spin: Bool[Array, ""]
     input_result: Any
-    unknowns: Unknowns
-    problem: Any
-    options: Any = eqx.field(static=True)
+    problem: Problem
     index: int = eqx.field(static=True, default=0)
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What the numbers mean: `unknowns.inertia(numbers)` is the tensor."""
+        return self.problem.unknowns
+
+    @property
+    def spoilt(self) -> Bool[Array, "*fits throws"]:
+        """Throws that a robust fit gave up."""
+        return jnp.any(self.problem.samples.seen, axis=-1) & ~jnp.any(self.kept, axis=-1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -283,36 +287,34 @@ class FitResult(eqx.Module):
 
     def rows(
         self, record: int = 0, throw: int = 0
-    ) -> tuple[Float[Array, "n outputs unknowns"], Float[Array, "n outputs"]]:
+    ) -> tuple[Float[Array, "n degrees unknowns"], Float[Array, "n degrees"]]:
         """Derivatives and whitened residuals of a record in a throw, of a single fit.
 
         Args:
             record: Which record.
             throw: Which throw.
         """
-        sizes = [x.weight.shape[1:] for x in self.problem.samples]
-        start = sum(n * d for n, d in sizes[:record])
-        n, d = sizes[record]
-        part = slice(start, start + n * d)
-        jacobian = self.jacobian[throw, part].reshape(n, d, -1)
-        return jacobian, self.residuals[throw, part].reshape(n, d)
+        part = self.problem.samples.parts[record]
+        return self.jacobian[throw, part], self.residuals[throw, part]
 
-    def left(self, record: int = 0) -> Float[Array, "throws n outputs"]:
+    def left(self, record: int = 0) -> Float[Array, "throws n degrees"]:
         """What is left of a record: predicted less observed, in its own units; of a single fit.
 
         Args:
             record: Which record.
         """
-        white = self.problem.samples[record].whitener
-        throws = range(white.shape[0])
-        rows = jnp.stack([self.rows(record, throw)[1] for throw in throws])
-        return jnp.linalg.solve(white, rows[..., None])[..., 0]
+        samples = self.problem.samples
+        white = samples.whitener[:, samples.parts[record]]
+        eye = jnp.eye(white.shape[-1], dtype=white.dtype)
+        white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
+        rows = self.residuals[:, samples.parts[record], :, None]
+        return jnp.linalg.solve(white, rows)[..., 0]
 
     @property
     def chi_square_by_throw(self) -> Float[Array, "*fits throws"]:
         """Mean square of the residuals of each throw."""
-        seen = jnp.maximum(jnp.sum(self.residuals != 0, axis=-1), 1)
-        return jnp.sum(self.residuals**2, axis=-1) / seen.astype(self.residuals.dtype)
+        seen = jnp.maximum(jnp.sum(self.residuals != 0, axis=(-2, -1)), 1)
+        return jnp.sum(self.residuals**2, axis=(-2, -1)) / seen.astype(self.residuals.dtype)
 
     @property
     def whiteness(self) -> tuple[float, float]:
@@ -321,15 +323,15 @@ class FitResult(eqx.Module):
         Of a single fit. Near 0 for noise; what a model leaves out changes slowly and brings it near
         1.
         """
-        square = product_ = count = 0.0
-        throws = range(self.residuals.shape[0])
-        for record in range(len(self.problem.samples)):
-            part = np.stack([np.asarray(self.rows(record, i)[1]) for i in throws])
-            both = (part[:, 1:] != 0) & (part[:, :-1] != 0)
-            product_ += float(np.sum(part[:, 1:] * part[:, :-1]))
-            square += float(np.sum(both * (part[:, 1:] ** 2 + part[:, :-1] ** 2) / 2))
+        square = turns = count = 0.0
+        for part in self.problem.samples.parts:
+            rows = np.asarray(self.residuals[:, part])
+            left, right = rows[:, :-1], rows[:, 1:]
+            both = (left != 0) & (right != 0)
+            turns += float(np.sum(left * right))
+            square += float(np.sum(both * (left**2 + right**2) / 2))
             count += int(both.sum())
-        like = product_ / max(square, 1e-300)
+        like = turns / max(square, 1e-300)
         return like, abs(like) * count**0.5
 
     @property

@@ -37,7 +37,7 @@ class Point(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Whitened residuals and derivatives: (throws, rows), in the border and the state of a node."""
+    """Whitened residuals (throws, n, D), and derivatives in the border and the state of a node."""
 
     residual: Array
     of_border: Array
@@ -79,25 +79,24 @@ def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Block
     Args:
         rows: Of the record.
         links: Between the segments; the next state enters with minus one.
-        weight: Of each row (throws, rows).
+        weight: Of each sample (throws, n).
         whitener: Of each link (throws, nodes, local, local), zero where there is none.
     """
     nodes = links.gap.shape[1]
 
-    def throw(r: Array, jb: Array, js: Array, node: Array, w: Array) -> tuple[Array, ...]:
-        def at_nodes(x: Array) -> Array:
-            return jax.ops.segment_sum(x, node, nodes)
-
-        ws, wb = w[:, None] * js, w[:, None] * jb
+    def throw(rows: Rows, w: Array) -> tuple[Array, ...]:
+        r, jb, js, node = rows
+        at_nodes = lambda x: jax.ops.segment_sum(x, node, nodes)  # noqa: E731
+        ws, wb = (product("n,ndi->ndi", w, x) for x in (js, jb))
         return (
-            at_nodes(ws[:, :, None] * js[:, None, :]),
-            at_nodes(ws[:, :, None] * jb[:, None, :]),
-            product("ri,rj->ij", wb, jb),
-            at_nodes(ws * r[:, None]),
-            product("ri,r->i", wb, r),
+            at_nodes(product("ndi,ndj->nij", ws, js)),
+            at_nodes(product("ndi,ndj->nij", ws, jb)),
+            product("ndi,ndj->ij", wb, jb),
+            at_nodes(product("ndi,nd->ni", ws, r)),
+            product("ndi,nd->i", wb, r),
         )
 
-    h, hb, bb, b, cb = jax.vmap(throw)(*rows, weight)
+    h, hb, bb, b, cb = jax.vmap(throw)(rows, weight)
 
     def white(x: Array) -> Array:
         return product("tsij,tsjk->tsik", whitener, x)
@@ -158,8 +157,8 @@ def reduced(blocks: Blocks, damping: Array) -> Reduced:
         matrix = jnp.block([[h[0] - less, side], [side.T, bb - schur[:, :-1]]])
         return matrix, jnp.concatenate([b[0] - right, cb - schur[:, -1]]), solved, jnp.sum(logs)
 
-    found = jax.vmap(throw)(h, u, hb, bb, b, cb)
-    return Reduced(*found[:3], jnp.sum(found[3]))
+    matrix, right, solved, logs = jax.vmap(throw)(h, u, hb, bb, b, cb)
+    return Reduced(matrix, right, solved, jnp.sum(logs))
 
 
 class Eliminated(NamedTuple):

@@ -78,11 +78,11 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
     found, unknowns = [], result.unknowns
     absolute = any(x.absolute for x in unknowns.shapes)
     if not unknowns.scaled and not absolute:
-        torque = not result.options.free_motion and any(
+        torque = not result.problem.options.free_motion and any(
             x.name.startswith("torque") for x in unknowns.sought
         )
         follow = ", which what is sought of the torque follows" if torque else ""
-        if torque or result.options.free_motion:
+        if torque or result.problem.options.free_motion:
             found.append("overall scale" + follow)
     if bool(result.pure_spin):
         found.append("spin is pure: ratios not determined")
@@ -93,7 +93,7 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
             text = _untold(result, direction)
             found += [text] * bool(text and text not in found)
     of_state = np.asarray(result.state_singular_values)
-    if result.options.on_attitude and (of_state[..., -1] < 1e-6 * of_state[..., 0]).any():
+    if result.problem.options.on_attitude and (of_state[..., -1] < 1e-6 * of_state[..., 0]).any():
         count = int((of_state < 1e-6 * of_state[..., :1]).sum(axis=-1).max())
         found.append("heading about the vertical" if count == 1 else "attitude in space")
     return tuple(found)
@@ -107,7 +107,7 @@ def _of_residuals(result: FitResult) -> list[str]:
     """How far what is left is from noise of the size stated."""
     found = []
     size = max(math.sqrt(float(result.reduced_chi_square)), float(np.max(result.scales)))
-    if result.options.noise_known and size > 1.3:
+    if result.problem.options.noise_known and size > 1.3:
         found.append(f"residuals are {_size(size)} times the stated noise")
     like, sure = result.whiteness
     if abs(like) > 0.1 and sure > 5:
@@ -150,8 +150,8 @@ def _of_clipping(result: FitResult) -> list[str]:
     """Values that repeat their largest one, as a saturated sensor's do."""
     found = []
     sensors = result.parts()[1:]
-    for sensor, x in zip(sensors, result.problem.samples, strict=True):
-        values = np.asarray(x.values)
+    for sensor, values in zip(sensors, result.problem.samples.values, strict=True):
+        values = np.asarray(values)
         largest = np.abs(values).max()
         count = int(np.sum(np.abs(values) >= largest * (1 - 1e-9)))
         if count > 3 and largest > 0 and sensor.largest() is None and not sensor.unit_length:
@@ -184,7 +184,12 @@ def remarks(result: FitResult) -> tuple[str, ...]:
             "times are not in seconds"
         )
     mirror = np.sort(np.asarray(result.mirror))
-    if by_rates and result.options.free_motion and mirror[0] > 0 and mirror[2] < mirror[:2].sum():
+    if (
+        by_rates
+        and result.problem.options.free_motion
+        and mirror[0] > 0
+        and mirror[2] < mirror[:2].sum()
+    ):
         found.append(
             "with one axis of the gyro reversed the same record is that of a body with "
             f"I2/I1 = {mirror[1] / mirror[0]:.4g}, I3/I1 = {mirror[2] / mirror[0]:.4g}"
@@ -226,10 +231,10 @@ def _of_tensor(result: FitResult) -> list[str]:
 
 def _of_level(result: FitResult) -> list[str]:
     """The unmodelled torque, and what of the errors it makes."""
-    if result.options.level == "none":
+    if result.problem.options.level == "none":
         return []
     pairs = list(zip(np.asarray(result.level), np.asarray(result.level_errors), strict=True))
-    if result.options.level != "estimate per axis":
+    if result.problem.options.level != "estimate per axis":
         pairs = pairs[:1]
     level = ", ".join(
         _with_error(*x) if x[0] > 0 else f"0 (of {_size(float(x[1]))} nothing would be seen)"
@@ -256,14 +261,14 @@ def report(result: FitResult) -> str:
         text = ", ".join(f"{n} {name}" for name, n in counts.items() if n)
         return f"{value.size} fits: {text}"
     lines = [f"{codes[int(value)]}: {Status[result.status]}"]
-    kept = sum(int(np.sum(np.asarray(k))) for k in result.kept)
+    kept = int(np.sum(result.kept))
     throws = result.state.omega.shape[0]
     seen = f"{kept} samples" + (f" of {throws} throws" if throws > 1 else "")
     steps = int(np.sum(np.isfinite(result.history)))
     freedom, noise = int(result.degrees_of_freedom), " (noise taken from the residuals)"
     lines.append(
         f"  {seen}, {steps} steps; chi-square {float(result.chi_square):.1f} for {freedom} degrees "
-        "of freedom" + noise * (not result.options.noise_known)
+        "of freedom" + noise * (not result.problem.options.noise_known)
     )
     spoilt = np.flatnonzero(np.asarray(result.spoilt))
     if spoilt.size:

@@ -1,0 +1,244 @@
+"""The least-squares problem of a record: residuals, their derivatives, and what links may gap."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._numerics import product
+from jrigid.dynamics import State
+from jrigid.identify._flow import forced_flow, free_flow
+from jrigid.identify._layout import Layout
+from jrigid.identify._records import Samples
+from jrigid.identify._smoother import Links, Point, Rows
+from jrigid.identify._unknowns import Unknowns
+from jrigid.rotation import conjugate, exp, multiply, normalize
+from jrigid.simulate import simulate
+
+RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
+_SURE = 6.0  # standard deviations beyond a limit, where nothing more is learnt
+
+
+class Options(NamedTuple):
+    """What is fixed when a fit is compiled."""
+
+    free_motion: bool
+    on_attitude: bool
+    shooting: bool = False  # from a state of each segment, or from one of each throw
+    nodes: int = 1
+    level: str = "none"  # of the unmodelled torque: or "known", "estimate", "estimate per axis"
+    robust: bool = False
+    noise_known: bool = True
+    motion: Any = None
+    doublings: int = 0
+    max_steps: int = 0
+    progress: bool = False
+
+    @property
+    def dense(self) -> bool:
+        """Whether each sample has a node."""
+        return self.level != "none"
+
+
+class Problem(eqx.Module):
+    """A record as it is fitted."""
+
+    options: Options = eqx.field(static=True)
+    unknowns: Unknowns
+    samples: Samples
+    bodies: Array  # of each throw
+    noise: Array  # of rates [rad/s] and turns [rad], (6,), for the links
+
+    @property
+    def known(self) -> int:
+        """How many samples stand for what is known beforehand, and for a fit held near its start.
+
+        Those of the throw come first, then, beside the first throw, those of all throws.
+        """
+        x = self.unknowns
+        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (x.held is not None)
+        return count + self.held
+
+    @property
+    def held(self) -> int:
+        """How many numbers hold a fit near its start while little of the record takes part."""
+        return self.unknowns.size - self.unknowns.slices["scale"].stop
+
+
+def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
+    """States of a motion that wants its times in order."""
+    order = jnp.argsort(ts)
+    states = motion(ts[order])
+    back = jnp.argsort(order)
+    return State(states.attitude[back], states.omega[back])
+
+
+def _flow(options: Options, system: Any, before: State, start: Array, end: Array) -> State:
+    """States a short time later, or earlier, each of its own start."""
+    if not options.free_motion:
+        flow = lambda x, a, b: forced_flow(system, x, a, b, options.on_attitude)  # noqa: E731
+        return jax.vmap(flow)(before, start, end)
+    turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(before.omega, end - start)
+    if options.on_attitude:
+        turn = jax.vmap(multiply)(before.attitude, turn)
+    return State(turn, omega)
+
+
+def _integrated(options: Options, system: Any, first: State, ts: Array, t0: Array) -> State:
+    """A throw from its first state, by `simulate`, or by the motion that was given."""
+    first = State(normalize(first.attitude), first.omega)
+
+    def motion(times: Array) -> State:
+        if options.motion is not None:
+            return options.motion(system, first, times, t0)
+        return simulate(
+            system, first, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
+            adjoint=diffrax.ForwardMode(), max_steps=100_000,
+        ).states  # fmt: skip
+
+    return in_any_order(motion, ts)
+
+
+class _Throw(NamedTuple):
+    """What is a throw's own: (nodes, ...), (samples, ...)."""
+
+    layout: Layout
+    samples: Samples
+    body: Array
+    first: Array  # 1 for the first throw
+
+
+def _picked(state: State, index: Any) -> State:
+    return State(state.attitude[index], state.omega[index])
+
+
+def _seen(
+    options: Options, system: Any, sensors: Any, nodes: State, throw: _Throw
+) -> tuple[list[Array], State]:
+    """What each sensor shows at its times (n, k); states at the ends of the links."""
+    layout, dtype = throw.layout, throw.layout.ts.dtype
+    samples, lags, weights = [], [], []
+    for sensor, part in zip(sensors, throw.samples.parts, strict=True):
+        late, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
+        samples.append(jnp.tile(jnp.arange(part.start, part.stop), late.size))
+        lags.append(jnp.repeat(late.astype(dtype), part.stop - part.start))
+        weights.append(weight.astype(dtype))
+    sample = jnp.concatenate(samples)
+    times, node = layout.ts[sample] - jnp.concatenate(lags), layout.node[sample]
+    if options.shooting or options.free_motion:
+        begin = jnp.concatenate([layout.start[node], layout.start])
+        end = jnp.concatenate([times, layout.end])
+        before = jtu.tree_map(lambda x: jnp.concatenate([x[node], x]), nodes)
+        states = _flow(options, system, before, begin, end)
+        ends = _picked(states, slice(sample.size, None))
+    else:
+        whole = _integrated(options, system, _picked(nodes, 0), layout.ts, layout.start[0])
+        states, ends = _picked(whole, sample), nodes
+        if any(x.memory() is not None for x in sensors):
+            states = _flow(options, system, states, layout.ts[sample], times)
+    shown, first = [], 0
+    for sensor, index, weight in zip(sensors, samples, weights, strict=True):
+        part = slice(first, first + index.size)
+        first = part.stop
+        one = lambda t, q, w, sensor=sensor: sensor.predict(t, State(q, w), system)  # noqa: E731
+        values = jax.vmap(one)(layout.ts[index], states.attitude[part], states.omega[part])
+        values = values.reshape(weight.size, -1, *values.shape[1:])
+        shown.append(product("l,lnk->nk", weight, values) if weight.size > 1 else values[0])
+    return shown, ends
+
+
+def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
+    """Residuals of a throw (n, D) in units of their noise; zero where nothing was seen."""
+    parts, width = [], samples.weight.shape[-1]
+    for sensor, values, predicted in zip(sensors, samples.values, shown, strict=True):
+        if predicted.shape != values.shape:
+            raise ValueError(
+                f"Argument `function` of `{type(sensor).__name__}` must return shape "
+                f"{values.shape[1:]}, but it returns {predicted.shape[1:]}."
+            )
+        part = jax.vmap(sensor.difference)(values, predicted)
+        parts.append(jnp.pad(part, ((0, 0), (0, width - part.shape[1]))))
+    rows = product("nij,nj->ni", samples.whitener, jnp.concatenate(parts))
+    if any(x.largest() is not None for x in sensors):
+        # A saturated number says "at least": the square is -2 log of its probability.
+        beyond = jnp.where(samples.sign != 0, jnp.clip(samples.sign * rows, -1e3, _SURE), 0.0)
+        likely = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
+        rows = jnp.where(samples.sign != 0, -samples.sign * likely, rows)
+    return rows * samples.weight
+
+
+def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
+    """Values of each record (throws, n, k) as its sensor would show them, one body for all."""
+    unknowns = problem.unknowns
+    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves, 0)
+
+    def throw(attitude: Array, omega: Array, data: _Throw) -> list[Array]:
+        return _seen(problem.options, system, sensors, State(attitude, omega), data)[0]
+
+    data = _Throw(layout, problem.samples, problem.bodies, problem.bodies)
+    return jax.vmap(throw)(point.attitude, point.omega, data)
+
+
+def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows, Links]]:
+    """Residuals and links, with their derivatives in the border and the states of the nodes.
+
+    Rows are those of the samples; then each number that is known beforehand has one; last come the
+    numbers themselves, which hold a fit near its start.
+    """
+    options, unknowns = problem.options, problem.unknowns
+    local, width = 6 if options.on_attitude else 3, problem.samples.weight.shape[-1]
+
+    def residuals(
+        moves: tuple[Array, Array, Array], point: Point, leaves: Any, throw: _Throw
+    ) -> tuple[Array, Array]:
+        """Of one throw: its rows and gaps."""
+        numbers, own, move = moves
+        system, *sensors = unknowns.parts(numbers, own, leaves, throw.body)
+        attitude = point.attitude
+        if options.on_attitude:
+            attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
+        nodes = State(attitude, point.omega + move[:, :3])
+        shown, ends = _seen(options, system, sensors, nodes, throw)
+        held = numbers[unknowns.slices["scale"].stop :]
+        shared = throw.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
+        known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
+        rows = [whitened(sensors, throw.samples, shown), jnp.pad(known, ((0, 0), (0, width - 1)))]
+        gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
+        if options.on_attitude:
+            following = jnp.roll(point.attitude, -1, axis=0)
+            turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(following, ends.attitude)
+            side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
+            gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
+        return jnp.concatenate(rows), jnp.where(throw.layout.linked[:, None], gap, 0.0)
+
+    def throw(point: Point, leaves: Any, data: _Throw) -> tuple[Any, Any]:
+        """Rows and gaps of one throw, then their derivatives."""
+        border = [point.own.size, point.own.size + point.numbers.size]
+        still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
+        start = point.numbers, point.own, still
+
+        def along(direction: Array) -> Any:
+            own, numbers, state = jnp.split(direction, border)
+            change = numbers, own, jnp.broadcast_to(state, still.shape)
+            return jax.jvp(lambda x: residuals(x, point, leaves, data), (start,), (change,))
+
+        directions = jnp.eye(border[1] + local, dtype=still.dtype)
+        (rows, gap), (d_rows, d_gap) = jax.vmap(along, out_axes=(None, -1))(directions)
+        node = jnp.pad(data.layout.node, (0, rows.shape[0] - data.layout.node.size))
+        b = border[1]
+        rows = Rows(rows, d_rows[..., :b], d_rows[..., b:], node)
+        return rows, Links(gap, d_gap[..., :b], d_gap[..., b:])
+
+    def evaluate(point: Point) -> tuple[Rows, Links]:
+        first = jnp.zeros(point.own.shape[0], point.omega.dtype).at[0].set(1)
+        data = _Throw(layout, problem.samples, problem.bodies, first)
+        leaves = tuple(0 if own else None for own in unknowns.stacked)
+        of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
+        return jax.vmap(throw, in_axes=(of_throws, leaves, 0))(point, unknowns.leaves, data)
+
+    return evaluate
