@@ -50,7 +50,8 @@ def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     if isinstance(state, State):
         attitude = jnp.broadcast_to(state.attitude, (throws, 4))
         state = State(attitude, jnp.broadcast_to(state.omega, (throws, 3)))
-    return None if inertia is None else as_tensor(jnp.asarray(inertia)), state
+    tensor = None if inertia is None else as_tensor(jnp.asarray(inertia))
+    return tensor, state  # type: ignore[return-value]
 
 
 def refuse(
