@@ -43,12 +43,14 @@ class LinearStart(Readable):
             the samples do not tell.
         result: `jrigid.RESULTS.successful`, or what is wrong with the samples.
         momentum: That in space which belongs to the tensor, from `momentum`; else None.
+        covariance: Of (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), from `gyrostat`; else None.
     """
 
     inertia: Matrix
     singular_values: Float[Array, " n"]
     result: Any
     momentum: Vector | None = None
+    covariance: Float[Array, "6 6"] | None = None
 
 
 def _momentum_matrix(omega: Array) -> Array:
@@ -254,9 +256,9 @@ def _momentum(ts: Array, attitudes: Array, omegas: Array) -> LinearStart:
 
 
 def gyrostat(
-    ts: Real[ArrayLike, " n"],
-    omegas: Real[ArrayLike, "n 3"],
-    rotor: Real[ArrayLike, "n 3"],
+    ts: Real[ArrayLike, "*throws n"],
+    omegas: Real[ArrayLike, "*throws n 3"],
+    rotor: Real[ArrayLike, "*throws n 3"],
     *,
     windows: int = 128,
     radians: float = 3.0,
@@ -264,18 +266,20 @@ def gyrostat(
 ) -> LinearStart:
     """The whole inertia tensor, scale included, from rates beside a rotor of known momentum.
 
-    The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares.
+    The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares over all
+    throws. Short windows do best where something smooth is not modelled.
 
     Args:
-        ts: Times, increasing [s].
+        ts: Times, increasing [s]; of throws, shorter ones end in NaN.
         omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out.
         rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s]; likewise.
-        windows: How many, spread over the record.
+        windows: How many, spread over each record.
         radians: Length of a window, in radians turned; at least eight samples.
         throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
-        The tensor [kg m^2] and singular values.
+        The tensor [kg m^2], singular values, and errors by how throws, or the parts of a single
+        one, scatter.
 
     Raises:
         ValueError: Fewer than four samples.
@@ -293,23 +297,64 @@ def gyrostat(
     """
     ts, omegas, rotor = float_arrays(ts, omegas, rotor)
     check_shape("rotor", rotor, (*ts.shape, 3))
+    check_shape("omegas", omegas, (*ts.shape, 3))
+    if ts.ndim == 1:
+        ts, omegas, rotor = ts[None], omegas[None], rotor[None]
+    check_shape("ts", ts, (None, None))
     found = _gyrostat(ts, omegas, rotor, whole_number("windows", windows), radians)
-    return settle(found, throw, lambda: _samples(ts, omegas, rotor)[0])
+
+    def findings() -> Findings:
+        found = Findings()
+        for t, w, h in zip(ts, omegas, rotor, strict=True):
+            each = _samples(_filled(t), w, h)[0]
+            for x in each.all:
+                found.require(~x.failed, RESULTS.invalid_state, x.message, x.value)
+        return found
+
+    return settle(found, throw, findings)
+
+
+def _filled(ts: Array) -> Array:
+    """Times with an end of NaN, which pads, filled up."""
+    last = jnp.nanmax(jnp.where(jnp.isfinite(ts), ts, -jnp.inf))
+    late = jnp.arange(ts.size, dtype=ts.dtype) * jnp.maximum(jnp.abs(last), 1.0)
+    return jnp.where(jnp.isnan(ts), last + late, ts)
 
 
 @eqx.filter_jit
 def _gyrostat(ts: Array, omegas: Array, rotor: Array, windows: int, radians: float) -> LinearStart:
-    findings, known, (ts, omegas, rotor) = _samples(ts, omegas, rotor)
-    rows, (bump, fall) = _weak_rows(omegas, ts, known, windows, radians)
-    given = product("wn,ni->wi", fall, rotor)
-    given = given + product("wn,ni->wi", bump, jnp.cross(omegas, rotor))
+    def of_throw(ts: Array, omegas: Array, rotor: Array) -> tuple[Any, ...]:
+        # Padding repeats the last time: such samples weigh nothing.
+        findings, known, (_, omegas, rotor) = _samples(_filled(ts), omegas, rotor)
+        ts = jnp.where(jnp.isnan(ts), jnp.nanmax(ts), ts)
+        rows, (bump, fall) = _weak_rows(omegas, ts, known, windows, radians)
+        given = product("wn,ni->wi", fall, rotor)
+        given = given + product("wn,ni->wi", bump, jnp.cross(omegas, rotor))
+        return findings.result._value, rows, -given.reshape(-1)
+
+    codes, rows, right = jax.vmap(of_throw)(ts, omegas, rotor)
     size = jnp.max(jnp.abs(jax.lax.stop_gradient(rows)))
     size = jnp.where(size > 0, size, 1.0)
-    left, values, right = jnp.linalg.svd(rows / size, full_matrices=False)
-    projected = product("ni,n->i", left, -given.reshape(-1) / size)
+    flat = rows.reshape(-1, 6) / size
+    left, values, vt = jnp.linalg.svd(flat, full_matrices=False)
     told = values > jnp.finfo(values.dtype).eps * 64 * values[0]
-    six = product("ij,i->j", right, jnp.where(told, projected / jnp.where(told, values, 1.0), 0.0))
-    return _answer(findings, _tensor(six), values)
+    inverse = jnp.where(told, 1 / jnp.where(told, values, 1.0), 0.0)
+    pseudo = product("kj,k,rk->jr", vt, inverse, left)
+    six = product("jr,r->j", pseudo, right.reshape(-1) / size)
+    misfit = right.reshape(-1) / size - product("rj,j->r", flat, six)
+    # Errors of neighbouring windows hang together: throws, or eight parts of one, are independent.
+    clusters = codes.shape[0] if codes.shape[0] > 1 else 8
+    whole = misfit.size // clusters * clusters
+    shift = (pseudo * misfit[None])[:, :whole].reshape(6, clusters, -1).sum(axis=-1)
+    covariance = product("ik,jk->ij", shift, shift) * clusters / (clusters - 1)
+    bad = jnp.max(codes)
+    start = LinearStart(_tensor(six), values, _result_of(bad), None, covariance)
+    return nan_where(bad != 0, start)
+
+
+def _result_of(code: Array) -> Any:
+    result: Any = RESULTS.successful
+    return eqx.tree_at(lambda x: x._value, result, code)
 
 
 def linear_starts(

@@ -55,9 +55,12 @@ class Sampled(Readable):
             return (values[j + 1] - values[j]) / jnp.where(span > 0, span, 1.0), span
 
         (before, a), (within, b), (after, c) = (steepness(i + k) for k in (-1, 0, 1))
-        # The slope at an end is that of the chord.
-        left = jnp.where(a > 0, (b * before + a * within) / jnp.where(a > 0, a + b, 1.0), within)
-        right = jnp.where(c > 0, (c * within + b * after) / jnp.where(c > 0, b + c, 1.0), within)
+        # Parabolas through three samples; at an end that of the last three, of two a chord.
+        ab, bc = (jnp.where(x > 0, x + b, 1.0) for x in (a, c))
+        bend_before = jnp.where(a > 0, (within - before) / ab, 0.0)
+        bend_after = jnp.where(c > 0, (after - within) / bc, 0.0)
+        left = within - b * jnp.where(a > 0, bend_before, bend_after)
+        right = within + b * jnp.where(c > 0, bend_after, bend_before)
         u = jnp.where(b > 0, (t - ts[i]) / jnp.where(b > 0, b, 1.0), 0.0)
         bend = u * (1 - u) * b
         value = values[i] + u * b * within
