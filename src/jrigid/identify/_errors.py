@@ -29,7 +29,7 @@ from jrigid.identify._stages import (
 _TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
 _WHITE = 6.0  # standard deviations of the correlation of neighbouring residuals
 _COLOURED = 0.25  # ... and its size, for residuals that are no noise
-_EXPLAINED = 0.1  # of the square of the record, beyond which a misfit is none of the model's
+_EXPLAINED = 0.3  # of the square of the record: one left over by more is not followed
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
