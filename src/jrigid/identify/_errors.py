@@ -70,7 +70,8 @@ def in_rows(rows: Rows, own: int) -> tuple[Array, Array, Array]:
     """Derivatives (throws, rows, ...) in the numbers, and in what is a throw's; and residuals."""
     jl = jnp.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
     parts = rows.of_border[..., own:], jl, rows.residual[..., None]
-    jg, jl, r = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in parts)
+    throws, count, width = rows.residual.shape
+    jg, jl, r = (x.reshape(throws, count * width, x.shape[-1]) for x in parts)
     return jg, jl, r[..., 0]
 
 
@@ -99,7 +100,8 @@ def told_by_rows(rows: Rows, own: int, units: Array) -> tuple[Told, Array]:
 
     r, half, follow, of_state, scores = jax.vmap(throw)(jg, jl, residual)
     local = product("tik,tjk->tij", half, half)
-    return _told(r.reshape(-1, size), local, follow, of_state, units), scores
+    r = r.reshape(r.shape[0] * r.shape[1], size)
+    return _told(r, local, follow, of_state, units), scores
 
 
 def told_by_equations(blocks: Blocks, own: int, units: Array) -> tuple[Told, Array]:
