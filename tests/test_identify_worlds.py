@@ -175,3 +175,28 @@ def test_gyrostat_takes_many_throws_and_states_its_errors(rng):
     assert np.all((errors > 1e-7) & (errors < 5e-5))
     with pytest.raises(RuntimeError, match="increasing"):
         identify.gyrostat(ts[:, ::-1], values, momenta)
+
+
+# The posterior
+
+
+def test_the_log_density_has_the_fit_s_minimum_and_curvature(rng):
+    """Its gradient at the fit is that of the priors' Jacobians, small beside the errors."""
+    motion = jr.free_rotation(TENSOR, jr.State(np.array([1.0, 0, 0, 0]), OMEGA), TS)
+    values = np.asarray(motion.omega) + 1e-4 * rng.normal(size=(100, 3))
+    free = lambda _, gyro: identify.prior(gyro.bias, 0.02)  # noqa: E731
+    found = identify.fit(BLIND, identify.Rates(TS, values, 1e-4), free=free)
+    density = identify.log_density(found)
+    both = quick_jit(lambda x: (jax.grad(density.function)(x), jax.hessian(density.function)(x)))
+    slope, curvature = both(density.start)
+    errors = np.sqrt(np.diagonal(density.covariance))
+    assert np.all(np.abs(slope) * errors < 1e-2)
+    inverse = np.linalg.inv(-np.asarray(curvature))
+    np.testing.assert_allclose(inverse, density.covariance, atol=0.02 * errors.max() ** 2)
+    np.testing.assert_allclose(np.diagonal(inverse), errors**2, rtol=0.02)
+    record = identify.Rates(TS, values, 1e-4)
+    smoothed = identify.identifiability(
+        jr.RigidBody(TENSOR), jr.State(np.array([1.0, 0, 0, 0]), OMEGA), record
+    )
+    told = identify.log_density(smoothed)  # a plan has a density too
+    assert told.start.shape == (8,)

@@ -58,7 +58,7 @@ NOTHING_TO_CALL = {
     "identify.Flat", "identify.FunctionSensor", "identify.Gyro", "identify.LogCholesky",
     "identify.Magnetometer", "identify.MomentumSensor", "identify.Moments", "identify.Observed",
     "identify.Rates", "identify.Record", "identify.Symmetric", "identify.Tensor", "identify.Top",
-    "identify.each", "identify.prior", "stability.Linearization", "stability.Modes",
+    "identify.each", "identify.prior", "identify.LogDensity", "identify.log_density", "stability.Linearization", "stability.Modes",
     "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
     "stability.STABILITY", "stability.ORDER", "stability.REGIONS",

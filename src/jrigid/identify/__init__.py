@@ -21,6 +21,8 @@ from jrigid.identify._records import Rates as Rates
 from jrigid.identify._records import Record as Record
 from jrigid.identify._result import FitResult as FitResult
 from jrigid.identify._result import Status as Status
+from jrigid.identify._sample import LogDensity as LogDensity
+from jrigid.identify._sample import log_density as log_density
 from jrigid.identify._sensors import AbstractSensor as AbstractSensor
 from jrigid.identify._sensors import Accelerometer as Accelerometer
 from jrigid.identify._sensors import AttitudeSensor as AttitudeSensor

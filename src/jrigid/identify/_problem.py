@@ -184,40 +184,63 @@ def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
     return jax.vmap(throw)(point.attitude, point.omega, data)
 
 
-def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows, Links]]:
-    """Residuals and links, with their derivatives in the border and the states of the nodes.
+def _of_throw(
+    problem: Problem, moves: tuple[Array, Array, Array], point: Point, leaves: Any, throw: _Throw
+) -> tuple[Array, Array]:
+    """Rows and gaps of one throw, of numbers, own numbers and states moved from those of a point.
 
     Rows are those of the samples; then each number that is known beforehand has one; last come the
     numbers themselves, which hold a fit near its start.
     """
-    options, unknowns = problem.options, problem.unknowns
-    local, width = 6 if options.on_attitude else 3, problem.samples.weight.shape[-1]
+    options, unknowns, (numbers, own, move) = problem.options, problem.unknowns, moves
+    system, *sensors = unknowns.parts(numbers, own, leaves, throw.body)
+    attitude = point.attitude
+    if options.on_attitude:
+        attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
+    nodes = State(attitude, point.omega + move[:, :3])
+    shown, ends = _seen(options, system, sensors, nodes, throw)
+    held = numbers[unknowns.slices["scale"].stop :]
+    shared = throw.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
+    known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
+    width = throw.samples.weight.shape[-1]
+    rows = [whitened(sensors, throw.samples, shown), jnp.pad(known, ((0, 0), (0, width - 1)))]
+    gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
+    if options.on_attitude:
+        following = jnp.roll(point.attitude, -1, axis=0)
+        turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(following, ends.attitude)
+        side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
+        gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
+    return jnp.concatenate(rows), jnp.where(throw.layout.linked[:, None], gap, 0.0)
 
-    def residuals(
-        moves: tuple[Array, Array, Array], point: Point, leaves: Any, throw: _Throw
-    ) -> tuple[Array, Array]:
-        """Of one throw: its rows and gaps."""
-        numbers, own, move = moves
-        system, *sensors = unknowns.parts(numbers, own, leaves, throw.body)
-        attitude = point.attitude
-        if options.on_attitude:
-            attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
-        nodes = State(attitude, point.omega + move[:, :3])
-        shown, ends = _seen(options, system, sensors, nodes, throw)
-        held = numbers[unknowns.slices["scale"].stop :]
-        shared = throw.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
-        known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
-        rows = [whitened(sensors, throw.samples, shown), jnp.pad(known, ((0, 0), (0, width - 1)))]
-        gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
-        if options.on_attitude:
-            following = jnp.roll(point.attitude, -1, axis=0)
-            turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(following, ends.attitude)
-            side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
-            gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
-        return jnp.concatenate(rows), jnp.where(throw.layout.linked[:, None], gap, 0.0)
 
-    def throw(point: Point, leaves: Any, data: _Throw) -> tuple[Any, Any]:
-        """Rows and gaps of one throw, then their derivatives."""
+def _over_throws(function: Callable[..., Any], problem: Problem, layout: Layout) -> Any:
+    """A function of a throw's point, arrays and data, and of moves, over all throws."""
+    stacked = tuple(0 if own else None for own in problem.unknowns.stacked)
+    first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
+    data = _Throw(layout, problem.samples, problem.bodies, first)
+    of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
+
+    def over(point: Point, *moves: Array) -> Any:
+        axes = of_throws, stacked, 0, *(0 for _ in moves)
+        return jax.vmap(function, in_axes=axes)(point, problem.unknowns.leaves, data, *moves)
+
+    return over
+
+
+def rows_at(problem: Problem, layout: Layout) -> Callable[[Point, Array], Array]:
+    """Rows (throws, n, D) at a point, its states (throws, nodes, local) moved."""
+
+    def throw(point: Point, leaves: Any, data: _Throw, move: Array) -> Array:
+        return _of_throw(problem, (point.numbers, point.own, move), point, leaves, data)[0]
+
+    return _over_throws(throw, problem, layout)
+
+
+def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows, Links]]:
+    """Rows and links, with their derivatives in the border and the states of the nodes."""
+    local = 6 if problem.options.on_attitude else 3
+
+    def throw(point: Point, leaves: Any, data: _Throw) -> tuple[Rows, Links]:
         border = [point.own.size, point.own.size + point.numbers.size]
         still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
         start = point.numbers, point.own, still
@@ -225,20 +248,13 @@ def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows
         def along(direction: Array) -> Any:
             own, numbers, state = jnp.split(direction, border)
             change = numbers, own, jnp.broadcast_to(state, still.shape)
-            return jax.jvp(lambda x: residuals(x, point, leaves, data), (start,), (change,))
+            moved = lambda x: _of_throw(problem, x, point, leaves, data)  # noqa: E731
+            return jax.jvp(moved, (start,), (change,))
 
         directions = jnp.eye(border[1] + local, dtype=still.dtype)
         (rows, gap), (d_rows, d_gap) = jax.vmap(along, out_axes=(None, -1))(directions)
         node = jnp.pad(data.layout.node, (0, rows.shape[0] - data.layout.node.size))
-        b = border[1]
-        rows = Rows(rows, d_rows[..., :b], d_rows[..., b:], node)
-        return rows, Links(gap, d_gap[..., :b], d_gap[..., b:])
+        of_border, of_state = jnp.split(d_rows, border[1:], axis=-1)
+        return Rows(rows, of_border, of_state, node), Links(gap, *jnp.split(d_gap, border[1:], -1))
 
-    def evaluate(point: Point) -> tuple[Rows, Links]:
-        first = jnp.zeros(point.own.shape[0], point.omega.dtype).at[0].set(1)
-        data = _Throw(layout, problem.samples, problem.bodies, first)
-        leaves = tuple(0 if own else None for own in unknowns.stacked)
-        of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
-        return jax.vmap(throw, in_axes=(of_throws, leaves, 0))(point, unknowns.leaves, data)
-
-    return evaluate
+    return _over_throws(throw, problem, layout)

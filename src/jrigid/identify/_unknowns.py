@@ -95,6 +95,11 @@ class AbstractSought(Readable):
         square = jnp.einsum("...n,nm,...m->...", slopes, covariance, slopes)
         return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
 
+    def log_volume(self, x: Array) -> Array:
+        """Logarithm of the volume of arrays that a volume of numbers makes."""
+        slopes = jax.jacfwd(self.value)(x).reshape(self.base.size, self.size)
+        return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
+
     def prior_rows(self, x: Array) -> Array:
         """What is known of it beforehand, as residuals."""
         if self.sigma is None:

@@ -1,0 +1,113 @@
+"""The posterior of a fit, for samplers of others."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jrigid._checks import demand
+from jrigid._numerics import product
+from jrigid._types import Scalar
+from jrigid.dynamics import State
+from jrigid.identify._layout import whole
+from jrigid.identify._problem import Problem, rows_at
+from jrigid.identify._result import FitResult
+from jrigid.identify._smoother import Point
+from jrigid.simulate import simulate
+
+
+class LogDensity(NamedTuple):
+    """A posterior density and where and how to sample it.
+
+    Attributes:
+        function: Logarithm of the density, but for a constant, of a position.
+        start: The position of the fit: its numbers, then, for each throw, its own numbers and the
+            moves of its state from that of the fit, zero.
+        covariance: That of the fit: the inverse of a mass matrix.
+    """
+
+    function: Callable[[Array], Scalar]
+    start: Float[Array, " size"]
+    covariance: Float[Array, "size size"]
+
+
+def _simulated(system: Any, state: State, ts: Array, t0: Array) -> State:
+    """A motion with derivatives in reverse mode."""
+    return simulate(system, state, ts, t0=t0, throw=False).states
+
+
+def log_density(result: FitResult) -> LogDensity:
+    """The posterior of a fit as a function without bounds, for blackjax, numpyro and their like.
+
+    Prior: what `prior` said in `free`; apart from that flat in the tensor (of a fixed trace, or,
+    where the scale is sought, in the logarithm of the scale too), in the arrays picked, and in the
+    states: the logarithms of the Jacobians that belong to the numbers are in the density. A record that fits two bodies, the mirror one, or spins about any axis, has two modes: a sampler
+    that starts at a fit stays in its own.
+
+    Args:
+        result: A single fit without an unmodelled torque. A noise that was not stated is as large
+            as the residuals say.
+
+    Raises:
+        ValueError: A fit with an unmodelled torque.
+
+    Gradients: of all modes.
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr
+    >>> record = jr.datasets.gyro_example()
+    >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+    >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+    >>> density = jr.identify.log_density(found)
+    >>> print(density.start.shape, bool(jnp.isfinite(density.function(density.start))))
+    (8,) True
+    """
+    problem, options = result.problem, result.problem.options
+    demand(
+        not options.dense,
+        "Argument `result` must be of a fit without an unmodelled torque, but it is not.",
+    )
+    motion = options.motion
+    if not options.free_motion and motion is None:
+        motion = _simulated
+    options = options._replace(shooting=False, nodes=1, motion=motion)
+    problem = Problem(options, problem.unknowns, problem.samples, problem.bodies, problem.noise)
+    unknowns, layout = problem.unknowns, whole(problem.samples, 1, result.t0)
+    states = result.state.attitude[:, None], result.state.omega[:, None]
+    size, (throws, own) = result.numbers.size, result.own_numbers.shape
+    local, rows_of = 6 if options.on_attitude else 3, rows_at(problem, layout)
+    weight = jnp.where(result.kept, 1.0, 0.0)
+    weight = jnp.pad(weight, ((0, 0), (0, problem.known - problem.held)), constant_values=1.0)
+
+    def function(position: Array) -> Array:
+        numbers, rest = position[:size], position[size:].reshape(throws, own + local)
+        point = Point(numbers, rest[:, :own], *states)
+        rows = rows_of(point, rest[:, None, own:])[:, : weight.shape[1]]
+        chi_square = jnp.sum(weight[..., None] * rows**2)
+        return -0.5 * chi_square / result.inflation + _log_jacobian(numbers, rest[:, :own])
+
+    def _log_jacobian(numbers: Array, own: Array) -> Array:
+        total = jnp.zeros((), numbers.dtype)
+        for x in unknowns.sought:
+            if not x.own:
+                total = total + x.log_volume(numbers[unknowns.slices[x.name]])
+        end = 0
+        for x in unknowns.own:
+            total = total + jnp.sum(jax.vmap(x.log_volume)(own[:, end : end + x.size]))
+            end += x.size
+        shape = slice(0, unknowns.slices["shape"].stop)
+        if shape.stop:
+            slopes = jax.jacfwd(lambda p: unknowns.inertia(numbers.at[shape].set(p)))(
+                numbers[shape]
+            )
+            slopes = slopes.reshape(9, shape.stop) / jnp.trace(unknowns.inertia(numbers))
+            total = total + 0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]
+        return total
+
+    parts = [jnp.concatenate([x, jnp.zeros(local)]) for x in result.own_numbers]
+    order = jnp.arange(throws * (own + local)).reshape(throws, -1)
+    order = jnp.roll(order, own, axis=1).reshape(-1)  # own numbers come before the state here
+    order = jnp.concatenate([jnp.arange(size), size + order])
+    covariance = result.covariance[order][:, order]
+    return LogDensity(function, jnp.concatenate([result.numbers, *parts]), covariance)
