@@ -43,7 +43,8 @@ def log_density(result: FitResult) -> LogDensity:
 
     Prior: what `prior` said in `free`; apart from that flat in the tensor (of a fixed trace, or,
     where the scale is sought, in the logarithm of the scale too), in the arrays picked, and in the
-    states: the logarithms of the Jacobians that belong to the numbers are in the density. A record that fits two bodies, the mirror one, or spins about any axis, has two modes: a sampler
+    states: the logarithms of the Jacobians that belong to the numbers are in the density. A record
+    that fits two bodies, the mirror one, or spins about any axis, has two modes: a sampler
     that starts at a fit stays in its own.
 
     Args:
