@@ -253,7 +253,8 @@ def _normalised(record: Record, guess: Array) -> tuple[Array, ...]:
         whitener = eye / jnp.where(known, sigma, 1.0)[..., None].astype(dtype)
     largest, sign = record.sensor.largest(), jnp.zeros(known.shape, dtype)
     if largest is not None:
-        beyond = known & (jnp.abs(values) >= largest.astype(dtype) * (1 - 1e-6))
+        most = jnp.broadcast_to(largest.astype(dtype) * (1 - 1e-6), values.shape)
+        beyond = known & (jnp.abs(values) >= most)
         sign = jnp.where(beyond, jnp.sign(values), 0.0)
     return record.ts, values, whitener, known.astype(dtype), sign
 

@@ -49,6 +49,7 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     BAD_INPUT = "The observations, or another argument, are not usable."
 
 
+_FAR = 1.0  # a change of a number beyond which the tensor is another one
 # An error above this, in natural units, and a direction is not told.
 LARGEST_ERROR = 0.3
 
@@ -193,13 +194,16 @@ class FitResult(eqx.Module):
         """
         size = self.numbers.size
         values, axes = jnp.linalg.eigh(self.numbers_covariance)
-        steps = product("ij,j->ji", axes, jnp.sqrt(jnp.maximum(values, 0.0) * size))
+        sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
+        near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
+        steps = product("ij,j->ji", axes, near)
         here = function(self.unknowns.inertia(self.numbers, self.index))
 
         def move(step: Array) -> Array:
             return function(self.unknowns.inertia(self.numbers + step, self.index)) - here
 
         moves = jax.vmap(move)(jnp.concatenate([steps, -steps]))
+        moves = product("ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2))
         return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
 
     @property
