@@ -1,0 +1,610 @@
+"""fit() on records that mislead: it is right, or says what is wrong. The records are of worlds."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+import jrigid as jr
+from jrigid import identify
+from jrigid.identify import Status
+
+BLIND = jr.RigidBody(np.ones(3))
+TS = np.arange(200) * 0.3  # ten turns at a radian a second, twenty samples each
+MOMENTS = np.array([1.0, 1.7, 2.3])
+FIVE = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
+SIX = (*FIVE, (2, 2))
+SAYS_WHY = (Status.UNIDENTIFIABLE, Status.MISFIT, Status.AT_BOUNDARY)
+
+
+def body_of(rng, moments=MOMENTS):
+    """Inertia of mean moment 1, its axes at random."""
+    axes = worlds.random_axes(rng)
+    tensor = axes @ np.diag(moments) @ axes.T
+    tensor = (tensor + tensor.T) / 2
+    return 3 * tensor / np.trace(tensor)
+
+
+def spin_of(rng, tensor, size=1.0, off=0.5):
+    """Rates half way between an axis and any direction."""
+    axes = np.linalg.eigh(tensor)[1]
+    direction = axes @ (np.array([0.5, 1.0, 0.4]) + off * rng.uniform(-0.5, 0.5, 3))
+    return size * direction / np.linalg.norm(direction)
+
+
+def seen(rng, tensor, ts=TS, sigma=0.01, omega0=None, **motion):
+    """True motion and readings with noise."""
+    omega0 = spin_of(rng, tensor) if omega0 is None else omega0
+    moved = worlds.tumble(tensor, omega0, ts, rng=rng, **motion)
+    return moved, moved.omega + sigma * rng.normal(size=moved.omega.shape)
+
+
+def fitted(values, sigma=0.01, ts=TS, **options):
+    """Of a free body; compiled once for 200 samples of about ten turns."""
+    return identify.fit(BLIND, identify.Rates(ts, values, sigma), **options)
+
+
+def is_in(found, statuses):
+    return any(bool(found.status == x) for x in statuses)
+
+
+def words(found):
+    """What a fit that is not OK must have: numbers that are, steps, and a word."""
+    text = str(found)
+    assert np.isfinite(float(found.chi_square)), text
+    assert int(np.sum(np.isfinite(found.history))) > 0, text
+    return text
+
+
+def covers(found, tensor, index=0, absolute=False, far=30.0):
+    """The tensor is within the errors stated: chi-square of five numbers, 1e-5; of six."""
+    pairs = SIX if absolute else FIVE
+    body = found.bodies[index]
+
+    def numbers(tensor):
+        return jnp.stack([tensor[i, j] for i, j in pairs])
+
+    slopes = numbers(jax.jacfwd(lambda x: found.unknowns.inertia(x, index))(found.numbers))
+    spread = np.asarray(slopes @ found.numbers_covariance @ slopes.T)
+    error = np.asarray(numbers(body.inertia) - numbers(jnp.asarray(tensor)))
+    distance = error @ np.linalg.solve(spread, error)
+    assert distance < far, f"{distance}\n{found}"
+    true = np.linalg.eigvalsh(tensor)
+    off = np.abs(np.asarray(body.ratios) - true[1:] / true[0])
+    assert np.all(off < 5 * np.asarray(body.ratios_errors)), str(found)
+
+
+def near(found, name, true, far=5.0, least=0.0):
+    """An array that was sought is within its errors."""
+    value, error = (np.asarray(x) for x in found.leaves[name])
+    assert np.all(np.abs(value - true) < far * error + least), f"{value} {error} {true}\n{found}"
+
+
+# Records that tell little, or not what they seem to
+
+
+@pytest.mark.parametrize("kind", ["prolate", "near sphere"])
+def test_a_spin_that_is_nearly_pure_does_not_tell_the_ratios(kind, rng):
+    for _ in range(6):
+        if kind == "prolate":  # about an equatorial axis
+            tensor = body_of(rng, np.array([1.0, 4.295, 4.295]))
+            omega0 = np.linalg.eigh(tensor)[1] @ np.array([0.0, 0.6, 0.8])
+        else:
+            tensor, omega0 = body_of(rng, 1 + 1e-4 * rng.normal(size=3)), None
+        _, values = seen(rng, tensor, omega0=omega0, sigma=0.014)
+        found = fitted(values, 0.014, throw=False)
+        assert is_in(found, (Status.UNIDENTIFIABLE, Status.AT_BOUNDARY)), words(found)
+        assert "spin is pure: ratios not determined" in found.null_directions
+
+
+@functools.cache
+def short_program():
+    """Of up to 64 samples, the rest padding."""
+    return jax.jit(lambda ts, y, s: identify.fit(BLIND, identify.Rates(ts, y, s), throw=False))
+
+
+def short_fit(ts, values, sigma):
+    rest = 64 - len(ts)
+    ts = np.pad(ts, (0, rest), constant_values=np.nan)
+    values = np.pad(values, ((0, rest), (0, 0)), constant_values=np.nan)
+    return short_program()(ts, values, jnp.asarray(sigma))
+
+
+@pytest.mark.slow  # many fits
+def test_prolate_bodies_about_equatorial_axes_are_never_ok_and_wrong(rng):
+    """Their rate along the axis is hardly told, and so is not the ratio."""
+    ts, wrong = np.arange(60.0), []
+    for i in range(100):
+        ratio, tilt = np.exp(rng.uniform([0.3, -9.0], [3.0, -2.0]))
+        noise, step = np.exp(rng.uniform([-6.9, -0.7], [-3.0, 1.1]))
+        tensor = body_of(rng, np.array([1.0, ratio, ratio]))
+        omega0 = np.linalg.eigh(tensor)[1] @ np.array([tilt, 0.6, 0.8])
+        _, values = seen(rng, tensor, ts * step, noise, omega0)
+        found = short_fit(ts * step, values, noise)
+        if is_in(found, (Status.OK,)):
+            try:
+                covers(found, tensor, far=53.0)
+            except AssertionError as error:
+                wrong.append(f"{i}: {ratio} {tilt} {noise} {step} {error}")
+    # FAILS: a fifth. Chi-square grows by less than 9 to bodies that differ by 1 in the number
+    # told least, where the Fisher information says 12 to 1400.
+    assert not wrong, "\n".join(wrong)
+
+
+# Of `worlds.random_record`, each of which tells both ratios to better than a tenth.
+TELLING = (2311, 21639, 21700, 3261, 21489, 2633, 2941, 1079, 3297, 21189, 1653, 21929, 21976, 3485)
+TELLING += (21453, 41, 1520, 1687, 3174, 20312, 2892)
+
+
+@pytest.mark.slow  # many fits
+def test_records_that_tell_all_are_fitted():
+    lost = []
+    for seed in TELLING:
+        record = worlds.random_record(np.random.default_rng([0, 60, seed]), largest=60)
+        found = short_fit(record.ts, record.readings, record.sigma)
+        try:
+            assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), str(found).split(":")[0]
+            covers(found, 3 * record.tensor / np.trace(record.tensor), far=53.0)
+        except AssertionError as error:
+            lost.append(f"{seed}: {str(error)[:40]}")
+    # FAILS for nearly all: most end at a flat body, which they do not from the truth nor, 11 in 12,
+    # from one of a sphere, three prolate and three oblate bodies along the axes of the rates. 21453
+    # (six samples in nine turns) is OK and wrong, by an alias.
+    assert not lost, "\n".join(lost)
+
+
+@pytest.mark.slow  # a long record
+def test_a_prolate_body_about_an_equatorial_axis_for_230_turns(rng):
+    """The issue's: 2.283 +- 0.15 was found, 4.295 is true."""
+    ts = np.arange(1024) * (230 * 2 * np.pi / 1024)
+    program = jax.jit(lambda y: identify.fit(BLIND, identify.Rates(ts, y, 0.014), throw=False))
+    for tilt in (0.0, 0.0, 0.003, 0.003, 0.01, 0.01):
+        tensor = body_of(rng, np.array([1.0, 4.295, 4.295]))
+        omega0 = np.linalg.eigh(tensor)[1] @ np.array([tilt, 0.6, 0.8])
+        _, values = seen(rng, tensor, ts, 0.014, omega0)
+        found = program(values)
+        if is_in(found, (Status.OK,)):
+            # FAILS: OK, I2/I1 = 1.55 +- 0.12. Told is the rate of the slow turn, (1 - I1/I2) times
+            # the rate along the axis, which is not; within 0.25 chi-square is lower or as low.
+            covers(found, tensor)
+        else:
+            assert is_in(found, (Status.UNIDENTIFIABLE, Status.AT_BOUNDARY)), words(found)
+
+
+def test_a_reversed_axis_of_the_gyro_is_that_of_the_mirror_body_which_is_named(rng):
+    tensor = body_of(rng)
+    _, values = seen(rng, tensor)
+    found = fitted(values * np.array([1.0, 1.0, -1.0]))
+    assert is_in(found, (Status.OK,)), words(found)
+    text = str(found)
+    assert "with one axis of the gyro reversed the same record is that of a body" in text
+    _, _, named = text.partition("of a body with ")
+    ratios = [float(part.split(" = ")[1].split()[0]) for part in named.split("\n")[0].split(", ")]
+    np.testing.assert_allclose(ratios, [1.7, 2.3], rtol=0.02)
+
+
+def test_flat_bodies_are_not_told_to_be_unknown_beside_sharp_ratios(rng):
+    for _ in range(6):
+        tensor = worlds.random_body(rng, "flat")
+        _, values = seen(rng, tensor)
+        found = fitted(values, throw=False)
+        text = words(found)
+        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE, Status.AT_BOUNDARY)), text
+        if found.ratios_errors[1] < 0.05 * found.ratios[1]:
+            assert not any("I3/I1" in x for x in found.null_directions), text
+
+
+# The noise that was stated, or not
+
+
+def test_a_noise_stated_a_little_too_small_is_a_misfit_and_no_error(rng):
+    tensor = body_of(rng)
+    _, values = seen(rng, tensor)
+    found = fitted(values, 0.01 / 1.3)
+    assert is_in(found, (Status.MISFIT,)), words(found)
+    covers(found, tensor)
+    honest = fitted(values)
+    np.testing.assert_allclose(found.ratios_errors, honest.ratios_errors, rtol=0.1)
+
+
+def in_space(tensor, omega0, ts):
+    """Rates along axes at rest."""
+    moved = worlds.tumble(tensor, omega0, ts, attitude0=np.array([1.0, 0.0, 0.0, 0.0]))
+    return worlds.turned(moved.attitude, moved.omega)
+
+
+def test_clipped_rates_and_rates_in_space_without_a_noise_stated_are_not_ok(rng):
+    for _ in range(3):
+        tensor = body_of(rng)
+        moved, values = seen(rng, tensor)
+        limit = 0.8 * np.abs(moved.omega).max()
+        found = fitted(np.clip(values, -limit, limit), None, throw=False)
+        text = words(found)
+        assert not is_in(found, (Status.OK,)), text
+        assert "saturated" in text
+        assert "not white" in text
+
+        values = in_space(tensor, moved.omega[0], TS) + 0.01 * rng.normal(size=moved.omega.shape)
+        found = fitted(values, None, throw=False)
+        text = words(found)
+        assert not is_in(found, (Status.OK,)), text
+        assert "not white" in text
+        found = fitted(seen(rng, tensor)[1], None)
+        assert is_in(found, (Status.OK,)), words(found)
+        covers(found, tensor)
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_clipped_gyro_whose_limit_is_given_is_ok(rng):
+    for fraction in (0.9, 0.75):
+        tensor = body_of(rng)
+        moved, values = seen(rng, tensor)
+        limit = fraction * np.abs(moved.omega).max()
+        # FAILS with jax_numpy_rank_promotion="raise": `samples_of` compares (1, 200, 3) to (3,).
+        record = identify.Record(
+            identify.Gyro(limit=limit), TS, np.clip(values, -limit, limit), 0.01
+        )
+        found = identify.fit(BLIND, record)
+        assert is_in(found, (Status.OK,)), words(found)
+        covers(found, tensor)
+
+
+@pytest.mark.slow  # a program of its own
+def test_robust_does_not_throw_all_away_where_the_model_is_wrong(rng):
+    """A torque moves the rates by 65 times the noise."""
+    tensor = body_of(rng)
+    omega0 = spin_of(rng, tensor)
+    torque = worlds.wobble_torque(rng, tensor, omega0, 0.1)
+    moved, _ = seen(rng, tensor, omega0=omega0, torque=torque)
+    free = worlds.tumble(tensor, omega0, TS)
+    plain = fitted(moved.omega, None, throw=False)
+    error = float(jnp.sqrt(plain.reduced_chi_square)) * 0.02
+    sigma = error / 65 if error > 1e-3 else np.std(moved.omega - free.omega) / 65
+    values = moved.omega + sigma * rng.normal(size=moved.omega.shape)
+    found = fitted(values, sigma, loss="robust", throw=False)
+    text = words(found)
+    assert int(np.sum(found.kept[0])) > 100, text
+    assert int(found.degrees_of_freedom) > 100, text
+    assert not is_in(found, (Status.OK,)), text
+    assert "times the stated noise" in text
+
+
+def test_blocks_of_residuals_dealt_out_anew_give_errors(rng):
+    tensor = body_of(rng)
+    found = fitted(seen(rng, tensor)[1])
+    rows = found.rows()
+    shifts = identify.block_bootstrap(*rows, 10, jax.random.key(0), samples=300)
+    spread = np.std(np.asarray(shifts), axis=0)
+    stated = np.sqrt(np.diagonal(np.asarray(found.covariance)))
+    assert np.all(spread > 0.5 * stated)
+    assert np.all(spread < 1.5 * stated)
+    with pytest.raises(ValueError, match="block"):
+        identify.block_bootstrap(*rows, 200, jax.random.key(0))
+
+
+# Torques
+
+
+CONSTANT = np.array([0.02, -0.01, 0.015])
+
+
+def pushed(tensor, drag=0.02):
+    del tensor
+    return lambda _t, w: CONSTANT - drag * w
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_known_thruster_and_a_known_drag_tell_the_tensor_blind(rng):
+    """Or it is said why they do not."""
+    system = jr.RigidBody(np.ones(3), jr.torques.Constant(CONSTANT) + jr.torques.LinearDrag(0.02))
+    ended = []
+    for _ in range(5):
+        tensor = rng.uniform(0.5, 2.0) * body_of(rng, np.exp(rng.uniform(0, 0.6, 3)))
+        _, values = seen(rng, tensor, torque=pushed(tensor))
+        found = identify.fit(system, identify.Rates(TS, values, 0.01), scale="known")
+        text = words(found)
+        assert is_in(found, (Status.OK, *SAYS_WHY)), text
+        if is_in(found, (Status.OK,)):
+            covers(found, tensor, absolute=True)
+        ended.append(is_in(found, (Status.OK,)))
+    assert sum(ended) >= 3
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_drag_that_is_not_there_ends_at_none(rng):
+    """Noise alone would make it negative half of the time."""
+    system = jr.RigidBody(np.ones(3), jr.torques.LinearDrag(0.1))
+    for drag in (0.0, 0.0, 0.001, 0.02):
+        tensor = body_of(rng)
+        _, values = seen(rng, tensor, torque=lambda _t, w, c=drag: -c * w)
+        found = identify.fit(
+            system, identify.Rates(TS, values, 0.01), free=lambda body: body.torque.coefficient,
+        )  # fmt: skip
+        text = words(found)
+        value, error = (float(x) for x in found.leaves["torque.coefficient"])
+        assert value >= 0
+        assert abs(value - drag) < 5 * error + 1e-4, text
+        covers(found, tensor)
+        assert "overall scale, which what is sought of the torque follows" in text
+        if drag > 0.01:
+            assert is_in(found, (Status.OK,)), text
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_drag_sought_as_a_tensor_stays_one(rng):
+    system = jr.RigidBody(np.ones(3), jr.torques.LinearDrag(0.05 * np.eye(3)))
+    for i in range(3):
+        tensor = body_of(rng)
+        drag = 0.02 * body_of(rng, np.array([1.0, 2.0, 3.0]))
+        if i == 2:  # none about one axis
+            drag = worlds.random_axes(rng)
+            drag = 0.02 * drag @ np.diag([0.0, 1.0, 2.0]) @ drag.T
+        torque = lambda _t, w, c=drag: -worlds.times(c, w)  # noqa: E731
+        _, values = seen(rng, tensor, torque=torque, sigma=0.003)
+        found = identify.fit(
+            system, identify.Rates(TS, values, 0.003), free=lambda body: body.torque.coefficient,
+            throw=False,
+        )  # fmt: skip
+        text = words(found)
+        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), text
+        value, error = (np.asarray(x) for x in found.leaves["torque.coefficient"])
+        np.testing.assert_allclose(value, value.T, rtol=1e-12)
+        assert np.linalg.eigvalsh(value)[0] > -1e-12
+        assert np.all(np.abs(value - drag) < 5 * error + 1e-4), f"{value} {error} {drag} {text}"
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_drag_alone_does_not_tell_scale_and_itself(rng):
+    system = jr.RigidBody(np.ones(3), jr.torques.LinearDrag(0.05))
+    tensor = body_of(rng)
+    _, values = seen(rng, tensor, torque=lambda _t, w: -0.02 * w)
+    found = identify.fit(
+        system, identify.Rates(TS, values, 0.01), free=lambda body: body.torque.coefficient,
+        scale="known",
+    )  # fmt: skip
+    text = words(found)
+    assert is_in(found, (Status.UNIDENTIFIABLE,)), text
+    assert any("overall scale" in x for x in found.null_directions), text
+    assert int(np.sum(np.isfinite(found.history))) < 200
+    # FAILS: errors of the ratios are NaN, for `spread` moves the scale by exp(1e8).
+    assert abs(float(found.ratios[1]) - 2.3) < 5 * float(found.ratios_errors[1])
+
+
+# A torque that no model has
+
+
+@pytest.mark.slow  # a program of its own, of many stages
+def test_a_torque_that_no_model_has_is_estimated(rng):
+    """White, then smooth, then none."""
+    for kind in ("white", "smooth", "none"):
+        tensor = body_of(rng)
+        omega0 = spin_of(rng, tensor)
+        torque = worlds.wobble_torque(rng, tensor, omega0, 0.03) if kind == "smooth" else None
+        kick = 0.02 if kind == "white" else 0.0
+        _, values = seen(rng, tensor, omega0=omega0, torque=torque, kick=kick)
+        found = fitted(values, unmodelled="estimate")
+        text = words(found)
+        assert is_in(found, (Status.OK,)), text
+        covers(found, tensor)
+        level, error = float(found.level[0]), float(found.level_errors[0])
+        if kind == "white":
+            assert abs(level - kick) < 5 * error, text
+        if kind == "none":
+            assert level < 3 * error, text
+        if kind == "smooth":
+            assert level > 3 * error, text
+
+
+# Sensors
+
+
+def gyro_of(rng, moved, ts, sigma, **errors):
+    """Readings of a motion on a grid that leads and ends with them."""
+    return worlds.gyro((moved.ts, moved.omega), ts, rng, sigma, **errors)
+
+
+def grid_for(ts, lead=3.0, fine=10):
+    step = (ts[1] - ts[0]) / fine
+    before = int(np.ceil(lead / step))
+    return ts[0] + np.arange(-before, (len(ts) - 1) * fine + 1) * step
+
+
+@pytest.mark.slow  # a program of its own
+@pytest.mark.parametrize("name", ["time_constant", "scale", "bias", "drift"])
+def test_errors_of_a_gyro_are_found(name, rng):
+    true = {"time_constant": 0.2, "scale": 1.02, "bias": 0.02, "drift": 0.001}[name]
+    sensor = identify.Gyro(time_constant=0.05 if name == "time_constant" else None)
+
+    def free(_, gyro):
+        picked = getattr(gyro, name)
+        return identify.prior(picked, 0.05) if name == "bias" else picked
+
+    grid = grid_for(TS)
+    for _ in range(2):
+        tensor = body_of(rng)
+        moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
+        errors = {"matrix": true * np.eye(3)} if name == "scale" else {name: true}
+        values = gyro_of(rng, moved, TS, 0.005, **errors)
+        found = identify.fit(BLIND, identify.Record(sensor, TS, values, 0.005), free=free)
+        assert is_in(found, (Status.OK,)), words(found)
+        covers(found, tensor)
+        # The memory of the filter is a quadrature.
+        near(found, f"gyro.{name}", true)
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_delay_of_a_gyro_alone_is_the_state_s_and_the_ratios_are_told_all_the_same(rng):
+    """Free motion a little later is free motion."""
+    grid = grid_for(TS)
+    for _ in range(6):
+        tensor = body_of(rng)
+        moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
+        values = gyro_of(rng, moved, TS, 0.005, delay=0.15)
+        record = identify.Record(identify.Gyro(delay=0.0), TS, values, 0.005)
+        found = identify.fit(BLIND, record, free=lambda _, gyro: gyro.delay)
+        text = words(found)
+        assert is_in(found, (Status.UNIDENTIFIABLE,)), text
+        assert "gyro delay" in found.null_directions
+        # FAILS for some: errors of the ratios of 0.5 and more, "not determined", for `spread` moves
+        # along the axes of the whole covariance; that of the delay, 1e8 long, has a little of the
+        # shape in it.
+        assert np.all(found.ratios_errors < 0.02), text
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_delay_of_half_a_sample_beside_attitudes(rng):
+    tensor = body_of(rng)
+    grid = grid_for(TS)
+    start = np.array([1.0, 0.0, 0.0, 0.0])
+    moved = worlds.tumble(tensor, spin_of(rng, tensor), grid, attitude0=start)
+    values = gyro_of(rng, moved, TS, 0.005, delay=0.15)
+    at = np.searchsorted(grid, TS - 1e-9)
+    small = 0.01 * rng.normal(size=(len(TS), 3))
+    turn = jax.vmap(lambda q, v: jr.rotation.multiply(q, jr.rotation.exp(v)))
+    looks = turn(moved.attitude[at], small)
+    records = (
+        identify.Record(identify.Gyro(delay=0.0), TS, values, 0.005),
+        identify.Attitudes(TS, looks, 0.01),
+    )
+    found = identify.fit(BLIND, records, free=lambda _, gyro: gyro.delay)
+    assert is_in(found, (Status.OK,)), words(found)
+    covers(found, tensor)
+    near(found, "gyro.delay", 0.15)
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_lever_of_an_accelerometer_beside_a_gyro(rng):
+    lever, sigma = np.array([0.03, -0.05, 0.02]), 0.003
+    tensor = body_of(rng)
+    moved, values = seen(rng, tensor)
+    force = worlds.accelerometer(moved, lever, rng, sigma, bias=0.01)
+    records = (
+        identify.Rates(TS, values, 0.01),
+        identify.Record(identify.Accelerometer(np.zeros(3)), TS, force, sigma),
+    )
+    found = identify.fit(BLIND, records, free=lambda _, __, box: (box.lever, box.bias))
+    assert is_in(found, (Status.OK,)), words(found)
+    covers(found, tensor)
+    near(found, "accelerometer.lever", lever)
+    near(found, "accelerometer.bias", 0.01)
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_magnetometer_of_an_unknown_field_beside_a_gyro(rng):
+    """Its field is in space axes, which the start sets."""
+    field, sigma = np.array([20.0, 5.0, -40.0]), 0.5
+    tensor = body_of(rng)
+    start = np.array([1.0, 0.0, 0.0, 0.0])
+    moved, values = seen(rng, tensor, attitude0=start)
+    back = moved.attitude * np.array([1.0, -1.0, -1.0, -1.0])
+    shown = worlds.turned(back, field) + sigma * rng.normal(size=moved.omega.shape)
+    shown += np.array([3.0, 0.0, -2.0])
+    records = (
+        identify.Rates(TS, values, 0.01),
+        identify.Record(identify.Magnetometer(np.array([1.0, 1.0, -1.0])), TS, shown, sigma),
+    )
+    free = lambda _, __, compass: (compass.field, compass.bias)  # noqa: E731
+    with pytest.raises(ValueError, match="start"):
+        identify.fit(BLIND, records, free=free)
+    found = identify.fit(BLIND, records, free=free, start=jr.State(start, np.zeros(3)))
+    text = words(found)
+    near(found, "magnetometer.bias", np.array([3.0, 0.0, -2.0]))
+    size, _ = found.leaves["magnetometer.field"]
+    assert abs(np.linalg.norm(size) - np.linalg.norm(field)) < 1.0, text
+    # Attitude and field turn together.
+    assert is_in(found, (Status.UNIDENTIFIABLE,)), text
+    assert "magnetometer field" in found.null_directions
+    # FAILS: errors of the ratios are NaN, as above.
+    covers(found, tensor)
+
+
+SHORT = np.arange(60) * 0.3
+SEVERAL = 4
+
+
+def throws_of(rng, tensors, **errors):
+    """A record of each body, three turns, and the gyro's errors, each throw's own if a list."""
+    records = []
+    grid = grid_for(SHORT)
+    for i, tensor in enumerate(tensors):
+        moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
+        own = {k: v[i] if isinstance(v, list) else v for k, v in errors.items()}
+        records.append(identify.Rates(SHORT, gyro_of(rng, moved, SHORT, 0.01, **own), 0.01))
+    return records
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_bias_of_each_throw(rng):
+    tensor, biases = body_of(rng), list(0.05 * rng.normal(size=(SEVERAL, 3)))
+    records = throws_of(rng, [tensor] * SEVERAL, bias=biases)
+    found = identify.fit(BLIND, records, free=lambda _, gyro: identify.each(gyro.bias))
+    assert is_in(found, (Status.OK,)), words(found)
+    covers(found, tensor)
+    near(found, "gyro.bias", np.stack(biases))
+
+
+@pytest.mark.slow  # a program of its own
+def test_several_bodies_share_a_scale_of_the_gyro(rng):
+    tensors = [body_of(rng), body_of(rng, np.array([1.0, 1.3, 1.6]))]
+    records = throws_of(rng, [tensors[i] for i in (0, 1, 0, 1)], matrix=1.03 * np.eye(3))
+    found = identify.fit(BLIND, records, bodies=[0, 1, 0, 1], free=lambda _, gyro: gyro.scale)
+    assert is_in(found, (Status.OK,)), words(found)
+    for i, tensor in enumerate(tensors):
+        covers(found, tensor, i)
+    near(found, "gyro.scale", 1.03)
+
+
+@pytest.mark.slow  # two programs of their own
+@pytest.mark.parametrize("sought", [False, True])
+def test_a_wheel_as_each_throw_recorded_it(sought, rng):
+    """With 1 % of scale and 5 ms of delay in the record, sought or none."""
+    spin, sigma = 5.0, 0.02
+    ts, clock = np.arange(60) * 0.02, np.arange(61) * 0.02
+    tensor = body_of(rng)
+    scale, delay = (1.01, 0.005) if sought else (1.0, 0.0)
+    systems, records = [], []
+    for i in range(3):
+        true, told = worlds.wheel_profile(rng.normal(size=3), 1.5, 0.1 + 0.1 * i, 0.6, scale, delay)
+        moved = worlds.tumble(tensor, spin_of(rng, tensor, spin), ts, wheel=true)
+        values = moved.omega + sigma * rng.normal(size=moved.omega.shape)
+        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
+        systems.append(jr.RigidBody(np.ones(3), wheel))
+        records.append(identify.Rates(ts, values, sigma))
+    free = None
+    if sought:
+        free = lambda body: (  # noqa: E731
+            identify.prior(body.torque.momentum.scale, 0.02), body.torque.momentum.delay
+        )  # fmt: skip
+    found = identify.fit(systems, records, scale="rotor", free=free)
+    text = words(found)
+    assert is_in(found, (Status.OK,)), text
+    covers(found, tensor, absolute=True, far=33.0)
+    if sought:
+        near(found, "torque.momentum.scale", 1 / scale)
+        near(found, "torque.momentum.delay", -delay)
+
+
+@pytest.mark.slow  # a program of its own
+def test_lanes_are_what_they_are_alone(rng):
+    """A bias sought in 64 records at once."""
+    records = []
+    for _ in range(64):
+        tensor = body_of(rng)
+        records.append(seen(rng, tensor, SHORT)[1] + 0.02 * rng.normal(size=3))
+
+    @jax.jit
+    def one(values):
+        found = identify.fit(
+            BLIND, identify.Rates(SHORT, values, 0.01), free=lambda _, gyro: gyro.bias,
+            throw=False,
+        )  # fmt: skip
+        return found.status._value, found.inertia, found.chi_square
+
+    alone = [one(x) for x in records]
+    together = jax.jit(jax.vmap(one))(np.stack(records))
+    for i, parts in enumerate(zip(*alone, strict=True)):
+        rtol = 0 if i == 0 else 1e-6
+        np.testing.assert_allclose(together[i], np.stack(parts), rtol=rtol, atol=1e-9)
