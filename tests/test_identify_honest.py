@@ -243,7 +243,6 @@ def test_a_clipped_gyro_whose_limit_is_given_is_ok(rng):
         tensor = body_of(rng)
         moved, values = seen(rng, tensor)
         limit = fraction * np.abs(moved.omega).max()
-        # FAILS with jax_numpy_rank_promotion="raise": `samples_of` compares (1, 200, 3) to (3,).
         record = identify.Record(
             identify.Gyro(limit=limit), TS, np.clip(values, -limit, limit), 0.01
         )

@@ -15,6 +15,7 @@ from jrigid.identify._problem import Problem
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._smoother import Blocks, Found, Links, Rows, blocks_of, eliminated, reduced
 from jrigid.identify._stages import (
+    EXPLAINED,
     GATE,
     Way,
     evidence_of,
@@ -23,13 +24,15 @@ from jrigid.identify._stages import (
     is_faint,
     link_whitener,
     schedule,
+    signal_of,
+    unexplained,
     weigher,
+    weights_of,
 )
 
 _TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
 _WHITE = 6.0  # standard deviations of the correlation of neighbouring residuals
 _COLOURED = 0.25  # ... and its size, for residuals that are no noise
-_EXPLAINED = 0.3  # of the square of the record: one left over by more is not followed
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
@@ -196,9 +199,8 @@ def _judged(problem: Problem, way: Way, told: Told, kicks: Array) -> _Judged:
     """Of the residuals, and the squares of the kicks between nodes."""
     found, kept, samples, count = way.found, way.kept, problem.samples, way.kept.shape[1]
     rows, dtype = found.rows.residual[:, :count], kicks.dtype
-    weight = jnp.where(samples.sign == 0, samples.weight, 0.0) * kept[..., None]
+    weight = weights_of(problem, kept)
     squares, number = jnp.sum(weight * rows * rows), jnp.sum(weight)
-    signal = jnp.sum(weight * _signal(problem, weight) ** 2)
     turns = pairs = jnp.zeros((), dtype)
     for part in samples.parts:
         both = weight[:, part][:, 1:] * weight[:, part][:, :-1]
@@ -213,30 +215,14 @@ def _judged(problem: Problem, way: Way, told: Told, kicks: Array) -> _Judged:
     noise, mean = chi_square / jnp.maximum(freedom, 1.0), squares / jnp.maximum(number, 1.0)
     if problem.options.noise_known:
         gate = 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1))
-        misfit, excess = (noise > gate) | (jnp.max(way.scales) > 2), squares + kicks - number
+        misfit = (noise > gate) | (jnp.max(way.scales) > 2)
         inflation = jnp.where(misfit, jnp.maximum(noise, 1.0), 1.0)
     else:
         like = turns / jnp.maximum(pairs, 1) / jnp.where(mean > 0, mean, 1.0)
         misfit = (like > _COLOURED) & (like * jnp.sqrt(pairs) > _WHITE)
-        excess, inflation = squares, noise
-    unexplained = excess / jnp.where(signal > 0, signal, 1.0)
-    return _Judged(chi_square, freedom.astype(int), inflation, unexplained, misfit)
-
-
-def _signal(problem: Problem, weight: Array) -> Array:
-    """What there is to explain of values, in units of their noise: a radian, or the variation."""
-    white, parts = jnp.diagonal(problem.samples.whitener, axis1=-2, axis2=-1), []
-    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
-        w, white_ = weight[:, part], white[:, part]
-        if values.shape[-1] < w.shape[-1]:
-            values = jnp.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
-        if values.shape != w.shape:  # quaternions
-            parts.append(white_)
-            continue
-        total = jnp.sum(w * white_**2, axis=1, keepdims=True)
-        mean = jnp.sum(w * white_**2 * values, axis=1, keepdims=True)
-        parts.append(white_ * (values - mean / jnp.where(total > 0, total, 1.0)))
-    return jnp.concatenate(parts, axis=1)
+        inflation = noise
+    left = unexplained(problem, way, kicks)
+    return _Judged(chi_square, freedom.astype(int), inflation, left, misfit)
 
 
 def _is_pure(problem: Problem, found: Found, kept: Array, noise: Array) -> Array:
@@ -250,8 +236,8 @@ def _is_pure(problem: Problem, found: Found, kept: Array, noise: Array) -> Array
     sought = any(x.names for x in problem.unknowns.shapes)
     if not sought or any(x.on_attitude or x.width != 3 for x in sensors):
         return jnp.asarray(False)
-    weight = jnp.where(problem.samples.sign == 0, problem.samples.weight, 0.0) * kept[..., None]
-    constant = jnp.sum(weight * _signal(problem, weight) ** 2)
+    weight = weights_of(problem, kept)
+    constant = jnp.sum(weight * signal_of(problem, weight) ** 2)
     fitted = jnp.sum(weight * found.rows.residual[:, : kept.shape[1]] ** 2)
     chance = 5 + GATE * 10**0.5 + 4 * jnp.log(jnp.maximum(jnp.sum(weight), 1.0))  # of five numbers
     return constant - fitted < noise * chance
@@ -266,7 +252,8 @@ def _status(problem: Problem, found: Found, seen: _Judged, told: Told, pure: Arr
     status = Status.where(is_at_boundary(problem, found), Status.AT_BOUNDARY, status)
     status = Status.where(pure, Status.UNIDENTIFIABLE, status)
     lost = Status.where(found.settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
-    wrong = Status.where(seen.unexplained > _EXPLAINED, lost, Status.MISFIT)
+    astray = (seen.unexplained > EXPLAINED) | is_at_boundary(problem, found)
+    wrong = Status.where(astray, lost, Status.MISFIT)
     status = Status.where(seen.misfit, wrong, status)
     sound = jnp.all(jnp.isfinite(told.covariance)) & (seen.freedom > 0)
     return Status.where(sound & jnp.isfinite(seen.chi_square), status, Status.NOT_CONVERGED)

@@ -41,16 +41,19 @@ from jrigid.identify._result import FitResult, Status
 from jrigid.identify._shapes import AbstractShape, Tensor
 from jrigid.identify._smoother import Found, Point, minimise
 from jrigid.identify._stages import (
+    EXPLAINED,
     Stage,
     Way,
     evidence_of,
     first_level,
+    is_at_boundary,
     link_whitener,
     misfit,
     next_level,
     rejected,
     scales_of,
     schedule,
+    unexplained,
     weigher,
 )
 from jrigid.identify._starts import linear_starts
@@ -60,6 +63,8 @@ from jrigid.systems import RigidBody
 _LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
 _GUESS = 0.02  # of the values' size, for a noise that is not known
 _HISTORY = 1024
+_FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
+_ROUND = 0.1  # least second moment of a body to start from, where the first start led nowhere
 
 
 def fit(
@@ -288,7 +293,8 @@ def _fitted(
     throws, dtype = samples.ts.shape[0], samples.ts.dtype
     starts = linear_starts(options, unknowns, told, bodies, tensor)
     unknowns, numbers = unknowns.start(starts[0])
-    other = unknowns.start(starts[1], 0.1)[1]
+    others = jax.vmap(lambda tensors: unknowns.start(tensors, _ROUND)[1])(starts[1:])
+    numbers = jnp.concatenate([numbers[None], others])
     single = cut = whole(samples, options.nodes)
     attitude = jnp.zeros((throws, options.nodes, 4), dtype).at[..., 0].set(1)
     if options.shooting and told is not None:
@@ -301,18 +307,18 @@ def _fitted(
             jnp.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
             for x in (state.omega, state.attitude)
         )
-    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
+    point = Point(numbers[0], unknowns.own_start(throws, dtype), attitude, omega)
     noise = noise_of(records, samples, prepared.rate)
     problem = Problem(options, unknowns, samples, bodies, noise)
-    way = _search(problem, single, cut, point, other, level)
+    way = _search(problem, single, cut, point, numbers, level)
     layout = cut if options.dense or not options.free_motion else single
     return conclude(problem, layout, way, prepared.result)
 
 
 def _search(
-    problem: Problem, single: Layout, cut: Layout, point: Point, other: Array, known: Array
+    problem: Problem, single: Layout, cut: Layout, point: Point, starts: Array, known: Array
 ) -> Way:
-    """Through all stages; if that ends wrong, once more, more slowly, from other numbers."""
+    """Through all stages; if that ends wrong, again, more slowly, from other numbers."""
     options, dtype = problem.options, point.omega.dtype
     stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
 
@@ -330,17 +336,23 @@ def _search(
 
     def attempt(carry: tuple[Array, Way, Array]) -> tuple[Array, Way, Array]:
         tried, best, wrong = carry
-        numbers, before = jnp.where(tried > 0, other, point.numbers), best.found
-        start = found._replace(
-            point=point._replace(numbers=numbers), steps=before.steps, history=before.history
-        )
-        now = jtu.tree_map(lambda x: x[tried], stages)
+        at, before = point._replace(numbers=starts[tried]), best.found
+        start = found._replace(point=at, steps=before.steps, history=before.history)
+        kinds = stages.weight.shape[0]
+        now = jtu.tree_map(lambda x: x[jnp.minimum(tried, kinds - 1)], stages)
         end, _ = jax.lax.scan(one, begin._replace(found=start), now)
-        off = misfit(problem, end.found, end.kept)
+        off = misfit(problem, end)
         best = jtu.tree_map(lambda a, b: jnp.where(off < wrong, a, b), end, best)
         return tried + 1, best, jnp.minimum(off, wrong)
 
-    going = lambda x: (x[0] < stages.weight.shape[0]) & (x[2] > 0)  # noqa: E731
+    def going(carry: tuple[Array, Way, Array]) -> Array:
+        """A misfit that follows the record has two attempts, any other failure all."""
+        tried, best, wrong = carry
+        lost = (unexplained(problem, best, wrong * 0) > EXPLAINED) | (wrong > _FAR)
+        lost = lost | is_at_boundary(problem, best.found)
+        most = jnp.where(lost, starts.shape[0], min(2, starts.shape[0]))
+        return (tried < most) & (wrong > 0)
+
     carry = none, begin, jnp.asarray(jnp.inf, dtype)
     return jax.lax.while_loop(going, attempt, carry)[1]
 

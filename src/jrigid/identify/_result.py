@@ -194,14 +194,15 @@ class FitResult(eqx.Module):
         Args:
             function: Of the tensor.
         """
-        size = self.numbers.size
-        values, axes = jnp.linalg.eigh(self.numbers_covariance)
+        size = self.unknowns.slices["scale"].stop  # the others do not move the tensor
+        values, axes = jnp.linalg.eigh(self.numbers_covariance[:size, :size])
         sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
         near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
         steps = product("ij,j->ji", axes, near)
         here = function(self.unknowns.inertia(self.numbers, self.index))
 
         def move(step: Array) -> Array:
+            step = jnp.pad(step, (0, self.numbers.size - size))
             return function(self.unknowns.inertia(self.numbers + step, self.index)) - here
 
         moves = jax.vmap(move)(jnp.concatenate([steps, -steps]))

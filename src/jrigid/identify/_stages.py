@@ -27,7 +27,8 @@ _FACES = 4.0  # where Cauchy's loss bends, in units of the noise, squared, of ea
 _REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
 _SPOILT = 0.25  # fraction of samples rejected that gives a throw up
 _FAINT = 1e-4  # of the level that links of weight 1 stand for: no torque at all
-_FLAT = 1e-3  # how far off a fit is that ended at a boundary
+FLAT = 1e-3  # how far off a fit is that ended at a boundary
+EXPLAINED = 0.3  # of the square of the record: one left over by more is not followed
 _MAD = 1.4826  # standard deviations of a normal number in its median size
 
 
@@ -43,6 +44,16 @@ class Stage(NamedTuple):
     soft: Any = False  # Cauchy's loss
     reject: Any = False  # samples too far off are left out from here on
     last: Any = False
+
+
+class Way(NamedTuple):
+    """Where a search stands."""
+
+    found: Found
+    kept: Array  # 1 or 0 for each sample
+    scales: Array  # of the residuals of each record, in units of the noise
+    level: Array  # of the unmodelled torque
+    done: Array  # the level has come to rest
 
 
 def schedule(options: Options, dtype: Any) -> Stage:
@@ -130,17 +141,46 @@ def rejected(problem: Problem, rows: Rows, kept: Array, scales: Array) -> Array:
     return jnp.where(good & ~spoilt[:, None], kept, 0.0)
 
 
-def misfit(problem: Problem, found: Found, kept: Array) -> Array:
+def misfit(problem: Problem, way: Way) -> Array:
     """0 for a fit that may be kept; else how far off it is."""
-    weight = jnp.where(problem.samples.sign == 0, problem.samples.weight, 0.0) * kept[..., None]
-    square = jnp.sum(weight * found.rows.residual[:, : kept.shape[1]] ** 2)
-    freedom = jnp.sum(weight) - found.point.numbers.size - 3.0 * kept.shape[0]
+    found, weight = way.found, weights_of(problem, way.kept)
+    square = jnp.sum(weight * found.rows.residual[:, : way.kept.shape[1]] ** 2)
+    freedom = jnp.sum(weight) - found.point.numbers.size - 3.0 * way.kept.shape[0]
     ratio = square / jnp.maximum(freedom, 1.0)
     good = found.settled & jnp.isfinite(ratio)
     if problem.options.noise_known and not problem.options.robust:
         good = good & (ratio < 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1.0)))
     off = jnp.where(jnp.isfinite(ratio), ratio, jnp.finfo(ratio.dtype).max)
-    return jnp.where(good, jnp.where(is_at_boundary(problem, found), _FLAT, 0.0), off)
+    return jnp.where(good, jnp.where(is_at_boundary(problem, found), FLAT, 0.0), off)
+
+
+def weights_of(problem: Problem, kept: Array) -> Array:
+    """Of numbers that are there, are kept and are not saturated."""
+    return jnp.where(problem.samples.sign == 0, problem.samples.weight, 0.0) * kept[..., None]
+
+
+def signal_of(problem: Problem, weight: Array) -> Array:
+    """What there is to explain of values, in units of their noise: a radian, or the variation."""
+    white, parts = jnp.diagonal(problem.samples.whitener, axis1=-2, axis2=-1), []
+    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
+        w, unit = weight[:, part], white[:, part]
+        if values.shape[-1] > w.shape[-1]:  # quaternions
+            parts.append(unit)
+            continue
+        values = jnp.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
+        total = jnp.sum(w * unit**2, axis=1, keepdims=True)
+        mean = jnp.sum(w * unit**2 * values, axis=1, keepdims=True)
+        parts.append(unit * (values - mean / jnp.where(total > 0, total, 1.0)))
+    return jnp.concatenate(parts, axis=1)
+
+
+def unexplained(problem: Problem, way: Way, kicks: Array) -> Array:
+    """Of the square of the record, beyond the noise if that is known."""
+    weight = weights_of(problem, way.kept)
+    left = jnp.sum(weight * way.found.rows.residual[:, : way.kept.shape[1]] ** 2) + kicks
+    left = left - jnp.sum(weight) if problem.options.noise_known else left
+    signal = jnp.sum(weight * signal_of(problem, weight) ** 2)
+    return left / jnp.where(signal > 0, signal, 1.0)
 
 
 def is_at_boundary(problem: Problem, found: Found) -> Array:
@@ -179,16 +219,6 @@ def first_level(problem: Problem, layout: Layout, numbers: Array) -> Array:
     size = jnp.trace(problem.unknowns.inertia(numbers)) / 3
     level = problem.noise[0] * size / jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
     return jnp.broadcast_to(level, (3,))
-
-
-class Way(NamedTuple):
-    """Where a search stands."""
-
-    found: Found
-    kept: Array  # 1 or 0 for each sample
-    scales: Array  # of the residuals of each record, in units of the noise
-    level: Array  # of the unmodelled torque
-    done: Array  # the level has come to rest
 
 
 class Evidence(NamedTuple):

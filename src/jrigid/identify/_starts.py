@@ -359,15 +359,15 @@ def _result_of(code: Array) -> Any:
 
 def linear_starts(
     options: Any, unknowns: Any, told: Told | None, bodies: Array, given: Array | None
-) -> tuple[Array, Array]:
-    """Tensors of each body (bodies, 3, 3) to start from, and others for a second attempt."""
+) -> Array:
+    """Tensors of each body (attempts, bodies, 3, 3) to start from, one attempt after the other."""
     dtype, count = unknowns.rate.dtype, len(unknowns.shapes)
     known = as_tensor(unknowns.original(0)[0].inertia.astype(dtype))
     sought = any(x.names and not isinstance(x, LogCholesky) for x in unknowns.shapes)
     if given is not None or told is None or not sought or options.motion is not None:
         tensor = known if given is None else given.astype(dtype)
         first = jnp.broadcast_to(tensor, (count, 3, 3))
-        return first, _rounder(first)
+        return jnp.stack([first, _rounder(first)])
     torques = None if options.free_motion else _torques(unknowns, told)
     attitudes = told.attitude if options.free_motion and told.ts.shape[1] < _FEW_ATTITUDES else None
     trace = None if unknowns.scaled and not options.free_motion else jnp.trace(known)
@@ -377,13 +377,24 @@ def linear_starts(
         return _linear_start(told.ts, there, told.omega, attitudes, torques, trace, known)
 
     firsts, leaning = jax.vmap(start)(jnp.arange(count))
-    return (leaning, _rounder(leaning)) if trace is not None else (firsts, leaning)
+    other = _rounder(leaning) if trace is not None else leaning
+    first = leaning if trace is not None else firsts
+    return jnp.concatenate([first[None], other[None], _plain_bodies(told, leaning)])
 
 
 def _rounder(tensors: Array) -> Array:
     """Of bodies half way to a sphere."""
     sphere = lambda x: jnp.trace(x) / 3 * jnp.eye(3, dtype=x.dtype)  # noqa: E731
     return jax.vmap(lambda x: 0.5 * (x + sphere(x)))(tensors)
+
+
+def _plain_bodies(told: Told, like: Array) -> Array:
+    """A sphere, and bodies of revolution along the axes of the rates, as large as those given."""
+    shown = jnp.where(told.there[..., None], told.omega, 0.0)
+    axes = jnp.linalg.eigh(product("tni,tnj->ij", shown, shown))[1]
+    shapes = jnp.concatenate([jnp.ones((1, 3)), 1 - 0.5 * jnp.eye(3), 1 + 0.5 * jnp.eye(3)])
+    tensors = product("ik,sk,jk->sij", axes, shapes.astype(axes.dtype), axes)
+    return jax.vmap(lambda x: jax.vmap(lambda y: x * jnp.trace(y) / jnp.trace(x))(like))(tensors)
 
 
 def _torques(unknowns: Any, told: Told) -> Array:
