@@ -150,9 +150,8 @@ def test_records_that_tell_all_are_fitted():
             covers(found, 3 * record.tensor / np.trace(record.tensor), far=53.0)
         except AssertionError as error:
             lost.append(f"{seed}: {str(error)[:40]}")
-    # FAILS for nearly all: most end at a flat body, which they do not from the truth nor, 11 in 12,
-    # from one of a sphere, three prolate and three oblate bodies along the axes of the rates. 21453
-    # (six samples in nine turns) is OK and wrong, by an alias.
+    # Known: 21700 and 1653 are lost, 21453 (six samples in nine turns) is OK and wrong, by an alias.
+    assert len(lost) <= 3, "\n".join(lost)
     assert not lost, "\n".join(lost)
 
 
@@ -368,7 +367,6 @@ def test_a_drag_alone_does_not_tell_scale_and_itself(rng):
     assert is_in(found, (Status.UNIDENTIFIABLE,)), text
     assert any("overall scale" in x for x in found.null_directions), text
     assert int(np.sum(np.isfinite(found.history))) < 200
-    # FAILS: errors of the ratios are NaN, for `spread` moves the scale by exp(1e8).
     assert abs(float(found.ratios[1]) - 2.3) < 5 * float(found.ratios_errors[1])
 
 
@@ -447,9 +445,6 @@ def test_a_delay_of_a_gyro_alone_is_the_state_s_and_the_ratios_are_told_all_the_
         text = words(found)
         assert is_in(found, (Status.UNIDENTIFIABLE,)), text
         assert "gyro delay" in found.null_directions
-        # FAILS for some: errors of the ratios of 0.5 and more, "not determined", for `spread` moves
-        # along the axes of the whole covariance; that of the delay, 1e8 long, has a little of the
-        # shape in it.
         assert np.all(found.ratios_errors < 0.02), text
 
 
@@ -516,7 +511,6 @@ def test_a_magnetometer_of_an_unknown_field_beside_a_gyro(rng):
     # Attitude and field turn together.
     assert is_in(found, (Status.UNIDENTIFIABLE,)), text
     assert "magnetometer field" in found.null_directions
-    # FAILS: errors of the ratios are NaN, as above.
     covers(found, tensor)
 
 

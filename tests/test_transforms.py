@@ -462,6 +462,11 @@ CASES = {
         (AXIS, 0.5, ATTITUDE, OMEGA),
         methods("torques.Rotor", "__call__", "internal_momentum"),
     ),
+    "torques.Sampled": Case(
+        lambda t, values: torques.Sampled(np.arange(4.0), values)(number(t)[()]),
+        (1.3, np.array([[0.1, 0.2], [0.5, -0.4], [0.3, 0.3], [1.0, 0.7]])),
+        ("torques.Sampled.__call__",),
+    ),
     "torques.Sum": Case(
         lambda *x: all_of_a_torque(
             two_parts(*x[:4]).of_body(MOMENTS),

@@ -15,8 +15,7 @@ _STEP, _STEPS = 0.4, 16  # in standard errors: 6.4 to each side
 _LINEAR = 0.03  # standard errors by which a function that counts as linear is off, rms
 _SMALL = 0.01  # standard errors across which slopes are taken; across a kink the mean
 _CROSS = _SMALL * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
-# A tail of 2.5 % is good to 0.5 points.
-_DRAWS = np.kron([[1], [-1]], np.random.default_rng(0).normal(size=(500, 6)))
+_PAIRS = 500  # of draws: a tail of 2.5 % is good to 0.5 points
 # I1 - I2, I2 - I3, I12, I23, I13; which of them vanish where I1 = I2, I2 = I3 and all are equal.
 _GAPS = np.eye(9)[[0, 4, 1, 5, 2]]
 _GAPS[:2] -= np.eye(9)[[4, 8]]
@@ -45,7 +44,8 @@ def interval(
         covariance: Of its elements, row by row.
         level: Of confidence.
     """
-    cross, draws, equal = (jnp.asarray(x, tensor.dtype) for x in (_CROSS, _DRAWS, _EQUAL))
+    pairs = np.kron([[1], [-1]], np.random.default_rng(0).normal(size=(_PAIRS, 6)))
+    cross, draws, equal = (jnp.asarray(x, tensor.dtype) for x in (_CROSS, pairs, _EQUAL))
     squares, axes = jnp.linalg.eigh(covariance)
     root = (0.5 * jnp.sqrt(jnp.maximum(squares, 0.0))[None] * axes)[:, 3:].reshape(3, 3, 6)
     root += root.transpose(1, 0, 2)  # symmetric to the last digit

@@ -51,7 +51,7 @@ class Sampled(Readable):
             """Mean slope from sample j to the next, and how long that is; 0 beyond the ends."""
             inside = (j >= 0) & (j < last)
             j = jnp.clip(j, 0, last - 1)
-            span = jnp.where(inside, ts[j + 1] - ts[j], 0.0)
+            span = jnp.where(inside, ts[j + 1] - ts[j], 0.0).astype(values.dtype)
             return (values[j + 1] - values[j]) / jnp.where(span > 0, span, 1.0), span
 
         (before, a), (within, b), (after, c) = (steepness(i + k) for k in (-1, 0, 1))
@@ -61,7 +61,8 @@ class Sampled(Readable):
         bend_after = jnp.where(c > 0, (after - within) / bc, 0.0)
         left = within - b * jnp.where(a > 0, bend_before, bend_after)
         right = within + b * jnp.where(c > 0, bend_after, bend_before)
-        u = jnp.where(b > 0, (t - ts[i]) / jnp.where(b > 0, b, 1.0), 0.0)
+        since = (t - ts[i]).astype(values.dtype)
+        u = jnp.where(b > 0, since / jnp.where(b > 0, b, 1.0), 0.0)
         bend = u * (1 - u) * b
         value = values[i] + u * b * within
         value = value + bend * ((1 - u) * (left - within) - u * (right - within))
