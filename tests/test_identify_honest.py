@@ -150,8 +150,7 @@ def test_records_that_tell_all_are_fitted():
             covers(found, 3 * record.tensor / np.trace(record.tensor), far=53.0)
         except AssertionError as error:
             lost.append(f"{seed}: {str(error)[:40]}")
-    # Known: 21700 and 1653 are lost, 21453 (six samples in nine turns) is OK and wrong, by an alias.
-    assert len(lost) <= 3, "\n".join(lost)
+    # FAILS: 21700 and 1653 are lost, 21453 (six samples in nine turns) is wrong, by an alias.
     assert not lost, "\n".join(lost)
 
 
