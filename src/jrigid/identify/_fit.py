@@ -16,6 +16,7 @@ from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import (
+    GUESS,
     findings_of,
     noise_of,
     refuse,
@@ -61,7 +62,6 @@ from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
 _LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
-_GUESS = 0.02  # of the values' size, for a noise that is not known
 _HISTORY = 1024
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
 _ROUND = 0.1  # least second moment of a body to start from, where the first start led nowhere
@@ -150,7 +150,6 @@ def fit(
     >>> print(found.null_directions)
     ('overall scale',)
     """
-    check_option("loss", loss, ("squares", "robust"))
     records = of_throws(observations)
     throws = records[0].ts.shape[0]
     systems = systems_of(system, throws)
@@ -289,7 +288,7 @@ def _fitted(
     level: Array,
 ) -> FitResult:
     told = prepared.told
-    samples = samples_of(records, _GUESS * prepared.sizes[0])
+    samples = samples_of(records, GUESS * prepared.sizes[0])
     throws, dtype = samples.ts.shape[0], samples.ts.dtype
     starts = linear_starts(options, unknowns, told, bodies, tensor)
     unknowns, numbers = unknowns.start(starts[0])
@@ -348,7 +347,7 @@ def _search(
     def going(carry: tuple[Array, Way, Array]) -> Array:
         """A misfit that follows the record has two attempts, any other failure all."""
         tried, best, wrong = carry
-        lost = (unexplained(problem, best, wrong * 0) > EXPLAINED) | (wrong > _FAR)
+        lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
         lost = lost | is_at_boundary(problem, best.found)
         most = jnp.where(lost, starts.shape[0], min(2, starts.shape[0]))
         return (tried < most) & (wrong > 0)

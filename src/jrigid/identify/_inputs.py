@@ -17,7 +17,7 @@ from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, SpinningMass, Sum
 
-_GUESS = 0.02  # of the size of values, for a noise that is not known
+GUESS = 0.02  # of the size of values, for a noise that is not known
 
 
 def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
@@ -111,10 +111,10 @@ def noise_of(records: tuple[Record, ...], samples: Samples, rate: Array) -> Arra
         median = jnp.nanmedian(sigma[:, part])
         rates += [median] * tells(record, "rates")
         angles += [median] * record.sensor.unit_length
-    of_rates = rates[0] if rates else (angles[0] * rate if angles else _GUESS * rate)
+    of_rates = rates[0] if rates else (angles[0] * rate if angles else GUESS * rate)
     of_angles = angles[0] if angles else of_rates / rate
     noise = jnp.repeat(jnp.stack([of_rates, of_angles]), 3)
-    return jnp.where(jnp.isfinite(noise), noise, _GUESS * rate)
+    return jnp.where(jnp.isfinite(noise), noise, GUESS * rate)
 
 
 def tells(record: Record, what: str) -> bool:

@@ -93,10 +93,8 @@ def log_density(result: FitResult) -> LogDensity:
         for x in unknowns.sought:
             if not x.own:
                 total = total + x.log_volume(numbers[unknowns.slices[x.name]])
-        end = 0
-        for x in unknowns.own:
-            total = total + jnp.sum(jax.vmap(x.log_volume)(own[:, end : end + x.size]))
-            end += x.size
+        for x, s in unknowns.own_slices:
+            total = total + jnp.sum(jax.vmap(x.log_volume)(own[:, s]))
         shape = slice(0, unknowns.slices["shape"].stop)
         if shape.stop:
             slopes = jax.jacfwd(lambda p: unknowns.inertia(numbers.at[shape].set(p)))(

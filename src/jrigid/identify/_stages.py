@@ -27,7 +27,7 @@ _FACES = 4.0  # where Cauchy's loss bends, in units of the noise, squared, of ea
 _REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
 _SPOILT = 0.25  # fraction of samples rejected that gives a throw up
 _FAINT = 1e-4  # of the level that links of weight 1 stand for: no torque at all
-FLAT = 1e-3  # how far off a fit is that ended at a boundary
+_FLAT = 1e-3  # how far off a fit is that ended at a boundary
 EXPLAINED = 0.3  # of the square of the record: one left over by more is not followed
 _MAD = 1.4826  # standard deviations of a normal number in its median size
 
@@ -60,7 +60,6 @@ def schedule(options: Options, dtype: Any) -> Stage:
     """The stages of each attempt."""
     whole = not options.dense and (options.free_motion or not options.shooting)
     end = Stage(_LARGEST[dtype.itemsize], options.max_steps, ACCURACY, whole=whole, last=True)
-    end = end._replace(soft=options.robust)
     if options.dense:
         count = _LEVELS if options.level != "known" else 6
         way = [Stage(float(x), 8, 0.01) for x in np.linspace(0, 1, count)]
@@ -151,7 +150,7 @@ def misfit(problem: Problem, way: Way) -> Array:
     if problem.options.noise_known and not problem.options.robust:
         good = good & (ratio < 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1.0)))
     off = jnp.where(jnp.isfinite(ratio), ratio, jnp.finfo(ratio.dtype).max)
-    return jnp.where(good, jnp.where(is_at_boundary(problem, found), FLAT, 0.0), off)
+    return jnp.where(good, jnp.where(is_at_boundary(problem, found), _FLAT, 0.0), off)
 
 
 def weights_of(problem: Problem, kept: Array) -> Array:
@@ -174,7 +173,7 @@ def signal_of(problem: Problem, weight: Array) -> Array:
     return jnp.concatenate(parts, axis=1)
 
 
-def unexplained(problem: Problem, way: Way, kicks: Array) -> Array:
+def unexplained(problem: Problem, way: Way, kicks: Array | float = 0.0) -> Array:
     """Of the square of the record, beyond the noise if that is known."""
     weight = weights_of(problem, way.kept)
     left = jnp.sum(weight * way.found.rows.residual[:, : way.kept.shape[1]] ** 2) + kicks

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
 from jrigid._types import Readable
@@ -239,6 +240,12 @@ class Unknowns(eqx.Module):
         """What is sought in each throw."""
         return tuple(x for x in self.sought if x.own)
 
+    @property
+    def own_slices(self) -> list[tuple[AbstractSought, slice]]:
+        """What is sought in each throw, and where it is in that throw's vector."""
+        ends = np.cumsum([0, *(x.size for x in self.own)])
+        return [(x, slice(int(a), int(a) + x.size)) for x, a in zip(self.own, ends, strict=False)]
+
     def names(self) -> tuple[str, ...]:
         """One for each number."""
         several = len(self.shapes) > 1
@@ -300,13 +307,11 @@ class Unknowns(eqx.Module):
         self, numbers: Array, own: Array, leaves: tuple[Array, ...], body: int | Array
     ) -> tuple[Any, ...]:
         """System and sensors of a throw: of its own numbers, the arrays given for it, its body."""
-        leaves_, ends = list(leaves), {True: 0, False: self.size}
-        ends[False] = self.slices["scale"].stop
-        for x in self.sought:
-            start = ends[x.own]
-            ends[x.own] = start + x.size
-            value = x.value((own if x.own else numbers)[start : ends[x.own]])
-            leaves_[x.index] = value.astype(numbers.dtype)
+        leaves_, slices = list(leaves), self.slices
+        found = [(x, numbers[slices[x.name]]) for x in self.sought if not x.own]
+        found += [(x, own[s]) for x, s in self.own_slices]
+        for x, part in found:
+            leaves_[x.index] = x.value(part).astype(numbers.dtype)
         system, *sensors = self._built(leaves_)
         mass = None
         if len(self.shapes) == 1:
@@ -337,11 +342,8 @@ class Unknowns(eqx.Module):
 
     def own_prior_rows(self, own: Array) -> Array:
         """What is known beforehand of a throw's own numbers."""
-        rows, end = [jnp.zeros(0, own.dtype)], 0
-        for x in self.own:
-            rows.append(x.prior_rows(own[end : end + x.size]))
-            end += x.size
-        return jnp.concatenate(rows)
+        rows = [x.prior_rows(own[s]) for x, s in self.own_slices]
+        return jnp.concatenate([jnp.zeros(0, own.dtype), *rows])
 
     def holding(self, function: Any, value: Array, unit: Array) -> "Unknowns":
         """The same, with a function of the tensor held at a value, to within a unit."""
