@@ -265,7 +265,15 @@ def identifiability(
     problem, found, layout = _planned(system, state, observations, t0, free, scale, shape)
     dtype, no = layout.ts.dtype, jnp.asarray(False)
     scales = jnp.ones(len(problem.samples.values), dtype)
-    way = Way(found, problem.samples.seen.astype(dtype), scales, jnp.zeros(3, dtype), no)
+    way = Way(
+        found,
+        problem.samples.seen.astype(dtype),
+        scales,
+        jnp.zeros(3, dtype),
+        no,
+        no,
+        jnp.zeros((), dtype),
+    )
     return conclude(problem, layout, way, RESULTS.successful)
 
 
@@ -315,9 +323,9 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     no, kept = jnp.asarray(False), result.kept.astype(dtype)
 
     def at(value: Array) -> Array:
-        held = problem.unknowns.holding(function, value, unit)
+        hold = lambda x: (function(result.unknowns.inertia(x)) - value) / unit  # noqa: E731
         parts = problem.samples, problem.bodies, problem.noise
-        now = Problem(options, held, *parts)
+        now = Problem(options, problem.unknowns.holding(hold), *parts)
         weigh = weigher(now, layout, kept, result.scales, last)
         evaluate = evaluation(now, layout)
         shapes = jax.eval_shape(evaluate, point)

@@ -1,5 +1,6 @@
 """What a fit tells: errors, what the record does not determine, and how the fit ended."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -163,8 +164,9 @@ def conclude(problem: Problem, layout: Layout, way: Way, input_result: Any) -> F
         level = jnp.where(is_faint(level, first_level(problem, layout, numbers)), 0.0, level)
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
     seen = _judged(problem, way, told, kicks)
+    told = _widened(told, way.wide / jnp.sqrt(seen.inflation), units)
     pure = _is_pure(problem, found, kept, seen.inflation)
-    status = _status(problem, found, seen, told, pure)
+    status = _status(problem, way, seen, told, pure)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
     count = kept.shape[1]
     jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
@@ -180,9 +182,25 @@ def conclude(problem: Problem, layout: Layout, way: Way, input_result: Any) -> F
         singular_values=told.values, directions=told.directions,
         state_singular_values=sensor.of_state, level=level, level_errors=level_errors,
         scales=scales, kept=kept > 0, history=found.history, pure_spin=pure,
+        doubtful=way.doubtful,
         input_result=input_result, problem=problem,
     )  # fmt: skip
+    loose = [jnp.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies]
+    loose = jnp.any(jnp.stack(loose)) & (status == Status.OK)
+    status = Status.where(loose, Status.UNIDENTIFIABLE, status)
+    result = dataclasses.replace(result, status=status)
     return nan_where(input_result != RESULTS.successful, result)
+
+
+def _widened(told: Told, error: Array, units: Array) -> Told:
+    """With the error of what is told least, in natural units, at least this large."""
+    if not units.size:
+        return told
+    last, direction = told.values[-1], told.directions[:, -1] * units
+    more = jnp.maximum(error**2 - 1 / jnp.maximum(last, 1e-150) ** 2, 0.0)
+    values = told.values.at[-1].min(1 / jnp.where(error > 0, error, 1e-300))
+    covariance = told.covariance + more * direction[:, None] * direction[None, :]
+    return told._replace(values=values, covariance=covariance)
 
 
 class _Judged(NamedTuple):
@@ -243,14 +261,15 @@ def _is_pure(problem: Problem, found: Found, kept: Array, noise: Array) -> Array
     return constant - fitted < noise * chance
 
 
-def _status(problem: Problem, found: Found, seen: _Judged, told: Told, pure: Array) -> Any:
+def _status(problem: Problem, way: Way, seen: _Judged, told: Told, pure: Array) -> Any:
     """How the fit ended; the last word counts."""
+    found = way.found
     # A fit that creeps along a direction which the record does not tell is as good as any.
     largest = jnp.sqrt(seen.inflation) / jnp.min(told.values, initial=jnp.inf)
     status = Status.where(found.settled, Status.OK, Status.NOT_CONVERGED)
     status = Status.where(largest > LARGEST_ERROR, Status.UNIDENTIFIABLE, status)
     status = Status.where(is_at_boundary(problem, found), Status.AT_BOUNDARY, status)
-    status = Status.where(pure, Status.UNIDENTIFIABLE, status)
+    status = Status.where(pure | way.doubtful, Status.UNIDENTIFIABLE, status)
     lost = Status.where(found.settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
     astray = (seen.unexplained > EXPLAINED) | is_at_boundary(problem, found)
     wrong = Status.where(astray, lost, Status.MISFIT)

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
@@ -27,43 +26,26 @@ from jrigid.identify._inputs import (
     typical_rate,
 )
 from jrigid.identify._layout import (
-    Layout,
     Told,
     angle_turned,
+    is_coarse,
     node_states,
     segments,
     segments_needed,
     told_by,
     whole,
 )
-from jrigid.identify._problem import Options, Problem, evaluation
+from jrigid.identify._problem import Options, Problem
 from jrigid.identify._records import Record, of_throws, samples_of
 from jrigid.identify._result import FitResult, Status
+from jrigid.identify._search import Line, search
 from jrigid.identify._shapes import AbstractShape, Tensor
-from jrigid.identify._smoother import Found, Point, minimise
-from jrigid.identify._stages import (
-    EXPLAINED,
-    Stage,
-    Way,
-    evidence_of,
-    first_level,
-    is_at_boundary,
-    link_whitener,
-    misfit,
-    next_level,
-    rejected,
-    scales_of,
-    schedule,
-    unexplained,
-    weigher,
-)
+from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
 _LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
-_HISTORY = 1024
-_FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
 _ROUND = 0.1  # least second moment of a body to start from, where the first start led nowhere
 
 
@@ -308,83 +290,9 @@ def _fitted(
         )
     point = Point(numbers[0], unknowns.own_start(throws, dtype), attitude, omega)
     noise = noise_of(records, samples, prepared.rate)
+    unknowns = unknowns.holding(Line(jnp.zeros_like(point.numbers), jnp.zeros((), dtype)))
     problem = Problem(options, unknowns, samples, bodies, noise)
-    way = _search(problem, single, cut, point, numbers, level)
+    coarse = jnp.asarray(False) if told is None else is_coarse(told)
+    way = search(problem, single, cut, point, numbers, level, coarse)
     layout = cut if options.dense or not options.free_motion else single
     return conclude(problem, layout, way, prepared.result)
-
-
-def _search(
-    problem: Problem, single: Layout, cut: Layout, point: Point, starts: Array, known: Array
-) -> Way:
-    """Through all stages; if that ends wrong, again, more slowly, from other numbers."""
-    options, dtype = problem.options, point.omega.dtype
-    stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
-
-    def one(way: Way, stage: Stage) -> tuple[Way, None]:
-        skip = (stage.steps == 0) | (way.done & ~stage.last)
-        run = lambda way: _stage(problem, single, cut, way, stage, first, known)  # noqa: E731
-        return jax.lax.cond(skip, lambda way: way, run, way), None
-
-    shapes = eqx.filter_eval_shape(evaluation(problem, cut), point)
-    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    no, none = jnp.asarray(False), jnp.asarray(0)
-    found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
-    scales = jnp.ones(len(problem.samples.values), dtype)
-    begin = Way(found, problem.samples.seen.astype(dtype), scales, 10 * first, no)
-
-    def attempt(carry: tuple[Array, Way, Array]) -> tuple[Array, Way, Array]:
-        tried, best, wrong = carry
-        at, before = point._replace(numbers=starts[tried]), best.found
-        start = found._replace(point=at, steps=before.steps, history=before.history)
-        kinds = stages.weight.shape[0]
-        now = jtu.tree_map(lambda x: x[jnp.minimum(tried, kinds - 1)], stages)
-        end, _ = jax.lax.scan(one, begin._replace(found=start), now)
-        off = misfit(problem, end)
-        best = jtu.tree_map(lambda a, b: jnp.where(off < wrong, a, b), end, best)
-        return tried + 1, best, jnp.minimum(off, wrong)
-
-    def going(carry: tuple[Array, Way, Array]) -> Array:
-        """A misfit that follows the record has two attempts, any other failure all."""
-        tried, best, wrong = carry
-        lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
-        lost = lost | is_at_boundary(problem, best.found)
-        most = jnp.where(lost, starts.shape[0], min(2, starts.shape[0]))
-        return (tried < most) & (wrong > 0)
-
-    carry = none, begin, jnp.asarray(jnp.inf, dtype)
-    return jax.lax.while_loop(going, attempt, carry)[1]
-
-
-def _stage(
-    problem: Problem, single: Layout, cut: Layout, way: Way, stage: Stage, first: Array,
-    known: Array,
-) -> Way:  # fmt: skip
-    """One minimisation, and what follows from it."""
-    options, (found, kept, scales, level, done) = problem.options, way
-    layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
-    if options.robust:
-        scales = scales_of(problem, found, kept)
-        fewer = rejected(problem, found.rows, kept, scales)
-        kept = jnp.where(stage.reject, fewer, kept)
-    if options.level == "known":
-        level = first * (known / first) ** stage.weight
-    weigh = weigher(problem, layout, kept, scales, stage)
-    white = link_whitener(problem, layout, found.point.numbers, stage.weight, level)
-
-    def enough(cost: Array) -> Array:
-        count = jnp.maximum(jnp.sum(kept[..., None] * problem.samples.weight), 1.0)
-        return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
-
-    found = found._replace(fresh=found.fresh | stage.fresh)
-    found = minimise(evaluation(problem, layout), weigh, white, found, enough, stage.steps)
-    if options.progress:
-        jax.debug.print(
-            "fit: {} steps, links {}, record {}: chi-square {}",
-            found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
-        )  # fmt: skip
-    if options.level.startswith("estimate"):
-        seen = evidence_of(problem, found, weigh(found.rows)[0], white)
-        new, still = next_level(level, first, seen)
-        level, done = jnp.where(stage.last, level, new), done | still
-    return Way(found, kept, scales, level, done)

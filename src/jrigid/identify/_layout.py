@@ -159,6 +159,11 @@ def angle_turned(told: Told) -> Array:
     return jax.vmap(throw)(told.ts, told.there, told.omega)
 
 
+def is_coarse(told: Told) -> Array:
+    """Whether a body turns by more than half a turn from one sample to the next."""
+    return jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0) > jnp.pi
+
+
 def whole(samples: Samples, nodes: int, t0: Array | None = None) -> Layout:
     """One segment a throw, in the first of so many nodes; its state at t0, or the first sample."""
     ts = samples.ts

@@ -61,7 +61,7 @@ class Problem(eqx.Module):
         Those of the throw come first, then, beside the first throw, those of all throws.
         """
         x = self.unknowns
-        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (x.held is not None)
+        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (x.hold is not None)
         return count + self.held
 
     @property

@@ -95,6 +95,7 @@ class FitResult(eqx.Module):
         kept: Which samples were, records side by side.
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
+        doubtful: Whether bodies far from this one describe the record nearly as well.
         input_result: `jrigid.RESULTS` of the input.
         problem: The record as it was fitted, and how.
         index: Which body this is.
@@ -125,6 +126,7 @@ class FitResult(eqx.Module):
     kept: Bool[Array, "throws samples"]
     history: Float[Array, " steps"]
     pure_spin: Bool[Array, ""]
+    doubtful: Bool[Array, ""]
     input_result: Any
     problem: Problem
     index: int = eqx.field(static=True, default=0)

@@ -54,6 +54,8 @@ class Way(NamedTuple):
     scales: Array  # of the residuals of each record, in units of the noise
     level: Array  # of the unmodelled torque
     done: Array  # the level has come to rest
+    doubtful: Array  # bodies far from this one describe the record nearly as well
+    wide: Array  # error of what is told least, by probes, in natural units
 
 
 def schedule(options: Options, dtype: Any) -> Stage:

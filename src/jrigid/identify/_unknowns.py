@@ -215,8 +215,7 @@ class Unknowns(eqx.Module):
     scaled: bool = eqx.field(static=True)
     trace: Array
     rate: Array  # rms of the rates [rad/s]
-    held: Any = eqx.field(static=True, default=None)  # a function of the tensor that is held
-    constraint: tuple[Array, Array] | None = None  # at a value, to within a unit
+    hold: Any = None  # what of the numbers is held at zero: a function that is a pytree
 
     @property
     def slices(self) -> dict[str, slice]:
@@ -335,9 +334,8 @@ class Unknowns(eqx.Module):
         """What is known beforehand of the numbers for all throws, as residuals."""
         rows = [jnp.zeros(0, numbers.dtype)]
         rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.sought if not x.own]
-        if self.held is not None and self.constraint is not None:
-            value, unit = self.constraint
-            rows.append(((self.held(self.inertia(numbers)) - value) / unit)[None])
+        if self.hold is not None:
+            rows.append(self.hold(numbers)[None])
         return jnp.concatenate(rows)
 
     def own_prior_rows(self, own: Array) -> Array:
@@ -345,10 +343,9 @@ class Unknowns(eqx.Module):
         rows = [x.prior_rows(own[s]) for x, s in self.own_slices]
         return jnp.concatenate([jnp.zeros(0, own.dtype), *rows])
 
-    def holding(self, function: Any, value: Array, unit: Array) -> "Unknowns":
-        """The same, with a function of the tensor held at a value, to within a unit."""
-        fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}
-        return Unknowns(**{**fields, "held": function, "constraint": (value, unit)})
+    def holding(self, hold: Any) -> "Unknowns":
+        """The same, with something held."""
+        return eqx.tree_at(lambda x: x.hold, self, hold, is_leaf=lambda x: x is None)
 
 
 def _of_body(torque: Any, body: MassProperties | None) -> Any:

@@ -92,6 +92,12 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
         if noise > LARGEST_ERROR * value:
             text = _untold(result, direction)
             found += [text] * bool(text and text not in found)
+    smallest = "I1's ratio to the others"
+    loose = any(np.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies)
+    found += [smallest] * (loose and smallest not in found)
+    if bool(result.doubtful):
+        text = _untold(result, np.asarray(result.directions)[:, -1])
+        found.append(f"{text}, which far from here is as good or nearly")
     of_state = np.asarray(result.state_singular_values)
     if result.problem.options.on_attitude and (of_state[..., -1] < 1e-6 * of_state[..., 0]).any():
         count = int((of_state < 1e-6 * of_state[..., :1]).sum(axis=-1).max())

@@ -1,0 +1,242 @@
+"""The search for the minimum: attempts from several bodies, and probes of what is told least."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from jrigid._numerics import product
+from jrigid.identify._layout import Layout
+from jrigid.identify._problem import Problem, evaluation
+from jrigid.identify._result import LARGEST_ERROR
+from jrigid.identify._smoother import Found, Point, blocks_of, eliminated, minimise, reduced
+from jrigid.identify._stages import (
+    EXPLAINED,
+    Stage,
+    Way,
+    evidence_of,
+    first_level,
+    is_at_boundary,
+    link_whitener,
+    misfit,
+    next_level,
+    rejected,
+    scales_of,
+    schedule,
+    unexplained,
+    weigher,
+    weights_of,
+)
+
+_HISTORY = 1024
+_FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
+_PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along what is told least
+_WEAK = 0.01  # an error in natural units that is worth probes
+_HARD = 1e4  # weight of what a probe holds, in natural units
+_SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
+_APART = 0.1  # natural units between two minima
+_FEW = 32  # numbers of a coarse record, which any alias follows
+_BENT = 2.0  # times what Fisher's information says: a valley that no covariance describes
+_LOWER = 1.0  # fall of chi-square that is another minimum
+_RIVAL = 25.0  # growth of chi-square at which another minimum is none
+_ROUNDS = 3
+
+
+class Line(eqx.Module):
+    """Holds the numbers on a plane: a residual that is zero there."""
+
+    direction: Array
+    value: Array
+
+    def __call__(self, numbers: Array) -> Array:
+        return jnp.sum(self.direction * numbers) - self.value
+
+
+class _Weakest(NamedTuple):
+    """Chi-square of an answer, its unit, and what it tells least."""
+
+    square: Array
+    noise: Array
+    error: Array  # in natural units
+    direction: Array  # a natural unit along it, in numbers
+    normal: Array  # whose product with that is one
+
+
+class _Hunt(NamedTuple):
+    """Where a search stands."""
+
+    tried: Array  # the next attempt: a start, then a probe, last what a probe found
+    rounds: Array
+    best: Way
+    wrong: Array  # 0 for an answer that may be kept, else how far off it is
+    weakest: _Weakest
+    lower: Array  # numbers that a probe found
+
+
+def search(
+    problem: Problem, single: Layout, cut: Layout, point: Point, starts: Array, known: Array,
+    coarse: Array,
+) -> Way:  # fmt: skip
+    """Through all stages; if that ends wrong, again, more slowly, from other numbers.
+
+    Fisher's information at a minimum knows nothing of a valley that bends, nor of other minima. So
+    an answer that tells some direction weakly is probed: that direction is held a natural unit, and
+    a quarter of one, to either side, and all else is fitted anew. By how little chi-square grows
+    says what the error is; where it falls there is a better answer, which is probed in its turn.
+    And of coarse records, which have aliases, all attempts are made and compared.
+
+    Args:
+        problem: The record.
+        single: One segment a throw.
+        cut: Many.
+        point: States at their starts, as observed.
+        starts: Numbers for each attempt.
+        known: Level of the unmodelled torque, if it is known.
+        coarse: Whether the body turns by more than half a turn between samples.
+    """
+    options, dtype, count = problem.options, point.omega.dtype, starts.shape[0]
+    stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
+    last = jtu.tree_map(lambda x: x[0, -1], stages)
+    final = cut if options.dense or not options.free_motion else single
+    steps, polish = jnp.asarray(_PROBES, dtype), count + len(_PROBES)
+
+    shapes = eqx.filter_eval_shape(evaluation(problem, cut), point)
+    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    no, none, nothing = jnp.asarray(False), jnp.asarray(0), jnp.zeros_like(point.numbers)
+    found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
+    scales, far = jnp.ones(len(problem.samples.values), dtype), jnp.asarray(jnp.inf, dtype)
+    begin = Way(
+        found, problem.samples.seen.astype(dtype), scales, 10 * first, no, no, none.astype(dtype)
+    )
+
+    def attempt(hunt: _Hunt) -> _Hunt:
+        tried, best, weakest = hunt.tried, hunt.best.found, hunt.weakest
+        probing, index = (tried >= count) & (tried < polish), jnp.clip(tried - count, 0, 3)
+        numbers = jnp.where(probing, best.point.numbers + steps[index] * weakest.direction,
+            jnp.where(tried == polish, hunt.lower, starts[jnp.minimum(tried, count - 1)]),
+        )  # fmt: skip
+        normal = jnp.where(probing, _HARD * weakest.normal, 0.0)
+        line = Line(normal, jnp.sum(normal * numbers))
+        now = eqx.tree_at(lambda x: x.unknowns, problem, problem.unknowns.holding(line))
+        kind = jnp.minimum(tried, stages.weight.shape[0] - 1)  # the second is slow
+
+        def one(way: Way, stage: Stage) -> tuple[Way, None]:
+            skip = (stage.steps == 0) | (way.done & ~stage.last)
+            run = lambda way: _stage(now, single, cut, way, stage, first, known)  # noqa: E731
+            return jax.lax.cond(skip, lambda way: way, run, way), None
+
+        at = found._replace(
+            point=point._replace(numbers=numbers), steps=best.steps, history=best.history
+        )
+        end, _ = jax.lax.scan(
+            one, begin._replace(found=at), jtu.tree_map(lambda x: x[kind], stages)
+        )
+        return _next(hunt, end, probing, index)
+
+    def _next(hunt: _Hunt, end: Way, probing: Array, index: Array) -> _Hunt:
+        """What an attempt says, and what comes after it."""
+        tried, best, weakest = hunt.tried, hunt.best, hunt.weakest
+        off, seen = misfit(problem, end), _weakest(problem, final, end, last)
+        fall = (weakest.square - seen.square) / weakest.noise
+        lower = (off < hunt.wrong) | ((off <= hunt.wrong) & (fall > 0))
+        better = lower & ~probing
+        numbers = end.found.point.numbers
+        units = problem.unknowns.natural_units(numbers)
+        apart = jnp.max(jnp.abs(numbers - best.found.point.numbers) / units, initial=0.0)
+        apart = apart > jnp.maximum(_APART, 6 * jnp.maximum(weakest.error, seen.error))
+        rival = ~probing & apart & (jnp.abs(fall) < _RIVAL)
+        fell, vain = probing & (fall > _LOWER), (tried == polish) & ~better
+        wide = jnp.abs(steps[index]) / jnp.sqrt(jnp.maximum(-fall, 1e-6))
+        wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
+        wide = jnp.where(better | fell, 0.0, wide)
+        doubtful = jnp.where(better & (fall > _RIVAL), False, best.doubtful) | rival | vain
+        doubtful = doubtful | (wide > _BENT * weakest.error)
+
+        wrong = jnp.where(better, off, hunt.wrong)
+        best, weakest = jtu.tree_map(
+            lambda a, b: jnp.where(better, a, b), (end, seen), (best, weakest)
+        )
+        best = best._replace(doubtful=doubtful, wide=wide)
+        # A misfit that follows the record has two attempts, any other failure all.
+        lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
+        lost = lost | is_at_boundary(problem, best.found) | coarse
+        more = (wrong > 0) | coarse
+        most = jnp.where(more, jnp.where(lost, count, min(2, count)), 0)
+        after = jnp.where((tried < count) & (tried + 1 >= most), count, tried + 1)
+        after = jnp.where(fell, polish, jnp.where(after == polish, polish + 1, after))
+        again = (tried == polish) & (hunt.rounds < _ROUNDS)
+        after = jnp.where(again, count, after)
+        lower = jnp.where(fell, numbers, hunt.lower)
+        return _Hunt(after, hunt.rounds + again.astype(int), best, wrong, weakest, lower)
+
+    def going(hunt: _Hunt) -> Array:
+        weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)
+        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried <= polish)
+        return (hunt.tried < count) | probes
+
+    weakest = _Weakest(far, jnp.ones((), dtype), far, nothing, nothing)
+    hunt = _Hunt(none, none, begin, far, weakest, nothing)
+    best = jax.lax.while_loop(going, attempt, hunt).best
+    few = jnp.sum(weights_of(problem, best.kept)) < _FEW
+    return best._replace(doubtful=best.doubtful | (coarse & few))
+
+
+def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakest:
+    """By the normal equations."""
+    found = way.found
+    numbers, own = found.point.numbers, found.point.own.shape[-1]
+    weight, square = weigher(problem, layout, way.kept, way.scales, last)(found.rows)
+    white = link_whitener(problem, layout, numbers, last.weight, way.level)
+    gap = product("tsij,tsj->tsi", white, found.links.gap)
+    square = square + jnp.sum(gap * gap)
+    freedom = jnp.sum(weights_of(problem, way.kept)) - numbers.size - gap.shape[-1] * gap.shape[0]
+    noise = jnp.ones_like(square)
+    if not problem.options.noise_known:
+        noise = square / jnp.maximum(freedom, 1.0)
+    if not numbers.size:
+        return _Weakest(square, noise, jnp.zeros_like(square), numbers, numbers)
+    left = reduced(blocks_of(found.rows, found.links, weight, white), jnp.zeros_like(square))
+    matrix = eliminated(left, own + gap.shape[-1]).numbers
+    units = problem.unknowns.natural_units(numbers)
+    matrix = matrix * units[:, None] * units[None, :]
+    sound = jnp.all(jnp.isfinite(matrix))
+    values, axes = jnp.linalg.eigh(jnp.where(sound, matrix, jnp.eye(units.size, dtype=units.dtype)))
+    error = jnp.sqrt(noise / jnp.maximum(values[0], 1e-30))
+    return _Weakest(square, noise, error, axes[:, 0] * units, axes[:, 0] / units)
+
+
+def _stage(
+    problem: Problem, single: Layout, cut: Layout, way: Way, stage: Stage, first: Array,
+    known: Array,
+) -> Way:  # fmt: skip
+    """One minimisation, and what follows from it."""
+    options, (found, kept, scales, level, done, *_) = problem.options, way
+    layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
+    if options.robust:
+        scales = scales_of(problem, found, kept)
+        fewer = rejected(problem, found.rows, kept, scales)
+        kept = jnp.where(stage.reject, fewer, kept)
+    if options.level == "known":
+        level = first * (known / first) ** stage.weight
+    weigh = weigher(problem, layout, kept, scales, stage)
+    white = link_whitener(problem, layout, found.point.numbers, stage.weight, level)
+
+    def enough(cost: Array) -> Array:
+        count = jnp.maximum(jnp.sum(kept[..., None] * problem.samples.weight), 1.0)
+        return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
+
+    found = found._replace(fresh=found.fresh | stage.fresh)
+    found = minimise(evaluation(problem, layout), weigh, white, found, enough, stage.steps)
+    if options.progress:
+        jax.debug.print(
+            "fit: {} steps, links {}, record {}: chi-square {}",
+            found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
+        )  # fmt: skip
+    if options.level.startswith("estimate"):
+        seen = evidence_of(problem, found, weigh(found.rows)[0], white)
+        new, still = next_level(level, first, seen)
+        level, done = jnp.where(stage.last, level, new), done | still
+    return way._replace(found=found, kept=kept, scales=scales, level=level, done=done)
