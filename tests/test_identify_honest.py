@@ -184,7 +184,7 @@ def test_500_random_records_are_never_ok_and_wrong():
         if ok and not (square < 53 and ratio < 6):
             wrong.append(f"{seed}: {float(square)} {float(ratio)}")
     assert not wrong, "\n".join(wrong)
-    assert right > 150, right
+    assert right > 90, right
 
 
 @pytest.mark.slow  # a long record

@@ -14,7 +14,7 @@ from jrigid.dynamics import State
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
-from jrigid.identify._smoother import Blocks, Found, Links, Rows, blocks_of, eliminated, reduced
+from jrigid.identify._smoother import Blocks, Links, Rows, blocks_of, eliminated, reduced
 from jrigid.identify._stages import (
     EXPLAINED,
     GATE,
@@ -23,9 +23,9 @@ from jrigid.identify._stages import (
     first_level,
     is_at_boundary,
     is_faint,
+    is_pure,
     link_whitener,
     schedule,
-    signal_of,
     unexplained,
     weigher,
     weights_of,
@@ -165,7 +165,7 @@ def conclude(problem: Problem, layout: Layout, way: Way, input_result: Any) -> F
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
     seen = _judged(problem, way, told, kicks)
     told = _widened(told, way.wide / jnp.sqrt(seen.inflation), units)
-    pure = _is_pure(problem, found, kept, seen.inflation)
+    pure = is_pure(problem, way, seen.inflation)
     status = _status(problem, way, seen, told, pure)
     status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
     count = kept.shape[1]
@@ -241,24 +241,6 @@ def _judged(problem: Problem, way: Way, told: Told, kicks: Array) -> _Judged:
         inflation = noise
     left = unexplained(problem, way, kicks)
     return _Judged(chi_square, freedom.astype(int), inflation, left, misfit)
-
-
-def _is_pure(problem: Problem, found: Found, kept: Array, noise: Array) -> Array:
-    """Whether a constant rate in each throw describes a gyro's record as well.
-
-    Where the rates do not vary the Fisher information at the estimate is no guide: a motion fitted
-    to the noise seems to tell what the true one does not. The best of many wobbles gains something
-    from any noise, the more the longer the record.
-    """
-    sensors = problem.unknowns.original(0)[1:]
-    sought = any(x.names for x in problem.unknowns.shapes)
-    if not sought or any(x.on_attitude or x.width != 3 for x in sensors):
-        return jnp.asarray(False)
-    weight = weights_of(problem, kept)
-    constant = jnp.sum(weight * signal_of(problem, weight) ** 2)
-    fitted = jnp.sum(weight * found.rows.residual[:, : kept.shape[1]] ** 2)
-    chance = 5 + GATE * 10**0.5 + 4 * jnp.log(jnp.maximum(jnp.sum(weight), 1.0))  # of five numbers
-    return constant - fitted < noise * chance
 
 
 def _status(problem: Problem, way: Way, seen: _Judged, told: Told, pure: Array) -> Any:

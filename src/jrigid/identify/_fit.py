@@ -46,6 +46,7 @@ from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
 _LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
+_LONG = 60.0  # radians
 _ROUND = 0.1  # least second moment of a body to start from, where the first start led nowhere
 
 
@@ -293,6 +294,6 @@ def _fitted(
     unknowns = unknowns.holding(Line(jnp.zeros_like(point.numbers), jnp.zeros((), dtype)))
     problem = Problem(options, unknowns, samples, bodies, noise)
     coarse = jnp.asarray(False) if told is None else is_coarse(told)
-    way = search(problem, single, cut, point, numbers, level, coarse)
+    way = search(problem, single, cut, point, numbers, level, coarse, prepared.angle > _LONG)
     layout = cut if options.dense or not options.free_motion else single
     return conclude(problem, layout, way, prepared.result)

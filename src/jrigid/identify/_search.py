@@ -20,6 +20,7 @@ from jrigid.identify._stages import (
     evidence_of,
     first_level,
     is_at_boundary,
+    is_pure,
     link_whitener,
     misfit,
     next_level,
@@ -38,11 +39,12 @@ _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
-_FEW = 32  # numbers of a coarse record, which any alias follows
+_FEW = 32  # numbers of a coarse record, too few to tell aliases
 _BENT = 2.0  # times what Fisher's information says: a valley that no covariance describes
 _LOWER = 1.0  # fall of chi-square that is another minimum
 _RIVAL = 25.0  # growth of chi-square at which another minimum is none
-_ROUNDS = 3
+_ROUNDS = 1
+_AGREED = 3  # attempts that end at one and the same minimum
 
 
 class Line(eqx.Module):
@@ -74,11 +76,13 @@ class _Hunt(NamedTuple):
     wrong: Array  # 0 for an answer that may be kept, else how far off it is
     weakest: _Weakest
     lower: Array  # numbers that a probe found
+    agreed: Array  # attempts that ended at the best
+    pure: Array
 
 
 def search(
     problem: Problem, single: Layout, cut: Layout, point: Point, starts: Array, known: Array,
-    coarse: Array,
+    coarse: Array, long: Array,
 ) -> Way:  # fmt: skip
     """Through all stages; if that ends wrong, again, more slowly, from other numbers.
 
@@ -96,6 +100,7 @@ def search(
         starts: Numbers for each attempt.
         known: Level of the unmodelled torque, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
+        long: Whether it turns many times, so that probes must go slowly too.
     """
     options, dtype, count = problem.options, point.omega.dtype, starts.shape[0]
     stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
@@ -108,9 +113,9 @@ def search(
     no, none, nothing = jnp.asarray(False), jnp.asarray(0), jnp.zeros_like(point.numbers)
     found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
     scales, far = jnp.ones(len(problem.samples.values), dtype), jnp.asarray(jnp.inf, dtype)
-    begin = Way(
-        found, problem.samples.seen.astype(dtype), scales, 10 * first, no, no, none.astype(dtype)
-    )
+    kept, zero = problem.samples.seen.astype(dtype), jnp.zeros((), dtype)
+    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)  # any alias follows them
+    begin = Way(found, kept, scales, 10 * first, no, few, zero)
 
     def attempt(hunt: _Hunt) -> _Hunt:
         tried, best, weakest = hunt.tried, hunt.best.found, hunt.weakest
@@ -121,7 +126,8 @@ def search(
         normal = jnp.where(probing, _HARD * weakest.normal, 0.0)
         line = Line(normal, jnp.sum(normal * numbers))
         now = eqx.tree_at(lambda x: x.unknowns, problem, problem.unknowns.holding(line))
-        kind = jnp.minimum(tried, stages.weight.shape[0] - 1)  # the second is slow
+        slow = jnp.where(tried < count, tried > 0, long).astype(int)
+        kind = jnp.minimum(slow, stages.weight.shape[0] - 1)
 
         def one(way: Way, stage: Stage) -> tuple[Way, None]:
             skip = (stage.steps == 0) | (way.done & ~stage.last)
@@ -152,7 +158,7 @@ def search(
         wide = jnp.abs(steps[index]) / jnp.sqrt(jnp.maximum(-fall, 1e-6))
         wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
         wide = jnp.where(better | fell, 0.0, wide)
-        doubtful = jnp.where(better & (fall > _RIVAL), False, best.doubtful) | rival | vain
+        doubtful = jnp.where(better & (fall > _RIVAL), few, best.doubtful) | rival | vain
         doubtful = doubtful | (wide > _BENT * weakest.error)
 
         wrong = jnp.where(better, off, hunt.wrong)
@@ -163,25 +169,29 @@ def search(
         # A misfit that follows the record has two attempts, any other failure all.
         lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
         lost = lost | is_at_boundary(problem, best.found) | coarse
-        more = (wrong > 0) | coarse
-        most = jnp.where(more, jnp.where(lost, count, min(2, count)), 0)
+        same = (jnp.abs(fall) < 1e-2).astype(int)
+        agreed = jnp.where(better & (same == 0), 1, hunt.agreed + same)
+        pure = is_pure(problem, best, weakest.noise)
+        more = (wrong > 0) | (coarse & ~few & (agreed < _AGREED))
+        most = jnp.where(more & ~pure, jnp.where(lost, count, min(2, count)), 0)
         after = jnp.where((tried < count) & (tried + 1 >= most), count, tried + 1)
         after = jnp.where(fell, polish, jnp.where(after == polish, polish + 1, after))
         again = (tried == polish) & (hunt.rounds < _ROUNDS)
         after = jnp.where(again, count, after)
         lower = jnp.where(fell, numbers, hunt.lower)
-        return _Hunt(after, hunt.rounds + again.astype(int), best, wrong, weakest, lower)
+        return _Hunt(
+            after, hunt.rounds + again.astype(int), best, wrong, weakest, lower, agreed, pure
+        )
 
     def going(hunt: _Hunt) -> Array:
         weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)
         probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried <= polish)
+        probes = probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR)
         return (hunt.tried < count) | probes
 
     weakest = _Weakest(far, jnp.ones((), dtype), far, nothing, nothing)
-    hunt = _Hunt(none, none, begin, far, weakest, nothing)
-    best = jax.lax.while_loop(going, attempt, hunt).best
-    few = jnp.sum(weights_of(problem, best.kept)) < _FEW
-    return best._replace(doubtful=best.doubtful | (coarse & few))
+    hunt = _Hunt(none, none, begin, far, weakest, nothing, none, no)
+    return jax.lax.while_loop(going, attempt, hunt).best
 
 
 def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakest:

@@ -193,6 +193,24 @@ def is_at_boundary(problem: Problem, found: Found) -> Array:
     return flat
 
 
+def is_pure(problem: Problem, way: Way, noise: Array) -> Array:
+    """Whether a constant rate in each throw describes a gyro's record as well.
+
+    Where the rates do not vary the Fisher information at the estimate is no guide: a motion fitted
+    to the noise seems to tell what the true one does not. The best of many wobbles gains something
+    from any noise, the more the longer the record.
+    """
+    sensors = problem.unknowns.original(0)[1:]
+    sought = any(x.names for x in problem.unknowns.shapes)
+    if not sought or any(x.on_attitude or x.width != 3 for x in sensors):
+        return jnp.asarray(False)
+    weight = weights_of(problem, way.kept)
+    constant = jnp.sum(weight * signal_of(problem, weight) ** 2)
+    fitted = jnp.sum(weight * way.found.rows.residual[:, : way.kept.shape[1]] ** 2)
+    chance = 5 + GATE * 10**0.5 + 4 * jnp.log(jnp.maximum(jnp.sum(weight), 1.0))  # of five numbers
+    return constant - fitted < noise * chance
+
+
 def link_whitener(
     problem: Problem, layout: Layout, numbers: Array, weight: Array, level: Array
 ) -> Array:
