@@ -1,4 +1,4 @@
-"""Files become tables: names of columns above numbers, whatever separates and surrounds them."""
+"""Files become tables with the units that their formats leave unsaid."""
 
 import csv
 import importlib
@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import pathlib
+import re
 import zipfile
 from typing import NamedTuple
 
@@ -17,19 +18,20 @@ _MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have t
 
 
 class Table(NamedTuple):
-    """Numbers under headers; what the file says `about` itself, and notes on how it was read."""
+    """Numbers under headers; what the file says `about` itself, notes, and who states its units."""
 
     name: str
     headers: list[str]
     values: np.ndarray
     about: dict[str, str]
     notes: list[str]
+    source: str = "the header says so"
 
 
 def tables_of(path: Source, log: int) -> list[Table]:
     """All tables behind a path; files of a folder or a zip that hold none are passed over."""
     if isinstance(path, io.TextIOBase):
-        return [_parse(path.read(), str(getattr(path, "name", "text")))]
+        return [_with_units(_parse(path.read(), str(getattr(path, "name", "text"))))]
     path = pathlib.Path(path)
     if path.is_dir():
         files = {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
@@ -40,7 +42,7 @@ def tables_of(path: Source, log: int) -> list[Table]:
     else:
         files = {path.stem: path.read_bytes()}
         if files[path.stem].startswith(_BLACKBOX):
-            return [_blackbox(path, log)]
+            return [_with_units(_blackbox(path, log))]
     texts = {name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()}
     about = next(csv.DictReader(texts.pop("Metadata", "").splitlines(), restval=""), {})
     tables = []
@@ -51,7 +53,7 @@ def tables_of(path: Source, log: int) -> list[Table]:
             if len(files) == 1:
                 raise
         else:
-            tables.append(table._replace(about=table.about | about))
+            tables.append(_with_units(table._replace(about=table.about | about)))
     return tables
 
 
@@ -124,3 +126,33 @@ def _number(cell: str) -> float:
         return float(cell.replace(",", ".", 1))
     except ValueError:
         return np.nan
+
+
+def _with_units(table: Table) -> Table:
+    """The table with units in its headers that Sensor Logger and Betaflight leave to the reader."""
+    about, rules = table.about, list[tuple[str, str, float]]()
+    if "seconds_elapsed" in table.headers:
+        table = table._replace(source="so Sensor Logger writes it")
+        sign = 1.0
+        if about.get("platform") == "ios" and about.get("standardisation") != "true":
+            table.notes.append("specific forces turned about: iOS gives them the other sign")
+            sign = -1.0
+        rules = [("^gyro|^rotationrate", "{} (rad/s)", 1.0), ("^magnetometer", "{} (uT)", 1.0)]
+        rules += [("^total", "{} (m/s^2)", sign), ("uncalibrated|^gravity", "{}", sign)]
+        rules += [("acc", "linear {}", sign), ("^seconds", "{} (s)", 1.0)]
+    elif any(x.startswith("gyroADC") for x in table.headers):
+        table = table._replace(source="so Betaflight logs it")
+        text = about.get("gyro_scale", about.get("gyro.scale", "1"))
+        scale = float(int(text, 0) if text.isalnum() else text)
+        if scale > 1 << 20:  # a float written as the integer of the same bits
+            scale = float(np.uint32(scale).view(np.float32))
+        rules = [(r"^gyro(ADC|Unfilt)\[.\]$", "{} (deg/s)", scale)]
+        if "acc_1G" in about:
+            rules += [(r"^accSmooth\[.\]$", "{} (g)", 1 / float(about["acc_1G"]))]
+    for j, header in enumerate(table.headers):
+        name = f"{table.name} {header}" if len(header) == 1 else header
+        fits = [rule for rule in rules if re.search(rule[0], name, re.IGNORECASE)]
+        for _, new, factor in fits[:1]:
+            table.headers[j] = new.format(name)
+            table.values[:, j] *= factor
+    return table

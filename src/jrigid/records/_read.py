@@ -30,6 +30,7 @@ _SPELLED = {
     r"dps$": "deg/s",
     r"m/s/s|mps2|m/?s(\^|\*\*)?(-?2|²)": "m/s^2",
 }
+Columns = Mapping[str, str | Sequence[str]]
 _MEASURED = ("rates", "specific_forces", "magnetic_fields")
 # What a column measures, by words in its name; the first that fits.
 _KINDS = {
@@ -57,26 +58,50 @@ _USUAL = {
 }
 _TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
 _LIKE = 0.4  # correlation of the two from which their ratio is believed
-Stated = tuple[str | None, str, float]  # a unit, who says so, the factor of the numbers to it
-
-
-Columns = Mapping[str, str | Sequence[str]]
 
 
 class _Sensor(NamedTuple):
-    """Columns of a table: the times and the axes, of the rows where all of these are numbers."""
+    """Times and three axes of a table, in the rows where all axes are numbers."""
 
-    kind: str
     label: str
     table: Table
     columns: list[int]
     rows: np.ndarray
-    stated: Stated
 
-    @property
-    def values(self) -> np.ndarray:
-        """Times and axes as they are in the table."""
-        return self.table.values[np.ix_(self.rows, self.columns)]
+
+class _Units(NamedTuple):
+    """What the caller `asked` for, and the notes on who says a unit."""
+
+    asked: dict[str, str]
+    notes: list[str]
+
+    def factor(
+        self,
+        kind: str,
+        label: str,
+        header: str,
+        source: str,
+        values: np.ndarray,
+        turned: str | None = None,
+    ) -> float | None:
+        """The factor to SI by the caller, the file or the numbers; None where nobody says it."""
+        unit = _split(header)[1]
+        if kind in self.asked:
+            heard = "" if unit in (None, self.asked[kind]) else f", though the file says {unit}"
+            unit, source = self.asked[kind], f"`unit` says so{heard}"
+        elif unit is None:
+            unit, source = _recognised(kind, values, turned)
+        what = f"{kind.replace('_', ' ')} ({label})"
+        if unit is None:
+            self.notes.append(f"{what} left out: their unit is not stated")
+            return None
+        other = f"but it does not, and the file's {unit!r} is not known."
+        demand(unit in _UNITS[kind], f"Argument `unit` must say the unit of `{kind}`, {other}")
+        self.notes.append(f"{what} taken as {unit}: {source}")
+        factor = _UNITS[kind][unit]
+        if turned and not 0.2 < factor / _UNITS["rates"][turned] < 5:  # headers can be wrong
+            self.notes.append(f"yet gravity turns in the body as if the rates were in {turned}")
+        return factor
 
 
 def read(
@@ -126,102 +151,88 @@ def read(
     `COORDINATES.md`; betaflight/blackbox-tools, `units.h` and `parser.c`.
     """
     given = {"rates": unit} if isinstance(unit, str) else dict(unit or {})
-    asked = {kind: _plain(said) for kind, said in given.items()}
-    for kind, said in asked.items():
+    units = _Units({kind: _plain(said) for kind, said in given.items()}, [])
+    for kind, said in units.asked.items():
         check_option("unit", kind, tuple(_UNITS))
         check_option("unit", said, tuple(_UNITS[kind]))
-    tables, columns = tables_of(path, log), dict(columns or {})
-    chosen = _choose(tables, columns)
+    tables = tables_of(path, log)
+    headers = ", ".join(header for table in tables for header in table.headers)
+    _rename(tables, columns or {})
+    sensors = [found for table in tables for found in _sensors(table, columns or {})]
+    chosen: dict[str, _Sensor] = {}
+    for kind, sensor in sorted(sensors, key=lambda x: "uncal" in x[1].label.lower()):
+        chosen.setdefault(kind, sensor)
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
-        headers = ", ".join(h for table in tables for h in table.headers)
         raise ValueError(
             "Argument `path` must hold three columns of a sensor, but none is recognised: name "
             f"them by `columns`. There are {headers or 'no tables'}."
         )
-    used = {s.table.name: s.table for s in chosen.values()}
-    notes = [f"{x.name}: {n}" if len(used) > 1 else n for x in used.values() for n in x.notes]
-    times = {}
-    for kind, sensor in chosen.items():
-        t, header = sensor.values[:, 0], sensor.table.headers[sensor.columns[0]]
-        stated = _split(header)[1], "the header says so", 1.0
-        times[kind] = t * _factor(asked, notes, "times", header, stated, t)
-    origin = min(np.nanmin(t, initial=np.inf) for t in times.values())
-    if _EPOCH < origin < np.inf:
-        notes.append(f"times count from {origin:.6f} s of the file's clock")
-        times = {kind: t - origin for kind, t in times.items()}
-    clocks = {k: repair(times[k], s.values[:, 1:], clock=clock) for k, s in chosen.items()}
-    own, raw = clocks[main.kind], {}
-    for kind, sensor in chosen.items():
-        said, rows = clocks[kind].notes, clocks[kind].rows
-        notes += [f"{sensor.label}: {x}" for x in said] if len(used) > 1 else said
-        raw[kind] = sensor.values[rows, 1:]
-        if not np.array_equal(own.times, clocks[kind].times):
-            notes.append(f"{sensor.label}: times of its own; brought to those of the rest linearly")
-            raw[kind] = _onto(own.times, clocks[kind], raw[kind])
-    found = _in_si(chosen, raw, own.times, asked, notes)
-    used = [s for k, s in chosen.items() if (k if k in _MEASURED else "specific_forces") in found]
-    others = _others(main, own.rows, used, columns)
-    said = tuple(dict.fromkeys(notes))
+    own, raw = _on_one_clock(chosen, main, clock, units)
+    found, used = {}, {main.columns[0]}
+    for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
+        if kind in chosen:
+            label, table, which, _ = chosen[kind]
+            unit, turned = table.headers[which[1]], None
+            if kind == "rates" and "specific_forces" in found:
+                turned = _turned(own.times, raw[kind], found["specific_forces"])
+            factor = units.factor(kind, label, unit, table.source, raw[kind], turned)
+            if factor is not None:
+                found[kind] = factor * raw[kind]
+                used.update(which if table is main.table else ())
+    rows = main.rows[own.rows]
+    others = {}
+    for j, header in enumerate(main.table.headers):
+        column = main.table.values[rows, j]
+        if header and j not in used and np.isfinite(column).any():
+            others[header] = column
+    said = tuple(dict.fromkeys(units.notes))
     return Reading(own.times, **found, columns=others, breaks=own.breaks, notes=said)
 
 
-def _choose(tables: list[Table], columns: Columns) -> dict[str, _Sensor]:
-    """The first sensor of each kind; named ones, and those that are calibrated, before others."""
-    names = [[_split(header)[0] for header in table.headers] for table in tables]
+def _rename(tables: list[Table], columns: Columns) -> None:
+    """Give columns the names that the caller has for them; where it is no sensor's, in SI."""
+    factors = {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
+    headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
-        olds = (old,) if isinstance(old, str) else old
+        olds, three = (old,) if isinstance(old, str) else old, new in _MEASURED
         demand(
-            len(olds) == 3 or new not in _MEASURED,
+            len(olds) == 3 or not three,
             f"Argument `columns` must name three columns for `{new}`, but it names {old!r}.",
         )
-        for axis, one in zip(("[0]", "[1]", "[2]"), olds, strict=False):
-            for i, j in _find(tables, one):
-                names[i][j] = f"{new}{axis}" if new in _MEASURED else new
-    sensors = [s for x, own in zip(tables, names, strict=True) for s in _sensors(x, own, columns)]
-    chosen: dict[str, _Sensor] = {}
-    for sensor in sorted(sensors, key=lambda s: "uncal" in s.label.lower()):
-        chosen.setdefault(sensor.kind, sensor)
-    if "specific_forces" in chosen:
-        chosen = {kind: s for kind, s in chosen.items() if kind in _MEASURED}
-    return chosen
+        for i, one in enumerate(olds):
+            places = [(t, j, *_split(x), x) for t in tables for j, x in enumerate(t.headers)]
+            places = [place for place in places if one in place[2:]]
+            demand(
+                len(places) > 0,
+                f"Argument `columns` must name columns of the file, but {one!r} is none of "
+                f"{headers}.",
+            )
+            for table, j, _, unit, _ in places:
+                if new not in _UNITS:
+                    table.values[:, j] *= factors.get(unit, 1.0)
+                    unit = None
+                name = f"{new}[{i}]" if three else new
+                table.headers[j] = name if unit is None else f"{name} ({unit})"
 
 
-def _find(tables: list[Table], wanted: str) -> list[tuple[int, int]]:
-    """Where columns are of this header, with or without its unit: numbers of table and column."""
-    for which in (lambda header: header, lambda header: _split(header)[0]):
-        every = ((i, j, x) for i, table in enumerate(tables) for j, x in enumerate(table.headers))
-        hits = [(i, j) for i, j, header in every if which(header) == wanted]
-        if hits:
-            return hits
-    headers = ", ".join(header for table in tables for header in table.headers)
-    raise ValueError(
-        f"Argument `columns` must name columns of the file, but {wanted!r} is none of {headers}."
-    )
-
-
-def _sensors(table: Table, names: list[str], columns: Columns) -> list[_Sensor]:
+def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
     """The sensors of a table: three columns whose names differ by the axis, and their times."""
-    known = np.isfinite(table.values)
-    times = [j for j, x in enumerate(names) if _kind(x) == "times" and known[:, j].any()]
-    times = [names.index("times")] if "times" in names else times
-    triples: dict[str, dict[str, int]] = {}
-    for j, name in enumerate(names):
-        match = _AXIS.match(name)
-        if match and known[:, j].any():
+    known, names = np.isfinite(table.values), [_split(x)[0] for x in table.headers]
+    times, triples = [], dict[str, dict[str, int]]()
+    for j in np.flatnonzero(known.any(axis=0)).tolist():
+        match = _AXIS.match(names[j])
+        if match:
             triples.setdefault(match[1], {}).setdefault(match[2].lower(), j)
+        elif _kind(names[j]) == "times":
+            times.append(j)
+    times = [names.index("times")] if "times" in columns else times
     sensors = []
     for stem, axes in triples.items():
-        kind = _kind(stem or table.name)
-        if len(axes) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
+        kind, three = _kind(stem or table.name), [axes[axis] for axis in sorted(axes)]
+        if len(three) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
             continue
-        three = [axes[axis] for axis in sorted(axes)]
-        headers = [_split(table.headers[j])[0] for j in three]
-        label = ", ".join(headers) if kind == stem or len(stem) == 1 else stem or table.name
-        kind, *stated = _stated(kind, label, table)
-        unit = _split(table.headers[three[0]])[1]
-        if unit is not None:  # a unit in the header beats that of the format
-            stated = unit, "the header says so", 1.0
+        label = ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
         demand(
             len(times) > 0,
             "Argument `columns` must name the column of the times, but it does not, and none of "
@@ -230,31 +241,43 @@ def _sensors(table: Table, names: list[str], columns: Columns) -> list[_Sensor]:
         time = max((j for j in times if j < three[0]), default=times[0])
         rows = np.flatnonzero(known[:, three].all(axis=1))
         if rows.size:
-            sensors.append(_Sensor(kind, label, table, [time, *three], rows, tuple(stated)))
+            sensors.append((kind, _Sensor(label, table, [time, *three], rows)))
     return sensors
 
 
-def _stated(kind: str, label: str, table: Table) -> tuple[str, str | None, str, float]:
-    """What is measured, its unit, who says so, and the factor to it, as the format has it."""
-    name, about = label.lower().partition("[")[0], table.about
-    if "seconds_elapsed" in table.headers:
-        units = {"rates": "rad/s", "magnetic_fields": "ut"}
-        unit = "m/s^2" if "total" in name else units.get(kind)
-        ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
-        sign = -1.0 if ios and kind not in units else 1.0
-        if kind == "specific_forces" and not re.search("total|uncal", name):
-            kind = "linear"
-        return kind, unit, "so Sensor Logger writes it", sign
-    if name in ("gyroadc", "gyrounfilt"):
-        text = about.get("gyro_scale", about.get("gyro.scale", "1"))
-        scale = int(text, 0) if text.isalnum() else float(text)
-        if scale > 1 << 20:  # a float written as the integer of the same bits
-            scale = float(np.uint32(scale).view(np.float32))
-        return kind, "deg/s", "so Betaflight logs its gyro", scale
-    if name == "accsmooth" and "acc_1G" in about:
-        one = about["acc_1G"]
-        return kind, "g", f"acc_1G is {one}", 1 / float(one)
-    return kind, None, "", 1.0
+def _on_one_clock(
+    chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
+) -> tuple[Clock, dict[str, np.ndarray]]:
+    """The clock of the main sensor put right, and what each sensor reads at its times."""
+    times, raw = {}, {k: x.table.values[np.ix_(x.rows, x.columns)] for k, x in chosen.items()}
+    for kind, (_, table, (time, *_), _) in chosen.items():
+        t, header = raw[kind][:, 0], table.headers[time]
+        times[kind] = t * units.factor("times", header, header, table.source, t)
+    origin = min(np.nanmin(t, initial=np.inf) for t in times.values())
+    if _EPOCH < origin < np.inf:
+        units.notes.append(f"times count from {origin:.6f} s of the file's clock")
+        times = {kind: t - origin for kind, t in times.items()}
+    clocks = {kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen}
+    own = clocks[next(kind for kind, x in chosen.items() if x is main)]
+    several = any(x.table is not main.table for x in chosen.values())
+    for kind, (label, table, _, _) in chosen.items():
+        said = [*table.notes, *clocks[kind].notes]
+        raw[kind] = raw[kind][clocks[kind].rows, 1:]
+        if not np.array_equal(own.times, clocks[kind].times):
+            said.append("times of its own; brought to those of the rest linearly")
+            raw[kind] = _onto(own.times, clocks[kind], raw[kind])
+        units.notes.extend(f"{label}: {x}" if several else x for x in said)
+    if "linear" in chosen and "specific_forces" not in chosen:
+        label, gravity = chosen["linear"].label, chosen.get("gravity")
+        if gravity is None:
+            units.notes.append(f"{label}: without gravity, no specific force; left out")
+        else:
+            raw["specific_forces"] = raw["linear"] + raw["gravity"]
+            both = [*chosen["linear"].columns, *gravity.columns]
+            chosen["specific_forces"] = chosen["linear"]._replace(
+                label=f"{label} with gravity", columns=both
+            )
+    return own, raw
 
 
 def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
@@ -266,69 +289,7 @@ def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
     return np.where(silent[:, None], np.nan, np.stack(columns, axis=1))
 
 
-def _in_si(
-    chosen: dict[str, _Sensor],
-    raw: dict[str, np.ndarray],
-    times: np.ndarray,
-    asked: dict[str, str],
-    notes: list[str],
-) -> dict[str, np.ndarray]:
-    """What is measured in SI, by kind; without that whose unit nobody knows."""
-    if "linear" in raw and "gravity" in raw:
-        label = f"{chosen['linear'].label} with gravity"
-        chosen["specific_forces"] = chosen["linear"]._replace(label=label)
-        raw["specific_forces"] = raw["linear"] + raw["gravity"]
-    elif "linear" in raw:
-        label = chosen["linear"].label
-        notes.append(f"{label}: without gravity, no specific force; left out")
-    found: dict[str, np.ndarray] = {}
-    for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
-        if kind in raw:
-            turned = None
-            if kind == "rates" and "specific_forces" in found:
-                turned = _turned(times, raw[kind], found["specific_forces"])
-            _, label, *_, stated = chosen[kind]
-            factor = _factor(asked, notes, kind, label, stated, raw[kind], turned)
-            if factor is not None:
-                found[kind] = factor * raw[kind]
-    return found
-
-
-def _factor(
-    asked: dict[str, str],
-    notes: list[str],
-    kind: str,
-    label: str,
-    stated: Stated,
-    values: np.ndarray,
-    turned: str | None = None,
-) -> float | None:
-    """The factor to SI by who says the unit: the caller, the file or the numbers; None if nobody."""
-    unit, source, factor = stated
-    if kind in asked:
-        heard = "" if unit in (None, asked[kind]) else f", though the file says {unit}"
-        unit, source = asked[kind], f"`unit` says so{heard}"
-    elif unit is None:
-        unit, source = _recognised(kind, values, turned)
-    what = f"{kind.replace('_', ' ')} ({label})"
-    if unit is None:
-        notes.append(f"{what} left out: their unit is not stated")
-        return None
-    demand(
-        unit in _UNITS[kind],
-        f"Argument `unit` must say the unit of `{kind}`, but it does not, and the file's {unit!r} "
-        "is not known.",
-    )
-    notes.append(f"{what} taken as {unit}: {source}")
-    if factor < 0:
-        notes.append(f"{what} turned about: iOS gives them the other sign")
-    factor *= _UNITS[kind][unit]
-    if turned and not 0.2 < factor / _UNITS["rates"][turned] < 5:  # headers can be wrong
-        notes.append(f"yet gravity turns in the body as if the rates were in {turned}")
-    return factor
-
-
-def _recognised(kind: str, values: np.ndarray, turned: str | None) -> tuple[str | None, str]:
+def _recognised(kind: str, values: np.ndarray, turned: str | None = None) -> tuple[str | None, str]:
     """The unit in which alone numbers make sense, and why."""
     if kind == "rates":
         most = float(np.abs(values).max())
@@ -345,7 +306,7 @@ def _recognised(kind: str, values: np.ndarray, turned: str | None) -> tuple[str 
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
     demand(
         unit is not None or kind not in ("times", "rates"),
-        f"Argument `unit` must say the unit of the {kind}, but neither it nor the file does; {doubt}.",
+        f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}.",
     )
     return unit, why
 
@@ -385,24 +346,3 @@ def _plain(unit: str) -> str:
     for pattern, plain in _SPELLED.items():
         unit = re.sub(pattern, plain, unit)
     return unit
-
-
-def _others(
-    main: _Sensor, rows: np.ndarray, used: list[_Sensor], columns: Columns
-) -> dict[str, np.ndarray]:
-    """The other columns with numbers, and those asked for by a name, in SI by their header."""
-    table, rows = main.table, main.rows[rows]
-    taken = {main.columns[0]}.union(*(s.columns for s in used if s.table is table))
-    others = {
-        header: table.values[rows, j]
-        for j, header in enumerate(table.headers)
-        if header and j not in taken and np.isfinite(table.values[rows, j]).any()
-    }
-    for name, header in columns.items():
-        if name not in _UNITS:
-            [(_, j), *_] = _find([table], str(header))
-            unit = _split(table.headers[j])[1]
-            factor = next((known[unit] for known in _UNITS.values() if unit in known), 1.0)
-            others.pop(table.headers[j], None)
-            others[name] = factor * table.values[rows, j]
-    return others

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from jrigid._checks import check_option, check_shape, demand
 from jrigid._types import Readable
 
-
 _WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
 _GUESSES = 300  # windows that are tried, at most
 _SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
