@@ -126,9 +126,7 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
         elif back > _LATE * interval:
             t[row:] += back + interval
             resets.append(float(t[row]))
-            notes.append(
-                f"the clock went back by {back:.3g} s at row {row}: a break of unknown length"
-            )
+            notes.append(f"the clock went back by {back:.3g} s at row {row}: a break of any length")
     return resets
 
 
@@ -150,10 +148,8 @@ def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) ->
     if beside:
         intervals, jitters = 1e3 * np.transpose(beside)
         why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"
-        notes.append(
-            f"times put on an even clock of {intervals.mean():.5g} ms: {why}, "
-            f"{jitters.max():.3g} ms rms beside it"
-        )
+        note = f"times put on an even clock of {intervals.mean():.5g} ms: {why}, "
+        notes.append(f"{note}{jitters.max():.3g} ms rms beside it")
     return np.concatenate(pieces)
 
 

@@ -12,8 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jrigid._checks import demand
+
 Source = str | os.PathLike[str] | io.TextIOBase
-_BLACKBOX = b"H Product:Blackbox"  # how the log of a flight controller begins
+_BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
 _MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have their settings there
 
 
@@ -31,9 +33,8 @@ class Table(NamedTuple):
 def tables_of(path: Source, log: int) -> list[Table]:
     """All tables behind a path; files of a folder or a zip that hold none are passed over."""
     if isinstance(path, io.TextIOBase):
-        return [_with_units(_parse(path.read(), str(getattr(path, "name", "text"))))]
-    path = pathlib.Path(path)
-    if path.is_dir():
+        files = {str(getattr(path, "name", "text")): path.read().encode()}
+    elif (path := pathlib.Path(path)).is_dir():
         files = {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
     elif zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
@@ -41,28 +42,25 @@ def tables_of(path: Source, log: int) -> list[Table]:
             files = {pathlib.PurePath(n).stem: archive.read(n) for n in names}
     else:
         files = {path.stem: path.read_bytes()}
-        if files[path.stem].startswith(_BLACKBOX):
-            return [_with_units(_blackbox(path, log))]
     texts = {name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()}
-    about = next(csv.DictReader(texts.pop("Metadata", "").splitlines(), restval=""), {})
+    about = next(csv.DictReader(texts.get("Metadata", "").splitlines(), restval=""), {})
     tables = []
     for name, text in texts.items():
         try:
-            table = _parse(text, name)
+            is_log = text.startswith(_BLACKBOX)
+            tables.append(_blackbox(str(path), name, log) if is_log else _parse(text, name))
         except ValueError:
-            if len(files) == 1:
+            if len(texts) == 1:
                 raise
-        else:
-            tables.append(_with_units(table._replace(about=table.about | about)))
-    return tables
+    return [_with_units(table._replace(about=table.about | about)) for table in tables]
 
 
-def _blackbox(path: pathlib.Path, log: int) -> Table:
+def _blackbox(path: str, name: str, log: int) -> Table:
     """A log of a flight controller, decoded by orangebox."""
     try:
         orangebox = importlib.import_module("orangebox")
         # A parser for each log: one that goes on to another keeps the headers of the last.
-        parser = orangebox.Parser.load(str(path), log, allow_invalid_header=True)
+        parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
     except ModuleNotFoundError as error:
         raise ImportError('This needs orangebox: pip install "jrigid[records]".') from error
     except RuntimeError as error:
@@ -79,7 +77,7 @@ def _blackbox(path: pathlib.Path, log: int) -> Table:
         notes.append(f"the log breaks off after {len(frames)} frames ({error})")
     values = np.array([x for x in frames if len(x) == len(names)], float).reshape(-1, len(names))
     about = {key: str(value) for key, value in parser.headers.items()}
-    return Table(path.stem, names, values, about, notes)
+    return Table(name, names, values, about, notes)
 
 
 def _parse(text: str, name: str) -> Table:
@@ -89,12 +87,9 @@ def _parse(text: str, name: str) -> Table:
     separator = next((d for d in "\t;," if sum(d in x for x in last) > len(last) / 2), ",")
     rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
-    head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), None)
-    if head is None:
-        raise ValueError(
-            "Argument `path` must be a file with the names of its columns in a line above its "
-            f"numbers, but in {name!r} there is none."
-        )
+    head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
+    lacking = f"Argument `path` must have names of its columns above numbers, but {name!r} has not."
+    demand(head >= 0, lacking)
     headers, width = rows[head], len(rows[head])
     below = [row for row in rows[head + 1 :] if row != headers]
     whole = [row[:width] for row in below if len(row) >= width and not any(row[width:])]
@@ -130,13 +125,13 @@ def _number(cell: str) -> float:
 
 def _with_units(table: Table) -> Table:
     """The table with units in its headers that Sensor Logger and Betaflight leave to the reader."""
-    about, rules = table.about, list[tuple[str, str, float]]()
+    about, rules = table.about, []
     if "seconds_elapsed" in table.headers:
         table = table._replace(source="so Sensor Logger writes it")
-        sign = 1.0
-        if about.get("platform") == "ios" and about.get("standardisation") != "true":
-            table.notes.append("specific forces turned about: iOS gives them the other sign")
-            sign = -1.0
+        ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
+        sign = -1.0 if ios else 1.0
+        if ios and "acc" in table.name.lower():
+            table.notes.append("turned about: iOS gives accelerations the other sign")
         rules = [("^gyro|^rotationrate", "{} (rad/s)", 1.0), ("^magnetometer", "{} (uT)", 1.0)]
         rules += [("^total", "{} (m/s^2)", sign), ("uncalibrated|^gravity", "{}", sign)]
         rules += [("acc", "linear {}", sign), ("^seconds", "{} (s)", 1.0)]

@@ -11,24 +11,15 @@ from jrigid.records._clock import Clock, repair
 from jrigid.records._files import Source, Table, tables_of
 from jrigid.records._reading import Reading
 
-_DEGREE = np.pi / 180
 # By what is measured, in SI, spelled as `_plain` returns them.
 _UNITS: dict[str, dict[str, float]] = {
     "times": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
-    "rates": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "mdeg/s": 1e-3 * _DEGREE}
-    | {"rpm": 6 * _DEGREE, "rev/s": 360 * _DEGREE},
-    "specific_forces": {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3},
+    "rates": dict.fromkeys(("rad/s", "rads", "rad_s", "radians/s"), 1.0)
+    | dict.fromkeys(("deg/s", "°/s", "dps", "deg_s", "degs", "degrees/s"), np.pi / 180)
+    | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi},
+    "specific_forces": dict.fromkeys(("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0)
+    | {"g": 9.80665, "mg": 9.80665e-3},
     "magnetic_fields": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "g": 1e-4, "gauss": 1e-4},
-}
-# Other spellings of them: two signs for micro, and one lost in decoding, are u.
-_SPELLED = {
-    r"[\u00b5\u03bc\ufffd]": "u",
-    r"\s|(?<=s)ec(s|onds?)?": "",
-    r"°|degrees?": "deg",
-    r"radians?": "rad",
-    r"(rad|deg)_?s$": r"\1/s",
-    r"dps$": "deg/s",
-    r"m/s/s|mps2|m/?s(\^|\*\*)?(-?2|²)": "m/s^2",
 }
 Columns = Mapping[str, str | Sequence[str]]
 _MEASURED = ("rates", "specific_forces", "magnetic_fields")
@@ -48,12 +39,7 @@ _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from
 _RANGE = 70.0, 4100.0  # [rad/s] no common gyro measures beyond; larger numbers are not deg/s either
 # Medians of what each row says: steps of 8 Hz to 8 kHz, and sizes at hand.
 _USUAL = {
-    "times": {
-        "s": (0.000125, 0.125),
-        "ms": (0.125, 125.0),
-        "us": (125.0, 125e3),
-        "ns": (125e3, 125e6),
-    },
+    "times": {"s": (125e-6, 0.125), "ms": (0.125, 125), "us": (125, 125e3), "ns": (125e3, 125e6)},
     "specific_forces": {"g": (0.8, 1.25), "m/s^2": (7.8, 12.3)},
 }
 _TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
@@ -76,21 +62,17 @@ class _Units(NamedTuple):
     notes: list[str]
 
     def factor(
-        self,
-        kind: str,
-        label: str,
-        header: str,
-        source: str,
-        values: np.ndarray,
-        turned: str | None = None,
+        self, kind: str, sensor: _Sensor, values: np.ndarray, turned: str = ""
     ) -> float | None:
         """The factor to SI by the caller, the file or the numbers; None where nobody says it."""
-        unit = _split(header)[1]
+        header = sensor.table.headers[sensor.columns[kind != "times"]]
+        unit, source = _split(header)[1], sensor.table.source
         if kind in self.asked:
             heard = "" if unit in (None, self.asked[kind]) else f", though the file says {unit}"
             unit, source = self.asked[kind], f"`unit` says so{heard}"
         elif unit is None:
             unit, source = _recognised(kind, values, turned)
+        label = header if kind == "times" else sensor.label
         what = f"{kind.replace('_', ' ')} ({label})"
         if unit is None:
             self.notes.append(f"{what} left out: their unit is not stated")
@@ -159,33 +141,27 @@ def read(
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns or {})
     sensors = [found for table in tables for found in _sensors(table, columns or {})]
-    chosen: dict[str, _Sensor] = {}
-    for kind, sensor in sorted(sensors, key=lambda x: "uncal" in x[1].label.lower()):
-        chosen.setdefault(kind, sensor)
+    chosen = dict(sorted(reversed(sensors), key=lambda x: "uncal" not in x[1].label.lower()))
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
-        raise ValueError(
+        needed = (
             "Argument `path` must hold three columns of a sensor, but none is recognised: name "
-            f"them by `columns`. There are {headers or 'no tables'}."
         )
+        raise ValueError(f"{needed}them by `columns`. There are {headers or 'no tables'}.")
     own, raw = _on_one_clock(chosen, main, clock, units)
     found, used = {}, {main.columns[0]}
     for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
         if kind in chosen:
-            label, table, which, _ = chosen[kind]
-            unit, turned = table.headers[which[1]], None
+            sensor, turned = chosen[kind], ""
             if kind == "rates" and "specific_forces" in found:
                 turned = _turned(own.times, raw[kind], found["specific_forces"])
-            factor = units.factor(kind, label, unit, table.source, raw[kind], turned)
+            factor = units.factor(kind, sensor, raw[kind], turned)
             if factor is not None:
                 found[kind] = factor * raw[kind]
-                used.update(which if table is main.table else ())
-    rows = main.rows[own.rows]
-    others = {}
-    for j, header in enumerate(main.table.headers):
-        column = main.table.values[rows, j]
-        if header and j not in used and np.isfinite(column).any():
-            others[header] = column
+                used.update(sensor.columns if sensor.table is main.table else ())
+    rest = zip(main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True)
+    rest = [(header, x) for j, (header, x) in enumerate(rest) if header and j not in used]
+    others = {header: x for header, x in rest if np.isfinite(x).any()}
     said = tuple(dict.fromkeys(units.notes))
     return Reading(own.times, **found, columns=others, breaks=own.breaks, notes=said)
 
@@ -195,25 +171,19 @@ def _rename(tables: list[Table], columns: Columns) -> None:
     factors = {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
     headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
-        olds, three = (old,) if isinstance(old, str) else old, new in _MEASURED
-        demand(
-            len(olds) == 3 or not three,
-            f"Argument `columns` must name three columns for `{new}`, but it names {old!r}.",
-        )
+        olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
+        named = f"Argument `columns` must name three columns for `{new}`, but it names {old!r}."
+        demand(len(olds) == 3 or not three, named)
         for i, one in enumerate(olds):
-            places = [(t, j, *_split(x), x) for t in tables for j, x in enumerate(t.headers)]
-            places = [place for place in places if one in place[2:]]
-            demand(
-                len(places) > 0,
-                f"Argument `columns` must name columns of the file, but {one!r} is none of "
-                f"{headers}.",
-            )
-            for table, j, _, unit, _ in places:
+            places = [(t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)]
+            places = [place for place in places if one in place[2:4]]
+            there = f"Argument `columns` must name columns of the file, but {one!r} is none of "
+            demand(len(places) > 0, there + headers)
+            for table, j, _, _, unit in places:
+                name = f"{new}[{i}]" if three else new
+                table.headers[j] = f"{name} ({unit})" if unit and new in _UNITS else name
                 if new not in _UNITS:
                     table.values[:, j] *= factors.get(unit, 1.0)
-                    unit = None
-                name = f"{new}[{i}]" if three else new
-                table.headers[j] = name if unit is None else f"{name} ({unit})"
 
 
 def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
@@ -233,11 +203,10 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
         if len(three) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
             continue
         label = ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
-        demand(
-            len(times) > 0,
+        needed = (
             "Argument `columns` must name the column of the times, but it does not, and none of "
-            f"{', '.join(table.headers)} is recognised.",
         )
+        demand(len(times) > 0, f"{needed}{', '.join(table.headers)} is recognised.")
         time = max((j for j in times if j < three[0]), default=times[0])
         rows = np.flatnonzero(known[:, three].all(axis=1))
         if rows.size:
@@ -250,9 +219,9 @@ def _on_one_clock(
 ) -> tuple[Clock, dict[str, np.ndarray]]:
     """The clock of the main sensor put right, and what each sensor reads at its times."""
     times, raw = {}, {k: x.table.values[np.ix_(x.rows, x.columns)] for k, x in chosen.items()}
-    for kind, (_, table, (time, *_), _) in chosen.items():
-        t, header = raw[kind][:, 0], table.headers[time]
-        times[kind] = t * units.factor("times", header, header, table.source, t)
+    for kind, sensor in chosen.items():
+        t = raw[kind][:, 0]
+        times[kind] = t * units.factor("times", sensor, t)
     origin = min(np.nanmin(t, initial=np.inf) for t in times.values())
     if _EPOCH < origin < np.inf:
         units.notes.append(f"times count from {origin:.6f} s of the file's clock")
@@ -268,15 +237,15 @@ def _on_one_clock(
             raw[kind] = _onto(own.times, clocks[kind], raw[kind])
         units.notes.extend(f"{label}: {x}" if several else x for x in said)
     if "linear" in chosen and "specific_forces" not in chosen:
-        label, gravity = chosen["linear"].label, chosen.get("gravity")
+        (label, table, columns, rows), gravity = chosen["linear"], chosen.get("gravity")
         if gravity is None:
             units.notes.append(f"{label}: without gravity, no specific force; left out")
         else:
-            raw["specific_forces"] = raw["linear"] + raw["gravity"]
-            both = [*chosen["linear"].columns, *gravity.columns]
-            chosen["specific_forces"] = chosen["linear"]._replace(
-                label=f"{label} with gravity", columns=both
+            raw["specific_forces"], columns = (
+                raw["linear"] + raw["gravity"],
+                columns + gravity.columns,
             )
+            chosen["specific_forces"] = _Sensor(f"{label} with gravity", table, columns, rows)
     return own, raw
 
 
@@ -289,11 +258,11 @@ def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
     return np.where(silent[:, None], np.nan, np.stack(columns, axis=1))
 
 
-def _recognised(kind: str, values: np.ndarray, turned: str | None = None) -> tuple[str | None, str]:
+def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None, str]:
     """The unit in which alone numbers make sense, and why."""
     if kind == "rates":
         most = float(np.abs(values).max())
-        unit, why = turned, "so gravity turns in the body"
+        unit, why = turned or None, "so gravity turns in the body"
         if most > _RANGE[0]:
             unit, why = "deg/s" if most < _RANGE[1] else None, f"no gyro reads {most:.0f} rad/s"
         doubt = f"numbers up to {most:.6g} do not tell"
@@ -304,15 +273,13 @@ def _recognised(kind: str, values: np.ndarray, turned: str | None = None) -> tup
         unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
         why = f"their median {'step ' * (kind == 'times')}is {size:.4g}"
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
-    demand(
-        unit is not None or kind not in ("times", "rates"),
-        f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}.",
-    )
+    doubt = f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}."
+    demand(unit is not None or kind not in ("times", "rates"), doubt)
     return unit, why
 
 
-def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str | None:
-    """The unit in which gravity turns as the rates say, df/dt = -omega x f; None if unclear."""
+def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
+    """The unit in which gravity turns as the rates say, df/dt = -omega x f; "" if unclear."""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
     sums, size = np.cumsum(steps, axis=0), np.linalg.norm(forces, axis=1)[lag:]
@@ -322,7 +289,7 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str | N
     said, seen = said[use], seen[use]
     product, square = np.sum(said * seen), np.sum(said**2)
     if product <= _LIKE * np.sqrt(square * np.sum(seen**2)):
-        return None
+        return ""
     return min(("rad/s", "deg/s"), key=lambda u: abs(np.log(product / square / _UNITS["rates"][u])))
 
 
@@ -341,8 +308,6 @@ def _split(header: str) -> tuple[str, str | None]:
 
 
 def _plain(unit: str) -> str:
-    """A unit as in `_UNITS`."""
-    unit = unit.strip().lower()
-    for pattern, plain in _SPELLED.items():
-        unit = re.sub(pattern, plain, unit)
-    return unit
+    """A unit as in `_UNITS`; two signs for micro, and one lost in decoding, are u."""
+    unit = re.sub(r"\s|(?<=s)ec(onds?|s)?", "", re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower()))
+    return unit.replace("²", "^2").replace("**", "^")

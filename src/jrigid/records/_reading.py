@@ -16,12 +16,11 @@ _WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
 _GUESSES = 300  # windows that are tried, at most
 _SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
 _SLOPE = 0.02  # [s] over which rates are differentiated
-_LEVER = 0.2  # [m] how far from the mass centre an accelerometer usually is
+_USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
 _FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
 _TURN = 0.1  # [s] over which a momentum must stay the same
 _KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
-_SHARE = 0.2  # how far moments usually are from equal, of a trace of 1
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
 _REST = 0.25  # [s] over which it is judged whether the body rests
 _STILL = 0.1  # [rad/s] standard deviation above which a body does not rest, whatever else it does
@@ -66,14 +65,11 @@ class Reading(Readable):
         """Consecutive rows, with the notes of the whole."""
         first, last, step = rows.indices(self.times.size)
         demand(step == 1, f"Argument `rows` must be consecutive, but their step is {step}.")
-
-        def part(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else array[first:last]
-
         arrays = (self.times, self.rates, self.specific_forces, self.magnetic_fields)
+        parts = [None if x is None else x[first:last] for x in arrays]
         columns = {name: column[first:last] for name, column in self.columns.items()}
         breaks = tuple(row - first for row in self.breaks if first < row < last)
-        return Reading(*map(part, arrays), columns, breaks, self.notes)
+        return Reading(*parts, columns, breaks, self.notes)
 
     def pieces(self) -> list["Reading"]:
         """The stretches between breaks: within each of them no time is missing."""
@@ -137,11 +133,9 @@ def flights(
     """
     check_option("by", by, (None, "forces", "momentum"))
     rates, forces, t = reading.rates, reading.specific_forces, reading.times
-    needed = "rates" if rates is None else "specific forces"
-    demand(
-        rates is not None and (by != "forces" or forces is not None),
-        f"Argument `reading` must have {needed}, but it has none.",
-    )
+    needed = "specific forces" if by == "forces" and forces is None else ""
+    needed = "rates" if rates is None else needed
+    demand(not needed, f"Argument `reading` must have {needed}, but it has none.")
     by = "momentum" if forces is None else by or "forces"
     size = max(4, round(_WINDOW / reading.interval)) if t.size > 4 else t.size
     if t.size <= size:
@@ -149,38 +143,24 @@ def flights(
     reach = max(1, round((_SLOPE if by == "forces" else _TURN) / 2 / reading.interval))
     law = _of_a_lever(t, rates, forces, reach) if by == "forces" else _of_a_tensor(t, rates, reach)
     for row in (0, *reading.breaks, t.size):
-        law.wanted[max(row - reach, 0) : row + reach] = np.nan
-    free = _consensus(law, size, max(2, round(least / reading.interval)) - 2 * reach)
+        law[1][max(row - reach, 0) : row + reach] = np.nan
+    free = _consensus(*law, size, max(2, round(least / reading.interval)) - 2 * reach)
     if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
         free = np.convolve(free, np.ones(2 * (4 * reach // 5) + 1), mode="same") > 0.5
     flown = []
     for first, last in _runs(free):
-        a, b = (
-            np.searchsorted(t, t[first] + margin),
-            np.searchsorted(t, t[last - 1] - margin, "right"),
-        )
-        if a < b and t[last - 1] - t[first] >= least:
-            flown.append(reading[int(a) : int(b)])
-    return [
-        dataclasses.replace(
-            x,
-            notes=(
-                *x.notes,
-                f"flight {i} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
-                f"no contact by the {'specific forces' if by == 'forces' else by}",
-            ),
-        )
-        for i, x in enumerate(flown, 1)
-    ]
+        rows = np.flatnonzero((t >= t[first] + margin) & (t <= t[last - 1] - margin))
+        if rows.size and t[last - 1] - t[first] >= least:
+            flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
+    for i, x in enumerate(flown):
+        note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
+        note += f"no contact by the {'momentum' if by == 'momentum' else 'specific forces'}"
+        flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
+    return flown
 
 
-class _Law(NamedTuple):
-    """Equations |model x - wanted| < bound(x, rows) that hold in flight, in units of their errors."""
-
-    model: np.ndarray
-    wanted: np.ndarray
-    usual: float  # size of the unknowns
-    bound: Callable[[np.ndarray, slice], np.ndarray | float]
+# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over their errors.
+_Law = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray, slice], np.ndarray | float]]
 
 
 def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int) -> _Law:
@@ -193,7 +173,7 @@ def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int
     absolute, relative = _FORCE
     tolerance = absolute + relative * np.linalg.norm(forces, axis=1, keepdims=True)
     model = (cross(slope) + cross(rates) @ cross(rates)) / tolerance[..., None]
-    return _Law(model, forces / tolerance, _LEVER, lambda *_: 1.0)
+    return model, forces / tolerance, lambda *_: 1.0
 
 
 def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
@@ -220,7 +200,7 @@ def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
             return 0.0
         return 3 * np.linalg.norm(rates[rows] @ tensor, axis=1) / np.maximum(spin[rows], _SPIN)
 
-    return _Law(change[..., 1:], -change[..., 0], _SHARE, bound)
+    return change[..., 1:], -change[..., 0], bound
 
 
 def _across(x: np.ndarray, reach: int) -> np.ndarray:
@@ -228,12 +208,14 @@ def _across(x: np.ndarray, reach: int) -> np.ndarray:
     return np.roll(x, -reach, axis=0) - np.roll(x, reach, axis=0)
 
 
-def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
+def _consensus(
+    model: np.ndarray, wanted: np.ndarray, bound: Callable, size: int, least: int
+) -> np.ndarray:
     """Rows that the best unknowns explain: those that explain the longest part in long runs."""
-    known = np.isfinite(law.wanted).all(axis=1) & np.isfinite(law.model).all(axis=(1, 2))
-    model = np.where(known[:, None, None], law.model, 0.0)
-    wanted = np.where(known[:, None], law.wanted, 0.0)
-    drawn = np.eye(model.shape[2]) / law.usual**2
+    known = np.isfinite(wanted).all(axis=1) & np.isfinite(model).all(axis=(1, 2))
+    model = np.where(known[:, None, None], model, 0.0)
+    wanted = np.where(known[:, None], wanted, 0.0)
+    drawn = np.eye(model.shape[2]) / _USUAL**2
 
     def solve(rows: slice | np.ndarray) -> np.ndarray:
         """Least squares, drawn to zero by what is usual where the rows do not tell."""
@@ -242,7 +224,7 @@ def _consensus(law: _Law, size: int, least: int) -> np.ndarray:
 
     def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
-        return known[rows] & (beside < law.bound(x, rows))
+        return known[rows] & (beside < bound(x, rows))
 
     def in_runs(x: np.ndarray) -> np.ndarray:
         kept = explained(x)
@@ -394,10 +376,8 @@ def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noi
     """
     pieces = reading.pieces() if at_rest else rests(reading, least=least)
     parts = [x.rates for x in pieces if x.rates is not None and x.times.size > 2]
-    demand(
-        len(parts) > 0,
-        f"Argument `reading` must have rates at rest for {least:g} s, but it has none.",
-    )
+    needed = f"rates at rest for {least:g} s"
+    demand(len(parts) > 0, f"Argument `reading` must have {needed}, but it has none.")
     curve = allan(parts, reading.interval)
     times, deviations = curve.times[:, None], curve.deviations
     lowest = np.argmin(deviations, axis=0)
