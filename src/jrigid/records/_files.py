@@ -130,8 +130,6 @@ def _with_units(table: Table) -> Table:
         table = table._replace(source="so Sensor Logger writes it")
         ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
         sign = -1.0 if ios else 1.0
-        if ios and "acc" in table.name.lower():
-            table.notes.append("turned about: iOS gives accelerations the other sign")
         rules = [("^gyro|^rotationrate", "{} (rad/s)", 1.0), ("^magnetometer", "{} (uT)", 1.0)]
         rules += [("^total", "{} (m/s^2)", sign), ("uncalibrated|^gravity", "{}", sign)]
         rules += [("acc", "linear {}", sign), ("^seconds", "{} (s)", 1.0)]
@@ -150,4 +148,6 @@ def _with_units(table: Table) -> Table:
         for _, new, factor in fits[:1]:
             table.headers[j] = new.format(name)
             table.values[:, j] *= factor
+            if factor < 0:
+                table.notes.append("turned about: iOS gives accelerations the other sign")
     return table

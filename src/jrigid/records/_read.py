@@ -141,7 +141,10 @@ def read(
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns or {})
     sensors = [found for table in tables for found in _sensors(table, columns or {})]
-    chosen = dict(sorted(reversed(sensors), key=lambda x: "uncal" not in x[1].label.lower()))
+    sensors.sort(key=lambda x: "uncal" in x[1].label.lower())
+    chosen = dict(reversed(sensors))  # the first of a kind
+    if "specific_forces" in chosen:
+        chosen = {kind: sensor for kind, sensor in chosen.items() if kind in _MEASURED}
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
         needed = (
@@ -168,7 +171,8 @@ def read(
 
 def _rename(tables: list[Table], columns: Columns) -> None:
     """Give columns the names that the caller has for them; where it is no sensor's, in SI."""
-    factors = {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
+    factors: dict[str | None, float] = {None: 1.0}
+    factors |= {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
     headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
         olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
@@ -218,7 +222,7 @@ def _on_one_clock(
     chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
 ) -> tuple[Clock, dict[str, np.ndarray]]:
     """The clock of the main sensor put right, and what each sensor reads at its times."""
-    times, raw = {}, {k: x.table.values[np.ix_(x.rows, x.columns)] for k, x in chosen.items()}
+    times, raw = {}, {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()}
     for kind, sensor in chosen.items():
         t = raw[kind][:, 0]
         times[kind] = t * units.factor("times", sensor, t)
@@ -236,7 +240,7 @@ def _on_one_clock(
             said.append("times of its own; brought to those of the rest linearly")
             raw[kind] = _onto(own.times, clocks[kind], raw[kind])
         units.notes.extend(f"{label}: {x}" if several else x for x in said)
-    if "linear" in chosen and "specific_forces" not in chosen:
+    if "linear" in chosen:
         (label, table, columns, rows), gravity = chosen["linear"], chosen.get("gravity")
         if gravity is None:
             units.notes.append(f"{label}: without gravity, no specific force; left out")

@@ -15,16 +15,14 @@ from jrigid._types import Readable
 _WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
 _GUESSES = 300  # windows that are tried, at most
 _SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
-_SLOPE = 0.02  # [s] over which rates are differentiated
+_REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
 _USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
 _FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
-_TURN = 0.1  # [s] over which a momentum must stay the same
 _KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
 _REST = 0.25  # [s] over which it is judged whether the body rests
-_STILL = 0.1  # [rad/s] standard deviation above which a body does not rest, whatever else it does
-_BIAS = 0.2  # [rad/s] mean above which it turns: biases of gyros are below
+_STILL = 0.1, 0.2  # [rad/s] standard deviation, and mean, above which a body does not rest
 _FLOOR = 0.1, 3.0  # the quietest tenth of the windows, and how much noisier others at rest may be
 _PER_OCTAVE = 4  # averaging times in a factor of two
 _FLICKER = 0.664  # Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi)
@@ -65,11 +63,12 @@ class Reading(Readable):
         """Consecutive rows, with the notes of the whole."""
         first, last, step = rows.indices(self.times.size)
         demand(step == 1, f"Argument `rows` must be consecutive, but their step is {step}.")
-        arrays = (self.times, self.rates, self.specific_forces, self.magnetic_fields)
-        parts = [None if x is None else x[first:last] for x in arrays]
+        arrays = (self.rates, self.specific_forces, self.magnetic_fields)
+        rates, forces, fields = (None if x is None else x[first:last] for x in arrays)
         columns = {name: column[first:last] for name, column in self.columns.items()}
         breaks = tuple(row - first for row in self.breaks if first < row < last)
-        return Reading(*parts, columns, breaks, self.notes)
+        times = self.times[first:last]
+        return Reading(times, rates, forces, fields, columns, breaks, self.notes)
 
     def pieces(self) -> list["Reading"]:
         """The stretches between breaks: within each of them no time is missing."""
@@ -133,15 +132,18 @@ def flights(
     """
     check_option("by", by, (None, "forces", "momentum"))
     rates, forces, t = reading.rates, reading.specific_forces, reading.times
-    needed = "specific forces" if by == "forces" and forces is None else ""
-    needed = "rates" if rates is None else needed
-    demand(not needed, f"Argument `reading` must have {needed}, but it has none.")
+    if rates is None or (by == "forces" and forces is None):
+        needed = "rates" if rates is None else "specific forces"
+        raise ValueError(f"Argument `reading` must have {needed}, but it has none.")
     by = "momentum" if forces is None else by or "forces"
     size = max(4, round(_WINDOW / reading.interval)) if t.size > 4 else t.size
     if t.size <= size:
         return []
-    reach = max(1, round((_SLOPE if by == "forces" else _TURN) / 2 / reading.interval))
-    law = _of_a_lever(t, rates, forces, reach) if by == "forces" else _of_a_tensor(t, rates, reach)
+    reach = max(1, round(_REACH[by] / reading.interval))
+    if forces is None or by == "momentum":
+        law = _of_a_tensor(t, rates, reach)
+    else:
+        law = _of_a_lever(t, rates, forces, reach)
     for row in (0, *reading.breaks, t.size):
         law[1][max(row - reach, 0) : row + reach] = np.nan
     free = _consensus(*law, size, max(2, round(least / reading.interval)) - 2 * reach)
@@ -154,7 +156,7 @@ def flights(
             flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
     for i, x in enumerate(flown):
         note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
-        note += f"no contact by the {'momentum' if by == 'momentum' else 'specific forces'}"
+        note += f"no contact by the {by.replace('forces', 'specific forces')}"
         flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
     return flown
 
@@ -212,7 +214,7 @@ def _consensus(
     model: np.ndarray, wanted: np.ndarray, bound: Callable, size: int, least: int
 ) -> np.ndarray:
     """Rows that the best unknowns explain: those that explain the longest part in long runs."""
-    known = np.isfinite(wanted).all(axis=1) & np.isfinite(model).all(axis=(1, 2))
+    known = np.isfinite(wanted.sum(axis=1) + model.sum(axis=(1, 2)))
     model = np.where(known[:, None, None], model, 0.0)
     wanted = np.where(known[:, None], wanted, 0.0)
     drawn = np.eye(model.shape[2]) / _USUAL**2
@@ -340,7 +342,8 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
         ValueError: No rates.
     """
     rates, times = reading.rates, reading.times
-    demand(rates is not None, "Argument `reading` must have rates, but it has none.")
+    if rates is None:
+        raise ValueError("Argument `reading` must have rates, but it has none.")
     size = max(4, round(_REST / reading.interval)) if times.size > 1 else 4
     ends = itertools.pairwise((0, *reading.breaks, times.size))
     starts = np.concatenate([np.arange(a, b - size + 1, size) for a, b in ends])
@@ -348,9 +351,9 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
         return []
     windows = starts[:, None] + np.arange(size)
     spreads = np.linalg.norm(rates[windows].std(axis=1), axis=1)
-    quantile, factor = _FLOOR
-    quiet = spreads <= min(_STILL, factor * np.quantile(spreads, quantile))
-    quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < _BIAS
+    (quantile, factor), (spread, mean) = _FLOOR, _STILL
+    quiet = spreads <= min(spread, factor * np.quantile(spreads, quantile))
+    quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < mean
     still = np.isin(np.arange(times.size), windows[quiet])
     parts = [part for first, last in _runs(still) for part in reading[first:last].pieces()]
     return [part for part in parts if np.ptp(part.times) >= least - reading.interval]
