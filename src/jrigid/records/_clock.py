@@ -14,6 +14,7 @@ _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line thro
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
 _OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
 _NEXT = 8  # stamps that tell a late reading from a lost one
+_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
 _SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
 _REPEATED = "with the time of the row before"
 
@@ -156,11 +157,17 @@ def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) ->
 def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
     """A robust line through times, counted one by one or, if that fits better, with some `lost`."""
     counts = [np.arange(t.size)]
-    if lost:  # where all of the next stamps are later by some intervals, not this one alone
-        usual = np.median(np.diff(t)) or np.mean(np.diff(t))
-        late = np.pad(t - usual * counts[0], (0, _NEXT - 1), constant_values=np.inf)
-        floor = np.lib.stride_tricks.sliding_window_view(late, _NEXT).min(axis=1)
-        counts.append(counts[0] + np.cumsum(np.round(np.diff(floor, prepend=floor[0]) / usual)))
+    if lost:
+        usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))
+        ticks, phase = np.ones(t.size), t[0]
+        for row in range(1, t.size):
+            # lost is a reading only where all of the next stamps are late, not this one alone
+            ahead = t[row : row + _NEXT] - phase
+            late = (ahead - usual * np.arange(ahead.size)).min()
+            ticks[row] = max(1, round(late / usual))
+            phase += ticks[row] * usual
+            phase += _LOCK * (t[row] - phase)
+        counts.append(np.cumsum(ticks))
     fits = []
     for count in counts:
         use = np.ones(t.size, bool)

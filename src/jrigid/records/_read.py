@@ -286,7 +286,7 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     """The unit in which gravity turns as the rates say, df/dt = -omega x f; "" if unclear."""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
-    sums, size = np.cumsum(steps, axis=0), np.linalg.norm(forces, axis=1)[lag:]
+    sums, size = np.cumsum(steps, axis=0) - steps / 2, np.linalg.norm(forces, axis=1)[lag:]
     said, seen = sums[lag:] - sums[:-lag], forces[lag:] - forces[:-lag]
     least, most = _USUAL["specific_forces"]["m/s^2"]
     use = np.isfinite(seen).all(axis=1) & (size > least) & (size < most)

@@ -186,7 +186,8 @@ def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
     tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
     momenta = np.einsum("kij,tj->tik", tensors, rates)
     turning = np.cross(rates[:, :, None], momenta, axis=1)
-    whole = momenta + np.cumsum(turning * np.gradient(t)[:, None, None], axis=0)
+    steps = turning * np.gradient(t)[:, None, None]
+    whole = momenta + np.cumsum(steps, axis=0) - steps / 2
     spin = np.linalg.norm(rates, axis=1)
     # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
     noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
