@@ -156,7 +156,7 @@ def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) ->
 
 def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
     """A robust line through times, counted one by one or, if that fits better, with some `lost`."""
-    counts = [np.arange(t.size)]
+    counts: list[np.ndarray] = [np.arange(t.size)]
     if lost:
         usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))
         ticks, phase = np.ones(t.size), t[0]

@@ -147,10 +147,10 @@ def read(
         chosen = {kind: sensor for kind, sensor in chosen.items() if kind in _MEASURED}
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
-        needed = (
-            "Argument `path` must hold three columns of a sensor, but none is recognised: name "
-        )
-        raise ValueError(f"{needed}them by `columns`. There are {headers or 'no tables'}.")
+        needed = "Argument `path` must hold three columns of a sensor, but none is recognised: "
+        raise ValueError(f"{needed}name them by `columns`. There are {headers or 'no tables'}.")
+    apart = columns.keys() - _UNITS.keys() - set(main.table.headers) if columns else set()
+    demand(not apart, f"Argument `columns` must name columns of one file, but {apart} is apart.")
     own, raw = _on_one_clock(chosen, main, clock, units)
     found, used = {}, {main.columns[0]}
     for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
@@ -180,7 +180,7 @@ def _rename(tables: list[Table], columns: Columns) -> None:
         demand(len(olds) == 3 or not three, named)
         for i, one in enumerate(olds):
             places = [(t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)]
-            places = [place for place in places if one in place[2:4]]
+            places = [x for x in places if x[2] == one] or [x for x in places if x[3] == one]
             there = f"Argument `columns` must name columns of the file, but {one!r} is none of "
             demand(len(places) > 0, there + headers)
             for table, j, _, _, unit in places:
@@ -207,10 +207,8 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
         if len(three) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
             continue
         label = ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
-        needed = (
-            "Argument `columns` must name the column of the times, but it does not, and none of "
-        )
-        demand(len(times) > 0, f"{needed}{', '.join(table.headers)} is recognised.")
+        needed = "Argument `columns` must name the column of the times, but it does not, and none "
+        demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
         time = max((j for j in times if j < three[0]), default=times[0])
         rows = np.flatnonzero(known[:, three].all(axis=1))
         if rows.size:
@@ -245,11 +243,9 @@ def _on_one_clock(
         if gravity is None:
             units.notes.append(f"{label}: without gravity, no specific force; left out")
         else:
-            raw["specific_forces"], columns = (
-                raw["linear"] + raw["gravity"],
-                columns + gravity.columns,
-            )
-            chosen["specific_forces"] = _Sensor(f"{label} with gravity", table, columns, rows)
+            raw["specific_forces"] = raw["linear"] + raw["gravity"]
+            columns, label = columns + gravity.columns, f"{label} with gravity"
+            chosen["specific_forces"] = _Sensor(label, table, columns, rows)
     return own, raw
 
 
