@@ -173,7 +173,9 @@ def test_only_what_is_used_is_told_of(tmp_path):
                               unit={"specific_forces": "g"})  # fmt: skip
     assert reading.specific_forces[0].tolist() == [3 * GRAVITY, GRAVITY, 2 * GRAVITY]
     assert not any("commas" in note for note in reading.notes)
-    with pytest.raises(ValueError, match=r"must name columns of one file, but \{'breeze'\} is apart"):
+    with pytest.raises(
+        ValueError, match=r"must name columns of one file, but \{'breeze'\} is apart"
+    ):
         jr.records.read(tmp_path / "some.zip", columns={"breeze": "u"})
     assert not any("commas" in x for x in read(PHYPHOX + ',n\n0,1,2,3,"a, b"\n1,1,2,3,"c"\n').notes)
 
