@@ -153,6 +153,33 @@ def test_the_calibrated_gyro_is_taken(tmp_path):
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
 
 
+def test_sensor_logger_in_one_file():
+    names = ["time", "seconds_elapsed", *(f"gyroscope_{a}" for a in "xyz")]
+    names += [f"{what}_{a}" for what in ("accelerometer", "gravity") for a in "xyz"]
+    rows = np.column_stack([1e9 * ROWS[:, 0], ROWS, np.tile([0.5, 0, 0, 0, 0, 9.8], (6, 1))])
+    reading = read(table(names, rows))
+    np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
+    np.testing.assert_allclose(reading.specific_forces, np.tile([0.5, 0, 9.8], (6, 1)))
+    said(reading, "rates (gyroscope) taken as rad/s: so Sensor Logger writes it")
+
+
+def test_only_what_is_used_is_told_of(tmp_path):
+    """And a column may be named that is in one of several files."""
+    with zipfile.ZipFile(tmp_path / "some.zip", "w") as archive:
+        archive.writestr("Gyroscope.csv", PHYPHOX.replace(",", ";") + "\n" + scientific(ROWS, ";"))
+        archive.writestr("meta/time.csv", '"event";"time";"system"\n"START";0,5;1,5\n')
+        archive.writestr("wind.csv", "t (s),label,u,v,w\n0,calm,1,2,3\n0.1,calm,1,2,3\n")
+    reading = jr.records.read(tmp_path / "some.zip", columns={"specific_forces": ("w", "u", "v")},
+                              unit={"specific_forces": "g"})  # fmt: skip
+    assert reading.specific_forces[0].tolist() == [3 * GRAVITY, GRAVITY, 2 * GRAVITY]
+    assert not any("commas" in note for note in reading.notes)
+    with pytest.raises(
+        ValueError, match=r"must name columns of one file, but \{'breeze'\} is apart"
+    ):
+        jr.records.read(tmp_path / "some.zip", columns={"breeze": "u"})
+    assert not any("commas" in x for x in read(PHYPHOX + ',n\n0,1,2,3,"a, b"\n1,1,2,3,"c"\n').notes)
+
+
 # Betaflight ---------------------------------------------------------------------------------------
 
 
@@ -362,6 +389,15 @@ def test_times_of_an_epoch_count_from_the_first_reading():
     reading = read(text)
     np.testing.assert_allclose(reading.times, ROWS[:, 0], atol=1e-6)
     said(reading, "times count from 1727600000.0")
+
+
+@pytest.mark.parametrize(
+    ("stated", "factor"),
+    [("rad/sec", 1.0), ("radians/second", 1.0), ("Degrees / s", DEGREE), ("mdps", 1e-3 * DEGREE)],
+)
+def test_spellings_of_units(stated, factor):
+    names = ["time (seconds)", *(f"gyro {a} [{stated}]" for a in "xyz")]
+    np.testing.assert_allclose(read(table(names, ROWS)).rates, factor * ROWS[:, 1:])
 
 
 def test_degrees_are_recognised_by_the_range_of_gyros():

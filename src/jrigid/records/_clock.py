@@ -9,12 +9,14 @@ from jrigid._checks import check_option, check_shape
 
 _LATE = 20  # intervals that a row may come too late; a clock that goes back further was reset
 _COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])  # when micro- and milliseconds in 32 bits wrap [s]
+_DIGITS = 10.0 ** -np.arange(5)  # [s] decimal digits that times may end with
 _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
 _OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
-_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
 _NEXT = 8  # stamps that tell a late reading from a lost one
+_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
 _SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
+_REPEATED = "with the time of the row before"
 
 
 class Clock(NamedTuple):
@@ -71,45 +73,44 @@ def repair(
     check_option("clock", clock, (None, "recorded", "uniform"))
     check_shape("times", np.asarray(times), (None,))
     notes: list[str] = []
-    rows = np.flatnonzero(np.isfinite(times))
-    _count(notes, times.size - rows.size, "without a time dropped")
-    t = np.array(times[rows], float)
-    forward = np.diff(t)
-    forward = forward[forward > 0]
-    if not forward.size:
-        rows = rows[:1]
-        return Clock(t[:1], rows, (), (*notes, "all rows are of one time"))
-    interval = float(np.median(forward))
-    resets = _resets(t, interval, notes)
-    order = np.argsort(t, kind="stable")
-    _count(notes, int(np.sum(np.diff(t) < 0)), "out of order sorted in")
-    t, rows = t[order], rows[order]
+    t, rows = np.array(times, float), np.arange(len(times))
 
-    equal = np.concatenate([[False], np.diff(t) == 0])
+    def keep(good: np.ndarray, others: str) -> None:
+        nonlocal t, rows
+        _say(notes, int(np.sum(~good)), f"{others} dropped")
+        t, rows = t[good], rows[good]
+
+    keep(np.isfinite(t), "without a time")
+    steps = np.diff(t)
+    if not (steps > 0).any():
+        return Clock(t[:1], rows[:1], (), (*notes, "all rows are of one time"))
+    interval = float(np.median(steps[steps > 0]))
+    resets = _resets(t, interval, notes)
+    _say(notes, int(np.sum(np.diff(t) < 0)), "out of order sorted in")
+    order = np.argsort(t, kind="stable")
+    t, rows = t[order], rows[order]
     if values is not None:
-        same = np.concatenate([[False], np.all(np.diff(values[rows], axis=0) == 0, axis=1)]) & equal
-        _count(notes, int(same.sum()), "written twice dropped")
-        t, rows, equal = t[~same], rows[~same], equal[~same]
-    coarse = equal.mean() > _SEVERAL and clock != "recorded"
-    if not coarse:
-        _count(notes, int(equal.sum()), "with the time of the row before dropped")
-        t, rows = t[~equal], rows[~equal]
+        same = np.diff(values[rows], axis=0, prepend=np.nan) == 0
+        keep(~same.all(axis=1) | (np.diff(t, prepend=np.nan) != 0), "written twice")
+    new = np.diff(t, prepend=np.nan) != 0
+    if clock == "recorded" or np.mean(~new) <= _SEVERAL:
+        keep(new, _REPEATED)
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > gap * interval) + 1
     if gaps.size:
         longest = gaps[np.argmax(steps[gaps - 1])]
         many = f"{gaps.size} gaps, the longest" if gaps.size > 1 else "1 gap,"
         notes.append(f"{many} of {steps[longest - 1]:.3g} s after {t[longest - 1]:.6g} s")
-    breaks = sorted({*gaps.tolist(), *np.searchsorted(t, resets).tolist()})
+    breaks = np.union1d(gaps, np.searchsorted(t, resets))
     if clock != "recorded":
         t = _evened(t, breaks, clock == "uniform", notes)
-    unequal = np.concatenate([[True], np.diff(t) > 0])
-    _count(notes, int(np.sum(~unequal)), "with the time of the row before dropped")
-    kept = np.cumsum(unequal)
-    return Clock(t[unequal], rows[unequal], tuple(int(kept[b]) - 1 for b in breaks), tuple(notes))
+    new = ~(np.diff(t, prepend=np.nan) <= 0)
+    breaks = np.cumsum(new)[breaks] - 1
+    keep(new, _REPEATED)
+    return Clock(t, rows, tuple(breaks.tolist()), tuple(notes))
 
 
-def _count(notes: list[str], count: int, what: str) -> None:
+def _say(notes: list[str], count: int, what: str) -> None:
     if count:
         notes.append(f"{count} row{'s' if count > 1 else ''} {what}")
 
@@ -126,72 +127,53 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
         elif back > _LATE * interval:
             t[row:] += back + interval
             resets.append(float(t[row]))
-            notes.append(
-                f"the clock went back by {back:.3g} s at row {row}: a break of unknown length"
-            )
+            notes.append(f"the clock went back by {back:.3g} s at row {row}: a break of any length")
     return resets
 
 
-def _evened(t: np.ndarray, breaks: list[int], asked: bool, notes: list[str]) -> np.ndarray:
+def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) -> np.ndarray:
     """Each piece on the line through it, where that is asked for or all it does is to round."""
-    pieces, jitters, intervals, digit = [], [], [], _digit(t)
-    for piece in np.split(t, breaks):
-        if piece.size < 4 or np.ptp(np.diff(piece)) < 1e-9 * np.ptp(piece):
-            pieces.append(piece)
+    ticks = (t - t[0])[:, None] / _DIGITS
+    digit = _DIGITS[np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3].max(initial=0.0)
+    pieces, beside = np.split(t, breaks), []
+    for i, piece in enumerate(pieces):
+        steps = np.diff(piece)
+        if piece.size < 4 or np.ptp(steps) < 1e-9 * np.ptp(piece):
             continue
         line, interval = _line(piece, asked)
-        jitter = piece - line
-        steps = np.diff(piece)
+        jitter = np.abs(piece - line)
         uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
-        rounded = digit > _COARSE * interval and np.max(np.abs(jitter)) < _ROUND * digit
-        rounded = rounded and uneven
-        if asked or rounded:
-            piece = line
-            jitters.append(float(np.sqrt(np.mean(jitter**2))))
-            intervals.append(interval)
-        pieces.append(piece)
-    if jitters:
+        if asked or (uneven and digit > _COARSE * interval and jitter.max() < _ROUND * digit):
+            pieces[i] = line
+            beside.append((interval, np.sqrt(np.mean(jitter**2))))
+    if beside:
+        intervals, jitters = 1e3 * np.transpose(beside)
         why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"
-        notes.append(
-            f"times put on an even clock of {1e3 * np.mean(intervals):.5g} ms: {why}, "
-            f"{1e3 * max(jitters):.3g} ms rms beside it"
-        )
+        note = f"times put on an even clock of {intervals.mean():.5g} ms: {why}, "
+        notes.append(f"{note}{jitters.max():.3g} ms rms beside it")
     return np.concatenate(pieces)
-
-
-def _digit(t: np.ndarray) -> float:
-    """The decimal digit that times end with [s]."""
-    for digit in (1.0, 0.1, 0.01, 1e-3, 1e-4):
-        ticks = (t - t[0]) / digit
-        if np.max(np.abs(ticks - np.round(ticks))) < 1e-3:
-            return digit
-    return 0.0
 
 
 def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
     """A robust line through times, counted one by one or, if that fits better, with some `lost`."""
-    counts = [np.arange(t.size)]
+    counts: list[np.ndarray] = [np.arange(t.size)]
     if lost:
-        steps = np.diff(t)
-        usual = float(np.median(steps)) or float(np.mean(steps))
-        count, phase = [0], t[0]
+        usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))
+        ticks, phase = np.ones(t.size), t[0]
         for row in range(1, t.size):
             # lost is a reading only where all of the next stamps are late, not this one alone
-            ahead = t[row : row + _NEXT] - usual * np.arange(min(_NEXT, t.size - row)) - phase
-            ticks = max(1, round(float(ahead.min()) / usual))
-            count.append(count[-1] + ticks)
-            phase += ticks * usual
+            ahead = t[row : row + _NEXT] - phase
+            late = (ahead - usual * np.arange(ahead.size)).min()
+            ticks[row] = max(1, round(late / usual))
+            phase += ticks[row] * usual
             phase += _LOCK * (t[row] - phase)
-        counts.append(np.array(count))
+        counts.append(np.cumsum(ticks))
     fits = []
     for count in counts:
         use = np.ones(t.size, bool)
-        line, slope = t, 0.0
         for _ in range(3):  # outliers are left out, twice
             slope, start = np.polyfit(count[use], t[use], 1)
-            line = start + slope * count
-            beside = np.abs(t - line)
+            beside = np.abs(t - start - slope * count)
             use = beside <= 4 * np.median(beside) + 1e-12 * np.ptp(t)
-        fits.append((float(np.median(np.abs(t - line))), line, float(slope)))
-    _, line, slope = min(fits, key=lambda fit: fit[0])
-    return line, slope
+        fits.append((np.median(beside), start + slope * count, float(slope)))
+    return min(fits, key=lambda fit: fit[0])[1:]

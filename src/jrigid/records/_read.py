@@ -1,23 +1,96 @@
-"""A file becomes a reading: which sensors, which units, whose clock; and all of it said."""
+"""Tables become a reading: which columns are of which sensor, in which unit, on whose clock."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from jrigid._checks import check_option, demand
 from jrigid.records._clock import Clock, repair
-from jrigid.records._formats import MEASURED, Named, Sensor, Source, sensors_of, tables_of
+from jrigid.records._files import Source, Table, tables_of
 from jrigid.records._reading import Reading
-from jrigid.records._table import Table
-from jrigid.records._units import UNITS, Units, split_unit
 
+# By what is measured, in SI, spelled as `_plain` returns them.
+_UNITS: dict[str, dict[str, float]] = {
+    "times": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "rates": dict.fromkeys(("rad/s", "rads", "rad_s", "radians/s"), 1.0)
+    | dict.fromkeys(("deg/s", "°/s", "dps", "deg_s", "degs", "degrees/s"), np.pi / 180)
+    | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi},
+    "specific_forces": dict.fromkeys(("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0)
+    | {"g": 9.80665, "mg": 9.80665e-3},
+    "magnetic_fields": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "g": 1e-4, "gauss": 1e-4},
+}
+Columns = Mapping[str, str | Sequence[str]]
+_MEASURED = ("rates", "specific_forces", "magnetic_fields")
+# What a column measures, by words in its name; the first that fits.
+_KINDS = {
+    "times": r"^t$|^ts$|time|^second|^zeit|^millis|^micros",
+    "gravity": r"gravity",
+    "linear": r"lin|user|without g",  # acceleration with gravity taken away
+    "rates": r"gyr|rot(?!.*vec)|angular|angvel|omega|winkel|^[wg]$|^rate",
+    "specific_forces": r"acc|specific|beschl|^[af]$",
+    "magnetic_fields": r"mag|^[mb]$",
+}
+_AXIS = re.compile(r"^(.*?)[\s_.\-]*(\[[012]\]|[xyz])$", re.IGNORECASE)
+_UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
+_SUFFIX = re.compile(r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE)
 _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from 0
+_RANGE = 70.0, 4100.0  # [rad/s] no common gyro measures beyond; larger numbers are not deg/s either
+# Medians of what each row says: steps of 8 Hz to 8 kHz, and sizes at hand.
+_USUAL = {
+    "times": {"s": (125e-6, 0.125), "ms": (0.125, 125), "us": (125, 125e3), "ns": (125e3, 125e6)},
+    "specific_forces": {"g": (0.8, 1.25), "m/s^2": (7.8, 12.3)},
+}
+_TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
+_LIKE = 0.4  # correlation of the two from which their ratio is believed
+
+
+class _Sensor(NamedTuple):
+    """Times and three axes of a table, in the rows where all axes are numbers."""
+
+    label: str
+    table: Table
+    columns: list[int]
+    rows: np.ndarray
+
+
+class _Units(NamedTuple):
+    """What the caller `asked` for, and the notes on who says a unit."""
+
+    asked: dict[str, str]
+    notes: list[str]
+
+    def factor(
+        self, kind: str, sensor: _Sensor, values: np.ndarray, turned: str = ""
+    ) -> float | None:
+        """The factor to SI by the caller, the file or the numbers; None where nobody says it."""
+        header = sensor.table.headers[sensor.columns[kind != "times"]]
+        unit, source = _split(header)[1], sensor.table.source
+        if kind in self.asked:
+            heard = "" if unit in (None, self.asked[kind]) else f", though the file says {unit}"
+            unit, source = self.asked[kind], f"`unit` says so{heard}"
+        elif unit is None:
+            unit, source = _recognised(kind, values, turned)
+        label = header if kind == "times" else sensor.label
+        what = f"{kind.replace('_', ' ')} ({label})"
+        if unit is None:
+            self.notes.append(f"{what} left out: their unit is not stated")
+            return None
+        other = f"but it does not, and the file's {unit!r} is not known."
+        demand(unit in _UNITS[kind], f"Argument `unit` must say the unit of `{kind}`, {other}")
+        self.notes.append(f"{what} taken as {unit}: {source}")
+        factor = _UNITS[kind][unit]
+        if turned and not 0.2 < factor / _UNITS["rates"][turned] < 5:  # headers can be wrong
+            self.notes.append(f"yet gravity turns in the body as if the rates were in {turned}")
+        return factor
 
 
 def read(
     path: Source,
     *,
     unit: str | Mapping[str, str] | None = None,
-    columns: Named | None = None,
+    columns: Columns | None = None,
     clock: str | None = None,
     log: int = 1,
 ) -> Reading:
@@ -59,136 +132,182 @@ def read(
     Source: phyphox-android, `DataExport.java`; awesome-sensor-logger, `UNITS.md` and
     `COORDINATES.md`; betaflight/blackbox-tools, `units.h` and `parser.c`.
     """
-    notes: list[str] = []
-    units = Units({"rates": unit} if isinstance(unit, str) else dict(unit or {}), notes)
-    named = dict(columns or {})
-    tables, about = tables_of(path, log)
-    chosen = _choose(tables, named)
-    main = next((chosen[kind] for kind in MEASURED if kind in chosen), None)
+    given = {"rates": unit} if isinstance(unit, str) else dict(unit or {})
+    units = _Units({kind: _plain(said) for kind, said in given.items()}, [])
+    for kind, said in units.asked.items():
+        check_option("unit", kind, tuple(_UNITS))
+        check_option("unit", said, tuple(_UNITS[kind]))
+    tables = tables_of(path, log)
+    headers = ", ".join(header for table in tables for header in table.headers)
+    _rename(tables, columns or {})
+    sensors = [found for table in tables for found in _sensors(table, columns or {})]
+    sensors.sort(key=lambda x: "uncal" in x[1].label.lower())
+    chosen = dict(reversed(sensors))  # the first of a kind
+    if "specific_forces" in chosen:
+        chosen = {kind: sensor for kind, sensor in chosen.items() if kind in _MEASURED}
+    main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
-        headers = ", ".join(h for table in tables for h in table.headers)
-        raise ValueError(
-            "Argument `path` must hold three columns of a sensor, but none is recognised: name "
-            f"them by `columns`. There are {headers or 'no tables'}."
-        )
-    several = len({s.table.name for s in chosen.values()}) > 1
-    notes += [f"{t.name}: {x}" if several else x for t in tables for x in t.notes]
+        needed = "Argument `path` must hold three columns of a sensor, but none is recognised: "
+        raise ValueError(f"{needed}name them by `columns`. There are {headers or 'no tables'}.")
+    apart = columns.keys() - _UNITS.keys() - set(main.table.headers) if columns else set()
+    demand(not apart, f"Argument `columns` must name columns of one file, but {apart} is apart.")
+    own, raw = _on_one_clock(chosen, main, clock, units)
+    found, used = {}, {main.columns[0]}
+    for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
+        if kind in chosen:
+            sensor, turned = chosen[kind], ""
+            if kind == "rates" and "specific_forces" in found:
+                turned = _turned(own.times, raw[kind], found["specific_forces"])
+            factor = units.factor(kind, sensor, raw[kind], turned)
+            if factor is not None:
+                found[kind] = factor * raw[kind]
+                used.update(sensor.columns if sensor.table is main.table else ())
+    rest = zip(main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True)
+    rest = [(header, x) for j, (header, x) in enumerate(rest) if header and j not in used]
+    others = {header: x for header, x in rest if np.isfinite(x).any()}
+    said = tuple(dict.fromkeys(units.notes))
+    return Reading(own.times, **found, columns=others, breaks=own.breaks, notes=said)
 
-    times = {kind: _seconds(sensor, units) for kind, sensor in chosen.items()}
+
+def _rename(tables: list[Table], columns: Columns) -> None:
+    """Give columns the names that the caller has for them; where it is no sensor's, in SI."""
+    factors: dict[str | None, float] = {None: 1.0}
+    factors |= {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
+    headers = ", ".join(header for table in tables for header in table.headers)
+    for new, old in columns.items():
+        olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
+        named = f"Argument `columns` must name three columns for `{new}`, but it names {old!r}."
+        demand(len(olds) == 3 or not three, named)
+        for i, one in enumerate(olds):
+            places = [(t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)]
+            places = [x for x in places if x[2] == one] or [x for x in places if x[3] == one]
+            there = f"Argument `columns` must name columns of the file, but {one!r} is none of "
+            demand(len(places) > 0, there + headers)
+            for table, j, _, _, unit in places:
+                name = f"{new}[{i}]" if three else new
+                table.headers[j] = f"{name} ({unit})" if unit and new in _UNITS else name
+                if new not in _UNITS:
+                    table.values[:, j] *= factors.get(unit, 1.0)
+
+
+def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
+    """The sensors of a table: three columns whose names differ by the axis, and their times."""
+    known, names = np.isfinite(table.values), [_split(x)[0] for x in table.headers]
+    times, triples = [], dict[str, dict[str, int]]()
+    for j in np.flatnonzero(known.any(axis=0)).tolist():
+        match = _AXIS.match(names[j])
+        if match:
+            triples.setdefault(match[1], {}).setdefault(match[2].lower(), j)
+        elif _kind(names[j]) == "times":
+            times.append(j)
+    times = [names.index("times")] if "times" in columns else times
+    sensors = []
+    for stem, axes in triples.items():
+        kind, three = _kind(stem or table.name), [axes[axis] for axis in sorted(axes)]
+        if len(three) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
+            continue
+        label = ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
+        needed = "Argument `columns` must name the column of the times, but it does not, and none "
+        demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
+        time = max((j for j in times if j < three[0]), default=times[0])
+        rows = np.flatnonzero(known[:, three].all(axis=1))
+        if rows.size:
+            sensors.append((kind, _Sensor(label, table, [time, *three], rows)))
+    return sensors
+
+
+def _on_one_clock(
+    chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
+) -> tuple[Clock, dict[str, np.ndarray]]:
+    """The clock of the main sensor put right, and what each sensor reads at its times."""
+    times, raw = {}, {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()}
+    for kind, sensor in chosen.items():
+        t = raw[kind][:, 0]
+        times[kind] = t * units.factor("times", sensor, t)
     origin = min(np.nanmin(t, initial=np.inf) for t in times.values())
     if _EPOCH < origin < np.inf:
-        notes.append(f"times count from {origin:.6f} s of the file's clock")
+        units.notes.append(f"times count from {origin:.6f} s of the file's clock")
         times = {kind: t - origin for kind, t in times.items()}
-    clocks: dict[str, Clock] = {}
-    for kind, sensor in chosen.items():
-        clocks[kind] = repair(times[kind], sensor.values, clock=clock)
-        notes += [f"{sensor.label}: {x}" if several else x for x in clocks[kind].notes]
-    own = clocks[main.kind]
-    onto = {kind: _onto(own, clocks[kind], sensor, notes) for kind, sensor in chosen.items()}
-
-    forces = _forces(chosen, onto, units, about)
-    rates = fields = None
-    if "magnetic_fields" in chosen:
-        fields = _in_si(chosen["magnetic_fields"], onto["magnetic_fields"], units)
-    if "rates" in chosen:
-        gyro, raw = chosen["rates"], onto["rates"]
-        factor = units.stated("rates", gyro.label, *gyro.scale)
-        if factor is None:
-            factor = units.of_rates(gyro.label, own.times, raw, forces)
-        elif forces is not None:
-            units.doubt(own.times, raw, forces, factor)
-        rates = factor * raw
-    missing = {"specific_forces", "linear", "gravity"} if forces is None else set()
-    missing |= {"magnetic_fields"} if fields is None else set()
-    used = [s for kind, s in chosen.items() if kind not in missing]
-    others = _others(main, main.rows[own.rows], used, named)
-    said = tuple(dict.fromkeys(notes))
-    return Reading(own.times, rates, forces, fields, others, own.breaks, said)
+    clocks = {kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen}
+    own = clocks[next(kind for kind, x in chosen.items() if x is main)]
+    several = any(x.table is not main.table for x in chosen.values())
+    for kind, (label, table, _, _) in chosen.items():
+        said = [*table.notes, *clocks[kind].notes]
+        raw[kind] = raw[kind][clocks[kind].rows, 1:]
+        if not np.array_equal(own.times, clocks[kind].times):
+            said.append("times of its own; brought to those of the rest linearly")
+            raw[kind] = _onto(own.times, clocks[kind], raw[kind])
+        units.notes.extend(f"{label}: {x}" if several else x for x in said)
+    if "linear" in chosen:
+        (label, table, columns, rows), gravity = chosen["linear"], chosen.get("gravity")
+        if gravity is None:
+            units.notes.append(f"{label}: without gravity, no specific force; left out")
+        else:
+            raw["specific_forces"] = raw["linear"] + raw["gravity"]
+            columns, label = columns + gravity.columns, f"{label} with gravity"
+            chosen["specific_forces"] = _Sensor(label, table, columns, rows)
+    return own, raw
 
 
-def _choose(tables: list[Table], named: Named) -> dict[str, Sensor]:
-    """The first sensor of each kind; one that is calibrated before others."""
-    chosen: dict[str, Sensor] = {}
-    for sensor in (s for table in tables for s in sensors_of(table, named)):
-        old = chosen.get(sensor.kind)
-        if old is None or ("uncal" in old.label.lower() and sensor.kind not in named):
-            chosen[sensor.kind] = sensor
-    for part in ("linear", "gravity") if "specific_forces" in chosen else ():
-        chosen.pop(part, None)
-    return chosen
-
-
-def _seconds(sensor: Sensor, units: Units) -> np.ndarray:
-    """Times of a sensor [s]."""
-    times, header = sensor.times, sensor.table.headers[sensor.time or 0]
-    stated = "s" if header == "seconds_elapsed" else split_unit(header)[1]
-    factor = units.stated("times", header, stated, "the header says so")
-    return times * (factor or units.of_times(header, times))
-
-
-def _onto(own: Clock, other: Clock, sensor: Sensor, notes: list[str]) -> np.ndarray:
-    """Values at the times of the main clock; NaN before, after and in breaks."""
-    values = sensor.values[other.rows]
-    if np.array_equal(own.times, other.times):
-        return values
-    notes.append(f"{sensor.label}: times of its own; brought to those of the rest linearly")
-    after = np.searchsorted(other.times, own.times, side="left")
-    silent = (own.times < other.times[0]) | (own.times > other.times[-1])
-    silent |= np.isin(after, other.breaks) & ~np.isin(own.times, other.times)
-    columns = [np.interp(own.times, other.times, column) for column in values.T]
+def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
+    """Values at other times; NaN before, after and in breaks."""
+    after = np.searchsorted(other.times, times, side="left")
+    silent = (times < other.times[0]) | (times > other.times[-1])
+    silent |= np.isin(after, other.breaks) & ~np.isin(times, other.times)
+    columns = [np.interp(times, other.times, column) for column in values.T]
     return np.where(silent[:, None], np.nan, np.stack(columns, axis=1))
 
 
-def _in_si(sensor: Sensor, values: np.ndarray, units: Units) -> np.ndarray | None:
-    """Forces or fields in SI; None where their unit is neither stated nor recognised."""
-    factor = units.stated(sensor.kind, sensor.label, *sensor.scale)
-    if factor is None and sensor.kind == "specific_forces":
-        factor = units.of_forces(sensor.label, values)
-    if factor is None:
-        what = sensor.kind.replace("_", " ")
-        units.notes.append(f"{what} ({sensor.label}) left out: their unit is not stated")
-        return None
-    return factor * values
+def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None, str]:
+    """The unit in which alone numbers make sense, and why."""
+    if kind == "rates":
+        most = float(np.abs(values).max())
+        unit, why = turned or None, "so gravity turns in the body"
+        if most > _RANGE[0]:
+            unit, why = "deg/s" if most < _RANGE[1] else None, f"no gyro reads {most:.0f} rad/s"
+        doubt = f"numbers up to {most:.6g} do not tell"
+    else:
+        size = np.diff(values) if kind == "times" else np.linalg.norm(values, axis=1)
+        size = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
+        usual = _USUAL.get(kind, {}).items()
+        unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
+        why = f"their median {'step ' * (kind == 'times')}is {size:.4g}"
+        doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
+    doubt = f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}."
+    demand(unit is not None or kind not in ("times", "rates"), doubt)
+    return unit, why
 
 
-def _forces(
-    chosen: dict[str, Sensor], onto: dict[str, np.ndarray], units: Units, about: dict[str, str]
-) -> np.ndarray | None:
-    """Specific forces [m/s^2], from one sensor or from what a phone took apart."""
-    sensor, values = chosen.get("specific_forces"), onto.get("specific_forces")
-    if sensor is None and "linear" in chosen:
-        sensor = chosen["linear"]
-        if "gravity" not in chosen:
-            units.notes.append(f"{sensor.label}: without gravity, no specific force; left out")
-            return None
-        sensor = sensor._replace(kind="specific_forces", label=f"{sensor.label} with gravity")
-        values = onto["linear"] + onto["gravity"]
-    if sensor is None or values is None:
-        return None
-    forces = _in_si(sensor, values, units)
-    standard = about.get("standardisation", "").lower() == "true"
-    if forces is not None and about.get("platform", "").lower() == "ios" and not standard:
-        units.notes.append("specific forces turned about: iOS gives them the other sign")
-        forces = -forces
-    return forces
+def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
+    """The unit in which gravity turns as the rates say, df/dt = -omega x f; "" if unclear."""
+    lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
+    steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
+    sums, size = np.cumsum(steps, axis=0) - steps / 2, np.linalg.norm(forces, axis=1)[lag:]
+    said, seen = sums[lag:] - sums[:-lag], forces[lag:] - forces[:-lag]
+    least, most = _USUAL["specific_forces"]["m/s^2"]
+    use = np.isfinite(seen).all(axis=1) & (size > least) & (size < most)
+    said, seen = said[use], seen[use]
+    product, square = np.sum(said * seen), np.sum(said**2)
+    if product <= _LIKE * np.sqrt(square * np.sum(seen**2)):
+        return ""
+    return min(("rad/s", "deg/s"), key=lambda u: abs(np.log(product / square / _UNITS["rates"][u])))
 
 
-def _others(
-    main: Sensor, rows: np.ndarray, used: list[Sensor], named: Named
-) -> dict[str, np.ndarray]:
-    """The other columns with numbers, and those asked for by a name, in SI by their header."""
-    table = main.table
-    taken = {main.time, *(j for s in used if s.table is table for j in (*s.columns, s.time))}
-    others = {
-        header: table.values[rows, j]
-        for j, header in enumerate(table.headers)
-        if header and j not in taken and np.isfinite(table.values[rows, j]).any()
-    }
-    for name, header in named.items():
-        if name not in UNITS:
-            column = table.column(str(header))
-            unit = split_unit(table.headers[column])[1]
-            factor = next((known[unit] for known in UNITS.values() if unit in known), 1.0)
-            others.pop(table.headers[column], None)
-            others[name] = factor * table.values[rows, column]
-    return others
+def _kind(name: str) -> str | None:
+    """What the words of a name say that is measured: a key of `_KINDS`."""
+    words = name.strip().lower()
+    return next((kind for kind, pattern in _KINDS.items() if re.search(pattern, words)), None)
+
+
+def _split(header: str) -> tuple[str, str | None]:
+    """A header without its unit, and the unit: `gyro x (deg/s)`, `t [ms]`, `gyro_x_dps`."""
+    match = _UNIT.search(header) or _SUFFIX.search(header)
+    if not match or not match.start():
+        return header, "s" if header == "seconds_elapsed" else None
+    return header[: match.start()], _plain(match[1])
+
+
+def _plain(unit: str) -> str:
+    """A unit as in `_UNITS`; two signs for micro, and one lost in decoding, are u."""
+    unit = re.sub(r"\s|(?<=s)ec(onds?|s)?", "", re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower()))
+    return unit.replace("²", "^2").replace("**", "^")

@@ -1,0 +1,153 @@
+"""Files become tables with the units that their formats leave unsaid."""
+
+import csv
+import importlib
+import io
+import itertools
+import os
+import pathlib
+import re
+import zipfile
+from typing import NamedTuple
+
+import numpy as np
+
+from jrigid._checks import demand
+
+Source = str | os.PathLike[str] | io.TextIOBase
+_BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
+_MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have their settings there
+
+
+class Table(NamedTuple):
+    """Numbers under headers; what the file says `about` itself, notes, and who states its units."""
+
+    name: str
+    headers: list[str]
+    values: np.ndarray
+    about: dict[str, str]
+    notes: list[str]
+    source: str = "the header says so"
+
+
+def tables_of(path: Source, log: int) -> list[Table]:
+    """All tables behind a path; files of a folder or a zip that hold none are passed over."""
+    if isinstance(path, io.TextIOBase):
+        files = {str(getattr(path, "name", "text")): path.read().encode()}
+    elif (path := pathlib.Path(path)).is_dir():
+        files = {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
+            files = {pathlib.PurePath(n).stem: archive.read(n) for n in names}
+    else:
+        files = {path.stem: path.read_bytes()}
+    texts = {name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()}
+    about = next(csv.DictReader(texts.get("Metadata", "").splitlines(), restval=""), {})
+    tables = []
+    for name, text in texts.items():
+        try:
+            is_log = text.startswith(_BLACKBOX)
+            tables.append(_blackbox(str(path), name, log) if is_log else _parse(text, name))
+        except ValueError:
+            if len(texts) == 1:
+                raise
+    return [_with_units(table._replace(about=table.about | about)) for table in tables]
+
+
+def _blackbox(path: str, name: str, log: int) -> Table:
+    """A log of a flight controller, decoded by orangebox."""
+    try:
+        orangebox = importlib.import_module("orangebox")
+        # A parser for each log: one that goes on to another keeps the headers of the last.
+        parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
+    except ModuleNotFoundError as error:
+        raise ImportError('This needs orangebox: pip install "jrigid[records]".') from error
+    except RuntimeError as error:
+        raise ValueError(
+            f"Arguments `path` and `log` must be of a log that can be decoded, but: {error}"
+        ) from error
+    names, several, frames = parser.field_names, parser.reader.log_count, []
+    notes = [f"log {log} of {several}"] if several > 1 else []
+    try:
+        for frame in parser.frames():
+            frames.append([x if isinstance(x, int | float) else np.nan for x in frame.data])
+    except (RuntimeError, ValueError, IndexError) as error:
+        # Where a crash or the battery ended the log, orangebox raises one of these.
+        notes.append(f"the log breaks off after {len(frames)} frames ({error})")
+    values = np.array([x for x in frames if len(x) == len(names)], float).reshape(-1, len(names))
+    about = {key: str(value) for key, value in parser.headers.items()}
+    return Table(name, names, values, about, notes)
+
+
+def _parse(text: str, name: str) -> Table:
+    """The table in a text, whatever its separator, decimal sign and lines above the header."""
+    lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
+    last = lines[-50:]
+    separator = next((d for d in "\t;," if sum(d in x for x in last) > len(last) / 2), ",")
+    rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
+    pairs = itertools.pairwise(rows[:_MOST_ABOVE])
+    head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
+    lacking = f"Argument `path` must have names of its columns above numbers, but {name!r} has not."
+    demand(head >= 0, lacking)
+    headers, width = rows[head], len(rows[head])
+    below = [row for row in rows[head + 1 :] if row != headers]
+    whole = [row[:width] for row in below if len(row) >= width and not any(row[width:])]
+    values = np.array([[_number(x) for x in row] for row in whole], float).reshape(-1, width)
+    cut = len(rows[-1]) < width
+    commas = any("," in x and not np.isnan(_number(x)) for row in whole for x in row)
+    said = (
+        (cut, "the last line is cut off: dropped"),
+        (len(below) - len(whole) - cut, "{} with another number of columns dropped"),
+        (len(rows) - head - 1 - len(below), "{} of headers in the middle skipped"),
+        (commas, "read with decimal commas"),
+    )
+    notes = [what.format(f"{n} line{'s' if n > 1 else ''}") for n, what in said if n]
+    about = {row[0]: separator.join(row[1:]) for row in rows[:head]}
+    return Table(name, headers, values, about, notes)
+
+
+def _is_header(names: list[str], numbers: list[str]) -> bool:
+    """Names without a number above at least two numbers."""
+    words = [x for x in names if x]
+    known = [x for x in numbers if x.lower() == "nan" or not np.isnan(_number(x))]
+    fits = min(len(known), len(words)) > 1 and len(numbers) <= len(names) + 1
+    return fits and all(np.isnan(_number(x)) for x in words)
+
+
+def _number(cell: str) -> float:
+    """A number, with a decimal point or comma; NaN for anything else."""
+    try:
+        return float(cell.replace(",", ".", 1))
+    except ValueError:
+        return np.nan
+
+
+def _with_units(table: Table) -> Table:
+    """The table with units in its headers that Sensor Logger and Betaflight leave to the reader."""
+    about, rules = table.about, []
+    if "seconds_elapsed" in table.headers:
+        table = table._replace(source="so Sensor Logger writes it")
+        ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
+        sign = -1.0 if ios else 1.0
+        rules = [("^gyro|^rotationrate", "{} (rad/s)", 1.0), ("^magnetometer", "{} (uT)", 1.0)]
+        rules += [("^total", "{} (m/s^2)", sign), ("uncalibrated|^gravity", "{}", sign)]
+        rules += [("acc", "linear {}", sign), ("^seconds", "{} (s)", 1.0)]
+    elif any(x.startswith("gyroADC") for x in table.headers):
+        table = table._replace(source="so Betaflight logs it")
+        text = about.get("gyro_scale", about.get("gyro.scale", "1"))
+        scale = float(int(text, 0) if text.isalnum() else text)
+        if scale > 1 << 20:  # a float written as the integer of the same bits
+            scale = float(np.uint32(scale).view(np.float32))
+        rules = [(r"^gyro(ADC|Unfilt)\[.\]$", "{} (deg/s)", scale)]
+        if "acc_1G" in about:
+            rules += [(r"^accSmooth\[.\]$", "{} (g)", 1 / float(about["acc_1G"]))]
+    for j, header in enumerate(table.headers):
+        name = f"{table.name} {header}" if len(header) == 1 else header
+        fits = [rule for rule in rules if re.search(rule[0], name, re.IGNORECASE)]
+        for _, new, factor in fits[:1]:
+            table.headers[j] = new.format(name)
+            table.values[:, j] *= factor
+            if factor < 0:
+                table.notes.append("turned about: iOS gives accelerations the other sign")
+    return table
