@@ -20,9 +20,7 @@ _EXIT = {
     "OK": 0, "UNIDENTIFIABLE": 3, "MISFIT": 4, "AT_BOUNDARY": 5, "WRONG_BASIN": 6,
     "NOT_CONVERGED": 7,
 }  # fmt: skip
-_SHAPES = {x.__name__.lower(): x for x in (
-    identify.Tensor, identify.Moments, identify.Symmetric, identify.Top, identify.Flat
-)}  # fmt: skip
+_SHAPES = "tensor", "moments", "symmetric", "top", "flat"  # of `jrigid.identify`
 
 
 def level(text: str) -> str | float:
@@ -48,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--flights", action="store_true", help="find throws in the record; else it is one throw")
     add("--sigma", type=float, help="noise of a reading [rad/s], whatever the file's unit")
     add("--bias", action="store_true", help="seek the gyro's bias")
-    add("--shape", choices=_SHAPES, help="what is known of the body (tensor: nothing)")
+    add("--shape", choices=_SHAPES, default="tensor", help="what is known of it (tensor: nothing)")
     add("--unmodelled", type=level, default=0.0, metavar="LEVEL",
         help="white torque, over the mean moment [rad/s^1.5], or estimate")  # fmt: skip
     add("--robust", action="store_true", help="leave outliers out")
@@ -102,7 +100,7 @@ def _fit(options: argparse.Namespace) -> int:
             RigidBody(np.ones(3)),
             [identify.Record(gyro, x.times, x.rates, sigma) for x in throws],
             free=(lambda _, gyro: gyro.bias) if options.bias else None,
-            shape=_SHAPES[options.shape or "tensor"](),
+            shape=getattr(identify, options.shape.title())(),
             unmodelled=options.unmodelled,
             loss="robust" if options.robust else "squares",
             throw=throw,

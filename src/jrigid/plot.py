@@ -183,5 +183,7 @@ def _ratios(ax: Any, result: FitResult, *_: int) -> None:
     ax.axline((1, 1), slope=1, color="0.5", ls="--")
     ax.axvline(1, color="0.5", lw=1)
     ax.axis(view)
+    ax.ticklabel_format(useOffset=False)
+    ax.locator_params(nbins=4)
     told = not result.pure_spin and np.all(result.ratios_errors < result.ratios)
     _label(ax, "Ratios" if told else "Ratios: not determined", "I2/I1", "I3/I1")
