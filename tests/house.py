@@ -77,7 +77,10 @@ def with_throw():
                     if x == "__init__" or not x.startswith("_")
                 }
             for label, function in own.items():
-                if callable(function) and "throw" in inspect.signature(function).parameters:
+                if not callable(function):
+                    continue
+                throw = inspect.signature(function).parameters.get("throw")
+                if throw and throw.default is True:  # elsewhere it is the number of a throw
                     found.add(label)
     return sorted(found)
 

@@ -59,6 +59,7 @@ NOTHING_TO_CALL = {
     "identify.Magnetometer", "identify.MomentumSensor", "identify.Moments", "identify.Observed",
     "identify.Rates", "identify.Record", "identify.Symmetric", "identify.Tensor", "identify.Top",
     "identify.each", "identify.prior", "identify.LogDensity", "identify.log_density",
+    "identify.save", "identify.load",
     "stability.Linearization", "stability.Modes",
     "stability.TopStability", "stability.PrecessionStability", "stability.SatelliteStability",
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",

@@ -9,6 +9,7 @@ from jrigid import free as free
 from jrigid import identify as identify
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
+from jrigid import plot as plot
 from jrigid import records as records
 from jrigid import rotation as rotation
 from jrigid import solids as solids
@@ -50,6 +51,6 @@ from jrigid.top import top_motion as top_motion
 __version__ = _version("jrigid")
 
 _list_public_names(
-    *(datasets, dynamics, elliptic, free, identify, lagrangian, mass, records, rotation, solids),
-    *(solvers, stability, systems, top, torques),
+    *(datasets, dynamics, elliptic, free, identify, lagrangian, mass, plot, records, rotation),
+    *(solids, solvers, stability, systems, top, torques),
 )

@@ -23,6 +23,8 @@ from jrigid.identify._result import FitResult as FitResult
 from jrigid.identify._result import Status as Status
 from jrigid.identify._sample import LogDensity as LogDensity
 from jrigid.identify._sample import log_density as log_density
+from jrigid.identify._save import load as load
+from jrigid.identify._save import save as save
 from jrigid.identify._sensors import AbstractSensor as AbstractSensor
 from jrigid.identify._sensors import Accelerometer as Accelerometer
 from jrigid.identify._sensors import AttitudeSensor as AttitudeSensor

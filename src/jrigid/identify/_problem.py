@@ -152,6 +152,17 @@ def _seen(
     return shown, ends
 
 
+def shown_by(
+    options: Options, system: Any, sensor: Any, start: State, t0: Array, ts: Array
+) -> Array:
+    """What a sensor shows at times (n, k) of the motion from a state at t0."""
+    first, none = t0[None], jnp.zeros((ts.size, 0), ts.dtype)
+    layout = Layout(ts, jnp.zeros(ts.shape, int), first, first, first > t0, ts)
+    throw = _Throw(layout, Samples(ts, (none,), none, none, none), t0, t0)
+    nodes = State(start.attitude[None], start.omega[None])
+    return _seen(options._replace(shooting=False), system, [sensor], nodes, throw)[0][0]
+
+
 def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
     """Residuals of a throw (n, D) in units of their noise; zero where nothing was seen."""
     parts, width = [], samples.weight.shape[-1]

@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import Enumeration
+from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
 from jrigid._numerics import product
 from jrigid._spectral import eigh
-from jrigid._types import Scalar, Vector
+from jrigid._types import Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._intervals import interval
-from jrigid.identify._problem import Problem
-from jrigid.identify._unknowns import Unknowns
+from jrigid.identify._problem import Problem, shown_by
+from jrigid.identify._unknowns import AbstractSought, Unknowns
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 
@@ -172,6 +173,19 @@ class FitResult(eqx.Module):
         return self.moments[..., 1:] / self.moments[..., :1]
 
     @property
+    def shares(self) -> Float[Array, "*fits 3"]:
+        """Moments over their sum, each at most 1/2, where I1 is too small to divide by.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> record = jr.datasets.gyro_example()
+        >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+        >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+        >>> print(found.shares.round(3), found.shares_errors.round(4))
+        [0.223 0.333 0.444] [0.0004 0.0004 0.0004]
+        """
+        return self.moments / jnp.sum(self.moments, axis=-1, keepdims=True)
+
+    @property
     def moments_covariance(self) -> Float[Array, "*fits 3 3"]:
         """Of the moments."""
         return _derived(self).moments_covariance
@@ -180,6 +194,11 @@ class FitResult(eqx.Module):
     def ratios_covariance(self) -> Float[Array, "*fits 2 2"]:
         """Of the ratios."""
         return _derived(self).ratios_covariance
+
+    @property
+    def shares_covariance(self) -> Float[Array, "*fits 3 3"]:
+        """Of the shares; singular, as their sum is 1."""
+        return _derived(self).shares_covariance
 
     @property
     def axes_errors(self) -> Float[Array, "*fits 3"]:
@@ -259,7 +278,7 @@ class FitResult(eqx.Module):
         """The body that was found, that of the first throw."""
         return self.parts()[0]
 
-    def parts(self, index: int = 0) -> tuple[Any, ...]:
+    def parts(self, index: Int[_ArrayLike, ""] = 0) -> tuple[Any, ...]:
         """System and sensors of a throw, as they were found.
 
         Args:
@@ -271,7 +290,7 @@ class FitResult(eqx.Module):
         body = self.problem.bodies[index]
         return unknowns.parts(self.numbers, self.own_numbers[index], leaves, body)
 
-    def start(self, index: int = 0) -> tuple[State, Float[Array, "*fits"]]:
+    def start(self, index: Int[_ArrayLike, ""] = 0) -> tuple[State, Float[Array, "*fits"]]:
         """The state of a throw and its time [s], which whoever moves the state needs.
 
         Args:
@@ -288,6 +307,48 @@ class FitResult(eqx.Module):
         """
         attitude, omega = self.state.attitude[..., index, :], self.state.omega[..., index, :]
         return State(attitude, omega), self.t0[..., index]
+
+    def predict(
+        self, ts: Real[_ArrayLike, "*times"], record: int = 0, throw: int = 0
+    ) -> Float[Array, "*times k"]:
+        """What a sensor would read in a throw, by the model that was found; of a single fit.
+
+        The motion goes on from the throw's `state` at `t0`, with no torque that is not modelled;
+        the sensor has the errors that were found, its delay, its filter and its limit.
+
+        Args:
+            ts: Times [s] on the clock of the record, of any shape; under a torque, whose motion is
+                followed forward only, not before `t0`.
+            record: Which record's sensor.
+            throw: Which throw.
+
+        Raises:
+            ValueError: No such record or throw, or times before `t0` under a torque.
+
+        Gradients: in forward mode.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> record = jr.datasets.gyro_example()
+        >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+        >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+        >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
+        [ 1.6 -2.4  1.2]
+        """
+        throws, records = self.t0.shape[0], len(self.problem.samples.values)
+        for name, value, count in (("record", record, records), ("throw", throw, throws)):
+            demand(
+                0 <= value < count,
+                f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
+            )
+        times = float_arrays(ts)[0].astype(self.numbers.dtype)
+        after, options = jnp.all(times >= self.t0[throw]), self.problem.options
+        backward = options.free_motion or options.motion is not None
+        demand(
+            backward or not is_concrete(after) or bool(after),
+            "Argument `ts` must not be before the throw's `t0` where there is a torque, but it is.",
+        )
+        found = _predicted(self, times.reshape(-1), record, jnp.asarray(throw))
+        return found.reshape(*times.shape, -1)
 
     @property
     def body(self) -> MassProperties:
@@ -320,6 +381,11 @@ class FitResult(eqx.Module):
     def ratios_errors(self) -> Float[Array, "*fits 2"]:
         """Standard errors of `ratios`."""
         return _errors(self.ratios_covariance)
+
+    @property
+    def shares_errors(self) -> Float[Array, "*fits 3"]:
+        """Standard errors of `shares`."""
+        return _errors(self.shares_covariance)
 
     @property
     def reduced_chi_square(self) -> Float[Array, "*fits"]:
@@ -382,23 +448,20 @@ class FitResult(eqx.Module):
 
         Of one that is sought anew in each throw, of each throw.
         """
-        found, start = {}, self.follow.shape[1] - self.own_numbers.shape[-1]
-        end = 0
-        for x in self.unknowns.sought:
+        first = self.follow.shape[1] - self.own_numbers.shape[-1]
+        covariance = self.local_covariance + product(
+            "tlg,gh,tmh->tlm", self.follow, self.numbers_covariance, self.follow
+        )
+        own = covariance[:, first:, first:]
+        slices = self.unknowns.slices | {x.name: s for x, s in self.unknowns.own_slices}
+
+        def value_and_errors(x: AbstractSought) -> tuple[Array, Array]:
+            s = slices[x.name]
             if x.own:
-                numbers = self.own_numbers[:, end : end + x.size]
-                part = slice(start + end, start + end + x.size)
-                cause = self.follow[:, part]
-                covariance = self.local_covariance[:, part, part]
-                covariance = covariance + product(
-                    "tlg,gh,tmh->tlm", cause, self.numbers_covariance, cause
-                )
-                found[x.name] = jax.vmap(x.with_errors)(numbers, covariance)
-                end += x.size
-            else:
-                s = self.unknowns.slices[x.name]
-                found[x.name] = x.with_errors(self.numbers[s], self.numbers_covariance[s, s])
-        return found
+                return jax.vmap(x.with_errors)(self.own_numbers[:, s], own[:, s, s])
+            return x.with_errors(self.numbers[s], self.numbers_covariance[s, s])
+
+        return {x.name: value_and_errors(x) for x in self.unknowns.sought}
 
     @property
     def mirror(self) -> Float[Array, "*fits 3"]:
@@ -430,6 +493,14 @@ class FitResult(eqx.Module):
 
 
 @quick_jit
+def _predicted(result: FitResult, ts: Array, record: int, throw: Array) -> Array:
+    system, *sensors = result.parts(throw)
+    shown = shown_by(result.problem.options, system, sensors[record], *result.start(throw), ts)
+    largest = sensors[record].largest()
+    return shown if largest is None else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
+
+
+@quick_jit
 def _tensor(result: FitResult) -> tuple[Array, Array]:
     """The tensor and the covariance of its elements, row by row."""
     tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
@@ -451,6 +522,7 @@ class _Derived(NamedTuple):
     axes: Array
     moments_covariance: Array
     ratios_covariance: Array
+    shares_covariance: Array
     axes_errors: Array
 
 
@@ -472,12 +544,13 @@ def _derived(result: FitResult) -> _Derived:
         turns = jnp.stack([turn(1, 2), turn(2, 0), turn(0, 1)])
         square = product("in,nm,im->i", turns, result.numbers_covariance, turns)
 
-        def both(tensor: Array) -> Array:
+        def all_three(tensor: Array) -> Array:
             moments = eigh(tensor)[0]
-            return jnp.concatenate([moments, moments[1:] / moments[0]])
+            return jnp.concatenate([moments, moments[1:] / moments[0], moments / jnp.sum(moments)])
 
-        spread = result.spread(both)
-        return _Derived(tensor, moments, axes, spread[:3, :3], spread[3:, 3:], jnp.sqrt(square))
+        spread = result.spread(all_three)
+        covariances = spread[:3, :3], spread[3:5, 3:5], spread[5:, 5:]
+        return _Derived(tensor, moments, axes, *covariances, jnp.sqrt(square))
 
     return _on_lanes(one, result)
 

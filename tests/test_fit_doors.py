@@ -1,0 +1,450 @@
+"""What leaves a fit: predictions, shares, files, pictures, and the command line's answer."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+import worlds
+from helpers import in_a_process
+
+import jrigid as jr
+from jrigid import _cli, identify
+from jrigid.identify import Status
+from jrigid.identify._problem import Problem
+
+matplotlib.use("Agg")
+
+DEGREE = np.pi / 180
+TENSOR = np.array([[2.0, 0.2, -0.1], [0.2, 3.0, 0.3], [-0.1, 0.3, 4.0]]) / 3
+MOMENTS = np.linalg.eigvalsh(TENSOR)
+RATIOS = MOMENTS[1:] / MOMENTS[0]
+TS = 0.05 * np.arange(200)
+OMEGA = np.array([0.6, 2.0, 0.8])
+SIGMA = 0.02
+QUICK = "--xla_backend_optimization_level=0"  # to compile
+BLIND = jr.RigidBody(np.ones(3))
+LATER = np.array([0.33, 7.5, 12.0])
+
+
+@pytest.fixture(scope="module")
+def readings():
+    rng = np.random.default_rng(7)
+    return worlds.gyro((TS, worlds.tumble(TENSOR, OMEGA, TS).omega), TS, rng, SIGMA)
+
+
+@pytest.fixture(scope="module")
+def found(readings):
+    """As the command line asks for it, so that both are compiled once."""
+    record = identify.Record(identify.Gyro(), TS, readings, SIGMA)
+    return identify.fit(BLIND, [record])
+
+
+# Predictions
+
+
+def test_a_prediction_is_the_record_less_its_noise(found, readings):
+    shown = found.predict(TS)
+    np.testing.assert_allclose(shown, readings + found.left()[0], atol=1e-12)
+    times = np.concatenate([TS[:1], LATER])
+    true = worlds.tumble(TENSOR, OMEGA, times).omega
+    np.testing.assert_allclose(found.predict(times), true, atol=0.8 * SIGMA)
+    backward = found.predict(-LATER)  # free motion goes both ways
+    again = jr.free_rotation(found.inertia, found.start()[0], -LATER).states.omega
+    np.testing.assert_allclose(backward, again, atol=1e-12)
+
+
+def test_times_of_a_prediction_may_have_any_shape(found):
+    flat = found.predict(LATER)
+    assert found.predict(LATER[1]).shape == (3,)
+    np.testing.assert_array_equal(found.predict(LATER[:, None, None])[:, 0, 0], flat)
+    inside = jax.jit(lambda ts: found.predict(ts))(LATER)
+    np.testing.assert_allclose(inside, flat, atol=1e-12)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"record": 1}, "`record` must be at least 0 and below 1, but it is 1"),
+    ({"throw": -1}, "`throw` must be at least 0 and below 1, but it is -1"),
+])  # fmt: skip
+def test_a_prediction_of_what_is_not_there_is_refused(found, options, words):
+    with pytest.raises(ValueError, match=words):
+        found.predict(TS, **options)
+
+
+def with_parts(found, body, *sensors, omegas=None, t0=(0.0,)):
+    """A result as if these had been fitted, which would take long to compile."""
+    throws = len(t0)
+    found = jax.tree.map(
+        lambda x: jnp.repeat(x, throws, axis=0) if x.ndim and x.shape[0] == 1 else x, found
+    )
+    given, rest = eqx.partition((body, *sensors), eqx.is_inexact_array)
+    old, stacked = found.problem, (False,) * len(jax.tree.leaves(given))
+    unknowns = dataclasses.replace(old.unknowns, given=given, rest=rest, stacked=stacked)
+    options = old.options._replace(free_motion=body.is_free, on_attitude=True)
+    samples = old.samples._replace(values=old.samples.values * len(sensors))
+    problem = Problem(options, unknowns, samples, old.bodies, old.noise)
+    omegas = found.state.omega if omegas is None else jnp.asarray(omegas)
+    state = jr.State(jnp.tile(jnp.array([1.0, 0, 0, 0]), (throws, 1)), omegas)
+    return dataclasses.replace(found, state=state, t0=jnp.asarray(t0), problem=problem)
+
+
+def test_a_prediction_has_the_sensors_memory_and_the_torque(found, rng):
+    """A late, slow, biased gyro that saturates, of two throws in air; the second starts at 3 s."""
+    late, slow, bias, limit, drag = 0.02, 0.015, 0.1, 1.7, 0.05
+    omegas, start = np.array([[0.6, 2.0, 0.8], [1.5, -0.4, 1.9]]), 3.0
+    gyro = identify.Gyro(bias * jnp.ones(3), delay=late, time_constant=slow, limit=limit)
+    body = jr.RigidBody(found.inertia, jr.torques.QuadraticDrag(drag * jnp.ones(3)))
+    star = identify.AttitudeSensor()
+    told = with_parts(found, body, star, gyro, omegas=omegas, t0=(0.0, start))
+    ts = start + np.array([2.4, 0.3, 4.1, 1.2])  # in any order
+    shown = told.predict(ts, record=1, throw=1)
+    grid = np.arange(0, 5, 0.001)
+    air, tensor = worlds.quadratic_drag(drag), np.asarray(found.inertia)
+    motion = worlds.tumble(tensor, omegas[1], grid, air)
+    order = np.argsort(ts)
+    true = worlds.gyro(
+        (start + grid, motion.omega), ts[order], rng, 0.0, bias, delay=late,
+        time_constant=slow, limit=limit,
+    )  # fmt: skip
+    assert np.max(np.abs(true)) == limit
+    np.testing.assert_allclose(shown[order], true, atol=1e-4)
+    assert np.abs(told.predict(ts, record=1, throw=0) - shown).max() > 0.1
+    turned = told.predict(ts[order], throw=1)
+    times, upright = np.append(0, ts[order] - start), np.array([1.0, 0, 0, 0])
+    true = worlds.tumble(tensor, omegas[1], times, air, attitude0=upright).attitude[1:]
+    side = np.sign(np.sum(turned * true, axis=1, keepdims=True))
+    np.testing.assert_allclose(side * turned, true, atol=1e-6)
+    with pytest.raises(ValueError, match="`ts` must not be before the throw's `t0`"):
+        told.predict(2.9, record=1, throw=1)
+
+
+# Shares
+
+
+def test_shares_are_moments_over_their_sum(found):
+    np.testing.assert_allclose(found.shares, found.moments / 3, rtol=1e-12)
+    pulls = (found.shares - MOMENTS / np.sum(MOMENTS)) / found.shares_errors
+    assert np.abs(pulls).max() < 4
+
+    def shares(numbers):
+        moments = jnp.linalg.eigvalsh(found.unknowns.inertia(numbers))
+        return moments / jnp.sum(moments)
+
+    slopes = jax.jacfwd(shares)(found.numbers)
+    straight = slopes @ found.numbers_covariance @ slopes.T
+    np.testing.assert_allclose(found.shares_covariance, straight, rtol=0.02, atol=1e-9)
+    np.testing.assert_allclose(found.shares_errors, np.sqrt(np.diagonal(straight)), rtol=0.02)
+    np.testing.assert_allclose(jnp.sum(found.shares_covariance, axis=0), 0, atol=1e-15)
+
+
+# Files
+
+
+def test_a_fit_is_read_as_it_was_written(found, tmp_path):
+    path = tmp_path / "fit.pkl"
+    identify.save(path, found)
+    again = identify.load(path)
+    assert str(again) == str(found)
+    assert again.status == Status.OK
+    assert jax.tree.structure(again) == jax.tree.structure(found)
+    for x, y in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(x, y, strict=True)
+    np.testing.assert_array_equal(again.ratios_intervals, found.ratios_intervals)
+    np.testing.assert_array_equal(again.predict(LATER), found.predict(LATER))
+
+
+READ = """
+import jax
+from jrigid import identify
+try:
+    identify.load("{path}")
+except ValueError as error:
+    print(error)
+jax.config.update("jax_enable_x64", True)
+found = identify.load("{path}")
+print(found)
+print(*found.ratios_intervals.ravel())
+"""
+
+
+def test_a_fit_is_read_in_another_process(found, tmp_path):
+    identify.save(tmp_path / "fit.pkl", found)
+    shown, _ = in_a_process(READ.format(path=tmp_path / "fit.pkl"))
+    refused, *report, limits = shown.splitlines()
+    assert "must be read with `jax_enable_x64` on" in refused
+    assert report == str(found).splitlines()
+    limits = np.array(limits.split(), float)
+    np.testing.assert_allclose(limits, np.ravel(found.ratios_intervals), rtol=1e-9)
+
+
+def spin(_, state, __):
+    return state.omega[2:]
+
+
+def test_functions_are_kept_by_their_names(found, tmp_path):
+    def told(function):
+        return with_parts(found, BLIND, identify.FunctionSensor(function))
+
+    path = tmp_path / "fit.pkl"
+    named = told(spin)
+    identify.save(path, named)
+    again = identify.load(path)
+    assert again.parts()[1].function is spin
+    np.testing.assert_array_equal(again.predict(1.0), named.predict(1.0))
+    with pytest.raises(ValueError, match=r"Argument `result` must hold functions .*lambda"):
+        identify.save(path, told(lambda _, state, __: state.omega[2:]))
+    path.write_bytes(path.read_bytes().replace(b"spin", b"spun"))
+    with pytest.raises(ValueError, match=r"Argument `path` must be a file .*spun"):
+        identify.load(path)
+
+
+def test_what_is_no_fit_is_not_read(tmp_path, untyped):
+    path = tmp_path / "fit.pkl"
+    path.write_text("not a fit\n")
+    with pytest.raises(ValueError, match="Argument `path` must be a file that `save` wrote"):
+        identify.load(path)
+    path.write_bytes(b"N.")  # None, as a pickle
+    with pytest.raises(ValueError, match="`path` must be a FitResult, but it is a NoneType"):
+        identify.load(path)
+    with pytest.raises(ValueError, match="`result` must be a FitResult, but it is a str"):
+        identify.save(path, "fit")
+    with pytest.raises(FileNotFoundError):
+        identify.load(tmp_path / "none.pkl")
+
+
+# Pictures
+
+
+@pytest.fixture
+def pictures():
+    from matplotlib import pyplot
+
+    yield pyplot
+    pyplot.close("all")
+
+
+def test_five_pictures_of_a_fit(found, readings, pictures, tmp_path):
+    axes = jr.plot.fit(found)
+    assert set(axes) == {"record", "residuals", "spectrum", "histogram", "ratios"}
+    axes["record"].figure.savefig(tmp_path / "fit.png")
+    assert axes["record"].figure.get_suptitle() == "OK"
+    assert axes["record"].get_ylabel() == "rate [rad/s]"
+    assert axes["record"].get_xlabel() == "time [s]"
+    model, points, dropped = axes["record"].lines[:3]
+    np.testing.assert_array_equal(points.get_xydata(), np.stack([TS, readings[:, 0]], axis=1))
+    np.testing.assert_allclose(model.get_ydata(), found.predict(model.get_xdata())[:, 0])
+    assert dropped.get_xdata().size == 0
+    left = [line.get_ydata() for line in axes["residuals"].lines]
+    np.testing.assert_allclose(np.stack(left, axis=1), found.residuals[0])
+    assert axes["ratios"].get_xlabel() == "I2/I1"
+
+
+def test_the_spectrum_of_white_noise_lies_in_its_range(found, pictures):
+    ax = jr.plot.fit(found, {"spectrum": pictures.figure().add_subplot()})["spectrum"]
+    frequencies, power = ax.lines[0].get_data()
+    assert ax.get_xlabel() == "frequency [Hz]"
+    assert 1 / 10 <= frequencies[0] < 1 / 5  # of 10 s, read at 20 Hz
+    assert 8 < frequencies[-1] < 10
+    edges = ax.collections[0].get_paths()[0].vertices
+    inside = [
+        np.min(edges[edges[:, 0] == f, 1]) < p < np.max(edges[edges[:, 0] == f, 1])
+        for f, p in zip(frequencies, power, strict=True)
+    ]
+    assert np.mean(inside) > 0.8
+    # A slow wave that no model has, of a tenth of its noise's power, in one band, and beyond it.
+    wave = 0.45 * np.sin(2 * np.pi * 0.3 * TS)[None, :, None]
+    ax.clear()
+    jr.plot.fit(dataclasses.replace(found, residuals=found.residuals + wave), {"spectrum": ax})
+    power = ax.lines[0].get_ydata()
+    assert abs(frequencies[np.argmax(power)] - 0.3) < 0.06
+    assert np.max(power) > 5
+
+
+def test_the_ellipse_is_that_of_the_covariance(found, pictures):
+    ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
+    inverse = np.linalg.inv(found.ratios_covariance)
+    for line, square in ((ax.lines[1], 2.279), (ax.lines[2], 5.991)):  # chi-square of two
+        apart = line.get_xydata() - np.asarray(found.ratios)
+        np.testing.assert_allclose(np.einsum("ni,ij,nj->n", apart, inverse, apart), square, 1e-3)
+
+
+def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
+    options = found.problem.options._replace(level="known")
+    problem = dataclasses.replace(found.problem, options=options)
+    kicked = dataclasses.replace(found, problem=problem, residuals=2 * found.residuals)
+    ax = jr.plot.fit(kicked, {"record": pictures.figure().add_subplot()})["record"]
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), (readings + kicked.left()[0])[:, 0])
+
+
+def test_attitudes_are_drawn_on_the_models_side(found, pictures):
+    told = with_parts(found, BLIND, identify.AttitudeSensor())
+    ax = pictures.figure().add_subplot()
+
+    def drawn(values):
+        samples = told.problem.samples._replace(values=(jnp.asarray(values)[None],))
+        problem = dataclasses.replace(told.problem, samples=samples)
+        ax.clear()
+        jr.plot.fit(dataclasses.replace(told, problem=problem), {"record": ax})
+        return ax.lines
+
+    model = drawn(np.ones((TS.size, 4)))[::3]
+    values = np.stack([np.interp(TS, *line.get_data()) for line in model], axis=1)
+    lines = drawn(np.where(np.arange(TS.size)[:, None] % 3 == 0, -values, values))
+    assert len(lines) == 12
+    np.testing.assert_allclose(lines[1].get_ydata(), values[:, 0], atol=1e-9)
+    assert ax.get_ylabel() == "attitude, quaternion"
+
+
+def test_a_picture_without_the_extra_names_it(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"jrigid\[plot\]"):
+        jr.plot.fit(found)
+
+
+# Command line
+
+
+def write(path, times, rates, **forces):
+    """Milliseconds and degrees a second."""
+    columns = [1e3 * times, *(rates / DEGREE).T]
+    names = ["t_ms", "gx (deg/s)", "gy (deg/s)", "gz (deg/s)"]
+    for name, force in forces.items():
+        columns += [*force.T / 9.80665]
+        names += [f"{name}{axis} (g)" for axis in "xyz"]
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=",".join(names), comments="")
+    return str(path)
+
+
+def assert_true(result):
+    pulls = (np.asarray(result.ratios) - RATIOS) / np.asarray(result.ratios_errors)
+    assert np.abs(pulls).max() < 4
+
+
+def test_a_file_in_degrees_becomes_ratios(found, readings, tmp_path, capsys):
+    path, out = write(tmp_path / "a.csv", TS, readings), str(tmp_path / "fit.pkl")
+    assert _cli.main(["fit", path, "--sigma", str(SIGMA), "--save", out]) == 0
+    shown = capsys.readouterr().out
+    assert "rates (gx, gy, gz) taken as deg/s: the header says so" in shown
+    assert "OK: The fit describes the record" in shown
+    again = identify.load(out)
+    assert_true(again)
+    np.testing.assert_allclose(again.ratios, found.ratios, rtol=1e-6)
+
+
+def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
+    path = write(tmp_path / "a.csv", TS, readings)
+    assert _cli.main(["fit", path, "--sigma", str(SIGMA / 3)]) == 4
+    assert "MISFIT" in capsys.readouterr().out
+    rng = np.random.default_rng(3)
+    pure = np.linalg.norm(OMEGA) * np.linalg.eigh(TENSOR)[1][:, 2] * np.ones((200, 1))
+    path = write(tmp_path / "b.csv", TS, pure + SIGMA * rng.normal(size=pure.shape))
+    assert _cli.main(["fit", path, "--sigma", str(SIGMA)]) == 3
+    assert "spin is pure" in capsys.readouterr().out
+    assert len(set(_cli._EXIT.values()) - {1, 2}) == len(_cli._EXIT)
+    ends = {x for x in dir(Status) if x.isupper()}
+    assert set(_cli._EXIT) == ends - {"BAD_INPUT"}
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["none.csv"], "No such file"),
+    (["words.csv"], "Argument `path` must be a file with the names of its columns"),
+    (["good.csv", "--unit", "furlong"], "Argument `unit` must be one of"),
+    (["good.csv", "--columns", "rates=p,q,r"], "Argument `columns` must name columns"),
+    (["held.csv", "--flights"], "Argument `path` must hold flights, but it has none"),
+    (["still.csv"], "Argument `path` must hold rates of a gyro, but it has none"),
+    (["good.csv", "--sigma", "-1"], "Arguments `sigma` and `covariance` of `Gyro` must be"),
+])  # fmt: skip
+def test_what_cannot_be_used_is_said_in_a_sentence(
+    readings, tmp_path, capsys, arguments, words, monkeypatch, rng
+):
+    monkeypatch.chdir(tmp_path)
+    Path("words.csv").write_text("no numbers\nhere\n")
+    Path("still.csv").write_text("t,ax,ay,az\n" + "".join(f"{i},0,0,9.8\n" for i in range(9)))
+    write("good.csv", TS, readings)
+    write("held.csv", TS, readings, a=9.8 * np.abs(rng.normal(size=readings.shape)))
+    assert _cli.main(["fit", *arguments]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("jrigid: ")
+    assert said.count("\n") == 1
+    assert words in said
+
+
+@pytest.mark.parametrize("arguments", [[], ["fit"], ["fit", "a", "--unmodelled", "some"],
+                                       ["fit", "a", "--shape", "cube"]])  # fmt: skip
+def test_wrong_arguments_are_argparses_to_tell(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        _cli.main(arguments)
+    assert stop.value.code == 2
+    assert "usage: jrigid" in capsys.readouterr().err
+
+
+def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):
+    asked = {}
+
+    def fit(system, observations, **options):
+        asked.update(options, observations=observations)
+        raise ValueError("stopped")
+
+    monkeypatch.setattr(identify, "fit", fit)
+    path = tmp_path / "a.csv"
+    rows = np.c_[TS, readings, readings]
+    np.savetxt(path, rows, delimiter=",", header="when,p,q,r,x,y,z", comments="")
+    columns = ["--columns", "times=when", "--columns", "rates=p,q,r"]
+    units = ["--unit", "times=s", "--unit", "rpm"]
+    rest = ["--unmodelled", "0.1", "--robust", "--bias", "--shape", "flat"]
+    assert _cli.main(["fit", *columns, *units, *rest, str(path)]) == 1
+    assert asked["unmodelled"] == 0.1
+    assert asked["loss"] == "robust"
+    assert asked["shape"] == identify.Flat()
+    assert asked["free"](None, identify.Gyro(jnp.ones(3))).shape == (3,)
+    (record,) = asked["observations"]
+    assert not record.states_noise
+    np.testing.assert_allclose(record.values, readings * 2 * np.pi / 60, rtol=1e-6)
+    assert _cli.main(["fit", *columns, "--unit", "times=s", "--unit", "dps", str(path)]) == 1
+    assert (asked["free"], asked["loss"], asked["unmodelled"]) == (None, "squares", 0.0)
+    assert asked["shape"] == identify.Tensor()
+
+
+def test_three_throws_in_a_process_of_its_own(tmp_path):
+    """Rest, hand, flight, catch, three times; the noise and the bias are those of the rest."""
+    rng, step, lever = np.random.default_rng(3), 0.01, np.array([0.03, -0.02, 0.05])
+    rates, forces = [np.zeros((300, 3))], [np.tile([0, 0, 9.81], (300, 1))]
+    for _ in range(3):
+        motion = worlds.tumble(TENSOR, 8 * rng.normal(size=3), step * np.arange(60))
+        hand = np.linspace(0, 1, 40)[:, None]
+        rates += [hand * motion.omega[0], motion.omega, hand[::-1] * motion.omega[-1]]
+        rates[-3] += 0.8 * rng.normal(size=(40, 3))
+        rates[-1] += 0.8 * rng.normal(size=(40, 3))
+        forces += [5 * rng.normal(size=(40, 3)) + [0, 0, 20]]
+        forces += [worlds.accelerometer(motion, lever, rng, 0.0)]
+        forces += [9 * rng.normal(size=(40, 3)) + [0, 0, 30]]
+        rates += [np.zeros((250, 3))]
+        forces += [np.tile([0, 0, 9.81], (250, 1))]
+    rates, forces, bias = np.concatenate(rates), np.concatenate(forces), [0.02, -0.03, 0.01]
+    rates = rates + bias + 0.01 * rng.normal(size=rates.shape)
+    forces = forces + 0.1 * rng.normal(size=forces.shape)
+    write(tmp_path / "a.csv", step * np.arange(len(rates)), rates, a=forces)
+    flags = ["--flights", "--plot", "fit.png", "--save", "fit.pkl"]
+    done = subprocess.run(
+        [sys.executable, "-m", "jrigid", "fit", "a.csv", *flags], cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(jr.__file__).parents[1]), "XLA_FLAGS": QUICK},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "flight 3 of 3" in done.stdout
+    assert "samples of 3 throws" in done.stdout
+    result = identify.load(tmp_path / "fit.pkl")
+    assert_true(result)
+    assert str(result) in done.stdout
+    np.testing.assert_allclose(result.parts()[1].bias, bias, atol=0.002)
+    sigma = 1 / np.asarray(result.problem.samples.whitener)[0, 0].diagonal()
+    np.testing.assert_allclose(sigma, 0.01, rtol=0.15)
+    assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
