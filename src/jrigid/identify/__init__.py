@@ -1,9 +1,7 @@
 """Inertia from what was observed: the fit, what it can tell, its numbers and its linear starts."""
 
 from jrigid.identify._design import Bound as Bound
-from jrigid.identify._design import cramer_rao as cramer_rao
-from jrigid.identify._design import fisher_information as fisher_information
-from jrigid.identify._design import identifiability as identifiability
+from jrigid.identify._design import Plan as Plan
 from jrigid.identify._design import profile as profile
 from jrigid.identify._design import residuals as residuals
 from jrigid.identify._fit import fit as fit
