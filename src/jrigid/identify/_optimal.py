@@ -61,7 +61,8 @@ def optimal_throw(
         steps: Evaluations from each start.
 
     Returns:
-        The best plan found. Times that were chosen may come in another order: sort them.
+        The best plan found. Times that were chosen may come in another order, and run together
+        where much is told: sort them, or give limits that keep each near its own.
 
     Raises:
         ValueError: As many limits as arrays were not given.
@@ -76,6 +77,7 @@ def optimal_throw(
     >>> best = jr.identify.optimal_throw(plan, lambda plan: plan.state.omega, 1.0)
     >>> errors = jnp.exp(jnp.stack([best.start_score, best.score]))
     >>> print(errors.round(4), abs(best.plan.state.omega).round(2))
+    [0.2349 0.0047] [0.41 0.91 0.02]
     """
     leaves = jtu.tree_leaves(choose(plan))
     given = [limits] if len(leaves) == 1 else list(limits)
