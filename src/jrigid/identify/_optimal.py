@@ -90,7 +90,7 @@ def optimal_throw(
     return _optimum(plan, choose, given, score, starts, steps)
 
 
-def _limited(limit: Any, x: Array) -> tuple[Callable[[Array], Array], Array, Array]:
+def _limited(limit: Any, x: Array) -> tuple[Any, Array, Array]:
     """What brings an array back within its limits, their middle and their size."""
     if callable(limit):
         return limit, x, jnp.full_like(x, jnp.sqrt(jnp.mean(x**2)))
@@ -121,7 +121,8 @@ def _optimum(
         return eqx.tree_at(choose, plan, place(middle + unit * x))
 
     def scored(x: Array) -> tuple[Array, Array]:
-        return (score(planned(x).bound),) * 2
+        value = score(planned(x).bound)
+        return value, value
 
     # Under a torque forward alone.
     derive = (jax.grad if plan.system.is_free else jax.jacfwd)(scored, has_aux=True)
