@@ -21,7 +21,7 @@ import optax
 import scipy.optimize
 
 import jrigid as jr
-from jrigid.identify import Rates, Status, cramer_rao, fit, residuals
+from jrigid.identify import Plan, Rates, Status, fit, residuals
 
 BODIES = {
     "asymmetric": ((1.0, 1.7, 2.3), (0.5, 1.0, 0.4)),
@@ -70,9 +70,8 @@ def fits(values, ts, noise):
 @jax.jit
 def bound_at_truth(tensor, omega, ts, noise):
     """Covariance of the five numbers, and the relative bounds of the ratios."""
-    body, plan = jr.RigidBody(tensor), Rates(ts, None, noise)
-    unknowns = jr.identify.identifiability(body, jr.State(UNTURNED, omega), plan).unknowns
-    bound = cramer_rao(body, jr.State(UNTURNED, omega), plan)
+    plan = Plan(jr.RigidBody(tensor), jr.State(UNTURNED, omega), Rates(ts, None, noise))
+    unknowns, bound = plan.told.unknowns, plan.bound
     numbers = jr.identify.parameters_from_inertia(tensor)[1:]
     slopes = jax.jacfwd(lambda p: of_elements(unknowns.inertia(p)))(numbers)
     moments = jnp.linalg.eigvalsh(tensor)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jrigid as jr
-from jrigid.identify import Rates, Status, cramer_rao, fit
+from jrigid.identify import Plan, Rates, Status, fit
 from jrigid.identify._intervals import interval
 
 GAPS, WIDE = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), 50.0
@@ -143,11 +143,11 @@ def records(name, gap, trials, rng):
     moments, which, spin, noise = BODIES[name]
     turned = lambda m: (TURN * np.asarray(m)) @ TURN.T  # noqa: E731
     omega = TURN @ np.array(spin) / np.linalg.norm(spin)
-    start, plan = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), omega), Rates(TS, None, noise)
-    body = jr.RigidBody(turned(moments))
-    known = jr.identify.identifiability(body, start, plan)
+    start = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), omega)
+    plan = Plan(jr.RigidBody(turned(moments)), start, Rates(TS, None, noise))
+    known = plan.told
     slopes = jax.jacfwd(known.unknowns.inertia)(known.numbers).reshape(9, -1)
-    covariance = slopes @ cramer_rao(body, start, plan).covariance[:5, :5] @ slopes.T
+    covariance = slopes @ plan.bound.covariance[:5, :5] @ slopes.T
     covariance = np.asarray(covariance).reshape(3, 3, 3, 3)
     inside = np.einsum("ia,jb,ijkl,kc,ld->abcd", TURN, TURN, covariance, TURN, TURN)
     i, j = which - 1, which

@@ -227,7 +227,8 @@ def bound(tensor, omega, ts, t0):
 
     def variance(omega, ts):
         plan, start = identify.Rates(ts, None, 0.02), jr.State(UNTURNED, omega)
-        covariance = identify.cramer_rao(jr.RigidBody(tensor), start, plan, t0=t0).ratios_covariance
+        bound = identify.Plan(jr.RigidBody(tensor), start, plan, t0=t0).bound
+        covariance = bound.ratios_covariance
         return covariance[1, 1], covariance
 
     return jax.value_and_grad(variance, argnums=(0, 1), has_aux=True)(omega, ts)
@@ -235,15 +236,9 @@ def bound(tensor, omega, ts, t0):
 
 @quick_jit
 def told_and_information(tensor, omega, ts, sigma, t0):
-    body, start, plan = (
-        jr.RigidBody(tensor),
-        jr.State(UNTURNED, omega),
-        identify.Rates(ts, None, sigma),
-    )
-    return (
-        identify.identifiability(body, start, plan, t0=t0),
-        identify.fisher_information(body, start, plan, t0=t0),
-    )
+    start, record = jr.State(UNTURNED, omega), identify.Rates(ts, None, sigma)
+    plan = identify.Plan(jr.RigidBody(tensor), start, record, t0=t0)
+    return plan.told, plan.information
 
 
 def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
@@ -284,7 +279,7 @@ def test_under_a_torque_a_state_after_the_first_sample_is_refused():
     both = eqx.filter_jit(
         lambda t0, t1: (
             identify.residuals(body, state, record, t0=t0),
-            identify.fisher_information(body, state, record, t0=t1),
+            identify.Plan(body, state, record, t0=t1).information,
         )
     )
     rows, information = both(np.zeros(()), np.ones(()))
@@ -342,11 +337,13 @@ def program(name=None, prior=None, factors=None):
         return lambda tensor, omega: told_and_information(tensor, omega, TS, 0.01, np.zeros(()))[0]
     gyro = identify.Gyro(scale=np.ones(factors) if factors else 1.0)
     return quick_jit(
-        lambda tensor, omega: identify.identifiability(
-            jr.RigidBody(tensor),
-            jr.State(UNTURNED, omega),
-            identify.Record(gyro, TS, None, 0.01),
-            free=lambda _, gyro: picked(gyro, name, prior),
+        lambda tensor, omega: (
+            identify.Plan(
+                jr.RigidBody(tensor),
+                jr.State(UNTURNED, omega),
+                identify.Record(gyro, TS, None, 0.01),
+                free=lambda _, gyro: picked(gyro, name, prior),
+            ).told
         )
     )
 
@@ -365,9 +362,9 @@ def test_free_motion_tells_everything_but_the_scale():
     plan = identify.Attitudes(TS, None, 0.01)
     omega = TURN @ np.array([0.5, 1.0, 0.4])
     body = jr.RigidBody(turned(ASYMMETRIC[0]))
-    found = quick_jit(
-        lambda omega: identify.identifiability(body, jr.State(UNTURNED, omega), plan)
-    )(omega)
+    found = quick_jit(lambda omega: identify.Plan(body, jr.State(UNTURNED, omega), plan).told)(
+        omega
+    )
     assert found.null_directions == ("overall scale",)
 
 
@@ -451,7 +448,7 @@ def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
     options = {"shape": identify.Top(), "free": lambda body: body.torque.mass}
 
-    told_of = quick_jit(lambda state: identify.identifiability(top, state, plan, **options))
+    told_of = quick_jit(lambda state: identify.Plan(top, state, plan, **options).told)
 
     def words(tilt):
         return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
@@ -632,9 +629,7 @@ WHEEL = jr.torques.Rotor(lambda t: jnp.stack([0.1 + 0 * t, 0.2 * jnp.sin(0.7 * t
 def test_a_rotor_of_known_momentum_tells_the_scale():
     plan, start = identify.Rates(TS / 2, None, 0.01), jr.State(UNTURNED, np.array([0.5, 1.0, 0.4]))
     told_of = quick_jit(
-        lambda tensor: identify.identifiability(
-            jr.RigidBody(tensor, WHEEL), start, plan, scale="rotor"
-        )
+        lambda tensor: identify.Plan(jr.RigidBody(tensor, WHEEL), start, plan, scale="rotor").told
     )
     for tensor in (turned(ASYMMETRIC[0]), 1.3 * np.eye(3)):
         found = told_of(tensor)
@@ -732,12 +727,12 @@ def test_ten_numbers_are_two_too_many():
     body = jr.RigidBody(arm.about(np.zeros(3)), weight)
     state = jr.State(jr.rotation.exp(jnp.array([2.5, 0.2, 0.0])), np.array([0.5, -1.0, 4.0]))
     plan, ten = identify.Rates(np.arange(100) * 0.05, None, 0.005), identify.LogCholesky(arm)
-    found = identify.identifiability(body, state, plan, shape=ten, scale="known")
+    found = identify.Plan(body, state, plan, shape=ten, scale="known").told
     nulls = [text for text in found.null_directions if "heading" not in text]
     assert len(nulls) == 2
     assert "alpha" in " ".join(nulls)
     with pytest.raises(ValueError, match="LogCholesky"):
-        _ = identify.identifiability(body, state, plan).body
+        _ = identify.Plan(body, state, plan).told.body
 
 
 def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
@@ -923,7 +918,7 @@ def test_what_cannot_be_weighed_is_refused():
     with pytest.raises(ValueError, match="each kind"):
         identify.fit(BLIND, (readings, identify.Attitudes(TS, turns)))
     with pytest.raises(ValueError, match="noise"):
-        identify.cramer_rao(BLIND, jr.State(UNTURNED, np.ones(3)), identify.Rates(TS, None))
+        identify.Plan(BLIND, jr.State(UNTURNED, np.ones(3)), identify.Rates(TS, None))
     with pytest.raises(ValueError, match="free"):
         identify.fit(BLIND, readings, free=lambda body: body.inertia)
     stars = [identify.Directions(TS, omegas, 0.01, of=of) for of in np.eye(3)[:2]]

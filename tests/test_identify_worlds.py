@@ -195,8 +195,7 @@ def test_the_log_density_has_the_fit_s_minimum_and_curvature(rng):
     np.testing.assert_allclose(inverse, density.covariance, atol=0.02 * errors.max() ** 2)
     np.testing.assert_allclose(np.diagonal(inverse), errors**2, rtol=0.02)
     record = identify.Rates(TS, values, 1e-4)
-    smoothed = identify.identifiability(
-        jr.RigidBody(TENSOR), jr.State(np.array([1.0, 0, 0, 0]), OMEGA), record
-    )
+    start = jr.State(np.array([1.0, 0, 0, 0]), OMEGA)
+    smoothed = identify.Plan(jr.RigidBody(TENSOR), start, record).told
     told = identify.log_density(smoothed)  # a plan has a density too
     assert told.start.shape == (8,)

@@ -74,8 +74,10 @@ CODES = {
 # Regressions and fits of records of some length: tests/test_identify*.py.
 OF_RECORDS = {
     "identify.LinearStart", "identify.weak_form", "identify.momentum", "identify.gyrostat",
-    "identify.fit", "identify.Status", "identify.Bound", "identify.cramer_rao",
-    "identify.fisher_information", "identify.identifiability", "identify.profile",
+    "identify.fit", "identify.Status", "identify.Bound", "identify.Plan", "identify.Plan.bound",
+    "identify.Plan.information", "identify.Plan.told", "identify.profile",
+    "identify.optimal_throw", "identify.Optimum", "identify.compare", "identify.Comparison",
+    "identify.cross_validate",
     "identify.residuals", "identify.block_bootstrap", "identify.coloured_covariance",
     # Long motions and grids: tests/test_stability*.py.
     "stability.lyapunov_spectrum", "stability.megno", "stability.poincare_section",

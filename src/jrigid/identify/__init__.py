@@ -1,14 +1,17 @@
 """Inertia from what was observed: the fit, what it can tell, its numbers and its linear starts."""
 
+from jrigid.identify._compare import Comparison as Comparison
+from jrigid.identify._compare import compare as compare
+from jrigid.identify._compare import cross_validate as cross_validate
 from jrigid.identify._design import Bound as Bound
-from jrigid.identify._design import cramer_rao as cramer_rao
-from jrigid.identify._design import fisher_information as fisher_information
-from jrigid.identify._design import identifiability as identifiability
+from jrigid.identify._design import Plan as Plan
 from jrigid.identify._design import profile as profile
 from jrigid.identify._design import residuals as residuals
 from jrigid.identify._fit import fit as fit
 from jrigid.identify._noise import block_bootstrap as block_bootstrap
 from jrigid.identify._noise import coloured_covariance as coloured_covariance
+from jrigid.identify._optimal import Optimum as Optimum
+from jrigid.identify._optimal import optimal_throw as optimal_throw
 from jrigid.identify._parameters import body_from_log_cholesky as body_from_log_cholesky
 from jrigid.identify._parameters import inertia_from_parameters as inertia_from_parameters
 from jrigid.identify._parameters import log_cholesky_from_body as log_cholesky_from_body

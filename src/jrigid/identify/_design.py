@@ -4,15 +4,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import INERTIA, RESULTS, check_shape, check_type, nan_where
+from jrigid._checks import INERTIA, RESULTS, check_shape, check_type, demand, nan_where
 from jrigid._numerics import product
-from jrigid._types import Real
+from jrigid._types import Readable, Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify._compile import quick_jit
@@ -51,42 +52,120 @@ class Bound(NamedTuple):
     ratios_covariance: Float[Array, "2 2"]
 
 
-def _planned(
-    system: RigidBody,
-    state: State,
-    observations: Any,
-    t0: Any,
-    free: Callable[..., Any] | None,
-    scale: str,
-    shape: AbstractShape | None,
-) -> tuple[Problem, Found, Layout]:
-    """Derivatives of a record that is what the body and the state say."""
-    check_type("system", system, RigidBody)
-    check_type("state", state, State)
-    check_shape("inertia", system.inertia, *INERTIA)
-    shape = Tensor() if shape is None else shape
-    check_type("shape", shape, AbstractShape)
-    records = tuple(x.with_values(jnp.ones_like(x.values)) for x in of_throws(observations))
-    refuse(system, records, scale, shape)
-    if not all(x.states_noise for x in records):
-        raise ValueError(
+class Plan(Readable):
+    """A record before it is taken: what it would tell, with derivatives in all that is planned.
+
+    Made within a function of the rate, the times, a wheel's samples, it can be improved by descent:
+    see `optimal_throw`.
+
+    Attributes:
+        system: The body as it is thought to be.
+        state: State at `t0`, of one throw, or with an axis of throws in front.
+        observations: When and how well it will be observed, as for `fit`; values play no role and
+            may be None.
+        t0: Time of the state [s], or of that of each throw; under a torque not later than the first
+            observation, or all is NaN.
+        free: What is sought beside the inertia, as for `fit`; nothing of each throw.
+        scale: "trace", "known" or "rotor".
+        shape: What is known of the tensor.
+
+    Raises:
+        ValueError: A request that no record could answer, or noise that is not stated.
+
+    Gradients: of `information` and `bound` in the state, the times and the noise, of the bound
+    where the record tells all that is sought; in the tensor they are not to be relied on. Under a
+    torque in forward mode.
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr
+    >>> body, ts = jr.RigidBody(jnp.array([1.0, 1.7, 2.3])), jnp.linspace(0.0, 20.0, 100)
+    >>> def error(omega):
+    ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
+    ...     plan = jr.identify.Plan(body, start, jr.identify.Rates(ts, None, 0.01))
+    ...     return plan.bound.ratios_covariance[1, 1] ** 0.5
+    >>> print(f"{error(jnp.array([0.5, 1.0, 0.3])):.5f}")
+    0.00378
+    """
+
+    system: RigidBody
+    state: State
+    observations: Any
+    t0: Float[Array, "*throws"]
+    free: Callable[..., Any] | None = eqx.field(static=True)
+    scale: str = eqx.field(static=True)
+    shape: AbstractShape
+
+    def __init__(
+        self, system: RigidBody, state: State, observations: Any, *,
+        t0: Real[_ArrayLike, "*throws"] = 0.0, free: Callable[..., Any] | None = None,
+        scale: str = "trace", shape: AbstractShape | None = None,
+    ):  # fmt: skip
+        """A body, its state at `t0`, and what will be seen of it."""
+        check_type("system", system, RigidBody)
+        check_type("state", state, State)
+        check_shape("inertia", system.inertia, *INERTIA)
+        shape = Tensor() if shape is None else shape
+        check_type("shape", shape, AbstractShape)
+        records = of_throws(observations)
+        refuse(system, records, scale, shape)
+        demand(
+            all(x.states_noise for x in records),
             "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
-            "not."
+            "not.",
         )
+        self.system, self.state, self.observations = system, state, observations
+        self.t0 = jnp.asarray(t0, records[0].ts.dtype)
+        self.free, self.scale, self.shape = free, scale, shape
+
+    @property
+    def information(self) -> Float[Array, "all all"]:
+        """Fisher's, about the numbers sought (the shape's, the scale's, what is picked) and states.
+
+        These are at `t0`, of each throw the rate and, if it matters, a small turn.
+        """
+        return _information(self)
+
+    @property
+    def bound(self) -> Bound:
+        """The least errors: the inverse of the information."""
+        return _bound(self)
+
+    @property
+    def told(self) -> FitResult:
+        """A result before there is a record, of chi-square 0; no gradients.
+
+        Its errors are those of `bound`, its `status` says whether all that is sought is told, and
+        `null_directions` what is not, in words.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> record = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
+        >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
+        >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
+        >>> plan = jr.identify.Plan(top, start, record, free=lambda body, gyro: gyro.scale)
+        >>> print(plan.told.null_directions)
+        ('overall scale', 'I3/I1 against gyro scale')
+        """
+        return _told(self)
+
+
+def _planned(plan: Plan) -> tuple[Problem, Found, Layout]:
+    """Derivatives of a record that is what the body and the state say."""
+    system, state, shape = plan.system, plan.state, plan.shape
+    records = of_throws(plan.observations)
+    records = tuple(x.with_values(jnp.ones_like(x.values)) for x in records)
     one = jnp.ones((), records[0].ts.dtype)
     samples, sensors = samples_of(records, one), tuple(x.sensor for x in records)
     (throws, _), dtype = samples.ts.shape, samples.ts.dtype
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
     rate = jax.lax.stop_gradient(jnp.sqrt(jnp.mean(jnp.sum(omega**2, axis=-1))))
-    scaled = scale != "trace" and not shape.absolute
+    scaled = plan.scale != "trace" and not shape.absolute
     unknowns = unknowns_of(
-        (system,), sensors, sizes_of(samples), free, (shape,), scaled,
+        (system,), sensors, sizes_of(samples), plan.free, (shape,), scaled,
         jnp.where(rate > 0, rate, 1.0),
     )  # fmt: skip
     unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
     point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
-    layout = whole(samples, 1, jnp.asarray(t0, dtype))
+    layout = whole(samples, 1, plan.t0)
     bodies, noise = jnp.zeros(throws, int), jnp.ones(6, dtype)
     problem = Problem(Options(system.is_free, True), unknowns, samples, bodies, noise)
     # Values as they would be seen: a residual of zero.
@@ -101,122 +180,42 @@ def _planned(
         first = first_and_last(samples.ts, samples.seen)[0]
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
     yes = jnp.asarray(True)
-    return (
-        problem,
-        Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan)),
-        layout,
-    )
+    found = Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan))
+    return problem, found, layout
 
 
-def _information(rows: Rows) -> Array:
-    """Of the numbers and of each throw's state."""
-    jg, jl, _ = in_rows(rows, 0)
-    throws, locals_ = jl.shape[0], jl.shape[-1]
-    gg = product("tri,trj->ij", jg, jg)
-    gl = product("tri,trl->itl", jg, jl).reshape(gg.shape[0], throws * locals_)
-    ll = product("trk,trl->tkl", jl, jl)
-    eye = jnp.eye(throws, dtype=jl.dtype)
-    blocks = (eye[:, None, :, None] * ll[:, :, None, :]).reshape(2 * (throws * locals_,))
-    return jnp.block([[gg, gl], [gl.T, blocks]])
-
-
-def _inverse(rows: Rows) -> Array:
-    """Of the information, from the derivatives themselves: their squares lose digits."""
+def _jacobian(rows: Rows) -> Array:
+    """Of all residuals in the numbers and in each throw's state."""
     jg, jl, _ = in_rows(rows, 0)
     throws, count, locals_ = jl.shape
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
-    jacobian = jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
+    return jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
+
+
+@quick_jit
+def _information(plan: Plan) -> Array:
+    jacobian = _jacobian(_planned(plan)[1].rows)
+    return product("ri,rj->ij", jacobian, jacobian)
+
+
+@quick_jit
+def _bound(plan: Plan) -> Bound:
+    """From the derivatives themselves: their squares lose digits."""
+    problem, found, _ = _planned(plan)
+    jacobian = _jacobian(found.rows)
     size = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0))
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
     # Where nothing is told the last rows keep the bound finite, and very large.
-    floor = 64 * jnp.finfo(jl.dtype).eps * jnp.eye(size.size, dtype=jl.dtype)
+    eye = jnp.eye(size.size, dtype=jacobian.dtype)
+    floor = 64 * jnp.finfo(eye.dtype).eps * eye
     _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
-    half = jax.scipy.linalg.solve_triangular(r, jnp.eye(size.size, dtype=jl.dtype))
-    return product("ij,kj->ik", half, half) / size[:, None] / size[None, :]
-
-
-def fisher_information(
-    system: RigidBody,
-    state: State,
-    observations: Any,
-    *,
-    t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Callable[..., Any] | None = None,
-    scale: str = "trace",
-    shape: AbstractShape | None = None,
-) -> Float[Array, "all all"]:
-    """Fisher information of a planned record, about what `fit` would seek in it.
-
-    Args:
-        system: The body as it is thought to be.
-        state: State at `t0`, of one throw, or with an axis of throws in front.
-        observations: When and how well it will be observed, as for `fit`; values play no role and
-            may be None.
-        t0: Time of the state [s], or of that of each throw; under a torque not later than the first
-            observation, or all is NaN.
-        free: As for `fit`, and so on; nothing of each throw.
-        scale: "trace", "known" or "rotor".
-        shape: What is known of the tensor.
-
-    Returns:
-        The information about the numbers sought (the shape's, the scale's, what is picked) and
-        the states at `t0` (rate, then, if it matters, a small turn, of each throw).
-
-    Gradients: in the state, the times and the noise; in the tensor they are not to be relied on.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
-    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
-    >>> body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]))
-    >>> print(jr.identify.fisher_information(body, start, plan).shape)
-    (8, 8)
-    """
-    return _information(_planned(system, state, observations, t0, free, scale, shape)[1].rows)
-
-
-def cramer_rao(
-    system: RigidBody,
-    state: State,
-    observations: Any,
-    *,
-    t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Callable[..., Any] | None = None,
-    scale: str = "trace",
-    shape: AbstractShape | None = None,
-) -> Bound:
-    """The least errors that a planned record allows: the inverse of `fisher_information`.
-
-    Args:
-        system: As for `fisher_information`, and so on.
-        state: State at `t0`.
-        observations: The plan.
-        t0: Time of the state [s].
-        free: What is sought beside the inertia.
-        scale: "trace", "known" or "rotor".
-        shape: What is known of the tensor.
-
-    Returns:
-        Covariances.
-
-    Gradients: as `fisher_information`, where the record tells all that is sought: so a plan can be
-    improved by descent.
-
-    >>> import jax, jax.numpy as jnp, jrigid as jr
-    >>> body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]))
-    >>> def error(omega):
-    ...     plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
-    ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
-    ...     return jr.identify.cramer_rao(body, start, plan).ratios_covariance[1, 1] ** 0.5
-    >>> print(f"{jax.jit(error)(jnp.array([0.5, 1.0, 0.3])):.5f}")
-    0.00378
-    """
-    problem, found, _ = _planned(system, state, observations, t0, free, scale, shape)
-    covariance = _inverse(found.rows)
-    numbers, unknowns = found.point.numbers, problem.unknowns
+    half = jax.scipy.linalg.solve_triangular(r, eye)
+    covariance = product("ij,kj->ik", half, half) / size[:, None] / size[None, :]
+    numbers = found.point.numbers
 
     def ratios(numbers: Array) -> Array:
-        moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
+        moments = jnp.linalg.eigvalsh(problem.unknowns.inertia(numbers))
         return moments[1:] / moments[0]
 
     slopes = jax.jacfwd(ratios)(numbers)
@@ -224,45 +223,9 @@ def cramer_rao(
     return Bound(covariance, slopes @ of_numbers @ slopes.T)
 
 
-def identifiability(
-    system: RigidBody,
-    state: State,
-    observations: Any,
-    *,
-    t0: Real[_ArrayLike, "*throws"] = 0.0,
-    free: Callable[..., Any] | None = None,
-    scale: str = "trace",
-    shape: AbstractShape | None = None,
-) -> FitResult:
-    """What a planned record would tell: a `FitResult` before there is a record.
-
-    Its errors are those of `cramer_rao`, its `status` says whether all that is sought is told, and
-    `null_directions` what is not, in words.
-
-    Args:
-        system: As for `fisher_information`, and so on.
-        state: State at `t0`.
-        observations: The plan.
-        t0: Time of the state [s].
-        free: What is sought beside the inertia.
-        scale: "trace", "known" or "rotor".
-        shape: What is known of the tensor.
-
-    Returns:
-        The result, of chi-square 0.
-
-    Gradients: use `cramer_rao`.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> plan = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
-    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
-    >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
-    >>> free = lambda body, gyro: gyro.scale
-    >>> told = jr.identify.identifiability(top, start, plan, free=free)
-    >>> print(told.null_directions)
-    ('overall scale', 'I3/I1 against gyro scale')
-    """
-    problem, found, layout = _planned(system, state, observations, t0, free, scale, shape)
+@quick_jit
+def _told(plan: Plan) -> FitResult:
+    problem, found, layout = _planned(plan)
     dtype, no = layout.ts.dtype, jnp.asarray(False)
     scales = jnp.ones(len(problem.samples.values), dtype)
     way = Way(

@@ -120,7 +120,7 @@ def fit(
         ValueError: A request that no record could answer.
         RuntimeError: A failed fit.
 
-    Gradients: none to be relied on; `residuals` and `cramer_rao` have theirs.
+    Gradients: none to be relied on; `residuals` and `Plan.bound` have theirs.
     Source: H. G. Bock, multiple shooting (1983); J. J. More, Levenberg-Marquardt (1978);
     docs/identify.md.
 

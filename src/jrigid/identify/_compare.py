@@ -1,0 +1,142 @@
+"""Which of several models a record asks for: by what they leave, and by throws they never saw."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jrigid._checks import demand
+from jrigid.identify._fit import fit
+from jrigid.identify._result import FitResult
+from jrigid.identify._shapes import Fixed
+
+_TOLD = 1e-9  # of the largest singular value, as in the fit
+
+
+class Comparison(NamedTuple):
+    """Fits of one record side by side; `print` shows it.
+
+    Attributes:
+        names: Of the models.
+        chi_square: Of each.
+        degrees_of_freedom: Residuals less what was sought.
+        unknowns: How many numbers were sought, those of the states with them.
+        aic: Akaike's criterion: a model is the better the less it is.
+        bic: The Bayesian one, which asks more of each unknown: 10 less is strong evidence.
+    """
+
+    names: tuple[str, ...]
+    chi_square: Float[Array, " fits"]
+    degrees_of_freedom: Int[Array, " fits"]
+    unknowns: Int[Array, " fits"]
+    aic: Float[Array, " fits"]
+    bic: Float[Array, " fits"]
+
+    def __str__(self) -> str:
+        """A table, the best by BIC first; criteria over those of the best."""
+        first = max(5, *map(len, self.names))
+        heads = "chi-square", "freedom", "unknowns", "AIC", "BIC"
+        lines = ["model".ljust(first) + "".join(x.rjust(12) for x in heads)]
+        columns = *self[1:4], self.aic - jnp.min(self.aic), self.bic - jnp.min(self.bic)
+        for i in jnp.argsort(self.bic).tolist():
+            numbers = (f"{x[i].item():.1f}" if x.dtype.kind == "f" else str(x[i]) for x in columns)
+            lines.append(self.names[i].ljust(first) + "".join(x.rjust(12) for x in numbers))
+        return "\n".join(lines)
+
+
+def compare(results: Mapping[str, FitResult]) -> Comparison:
+    """Fits of one record with different models: what each leaves, and what it asks for that.
+
+    With the noise stated the criteria are chi-square + 2 k and chi-square + k log n, of k unknowns
+    and n residuals; else n log(chi-square / n) stands for chi-square. What was known beforehand
+    counts as sought, and its squares are in chi-square.
+
+    Args:
+        results: Each fit by the name of its model.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: Fits of different samples, or with an unmodelled torque.
+
+    Gradients: none.
+    Source: G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6 (1978) 461.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
+    >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+    >>> whole = jr.identify.fit(body, readings)
+    >>> known_axes = jr.identify.fit(body, readings, shape=jr.identify.Moments())
+    >>> print(jr.identify.compare({"axes known": known_axes, "any body": whole}))
+    model       chi-square     freedom    unknowns         AIC         BIC
+    axes known       594.7         595           5         0.0         0.0
+    any body         593.0         592           8         4.3        17.5
+    """
+    fits = tuple(results.values())
+    asked = [((x.problem.samples, x.kept), x.problem.options.noise_known) for x in fits]
+    demand(
+        all(bool(eqx.tree_equal(x, asked[0], rtol=1e-6)) for x in asked)
+        and not any(x.problem.options.dense for x in fits),
+        "Argument `results` must be fits of the same samples, their noise taken alike, without an "
+        "unmodelled torque, but they are not.",
+    )
+    n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
+    shown = [x.state_singular_values for x in fits]
+    states = [jnp.sum(x > _TOLD * x[:, :1]) for x in shown]
+    unknowns = jnp.stack([x.numbers.size + count for x, count in zip(fits, states, strict=True)])
+    square = jnp.stack([x.chi_square for x in fits])
+    freedom = jnp.stack([x.degrees_of_freedom for x in fits])
+    left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)
+    criteria = left + 2 * k, left + k * jnp.log(n)
+    return Comparison(tuple(results), square, freedom, unknowns, *criteria)
+
+
+def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
+    system, *sensors = found.parts()
+    records = [x if isinstance(x, tuple) else (x,) for x in throws]
+    records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
+    return fit(system, records, shape=Fixed(), throw=False)
+
+
+def cross_validate(
+    fit_function: Callable[[list[Any]], FitResult], throws: Sequence[Any], *,
+    refit: Callable[[FitResult, list[Any]], FitResult] = _with_its_own_state,
+) -> Float[Array, " throws"]:  # fmt: skip
+    """How well throws that a fit has not seen are described: chi-square of each, left out in turn.
+
+    A fit of the others gives the body, its torque and the sensors; of the throw left out only the
+    state is sought. Models are compared throw by throw: the difference and its scatter tell which
+    predicts better, with no count of unknowns.
+
+    Args:
+        fit_function: Fits a list of throws: `lambda throws: jr.identify.fit(body, throws, ...)`.
+        throws: Of each a record or a tuple of records; a list of throws is left out as a group.
+        refit: What finds the states of throws left out from the fit of the others, where the
+            default cannot: wheels that each throw has its own record of, numbers sought by `each`,
+            a motion that depends on an attitude that was not observed.
+
+    Returns:
+        Chi-square of each throw or group.
+
+    Gradients: none.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
+    >>> parts = [slice(0, 100), slice(50, 150), slice(100, 200)]
+    >>> rates = lambda x: jr.identify.Rates(record.times[x], record.omegas[x], record.sigma)
+    >>> throws = [rates(x) for x in parts]  # of 300 numbers each, less three of its state
+    >>> print(jr.identify.cross_validate(lambda x: jr.identify.fit(body, x), throws).round())
+    [293. 300. 307.]
+    """
+    groups = [x if isinstance(x, list) else [x] for x in throws]
+    demand(
+        len(groups) > 1,
+        f"Argument `throws` must hold two throws or groups at least, but it holds {len(groups)}.",
+    )
+    others = [[*chain(*groups[:i], *groups[i + 1 :])] for i in range(len(groups))]
+    pairs = zip(others, groups, strict=True)
+    return jnp.stack([refit(fit_function(rest), group).chi_square for rest, group in pairs])

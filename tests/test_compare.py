@@ -1,0 +1,113 @@
+"""Which model a record asks for: criteria, and throws that a fit has not seen."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from scipy.spatial.transform import Rotation
+
+import jrigid as jr
+from jrigid import identify
+
+BLIND = jr.RigidBody(np.ones(3))
+TS, NOISE = np.arange(80) * 0.25, 0.02
+MOMENTS = np.array([0.6, 1.02, 1.38])
+
+
+def throws(rng, drag=0.0, turn=0.0, count=1, noise=NOISE):
+    """Records of a body that the air brakes, its principal axes turned from the gyro's."""
+    axes = Rotation.from_rotvec(turn * np.array([0.6, -0.4, 0.9])).as_matrix()
+    omega = rng.normal(size=(count, 3))
+    omega /= np.linalg.norm(omega, axis=1, keepdims=True)
+    torque = worlds.quadratic_drag(drag) if drag else None
+    motion = worlds.tumble(axes @ np.diag(MOMENTS) @ axes.T, omega, TS, torque)
+    values = motion.omega + NOISE * rng.normal(size=motion.omega.shape)
+    return [identify.Rates(TS, x, noise) for x in values]
+
+
+def of_axes(record):
+    """Fits with the axes known to be the gyro's, and with any."""
+    known = identify.fit(BLIND, record, shape=identify.Moments(), throw=False)
+    return {"known axes": known, "any axes": identify.fit(BLIND, record, throw=False)}
+
+
+def test_three_numbers_too_many_are_told_from_three_too_few(rng):
+    for turn, best, least in ((0.0, "known axes", 8), (0.3, "any axes", 10)):
+        found = [identify.compare(of_axes(throws(rng, turn=turn)[0])) for _ in range(10)]
+        wins = [x.names[int(jnp.argmin(x.bic))] == best for x in found]
+        assert sum(wins) >= least, wins
+    one = found[0]
+    np.testing.assert_array_equal(one.unknowns, [2 + 3, 5 + 3])
+    np.testing.assert_array_equal(one.degrees_of_freedom, 240 - np.asarray(one.unknowns))
+    counts = np.asarray(one.unknowns)
+    np.testing.assert_allclose(one.aic - one.chi_square, 2 * counts)
+    np.testing.assert_allclose(one.bic - one.chi_square, np.log(240) * counts)
+    lines = str(one).splitlines()
+    assert lines[0].split() == ["model", "chi-square", "freedom", "unknowns", "AIC", "BIC"]
+    assert lines[1].startswith("any axes")
+    assert lines[1].endswith("0.0")
+
+
+def test_fits_of_different_records_are_not_compared(rng):
+    first, second = (of_axes(x)["any axes"] for x in throws(rng, count=2))
+    assert identify.compare({"one": first, "two": first}).names == ("one", "two")
+    with pytest.raises(ValueError, match="same samples"):
+        identify.compare({"one": first, "two": second})
+
+
+def test_each_throw_or_group_is_left_out_once():
+    """By a fit that remembers what it was shown."""
+
+    class Shown:
+        def __init__(self, chi_square):
+            self.chi_square = jnp.asarray(chi_square)
+
+    def refit(found, group):
+        return Shown(float(found) * 100 + sum(group))
+
+    squares = identify.cross_validate(sum, [1, 2, [3, 4]], refit=refit)
+    np.testing.assert_array_equal(squares, [901, 802, 307])
+    with pytest.raises(ValueError, match="two throws"):
+        identify.cross_validate(sum, [1], refit=refit)
+
+
+DRAGGED = jr.RigidBody(np.ones(3), jr.torques.QuadraticDrag(0.003))
+
+
+def with_drag(records):
+    return identify.fit(DRAGGED, records, free=lambda body: body.torque.coefficient, throw=False)
+
+
+def without_drag(records):
+    return identify.fit(BLIND, records, throw=False)
+
+
+def compared(records):
+    return identify.compare({"drag": with_drag(records), "free": without_drag(records)})
+
+
+@pytest.mark.slow  # fits under a torque
+def test_drag_is_found_where_it_is_and_not_where_it_is_not(rng):
+    records = throws(rng, 0.004, count=4)
+    bic = compared(records).bic
+    assert float(bic[1] - bic[0]) > 50
+    better = identify.cross_validate(without_drag, records)
+    better -= identify.cross_validate(with_drag, records)
+    assert np.all(better > 0)
+    # of a throw left out its three rates are sought, and the rest is as the others say
+    assert float(jnp.sum(identify.cross_validate(with_drag, records))) < 1.2 * 4 * 237
+    margins = []
+    for _ in range(10):
+        bic = compared(throws(rng, 0.0, count=4)).bic
+        margins.append(float(bic[0] - bic[1]))
+    assert sum(x > 0 for x in margins) >= 8, margins
+    assert np.all(np.array(margins) < np.log(960) + 0.1)  # an unknown too many costs that at most
+
+
+@pytest.mark.slow  # a program of its own
+def test_without_a_stated_noise_the_residuals_take_its_place(rng):
+    records = throws(rng, turn=0.3, noise=None)
+    table = identify.compare(of_axes(records[0]))
+    assert int(jnp.argmin(table.bic)) == 1
+    left = 240 * np.log(np.asarray(table.chi_square) / 240)
+    np.testing.assert_allclose(table.bic, left + np.log(240) * np.asarray(table.unknowns))
