@@ -34,17 +34,14 @@ from jrigid.identify._stages import (
 
 _HISTORY = 1024
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
-_PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along what is told least
+_PROBES = [-1.0, 1.0, -0.25, 0.25]  # natural units, along what is told least
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
 _BENT = 2.0  # times what Fisher's information says: a valley that no covariance describes
-_LOWER = 1.0  # fall of chi-square that is another minimum
 _RIVAL = 25.0  # growth of chi-square at which another minimum is none
-_ROUNDS = 1
-_AGREED = 3  # attempts that end at one and the same minimum
 
 
 class Line(eqx.Module):
@@ -70,13 +67,10 @@ class _Weakest(NamedTuple):
 class _Hunt(NamedTuple):
     """Where a search stands."""
 
-    tried: Array  # the next attempt: a start, then a probe, last what a probe found
-    rounds: Array
+    tried: Array  # the next attempt: a start, then a probe
     best: Way
     wrong: Array  # 0 for an answer that may be kept, else how far off it is
     weakest: _Weakest
-    lower: Array  # numbers that a probe found
-    agreed: Array  # attempts that ended at the best
     pure: Array
 
 
@@ -89,8 +83,7 @@ def search(
     Fisher's information at a minimum knows nothing of a valley that bends, nor of other minima. So
     an answer that tells some direction weakly is probed: that direction is held a natural unit, and
     a quarter of one, to either side, and all else is fitted anew. By how little chi-square grows
-    says what the error is; where it falls there is a better answer, which is probed in its turn.
-    And of coarse records, which have aliases, all attempts are made and compared.
+    says what the error is. Of coarse records, which have aliases, several attempts are compared.
 
     Args:
         problem: The record.
@@ -106,91 +99,85 @@ def search(
     stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
     last = jtu.tree_map(lambda x: x[0, -1], stages)
     final = cut if options.dense or not options.free_motion else single
-    steps, polish = jnp.asarray(_PROBES, dtype), count + len(_PROBES)
-
+    steps = jnp.asarray([0.0] * count + _PROBES, dtype)
     shapes = eqx.filter_eval_shape(evaluation(problem, cut), point)
     rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, none, nothing = jnp.asarray(False), jnp.asarray(0), jnp.zeros_like(point.numbers)
     found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
-    scales, far = jnp.ones(len(problem.samples.values), dtype), jnp.asarray(jnp.inf, dtype)
     kept, zero = problem.samples.seen.astype(dtype), jnp.zeros((), dtype)
-    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)  # any alias follows them
+    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)
+    scales = jnp.ones(len(problem.samples.values), dtype)
     begin = Way(found, kept, scales, 10 * first, no, few, zero)
 
+    def tensors(numbers: Array) -> Array:
+        unknowns = problem.unknowns
+        return jnp.stack([unknowns.inertia(numbers, i) for i in range(len(unknowns.shapes))])
+
     def attempt(hunt: _Hunt) -> _Hunt:
-        tried, best, weakest = hunt.tried, hunt.best.found, hunt.weakest
-        probing, index = (tried >= count) & (tried < polish), jnp.clip(tried - count, 0, 3)
-        numbers = jnp.where(probing, best.point.numbers + steps[index] * weakest.direction,
-            jnp.where(tried == polish, hunt.lower, starts[jnp.minimum(tried, count - 1)]),
-        )  # fmt: skip
+        best, weakest, step = hunt.best.found, hunt.weakest, steps[hunt.tried]
+        probing = hunt.tried >= count
+        numbers = best.point.numbers + step * weakest.direction
+        numbers = jnp.where(probing, numbers, starts[jnp.minimum(hunt.tried, count - 1)])
         normal = jnp.where(probing, _HARD * weakest.normal, 0.0)
-        line = Line(normal, jnp.sum(normal * numbers))
-        now = eqx.tree_at(lambda x: x.unknowns, problem, problem.unknowns.holding(line))
-        slow = jnp.where(tried < count, tried > 0, long).astype(int)
-        kind = jnp.minimum(slow, stages.weight.shape[0] - 1)
+        held = problem.unknowns.holding(Line(normal, jnp.sum(normal * numbers)))
+        now = eqx.tree_at(lambda x: x.unknowns, problem, held)
+        slow = jnp.where(probing, long, hunt.tried > 0).astype(int)
+        way = jtu.tree_map(lambda x: x[jnp.minimum(slow, x.shape[0] - 1)], stages)
 
         def one(way: Way, stage: Stage) -> tuple[Way, None]:
             skip = (stage.steps == 0) | (way.done & ~stage.last)
             run = lambda way: _stage(now, single, cut, way, stage, first, known)  # noqa: E731
             return jax.lax.cond(skip, lambda way: way, run, way), None
 
-        at = found._replace(
-            point=point._replace(numbers=numbers), steps=best.steps, history=best.history
-        )
-        end, _ = jax.lax.scan(
-            one, begin._replace(found=at), jtu.tree_map(lambda x: x[kind], stages)
-        )
-        return _next(hunt, end, probing, index)
+        at = point._replace(numbers=numbers)
+        start = found._replace(point=at, steps=best.steps, history=best.history)
+        end = jax.lax.scan(one, begin._replace(found=start), way)[0]
+        return _next(hunt, end, probing, step)
 
-    def _next(hunt: _Hunt, end: Way, probing: Array, index: Array) -> _Hunt:
+    def _next(hunt: _Hunt, end: Way, probing: Array, step: Array) -> _Hunt:
         """What an attempt says, and what comes after it."""
-        tried, best, weakest = hunt.tried, hunt.best, hunt.weakest
+        best, weakest, wrong = hunt.best, hunt.weakest, hunt.wrong
         off, seen = misfit(problem, end), _weakest(problem, final, end, last)
         fall = (weakest.square - seen.square) / weakest.noise
-        lower = (off < hunt.wrong) | ((off <= hunt.wrong) & (fall > 0))
-        better = lower & ~probing
+        better = ~probing & ((off < wrong) | ((off <= wrong) & (fall > 0)))
         numbers = end.found.point.numbers
-        units = problem.unknowns.natural_units(numbers)
-        apart = jnp.max(jnp.abs(numbers - best.found.point.numbers) / units, initial=0.0)
-        apart = apart > jnp.maximum(_APART, 6 * jnp.maximum(weakest.error, seen.error))
+        apart = (numbers - best.found.point.numbers) / problem.unknowns.natural_units(numbers)
+        error = jnp.maximum(weakest.error, seen.error)
+        apart = jnp.max(jnp.abs(apart), initial=0.0) > jnp.maximum(_APART, 6 * error)
         rival = ~probing & apart & (jnp.abs(fall) < _RIVAL)
-        fell, vain = probing & (fall > _LOWER), (tried == polish) & ~better
-        wide = jnp.abs(steps[index]) / jnp.sqrt(jnp.maximum(-fall, 1e-6))
+        doubtful = (best.doubtful & ~(better & (fall > _RIVAL))) | rival | few
+        # By how far the tensor moves: numbers are logarithms.
+        moved = tensors(numbers) - tensors(best.found.point.numbers)
+        slope = jax.jvp(tensors, (best.found.point.numbers,), (weakest.direction,))[1]
+        square = jnp.sum(slope * slope)
+        step = jnp.where(square > 0, jnp.sum(moved * slope) / square, step)
+        wide = jnp.abs(step) / jnp.sqrt(jnp.maximum(-fall, 1e-6))
         wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
-        wide = jnp.where(better | fell, 0.0, wide)
-        doubtful = jnp.where(better & (fall > _RIVAL), few, best.doubtful) | rival | vain
-        doubtful = doubtful | (wide > _BENT * weakest.error)
+        bent = wide > _BENT * weakest.error
 
-        wrong = jnp.where(better, off, hunt.wrong)
-        best, weakest = jtu.tree_map(
-            lambda a, b: jnp.where(better, a, b), (end, seen), (best, weakest)
-        )
-        best = best._replace(doubtful=doubtful, wide=wide)
+        wrong = jnp.where(better, off, wrong)
+        choose = lambda a, b: jnp.where(better, a, b)  # noqa: E731
+        best, weakest = jtu.tree_map(choose, (end, seen), (best, weakest))
+        best = best._replace(doubtful=doubtful | bent, wide=wide)
         # A misfit that follows the record has two attempts, any other failure all.
         lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
-        lost = lost | is_at_boundary(problem, best.found) | coarse
-        same = (jnp.abs(fall) < 1e-2).astype(int)
-        agreed = jnp.where(better & (same == 0), 1, hunt.agreed + same)
+        lost = lost | is_at_boundary(problem, best.found)
         pure = is_pure(problem, best, weakest.noise)
-        more = (wrong > 0) | (coarse & ~few & (agreed < _AGREED))
-        most = jnp.where(more & ~pure, jnp.where(lost, count, min(2, count)), 0)
-        after = jnp.where((tried < count) & (tried + 1 >= most), count, tried + 1)
-        after = jnp.where(fell, polish, jnp.where(after == polish, polish + 1, after))
-        again = (tried == polish) & (hunt.rounds < _ROUNDS)
-        after = jnp.where(again, count, after)
-        lower = jnp.where(fell, numbers, hunt.lower)
-        return _Hunt(
-            after, hunt.rounds + again.astype(int), best, wrong, weakest, lower, agreed, pure
-        )
+        most = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
+        most = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, most), count)
+        after = hunt.tried + 1
+        return _Hunt(jnp.where(after < most, after, jnp.maximum(after, count)), best, wrong,
+            weakest, pure,
+        )  # fmt: skip
 
     def going(hunt: _Hunt) -> Array:
         weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)
-        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried <= polish)
-        probes = probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR)
-        return (hunt.tried < count) | probes
+        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried < steps.size)
+        return (hunt.tried < count) | (probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR))
 
+    far = jnp.asarray(jnp.inf, dtype)
     weakest = _Weakest(far, jnp.ones((), dtype), far, nothing, nothing)
-    hunt = _Hunt(none, none, begin, far, weakest, nothing, none, no)
+    hunt = _Hunt(none, begin, far, weakest, no)
     return jax.lax.while_loop(going, attempt, hunt).best
 
 
