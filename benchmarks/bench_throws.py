@@ -21,6 +21,7 @@ import time
 
 import common
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jrigid as jr
@@ -28,7 +29,7 @@ from jrigid import identify
 from jrigid.identify import Status
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests"))
-import worlds
+import worlds  # pyright: ignore[reportMissingImports]
 
 MOMENTS = np.array([0.07, 0.93, 1.0])
 RATIOS, DRAG, LAG, MOST = MOMENTS[1:] / MOMENTS[0], 0.003, 0.003, 101
@@ -56,8 +57,8 @@ def records(lash, count, seed):
 
 def fitter(shape, lag, unmodelled):
     """A fit of one throw, or of several at once; compiled once for each."""
-    body = jr.RigidBody(np.full(3, MOMENTS.mean()), jr.torques.QuadraticDrag(1e-3))
-    gyro = identify.Gyro(time_constant=None if lag == "ignored" else LAG)
+    body = jr.RigidBody(np.full(3, MOMENTS.mean()), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
+    gyro = identify.Gyro(time_constant=None if lag == "ignored" else jnp.asarray(LAG))
 
     def free(body, gyro):
         sought = identify.prior(gyro.time_constant, 0.002) if lag == "sought" else ()

@@ -18,7 +18,7 @@ from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import findings_of
-from jrigid.identify._layout import Told, angle_turned, told_by
+from jrigid.identify._layout import angle_turned, told_by
 from jrigid.identify._problem import in_any_order, whitened
 from jrigid.identify._records import Record, Samples, of_throws, samples_of
 from jrigid.rotation import exp, multiply, normalize
@@ -97,7 +97,7 @@ def train(
         free: Which arrays of the system are trained: a function that picks them, or parts that
             hold them, `lambda body: body.torque.network`; by default all of the torque. What must
             be positive is for the torque to keep so.
-        validation: Indices of throws that are not trained on; by default each fifth, or the last.
+        validation: Indices of throws that are not trained on; by default each fifth from the last.
         segment: About how many samples of the first record are in one; long ones tell more.
         batch: How many segments make a step of the optimiser. What is left over in an epoch waits.
         epochs: At most so many.
@@ -134,7 +134,6 @@ def train(
     params, rest = _parameters(system, free)
     records = of_throws(observations)
     held_out = _held_out(validation, records[0].ts.shape[0])
-    settle(_judged(system, records), True, lambda: findings_of((system,), records, None, None))
     records, throw = _segments(records, segment)
     data, on_attitude, steps = _prepared(system, records)
     trained = np.flatnonzero(~np.isin(throw, held_out))
@@ -142,9 +141,9 @@ def train(
     sensors, judged = [x.sensor for x in records], np.flatnonzero(np.isin(throw, held_out))
     memory, best, since = optimizer.init(params), (params, np.inf), 0
     losses: list[tuple[Array, Array]] = []
+    held = rest, sensors, data, trained, judged
     for epoch in range(epochs + 1):
         now = jax.random.fold_in(key, epoch)
-        held = rest, sensors, data, trained, judged
         new, memory, mean, loss = _epoch(setting, params, memory, now, *held)
         losses.append((mean, loss))
         if progress:
@@ -181,8 +180,7 @@ def _held_out(validation: Sequence[int] | None, throws: int) -> np.ndarray:
         "Argument `observations` must hold two throws or more, one of them to judge by, but it "
         "holds one.",
     )
-    chosen = np.arange(throws)[4::5] if validation is None else np.unique(np.asarray(validation))
-    chosen = np.array([throws - 1]) if validation is None and not chosen.size else chosen
+    chosen = np.arange(throws)[::-5] if validation is None else np.unique(np.asarray(validation))
     demand(
         0 < chosen.size < throws and bool(np.all(np.isin(chosen, np.arange(throws)))),
         f"Argument `validation` must be indices of some of {throws} throws, not all, but it is "
@@ -220,47 +218,49 @@ def _segments(records: tuple[Record, ...], length: int) -> tuple[tuple[Record, .
     return tuple(map(cut, records)), throw
 
 
-class _Judged(NamedTuple):
+class _Observed(NamedTuple):
+    """What segments tell of their states, the most that one turns between samples, and findings."""
+
+    data: _Data | None
+    has_attitude: Array
+    turn: Array
     result: Any
 
 
 @eqx.filter_jit
-def _judged(system: RigidBody, records: tuple[Record, ...]) -> _Judged:
-    return _Judged(findings_of((system,), records, None, None).result)
-
-
-def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
-    """Segments, whether the attitude matters, and steps between two samples."""
-    data, told, turn = _observed(records)
-    on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
-    inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
-    demand(
-        told is not None and not inside and (told.attitude is not None or not on_attitude),
-        "Argument `observations` must tell the whole state, rates and, where a torque or a sensor "
-        "looks at them, attitudes, and no part may move inside the body, but it is not so.",
-    )
-    assert data is not None
-    demand(
-        bool(np.min(np.sum(data.samples.weight, axis=(1, 2))) > (6 if on_attitude else 3)),
-        "Argument `observations` must hold more numbers in each throw, and `segment` in each "
-        "segment, than a state has, but one does not.",
-    )
-    return data, on_attitude, max(1, int(np.ceil(float(turn) / _TURN)))
-
-
-@eqx.filter_jit
-def _observed(records: tuple[Record, ...]) -> tuple[_Data | None, Told | None, Array]:
-    """Segments, what tells their states, and the most that one turns between two samples."""
+def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
+    result = findings_of((system,), records, None, None).result
     samples = samples_of(records, jnp.ones((), records[0].values.dtype))
-    told = told_by(records, samples, None)
+    told, no = told_by(records, samples, None), jnp.asarray(False)
     if told is None:
-        return None, None, jnp.zeros(())
+        return _Observed(None, no, jnp.zeros(()), result)
     first = jnp.argmax(told.there, axis=1)
     at = jax.vmap(lambda x, i: x[i])
     unit = jnp.zeros((first.size, 4), samples.ts.dtype).at[:, 0].set(1)
     attitude = unit if told.attitude is None else at(told.attitude, first)
     turn = jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
-    return _Data(samples, State(attitude, at(told.omega, first))), told, turn
+    data = _Data(samples, State(attitude, at(told.omega, first)))
+    return _Observed(data, no if told.attitude is None else ~no, turn, result)
+
+
+def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
+    """Segments, whether the attitude matters, and steps between two samples."""
+    seen = _observed(system, records)
+    settle(seen, True, lambda: findings_of((system,), records, None, None))
+    on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
+    inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
+    if seen.data is None or inside or (on_attitude and not seen.has_attitude):
+        raise ValueError(
+            "Argument `observations` must tell the whole state, rates and, where a torque or a "
+            "sensor looks at them, attitudes, and no part may move inside the body, but it is not "
+            "so."
+        )
+    demand(
+        bool(np.min(np.sum(seen.data.samples.weight, axis=(1, 2))) > (6 if on_attitude else 3)),
+        "Argument `observations` must hold more numbers in each throw, and `segment` in each "
+        "segment, than a state has, but one does not.",
+    )
+    return seen.data, on_attitude, max(1, int(np.ceil(float(seen.turn) / _TURN)))
 
 
 @quick_jit
