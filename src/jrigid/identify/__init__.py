@@ -48,5 +48,7 @@ from jrigid.identify._starts import LinearStart as LinearStart
 from jrigid.identify._starts import gyrostat as gyrostat
 from jrigid.identify._starts import momentum as momentum
 from jrigid.identify._starts import weak_form as weak_form
+from jrigid.identify._train import TrainResult as TrainResult
+from jrigid.identify._train import train as train
 from jrigid.identify._unknowns import each as each
 from jrigid.identify._unknowns import prior as prior

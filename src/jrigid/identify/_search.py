@@ -162,7 +162,7 @@ def search(
         # A misfit that follows the record has two attempts, any other failure all.
         lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
         lost = lost | is_at_boundary(problem, best.found)
-        pure = is_pure(problem, best, weakest.noise)
+        pure = is_pure(problem, best, weakest.noise) & (wrong < 0.5)  # no misfit
         most = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
         most = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, most), count)
         after = hunt.tried + 1

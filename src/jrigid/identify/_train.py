@@ -1,0 +1,367 @@
+"""Torques too rich for Levenberg-Marquardt, a network or a table, learnt from throws in batches."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import check_type, demand, settle, whole_number
+from jrigid._numerics import product
+from jrigid._types import RandomKey
+from jrigid.dynamics import State
+from jrigid.identify._compile import quick_jit
+from jrigid.identify._flow import depends_on_attitude
+from jrigid.identify._inputs import findings_of
+from jrigid.identify._layout import angle_turned, told_by
+from jrigid.identify._problem import in_any_order, whitened
+from jrigid.identify._records import Record, Samples, of_throws, samples_of
+from jrigid.rotation import exp, multiply, normalize
+from jrigid.systems import RigidBody
+
+_TURN = 0.1  # [rad] of a Runge-Kutta step: its error is 1e-7 of the rate
+_NEWTON = 2  # Gauss-Newton steps to a segment's state: the observed one is off by the noise alone
+_RIDGE = 1e-12  # of the normal equations, for a turn that no sample shows
+
+
+class TrainResult(NamedTuple):
+    """What `train` learnt, and how it went.
+
+    Attributes:
+        system: That of the least validation loss.
+        training: Mean loss over the batches of each epoch, while it changes.
+        validation: Loss of the validation throws before each epoch; the first is that of the system
+            as it was given.
+        epoch: How many epochs had passed at the least validation loss.
+    """
+
+    system: RigidBody
+    training: Float[Array, " epochs"]
+    validation: Float[Array, " epochs"]
+    epoch: int
+
+
+class _Data(NamedTuple):
+    """All segments: what was seen, and a state at the first sample, as observed."""
+
+    samples: Samples
+    guess: State
+
+
+class _Setting(NamedTuple):
+    """What is fixed when an epoch is compiled."""
+
+    optimizer: Any
+    batch: int
+    on_attitude: bool
+    steps: int  # of Runge and Kutta's between two samples
+
+
+def train(
+    system: RigidBody,
+    observations: Any,
+    optimizer: Any,
+    *,
+    key: RandomKey,
+    free: Callable[[Any], Any] | None = None,
+    validation: Sequence[int] | None = None,
+    segment: int = 50,
+    batch: int = 32,
+    epochs: int = 300,
+    patience: int = 30,
+    progress: bool = False,
+) -> TrainResult:
+    r"""A torque with many parameters, from what was observed, by an optimiser of optax.
+
+    Throws are cut into segments. The loss is the sum of a segment's squared residuals, in units of
+    their noise, at the state that fits the segment best, over its degrees of freedom: 1 for a
+    torque that leaves noise alone. States are no parameters: Gauss and Newton's steps find them
+    anew for each torque, so that throws never trained on can be judged in the same way. Of all
+    epochs the system with the least loss of the validation throws is returned.
+
+    The inertia is held: a torque that may be anything takes over the gyroscopic one, and no record
+    tells the two apart. `fit` seeks it beside a torque with few parameters, and with the one learnt
+    here in its place: `fit(train(...).system, observations)`.
+
+    Args:
+        system: The body; its torque holds parameters to start from (an `equinox.Module`).
+        observations: As for `fit`, of two throws or more. Rates must be told, and attitudes where
+            the torque or a sensor looks at them.
+        optimizer: An `optax.GradientTransformation`.
+        key: For the order of the segments: the same key gives the same bits on the same machine.
+        free: Which arrays of the system are trained: a function that picks them, or parts that
+            hold them, `lambda body: body.torque.network`; by default all of the torque. What must
+            be positive is for the torque to keep so.
+        validation: Indices of throws that are not trained on; by default each fifth from the last.
+        segment: About how many samples of the first record are in one; long ones tell more.
+        batch: How many segments make a step of the optimiser. What is left over in an epoch waits.
+        epochs: At most so many.
+        patience: Stop when the validation loss has not fallen for so many epochs.
+        progress: Print the losses of each epoch.
+
+    Returns:
+        The system that was learnt, and both losses of each epoch.
+
+    Raises:
+        ValueError: A request that makes no sense.
+        RuntimeError: Bad values in the record or the system; a loss that is not finite from the
+            first on.
+
+    Gradients: none.
+
+    >>> import jax, jax.numpy as jnp, jrigid as jr, optax
+    >>> seen = jr.datasets.gyro_example()
+    >>> halves = [jr.identify.Rates(seen.times[i], seen.omegas[i], seen.sigma)
+    ...           for i in (slice(0, 100), slice(100, 200))]
+    >>> dragged = jr.RigidBody(seen.true_moments, jr.torques.LinearDrag(0.02))  # there is none
+    >>> learnt = jr.identify.train(
+    ...     dragged, halves, optax.adam(3e-3), key=jax.random.key(0), batch=2, epochs=20)
+    >>> print(learnt.validation[0] > 2 * min(learnt.validation))
+    True
+    """
+    import optax
+
+    check_type("system", system, RigidBody)
+    check_type("optimizer", optimizer, optax.GradientTransformation)
+    for name, value in (("segment", segment), ("batch", batch), ("patience", patience)):
+        whole_number(name, value)
+    whole_number("epochs", epochs)
+    params, rest = _parameters(system, free)
+    records = of_throws(observations)
+    held_out = _held_out(validation, records[0].ts.shape[0])
+    records, throw = _segments(records, segment)
+    data, on_attitude, steps = _prepared(system, records)
+    trained = np.flatnonzero(~np.isin(throw, held_out))
+    setting = _Setting(optimizer, min(batch, trained.size), on_attitude, steps)
+    sensors, judged = [x.sensor for x in records], np.flatnonzero(np.isin(throw, held_out))
+    memory, best, since = optimizer.init(params), (params, np.inf), 0
+    losses: list[tuple[Array, Array]] = []
+    held = rest, sensors, data, trained, judged
+    for epoch in range(epochs + 1):
+        now = jax.random.fold_in(key, epoch)
+        new, memory, mean, loss = _epoch(setting, params, memory, now, *held)
+        losses.append((mean, loss))
+        if progress:
+            print(f"epoch {epoch}: training {mean:.4g}, validation {loss:.4g}", flush=True)
+        if float(loss) < best[1]:
+            best, since = (params, float(loss)), epoch
+        elif epoch - since >= patience or not np.isfinite(best[1]):
+            break
+        params = new
+    if not np.isfinite(best[1]):
+        raise RuntimeError("Argument `system` must have a finite loss to start from, but has none.")
+    training, seen = (jnp.stack(x) for x in zip(*losses, strict=True))
+    return TrainResult(eqx.combine(best[0], rest), training, seen, since)
+
+
+def _parameters(system: RigidBody, free: Callable[[Any], Any] | None) -> tuple[Any, Any]:
+    """The system's arrays that are trained, and the rest."""
+    pick = (lambda body: body.torque) if free is None else free
+    none = jtu.tree_map(lambda _: False, system)
+    mask = eqx.tree_at(pick, none, replace_fn=lambda x: jtu.tree_map(lambda _: True, x))
+    mask = jtu.tree_map(lambda chosen, x: chosen and eqx.is_inexact_array(x), mask, system)
+    params, rest = eqx.partition(system, mask)
+    demand(
+        params.inertia is None and bool(jtu.tree_leaves(params)),
+        "Argument `free` must pick floating point arrays of the system, beside the inertia, which "
+        "is held, but it does not.",
+    )
+    return params, rest
+
+
+def _held_out(validation: Sequence[int] | None, throws: int) -> np.ndarray:
+    demand(
+        throws > 1,
+        "Argument `observations` must hold two throws or more, one of them to judge by, but it "
+        "holds one.",
+    )
+    chosen = np.arange(throws)[::-5] if validation is None else np.unique(np.asarray(validation))
+    demand(
+        0 < chosen.size < throws and bool(np.all(np.isin(chosen, np.arange(throws)))),
+        f"Argument `validation` must be indices of some of {throws} throws, not all, but it is "
+        f"{validation!r}.",
+    )
+    return chosen
+
+
+def _segments(records: tuple[Record, ...], length: int) -> tuple[tuple[Record, ...], np.ndarray]:
+    """Records whose throws are segments, of equal counts in each throw; and the throw of each."""
+    windows, first = [], [np.asarray(x) for x in (records[0].ts, records[0].known)]
+    for i, (ts, known) in enumerate(zip(*first, strict=True)):
+        seen = ts[np.any(known, axis=-1)]
+        parts = np.array_split(seen, max(1, round(seen.size / length)))
+        edges = [-np.inf, *(x[0] for x in parts[1:]), np.inf]
+        windows += [(i, a, b) for a, b in pairwise(edges)]
+    throw = np.array([i for i, _, _ in windows])
+
+    def cut(record: Record) -> Record:
+        ts, known = np.asarray(record.ts), np.any(np.asarray(record.known), axis=-1)
+        rows = [np.flatnonzero(known[i] & (a <= ts[i]) & (ts[i] < b)) for i, a, b in windows]
+        most = max(x.size for x in rows)
+        index = np.stack([np.pad(x, (0, most - x.size), constant_values=-1) for x in rows])
+
+        def taken(x: Array | None) -> Array | None:
+            if x is None:
+                return None
+            there = (index >= 0).reshape(*index.shape, *[1] * (x.ndim - 2))
+            return jnp.asarray(np.where(there, np.asarray(x)[throw[:, None], index], np.nan))
+
+        fields = lambda x: (x.ts, x.values, x.sigma, x.covariance)  # noqa: E731
+        new = tuple(map(taken, fields(record)))
+        return eqx.tree_at(fields, record, new, is_leaf=lambda x: x is None)
+
+    return tuple(map(cut, records)), throw
+
+
+class _Observed(NamedTuple):
+    """What segments tell of their states, the most that one turns between samples, and findings."""
+
+    data: _Data | None
+    has_attitude: Array
+    turn: Array
+    result: Any
+
+
+@eqx.filter_jit
+def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
+    result = findings_of((system,), records, None, None).result
+    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
+    told, no = told_by(records, samples, None), jnp.asarray(False)
+    if told is None:
+        return _Observed(None, no, jnp.zeros(()), result)
+    first = jnp.argmax(told.there, axis=1)
+    at = jax.vmap(lambda x, i: x[i])
+    unit = jnp.zeros((first.size, 4), samples.ts.dtype).at[:, 0].set(1)
+    attitude = unit if told.attitude is None else at(told.attitude, first)
+    turn = jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
+    data = _Data(samples, State(attitude, at(told.omega, first)))
+    return _Observed(data, no if told.attitude is None else ~no, turn, result)
+
+
+def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
+    """Segments, whether the attitude matters, and steps between two samples."""
+    seen = _observed(system, records)
+    settle(seen, True, lambda: findings_of((system,), records, None, None))
+    on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
+    inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
+    if seen.data is None or inside or (on_attitude and not seen.has_attitude):
+        raise ValueError(
+            "Argument `observations` must tell the whole state, rates and, where a torque or a "
+            "sensor looks at them, attitudes, and no part may move inside the body, but it is not "
+            "so."
+        )
+    demand(
+        bool(np.min(np.sum(seen.data.samples.weight, axis=(1, 2))) > (6 if on_attitude else 3)),
+        "Argument `observations` must hold more numbers in each throw, and `segment` in each "
+        "segment, than a state has, but one does not.",
+    )
+    return seen.data, on_attitude, max(1, int(np.ceil(float(seen.turn) / _TURN)))
+
+
+@quick_jit
+def _epoch(
+    setting: _Setting, params: Any, memory: Any, key: Array, rest: Any, sensors: Any,
+    data: _Data, trained: Array, judged: Array,
+) -> tuple[Any, Any, Array, Array]:  # fmt: skip
+    """Parameters and optimiser after each batch; mean loss on the way; validation loss before."""
+
+    def loss(params: Any, index: Array) -> Array:
+        some = jtu.tree_map(lambda x: x[index], data)
+        of_one = lambda x: _chi_square(setting, params, rest, sensors, x)  # noqa: E731
+        squares, freedom = jax.vmap(of_one)(some)
+        return jnp.sum(squares) / jnp.sum(freedom)
+
+    def step(carry: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], Array]:
+        params, memory = carry
+        value, slope = jax.value_and_grad(loss)(params, index)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes types
+            updates, memory = setting.optimizer.update(slope, memory, params)
+            params = eqx.apply_updates(params, updates)
+        return (params, memory), value
+
+    count = trained.size // setting.batch * setting.batch
+    order = jax.random.permutation(key, trained)[:count].reshape(-1, setting.batch)
+    before = loss(params, judged)
+    (params, memory), losses = jax.lax.scan(step, (params, memory), order)
+    return params, memory, jnp.mean(losses), before
+
+
+def _chi_square(
+    setting: _Setting, params: Any, rest: Any, sensors: Any, data: _Data
+) -> tuple[Array, Array]:
+    """Squares of a segment at the state that fits it best, and degrees of freedom."""
+    guess = data.guess
+
+    def rows(params: Any, move: Array) -> Array:
+        system, attitude = eqx.combine(params, rest), guess.attitude
+        if setting.on_attitude:
+            attitude = multiply(attitude, exp(move[3:]))
+        state = State(attitude, guess.omega + move[:3])
+        motion = lambda ts: _motion(system, state, ts, setting.steps)  # noqa: E731
+        states = in_any_order(motion, data.samples.ts)
+        shown = [
+            jax.vmap(lambda t, q, w, sensor=sensor: _shown(system, sensor, t, State(q, w)))(
+                data.samples.ts[part], states.attitude[part], states.omega[part]
+            )
+            for sensor, part in zip(sensors, data.samples.parts, strict=True)
+        ]
+        return whitened(sensors, data.samples, shown).reshape(-1)
+
+    # The slope in the parameters at the best state is that with the state held.
+    still = jax.lax.stop_gradient(params)
+
+    def newton(_: Any, move: Array) -> Array:
+        slopes, left = jax.jacfwd(lambda x: (rows(still, x),) * 2, has_aux=True)(move)
+        normal = product("ni,nj->ij", slopes, slopes)
+        normal = normal + _RIDGE * jnp.trace(normal) * jnp.eye(move.size, dtype=move.dtype)
+        return move - jnp.linalg.solve(normal, product("ni,n->i", slopes, left))
+
+    none = jnp.zeros(6 if setting.on_attitude else 3, guess.omega.dtype)
+    move = jax.lax.fori_loop(0, _NEWTON, newton, none)
+    return jnp.sum(rows(params, move) ** 2), jnp.sum(data.samples.weight) - move.size
+
+
+def _shown(system: RigidBody, sensor: Any, t: Array, state: State) -> Array:
+    """What a sensor shows, with its memory."""
+    memory = sensor.memory()
+    if memory is None:
+        return sensor.predict(t, state, system)
+    before = lambda lag: sensor.predict(t, _step(system, state, t, -lag), system)  # noqa: E731
+    lags, weights = (x.astype(state.omega.dtype) for x in memory)
+    return product("l,l...->...", weights, jax.vmap(before)(lags))
+
+
+def _motion(system: RigidBody, state: State, ts: Array, steps: int) -> State:
+    """States at the times, of which the first is that of the state."""
+
+    def gap(before: State, times: tuple[Array, Array]) -> tuple[State, State]:
+        t, h = times[0], (times[1] - times[0]) / steps
+        move = lambda i, x: _step(system, x, t + i * h, h)  # noqa: E731
+        after = jax.lax.fori_loop(0, steps, move, before)
+        return after, after
+
+    _, later = jax.lax.scan(gap, state, (ts[:-1], ts[1:]))
+    states = jtu.tree_map(lambda a, b: jnp.concatenate([a[None], b]), state, later)
+    return State(jax.vmap(normalize)(states.attitude), states.omega)
+
+
+def _step(system: RigidBody, state: State, t: Array, h: Array) -> State:
+    """One step of the classical Runge-Kutta method."""
+
+    def rate(part: float, slope: State | None) -> State:
+        y = state if slope is None else moved(part, slope)
+        return system.vector_field(t + part * h, y, None)
+
+    def moved(part: float, *slopes: State) -> State:
+        return jtu.tree_map(lambda x, *k: x + part * h * sum(k), state, *slopes)
+
+    one = rate(0.0, None)
+    two = rate(0.5, one)
+    three = rate(0.5, two)
+    four = rate(1.0, three)
+    return moved(1 / 6, one, two, two, three, three, four)

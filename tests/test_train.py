@@ -1,0 +1,140 @@
+"""train() against an independent simulator: a table learns a drag that no model was told."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import worlds
+from helpers import ATTITUDE
+
+import jrigid as jr
+from jrigid import identify
+
+RATES = np.linspace(0.0, 16.0, 7)
+ADAM = optax.adam(2e-2)
+
+
+class Table(jr.torques.AbstractTorque):
+    """A drag -f(|w|) w in units of an inertia, linear between the rates of a table."""
+
+    inertia: jax.Array
+    table: jax.Array
+
+    def __call__(self, t, state, args):  # noqa: ARG002
+        speed = jnp.sqrt(jnp.sum(state.omega**2))
+        return -self.inertia * jnp.interp(speed, RATES, self.table) * state.omega
+
+
+class Scene:
+    """Thirty throws of a phone in thick air, read by a gyro with a memory."""
+
+    def __init__(self):
+        seen = worlds.throws(
+            np.random.default_rng(4), 30, spin=(5.0, 15.0), duration=(0.4, 0.5), sigma=1e-3,
+            drag=0.02, wobble=0.0, time_constant=0.004,
+        )  # fmt: skip
+        gyro, self.tensor = identify.Gyro(time_constant=jnp.asarray(0.004)), seen[0].tensor
+        self.throws = [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in seen]
+        mean = jnp.trace(jnp.asarray(self.tensor)) / 3
+        self.body = jr.RigidBody(self.tensor, Table(mean, jnp.zeros(7)))
+
+    def train(self, body=None, **options):
+        given = {"key": jax.random.key(0), "free": lambda body: body.torque.table, "batch": 8}
+        return identify.train(body or self.body, self.throws, ADAM, **given | options)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def learnt(scene):
+    return scene.train(epochs=35)
+
+
+def test_a_table_learns_quadratic_drag(scene, learnt):
+    assert learnt.validation[0] > 100  # without a torque
+    assert learnt.validation[learnt.epoch] == np.min(learnt.validation) < 1.2
+    assert abs(learnt.training[-1] - 1) < 0.1
+    table = learnt.system.torque.table
+    # between 5 and 15 rad/s; a chord of a straight line is the line
+    np.testing.assert_allclose(table[2:6], 0.02 * RATES[2:6], atol=0.01)
+    assert learnt.system.inertia is scene.body.inertia
+    assert learnt.system.torque.inertia is scene.body.torque.inertia  # not picked
+
+
+def test_the_same_key_gives_the_same_bits(scene, learnt):
+    again, other = scene.train(epochs=3), scene.train(epochs=3, key=jax.random.key(1))
+    assert np.array_equal(again.validation, learnt.validation[:4])
+    assert np.array_equal(again.training, learnt.training[:4])
+    assert again.validation[0] == other.validation[0]
+    assert again.validation[-1] != other.validation[-1]
+
+
+def test_training_stops_when_validation_has_stopped_to_fall(scene, learnt, capsys):
+    ended = scene.train(learnt.system, epochs=60, patience=3, progress=True)
+    assert len(ended.validation) == len(ended.training) == ended.epoch + 4 < 60
+    assert np.all(ended.validation[ended.epoch :] >= ended.validation[ended.epoch])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(ended.training)
+    assert lines[0].startswith("epoch 0: training ")
+
+
+@pytest.mark.slow
+def test_the_loss_of_the_truth_is_one(rng):
+    """A gyro with a memory, pictures at other times; long and short throws, of a few segments."""
+    tensor, lag = worlds.random_body(rng), 0.004
+    grid = np.arange(-400, 1001) / 1000
+    start = rng.normal(size=(12, 3))
+    start *= 8 / np.linalg.norm(start, axis=1, keepdims=True)
+    drag = worlds.quadratic_drag(0.01)
+    motion = worlds.tumble(tensor, start, grid, drag, attitude0=ATTITUDE)
+    throws = []
+    for i in range(12):
+        ts, seen = np.arange(100)[: 100 - 7 * i] / 100, slice(405, 1405, 40)
+        values = worlds.gyro((grid, motion.omega[i]), ts, rng, 0.01, time_constant=lag)
+        turns = jax.vmap(jr.rotation.exp)(0.002 * rng.normal(size=(25, 3)))
+        pictures = jax.vmap(jr.rotation.multiply)(motion.attitude[i, seen], turns)
+        gyro = identify.Gyro(time_constant=lag)
+        throws.append((identify.Record(gyro, ts, values, 0.01),
+                       identify.Attitudes(grid[seen], pictures, 0.002)))  # fmt: skip
+    body = jr.RigidBody(tensor, jr.torques.QuadraticDrag(0.01))
+    learnt = identify.train(
+        body, throws, ADAM, key=jax.random.key(0), validation=range(11), segment=30, epochs=1
+    )
+    # 4300 numbers: 1 +- 0.02
+    assert abs(learnt.validation[0] - 1) < 0.08
+
+
+def test_bad_arguments_are_named(scene, untyped):
+    train, body = scene.train, scene.body
+    key = jax.random.key(0)
+    with pytest.raises(ValueError, match="`observations` must hold two throws or more"):
+        identify.train(body, scene.throws[:1], ADAM, key=key)
+    with pytest.raises(ValueError, match="`validation` must be indices of some of 30 throws"):
+        train(validation=[30])
+    with pytest.raises(ValueError, match=r"`validation` must be indices .* not all"):
+        train(validation=range(30))
+    with pytest.raises(ValueError, match="`free` must pick floating point arrays"):
+        train(free=lambda body: body)
+    with pytest.raises(ValueError, match="`free` must pick floating point arrays"):
+        identify.train(jr.RigidBody(scene.tensor), scene.throws, ADAM, key=key)
+    with pytest.raises(ValueError, match="`segment` in each segment"):
+        train(segment=1)
+    with pytest.raises(ValueError, match="`batch` must be an integer"):
+        train(batch=0)
+    with pytest.raises(ValueError, match="`optimizer` must be a GradientTransformation"):
+        identify.train(body, scene.throws, "adam", key=key)
+    with pytest.raises(ValueError, match="`system` must be a RigidBody"):
+        identify.train(scene.tensor, scene.throws, ADAM, key=key)
+    upright = jr.torques.MagneticDipole(np.ones(3), np.ones(3))
+    with pytest.raises(ValueError, match="must tell the whole state"):
+        identify.train(jr.RigidBody(scene.tensor, upright), scene.throws, ADAM, key=key)
+    with pytest.raises(RuntimeError, match="`inertia` must"):
+        train(jr.RigidBody(-scene.tensor, body.torque))
+    broken = eqx.tree_at(lambda x: x.torque.table, body, np.nan * body.torque.table)
+    with pytest.raises(RuntimeError, match="must have a finite loss"):
+        train(broken, epochs=1)
