@@ -354,7 +354,7 @@ def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["none.csv"], "No such file"),
-    (["words.csv"], "Argument `path` must be a file with the names of its columns"),
+    (["words.csv"], "Argument `path` must have names of its columns above numbers"),
     (["good.csv", "--unit", "furlong"], "Argument `unit` must be one of"),
     (["good.csv", "--columns", "rates=p,q,r"], "Argument `columns` must name columns"),
     (["held.csv", "--flights"], "Argument `path` must hold flights, but it has none"),

@@ -134,15 +134,13 @@ def fit(
     ('overall scale',)
     """
     records = of_throws(observations)
-    throws = records[0].ts.shape[0]
+    throws, shape = records[0].ts.shape[0], Tensor() if shape is None else shape
     systems = systems_of(system, throws)
-    shape = Tensor() if shape is None else shape
     check_type("shape", shape, AbstractShape)
     check_option("loss", loss, ("squares", "robust"))
     refuse(systems[0], records, scale, shape)
     tensor, state = start_of(start, throws)
-    kind, level = _level(unmodelled)
-    stated = all(x.states_noise for x in records)
+    (kind, level), stated = _level(unmodelled), all(x.states_noise for x in records)
     demand(
         stated or len(records) == 1,
         "Argument `observations` must state the noise of each kind where there are several, but "
@@ -174,12 +172,15 @@ def fit(
     )
     level = jnp.asarray(level, prepared.rate.dtype)
     found = _fit(options, length, unknowns, records, prepared, each_body, tensor, state, level)
-    if not throw:
-        return found
+    return _guarded(found) if throw else found
+
+
+def _guarded(found: FitResult) -> FitResult:
+    """The result, or an error where there is none."""
     findings = Findings()
     for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
         findings.require(found.status != status, None, Status[status])
-    return findings.guard(found, throw)
+    return findings.guard(found, True)
 
 
 def _level(unmodelled: Any) -> tuple[str, Any]:

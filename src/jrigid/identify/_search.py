@@ -100,18 +100,8 @@ def search(
     last = jtu.tree_map(lambda x: x[0, -1], stages)
     final = cut if options.dense or not options.free_motion else single
     steps = jnp.asarray([0.0] * count + _PROBES, dtype)
-    shapes = eqx.filter_eval_shape(evaluation(problem, cut), point)
-    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    no, none, nothing = jnp.asarray(False), jnp.asarray(0), jnp.zeros_like(point.numbers)
-    found = Found(point, rows, links, ~no, no, none, jnp.full(_HISTORY, jnp.nan, dtype))
-    kept, zero = problem.samples.seen.astype(dtype), jnp.zeros((), dtype)
-    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)
-    scales = jnp.ones(len(problem.samples.values), dtype)
-    begin = Way(found, kept, scales, 10 * first, no, few, zero)
-
-    def tensors(numbers: Array) -> Array:
-        unknowns = problem.unknowns
-        return jnp.stack([unknowns.inertia(numbers, i) for i in range(len(unknowns.shapes))])
+    most = count if options.dense else steps.size  # squares beside levels of their own differ
+    begin = _begun(problem, cut, point, 10 * first, coarse)
 
     def attempt(hunt: _Hunt) -> _Hunt:
         best, weakest, step = hunt.best.found, hunt.weakest, steps[hunt.tried]
@@ -130,7 +120,7 @@ def search(
             return jax.lax.cond(skip, lambda way: way, run, way), None
 
         at = point._replace(numbers=numbers)
-        start = found._replace(point=at, steps=best.steps, history=best.history)
+        start = begin.found._replace(point=at, steps=best.steps, history=best.history)
         end = jax.lax.scan(one, begin._replace(found=start), way)[0]
         return _next(hunt, end, probing, step)
 
@@ -140,18 +130,11 @@ def search(
         off, seen = misfit(problem, end), _weakest(problem, final, end, last)
         fall = (weakest.square - seen.square) / weakest.noise
         better = ~probing & ((off < wrong) | ((off <= wrong) & (fall > 0)))
-        numbers = end.found.point.numbers
-        apart = (numbers - best.found.point.numbers) / problem.unknowns.natural_units(numbers)
-        error = jnp.maximum(weakest.error, seen.error)
-        apart = jnp.max(jnp.abs(apart), initial=0.0) > jnp.maximum(_APART, 6 * error)
+        points = best.found.point.numbers, end.found.point.numbers
+        apart = _are_apart(problem, *points, jnp.maximum(weakest.error, seen.error))
         rival = ~probing & apart & (jnp.abs(fall) < _RIVAL)
-        doubtful = (best.doubtful & ~(better & (fall > _RIVAL))) | rival | few
-        # By how far the tensor moves: numbers are logarithms.
-        moved = tensors(numbers) - tensors(best.found.point.numbers)
-        slope = jax.jvp(tensors, (best.found.point.numbers,), (weakest.direction,))[1]
-        square = jnp.sum(slope * slope)
-        step = jnp.where(square > 0, jnp.sum(moved * slope) / square, step)
-        wide = jnp.abs(step) / jnp.sqrt(jnp.maximum(-fall, 1e-6))
+        doubtful = (best.doubtful & ~(better & (fall > _RIVAL))) | rival | begin.doubtful
+        wide = _error_by_probe(problem, *points, weakest.direction, step, -fall)
         wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
         bent = wide > _BENT * weakest.error
 
@@ -163,22 +146,33 @@ def search(
         lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
         lost = lost | is_at_boundary(problem, best.found)
         pure = is_pure(problem, best, weakest.noise) & (wrong < 0.5)  # no misfit
-        most = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
-        most = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, most), count)
+        few = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
+        few = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, few), count)
         after = hunt.tried + 1
-        return _Hunt(jnp.where(after < most, after, jnp.maximum(after, count)), best, wrong,
+        return _Hunt(jnp.where(after < few, after, jnp.maximum(after, count)), best, wrong,
             weakest, pure,
         )  # fmt: skip
 
     def going(hunt: _Hunt) -> Array:
         weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)
-        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried < steps.size)
+        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried < most)
         return (hunt.tried < count) | (probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR))
 
-    far = jnp.asarray(jnp.inf, dtype)
-    weakest = _Weakest(far, jnp.ones((), dtype), far, nothing, nothing)
-    hunt = _Hunt(none, begin, far, weakest, no)
+    far, none = jnp.asarray(jnp.inf, dtype), jnp.zeros_like(point.numbers)
+    weakest = _Weakest(far, jnp.ones((), dtype), far, none, none)
+    hunt = _Hunt(jnp.asarray(0), begin, far, weakest, jnp.asarray(False))
     return jax.lax.while_loop(going, attempt, hunt).best
+
+
+def _begun(problem: Problem, cut: Layout, point: Point, level: Array, coarse: Array) -> Way:
+    """Before anything is known; few samples of a coarse record follow any alias."""
+    shapes, dtype = eqx.filter_eval_shape(evaluation(problem, cut), point), level.dtype
+    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    no, history = jnp.asarray(False), jnp.full(_HISTORY, jnp.nan, dtype)
+    found = Found(point, rows, links, ~no, no, jnp.asarray(0), history)
+    kept, scales = problem.samples.seen.astype(dtype), jnp.ones(len(problem.samples.values), dtype)
+    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)
+    return Way(found, kept, scales, level, no, few, jnp.zeros((), dtype))
 
 
 def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakest:
@@ -203,6 +197,25 @@ def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakes
     values, axes = jnp.linalg.eigh(jnp.where(sound, matrix, jnp.eye(units.size, dtype=units.dtype)))
     error = jnp.sqrt(noise / jnp.maximum(values[0], 1e-30))
     return _Weakest(square, noise, error, axes[:, 0] * units, axes[:, 0] / units)
+
+
+def _are_apart(problem: Problem, one: Array, other: Array, error: Array) -> Array:
+    """Whether two points are different minima."""
+    apart = jnp.abs(one - other) / problem.unknowns.natural_units(other)
+    return jnp.max(apart, initial=0.0) > jnp.maximum(_APART, 6 * error)
+
+
+def _error_by_probe(
+    problem: Problem, before: Array, after: Array, direction: Array, step: Array, growth: Array
+) -> Array:
+    """In natural units, by how far the tensor moved: numbers are logarithms."""
+    unknowns = problem.unknowns
+    tensors = lambda x: jnp.stack([unknowns.inertia(x, i) for i in range(len(unknowns.shapes))])  # noqa: E731
+    slope = jax.jvp(tensors, (before,), (direction,))[1]
+    square = jnp.sum(slope * slope)
+    along = jnp.sum((tensors(after) - tensors(before)) * slope)
+    step = jnp.where(square > 0, along / jnp.where(square > 0, square, 1.0), step)
+    return jnp.abs(step) / jnp.sqrt(jnp.maximum(growth, 1e-6))
 
 
 def _stage(
