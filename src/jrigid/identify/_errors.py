@@ -1,6 +1,5 @@
 """What a fit tells: errors, what the record does not determine, and how the fit ended."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -11,25 +10,11 @@ from jaxtyping import Array
 from jrigid._checks import RESULTS, nan_where
 from jrigid._numerics import product
 from jrigid.dynamics import State
+from jrigid.identify import _stages as stages
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem
-from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
+from jrigid.identify._result import LARGEST_ERROR, FitResult, Status, derive
 from jrigid.identify._smoother import Blocks, Links, Rows, blocks_of, eliminated, reduced
-from jrigid.identify._stages import (
-    EXPLAINED,
-    GATE,
-    Way,
-    evidence_of,
-    first_level,
-    is_at_boundary,
-    is_faint,
-    is_pure,
-    link_whitener,
-    schedule,
-    unexplained,
-    weigher,
-    weights_of,
-)
 
 _TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
 _WHITE = 6.0  # standard deviations of the correlation of neighbouring residuals
@@ -94,18 +79,16 @@ def told_by_rows(rows: Rows, own: int, units: Array) -> tuple[Told, Array]:
         u, s, vt = jnp.linalg.svd(jl / scale[None, :], full_matrices=False)
         told = s > _TOLD * s[0]
         u = jnp.where(told[None, :], u, 0.0)
-        inverse = jnp.where(told, 1 / jnp.where(told, s, 1.0), 1 / (eps * jnp.maximum(s[0], 1.0)))
+        inverse = 1 / jnp.where(told, s, eps * jnp.maximum(s[0], 1.0))
         half = vt.T * inverse[None, :] / scale[:, None]
-        of_told = jnp.where(told[None, :], half, 0.0)
-        follow = product("lk,rk,rg->lg", of_told, u, jg)
+        follow = product("lk,rk,rg->lg", jnp.where(told[None, :], half, 0.0), u, jg)
         rest = jg - product("rk,sk,sg->rg", u, u, jg)
-        r = jnp.linalg.qr(rest, mode="r") if size else rest[:0]
-        return r, half, follow, s, product("rg,r->g", rest, residual) / units
+        scores = product("rg,r->g", rest, residual) / units
+        return jnp.linalg.qr(rest, mode="r"), half, follow, s, scores
 
     r, half, follow, of_state, scores = jax.vmap(throw)(jg, jl, residual)
-    local = product("tik,tjk->tij", half, half)
     r = r.reshape(r.shape[0] * r.shape[1], size)
-    return _told(r, local, follow, of_state, units), scores
+    return _told(r, half, follow, of_state, units), scores
 
 
 def told_by_equations(blocks: Blocks, own: int, units: Array) -> tuple[Told, Array]:
@@ -120,82 +103,64 @@ def told_by_equations(blocks: Blocks, own: int, units: Array) -> tuple[Told, Arr
     half = axes / jnp.sqrt(values)[:, None, :] / scale[:, :, None]
     s, axes = jnp.linalg.eigh(rest.numbers * units[:, None] * units[None, :])
     r = jnp.sqrt(jnp.maximum(s, 0.0))[:, None] * axes.T
-    local = product("tik,tjk->tij", half, half)
-    singular = jnp.sqrt(values)[:, ::-1]
-    return _told(r, local, product("tlg,g->tlg", rest.follow, units), singular, units), rest.right
+    follow, singular = product("tlg,g->tlg", rest.follow, units), jnp.sqrt(values)[:, ::-1]
+    return _told(r, half, follow, singular, units), rest.right
 
 
-def _told(r: Array, local: Array, follow: Array, of_state: Array, units: Array) -> Told:
+def _told(r: Array, half: Array, follow: Array, of_state: Array, units: Array) -> Told:
     """With numbers in their own units, of what is told in natural ones."""
-    if units.size:
-        eps = jnp.finfo(r.dtype).eps
-        _, values, vt = jnp.linalg.svd(r, full_matrices=False)
-        floor = jnp.maximum(values, 16 * eps * values[0] + 1e-150)
-        covariance = product("ki,kj->ij", vt / floor[:, None], vt / floor[:, None])
-    else:
-        values, vt = jnp.zeros(0, r.dtype), jnp.zeros((0, 0), r.dtype)
-        covariance = vt
+    _, values, vt = jnp.linalg.svd(r, full_matrices=False)
+    largest = jnp.max(values, initial=0.0)
+    floor = jnp.maximum(values, 16 * jnp.finfo(r.dtype).eps * largest + 1e-150)
+    covariance = product("ki,kj->ij", vt / floor[:, None], vt / floor[:, None])
     covariance = covariance * units[:, None] * units[None, :]
-    follow = product("tlg,g->tlg", follow, 1 / units)
+    follow, local = product("tlg,g->tlg", follow, 1 / units), product("tik,tjk->tij", half, half)
     return Told(values, vt.T, covariance, local, follow, of_state)
 
 
-def conclude(problem: Problem, layout: Layout, way: Way, input_result: Any) -> FitResult:
+def conclude(problem: Problem, layout: Layout, way: stages.Way, input_result: Any) -> FitResult:
     """The result of a fit at a minimum."""
-    found, kept, scales, level = way.found, way.kept, way.scales, way.level
-    numbers, own = found.point.numbers, found.point.own.shape[-1]
-    units = problem.unknowns.natural_units(numbers)
-    end = jtu.tree_map(lambda x: x[0, -1], schedule(problem.options, numbers.dtype))
-    weight, _ = weigher(problem, layout, kept, scales, end)(found.rows)
-    root, rows = jnp.sqrt(weight), found.rows
-    rows = Rows(
-        root[..., None] * rows.residual, root[..., None, None] * rows.of_border,
-        root[..., None, None] * rows.of_state, rows.node,
-    )  # fmt: skip
-    rows = condensed(rows, found.links)
+    found, kept, level, point = way.found, way.kept, way.level, way.found.point
+    numbers, own, unknowns = point.numbers, point.own.shape[-1], problem.unknowns
+    units = unknowns.natural_units(numbers)
+    end = jtu.tree_map(lambda x: x[0, -1], stages.schedule(problem.options, numbers.dtype))
+    weight, _ = stages.weigher(problem, layout, kept, way.scales, end)(found.rows)
+    scaled = [product("tn,tn...->tn...", jnp.sqrt(weight), x) for x in found.rows[:3]]
+    rows = condensed(Rows(*scaled, node=found.rows.node), found.links)
     sensor, scores = told_by_rows(rows, own, units)
     told, kicks, level_errors = sensor, jnp.zeros((), numbers.dtype), jnp.zeros_like(level)
     if problem.options.dense:
-        white = link_whitener(problem, layout, numbers, end.weight, level)
+        white = stages.link_whitener(problem, layout, numbers, end.weight, level)
         blocks = blocks_of(found.rows, found.links, weight, white)
         told, scores = told_by_equations(blocks, own, units)
-        information = evidence_of(problem, found, weight, white).information
+        information = stages.evidence_of(problem, found, weight, white).information
         level_errors = 0.5 * level / jnp.sqrt(information)
-        level = jnp.where(is_faint(level, first_level(problem, layout, numbers)), 0.0, level)
+        first = stages.first_level(problem, layout, numbers)
+        level = jnp.where(stages.is_faint(level, first), 0.0, level)
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
-    seen = _judged(problem, way, told, kicks)
-    told = _widened(told, way.wide / jnp.sqrt(seen.inflation), units)
-    pure = is_pure(problem, way, seen.inflation)
-    status = _status(problem, way, seen, told, pure)
-    status = Status.where(input_result == RESULTS.successful, status, Status.BAD_INPUT)
-    count = kept.shape[1]
+    judged = _judged(problem, way, told, kicks, units)
+    inflation, covariance = judged["inflation"], judged["numbers_covariance"]
+    status = Status.where(input_result == RESULTS.successful, judged["status"], Status.BAD_INPUT)
+    bodies = range(len(unknowns.shapes))
+    derived = tuple(derive(unknowns, i, numbers, covariance) for i in bodies)
+    loose = [jnp.any(x["ratios_errors"] > LARGEST_ERROR * x["ratios"]) for x in derived]
+    loose = jnp.any(jnp.stack(loose)) & (status == Status.OK)
+    judged["status"] = Status.where(loose, Status.UNIDENTIFIABLE, status)
     jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
     result = FitResult(
-        status=status, numbers=numbers, own_numbers=found.point.own,
-        numbers_covariance=seen.inflation * told.covariance,
-        sensor_covariance=seen.inflation * sensor.covariance,
-        local_covariance=seen.inflation * told.local, follow=told.follow, scores=scores,
-        inflation=seen.inflation,
-        state=State(found.point.attitude[:, 0], found.point.omega[:, 0]),
-        t0=layout.start[:, 0], residuals=rows.residual[:, :count], jacobian=jacobian[:, :count],
-        chi_square=seen.chi_square, degrees_of_freedom=seen.freedom, unexplained=seen.unexplained,
-        singular_values=told.values, directions=told.directions,
-        state_singular_values=sensor.of_state, level=level, level_errors=level_errors,
-        scales=scales, kept=kept > 0, history=found.history, pure_spin=pure,
-        doubtful=way.doubtful,
-        input_result=input_result, problem=problem,
+        **judged, **derived[0], numbers=numbers, own_numbers=point.own,
+        sensor_covariance=inflation * sensor.covariance, local_covariance=inflation * told.local,
+        follow=told.follow, scores=scores, state=State(point.attitude[:, 0], point.omega[:, 0]),
+        t0=layout.start[:, 0], residuals=rows.residual[:, : kept.shape[1]],
+        jacobian=jacobian[:, : kept.shape[1]], state_singular_values=sensor.of_state, level=level,
+        level_errors=level_errors, scales=way.scales, kept=kept > 0, history=found.history,
+        doubtful=way.doubtful, input_result=input_result, problem=problem, derived=derived,
     )  # fmt: skip
-    loose = [jnp.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies]
-    loose = jnp.any(jnp.stack(loose)) & (status == Status.OK)
-    status = Status.where(loose, Status.UNIDENTIFIABLE, status)
-    result = dataclasses.replace(result, status=status)
     return nan_where(input_result != RESULTS.successful, result)
 
 
 def _widened(told: Told, error: Array, units: Array) -> Told:
     """With the error of what is told least, in natural units, at least this large."""
-    if not units.size:
-        return told
     last, direction = told.values[-1], told.directions[:, -1] * units
     more = jnp.maximum(error**2 - 1 / jnp.maximum(last, 1e-150) ** 2, 0.0)
     values = told.values.at[-1].min(1 / jnp.where(error > 0, error, 1e-300))
@@ -203,58 +168,49 @@ def _widened(told: Told, error: Array, units: Array) -> Told:
     return told._replace(values=values, covariance=covariance)
 
 
-class _Judged(NamedTuple):
-    """How well a fit describes the record."""
-
-    chi_square: Array
-    freedom: Array
-    inflation: Array  # of the covariance
-    unexplained: Array  # of the square of the record
-    misfit: Array  # whether that is no noise
-
-
-def _judged(problem: Problem, way: Way, told: Told, kicks: Array) -> _Judged:
-    """Of the residuals, and the squares of the kicks between nodes."""
-    found, kept, samples, count = way.found, way.kept, problem.samples, way.kept.shape[1]
-    rows, dtype = found.rows.residual[:, :count], kicks.dtype
-    weight = weights_of(problem, kept)
+def _judged(
+    problem: Problem, way: stages.Way, told: Told, kicks: Array, units: Array
+) -> dict[str, Any]:
+    """How well a fit describes the record, by residuals and the squares of kicks; how it ended."""
+    found, options, count = way.found, problem.options, way.kept.shape[1]
+    rows, weight = found.rows.residual[:, :count], stages.weights_of(problem, way.kept)
     squares, number = jnp.sum(weight * rows * rows), jnp.sum(weight)
-    turns = pairs = jnp.zeros((), dtype)
-    for part in samples.parts:
-        both = weight[:, part][:, 1:] * weight[:, part][:, :-1]
-        turns += jnp.sum(both * rows[:, part][:, 1:] * rows[:, part][:, :-1])
-        pairs += jnp.sum(both)
-    alive = jnp.any(kept > 0, axis=1)[:, None]
+    alive = jnp.any(way.kept > 0, axis=1)[:, None]
     shown = jnp.sum((told.of_state > _TOLD * told.of_state[:, :1]) & alive)
     known = found.rows.residual[:, count : found.rows.residual.shape[1] - problem.held]
-    count = jnp.sum(known != 0) - found.point.numbers.size - shown
-    freedom = number + count.astype(dtype)
+    freedom = number + (jnp.sum(known != 0) - units.size - shown).astype(kicks.dtype)
     chi_square = squares + jnp.sum(known**2) + kicks
     noise, mean = chi_square / jnp.maximum(freedom, 1.0), squares / jnp.maximum(number, 1.0)
-    if problem.options.noise_known:
-        gate = 1 + GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1))
+    if options.noise_known:
+        gate = 1 + stages.GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1))
         misfit = (noise > gate) | (jnp.max(way.scales) > 2)
         inflation = jnp.where(misfit, jnp.maximum(noise, 1.0), 1.0)
     else:
+        parts = [slice(x.start, x.stop - 1) for x in problem.samples.parts]
+        after = [slice(x.start + 1, x.stop) for x in problem.samples.parts]
+        turns, pairs = (
+            sum(jnp.sum(x[:, a] * x[:, b]) for a, b in zip(parts, after, strict=True))
+            for x in (weight * rows, weight)
+        )
         like = turns / jnp.maximum(pairs, 1) / jnp.where(mean > 0, mean, 1.0)
         misfit = (like > _COLOURED) & (like * jnp.sqrt(pairs) > _WHITE)
         inflation = noise
-    left = unexplained(problem, way, kicks)
-    return _Judged(chi_square, freedom.astype(int), inflation, left, misfit)
-
-
-def _status(problem: Problem, way: Way, seen: _Judged, told: Told, pure: Array) -> Any:
-    """How the fit ended; the last word counts."""
-    found = way.found
-    # A fit that creeps along a direction which the record does not tell is as good as any.
-    largest = jnp.sqrt(seen.inflation) / jnp.min(told.values, initial=jnp.inf)
+    told = _widened(told, way.wide / jnp.sqrt(inflation), units) if units.size else told
+    pure, left = stages.is_pure(problem, way, inflation), stages.unexplained(problem, way, kicks)
+    flat = stages.is_at_boundary(problem, found)
+    # The last word counts. A fit that creeps along what the record does not tell is as good as any.
+    largest = jnp.sqrt(inflation) / jnp.min(told.values, initial=jnp.inf)
     status = Status.where(found.settled, Status.OK, Status.NOT_CONVERGED)
     status = Status.where(largest > LARGEST_ERROR, Status.UNIDENTIFIABLE, status)
-    status = Status.where(is_at_boundary(problem, found), Status.AT_BOUNDARY, status)
+    status = Status.where(flat, Status.AT_BOUNDARY, status)
     status = Status.where(pure | way.doubtful, Status.UNIDENTIFIABLE, status)
     lost = Status.where(found.settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
-    astray = (seen.unexplained > EXPLAINED) | is_at_boundary(problem, found)
-    wrong = Status.where(astray, lost, Status.MISFIT)
-    status = Status.where(seen.misfit, wrong, status)
-    sound = jnp.all(jnp.isfinite(told.covariance)) & (seen.freedom > 0)
-    return Status.where(sound & jnp.isfinite(seen.chi_square), status, Status.NOT_CONVERGED)
+    wrong = Status.where((left > stages.EXPLAINED) | flat, lost, Status.MISFIT)
+    status = Status.where(misfit, wrong, status)
+    sound = jnp.all(jnp.isfinite(told.covariance)) & (freedom > 0) & jnp.isfinite(chi_square)
+    return {
+        "status": Status.where(sound, status, Status.NOT_CONVERGED), "chi_square": chi_square,
+        "degrees_of_freedom": freedom.astype(int), "inflation": inflation, "unexplained": left,
+        "pure_spin": pure, "singular_values": told.values, "directions": told.directions,
+        "numbers_covariance": inflation * told.covariance,
+    }  # fmt: skip

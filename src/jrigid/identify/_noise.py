@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jrigid._checks import demand
 from jrigid._types import RandomKey
 
 
@@ -41,13 +42,9 @@ def coloured_covariance(
 
 
 def block_bootstrap(
-    jacobian: Float[Array, "times outputs params"],
-    residuals: Float[Array, "times outputs"],
-    block: int,
-    key: RandomKey,
-    *,
-    samples: int = 1000,
-) -> Float[Array, "samples params"]:
+    jacobian: Float[Array, "times outputs params"], residuals: Float[Array, "times outputs"],
+    block: int, key: RandomKey, *, samples: int = 1000,
+) -> Float[Array, "samples params"]:  # fmt: skip
     """Shifts of the parameters when blocks of residuals are dealt out anew.
 
     The moving-block bootstrap of Kuensch (1989), with the fit linearised at its optimum, so that no
@@ -75,16 +72,13 @@ def block_bootstrap(
     (1000, 1)
     """
     times, outputs, params = jacobian.shape
-    if not 1 <= block < times:
-        raise ValueError(
-            f"Argument `block` must be at least 1 and less than {times}, but it is {block}."
-        )
+    text = f"Argument `block` must be at least 1 and less than {times}, but it is {block}."
+    demand(1 <= block < times, text)
     gain = _influence(jacobian.reshape(times * outputs, params))
     centred = residuals - jnp.mean(residuals, axis=0, keepdims=True)
-    blocks = -(-times // block)
 
     def shift(key):
-        starts = jax.random.randint(key, (blocks,), 0, times - block + 1)
+        starts = jax.random.randint(key, (-(-times // block),), 0, times - block + 1)
         rows = (starts[:, None] + jnp.arange(block)[None, :]).reshape(-1)[:times]
         return gain @ centred[rows].reshape(-1)
 

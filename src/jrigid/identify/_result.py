@@ -2,20 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
 from jrigid._numerics import product
 from jrigid._spectral import eigh
-from jrigid._types import Real, Scalar, Vector
+from jrigid._types import Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._intervals import interval
@@ -70,6 +70,18 @@ class FitResult(eqx.Module):
 
     Attributes:
         status: A `jrigid.identify.Status`.
+        inertia: The tensor, body axes [kg m^2]; with `scale="trace"` of the trace of the system's.
+        inertia_covariance: Of its elements, row by row.
+        moments: Principal moments, ascending.
+        axes: Principal axes, columns, body from principal.
+        ratios: I2/I1 and I3/I1.
+        shares: Moments over their sum, each at most 1/2, where I1 is too small to divide by.
+        moments_covariance: Of the moments.
+        ratios_covariance: Of the ratios.
+        shares_covariance: Of the shares; singular, as their sum is 1.
+        ratios_errors: Standard errors of `ratios`.
+        shares_errors: Standard errors of `shares`.
+        axes_errors: Errors of the turn about each principal axis [rad].
         numbers: The numbers sought for all throws: see `names`.
         own_numbers: Those sought in each throw (throws, own).
         numbers_covariance: Of `numbers`.
@@ -99,10 +111,30 @@ class FitResult(eqx.Module):
         doubtful: Whether bodies far from this one describe the record nearly as well.
         input_result: `jrigid.RESULTS` of the input.
         problem: The record as it was fitted, and how.
+        derived: What follows of the tensor of each body.
         index: Which body this is.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> record = jr.datasets.gyro_example()
+    >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+    >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+    >>> print(found.shares.round(3), found.shares_errors.round(4))
+    [0.223 0.333 0.444] [0.0004 0.0004 0.0004]
     """
 
     status: Any
+    inertia: Matrix
+    inertia_covariance: Float[Array, "9 9"]
+    moments: Vector
+    axes: Matrix
+    ratios: Float[Array, "2"]
+    shares: Vector
+    moments_covariance: Matrix
+    ratios_covariance: Float[Array, "2 2"]
+    shares_covariance: Matrix
+    ratios_errors: Float[Array, "2"]
+    shares_errors: Vector
+    axes_errors: Vector
     numbers: Float[Array, " numbers"]
     own_numbers: Float[Array, "throws own"]
     numbers_covariance: Float[Array, "numbers numbers"]
@@ -130,6 +162,7 @@ class FitResult(eqx.Module):
     doubtful: Bool[Array, ""]
     input_result: Any
     problem: Problem
+    derived: tuple[dict[str, Array], ...]
     index: int = eqx.field(static=True, default=0)
 
     @property
@@ -150,60 +183,8 @@ class FitResult(eqx.Module):
     @property
     def bodies(self) -> tuple["FitResult", ...]:
         """The result for each body."""
-        return tuple(dataclasses.replace(self, index=i) for i in range(len(self.unknowns.shapes)))
-
-    @property
-    def inertia(self) -> Float[Array, "*fits 3 3"]:
-        """The tensor, body axes [kg m^2]; with `scale="trace"` of the trace of the system's."""
-        return _derived(self).inertia
-
-    @property
-    def moments(self) -> Float[Array, "*fits 3"]:
-        """Principal moments, ascending."""
-        return _derived(self).moments
-
-    @property
-    def axes(self) -> Float[Array, "*fits 3 3"]:
-        """Principal axes, columns, body from principal."""
-        return _derived(self).axes
-
-    @property
-    def ratios(self) -> Float[Array, "*fits 2"]:
-        """I2/I1 and I3/I1."""
-        return self.moments[..., 1:] / self.moments[..., :1]
-
-    @property
-    def shares(self) -> Float[Array, "*fits 3"]:
-        """Moments over their sum, each at most 1/2, where I1 is too small to divide by.
-
-        >>> import jax.numpy as jnp, jrigid as jr
-        >>> record = jr.datasets.gyro_example()
-        >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
-        >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-        >>> print(found.shares.round(3), found.shares_errors.round(4))
-        [0.223 0.333 0.444] [0.0004 0.0004 0.0004]
-        """
-        return self.moments / jnp.sum(self.moments, axis=-1, keepdims=True)
-
-    @property
-    def moments_covariance(self) -> Float[Array, "*fits 3 3"]:
-        """Of the moments."""
-        return _derived(self).moments_covariance
-
-    @property
-    def ratios_covariance(self) -> Float[Array, "*fits 2 2"]:
-        """Of the ratios."""
-        return _derived(self).ratios_covariance
-
-    @property
-    def shares_covariance(self) -> Float[Array, "*fits 3 3"]:
-        """Of the shares; singular, as their sum is 1."""
-        return _derived(self).shares_covariance
-
-    @property
-    def axes_errors(self) -> Float[Array, "*fits 3"]:
-        """Errors of the turn about each principal axis [rad]."""
-        return _derived(self).axes_errors
+        pairs = enumerate(self.derived)
+        return tuple(dataclasses.replace(self, index=i, **of_body) for i, of_body in pairs)
 
     def spread(self, function: Callable[[Array], Array]) -> Array:
         """Covariance of a function of the tensor, to a vector; of a single fit.
@@ -215,20 +196,7 @@ class FitResult(eqx.Module):
         Args:
             function: Of the tensor.
         """
-        size = self.unknowns.slices["scale"].stop  # the others do not move the tensor
-        values, axes = jnp.linalg.eigh(self.numbers_covariance[:size, :size])
-        sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
-        near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
-        steps = product("ij,j->ji", axes, near)
-        here = function(self.unknowns.inertia(self.numbers, self.index))
-
-        def move(step: Array) -> Array:
-            step = jnp.pad(step, (0, self.numbers.size - size))
-            return function(self.unknowns.inertia(self.numbers + step, self.index)) - here
-
-        moves = jax.vmap(move)(jnp.concatenate([steps, -steps]))
-        moves = product("ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2))
-        return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
+        return _spread(self.unknowns, self.index, self.numbers, self.numbers_covariance, function)
 
     def interval(self, function: Callable[[Array], Array], level: float = 0.95) -> Array:
         """Lower and upper limit of a scalar function of the tensor; of a single fit.
@@ -256,22 +224,34 @@ class FitResult(eqx.Module):
         >>> print(found.interval(lambda tensor: tensor[2, 2] / jnp.trace(tensor)).round(2))
         [0.44 0.44]
         """
-        return interval(function, *_tensor(self), jnp.asarray(level, self.numbers.dtype))
+        level_ = jnp.asarray(level, self.numbers.dtype)
+        return interval(function, self.inertia, self.inertia_covariance, level_)
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
         """Lower and upper limits of I2/I1 and I3/I1 at 95 %, in columns; of a single fit."""
-        return jnp.stack([self.interval(Partial(_ratio, jnp.asarray(i))) for i in (1, 2)], axis=1)
+        ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
+        return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
         """Of `numbers`, then of each throw's state and own numbers."""
-        return _on_lanes(_covariance, self)
+        numbers, (*lanes, throws, local, size) = self.numbers_covariance, self.follow.shape
+        follow = self.follow.reshape(*lanes, throws * local, size)
+        across = -product("...ag,...gh->...ah", follow, numbers)
+        eye = jnp.eye(throws, dtype=numbers.dtype)
+        blocks = product("ts,...tlm->...tlsm", eye, self.local_covariance)
+        blocks = blocks.reshape(*lanes, throws * local, throws * local)
+        blocks = blocks - product("...ah,...bh->...ab", across, follow)
+        return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
 
     @property
     def clustered_covariance(self) -> Float[Array, "*fits numbers numbers"]:
         """Of `numbers`, by how much throws scatter, whatever the noise; of few throws too small."""
-        return _on_lanes(_clustered, self)
+        throws, inverse = self.scores.shape[-2], self.numbers_covariance
+        inverse = inverse / self.inflation[..., None, None]
+        spread = product("...tg,...th->...gh", self.scores, self.scores)
+        return inverse @ (spread * throws / max(throws - 1, 1)) @ inverse
 
     @property
     def system(self) -> RigidBody:
@@ -284,11 +264,9 @@ class FitResult(eqx.Module):
         Args:
             index: Which throw.
         """
-        unknowns = self.unknowns
-        pairs = zip(unknowns.leaves, unknowns.stacked, strict=True)
-        leaves = tuple(x[index] if own else x for x, own in pairs)
-        body = self.problem.bodies[index]
-        return unknowns.parts(self.numbers, self.own_numbers[index], leaves, body)
+        given, body = (self.unknowns.leaves, self.unknowns.stacked), self.problem.bodies[index]
+        leaves = jtu.tree_map(lambda x, own: x[index] if own else x, *given)
+        return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves, body)
 
     def start(self, index: Int[_ArrayLike, ""] = 0) -> tuple[State, Float[Array, "*fits"]]:
         """The state of a throw and its time [s], which whoever moves the state needs.
@@ -378,16 +356,6 @@ class FitResult(eqx.Module):
         return self.covariance / error[..., :, None] / error[..., None, :]
 
     @property
-    def ratios_errors(self) -> Float[Array, "*fits 2"]:
-        """Standard errors of `ratios`."""
-        return _errors(self.ratios_covariance)
-
-    @property
-    def shares_errors(self) -> Float[Array, "*fits 3"]:
-        """Standard errors of `shares`."""
-        return _errors(self.shares_covariance)
-
-    @property
     def reduced_chi_square(self) -> Float[Array, "*fits"]:
         """Chi-square for each degree of freedom."""
         freedom = jnp.maximum(self.degrees_of_freedom, 1).astype(self.chi_square.dtype)
@@ -431,16 +399,13 @@ class FitResult(eqx.Module):
         Of a single fit. Near 0 for noise; what a model leaves out changes slowly and brings it near
         1.
         """
-        square = turns = count = 0.0
-        for part in self.problem.samples.parts:
-            rows = np.asarray(self.residuals[:, part])
-            left, right = rows[:, :-1], rows[:, 1:]
-            both = (left != 0) & (right != 0)
-            turns += float(np.sum(left * right))
-            square += float(np.sum(both * (left**2 + right**2) / 2))
-            count += int(both.sum())
-        like = turns / max(square, 1e-300)
-        return like, abs(like) * count**0.5
+        rows = [np.asarray(self.residuals[:, part]) for part in self.problem.samples.parts]
+        left = np.concatenate([x[:, :-1].ravel() for x in rows])
+        right = np.concatenate([x[:, 1:].ravel() for x in rows])
+        both = (left != 0) & (right != 0)
+        square = np.sum(both * (left**2 + right**2) / 2)
+        like = float(np.sum(left * right) / max(square, 1e-300))
+        return like, abs(like) * float(both.sum()) ** 0.5
 
     @property
     def leaves(self) -> dict[str, tuple[Array, Array]]:
@@ -448,20 +413,18 @@ class FitResult(eqx.Module):
 
         Of one that is sought anew in each throw, of each throw.
         """
-        first = self.follow.shape[1] - self.own_numbers.shape[-1]
-        covariance = self.local_covariance + product(
-            "tlg,gh,tmh->tlm", self.follow, self.numbers_covariance, self.follow
-        )
-        own = covariance[:, first:, first:]
+        numbers, first = self.numbers_covariance, self.follow.shape[1] - self.own_numbers.shape[1]
+        follow = self.follow[:, first:]
+        own = product("tlg,gh,tmh->tlm", follow, numbers, follow)
+        own = own + self.local_covariance[:, first:, first:]
         slices = self.unknowns.slices | {x.name: s for x, s in self.unknowns.own_slices}
 
-        def value_and_errors(x: AbstractSought) -> tuple[Array, Array]:
-            s = slices[x.name]
+        def value_and_errors(x: AbstractSought, s: slice) -> tuple[Array, Array]:
             if x.own:
                 return jax.vmap(x.with_errors)(self.own_numbers[:, s], own[:, s, s])
-            return x.with_errors(self.numbers[s], self.numbers_covariance[s, s])
+            return x.with_errors(self.numbers[s], numbers[s, s])
 
-        return {x.name: value_and_errors(x) for x in self.unknowns.sought}
+        return {x.name: value_and_errors(x, slices[x.name]) for x in self.unknowns.sought}
 
     @property
     def mirror(self) -> Float[Array, "*fits 3"]:
@@ -500,80 +463,46 @@ def _predicted(result: FitResult, ts: Array, record: int, throw: Array) -> Array
     return shown if largest is None else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
 
 
-@quick_jit
-def _tensor(result: FitResult) -> tuple[Array, Array]:
-    """The tensor and the covariance of its elements, row by row."""
-    tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
-    slopes = jax.jacfwd(tensor_of)(result.numbers).reshape(9, -1)
-    covariance = product("in,nm,jm->ij", slopes, result.numbers_covariance, slopes)
-    return tensor_of(result.numbers), covariance
+def _of_moments(which: Any, tensor: Array) -> Array:
+    """Of the moments, ratios and shares some."""
+    moments = eigh(tensor)[0]
+    found = jnp.concatenate([moments, moments[1:] / moments[0], moments / jnp.sum(moments)])
+    return found[which]
 
 
-def _ratio(which: Array, tensor: Array) -> Array:
-    moments, _ = eigh(tensor)
-    return moments[which] / moments[0]
+def _spread(
+    unknowns: Unknowns, index: int, numbers: Array, covariance: Array, function: Callable[..., Any]
+) -> Array:
+    size = unknowns.slices["scale"].stop  # the others do not move the tensor
+    values, axes = jnp.linalg.eigh(covariance[:size, :size])
+    sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
+    near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
+    steps = jnp.pad(product("ij,j->ji", axes, near), ((0, 0), (0, numbers.size - size)))
+    of_numbers = lambda x: function(unknowns.inertia(x, index))  # noqa: E731
+    moves = jax.vmap(of_numbers)(numbers[None] + jnp.concatenate([steps, -steps]))
+    moves = moves - of_numbers(numbers)[None]
+    moves = product("ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2))
+    return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
 
 
-class _Derived(NamedTuple):
-    """What follows from the numbers and their covariance."""
-
-    inertia: Array
-    moments: Array
-    axes: Array
-    moments_covariance: Array
-    ratios_covariance: Array
-    shares_covariance: Array
-    axes_errors: Array
-
-
-@quick_jit
-def _derived(result: FitResult) -> _Derived:
-    """Of one fit, or of each lane of many."""
-
-    def one(result: FitResult) -> _Derived:
-        tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
-        tensor = tensor_of(result.numbers)
-        moments, axes = eigh(tensor)
-        inside = product("ki,kln,lj->ijn", axes, jax.jacfwd(tensor_of)(result.numbers), axes)
-        floor = jnp.finfo(moments.dtype).eps * moments[2]
-
-        def turn(i: int, j: int) -> Array:
-            gap = moments[i] - moments[j]
-            return inside[i, j] / jnp.where(jnp.abs(gap) > floor, gap, floor)
-
-        turns = jnp.stack([turn(1, 2), turn(2, 0), turn(0, 1)])
-        square = product("in,nm,im->i", turns, result.numbers_covariance, turns)
-
-        def all_three(tensor: Array) -> Array:
-            moments = eigh(tensor)[0]
-            return jnp.concatenate([moments, moments[1:] / moments[0], moments / jnp.sum(moments)])
-
-        spread = result.spread(all_three)
-        covariances = spread[:3, :3], spread[3:5, 3:5], spread[5:, 5:]
-        return _Derived(tensor, moments, axes, *covariances, jnp.sqrt(square))
-
-    return _on_lanes(one, result)
-
-
-def _on_lanes(function: Callable[[FitResult], Any], result: FitResult) -> Any:
-    for _ in range(result.numbers.ndim - 1):
-        function = eqx.filter_vmap(function)
-    return function(result)
-
-
-def _covariance(result: FitResult) -> Array:
-    numbers, follow = result.numbers_covariance, result.follow
-    throws, local, size = follow.shape
-    across = -product("tlg,gh->tlh", follow, numbers).reshape(throws * local, size)
-    blocks = product("tlg,gh,smh->tlsm", follow, numbers, follow)
-    eye = jnp.eye(throws, dtype=numbers.dtype)
-    blocks = blocks + eye[:, None, :, None] * result.local_covariance[:, :, None, :]
-    blocks = blocks.reshape(throws * local, throws * local)
-    return jnp.block([[numbers, across.T], [across, blocks]])
-
-
-def _clustered(result: FitResult) -> Array:
-    throws = result.scores.shape[0]
-    inverse = result.numbers_covariance / result.inflation
-    spread = product("tg,th->gh", result.scores, result.scores) * throws / max(throws - 1, 1)
-    return inverse @ spread @ inverse
+def derive(unknowns: Unknowns, index: int, numbers: Array, covariance: Array) -> dict[str, Any]:
+    """What follows from the numbers and their covariance for a body."""
+    tensor_of = lambda x: unknowns.inertia(x, index)  # noqa: E731
+    tensor, slopes = tensor_of(numbers), jax.jacfwd(tensor_of)(numbers)
+    (moments, axes), elements = eigh(tensor), slopes.reshape(9, -1)
+    gaps = jnp.roll(moments, -1) - jnp.roll(moments, 1)
+    floor = jnp.finfo(gaps.dtype).eps * moments[2]
+    gaps = jnp.where(jnp.abs(gaps) > floor, gaps, floor)
+    sides = jnp.roll(axes, -1, axis=1), jnp.roll(axes, 1, axis=1)
+    turns = product("ki,kln,li->in", sides[0], slopes, sides[1]) / gaps[:, None]
+    spread = _spread(unknowns, index, numbers, covariance, jtu.Partial(_of_moments, ...))
+    errors = _errors(spread)
+    return {
+        "inertia": tensor, "moments": moments, "axes": axes,
+        "ratios": moments[1:] / moments[:1], "shares": moments / jnp.sum(moments),
+        "inertia_covariance": product("in,nm,jm->ij", elements, covariance, elements),
+        "moments_covariance": spread[:3, :3], "ratios_covariance": spread[3:5, 3:5],
+        "shares_covariance": spread[5:, 5:], "ratios_errors": errors[3:5],
+        "shares_errors": errors[5:],
+        "axes_errors": jnp.sqrt(product("in,nm,im->i", turns, covariance, turns)),
+    }  # fmt: skip

@@ -23,8 +23,8 @@ class LogDensity(NamedTuple):
 
     Attributes:
         function: Logarithm of the density, but for a constant, of a position.
-        start: The position of the fit: its numbers, then, for each throw, its own numbers and the
-            moves of its state from that of the fit, zero.
+        start: The position of the fit: its numbers, then, for each throw, the moves of its state
+            from that of the fit, zero, and its own numbers: in the order of `covariance`.
         covariance: That of the fit: the inverse of a mass matrix.
     """
 
@@ -69,44 +69,33 @@ def log_density(result: FitResult) -> LogDensity:
         not options.dense,
         "Argument `result` must be of a fit without an unmodelled torque, but it is not.",
     )
-    motion = options.motion
-    if not options.free_motion and motion is None:
-        motion = _simulated
+    motion = options.motion or (None if options.free_motion else _simulated)
     options = options._replace(shooting=False, nodes=1, motion=motion)
     problem = Problem(options, problem.unknowns, problem.samples, problem.bodies, problem.noise)
     unknowns, layout = problem.unknowns, whole(problem.samples, 1, result.t0)
     states = result.state.attitude[:, None], result.state.omega[:, None]
-    size, (throws, own) = result.numbers.size, result.own_numbers.shape
-    local, rows_of = 6 if options.on_attitude else 3, rows_at(problem, layout)
-    weight = jnp.where(result.kept, 1.0, 0.0)
-    weight = jnp.pad(weight, ((0, 0), (0, problem.known - problem.held)), constant_values=1.0)
+    size, end = result.numbers.size, unknowns.slices["shape"].stop
+    (throws, own), local = result.own_numbers.shape, 6 if options.on_attitude else 3
+    known = (0, 0), (0, problem.known - problem.held)
+    weight = jnp.pad(jnp.where(result.kept, 1.0, 0.0), known, constant_values=1.0)
+    rows_of = rows_at(problem, layout)
 
     def function(position: Array) -> Array:
-        numbers, rest = position[:size], position[size:].reshape(throws, own + local)
-        point = Point(numbers, rest[:, :own], *states)
-        rows = rows_of(point, rest[:, None, own:])[:, : weight.shape[1]]
-        chi_square = jnp.sum(weight[..., None] * rows**2)
-        return -0.5 * chi_square / result.inflation + _log_jacobian(numbers, rest[:, :own])
+        numbers, rest = position[:size], position[size:].reshape(throws, local + own)
+        rows = rows_of(Point(numbers, rest[:, local:], *states), rest[:, None, :local])
+        chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
+        return -0.5 * chi_square / result.inflation + log_jacobian(numbers, rest[:, local:])
 
-    def _log_jacobian(numbers: Array, own: Array) -> Array:
-        total = jnp.zeros((), numbers.dtype)
-        for x in unknowns.sought:
-            if not x.own:
-                total = total + x.log_volume(numbers[unknowns.slices[x.name]])
-        for x, s in unknowns.own_slices:
-            total = total + jnp.sum(jax.vmap(x.log_volume)(own[:, s]))
-        shape = slice(0, unknowns.slices["shape"].stop)
-        if shape.stop:
-            slopes = jax.jacfwd(lambda p: unknowns.inertia(numbers.at[shape].set(p)))(
-                numbers[shape]
-            )
-            slopes = slopes.reshape(9, shape.stop) / jnp.trace(unknowns.inertia(numbers))
-            total = total + 0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]
-        return total
+    def log_jacobian(numbers: Array, own: Array) -> Array:
+        inertia = lambda x: unknowns.inertia(jnp.concatenate([x, numbers[end:]]))  # noqa: E731
+        slopes = jax.jacfwd(inertia)(numbers[:end]).reshape(9, end)
+        slopes = slopes / jnp.trace(unknowns.inertia(numbers))
+        parts = [0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]]
+        shared = [x for x in unknowns.sought if not x.own]
+        parts += [x.log_volume(numbers[unknowns.slices[x.name]]) for x in shared]
+        parts += [jnp.sum(jax.vmap(x.log_volume)(own[:, s])) for x, s in unknowns.own_slices]
+        return jnp.sum(jnp.stack(parts))
 
-    parts = [jnp.concatenate([x, jnp.zeros(local)]) for x in result.own_numbers]
-    order = jnp.arange(throws * (own + local)).reshape(throws, -1)
-    order = jnp.roll(order, own, axis=1).reshape(-1)  # own numbers come before the state here
-    order = jnp.concatenate([jnp.arange(size), size + order])
-    covariance = result.covariance[order][:, order]
-    return LogDensity(function, jnp.concatenate([result.numbers, *parts]), covariance)
+    still = jnp.zeros((throws, local), result.numbers.dtype)
+    start = jnp.concatenate([still, result.own_numbers], axis=1).reshape(-1)
+    return LogDensity(function, jnp.concatenate([result.numbers, start]), result.covariance)

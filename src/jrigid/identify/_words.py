@@ -10,197 +10,140 @@ import numpy as np
 
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._shapes import Fixed, Flat, Symmetric, Tensor, Top
-from jrigid.identify._unknowns import AbstractSought
 
 _NEARLY_A_SPHERE = 1.03  # degrees for radians shrink the gaps of the moments by 57
 _FAINT = 0.02  # relative change of a tensor by a unit of one of its numbers: of a thickness
-_AXES = ((1, 2), (2, 0), (0, 1))
 
 
 def _of_shape(result: FitResult, direction: np.ndarray) -> str:
     """What a change of the shape's numbers does to the body."""
-    unknowns, index = result.unknowns, result.index
-    slope = jax.jvp(
-        lambda x: unknowns.inertia(x, index), (result.numbers,), (jnp.asarray(direction),)
-    )[1]
+    tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
+    slope = jax.jvp(tensor_of, (result.numbers,), (jnp.asarray(direction),))[1]
     axes, moments = np.asarray(result.axes), np.asarray(result.moments)
     inside = axes.T @ np.asarray(slope) @ axes
     if np.abs(inside).max() < _FAINT * moments.max():
         return "thickness"
     relative = np.diag(inside) / moments
-    relative = relative - relative.mean()
-    turns = np.array([inside[i, j] / moments.mean() for i, j in _AXES])
-    if np.abs(turns).max() > np.abs(relative).max():
-        i, j = sorted(_AXES[int(np.abs(turns).argmax())])
-        return f"directions of the axes of I{i + 1} and I{j + 1}"
+    relative = np.abs(relative - relative.mean())
+    turns = np.abs(inside[[1, 2, 0], [2, 0, 1]] / moments.mean())
+    if turns.max() > relative.max():
+        i, j = sorted({1, 2, 3} - {int(turns.argmax()) + 1})
+        return f"directions of the axes of I{i} and I{j}"
     gaps = np.sort(np.diff(moments))
     if gaps[0] < 0.1 * gaps[1]:  # of a symmetric body I3 is the odd one
         return "I3/I1"
-    return f"I{int(np.abs(relative).argmax()) + 1}'s ratio to the others"
+    return f"I{relative.argmax() + 1}'s ratio to the others"
 
 
-def _of_sought(result: FitResult, sought: AbstractSought, direction: np.ndarray) -> str:
-    """What a change of an array's numbers is."""
-    owner, _, name = sought.name.rpartition(".")
-    text = f"{owner} {name}"
-    if direction.size == 3 and name == "bias":
-        axis = int(np.abs(np.asarray(result.axes).T @ direction).argmax())
-        return f"{text} along the axis of I{axis + 1}"
-    if owner.startswith("torque"):
-        chosen = np.abs(direction) > 0.2 * np.abs(direction).max()
-        return ", ".join(np.array(sought.names)[chosen])
-    return text
+def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
+    """What a change of the shape's, the scale's or an array's numbers is."""
+    unknowns, s = result.unknowns, result.unknowns.slices[name]
+    names, sizes, (owner, _, field) = result.names[s], np.abs(direction[s]), name.rpartition(".")
+    if name == "scale":
+        return "overall scale"
+    if name == "shape" and not unknowns.shapes[0].absolute:
+        only = np.where(np.arange(direction.size) < s.stop, direction, 0.0)
+        return "" if result.pure_spin else _of_shape(result, only)
+    if sizes.size == 3 and field == "bias":
+        axis = np.abs(np.asarray(result.axes).T @ direction[s]).argmax()
+        return f"{owner} bias along the axis of I{axis + 1}"
+    if name == "shape" or owner.startswith("torque"):
+        least = 0.2 if name == "shape" else 0.2 * sizes.max()
+        return ", ".join(np.array(names)[sizes > least])
+    return f"{owner} {field}"
 
 
 def _untold(result: FitResult, direction: np.ndarray) -> str:
     """A direction of the numbers, in words, the largest part first."""
-    unknowns, parts = result.unknowns, []
-    named = {x.name: x for x in unknowns.sought}
-    for name, s in unknowns.slices.items():
-        size = float(np.sqrt(np.sum(direction[s] ** 2)))
-        if s.stop == s.start or size < 0.2:
-            continue
-        if name == "scale":
-            parts.append((size, "overall scale"))
-        elif name in named:
-            parts.append((size, _of_sought(result, named[name], direction[s])))
-        elif unknowns.shapes[0].absolute:
-            chosen = np.array(result.names[s])[np.abs(direction[s]) > 0.2]
-            parts.append((size, ", ".join(chosen)))
-        elif not bool(result.pure_spin):
-            only = np.where(np.arange(direction.size) < s.stop, direction, 0.0)
-            parts.append((size, _of_shape(result, only)))
-    return " against ".join(text for _, text in sorted(parts, reverse=True))
+    parts = result.unknowns.slices.items()
+    sizes = {name: float(np.sqrt(np.sum(direction[s] ** 2))) for name, s in parts}
+    texts = [(x, _of_part(result, name, direction)) for name, x in sizes.items() if x >= 0.2]
+    return " against ".join(text for _, text in sorted(texts, reverse=True) if text)
 
 
 def null_directions(result: FitResult) -> tuple[str, ...]:
     """What the record does not tell."""
-    found, unknowns = [], result.unknowns
-    absolute = any(x.absolute for x in unknowns.shapes)
-    if not unknowns.scaled and not absolute:
-        torque = not result.problem.options.free_motion and any(
-            x.name.startswith("torque") for x in unknowns.sought
-        )
-        follow = ", which what is sought of the torque follows" if torque else ""
-        if torque or result.problem.options.free_motion:
-            found.append("overall scale" + follow)
-    if bool(result.pure_spin):
-        found.append("spin is pure: ratios not determined")
-    noise = math.sqrt(float(result.inflation))
-    values = np.asarray(result.singular_values)
-    for value, direction in zip(values, np.asarray(result.directions).T, strict=True):
-        if noise > LARGEST_ERROR * value:
-            text = _untold(result, direction)
-            found += [text] * bool(text and text not in found)
-    smallest = "I1's ratio to the others"
+    unknowns, options = result.unknowns, result.problem.options
+    known = unknowns.scaled or any(x.absolute for x in unknowns.shapes)
+    driven = any(x.name.startswith("torque") for x in unknowns.sought)
+    follow = "" if options.free_motion else ", which what is sought of the torque follows"
+    found = ["overall scale" + follow] * (not known and (driven or options.free_motion))
+    found += ["spin is pure: ratios not determined"] * bool(result.pure_spin)
+    directions = np.asarray(result.directions).T
+    weak = math.sqrt(result.inflation) > LARGEST_ERROR * np.asarray(result.singular_values)
+    found += [_untold(result, x) for x in directions[weak]]
     loose = any(np.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies)
-    found += [smallest] * (loose and smallest not in found)
-    if bool(result.doubtful):
-        text = _untold(result, np.asarray(result.directions)[:, -1])
-        found.append(f"{text}, which far from here is as good or nearly")
+    found += ["I1's ratio to the others"] * loose
+    if result.doubtful:
+        found.append(f"{_untold(result, directions[-1])}, which far from here is as good or nearly")
     of_state = np.asarray(result.state_singular_values)
-    if result.problem.options.on_attitude and (of_state[..., -1] < 1e-6 * of_state[..., 0]).any():
-        count = int((of_state < 1e-6 * of_state[..., :1]).sum(axis=-1).max())
+    count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
+    if options.on_attitude and count:
         found.append("heading about the vertical" if count == 1 else "attitude in space")
-    return tuple(found)
+    return tuple(dict.fromkeys(filter(None, found)))
 
 
-def _size(x: float) -> str:
-    return f"{x:.2g}"
+def _diagonal(matrix: Any) -> np.ndarray:
+    return np.maximum(np.diagonal(np.asarray(matrix)), 1e-300)
 
 
-def _of_residuals(result: FitResult) -> list[str]:
-    """How far what is left is from noise of the size stated."""
-    found = []
-    size = max(math.sqrt(float(result.reduced_chi_square)), float(np.max(result.scales)))
-    if result.problem.options.noise_known and size > 1.3:
-        found.append(f"residuals are {_size(size)} times the stated noise")
-    like, sure = result.whiteness
-    if abs(like) > 0.1 and sure > 5:
-        found.append(
-            f"residuals are not white: neighbours correlate by {like:.2f}, {sure:.0f} standard "
-            "deviations from none"
-        )
-    by_throw = np.asarray(result.chi_square_by_throw)
-    if by_throw.size > 2:
-        spread = float(np.quantile(by_throw, 0.9) / max(np.quantile(by_throw, 0.1), 1e-300))
-        if spread > 4:
-            found.append(f"throws differ: chi-square of nine tenths spreads by {_size(spread)}")
-    if by_throw.size >= 8 and result.numbers.size:
-        clustered = np.diagonal(np.asarray(result.clustered_covariance))
-        stated = np.diagonal(np.asarray(result.numbers_covariance))
-        worst = math.sqrt(float(np.max(clustered / np.maximum(stated, 1e-300))))
-        if worst > 1.6:
-            found.append(
-                f"throws scatter more than the errors say: by up to {_size(worst)} times "
-                "(`clustered_covariance`)"
-            )
-    return found
-
-
-def _of_priors(result: FitResult) -> list[str]:
-    """What ended far from what was known of it beforehand."""
-    found = []
+def _of_record(result: FitResult) -> list[tuple[Any, str]]:
+    """What residuals, and values that repeat their largest one, would say, and if it is so."""
+    by_throw, known = np.asarray(result.chi_square_by_throw), result.problem.options.noise_known
+    size = max(math.sqrt(result.reduced_chi_square), float(np.max(result.scales)))
+    (like, sure), worst = result.whiteness, 0.0
+    low, high = np.maximum(np.quantile(by_throw, [0.1, 0.9]), 1e-300)
+    if by_throw.size >= 8:  # whose scatter says something
+        ratios = _diagonal(result.clustered_covariance) / _diagonal(result.numbers_covariance)
+        worst = math.sqrt(np.max(ratios, initial=0.0))
+    notes = [
+        (known and size > 1.3, f"residuals are {size:.2g} times the stated noise"),
+        (abs(like) > 0.1 and sure > 5, "residuals are not white: neighbours correlate by "
+         f"{like:.2f}, {sure:.0f} standard deviations from none"),
+        (by_throw.size > 2 and high > 4 * low,
+         f"throws differ: chi-square of nine tenths spreads by {high / low:.2g}"),
+        (worst > 1.6, f"throws scatter more than the errors say: by up to {worst:.2g} times "
+         "(`clustered_covariance`)"),
+    ]  # fmt: skip
     for x in result.unknowns.sought:
-        if x.own or x.sigma is None:
-            continue
-        far = np.max(
-            np.abs(np.asarray(x.prior_rows(result.numbers[result.unknowns.slices[x.name]])))
-        )
-        if far > 3:
-            found.append(f"{x.name} is {far:.1f} standard deviations from what was known of it")
-    return found
-
-
-def _of_clipping(result: FitResult) -> list[str]:
-    """Values that repeat their largest one, as a saturated sensor's do."""
-    found = []
-    sensors = result.parts()[1:]
-    for sensor, values in zip(sensors, result.problem.samples.values, strict=True):
-        values = np.asarray(values)
-        largest = np.abs(values).max()
-        count = int(np.sum(np.abs(values) >= largest * (1 - 1e-9)))
-        if count > 3 and largest > 0 and sensor.largest() is None and not sensor.unit_length:
-            name = type(sensor).__name__
-            found.append(f"{count} values of {name} are its largest: saturated? (`limit`)")
-    return found
+        if not x.own and x.sigma is not None:
+            numbers = result.numbers[result.unknowns.slices[x.name]]
+            far = float(jnp.max(jnp.abs(x.prior_rows(numbers))))
+            text = f"{x.name} is {far:.1f} standard deviations from what was known of it"
+            notes.append((far > 3, text))
+    for sensor, values in zip(result.parts()[1:], result.problem.samples.values, strict=True):
+        sizes, free = np.abs(values), sensor.largest() is None and not sensor.unit_length
+        count = np.sum(sizes >= sizes.max() * (1 - 1e-9))
+        text = f"{count} values of {type(sensor).__name__} are its largest: saturated? (`limit`)"
+        notes.append((count > 3 and sizes.max() > 0 and free, text))
+    return notes
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
-    found = _of_residuals(result) + _of_priors(result) + _of_clipping(result)
-    if isinstance(result.unknowns.shapes[result.index], Symmetric | Top | Fixed):
-        return tuple(found)
-    ratios, errors = np.asarray(result.ratios), np.asarray(result.ratios_errors)
-    if (errors > 0.03 * ratios).any():
-        found.append("the ratios are weakly constrained: errors of 3 % or more")
-    covariance, moments = np.asarray(result.moments_covariance), np.asarray(result.moments)
-    for i, j in ((0, 1), (1, 2)):
-        gap = moments[j] - moments[i]
-        error = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2 * covariance[i, j], 0.0))
-        if gap < 2 * error:
-            found.append(
-                f"I{i + 1} and I{j + 1} are equal within their errors: which is the larger, and "
-                "the axes of each, are not determined"
-            )
+    notes, free_motion = _of_record(result), result.problem.options.free_motion
+    covariance = np.asarray(result.moments_covariance)
     by_rates = not any(x.on_attitude for x in result.parts()[1:])
-    if by_rates and ratios[1] < _NEARLY_A_SPHERE:
-        found.append(
-            "nearly a sphere: so would any body look whose rates are in degrees a second, or whose "
-            "times are not in seconds"
-        )
-    mirror = np.sort(np.asarray(result.mirror))
-    if (
-        by_rates
-        and result.problem.options.free_motion
-        and mirror[0] > 0
-        and mirror[2] < mirror[:2].sum()
-    ):
-        found.append(
-            "with one axis of the gyro reversed the same record is that of a body with "
-            f"I2/I1 = {mirror[1] / mirror[0]:.4g}, I3/I1 = {mirror[2] / mirror[0]:.4g}"
-        )
-    return tuple(found)
+    if not isinstance(result.unknowns.shapes[result.index], Symmetric | Top | Fixed):
+        ratios, moments = np.asarray(result.ratios), np.asarray(result.moments)
+        loose = (np.asarray(result.ratios_errors) > 0.03 * ratios).any()
+        notes.append((loose, "the ratios are weakly constrained: errors of 3 % or more"))
+        for i in (0, 1):
+            (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
+            error = math.sqrt(max(first + second - 2 * across, 0.0))
+            text = f"I{i + 1} and I{i + 2} are equal within their errors: which is the larger, and "
+            text += "the axes of each, are not determined"
+            notes.append((moments[i + 1] - moments[i] < 2 * error, text))
+        least, middle, most = np.sort(np.asarray(result.mirror))
+        real, unit = least > 0 and most < least + middle, max(least, 1e-300)
+        notes += [
+            (by_rates and ratios[1] < _NEARLY_A_SPHERE, "nearly a sphere: so would any body look "
+             "whose rates are in degrees a second, or whose times are not in seconds"),
+            (by_rates and free_motion and real,
+             "with one axis of the gyro reversed the same record is that of a body with "
+             f"I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}"),
+        ]  # fmt: skip
+    return tuple(text for holds, text in notes if holds)
 
 
 def _with_error(value: Any, error: Any) -> str:
@@ -216,20 +159,21 @@ def _with_error(value: Any, error: Any) -> str:
     return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
+def _with_errors(values: Any, errors: Any, between: str = ", ") -> str:
+    return between.join(map(_with_error, np.ravel(values), np.ravel(errors)))
+
+
 def _of_tensor(result: FitResult) -> list[str]:
-    pairs = zip(np.asarray(result.ratios), np.asarray(result.ratios_errors), strict=True)
-    lines = ["  ratios   I2/I1 = " + "   I3/I1 = ".join(_with_error(*pair) for pair in pairs)]
     shape = result.unknowns.shapes[result.index]
     unit = " kg m^2" if result.unknowns.scaled or shape.absolute else " (trace as declared)"
     errors = np.sqrt(np.diagonal(np.asarray(result.moments_covariance)))
-    listed = zip(np.asarray(result.moments), errors, strict=True)
-    lines.append("  moments  " + ", ".join(_with_error(*x) for x in listed) + unit)
-    for i in range(3):
-        axis = ", ".join(f"{x: .4f}" for x in np.asarray(result.axes)[:, i])
-        lines.append(f"  axis of I{i + 1}  ({axis})")
-    turns = [
-        f"{np.degrees(float(e)):.2g}" if e < 1 else "not determined" for e in result.axes_errors
+    lines = [
+        "  ratios   I2/I1 = " + _with_errors(result.ratios, result.ratios_errors, "   I3/I1 = "),
+        "  moments  " + _with_errors(result.moments, errors) + unit,
     ]
+    for i, axis in enumerate(np.asarray(result.axes).T):
+        lines.append(f"  axis of I{i + 1}  ({', '.join(f'{x: .4f}' for x in axis)})")
+    turns = (f"{np.degrees(e):.2g}" if e < 1 else "not determined" for e in result.axes_errors)
     if isinstance(shape, Tensor | Flat | Symmetric):
         lines.append(f"  errors of the axes, as turns about each [deg]: {', '.join(turns)}")
     return lines
@@ -237,18 +181,15 @@ def _of_tensor(result: FitResult) -> list[str]:
 
 def _of_level(result: FitResult) -> list[str]:
     """The unmodelled torque, and what of the errors it makes."""
-    if result.problem.options.level == "none":
+    kind = result.problem.options.level
+    if kind == "none":
         return []
     pairs = list(zip(np.asarray(result.level), np.asarray(result.level_errors), strict=True))
-    if result.problem.options.level != "estimate per axis":
-        pairs = pairs[:1]
-    level = ", ".join(
-        _with_error(*x) if x[0] > 0 else f"0 (of {_size(float(x[1]))} nothing would be seen)"
-        for x in pairs
-    )
-    own, whole = (np.diagonal(np.asarray(x)) for x in
-                  (result.sensor_covariance, result.numbers_covariance))  # fmt: skip
-    part = 100 * math.sqrt(float(np.median(own / np.maximum(whole, 1e-300)))) if own.size else 100
+    pairs = pairs if kind == "estimate per axis" else pairs[:1]
+    unseen = "0 (of {:.2g} nothing would be seen)"
+    level = ", ".join(_with_error(*x) if x[0] > 0 else unseen.format(x[1]) for x in pairs)
+    own = np.diagonal(np.asarray(result.sensor_covariance))
+    part = 100 * np.sqrt(np.median(own / _diagonal(result.numbers_covariance))) if own.size else 100
     return [
         f"  unmodelled torque {level} N m s^1/2; the sensors alone would make {part:.0f} % of the "
         "errors"
@@ -259,39 +200,31 @@ def report(result: FitResult) -> str:
     """The fit in words."""
     if isinstance(result.chi_square, jax.core.Tracer):
         return "FitResult under a transformation"
-    names = [x for x in dir(Status) if x.isupper()]
-    codes = {int(getattr(Status, name)._value): name for name in names}
+    codes = {int(getattr(Status, x)._value): x for x in dir(Status) if x.isupper()}
     value = np.asarray(result.status._value)
     if value.ndim:
-        counts = {name: int(np.sum(value == code)) for code, name in sorted(codes.items())}
-        text = ", ".join(f"{n} {name}" for name, n in counts.items() if n)
+        counts = {codes[code]: np.sum(value == code) for code in sorted(codes)}
+        text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         return f"{value.size} fits: {text}"
-    lines = [f"{codes[int(value)]}: {Status[result.status]}"]
-    kept = int(np.sum(result.kept))
-    throws = result.state.omega.shape[0]
-    seen = f"{kept} samples" + (f" of {throws} throws" if throws > 1 else "")
-    steps = int(np.sum(np.isfinite(result.history)))
-    freedom, noise = int(result.degrees_of_freedom), " (noise taken from the residuals)"
-    lines.append(
-        f"  {seen}, {steps} steps; chi-square {float(result.chi_square):.1f} for {freedom} degrees "
-        "of freedom" + noise * (not result.problem.options.noise_known)
-    )
-    spoilt = np.flatnonzero(np.asarray(result.spoilt))
-    if spoilt.size:
-        lines.append("  throws left out: " + ", ".join(str(i) for i in spoilt))
-    several = len(result.unknowns.shapes) > 1
+    throws, steps = result.state.omega.shape[0], np.sum(np.isfinite(result.history))
+    seen = f"{np.sum(result.kept)} samples" + f" of {throws} throws" * (throws > 1)
+    noise = " (noise taken from the residuals)" * (not result.problem.options.noise_known)
+    lines = [
+        f"{codes[int(value)]}: {Status[result.status]}",
+        f"  {seen}, {steps} steps; chi-square {result.chi_square:.1f} for "
+        f"{result.degrees_of_freedom} degrees of freedom{noise}",
+    ]
+    spoilt = ", ".join(map(str, np.flatnonzero(result.spoilt)))
+    lines += [f"  throws left out: {spoilt}"] * bool(spoilt)
     for i, body in enumerate(result.bodies):
-        lines += [f"  body {i}"] * several
-        lines += ["  ratios   not determined"] if bool(result.pure_spin) else _of_tensor(body)
+        lines += [f"  body {i}"] * (len(result.bodies) > 1)
+        lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(body)
     lines += _of_level(result)
-    for name, (value, error) in result.leaves.items():
-        if np.shape(value)[:1] == (throws,) and throws > 1 and np.ndim(value) > 1:
-            continue
-        pairs = zip(np.ravel(value), np.ravel(error), strict=True)
-        lines.append(f"  {name} = " + ", ".join(_with_error(v, e) for v, e in pairs))
+    each = {x.name for x in result.unknowns.own if x.base.ndim and throws > 1}  # too many
+    pairs = {name: pair for name, pair in result.leaves.items() if name not in each}
+    lines += [f"  {name} = {_with_errors(*pair)}" for name, pair in pairs.items()]
     if throws == 1:
         omega = ", ".join(f"{x:.5g}" for x in np.asarray(result.state.omega)[0])
-        lines.append(f"  rates at t = {float(result.t0[0]):.6g} s: ({omega}) rad/s")
-    untold = result.null_directions
-    lines.append("  not told by the record: " + ("; ".join(untold) if untold else "nothing"))
+        lines.append(f"  rates at t = {result.t0[0]:.6g} s: ({omega}) rad/s")
+    lines.append("  not told by the record: " + ("; ".join(result.null_directions) or "nothing"))
     return "\n".join(lines + [f"  {note}" for note in remarks(result)])
