@@ -224,9 +224,8 @@ def _normalised(record: Record, guess: Array, width: int) -> tuple[Array, ...]:
     known, values, sensor = record.known, record.values, record.sensor
     dtype, size = values.dtype, record.degrees
     seen = jnp.any(known, axis=-1, keepdims=True)
-    there = seen & jnp.isfinite(values) if sensor.degrees is None else seen
     harmless = jnp.zeros_like(values).at[..., 0].set(float(sensor.unit_length))
-    values = jnp.where(there, values, harmless)
+    values = jnp.where(seen & jnp.isfinite(values), values, harmless)
     eye = jnp.broadcast_to(jnp.eye(size, dtype=dtype), (*known.shape, size))
     if record.covariance is not None:
         lower = jnp.linalg.cholesky(jnp.where(seen[..., None], record.covariance, eye))

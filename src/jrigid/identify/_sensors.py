@@ -25,13 +25,12 @@ _FADING = (
 _EYE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
-def _array(
-    name: str, unit: Any = None, default: Any = (0.0,) * 3, shapes: Any = ((3,),), **metadata: Any
-) -> Any:  # fmt: skip
+def _array(name: str, unit: Any, default: Any = (0.0,) * 3, *shapes: Any, **metadata: Any) -> Any:
     """A field that holds an array of one of these shapes, or None.
 
     The unit of its errors is in powers of the rms of the rates [rad/s] and of that of the values.
     """
+    shapes = shapes or ((3,),)
     convert = lambda x: None if x is None else array_of_shape(name, x, *shapes)  # noqa: E731
     return eqx.field(default=default, converter=convert, metadata=metadata | {"unit": unit})
 
@@ -127,14 +126,14 @@ class Gyro(AbstractSensor):
     on_attitude: ClassVar[bool] = False
     bias: Float[Array, "3"] = _array("bias", (1, 0))
     drift: Float[Array, "3"] = _array("drift", (2, 0))
-    scale: Float[Array, "..."] = _array("scale", (0, 0), 1.0, ((), (3,)))
+    scale: Float[Array, "..."] = _array("scale", (0, 0), 1.0, (), (3,))
     misalignment: Float[Array, "3"] = _array("misalignment", (0, 0))
-    matrix: Float[Array, "3 3"] = _array("matrix", (0, 0), _EYE, ((3, 3),))
-    delay: Float[Array, ""] | None = _array("delay", (-1, 0), None, ((),))
+    matrix: Float[Array, "3 3"] = _array("matrix", (0, 0), _EYE, (3, 3))
+    delay: Float[Array, ""] | None = _array("delay", (-1, 0), None, ())
     time_constant: Float[Array, ""] | None = _array(
-        "time_constant", (-1, 0), None, ((),), positive=True
+        "time_constant", (-1, 0), None, (), positive=True
     )
-    limit: Float[Array, "..."] | None = _array("limit", None, None, ((), (3,)))
+    limit: Float[Array, "..."] | None = _array("limit", None, None, (), (3,))
 
     def _matrix(self, dtype: Any) -> Array:
         turn = rotation.to_matrix(rotation.exp(self.misalignment.astype(dtype)))
