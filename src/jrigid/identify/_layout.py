@@ -1,14 +1,16 @@
 """Where a record is cut into segments, and the states they start from."""
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._checks import is_concrete
 from jrigid._numerics import safe_norm
-from jrigid.identify._records import Record, Samples
+from jrigid.identify._records import Record, Samples, first_and_last
 from jrigid.rotation import conjugate, exp, log, multiply, normalize
 
 MOST_NODES = 2000  # of a throw, where each sample has one
@@ -37,51 +39,60 @@ class Told(NamedTuple):
     attitude: Array | None
 
 
-def first_and_last(ts: Array, there: Array) -> tuple[Array, Array]:
-    """Times of the first and last samples of each throw; zero for one without samples."""
-    first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1)
-    last = jnp.max(jnp.where(there, ts, -jnp.inf), axis=1)
-    some = jnp.any(there, axis=1)
-    return jnp.where(some, first, 0.0), jnp.where(some, last, 0.0)
+def _before(there: Array) -> Array:
+    """Index of the last sample that is there, before each; -1 up to the first."""
+    latest = jax.lax.cummax(jnp.where(there, jnp.arange(there.size), -1))
+    return jnp.roll(latest, 1).at[0].set(-1)
 
 
 def _nearest_before(ts: Array, there: Array, t: Array) -> Array:
-    """Index of the last sample not after t; of the first one if all are later."""
-    times = jnp.where(there, ts, jnp.inf)
-    before = jnp.where(there & (ts <= t), ts, -jnp.inf)
-    return jnp.where(jnp.any(there & (ts <= t)), jnp.argmax(before), jnp.argmin(times))
+    """Index of the last sample not after each t; of the first one if all are later."""
+    times = jax.lax.cummax(jnp.where(there, ts, -jnp.inf))
+    after = jnp.searchsorted(times, t, side="right")
+    latest = _before(jnp.append(there, False))[after]
+    return jnp.where(latest < 0, jnp.argmax(there), latest)
 
 
 def _slopes(ts: Array, there: Array, attitude: Array) -> Array:
     """Rates from attitudes: the mean of the turns to the samples on either side."""
-    count = ts.shape[0]
-    index = jnp.arange(count)
-    last = jax.lax.associative_scan(jnp.maximum, jnp.where(there, index, -1))
-    before = jnp.concatenate([jnp.full(1, -1), last[:-1]])
-    following = jnp.where(there, index, count)[::-1]
-    next_ = jax.lax.associative_scan(jnp.minimum, following)[::-1]
-    after = jnp.concatenate([next_[1:], jnp.full(1, count)])
+    count, before = ts.size, _before(there)
+    after = count - 1 - _before(there[::-1])[::-1]
 
     def turn(a: Array, b: Array) -> tuple[Array, Array]:
-        ok = (a >= 0) & (b < count)
-        a, b = jnp.clip(a, 0, count - 1), jnp.clip(b, 0, count - 1)
         step = ts[b] - ts[a]
-        ok = ok & (step > 0)
+        ok = (a >= 0) & (b < count) & (step > 0)
         vector = log(normalize(multiply(conjugate(attitude[a]), attitude[b])))
-        return jnp.where(ok, vector / jnp.where(ok, step, 1.0), 0.0), ok.astype(ts.dtype)
+        return jnp.where(ok, vector / jnp.where(ok, step, 1.0), 0.0), ok
 
     def at(i: Array) -> Array:
-        left, a = turn(before[i], i)
-        right, b = turn(i, after[i])
-        return (left + right) / jnp.maximum(a + b, 1.0)
+        (left, is_left), (right, is_right) = turn(before[i], i), turn(i, after[i])
+        return (left + right) / jnp.where(is_left & is_right, 2.0, 1.0)
 
-    return jax.vmap(at)(index)
+    return jax.vmap(at)(jnp.arange(count))
 
 
-def _carried(attitude: Array, omega: Array, late: Array) -> Array:
-    """Attitudes a time later, at the rates there: (throws, n)."""
-    turn = jax.vmap(jax.vmap(lambda q, w, dt: multiply(q, exp(w * dt))))
-    return turn(attitude, omega, late)
+def _turned(ts: Array, there: Array, rates: Array) -> Array:
+    """Rates (n, k) by time, since the sample before: by the mean of the two."""
+    last = _before(there)
+    step = jnp.where(there & (last >= 0), jnp.maximum(ts - ts[last], 0.0), 0.0)
+    return 0.5 * (rates[last] + rates) * step[:, None]
+
+
+_carried = jax.vmap(lambda q, rate, late: multiply(q, exp(rate * late)))  # an attitude on the way
+
+
+def _reckoned(ts: Array, there: Array, omega: Array, q_ts: Array, q_ok: Array, q: Array) -> Array:
+    """Attitudes by dead reckoning, each from the last that was seen."""
+    latest = _nearest_before(q_ts, q_ok, ts)
+    seen = _carried(q[latest], omega, ts - q_ts[latest])
+    fresh = (latest != jnp.roll(latest, 1)).at[0].set(True)
+
+    def turn(q: Array, sample: tuple) -> tuple[Array, Array]:
+        vector, now, anew = sample
+        q = jnp.where(anew, now, normalize(multiply(q, exp(vector))))
+        return q, q
+
+    return jax.lax.scan(turn, q[0], (_turned(ts, there, omega), seen, fresh))[1]
 
 
 def told_by(records: tuple[Record, ...], samples: Samples, attitude0: Array | None) -> Told | None:
@@ -91,72 +102,28 @@ def told_by(records: tuple[Record, ...], samples: Samples, attitude0: Array | No
         for record, values, part in zip(records, samples.values, samples.parts, strict=True):
             seen = jax.vmap(jax.vmap(getattr(record.sensor, name)))(values)
             if seen is not None:
-                weight, sign = samples.weight[:, part], samples.sign[:, part]
-                there = jnp.all((weight > 0) & (sign == 0), axis=-1)
+                plain = (samples.weight[:, part] > 0) & (samples.sign[:, part] == 0)
+                there = jnp.all(plain, axis=-1)
                 return jnp.where(there, samples.ts[:, part], 0.0), there, seen
         return None
 
     rates, attitudes = first("rates"), first("attitude")
     if rates is None:
-        if attitudes is None:
-            return None
-        return Told(*attitudes[:2], jax.vmap(_slopes)(*attitudes), attitudes[2])
+        return attitudes and Told(*attitudes[:2], jax.vmap(_slopes)(*attitudes), attitudes[2])
     ts, there, omega = rates
     omega = jnp.where(there[..., None], omega, 0.0)
-    if attitudes is not None:
-        q_ts, q_there, q = attitudes
-        latest = jax.vmap(lambda t, a, b: jax.vmap(lambda t: _nearest_before(a, b, t))(t))(
-            ts, q_ts, q_there
-        )
-        at = jax.vmap(lambda x, i: x[i])
-        seen, late = at(q, latest), ts - at(q_ts, latest)
-        fresh = jnp.concatenate(
-            [jnp.ones_like(there[:, :1]), latest[:, 1:] != latest[:, :-1]], axis=1
-        )
-        found = jax.vmap(_reckoned)(ts, there, omega, q[:, 0], _carried(seen, omega, late), fresh)
-        return Told(ts, there, omega, found)
-    if attitude0 is None:
-        return Told(ts, there, omega, None)
-    none = jnp.zeros((*ts.shape, 4), ts.dtype).at[..., 0].set(1), jnp.zeros(ts.shape, bool)
-    return Told(ts, there, omega, jax.vmap(_reckoned)(ts, there, omega, attitude0, *none))
-
-
-def _reckoned(
-    ts: Array, there: Array, omega: Array, attitude0: Array, seen: Array, fresh: Array
-) -> Array:
-    """Attitudes by dead reckoning from those that are fresh: by the mean of neighbouring rates."""
-
-    def turn(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
-        q, t, w, any_ = carry
-        time, rate, ok, now, anew = sample
-        step = jnp.where(ok & any_, time - t, 0.0)
-        q = normalize(multiply(q, exp(0.5 * (w + rate) * step)))
-        q = jnp.where(anew, now, q)
-        carry = q, jnp.where(ok, time, t), jnp.where(ok, rate, w), any_ | ok
-        return carry, q
-
-    start = attitude0, ts[0], omega[0], jnp.asarray(False)
-    return jax.lax.scan(turn, start, (ts, omega, there, seen, fresh))[1]
+    if attitudes is None and attitude0 is not None:
+        start = first_and_last(ts, there)[0][:, None]
+        attitudes = start, jnp.ones_like(start, bool), attitude0[:, None]
+    found = attitudes and jax.vmap(_reckoned)(ts, there, omega, *attitudes)
+    return Told(ts, there, omega, found)
 
 
 def angle_turned(told: Told) -> Array:
     """Radians turned up to each sample, from the rates there."""
-
-    def throw(ts: Array, there: Array, omega: Array) -> Array:
-        speed = jnp.where(there, jax.vmap(safe_norm)(omega), 0.0)
-
-        def add(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
-            total, t, w, any_ = carry
-            time, rate, ok = sample
-            step = jnp.where(ok & any_, jnp.maximum(time - t, 0.0), 0.0)
-            total = total + 0.5 * (rate + w) * step
-            carry = total, jnp.where(ok, time, t), jnp.where(ok, rate, w), any_ | ok
-            return carry, total
-
-        zero = jnp.zeros_like(ts[0])
-        return jax.lax.scan(add, (zero, zero, zero, jnp.asarray(False)), (ts, speed, there))[1]
-
-    return jax.vmap(throw)(told.ts, told.there, told.omega)
+    speed = jnp.where(told.there, jax.vmap(jax.vmap(safe_norm))(told.omega), 0.0)
+    turned = jax.vmap(_turned)(told.ts, told.there, speed[..., None])
+    return jnp.cumsum(turned[..., 0], axis=1)
 
 
 def is_coarse(told: Told) -> Array:
@@ -180,53 +147,33 @@ def segments(samples: Samples, told: Told, nodes: int, length: float) -> tuple[L
 
     They are longer where the nodes do not suffice.
     """
-    ts, whole_ = samples.ts, whole(samples, nodes)
-    count = jnp.cumsum(told.there, axis=1).astype(ts.dtype)
-    measure = angle_turned(told) if length else count - 0.5
+    layout = whole(samples, nodes)
+    count = jnp.cumsum(told.there, axis=1).astype(samples.ts.dtype)
+    most = max(nodes - 1, 1) if length else nodes
 
-    def throw(measure: Array, times: Array, ok: Array) -> tuple[Array, ...]:
-        most = max(nodes - 1, 1) if length else nodes
+    def throw(layout: Layout, measure: Array, times: Array, ok: Array) -> tuple[Layout, Array]:
         part = jnp.maximum(length or 1.0, measure[-1] / most)
-        part = jnp.floor(measure / part * (1 - 1e-12)).astype(int)
-        count = part.size
+        part, last = jnp.floor(measure / part * (1 - 1e-12)).astype(int), _before(ok)
+        new = ok & ((last < 0) | (part != part[last]))
+        opening, used = jnp.nonzero(new, size=nodes)[0], jnp.arange(nodes) < jnp.sum(new)
+        # The first node stands at the first sample of any kind.
+        start = times[opening].at[0].set(layout.start[0])
+        node = jnp.searchsorted(jnp.where(used, start, jnp.inf), layout.ts, side="right") - 1
+        linked = jnp.append(used[1:], False)
+        end = jnp.where(linked, jnp.roll(start, -1), start)
+        node = jnp.clip(node.astype(int), 0, nodes - 1)
+        return Layout(layout.ts, node, start, end, linked, layout.since), opening
 
-        def rank(carry: tuple, sample: tuple) -> tuple[tuple, Array]:
-            last, index = carry
-            now, here = sample
-            new = here & (now != last)
-            index = jnp.where(new, index + 1, index)
-            return (jnp.where(new, now, last), index), index
-
-        _, index = jax.lax.scan(rank, (jnp.asarray(-1), jnp.asarray(-1)), (part, ok))
-        index = jnp.clip(index, 0, nodes - 1)
-        opening = jax.ops.segment_min(jnp.where(ok, jnp.arange(count), count), index, nodes)
-        used = opening < count
-        opening = jnp.where(used, opening, 0)
-        return opening, used, times[opening]
-
-    opening, used, start = jax.vmap(throw)(measure, told.ts, told.there)
-    # The first node stands at the first sample of any kind.
-    start = start.at[:, 0].set(whole_.start[:, 0])
-    reach = jnp.where(used, start, jnp.inf)
-    node = jax.vmap(
-        lambda starts, t: jnp.clip(
-            jnp.searchsorted(starts, t, side="right").astype(int) - 1, 0, nodes - 1
-        )
-    )(reach, ts)
-    following = jnp.concatenate([used[:, 1:], jnp.zeros_like(used[:, :1])], axis=1)
-    linked = used & following
-    end = jnp.where(linked, jnp.roll(start, -1, axis=1), start)
-    return Layout(ts, node, start, end, linked, whole_.since), opening
+    measure = angle_turned(told) if length else count - 0.5
+    return jax.vmap(throw)(layout, measure, told.ts, told.there)
 
 
 def node_states(told: Told, opening: Array, start: Array) -> tuple[Array, Array | None]:
     """States at the nodes, as observed."""
-    omega = jax.vmap(lambda w, i: w[i])(told.omega, opening)
-    if told.attitude is None:
-        return omega, None
-    at = jax.vmap(lambda q, i: q[i])(told.attitude, opening)
-    late = start - jax.vmap(lambda t, i: t[i])(told.ts, opening)
-    return omega, _carried(at, omega, late)
+    at = jax.vmap(lambda told, i: jtu.tree_map(lambda x: x[i], told))(told, opening)
+    if at.attitude is None:
+        return at.omega, None
+    return at.omega, jax.vmap(_carried)(at.attitude, at.omega, start - at.ts)
 
 
 def segments_needed(angle: Array, n: int, length: float) -> int:
@@ -234,9 +181,6 @@ def segments_needed(angle: Array, n: int, length: float) -> int:
     if not length:
         return min(n, MOST_NODES)
     most = n // 2 + 2
-    if not is_concrete(angle) or not float(angle) >= 0:
+    if not is_concrete(angle) or not 0 <= float(angle) < math.inf:
         return most
-    needed = 2
-    while needed < float(angle) / length + 2:
-        needed *= 2
-    return min(needed, most)
+    return min(2 ** math.ceil(math.log2(float(angle) / length + 2)), most)

@@ -1,6 +1,8 @@
 """What sensors show of the motion, and the errors they make: objects with arrays to seek."""
+# ruff: noqa: ARG002 (all take what one of them needs)
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -8,20 +10,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import array_of_shape, check_option
+from jrigid import rotation
+from jrigid._checks import array_of_shape, check_option, demand
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Readable
 from jrigid.dynamics import State, angular_momentum
-from jrigid.rotation import (
-    conjugate,
-    exp,
-    log,
-    multiply,
-    normalize,
-    rotate,
-    rotate_inverse,
-    to_matrix,
-)
 from jrigid.systems import AbstractSystem
 
 # Gauss and Laguerre's rule: the mean over a memory that fades as exp(-u), to u^5.
@@ -29,15 +22,21 @@ _FADING = (
     (0.4157745567834791, 2.294280360279042, 6.289945082937479),
     (0.711093009929173, 0.2785177335692409, 0.0103892565015861),
 )
+_EYE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
-def _vector(name: str, *shapes: tuple[int, ...]) -> Any:
-    """A field that holds an array of one of these shapes, or None."""
+def _array(name: str, unit: Any, default: Any = (0.0,) * 3, *shapes: Any, **metadata: Any) -> Any:
+    """A field that holds an array of one of these shapes, or None.
 
-    def convert(value: Any) -> Array | None:
-        return None if value is None else array_of_shape(name, value, *shapes)
+    The unit of its errors is in powers of the rms of the rates [rad/s] and of that of the values.
+    """
+    shapes = shapes or ((3,),)
+    convert = lambda x: None if x is None else array_of_shape(name, x, *shapes)  # noqa: E731
+    return eqx.field(default=default, converter=convert, metadata=metadata | {"unit": unit})
 
-    return convert
+
+def _vector(name: str) -> Any:
+    return lambda value: array_of_shape(name, value, 3)
 
 
 class AbstractSensor(Readable):
@@ -85,17 +84,19 @@ class AbstractSensor(Readable):
             rate: Of the record, rms [rad/s].
             size: Of the values, rms.
         """
-        del rate, size
-        return self
+        sizes = {}
+        for x in dataclasses.fields(self):
+            value, powers = getattr(self, x.name), x.metadata.get("unit")
+            if powers and value is not None:
+                sizes[x.name] = jnp.full(value.shape, rate ** powers[0] * size ** powers[1])
+        return dataclasses.replace(self, **sizes) if sizes else self
 
     def rates(self, value: Array) -> Array | None:
         """The body's rates that a value tells of by itself, or None."""
-        del value
         return None
 
     def attitude(self, value: Array) -> Array | None:
         """The attitude that a value tells of by itself, or None."""
-        del value
         return None
 
 
@@ -123,32 +124,24 @@ class Gyro(AbstractSensor):
     """
 
     on_attitude: ClassVar[bool] = False
-    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
-    drift: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("drift", (3,)))
-    scale: Float[Array, "..."] = eqx.field(default=1.0, converter=_vector("scale", (), (3,)))
-    misalignment: Float[Array, "3"] = eqx.field(
-        default=(0.0,) * 3, converter=_vector("misalignment", (3,))
+    bias: Float[Array, "3"] = _array("bias", (1, 0))
+    drift: Float[Array, "3"] = _array("drift", (2, 0))
+    scale: Float[Array, "..."] = _array("scale", (0, 0), 1.0, (), (3,))
+    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0))
+    matrix: Float[Array, "3 3"] = _array("matrix", (0, 0), _EYE, (3, 3))
+    delay: Float[Array, ""] | None = _array("delay", (-1, 0), None, ())
+    time_constant: Float[Array, ""] | None = _array(
+        "time_constant", (-1, 0), None, (), positive=True
     )
-    matrix: Float[Array, "3 3"] = eqx.field(
-        default=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        converter=_vector("matrix", (3, 3)),
-    )
-    delay: Float[Array, ""] | None = eqx.field(default=None, converter=_vector("delay", ()))
-    time_constant: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_vector("time_constant", ()), metadata={"positive": True}
-    )
-    limit: Float[Array, "..."] | None = eqx.field(
-        default=None, converter=_vector("limit", (), (3,))
-    )
+    limit: Float[Array, "..."] | None = _array("limit", None, None, (), (3,))
 
     def _matrix(self, dtype: Any) -> Array:
-        turn = to_matrix(exp(self.misalignment.astype(dtype)))
+        turn = rotation.to_matrix(rotation.exp(self.misalignment.astype(dtype)))
         scale = jnp.broadcast_to(self.scale, (3,)).astype(dtype)
         return product("ij,j,kj->ik", self.matrix.astype(dtype), scale, turn)
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The reading [rad/s], without delay and limit."""
-        del system
         dtype = state.omega.dtype
         offset = self.bias.astype(dtype) + self.drift.astype(dtype) * jnp.asarray(t, dtype)
         return product("ij,j->i", self._matrix(dtype), state.omega) + offset
@@ -159,7 +152,7 @@ class Gyro(AbstractSensor):
             return None
         lags, weights = jnp.zeros(1), jnp.ones(1)
         if self.time_constant is not None:
-            lags, weights = (jnp.asarray(x, self.time_constant.dtype) for x in _FADING)
+            lags, weights = jnp.asarray(_FADING, self.time_constant.dtype)
             lags = lags * self.time_constant
         if self.delay is not None:
             lags = lags.astype(self.delay.dtype) + self.delay
@@ -168,17 +161,6 @@ class Gyro(AbstractSensor):
     def largest(self) -> Array | None:
         """The limit."""
         return None if self.limit is None else jnp.broadcast_to(self.limit, (3,))
-
-    def units(self, rate: Array, size: Array) -> "Gyro":
-        """Biases in units of the rate, times in radians turned."""
-        del size
-        one, second = jnp.ones((), rate.dtype), 1 / rate
-        late = None if self.delay is None else second
-        slow = None if self.time_constant is None else second
-        return Gyro(
-            rate * jnp.ones(3), rate**2 * jnp.ones(3), jnp.broadcast_to(one, self.scale.shape),
-            jnp.ones(3, rate.dtype), jnp.ones((3, 3), rate.dtype), late, slow, self.limit,
-        )  # fmt: skip
 
     def rates(self, value: Array) -> Array:
         """The reading, less what is known of the errors."""
@@ -203,8 +185,8 @@ class Accelerometer(AbstractSensor):
     """
 
     on_attitude: ClassVar[bool] = False
-    lever: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("lever", (3,)))
-    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
+    lever: Float[Array, "3"] = _array("lever", (-2, 1))
+    bias: Float[Array, "3"] = _array("bias", (0, 1))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The specific force [m/s^2]."""
@@ -212,10 +194,6 @@ class Accelerometer(AbstractSensor):
         lever, bias = self.lever.astype(omega.dtype), self.bias.astype(omega.dtype)
         rate = system.vector_field(t, system.with_parts(state), None).omega
         return jnp.cross(rate, lever) + jnp.cross(omega, jnp.cross(omega, lever)) + bias
-
-    def units(self, rate: Array, size: Array) -> "Accelerometer":
-        """The lever that gives values of this size, and the values."""
-        return Accelerometer(size / rate**2 * jnp.ones(3), size * jnp.ones(3))
 
 
 class Magnetometer(AbstractSensor):
@@ -229,19 +207,14 @@ class Magnetometer(AbstractSensor):
     >>> north = jr.identify.Magnetometer(jnp.array([20.0, 0.0, -40.0]))
     """
 
-    field: Float[Array, "3"] = eqx.field(converter=_vector("field", (3,)))
-    bias: Float[Array, "3"] = eqx.field(default=(0.0,) * 3, converter=_vector("bias", (3,)))
+    field: Float[Array, "3"] = eqx.field(converter=_vector("field"), metadata={"unit": (0, 1)})
+    bias: Float[Array, "3"] = _array("bias", (0, 1))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The field in the body, in its own unit."""
-        del t, system
         dtype = state.omega.dtype
-        return rotate_inverse(state.attitude, self.field.astype(dtype)) + self.bias.astype(dtype)
-
-    def units(self, rate: Array, size: Array) -> "Magnetometer":
-        """The size of the values."""
-        del rate
-        return Magnetometer(size * jnp.ones(3), size * jnp.ones(3))
+        field = rotation.rotate_inverse(state.attitude, self.field.astype(dtype))
+        return field + self.bias.astype(dtype)
 
 
 class AttitudeSensor(AbstractSensor):
@@ -257,27 +230,21 @@ class AttitudeSensor(AbstractSensor):
     width: ClassVar[int | None] = 4
     degrees: ClassVar[int | None] = 3
     unit_length: ClassVar[bool] = True
-    misalignment: Float[Array, "3"] = eqx.field(
-        default=(0.0,) * 3, converter=_vector("misalignment", (3,))
-    )
+    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The attitude."""
-        del t, system
-        return multiply(state.attitude, exp(self.misalignment.astype(state.attitude.dtype)))
+        q = state.attitude
+        return rotation.multiply(q, rotation.exp(self.misalignment.astype(q.dtype)))
 
     def difference(self, value: Array, predicted: Array) -> Array:
         """Rotation vector from the observed to the predicted attitude, body axes."""
-        return log(multiply(conjugate(value), predicted))
-
-    def units(self, rate: Array, size: Array) -> "AttitudeSensor":
-        """A radian."""
-        del size
-        return AttitudeSensor(jnp.ones(3, rate.dtype))
+        return rotation.log(rotation.multiply(rotation.conjugate(value), predicted))
 
     def attitude(self, value: Array) -> Array:
         """The attitude, less the misalignment."""
-        return normalize(multiply(value, exp(-self.misalignment.astype(value.dtype))))
+        turn = rotation.exp(-self.misalignment.astype(value.dtype))
+        return rotation.normalize(rotation.multiply(value, turn))
 
 
 class DirectionSensor(AbstractSensor):
@@ -293,7 +260,7 @@ class DirectionSensor(AbstractSensor):
 
     degrees: ClassVar[int | None] = 2
     unit_length: ClassVar[bool] = True
-    of: Float[Array, "3"] = eqx.field(converter=_vector("of", (3,)))
+    of: Float[Array, "3"] = eqx.field(converter=_vector("of"))
     seen_from: str = eqx.field(static=True, default="body")
 
     def __check_init__(self) -> None:
@@ -302,9 +269,8 @@ class DirectionSensor(AbstractSensor):
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The direction."""
-        del t, system
         of = self.of.astype(state.omega.dtype)
-        turn = rotate_inverse if self.seen_from == "body" else rotate
+        turn = rotation.rotate_inverse if self.seen_from == "body" else rotation.rotate
         return turn(state.attitude, of / safe_norm(of))
 
     def difference(self, value: Array, predicted: Array) -> Array:
@@ -355,11 +321,8 @@ class FunctionSensor(AbstractSensor):
 
     def __check_init__(self) -> None:
         """Raise ValueError for what is no function."""
-        if not callable(self.function):
-            raise ValueError(
-                "Argument `function` must be a callable (t, state, system) -> (k,), "
-                f"but it is {self.function!r}."
-            )
+        text = f"a callable (t, state, system) -> (k,), but it is {self.function!r}."
+        demand(callable(self.function), f"Argument `function` must be {text}")
 
     @property
     def on_attitude(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,4 +1,5 @@
 """What is known of a tensor beforehand: shapes of inertia, each with the numbers that are left."""
+# ruff: noqa: ARG002 (all take what one of them needs)
 
 import abc
 from collections.abc import Sequence
@@ -9,16 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_option
+from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import Readable
-from jrigid.identify._parameters import (
-    body_from_log_cholesky,
-    from_second_moments,
-    log_cholesky_from_body,
-    second_moments,
-)
+from jrigid.identify import _parameters
 from jrigid.mass import MassProperties
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
@@ -33,19 +29,24 @@ def as_tensor(inertia: Array) -> Array:
 
 def real_body(tensor: Array, flattest: float) -> Array:
     """The nearest shape of a body with extent in three directions: second moments of trace 1."""
-    values, axes = eigh(2 * second_moments(tensor) / jnp.trace(tensor))
+    values, axes = eigh(2 * _parameters.second_moments(tensor) / jnp.trace(tensor))
     values = jnp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / jnp.sum(values), axes)
 
 
 def is_near_flat(tensor: Array) -> Array:
     """Whether a fit has run into the boundary of real bodies."""
-    return eigh(2 * second_moments(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
+    return eigh(2 * _parameters.second_moments(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
 
 
-def _lower(rows: Sequence[Sequence[Array]]) -> Array:
-    """L L^T."""
-    lower = jnp.stack([jnp.stack(list(row)) for row in rows])
+SIDES = [1, 2, 2], [0, 0, 1]  # of a lower triangle, below its diagonal
+_PLACES = np.eye(9)[[0, 4, 8, 3, 6, 7]].reshape(6, 3, 3)
+
+
+def squared(diagonal: Array, sides: Array) -> Array:
+    """L L^T of a lower triangle."""
+    numbers = jnp.concatenate([diagonal, sides])
+    lower = product("i,ijk->jk", numbers, jnp.asarray(_PLACES, numbers.dtype))
     return product("ik,jk->ij", lower, lower)
 
 
@@ -96,7 +97,6 @@ class AbstractShape(Readable):
 
     def body(self, numbers: Array) -> MassProperties | None:
         """The body about its fixed point, of a shape that tells the mass and where it is."""
-        del numbers
         return None
 
 
@@ -114,17 +114,15 @@ class Tensor(AbstractShape):
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Tensor", Array]:
         """The numbers of the nearest real body."""
-        del known
         sigma = real_body(tensor, flattest)
         lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
-        sizes = jnp.log(jnp.stack([lower[1, 1], lower[2, 2]]))
-        return self, jnp.concatenate([sizes, jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])])
+        return self, jnp.concatenate([jnp.log(jnp.diagonal(lower)[1:]), lower[SIDES]])
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
-        p, one, zero = numbers, jnp.ones_like(numbers[0]), jnp.zeros_like(numbers[0])
-        rows = [[one, zero, zero], [p[2], jnp.exp(p[0]), zero], [p[3], p[4], jnp.exp(p[1])]]
-        return from_second_moments(_lower(rows))
+        return _parameters.from_second_moments(
+            squared(jnp.exp(jnp.pad(numbers[:2], (1, 0))), numbers[2:])
+        )
 
 
 class _InFrame(AbstractShape):
@@ -132,14 +130,16 @@ class _InFrame(AbstractShape):
 
     frame: Float[Array, "3 3"] | None = None
 
-    @abc.abstractmethod
     def sigma(self, numbers: Array) -> Array:
-        """Second moments in the frame, of whatever trace."""
+        """Second moments in the frame, of whatever trace: by default of its axes, the last ones."""
+        return jnp.diag(jnp.exp(jnp.pad(numbers, (3 - numbers.size, 0))))
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
         frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
-        return from_second_moments(product("ik,kl,jl->ij", frame, self.sigma(numbers), frame))
+        return _parameters.from_second_moments(
+            product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
+        )
 
 
 class Moments(_InFrame):
@@ -154,10 +154,6 @@ class Moments(_InFrame):
         values = product("ki,kl,li->i", frame, real_body(tensor, flattest), frame)
         return Moments(frame), jnp.log(values[1:] / values[0])
 
-    def sigma(self, numbers: Array) -> Array:
-        """Diagonal."""
-        return jnp.diag(jnp.exp(jnp.concatenate([jnp.zeros_like(numbers[:1]), numbers])))
-
 
 class Symmetric(_InFrame):
     """Two moments are equal, about an axis that is sought: three numbers."""
@@ -166,13 +162,12 @@ class Symmetric(_InFrame):
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Symmetric", Array]:
         """The odd moment's axis as axis 3 of the frame."""
-        del known
         values, frame = eigh(real_body(tensor, flattest))
         last = values[2] - values[1] > values[1] - values[0]
         frame = jnp.where(last, frame, frame[:, ::-1])
         values = jnp.where(last, values, values[::-1])
-        size = jnp.log(2 * values[2] / (values[0] + values[1]))
-        return Symmetric(frame), jnp.stack([size, jnp.zeros_like(size), jnp.zeros_like(size)])
+        size = jnp.log(2 * values[2:] / (values[0] + values[1]))
+        return Symmetric(frame), jnp.pad(size, (0, 2))
 
     def sigma(self, numbers: Array) -> Array:
         """Of an axis near axis 3."""
@@ -188,14 +183,8 @@ class Top(_InFrame):
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Top", Array]:
         """Of the body's own axes."""
-        del known
         values = jnp.diagonal(real_body(tensor, flattest))
         return self, jnp.log(2 * values[2:] / (values[0] + values[1]))
-
-    def sigma(self, numbers: Array) -> Array:
-        """Diagonal."""
-        one = jnp.ones_like(numbers[0])
-        return jnp.diag(jnp.stack([one, one, jnp.exp(numbers[0])]))
 
 
 class Flat(_InFrame):
@@ -205,15 +194,13 @@ class Flat(_InFrame):
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Flat", Array]:
         """The largest second moment first, the thickness last."""
-        del known
         values, frame = eigh(real_body(tensor, flattest))
-        numbers = jnp.zeros(4, values.dtype).at[0].set(0.5 * jnp.log(values[1] / values[2]))
-        return Flat(frame[:, ::-1]), numbers
+        return Flat(frame[:, ::-1]), jnp.pad(0.5 * jnp.log(values[1:2] / values[2:]), (0, 3))
 
     def sigma(self, numbers: Array) -> Array:
         """L L^T, the third column of L zero."""
-        p, one, zero = numbers, jnp.ones_like(numbers[0]), jnp.zeros_like(numbers[0])
-        return _lower([[one, zero, zero], [p[1], jnp.exp(p[0]), zero], [p[2], p[3], zero]])
+        sizes = jnp.exp(jnp.pad(numbers[:1], (1, 0)))
+        return squared(jnp.pad(sizes, (0, 1)), numbers[1:])
 
 
 class Fixed(AbstractShape):
@@ -229,7 +216,6 @@ class Fixed(AbstractShape):
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Fixed", Array]:
         """No numbers."""
-        del flattest
         return Fixed(known), jnp.zeros(0, tensor.dtype)
 
     def inertia(self, numbers: Array) -> Array:
@@ -271,16 +257,12 @@ class LogCholesky(AbstractShape):
         self.frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
         for name in self.frozen:
             check_option("frozen", name, LOG_CHOLESKY)
-        if not self.names:
-            raise ValueError("Argument `frozen` must leave a number to seek, but it does not.")
-        parameters = log_cholesky_from_body(body)
-        findings = Findings()
-        findings.require(
-            all_finite(parameters),
-            RESULTS.unphysical_inertia,
-            "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not.",
-            body.inertia,
-        )
+        text = "Argument `frozen` must leave a number to seek, but it does not."
+        demand(bool(self.names), text)
+        parameters, findings = _parameters.log_cholesky_from_body(body), Findings()
+        text = "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not."
+        ok, code = all_finite(parameters), RESULTS.unphysical_inertia
+        findings.require(ok, code, text, body.inertia)
         self.parameters = findings.guard(parameters, throw=True)
 
     @property
@@ -290,14 +272,13 @@ class LogCholesky(AbstractShape):
 
     def units(self) -> Array:
         """1, or, of numbers in metres, the size of the body."""
-        body = body_from_log_cholesky(self.parameters)
+        body = _parameters.body_from_log_cholesky(self.parameters)
         square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
         of_length = np.array([name[0] in "st" for name in self.names])
         return jnp.where(of_length, jnp.sqrt(square), 1.0)
 
     def start(self, tensor: Array, known: Array, flattest: float) -> tuple["LogCholesky", Array]:
         """The numbers sought, as they were given."""
-        del known, flattest
         return self, self.parameters[self._indices()].astype(tensor.dtype)
 
     def inertia(self, numbers: Array) -> Array:
@@ -307,7 +288,7 @@ class LogCholesky(AbstractShape):
     def body(self, numbers: Array) -> MassProperties:
         """The body, of other numbers for those that are sought."""
         whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
-        return body_from_log_cholesky(whole)
+        return _parameters.body_from_log_cholesky(whole)
 
     def _indices(self) -> Any:
         return np.array([LOG_CHOLESKY.index(name) for name in self.names])

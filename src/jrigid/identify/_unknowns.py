@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,16 +17,19 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from jrigid._checks import demand
 from jrigid._types import Readable
-from jrigid.identify._shapes import AbstractShape, as_tensor
+from jrigid.identify._records import one_after_another
+from jrigid.identify._shapes import SIDES, AbstractShape, as_tensor, squared
 from jrigid.mass import MassProperties
 from jrigid.torques import Sum, UniformGravity
 
 _LEAST = 1e-3  # of its unit, for a positive number to start from
 
 
-class _Pick(NamedTuple):
-    """An array that `free` picked: its place among the arrays, and how it is sought."""
+@dataclasses.dataclass(frozen=True)
+class _Pick:
+    """In the place of an array, for `free`: which it is, and how it is sought."""
 
     index: int
     sigma: Any = None
@@ -45,7 +48,7 @@ def prior(array: Any, sigma: Any) -> Any:
     >>> print(found.names[5:])
     ('gyro.bias[0]', 'gyro.bias[1]', 'gyro.bias[2]')
     """
-    return jtu.tree_map(lambda x: x._replace(sigma=sigma), array, is_leaf=_is_pick)
+    return jtu.tree_map(lambda x: dataclasses.replace(x, sigma=sigma), array)
 
 
 def each(array: Any) -> Any:
@@ -54,11 +57,7 @@ def each(array: Any) -> Any:
     >>> import jrigid as jr
     >>> free = lambda body, gyro: jr.identify.each(gyro.bias)
     """
-    return jtu.tree_map(lambda x: x._replace(own=True), array, is_leaf=_is_pick)
-
-
-def _is_pick(x: Any) -> bool:
-    return isinstance(x, _Pick)
+    return jtu.tree_map(lambda x: dataclasses.replace(x, own=True), array)
 
 
 class AbstractSought(Readable):
@@ -90,6 +89,10 @@ class AbstractSought(Readable):
     def value(self, x: Array) -> Array:
         """The array."""
 
+    def natural_units(self, x: Array) -> Array:
+        """Units in which an error is large or small."""
+        return jnp.ones_like(x)
+
     def with_errors(self, x: Array, covariance: Array) -> tuple[Array, Array]:
         """The array and its standard errors."""
         slopes = jax.jacfwd(self.value)(x)
@@ -117,6 +120,9 @@ class _Any(AbstractSought):
     def value(self, x: Array) -> Array:
         return self.base + self.unit * x.reshape(self.base.shape)
 
+    def natural_units(self, x: Array) -> Array:
+        return jnp.maximum(jnp.abs(self.value(x)) / self.unit, 1.0).reshape(-1)
+
 
 class _Positive(AbstractSought):
     """Positive: linear in the number where it is large, exponential where it is small."""
@@ -138,14 +144,10 @@ class _Definite(AbstractSought):
     def start(self) -> Array:
         eye = _LEAST * jnp.eye(3, dtype=self.unit.dtype)
         lower = jnp.linalg.cholesky(self.base / jnp.max(self.unit) + eye)
-        sides = jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])
-        return jnp.concatenate([jnp.log(jnp.diagonal(lower)), sides])
+        return jnp.concatenate([jnp.log(jnp.diagonal(lower)), lower[SIDES]])
 
     def value(self, x: Array) -> Array:
-        zero, size = jnp.zeros_like(x[0]), jnp.exp(x[:3])
-        rows = [[size[0], zero, zero], [x[3], size[1], zero], [x[4], x[5], size[2]]]
-        lower = jnp.stack([jnp.stack(row) for row in rows])
-        return jnp.max(self.unit) * (lower @ lower.T)
+        return jnp.max(self.unit) * squared(jnp.exp(x[:3]), x[3:])
 
 
 def _field(tree: Any, path: Sequence[Any]) -> Any:
@@ -153,8 +155,7 @@ def _field(tree: Any, path: Sequence[Any]) -> Any:
     metadata: Any = {}
     for key in path:
         if isinstance(key, jtu.GetAttrKey):
-            fields = {x.name: x.metadata for x in dataclasses.fields(tree)}
-            metadata = fields[key.name]
+            metadata = type(tree).__dataclass_fields__[key.name].metadata
             tree = getattr(tree, key.name)
         else:
             tree = tree[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
@@ -163,45 +164,30 @@ def _field(tree: Any, path: Sequence[Any]) -> Any:
 
 def _named(tree: Any, path: Sequence[Any]) -> str:
     """`torque.coefficient` of a system, `gyro.bias` of a sensor."""
-    part, *inner = path
-    text = jtu.keystr(tuple(inner)).lstrip(".")
-    if part.idx == 0:
+    text, index = jtu.keystr(tuple(path[1:])).lstrip("."), path[0].idx
+    if index == 0:
         return text
-    sensors = [type(x).__name__.lower() for x in tree[1:]]
-    name = sensors[part.idx - 1]
-    return f"{name if sensors.count(name) == 1 else f'{name}{part.idx}'}.{text}"
+    kinds = [type(x).__name__.lower() for x in tree]
+    name = kinds[index]
+    return f"{name if kinds[1:].count(name) == 1 else f'{name}{index}'}.{text}"
 
 
-def _picks(parts: tuple[Any, ...], free: Callable[..., Any] | None) -> list[_Pick]:
+def _picks(paths: Any, tree: Any, rest: Any, free: Callable[..., Any] | None) -> list[_Pick]:
     """What `free` picks among the arrays of the system and the sensors, in their order."""
     if free is None:
         return []
-    arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
-    flat, tree = jtu.tree_flatten(arrays)
-    marked = eqx.combine(tree.unflatten([_Mark(i) for i in range(len(flat))]), rest)
-    marked = jtu.tree_map(lambda x: _Pick(x.index) if isinstance(x, _Mark) else x, marked)
+    marked = eqx.combine(tree.unflatten(map(_Pick, range(len(paths)))), rest)
     accepts = inspect.signature(free).parameters.values()
-    if any(x.kind == x.VAR_POSITIONAL for x in accepts):
-        count = len(parts)
-    else:
-        count = min(len(parts), len(accepts))
-    chosen = jtu.tree_leaves(free(*marked[:count]), is_leaf=_is_pick)
-    paths = [path for path, _ in jtu.tree_leaves_with_path(arrays)]
-    known = {x.index: x for x in chosen if _is_pick(x)}
-    known = {i: x for i, x in known.items() if not jtu.keystr(paths[i]).startswith("[0].inertia")}
-    if not known or not all(map(_is_pick, chosen)):
-        raise ValueError(
-            "Argument `free` must be a function of the system and the sensors that picks floating "
-            "point arrays of theirs, beside the inertia, which is always sought, but it is not."
-        )
+    several = any(x.kind == x.VAR_POSITIONAL for x in accepts)
+    chosen = jtu.tree_leaves(free(*marked[: None if several else len(accepts)]))
+    known = {x.index: x for x in chosen if isinstance(x, _Pick)}
+    known = {i: x for i, x in known.items() if jtu.keystr(paths[i][0][:2]) != "[0].inertia"}
+    demand(
+        bool(known) and all(isinstance(x, _Pick) for x in chosen),
+        "Argument `free` must be a function of the system and the sensors that picks floating "
+        "point arrays of theirs, beside the inertia, which is always sought, but it is not.",
+    )
     return [known[i] for i in sorted(known)]
-
-
-class _Mark:
-    """In the place of an array."""
-
-    def __init__(self, index: int):
-        self.index = index
 
 
 class Unknowns(eqx.Module):
@@ -218,16 +204,17 @@ class Unknowns(eqx.Module):
     hold: Any = None  # what of the numbers is held at zero: a function that is a pytree
 
     @property
+    def shared(self) -> tuple[AbstractSought, ...]:
+        """What is sought for all throws."""
+        return tuple(x for x in self.sought if not x.own)
+
+    @property
     def slices(self) -> dict[str, slice]:
         """Where each part is in the vector for all throws."""
-        parts = {"shape": sum(len(x.names) for x in self.shapes)}
-        parts["scale"] = len(self.shapes) * self.scaled
-        parts.update({x.name: x.size for x in self.sought if not x.own})
-        found, end = {}, 0
-        for name, size in parts.items():
-            found[name] = slice(end, end + size)
-            end += size
-        return found
+        sizes = {"shape": sum(len(x.names) for x in self.shapes)}
+        sizes["scale"] = len(self.shapes) * self.scaled
+        sizes |= {x.name: x.size for x in self.shared}
+        return dict(zip(sizes, one_after_another(sizes.values()), strict=True))
 
     @property
     def size(self) -> int:
@@ -235,15 +222,10 @@ class Unknowns(eqx.Module):
         return max(s.stop for s in self.slices.values())
 
     @property
-    def own(self) -> tuple[AbstractSought, ...]:
-        """What is sought in each throw."""
-        return tuple(x for x in self.sought if x.own)
-
-    @property
     def own_slices(self) -> list[tuple[AbstractSought, slice]]:
         """What is sought in each throw, and where it is in that throw's vector."""
-        ends = np.cumsum([0, *(x.size for x in self.own)])
-        return [(x, slice(int(a), int(a) + x.size)) for x, a in zip(self.own, ends, strict=False)]
+        own = [x for x in self.sought if x.own]
+        return list(zip(own, one_after_another(x.size for x in own), strict=True))
 
     def names(self) -> tuple[str, ...]:
         """One for each number."""
@@ -251,41 +233,32 @@ class Unknowns(eqx.Module):
         end = [f" of body {i}" if several else "" for i in range(len(self.shapes))]
         found = [name + end[i] for i, x in enumerate(self.shapes) for name in x.names]
         found += ["scale" + x for x in end] * self.scaled
-        return (*found, *(name for x in self.sought if not x.own for name in x.names))
+        return (*found, *(name for x in self.shared for name in x.names))
 
     def inertia(self, numbers: Array, body: int | Array = 0) -> Array:
         """The tensor of a body."""
-        dtype, end, found = numbers.dtype, 0, []
+        parts = jnp.split(numbers, np.cumsum([len(x.names) for x in self.shapes]))
+        scales, found = jnp.exp(numbers[self.slices["scale"]]), []
         for i, shape in enumerate(self.shapes):
-            start, end = end, end + len(shape.names)
-            tensor = shape.inertia(numbers[start:end]).astype(dtype)
-            if not shape.absolute:
-                tensor = self.trace * tensor / jnp.trace(tensor)
-            if self.scaled:
-                tensor = tensor * jnp.exp(numbers[self.slices["scale"]][i])
-            found.append(tensor)
+            tensor = shape.inertia(parts[i]).astype(numbers.dtype)
+            tensor = tensor if shape.absolute else self.trace * tensor / jnp.trace(tensor)
+            found.append(tensor * scales[i] if self.scaled else tensor)
         return found[0] if len(found) == 1 else jnp.stack(found)[body]
 
     def start(self, tensors: Array, flattest: float = 1e-3) -> tuple["Unknowns", Array]:
         """Numbers for the bodies' tensors; the frames of their shapes are chosen for them."""
         known = as_tensor(self.original(0)[0].inertia.astype(tensors.dtype))
-        pairs = [
-            shape.start(tensor, known, flattest)
-            for shape, tensor in zip(self.shapes, tensors, strict=True)
-        ]
+        pairs = zip(self.shapes, tensors, strict=True)
+        shapes, numbers = zip(*(x.start(y, known, flattest) for x, y in pairs), strict=True)
         factors = jnp.trace(tensors, axis1=-2, axis2=-1) / self.trace
-        scales = jnp.log(jnp.where(factors > 0, factors, 1.0))[: len(pairs) * self.scaled]
-        shared = [x.start() for x in self.sought if not x.own]
-        numbers = [*(x for _, x in pairs), scales, *shared]
-        unknowns = eqx.tree_at(
-            lambda u: u.shapes, self, tuple(shape for shape, _ in pairs),
-            is_leaf=lambda x: x is None,
-        )  # fmt: skip
-        return unknowns, jnp.concatenate([x.astype(tensors.dtype) for x in numbers])
+        scales = jnp.log(jnp.where(factors > 0, factors, 1.0))[: len(shapes) * self.scaled]
+        numbers = [*numbers, scales, *(x.start() for x in self.shared)]
+        numbers = jnp.concatenate([x.astype(tensors.dtype) for x in numbers])
+        return dataclasses.replace(self, shapes=shapes), numbers
 
     def own_start(self, throws: int, dtype: Any) -> Array:
         """Numbers of each throw."""
-        parts = [jnp.zeros(0, dtype), *(x.start().astype(dtype) for x in self.own)]
+        parts = [jnp.zeros(0, dtype), *(x.start().astype(dtype) for x, _ in self.own_slices)]
         return jnp.tile(jnp.concatenate(parts), (throws, 1))
 
     @property
@@ -299,43 +272,32 @@ class Unknowns(eqx.Module):
         return self._built([x[throw] if own else x for x, own in pairs])
 
     def _built(self, leaves: Sequence[Array]) -> tuple[Any, ...]:
-        arrays = jtu.tree_unflatten(jtu.tree_structure(self.given), leaves)
-        return eqx.combine(arrays, self.rest)
+        return eqx.combine(jtu.tree_structure(self.given).unflatten(leaves), self.rest)
 
     def parts(
         self, numbers: Array, own: Array, leaves: tuple[Array, ...], body: int | Array
     ) -> tuple[Any, ...]:
         """System and sensors of a throw: of its own numbers, the arrays given for it, its body."""
         leaves_, slices = list(leaves), self.slices
-        found = [(x, numbers[slices[x.name]]) for x in self.sought if not x.own]
-        found += [(x, own[s]) for x, s in self.own_slices]
-        for x, part in found:
+        found = [(x, numbers[slices[x.name]]) for x in self.shared]
+        for x, part in found + [(x, own[s]) for x, s in self.own_slices]:
             leaves_[x.index] = x.value(part).astype(numbers.dtype)
         system, *sensors = self._built(leaves_)
-        mass = None
-        if len(self.shapes) == 1:
-            mass = self.shapes[0].body(numbers[: len(self.shapes[0].names)])
-        torque = _of_body(system.torque, mass)
-        inertia = self.inertia(numbers, body)
-        return eqx.tree_at(lambda x: (x.inertia, x.torque), system, (inertia, torque)), *sensors
+        mass = self.shapes[0].body(numbers[slices["shape"]]) if len(self.shapes) == 1 else None
+        changed = self.inertia(numbers, body), _of_body(system.torque, mass)
+        return eqx.tree_at(lambda x: (x.inertia, x.torque), system, changed), *sensors
 
     def natural_units(self, numbers: Array) -> Array:
         """Units in which an error is large or small: for what is picked, its size."""
         units = [x.units() for x in self.shapes] + [jnp.ones(len(self.shapes) * self.scaled)]
-        for x in self.sought:
-            if isinstance(x, _Any) and not x.own:
-                size = jnp.abs(x.value(numbers[self.slices[x.name]])) / x.unit
-                units.append(jnp.maximum(size, 1.0).reshape(-1))
-            elif not x.own:
-                units.append(jnp.ones(x.size))
+        units += [x.natural_units(numbers[self.slices[x.name]]) for x in self.shared]
         return jnp.concatenate([x.astype(numbers.dtype) for x in units])
 
     def prior_rows(self, numbers: Array) -> Array:
         """What is known beforehand of the numbers for all throws, as residuals."""
         rows = [jnp.zeros(0, numbers.dtype)]
-        rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.sought if not x.own]
-        if self.hold is not None:
-            rows.append(self.hold(numbers)[None])
+        rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.shared]
+        rows += [] if self.hold is None else [self.hold(numbers)[None]]
         return jnp.concatenate(rows)
 
     def own_prior_rows(self, own: Array) -> Array:
@@ -345,7 +307,7 @@ class Unknowns(eqx.Module):
 
     def holding(self, hold: Any) -> "Unknowns":
         """The same, with something held."""
-        return eqx.tree_at(lambda x: x.hold, self, hold, is_leaf=lambda x: x is None)
+        return dataclasses.replace(self, hold=hold)
 
 
 def _of_body(torque: Any, body: MassProperties | None) -> Any:
@@ -358,14 +320,9 @@ def _of_body(torque: Any, body: MassProperties | None) -> Any:
 
 
 def unknowns_of(
-    systems: Sequence[Any],
-    sensors: tuple[Any, ...],
-    sizes: Sequence[Array],
-    free: Callable[..., Any] | None,
-    shapes: tuple[AbstractShape, ...],
-    scaled: bool,
-    rate: Array,
-) -> Unknowns:
+    systems: Sequence[Any], sensors: tuple[Any, ...], sizes: Sequence[Array],
+    free: Callable[..., Any] | None, shapes: tuple[AbstractShape, ...], scaled: bool, rate: Array,
+) -> Unknowns:  # fmt: skip
     """Set up the numbers.
 
     Args:
@@ -379,32 +336,26 @@ def unknowns_of(
     """
     dtype, parts = rate.dtype, (systems[0], *sensors)
     arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
-    flat, tree = jtu.tree_flatten(arrays)
-    others = [jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array)) for x in systems]
-    if any(len(x) != len(flat) for x in others):
-        raise ValueError(
-            "Argument `system` must hold bodies of the same kind for all throws, but it does not."
-        )
-    stacked = tuple(any(x[i] is not leaf for x in others) for i, leaf in enumerate(flat))
-    leaves = tuple(
-        jnp.stack([x[i] for x in others]) if own else leaf
-        for i, (leaf, own) in enumerate(zip(flat, stacked, strict=True))
-    )
+    paths, tree = jtu.tree_flatten_with_path(arrays)
+    throws = [jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array)) for x in systems]
+    text = "must hold bodies of the same kind for all throws, but it does not."
+    demand(all(len(x) == len(paths) for x in throws), f"Argument `system` {text}")
+    columns = list(zip(*throws, strict=True))  # of each array
+    stacked = tuple(any(x is not column[0] for x in column) for column in columns)
+    leaves = [jnp.stack(x) if own else x[0] for x, own in zip(columns, stacked, strict=True)]
     units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
     units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
-    paths = [path for path, _ in jtu.tree_leaves_with_path(arrays)]
     sought = []
-    for pick in _picks(parts, free):
-        base, path = flat[pick.index].astype(dtype), paths[pick.index]
+    for pick in _picks(paths, tree, rest, free):
+        path, base = paths[pick.index]
+        base, largest = base.astype(dtype), jnp.max(jnp.abs(base)).astype(dtype)
         of_system = path[0].idx == 0  # type: ignore[union-attr]
-        largest = jnp.max(jnp.abs(base))
         unit = jnp.where(largest > 0, largest, 1.0) if of_system else units[pick.index]
         unit = jax.lax.stop_gradient(jnp.broadcast_to(unit, base.shape).astype(dtype))
         sigma = None if pick.sigma is None else jnp.asarray(pick.sigma, dtype)
-        kind = _Any
-        if _field(parts, path).get("positive"):
-            kind = _Definite if base.shape == (3, 3) else _Positive
+        positive = _Definite if base.shape == (3, 3) else _Positive
+        kind = positive if _field(parts, path).get("positive") else _Any
         sought.append(kind(pick.index, _named(parts, path), pick.own, base, unit, sigma))
-    inertia = as_tensor(systems[0].inertia.astype(dtype))
+    trace = jnp.trace(as_tensor(systems[0].inertia.astype(dtype)))
     given = tree.unflatten(leaves)
-    return Unknowns(given, rest, stacked, tuple(sought), shapes, scaled, jnp.trace(inertia), rate)
+    return Unknowns(given, rest, stacked, tuple(sought), shapes, scaled, trace, rate)
