@@ -112,17 +112,16 @@ def search(
         held = problem.unknowns.holding(Line(normal, jnp.sum(normal * numbers)))
         now = eqx.tree_at(lambda x: x.unknowns, problem, held)
         slow = jnp.where(probing, long, hunt.tried > 0).astype(int)
-        way = jtu.tree_map(lambda x: x[jnp.minimum(slow, x.shape[0] - 1)], stages)
+        way = jtu.tree_map(lambda x: x[slow % x.shape[0]], stages)
 
         def one(way: Way, stage: Stage) -> tuple[Way, None]:
             skip = (stage.steps == 0) | (way.done & ~stage.last)
             run = lambda way: _stage(now, single, cut, way, stage, first, known)  # noqa: E731
             return jax.lax.cond(skip, lambda way: way, run, way), None
 
-        at = point._replace(numbers=numbers)
-        start = begin.found._replace(point=at, steps=best.steps, history=best.history)
-        end = jax.lax.scan(one, begin._replace(found=start), way)[0]
-        return _next(hunt, end, probing, step)
+        at = begin.found._replace(point=point._replace(numbers=numbers))
+        at = at._replace(steps=best.steps, history=best.history)
+        return _next(hunt, jax.lax.scan(one, begin._replace(found=at), way)[0], probing, step)
 
     def _next(hunt: _Hunt, end: Way, probing: Array, step: Array) -> _Hunt:
         """What an attempt says, and what comes after it."""
@@ -138,13 +137,13 @@ def search(
         wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
         bent = wide > _BENT * weakest.error
 
-        wrong = jnp.where(better, off, wrong)
-        choose = lambda a, b: jnp.where(better, a, b)  # noqa: E731
-        best, weakest = jtu.tree_map(choose, (end, seen), (best, weakest))
+        best, weakest, wrong = jtu.tree_map(
+            lambda a, b: jnp.where(better, a, b), (end, seen, off), (best, weakest, wrong)
+        )
         best = best._replace(doubtful=doubtful | bent, wide=wide)
         # A misfit that follows the record has two attempts, any other failure all.
-        lost = (unexplained(problem, best) > EXPLAINED) | (wrong > _FAR)
-        lost = lost | is_at_boundary(problem, best.found)
+        lost = (wrong > _FAR) | is_at_boundary(problem, best.found)
+        lost = lost | (unexplained(problem, best) > EXPLAINED)
         pure = is_pure(problem, best, weakest.noise) & (wrong < 0.5)  # no misfit
         few = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
         few = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, few), count)
@@ -159,8 +158,8 @@ def search(
         return (hunt.tried < count) | (probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR))
 
     far, none = jnp.asarray(jnp.inf, dtype), jnp.zeros_like(point.numbers)
-    weakest = _Weakest(far, jnp.ones((), dtype), far, none, none)
-    hunt = _Hunt(jnp.asarray(0), begin, far, weakest, jnp.asarray(False))
+    nothing = _Weakest(far, jnp.ones((), dtype), far, none, none)
+    hunt = _Hunt(jnp.asarray(0), begin, far, nothing, jnp.asarray(False))
     return jax.lax.while_loop(going, attempt, hunt).best
 
 

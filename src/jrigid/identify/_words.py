@@ -73,9 +73,9 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
     weak = math.sqrt(result.inflation) > LARGEST_ERROR * np.asarray(result.singular_values)
     found += [_untold(result, x) for x in directions[weak]]
     loose = any(np.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies)
-    found += ["I1's ratio to the others"] * loose
-    if result.doubtful:
-        found.append(f"{_untold(result, directions[-1])}, which far from here is as good or nearly")
+    found += ["I1's ratio to the others"] * (loose and not weak.any() and not result.pure_spin)
+    if result.doubtful and not result.pure_spin:
+        found.append(f"{_untold(result, directions[-1])}: others far from it are nearly as good")
     of_state = np.asarray(result.state_singular_values)
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
     if options.on_attitude and count:
@@ -220,7 +220,8 @@ def report(result: FitResult) -> str:
         lines += [f"  body {i}"] * (len(result.bodies) > 1)
         lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(body)
     lines += _of_level(result)
-    each = {x.name for x in result.unknowns.own if x.base.ndim and throws > 1}  # too many
+    own = [x for x in result.unknowns.sought if x.own and x.base.ndim]
+    each = {x.name for x in own if throws > 1}  # too many to print
     pairs = {name: pair for name, pair in result.leaves.items() if name not in each}
     lines += [f"  {name} = {_with_errors(*pair)}" for name, pair in pairs.items()]
     if throws == 1:
