@@ -1,5 +1,6 @@
 """What a fit tells: errors, what the record does not determine, and how the fit ended."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from jrigid.dynamics import State
 from jrigid.identify import _stages as stages
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem
-from jrigid.identify._result import LARGEST_ERROR, FitResult, Status, derive
+from jrigid.identify._result import LARGEST_ERROR, FitResult, Status, derive, errors_of
 from jrigid.identify._smoother import Blocks, Links, Rows, blocks_of, eliminated, reduced
 
 _TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
@@ -138,25 +139,28 @@ def conclude(problem: Problem, layout: Layout, way: stages.Way, input_result: An
         first = stages.first_level(problem, layout, numbers)
         level = jnp.where(stages.is_faint(level, first), 0.0, level)
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
-    judged = _judged(problem, way, told, kicks, units)
+    jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
+    residuals, jacobian = (x[:, : kept.shape[1]] for x in (rows.residual, jacobian))
+    judged = _judged(problem, way, told, kicks, units, residuals)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
-    status = Status.where(input_result == RESULTS.successful, judged["status"], Status.BAD_INPUT)
-    bodies = range(len(unknowns.shapes))
-    derived = tuple(derive(unknowns, i, numbers, covariance) for i in bodies)
+    status, good = judged["status"], input_result == RESULTS.successful
+    count = len(unknowns.shapes)
+    derived = tuple(derive(unknowns, i, numbers, covariance) for i in range(count))
     loose = [jnp.any(x["ratios_errors"] > LARGEST_ERROR * x["ratios"]) for x in derived]
     loose = jnp.any(jnp.stack(loose)) & (status == Status.OK)
-    judged["status"] = Status.where(loose, Status.UNIDENTIFIABLE, status)
-    jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
+    status = Status.where(loose, Status.UNIDENTIFIABLE, status)
+    judged["status"] = Status.where(good, status, Status.BAD_INPUT)
     result = FitResult(
         **judged, **derived[0], numbers=numbers, own_numbers=point.own,
-        sensor_covariance=inflation * sensor.covariance, local_covariance=inflation * told.local,
-        follow=told.follow, scores=scores, state=State(point.attitude[:, 0], point.omega[:, 0]),
-        t0=layout.start[:, 0], residuals=rows.residual[:, : kept.shape[1]],
-        jacobian=jacobian[:, : kept.shape[1]], state_singular_values=sensor.of_state, level=level,
-        level_errors=level_errors, scales=way.scales, kept=kept > 0, history=found.history,
-        doubtful=way.doubtful, input_result=input_result, problem=problem, derived=derived,
+        errors=errors_of(covariance), sensor_covariance=inflation * sensor.covariance,
+        local_covariance=inflation * told.local, follow=told.follow, scores=scores,
+        state=State(point.attitude[:, 0], point.omega[:, 0]), t0=layout.start[:, 0],
+        residuals=residuals, jacobian=jacobian, state_singular_values=sensor.of_state,
+        level=level, level_errors=level_errors, scales=way.scales, kept=kept > 0,
+        history=found.history, doubtful=way.doubtful, input_result=input_result, problem=problem,
+        derived=derived,
     )  # fmt: skip
-    return nan_where(input_result != RESULTS.successful, result)
+    return nan_where(~good, result)
 
 
 def _widened(told: Told, error: Array, units: Array) -> Told:
@@ -168,32 +172,36 @@ def _widened(told: Told, error: Array, units: Array) -> Told:
     return told._replace(values=values, covariance=covariance)
 
 
+def _whiteness(rows: Array, parts: Sequence[slice]) -> tuple[Array, Array]:
+    """Correlation of neighbours, and how many standard deviations that is from 0."""
+    left = jnp.concatenate([rows[:, x.start : x.stop - 1] for x in parts], axis=1)
+    right = jnp.concatenate([rows[:, x.start + 1 : x.stop] for x in parts], axis=1)
+    both = ((left != 0) & (right != 0)).astype(rows.dtype)
+    square = jnp.sum(both * (left**2 + right**2) / 2)
+    like = jnp.sum(left * right) / jnp.maximum(square, jnp.finfo(rows.dtype).tiny)
+    return like, jnp.abs(like) * jnp.sqrt(jnp.sum(both))
+
+
 def _judged(
-    problem: Problem, way: stages.Way, told: Told, kicks: Array, units: Array
+    problem: Problem, way: stages.Way, told: Told, kicks: Array, units: Array, residuals: Array
 ) -> dict[str, Any]:
     """How well a fit describes the record, by residuals and the squares of kicks; how it ended."""
     found, options, count = way.found, problem.options, way.kept.shape[1]
+    whiteness = _whiteness(residuals, problem.samples.parts)
     rows, weight = found.rows.residual[:, :count], stages.weights_of(problem, way.kept)
-    squares, number = jnp.sum(weight * rows * rows), jnp.sum(weight)
     alive = jnp.any(way.kept > 0, axis=1)[:, None]
     shown = jnp.sum((told.of_state > _TOLD * told.of_state[:, :1]) & alive)
     known = found.rows.residual[:, count : found.rows.residual.shape[1] - problem.held]
-    freedom = number + (jnp.sum(known != 0) - units.size - shown).astype(kicks.dtype)
-    chi_square = squares + jnp.sum(known**2) + kicks
-    noise, mean = chi_square / jnp.maximum(freedom, 1.0), squares / jnp.maximum(number, 1.0)
+    freedom = jnp.sum(weight) + (jnp.sum(known != 0) - units.size - shown).astype(kicks.dtype)
+    chi_square = jnp.sum(weight * rows * rows) + jnp.sum(known**2) + kicks
+    noise = chi_square / jnp.maximum(freedom, 1.0)
     if options.noise_known:
         gate = 1 + stages.GATE * jnp.sqrt(2 / jnp.maximum(freedom, 1))
         misfit = (noise > gate) | (jnp.max(way.scales) > 2)
         inflation = jnp.where(misfit, jnp.maximum(noise, 1.0), 1.0)
     else:
-        parts = [slice(x.start, x.stop - 1) for x in problem.samples.parts]
-        after = [slice(x.start + 1, x.stop) for x in problem.samples.parts]
-        turns, pairs = (
-            sum(jnp.sum(x[:, a] * x[:, b]) for a, b in zip(parts, after, strict=True))
-            for x in (weight * rows, weight)
-        )
-        like = turns / jnp.maximum(pairs, 1) / jnp.where(mean > 0, mean, 1.0)
-        misfit = (like > _COLOURED) & (like * jnp.sqrt(pairs) > _WHITE)
+        like, sure = whiteness
+        misfit = (like > _COLOURED) & (sure > _WHITE)
         inflation = noise
     told = _widened(told, way.wide / jnp.sqrt(inflation), units) if units.size else told
     pure, left = stages.is_pure(problem, way, inflation), stages.unexplained(problem, way, kicks)
@@ -207,10 +215,13 @@ def _judged(
     lost = Status.where(found.settled, Status.WRONG_BASIN, Status.NOT_CONVERGED)
     wrong = Status.where((left > stages.EXPLAINED) | flat, lost, Status.MISFIT)
     status = Status.where(misfit, wrong, status)
+    seen = jnp.maximum(jnp.sum(residuals != 0, axis=(1, 2)), 1).astype(kicks.dtype)
     sound = jnp.all(jnp.isfinite(told.covariance)) & (freedom > 0) & jnp.isfinite(chi_square)
     return {
         "status": Status.where(sound, status, Status.NOT_CONVERGED), "chi_square": chi_square,
-        "degrees_of_freedom": freedom.astype(int), "inflation": inflation, "unexplained": left,
-        "pure_spin": pure, "singular_values": told.values, "directions": told.directions,
+        "degrees_of_freedom": freedom.astype(int), "reduced_chi_square": noise,
+        "whiteness": whiteness, "chi_square_by_throw": jnp.sum(residuals**2, axis=(1, 2)) / seen,
+        "inflation": inflation, "unexplained": left, "pure_spin": pure,
+        "singular_values": told.values, "directions": told.directions,
         "numbers_covariance": inflation * told.covariance,
     }  # fmt: skip

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
@@ -57,7 +56,8 @@ _FAR = 1.0  # a change of a number beyond which the tensor is another one
 LARGEST_ERROR = 0.3
 
 
-def _errors(covariance: Array) -> Array:
+def errors_of(covariance: Array) -> Array:
+    """Standard errors."""
     return jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
@@ -85,6 +85,7 @@ class FitResult(eqx.Module):
         numbers: The numbers sought for all throws: see `names`.
         own_numbers: Those sought in each throw (throws, own).
         numbers_covariance: Of `numbers`.
+        errors: Standard errors of `numbers`.
         sensor_covariance: The part of it that the sensors' noise makes.
         local_covariance: Of each throw's state at `t0` (rate, then, if it matters, a small turn of
             the attitude about the body axes) and own numbers, beside given numbers.
@@ -97,6 +98,10 @@ class FitResult(eqx.Module):
         jacobian: Their derivatives in the numbers and in the state of the throw.
         chi_square: Sum of their squares.
         degrees_of_freedom: Residuals less what was sought.
+        reduced_chi_square: Chi-square for each degree of freedom.
+        chi_square_by_throw: Mean square of the residuals of each throw.
+        whiteness: Correlation of neighbouring residuals, and how many standard deviations that is
+            from 0. Near 0 for noise; what a model leaves out changes slowly and brings it near 1.
         unexplained: Of the square of what was observed, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed, descending.
         directions: In the numbers, columns for the singular values.
@@ -138,6 +143,7 @@ class FitResult(eqx.Module):
     numbers: Float[Array, " numbers"]
     own_numbers: Float[Array, "throws own"]
     numbers_covariance: Float[Array, "numbers numbers"]
+    errors: Float[Array, " numbers"]
     sensor_covariance: Float[Array, "numbers numbers"]
     local_covariance: Float[Array, "throws local local"]
     follow: Float[Array, "throws local numbers"]
@@ -149,6 +155,9 @@ class FitResult(eqx.Module):
     jacobian: Float[Array, "throws samples degrees unknowns"]
     chi_square: Scalar
     degrees_of_freedom: Int[Array, ""]
+    reduced_chi_square: Scalar
+    chi_square_by_throw: Float[Array, " throws"]
+    whiteness: tuple[Scalar, Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
@@ -314,10 +323,8 @@ class FitResult(eqx.Module):
         """
         throws, records = self.t0.shape[0], len(self.problem.samples.values)
         for name, value, count in (("record", record, records), ("throw", throw, throws)):
-            demand(
-                0 <= value < count,
-                f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
-            )
+            text = f"Argument `{name}` must be at least 0 and below {count}, but it is {value}."
+            demand(0 <= value < count, text)
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
         after, options = jnp.all(times >= self.t0[throw]), self.problem.options
         backward = options.free_motion or options.motion is not None
@@ -345,21 +352,10 @@ class FitResult(eqx.Module):
         return body
 
     @property
-    def errors(self) -> Float[Array, "*fits numbers"]:
-        """Standard errors of `numbers`."""
-        return _errors(self.numbers_covariance)
-
-    @property
     def correlation(self) -> Float[Array, "*fits all all"]:
         """The covariance with ones on its diagonal."""
-        error = _errors(self.covariance)
+        error = errors_of(self.covariance)
         return self.covariance / error[..., :, None] / error[..., None, :]
-
-    @property
-    def reduced_chi_square(self) -> Float[Array, "*fits"]:
-        """Chi-square for each degree of freedom."""
-        freedom = jnp.maximum(self.degrees_of_freedom, 1).astype(self.chi_square.dtype)
-        return self.chi_square / freedom
 
     def rows(
         self, record: int = 0, throw: int = 0
@@ -385,27 +381,6 @@ class FitResult(eqx.Module):
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
         rows = self.residuals[:, samples.parts[record], :, None]
         return jnp.linalg.solve(white, rows)[..., 0]
-
-    @property
-    def chi_square_by_throw(self) -> Float[Array, "*fits throws"]:
-        """Mean square of the residuals of each throw."""
-        seen = jnp.maximum(jnp.sum(self.residuals != 0, axis=(-2, -1)), 1)
-        return jnp.sum(self.residuals**2, axis=(-2, -1)) / seen.astype(self.residuals.dtype)
-
-    @property
-    def whiteness(self) -> tuple[float, float]:
-        """Correlation of neighbouring residuals, and how many standard deviations that is from 0.
-
-        Of a single fit. Near 0 for noise; what a model leaves out changes slowly and brings it near
-        1.
-        """
-        rows = [np.asarray(self.residuals[:, part]) for part in self.problem.samples.parts]
-        left = np.concatenate([x[:, :-1].ravel() for x in rows])
-        right = np.concatenate([x[:, 1:].ravel() for x in rows])
-        both = (left != 0) & (right != 0)
-        square = np.sum(both * (left**2 + right**2) / 2)
-        like = float(np.sum(left * right) / max(square, 1e-300))
-        return like, abs(like) * float(both.sum()) ** 0.5
 
     @property
     def leaves(self) -> dict[str, tuple[Array, Array]]:
@@ -496,7 +471,7 @@ def derive(unknowns: Unknowns, index: int, numbers: Array, covariance: Array) ->
     sides = jnp.roll(axes, -1, axis=1), jnp.roll(axes, 1, axis=1)
     turns = product("ki,kln,li->in", sides[0], slopes, sides[1]) / gaps[:, None]
     spread = _spread(unknowns, index, numbers, covariance, jtu.Partial(_of_moments, ...))
-    errors = _errors(spread)
+    errors = errors_of(spread)
     return {
         "inertia": tensor, "moments": moments, "axes": axes,
         "ratios": moments[1:] / moments[:1], "shares": moments / jnp.sum(moments),

@@ -65,10 +65,8 @@ def log_density(result: FitResult) -> LogDensity:
     (8,) True
     """
     problem, options = result.problem, result.problem.options
-    demand(
-        not options.dense,
-        "Argument `result` must be of a fit without an unmodelled torque, but it is not.",
-    )
+    text = "Argument `result` must be of a fit without an unmodelled torque, but it is not."
+    demand(not options.dense, text)
     motion = options.motion or (None if options.free_motion else _simulated)
     options = options._replace(shooting=False, nodes=1, motion=motion)
     problem = Problem(options, problem.unknowns, problem.samples, problem.bodies, problem.noise)
