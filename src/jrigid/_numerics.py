@@ -27,6 +27,18 @@ def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return scale * root_of_positive(jnp.sum(scaled * scaled))
 
 
+def or_one(size: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A size to divide by: 1 where it is not positive."""
+    return jnp.where(size > 0, size, 1.0)
+
+
+def rms(vectors: Float[Array, "*n k"], there: Array) -> Float[Array, ""]:
+    """Root of the mean square length of the vectors that are there; 1 where it tells no size."""
+    count = jnp.maximum(jnp.sum(there), 1).astype(vectors.dtype)
+    size = safe_norm(jnp.where(there[..., None], vectors, 0.0).reshape(-1)) / jnp.sqrt(count)
+    return jnp.where((size > 0) & (size < jnp.inf), size, 1.0)
+
+
 def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
     """The square root where there is one, else 0; the slope at 0, infinite in truth, is 0."""
     positive = square > 0

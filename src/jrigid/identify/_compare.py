@@ -85,11 +85,9 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
         "unmodelled torque, but they are not.",
     )
     n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
-    shown = [x.state_singular_values for x in fits]
-    states = [jnp.sum(x > _TOLD * x[:, :1]) for x in shown]
+    states = [jnp.sum(x > _TOLD * x[:, :1]) for x in (y.state_singular_values for y in fits)]
     unknowns = jnp.stack([x.numbers.size + count for x, count in zip(fits, states, strict=True)])
-    square = jnp.stack([x.chi_square for x in fits])
-    freedom = jnp.stack([x.degrees_of_freedom for x in fits])
+    square, freedom = (jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3])
     left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)
     criteria = left + 2 * k, left + k * jnp.log(n)
     return Comparison(tuple(results), square, freedom, unknowns, *criteria)
@@ -137,6 +135,6 @@ def cross_validate(
         len(groups) > 1,
         f"Argument `throws` must hold two throws or groups at least, but it holds {len(groups)}.",
     )
-    others = [[*chain(*groups[:i], *groups[i + 1 :])] for i in range(len(groups))]
-    pairs = zip(others, groups, strict=True)
-    return jnp.stack([refit(fit_function(rest), group).chi_square for rest, group in pairs])
+    others = ([*chain(*groups[:i], *groups[i + 1 :])] for i in range(len(groups)))
+    fits = map(refit, map(fit_function, others), groups)
+    return jnp.stack([x.chi_square for x in fits])

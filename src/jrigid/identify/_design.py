@@ -1,6 +1,8 @@
 """What a planned record would tell, the likelihood along a line, and residuals for other losses."""
 
+import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -12,23 +14,16 @@ from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import INERTIA, RESULTS, check_shape, check_type, demand, nan_where
-from jrigid._numerics import product
+from jrigid._numerics import or_one, product
 from jrigid._types import Readable, Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
+from jrigid.identify import _problem as problems
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._errors import conclude, in_rows
 from jrigid.identify._flow import depends_on_attitude
-from jrigid.identify._inputs import refuse, sizes_of
+from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
-from jrigid.identify._problem import (
-    Options,
-    Problem,
-    evaluation,
-    in_any_order,
-    predictions,
-    whitened,
-)
 from jrigid.identify._records import Samples, of_throws, samples_of
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
@@ -103,9 +98,8 @@ class Plan(Readable):
         check_type("system", system, RigidBody)
         check_type("state", state, State)
         check_shape("inertia", system.inertia, *INERTIA)
-        shape = Tensor() if shape is None else shape
+        shape, records = Tensor() if shape is None else shape, of_throws(observations)
         check_type("shape", shape, AbstractShape)
-        records = of_throws(observations)
         refuse(system, records, scale, shape)
         demand(
             all(x.states_noise for x in records),
@@ -117,19 +111,38 @@ class Plan(Readable):
         self.free, self.scale, self.shape = free, scale, shape
 
     @property
+    @quick_jit
     def information(self) -> Float[Array, "all all"]:
         """Fisher's, about the numbers sought (the shape's, the scale's, what is picked) and states.
 
         These are at `t0`, of each throw the rate and, if it matters, a small turn.
         """
-        return _information(self)
+        jacobian = _jacobian(_planned(self)[1].rows)
+        return product("ri,rj->ij", jacobian, jacobian)
 
     @property
+    @quick_jit
     def bound(self) -> Bound:
         """The least errors: the inverse of the information."""
-        return _bound(self)
+        problem, found, _ = _planned(self)
+        # From the derivatives themselves: their squares lose digits.
+        jacobian, numbers = _jacobian(found.rows), found.point.numbers
+        size = or_one(jax.lax.stop_gradient(jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0))))
+        # Where nothing is told the last rows keep the bound finite, and very large.
+        eye = jnp.eye(size.size, dtype=jacobian.dtype)
+        floor = 64 * jnp.finfo(eye.dtype).eps * eye
+        _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
+        half = jax.scipy.linalg.solve_triangular(r, eye) / size[:, None]
+
+        def ratios(numbers: Array) -> Array:
+            moments = jnp.linalg.eigvalsh(problem.unknowns.inertia(numbers))
+            return moments[1:] / moments[0]
+
+        of_ratios = product("ij,jk->ik", jax.jacfwd(ratios)(numbers), half[: numbers.size])
+        return Bound(*(product("ij,kj->ik", x, x) for x in (half, of_ratios)))
 
     @property
+    @quick_jit
     def told(self) -> FitResult:
         """A result before there is a record, of chi-square 0; no gradients.
 
@@ -144,10 +157,14 @@ class Plan(Readable):
         >>> print(plan.told.null_directions)
         ('overall scale', 'I3/I1 against gyro scale')
         """
-        return _told(self)
+        problem, found, layout = _planned(self)
+        dtype, no, seen = layout.ts.dtype, jnp.asarray(False), problem.samples.seen
+        scales, none = jnp.ones(len(problem.samples.values), dtype), jnp.zeros(3, dtype)
+        way = Way(found, seen.astype(dtype), scales, none, no, no, none[0])
+        return conclude(problem, layout, way, RESULTS.successful)
 
 
-def _planned(plan: Plan) -> tuple[Problem, Found, Layout]:
+def _planned(plan: Plan) -> tuple[problems.Problem, Found, Layout]:
     """Derivatives of a record that is what the body and the state say."""
     system, state, shape = plan.system, plan.state, plan.shape
     records = of_throws(plan.observations)
@@ -155,27 +172,22 @@ def _planned(plan: Plan) -> tuple[Problem, Found, Layout]:
     one = jnp.ones((), records[0].ts.dtype)
     samples, sensors = samples_of(records, one), tuple(x.sensor for x in records)
     (throws, _), dtype = samples.ts.shape, samples.ts.dtype
+    sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
+    scaled = plan.scale != "trace" and not shape.absolute
+    unknowns = unknowns_of((system,), sensors, sizes, plan.free, (shape,), scaled, rate)
+    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
-    rate = jax.lax.stop_gradient(jnp.sqrt(jnp.mean(jnp.sum(omega**2, axis=-1))))
-    scaled = plan.scale != "trace" and not shape.absolute
-    unknowns = unknowns_of(
-        (system,), sensors, sizes_of(samples), plan.free, (shape,), scaled,
-        jnp.where(rate > 0, rate, 1.0),
-    )  # fmt: skip
-    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
     point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
-    layout = whole(samples, 1, plan.t0)
-    bodies, noise = jnp.zeros(throws, int), jnp.ones(6, dtype)
-    problem = Problem(Options(system.is_free, True), unknowns, samples, bodies, noise)
-    # Values as they would be seen: a residual of zero.
-    seen = predictions(problem, layout, point)
-    pairs = zip(records, seen, strict=True)
-    records = tuple(x.with_values(jax.lax.stop_gradient(y)) for x, y in pairs)
     on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
-    options = Options(system.is_free, on_attitude)
-    problem = Problem(options, unknowns, samples_of(records, one), bodies, noise)
-    rows, links = evaluation(problem, layout)(point)
+    options, layout = problems.Options(system.is_free, on_attitude), whole(samples, 1, plan.t0)
+    bodies, noise = jnp.zeros(throws, int), jnp.ones(6, dtype)
+    problem = problems.Problem(options, unknowns, samples, bodies, noise)
+    # Values as they would be seen: a residual of zero.
+    seen = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
+    records = [x.with_values(y) for x, y in zip(records, seen, strict=True)]
+    problem = dataclasses.replace(problem, samples=samples_of(records, one))
+    rows, links = problems.evaluation(problem, layout)(point)
     if not system.is_free:  # which is followed forward only
         first = first_and_last(samples.ts, samples.seen)[0]
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
@@ -191,53 +203,6 @@ def _jacobian(rows: Rows) -> Array:
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
     return jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
-
-
-@quick_jit
-def _information(plan: Plan) -> Array:
-    jacobian = _jacobian(_planned(plan)[1].rows)
-    return product("ri,rj->ij", jacobian, jacobian)
-
-
-@quick_jit
-def _bound(plan: Plan) -> Bound:
-    """From the derivatives themselves: their squares lose digits."""
-    problem, found, _ = _planned(plan)
-    jacobian = _jacobian(found.rows)
-    size = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0))
-    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
-    # Where nothing is told the last rows keep the bound finite, and very large.
-    eye = jnp.eye(size.size, dtype=jacobian.dtype)
-    floor = 64 * jnp.finfo(eye.dtype).eps * eye
-    _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
-    half = jax.scipy.linalg.solve_triangular(r, eye)
-    covariance = product("ij,kj->ik", half, half) / size[:, None] / size[None, :]
-    numbers = found.point.numbers
-
-    def ratios(numbers: Array) -> Array:
-        moments = jnp.linalg.eigvalsh(problem.unknowns.inertia(numbers))
-        return moments[1:] / moments[0]
-
-    slopes = jax.jacfwd(ratios)(numbers)
-    of_numbers = covariance[: numbers.size, : numbers.size]
-    return Bound(covariance, slopes @ of_numbers @ slopes.T)
-
-
-@quick_jit
-def _told(plan: Plan) -> FitResult:
-    problem, found, layout = _planned(plan)
-    dtype, no = layout.ts.dtype, jnp.asarray(False)
-    scales = jnp.ones(len(problem.samples.values), dtype)
-    way = Way(
-        found,
-        problem.samples.seen.astype(dtype),
-        scales,
-        jnp.zeros(3, dtype),
-        no,
-        no,
-        jnp.zeros((), dtype),
-    )
-    return conclude(problem, layout, way, RESULTS.successful)
 
 
 def profile(
@@ -274,23 +239,22 @@ def profile(
 
 @quick_jit
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
-    problem, start = result.problem, result.state
-    options = problem.options._replace(shooting=False, level="none", nodes=1)
-    slope = jax.grad(lambda x: function(result.unknowns.inertia(x)))(result.numbers)
-    noise, dtype = result.inflation, result.numbers.dtype
+    options = result.problem.options._replace(shooting=False, level="none", nodes=1)
+    problem = dataclasses.replace(result.problem, options=options)
+    of_numbers = lambda x: function(result.unknowns.inertia(x))  # noqa: E731
+    slope, noise = jax.grad(of_numbers)(result.numbers), result.inflation
     unit = 1e-3 * jnp.sqrt(slope @ result.numbers_covariance @ slope / noise)
-    layout = whole(problem.samples, 1, result.t0)
-    states = start.attitude[:, None], start.omega[:, None]
+    layout, dtype = whole(problem.samples, 1, result.t0), result.numbers.dtype
+    states = result.state.attitude[:, None], result.state.omega[:, None]
     point = Point(result.numbers, result.own_numbers, *states)
     last = jtu.tree_map(lambda x: x[0, -1], schedule(options, dtype))
     no, kept = jnp.asarray(False), result.kept.astype(dtype)
 
     def at(value: Array) -> Array:
-        hold = lambda x: (function(result.unknowns.inertia(x)) - value) / unit  # noqa: E731
-        parts = problem.samples, problem.bodies, problem.noise
-        now = Problem(options, problem.unknowns.holding(hold), *parts)
+        hold = lambda x: (of_numbers(x) - value) / unit  # noqa: E731
+        now = dataclasses.replace(problem, unknowns=problem.unknowns.holding(hold))
         weigh = weigher(now, layout, kept, result.scales, last)
-        evaluate = evaluation(now, layout)
+        evaluate = problems.evaluation(now, layout)
         shapes = jax.eval_shape(evaluate, point)
         rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         begin = Found(point, rows, links, ~no, no, jnp.asarray(0), jnp.full(1, jnp.nan))
@@ -304,13 +268,9 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
 
 
 def residuals(
-    system: RigidBody,
-    state: State,
-    observations: Any,
-    *,
-    t0: Real[_ArrayLike, "*throws"] = 0.0,
-    adjoint: diffrax.AbstractAdjoint | None = None,
-) -> Float[Array, "throws rows"]:
+    system: RigidBody, state: State, observations: Any, *,
+    t0: Real[_ArrayLike, "*throws"] = 0.0, adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Float[Array, "throws rows"]:  # fmt: skip
     """Whitened residuals of a motion, for a loss or an optimiser of one's own (optax, say).
 
     Args:
@@ -342,26 +302,26 @@ def residuals(
     check_type("system", system, RigidBody)
     check_type("state", state, State)
     records = of_throws(observations)
-    sensors = [x.sensor for x in records]
-    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
-    ts, throws = samples.ts, samples.ts.shape[0]
-    begin = jnp.broadcast_to(jnp.asarray(t0, ts.dtype), (throws,))
-    attitude = jnp.broadcast_to(state.attitude, (throws, 4))
-    omega = jnp.broadcast_to(state.omega, (throws, 3))
+    guess = jnp.ones((), records[0].values.dtype)
+    samples, sensors = samples_of(records, guess), [x.sensor for x in records]
+    throws, begin = samples.ts.shape[0], jnp.asarray(t0, samples.ts.dtype)
+    shapes = (state.attitude, (4,)), (state.omega, (3,)), (begin, ())
+    q, w, begin = (jnp.broadcast_to(x, (throws, *shape)) for x, shape in shapes)
 
-    def throw(q: Array, w: Array, samples: Samples, begin: Array) -> Array:
-        if system.is_free:
-            states = free_rotation(system.inertia, State(q, w), samples.ts, t0=begin).states
-        else:
-            states = in_any_order(
-                lambda ts: simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states,
-                samples.ts,
-            )
-        shown = []
-        for sensor, part in zip(sensors, samples.parts, strict=True):
-            one = lambda t, q, w, sensor=sensor: sensor.predict(t, State(q, w), system)  # noqa: E731
-            seen = samples.ts[part], states.attitude[part], states.omega[part]
-            shown.append(jax.vmap(one)(*seen))
-        return whitened(sensors, samples, shown).reshape(-1)
+    def throw(q: Array, w: Array, begin: Array, samples: Samples) -> Array:
+        def motion(ts: Array) -> State:
+            if system.is_free:
+                return free_rotation(system.inertia, State(q, w), ts, t0=begin).states
+            return simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states
 
-    return jax.vmap(throw)(attitude, omega, samples, begin)
+        def shown(sensor: Any, part: slice) -> Array:
+            one = lambda t, q, w: sensor.predict(t, State(q, w), system)  # noqa: E731
+            return jax.vmap(one)(*(x[part] for x in seen))
+
+        find = motion if system.is_free else partial(problems.in_any_order, motion)
+        states = find(samples.ts)
+        seen = samples.ts, states.attitude, states.omega
+        values = list(map(shown, sensors, samples.parts))
+        return problems.whitened(sensors, samples, values).reshape(-1)
+
+    return jax.vmap(throw)(q, w, begin, samples)

@@ -155,7 +155,8 @@ def fit(
     options = options._replace(shooting=_shoots(options, systems[0], records, state))
     each_body = jnp.zeros(throws, int) if bodies is None else jnp.asarray(bodies)
     given = systems, records, tensor, state, options.on_attitude
-    prepared = settle(_prepare(*given), throw, lambda: findings_of(*given[:-1]))
+    prepared = _prepare(*given)
+    prepared = settle(prepared, throw, lambda: findings_of(*given[:-1], prepared.told))
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and prepared.told is not None:
         count = prepared.told.ts.shape[1]
@@ -243,7 +244,7 @@ def _prepare(
     attitude0 = None if state is None or not on_attitude else state.attitude.astype(dtype)
     told = told_by(records, samples, attitude0)
     rate = typical_rate(told, state, dtype)
-    findings = findings_of(systems, records, tensor, state)
+    findings = findings_of(systems, records, tensor, state, told)
     angle = jnp.zeros(()) if told is None else jnp.max(angle_turned(told)[:, -1])
     return _Prepared(told, rate, sizes_of(samples), angle, findings.result)
 

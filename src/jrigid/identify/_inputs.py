@@ -8,16 +8,20 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
-from jrigid._numerics import safe_norm
+from jrigid._numerics import or_one, rms
 from jrigid.dynamics import State
-from jrigid.identify._layout import Told, told_by
-from jrigid.identify._records import Record, Samples, check_records, samples_of
+from jrigid.identify._layout import Told
+from jrigid.identify._records import Record, Samples, check_records
 from jrigid.identify._sensors import AbstractSensor, MomentumSensor
 from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, SpinningMass, Sum
 
 GUESS = 0.02  # of the size of values, for a noise that is not known
+_COARSE = (
+    "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a turn, "
+    "but the body turns more between samples: are the rates in degrees a second?"
+)
 
 
 def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
@@ -40,8 +44,7 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
 def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     """The tensor to start from, if one is given, and the state of each throw."""
     inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)
-    if isinstance(inertia, RigidBody):
-        inertia = inertia.inertia
+    inertia = inertia.inertia if isinstance(inertia, RigidBody) else inertia
     demand(
         state is None or isinstance(state, State),
         "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
@@ -50,13 +53,10 @@ def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     if isinstance(state, State):
         attitude = jnp.broadcast_to(state.attitude, (throws, 4))
         state = State(attitude, jnp.broadcast_to(state.omega, (throws, 3)))
-    tensor = None if inertia is None else as_tensor(jnp.asarray(inertia))
-    return tensor, state  # type: ignore[return-value]
+    return None if inertia is None else as_tensor(jnp.asarray(inertia)), state  # type: ignore[return-value]
 
 
-def refuse(
-    system: RigidBody, records: tuple[Record, ...], scale: str, shape: AbstractShape
-) -> None:
+def refuse(system: RigidBody, records: Sequence[Record], scale: str, shape: AbstractShape) -> None:
     """ValueError for a scale that nothing tells, and numbers that hold it without one."""
     check_option("scale", scale, ("trace", "known", "rotor"))
     demand(
@@ -81,39 +81,27 @@ def refuse(
 def typical_rate(told: Told | None, state: State | None, dtype: Any) -> Array:
     """Rms of the rates, 1 where there are none."""
     if told is not None:
-        shown = jnp.where(told.there[..., None], told.omega, 0.0)
-        count = jnp.sum(told.there)
-    else:
-        assert state is not None
-        shown = state.omega.astype(dtype)
-        count = jnp.asarray(shown.shape[0])
-    size = safe_norm(shown.reshape(-1)) / jnp.sqrt(jnp.maximum(count, 1).astype(dtype))
-    size = jax.lax.stop_gradient(size)
-    return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
+        return jax.lax.stop_gradient(rms(told.omega, told.there))
+    assert state is not None
+    omega = jax.lax.stop_gradient(state.omega.astype(dtype))
+    return rms(omega, jnp.ones(omega.shape[:-1], bool))
 
 
 def sizes_of(samples: Samples) -> tuple[Array, ...]:
     """Rms of the values of each record; 1 where they are zero."""
-    sizes = []
-    for part, values in zip(samples.parts, samples.values, strict=True):
-        seen = samples.seen[:, part]
-        square = jnp.sum(jnp.where(seen[..., None], values, 0.0) ** 2)
-        mean = square / jnp.maximum(jnp.sum(seen), 1).astype(square.dtype)
-        sizes.append(jnp.sqrt(jnp.where(mean > 0, mean, 1.0)))
-    return tuple(sizes)
+    pairs = zip(samples.values, samples.parts, strict=True)
+    return tuple(rms(values, samples.seen[:, part]) for values, part in pairs)
 
 
 def noise_of(records: tuple[Record, ...], samples: Samples, rate: Array) -> Array:
     """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
-    white, rates, angles = jnp.diagonal(samples.whitener, axis1=-2, axis2=-1), [], []
-    sigma = jnp.where(samples.weight > 0, 1 / jnp.where(white > 0, white, 1.0), jnp.nan)
-    for record, part in zip(records, samples.parts, strict=True):
-        median = jnp.nanmedian(sigma[:, part])
-        rates += [median] * tells(record, "rates")
-        angles += [median] * record.sensor.unit_length
-    of_rates = rates[0] if rates else (angles[0] * rate if angles else GUESS * rate)
-    of_angles = angles[0] if angles else of_rates / rate
-    noise = jnp.repeat(jnp.stack([of_rates, of_angles]), 3)
+    white = jnp.diagonal(samples.whitener, axis1=-2, axis2=-1)
+    sigma = jnp.where(samples.weight > 0, 1 / or_one(white), jnp.nan)
+    pairs = [(x, jnp.nanmedian(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)]
+    rates = [median for x, median in pairs if tells(x, "rates")]
+    angles = [median for x, median in pairs if x.sensor.unit_length]
+    angle = [*angles, *(x / rate for x in rates), jnp.full_like(rate, GUESS)][0]
+    noise = jnp.repeat(jnp.stack([[*rates, angle * rate][0], angle]), 3)
     return jnp.where(jnp.isfinite(noise), noise, GUESS * rate)
 
 
@@ -122,11 +110,9 @@ def tells(record: Record, what: str) -> bool:
 
 
 def findings_of(
-    systems: tuple[RigidBody, ...],
-    records: tuple[Record, ...],
-    tensor: Any,
-    state: State | None,
-) -> Findings:
+    systems: tuple[RigidBody, ...], records: tuple[Record, ...], tensor: Any, state: State | None,
+    told: Told | None,
+) -> Findings:  # fmt: skip
     """What is wrong with the values of the arguments."""
     findings = Findings()
     for system in systems:
@@ -137,24 +123,15 @@ def findings_of(
         findings.require(all_finite(state), RESULTS.invalid_state)
         findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
     check_records(findings, records)
-    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
-    told = told_by(records, samples, None)
-    if told is not None and told.attitude is None:
-        findings.require(
-            _between(told) < jnp.pi,
-            RESULTS.invalid_state,
-            "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a "
-            "turn, but the body turns more between samples: are the rates in degrees a second?",
-        )
+    known = any(tells(x, "attitude") for x in records)
+    if told is not None and told.ts.shape[1] > 1 and not known:
+        findings.require(_between(told) < jnp.pi, RESULTS.invalid_state, _COARSE)
     return findings
 
 
 def _between(told: Told) -> Array:
     """Angle turned between neighbouring samples, as a median."""
-    if told.ts.shape[1] < 2:
-        return jnp.zeros((), told.ts.dtype)
     ok = told.there[:, 1:] & told.there[:, :-1]
-    step = jnp.where(ok, jnp.diff(told.ts, axis=1), jnp.nan)
     speed = jnp.sqrt(jnp.sum(told.omega[:, 1:] ** 2, axis=-1))
-    median = jnp.nanmedian(jnp.where(ok, step * speed, jnp.nan))
-    return jnp.where(jnp.isnan(median), 0.0, median)
+    turned = jnp.where(ok, jnp.diff(told.ts, axis=1) * speed, jnp.nan)
+    return jnp.nan_to_num(jnp.nanmedian(turned))

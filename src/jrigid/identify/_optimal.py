@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jrigid._checks import demand
+from jrigid._numerics import or_one
 from jrigid._types import Scalar
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._design import Bound, Plan
@@ -111,7 +112,7 @@ def _optimum(
     pairs = zip(limits, jtu.tree_leaves(place(given)), strict=True)
     within, *sizes = zip(*(_limited(limit, x) for limit, x in pairs), strict=True)
     middle, unit = (ravel_pytree(x)[0] for x in sizes)
-    unit = jnp.where(unit > 0, unit, 1.0)
+    unit, start = or_one(unit), (starts - 1, given.size)
 
     def project(x: Array) -> Array:
         arrays = zip(within, jtu.tree_leaves(place(middle + unit * x)), strict=True)
@@ -120,10 +121,7 @@ def _optimum(
     def planned(x: Array) -> Plan:
         return eqx.tree_at(choose, plan, place(middle + unit * x))
 
-    def scored(x: Array) -> tuple[Array, Array]:
-        value = score(planned(x).bound)
-        return value, value
-
+    scored = lambda x: (score(planned(x).bound),) * 2  # noqa: E731
     # Under a torque forward alone.
     derive = (jax.grad if plan.system.is_free else jax.jacfwd)(scored, has_aux=True)
 
@@ -132,23 +130,19 @@ def _optimum(
         move = share * (project(x - size * slope) - x)
         ahead_slope, ahead = derive(x + move)
         bend = jnp.sum(move * (ahead_slope - slope))
-        size = jnp.where(bend > 0, jnp.sum(move**2) / jnp.where(bend > 0, bend, 1.0), 10 * size)
+        size = jnp.where(bend > 0, jnp.sum(move**2) / or_one(bend), 10 * size)
         after = x + move, ahead, ahead_slope, jnp.clip(size, 1e-6, 1e6), jnp.ones_like(share)
         better = ahead <= value + 1e-4 * jnp.sum(slope * move)
-        stay = *now[:4], share / 4
-        now = jtu.tree_map(lambda a, b: jnp.where(better, a, b), after, stay)
+        now = jtu.tree_map(lambda a, b: jnp.where(better, a, b), after, (*now[:4], share / 4))
         return now, now[1]
 
     def descend(x: Array) -> tuple[tuple[Array, ...], Array]:
-        begin = x, jnp.inf, jnp.zeros_like(x), 0.1, 1.0
-        begin = tuple(jnp.asarray(y, x.dtype) for y in begin)
-        return jax.lax.scan(step, begin, None, steps)
+        begin = (jnp.asarray(y, x.dtype) for y in (x, jnp.inf, jnp.zeros_like(x), 0.1, 1.0))
+        return jax.lax.scan(step, tuple(begin), None, steps)
 
-    shape = starts - 1, given.size
-    others = jax.random.uniform(jax.random.key(0), shape, given.dtype, -1.0, 1.0)
+    others = jax.random.uniform(jax.random.key(0), start, given.dtype, -1.0, 1.0)
     begin = jnp.concatenate([((given - middle) / unit)[None], others])
     (x, values, slopes, *_), history = jax.lax.map(descend, jax.vmap(project)(begin))
     best = jnp.argmin(values)
-    x, slope = x[best], slopes[best]
-    slope = jnp.linalg.norm(project(x - slope) - x)
-    return Optimum(planned(x), values[best], history[0, 0], slope, history)
+    slope = jnp.linalg.norm(project(x[best] - slopes[best]) - x[best])
+    return Optimum(planned(x[best]), values[best], history[0, 0], slope, history)

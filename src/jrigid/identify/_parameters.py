@@ -1,17 +1,10 @@
 """Numbers without bounds for the inertia of a real body: physical by construction."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import (
-    INERTIA,
-    all_finite,
-    array_of_shape,
-    check_type,
-    is_positive_definite,
-    is_symmetric,
-    where_defined,
-)
+from jrigid._checks import INERTIA, all_finite, check_type, is_inertia, shaped, where_defined
 from jrigid._numerics import product
 from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
 from jrigid.mass import MassProperties
@@ -19,14 +12,19 @@ from jrigid.mass import MassProperties
 
 def second_moments(tensor: Matrix) -> Matrix:
     """Sigma = (trace I / 2) 1 - I, the integral of r r^T over the mass."""
-    half = 0.5 * jnp.trace(tensor)
-    return half * jnp.eye(3, dtype=tensor.dtype) - tensor
+    return 0.5 * jnp.trace(tensor) * jnp.eye(3, dtype=tensor.dtype) - tensor
 
 
 def from_second_moments(second_moments: Matrix) -> Matrix:
     """I = (trace Sigma) 1 - Sigma."""
-    trace = jnp.trace(second_moments)
-    return trace * jnp.eye(3, dtype=second_moments.dtype) - second_moments
+    return jnp.trace(second_moments) * jnp.eye(3, dtype=second_moments.dtype) - second_moments
+
+
+def _of_factor(diagonal: Array, sides: Array, places: list[list[int]]) -> Matrix:
+    """A tensor from a triangular factor, its places in (0, diagonal, sides)."""
+    numbers = jnp.concatenate([jnp.zeros_like(sides[:1]), diagonal, sides])
+    factor = numbers[np.array(places)]
+    return from_second_moments(product("ik,jk->ij", factor, factor))
 
 
 def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
@@ -55,13 +53,11 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
      [0. 2. 0.]
      [0. 0. 2.]]
     """
-    parameters = array_of_shape("parameters", parameters, 6)
+    (parameters,) = shaped(parameters=(parameters, 6))
 
     def tensor(p: Array) -> Matrix:
-        zero, one = jnp.zeros_like(p[0]), jnp.ones_like(p[0])
-        rows = [[one, zero, zero], [p[3], jnp.exp(p[1]), zero], [p[4], p[5], jnp.exp(p[2])]]
-        lower = jnp.exp(p[0]) * jnp.stack([jnp.stack(row) for row in rows])
-        return from_second_moments(product("ik,jk->ij", lower, lower))
+        scale, sizes = jnp.exp(p[0]), jnp.exp(p[:3].at[0].set(0))
+        return _of_factor(scale * sizes, scale * p[3:], [[1, 0, 0], [4, 2, 0], [5, 6, 3]])
 
     return where_defined(all_finite(parameters), tensor, parameters)
 
@@ -85,17 +81,16 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
      [0.  2.  0. ]
      [0.  0.  2.5]]
     """
-    inertia = array_of_shape("inertia", inertia, *INERTIA)
+    (inertia,) = shaped(inertia=(inertia, *INERTIA))
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
     second = second_moments(0.5 * (tensor + tensor.T))
-    solid = all_finite(tensor) & is_symmetric(tensor) & is_positive_definite(second)
+    solid = is_inertia(tensor) & is_inertia(second)
 
     def numbers(second: Matrix) -> Array:
         lower = jnp.linalg.cholesky(second)
-        scale = lower[0, 0]
-        sizes = jnp.stack([scale, lower[1, 1] / scale, lower[2, 2] / scale])
-        below = jnp.stack([lower[1, 0], lower[2, 0], lower[2, 1]])
-        return jnp.concatenate([jnp.log(sizes), below / scale])
+        diagonal, scale = jnp.diagonal(lower), lower[0, 0]
+        sizes = jnp.log(diagonal / scale).at[0].set(jnp.log(scale))
+        return jnp.concatenate([sizes, lower[np.tril_indices(3, -1)] / scale])
 
     return where_defined(solid, numbers, second)
 
@@ -123,16 +118,13 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     >>> print(body.mass, body.inertia[0])
     1.0 [2. 0. 0.]
     """
-    parameters = array_of_shape("parameters", parameters, 10)
+    (parameters,) = shaped(parameters=(parameters, 10))
 
     def body(p: Array) -> tuple[Scalar, Vector, Matrix]:
-        alpha, d1, d2, d3, s12, s23, s13, *t = p
-        zero = jnp.zeros_like(alpha)
-        rows = [[jnp.exp(d1), s12, s13], [zero, jnp.exp(d2), s23], [zero, zero, jnp.exp(d3)]]
-        upper = jnp.stack([jnp.stack(row) for row in rows])
-        mass = jnp.exp(2 * alpha)
+        mass = jnp.exp(2 * p[0])
         # About the centre of mass the column t drops out.
-        return mass, jnp.stack(t), mass * from_second_moments(product("ik,jk->ij", upper, upper))
+        inertia = _of_factor(jnp.exp(p[1:4]), p[4:7], [[1, 4, 6], [0, 2, 5], [0, 0, 3]])
+        return mass, p[7:], mass * inertia
 
     return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
 
@@ -155,15 +147,13 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     """
     check_type("body", body, MassProperties)
     second = second_moments(body.inertia)
-    solid = (body.mass > 0) & all_finite(body) & is_positive_definite(second)
+    solid = (body.mass > 0) & all_finite(body) & is_inertia(second + second.T)
 
     def numbers(mass: Scalar, center_of_mass: Vector, second: Matrix) -> Array:
-        second = second / mass
         # The upper factor is the lower one with rows and columns reversed.
-        upper = jnp.linalg.cholesky(second[::-1, ::-1])[::-1, ::-1]
-        sides = jnp.stack([upper[0, 1], upper[1, 2], upper[0, 2]])
-        return jnp.concatenate(
-            [0.5 * jnp.log(mass)[None], jnp.log(jnp.diagonal(upper)), sides, center_of_mass]
-        )
+        upper = jnp.linalg.cholesky(second[::-1, ::-1] / mass)[::-1, ::-1]
+        sizes = jnp.log(jnp.append(mass**0.5, jnp.diagonal(upper)))
+        sides = upper[np.array([0, 1, 0]), np.array([1, 2, 2])]
+        return jnp.concatenate([sizes, sides, center_of_mass])
 
     return where_defined(solid, numbers, body.mass, body.center_of_mass, second)
