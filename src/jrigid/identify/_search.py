@@ -148,9 +148,8 @@ def search(
         few = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
         few = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, few), count)
         after = hunt.tried + 1
-        return _Hunt(jnp.where(after < few, after, jnp.maximum(after, count)), best, wrong,
-            weakest, pure,
-        )  # fmt: skip
+        after = jnp.where(after < few, after, jnp.maximum(after, count))
+        return _Hunt(after, best, wrong, weakest, pure)
 
     def going(hunt: _Hunt) -> Array:
         weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)

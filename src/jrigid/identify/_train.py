@@ -18,7 +18,7 @@ from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import findings_of
-from jrigid.identify._layout import angle_turned, told_by
+from jrigid.identify._layout import Told, angle_turned, told_by
 from jrigid.identify._problem import in_any_order, whitened
 from jrigid.identify._records import Record, Samples, of_throws, samples_of
 from jrigid.rotation import exp, multiply, normalize
@@ -224,29 +224,30 @@ class _Observed(NamedTuple):
     data: _Data | None
     has_attitude: Array
     turn: Array
+    told: Told | None
     result: Any
 
 
 @eqx.filter_jit
 def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
-    result = findings_of((system,), records, None, None).result
     samples = samples_of(records, jnp.ones((), records[0].values.dtype))
     told, no = told_by(records, samples, None), jnp.asarray(False)
+    result = findings_of((system,), records, None, None, told).result
     if told is None:
-        return _Observed(None, no, jnp.zeros(()), result)
+        return _Observed(None, no, jnp.zeros(()), None, result)
     first = jnp.argmax(told.there, axis=1)
     at = jax.vmap(lambda x, i: x[i])
     unit = jnp.zeros((first.size, 4), samples.ts.dtype).at[:, 0].set(1)
     attitude = unit if told.attitude is None else at(told.attitude, first)
     turn = jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
     data = _Data(samples, State(attitude, at(told.omega, first)))
-    return _Observed(data, no if told.attitude is None else ~no, turn, result)
+    return _Observed(data, no if told.attitude is None else ~no, turn, told, result)
 
 
 def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
     """Segments, whether the attitude matters, and steps between two samples."""
     seen = _observed(system, records)
-    settle(seen, True, lambda: findings_of((system,), records, None, None))
+    settle(seen, True, lambda: findings_of((system,), records, None, None, seen.told))
     on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
     inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     if seen.data is None or inside or (on_attitude and not seen.has_attitude):
