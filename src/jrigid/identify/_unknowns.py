@@ -266,7 +266,7 @@ class Unknowns(eqx.Module):
         """The arrays of the system and the sensors."""
         return tuple(jtu.tree_leaves(self.given))
 
-    def original(self, throw: int) -> tuple[Any, ...]:
+    def original(self, throw: int | Array) -> tuple[Any, ...]:
         """System and sensors of a throw as they were given."""
         pairs = zip(self.leaves, self.stacked, strict=True)
         return self._built([x[throw] if own else x for x, own in pairs])
