@@ -27,7 +27,7 @@ from jrigid.identify._layout import Layout, first_and_last, whole
 from jrigid.identify._records import Samples, of_throws, samples_of
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
-from jrigid.identify._smoother import Found, Point, Rows, minimise
+from jrigid.identify._smoother import Found, Point, Rows, minimise, unevaluated
 from jrigid.identify._stages import ACCURACY, Way, schedule, weigher
 from jrigid.identify._unknowns import unknowns_of
 from jrigid.simulate import simulate
@@ -248,17 +248,16 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     states = result.state.attitude[:, None], result.state.omega[:, None]
     point = Point(result.numbers, result.own_numbers, *states)
     last = jtu.tree_map(lambda x: x[0, -1], schedule(options, dtype))
-    no, kept = jnp.asarray(False), result.kept.astype(dtype)
+    kept = result.kept.astype(dtype)
 
     def at(value: Array) -> Array:
         hold = lambda x: (of_numbers(x) - value) / unit  # noqa: E731
         now = dataclasses.replace(problem, unknowns=problem.unknowns.holding(hold))
         weigh = weigher(now, layout, kept, result.scales, last)
         evaluate = problems.evaluation(now, layout)
-        shapes = jax.eval_shape(evaluate, point)
-        rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        begin = Found(point, rows, links, ~no, no, jnp.asarray(0), jnp.full(1, jnp.nan))
-        white = jnp.zeros((*links.gap.shape, links.gap.shape[-1]), dtype)
+        begin = unevaluated(evaluate, point, 1)
+        gap = begin.links.gap
+        white = jnp.zeros((*gap.shape, gap.shape[-1]), dtype)
         enough = lambda _: ACCURACY * noise  # noqa: E731
         found = minimise(evaluate, weigh, white, begin, enough, jnp.asarray(100))
         growth = weigh(found.rows)[1] - result.chi_square

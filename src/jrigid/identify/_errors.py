@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, nan_where
-from jrigid._numerics import product
+from jrigid._numerics import or_one, product
 from jrigid.dynamics import State
 from jrigid.identify import _stages as stages
 from jrigid.identify._layout import Layout
@@ -75,8 +75,7 @@ def told_by_rows(rows: Rows, own: int, units: Array) -> tuple[Told, Array]:
     size, eps = jg.shape[-1], jnp.finfo(jg.dtype).eps
 
     def throw(jg: Array, jl: Array, residual: Array) -> tuple[Array, ...]:
-        scale = jnp.sqrt(jnp.sum(jl * jl, axis=0))
-        scale = jnp.where(scale > 0, scale, 1.0)
+        scale = or_one(jnp.sqrt(jnp.sum(jl * jl, axis=0)))
         u, s, vt = jnp.linalg.svd(jl / scale[None, :], full_matrices=False)
         told = s > _TOLD * s[0]
         u = jnp.where(told[None, :], u, 0.0)

@@ -28,7 +28,7 @@ from jrigid.identify._inputs import (
 from jrigid.identify._layout import (
     Told,
     angle_turned,
-    is_coarse,
+    longest_turn,
     node_states,
     segments,
     segments_needed,
@@ -295,7 +295,7 @@ def _fitted(
     noise = noise_of(records, samples, prepared.rate)
     unknowns = unknowns.holding(Line(jnp.zeros_like(point.numbers), jnp.zeros((), dtype)))
     problem = Problem(options, unknowns, samples, bodies, noise)
-    coarse = jnp.asarray(False) if told is None else is_coarse(told)
+    coarse = jnp.asarray(False) if told is None else longest_turn(told) > jnp.pi
     way = search(problem, single, cut, point, numbers, level, coarse, prepared.angle > _LONG)
     layout = cut if options.dense or not options.free_motion else single
     return conclude(problem, layout, way, prepared.result)

@@ -126,9 +126,9 @@ def angle_turned(told: Told) -> Array:
     return jnp.cumsum(turned[..., 0], axis=1)
 
 
-def is_coarse(told: Told) -> Array:
-    """Whether a body turns by more than half a turn from one sample to the next."""
-    return jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0) > jnp.pi
+def longest_turn(told: Told) -> Array:
+    """The most that a body turns from one sample to the next [rad]."""
+    return jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
 
 
 def whole(samples: Samples, nodes: int, t0: Array | None = None) -> Layout:

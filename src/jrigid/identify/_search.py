@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._numerics import product
+from jrigid._numerics import or_one, product
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem, evaluation
 from jrigid.identify._result import LARGEST_ERROR
-from jrigid.identify._smoother import Found, Point, blocks_of, eliminated, minimise, reduced
+from jrigid.identify._smoother import Point, blocks_of, eliminated, minimise, reduced, unevaluated
 from jrigid.identify._stages import (
     EXPLAINED,
     Stage,
@@ -164,13 +164,10 @@ def search(
 
 def _begun(problem: Problem, cut: Layout, point: Point, level: Array, coarse: Array) -> Way:
     """Before anything is known; few samples of a coarse record follow any alias."""
-    shapes, dtype = eqx.filter_eval_shape(evaluation(problem, cut), point), level.dtype
-    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    no, history = jnp.asarray(False), jnp.full(_HISTORY, jnp.nan, dtype)
-    found = Found(point, rows, links, ~no, no, jnp.asarray(0), history)
+    found, dtype = unevaluated(evaluation(problem, cut), point, _HISTORY), level.dtype
     kept, scales = problem.samples.seen.astype(dtype), jnp.ones(len(problem.samples.values), dtype)
     few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)
-    return Way(found, kept, scales, level, no, few, jnp.zeros((), dtype))
+    return Way(found, kept, scales, level, jnp.asarray(False), few, jnp.zeros((), dtype))
 
 
 def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakest:
@@ -212,7 +209,7 @@ def _error_by_probe(
     slope = jax.jvp(tensors, (before,), (direction,))[1]
     square = jnp.sum(slope * slope)
     along = jnp.sum((tensors(after) - tensors(before)) * slope)
-    step = jnp.where(square > 0, along / jnp.where(square > 0, square, 1.0), step)
+    step = jnp.where(square > 0, along / or_one(square), step)
     return jnp.abs(step) / jnp.sqrt(jnp.maximum(growth, 1e-6))
 
 

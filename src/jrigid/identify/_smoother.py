@@ -237,6 +237,16 @@ class Found(NamedTuple):
     history: Array  # sum of squares of the record after each step
 
 
+def unevaluated(
+    evaluate: Callable[[Point], tuple[Rows, Links]], point: Point, history: int
+) -> Found:
+    """A minimisation that stands at a point where nothing is known yet, and will note its steps."""
+    shapes = jax.eval_shape(evaluate, point)
+    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    no, notes = jnp.asarray(False), jnp.full(history, jnp.nan, point.omega.dtype)
+    return Found(point, rows, links, ~no, no, jnp.asarray(0), notes)
+
+
 class _Carry(NamedTuple):
     found: Found
     weight: Array

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jrigid._numerics import product
+from jrigid._numerics import or_one, product
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Options, Problem
 from jrigid.identify._shapes import Fixed, Flat, is_near_flat
@@ -171,7 +171,7 @@ def signal_of(problem: Problem, weight: Array) -> Array:
         values = jnp.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
         total = jnp.sum(w * unit**2, axis=1, keepdims=True)
         mean = jnp.sum(w * unit**2 * values, axis=1, keepdims=True)
-        parts.append(unit * (values - mean / jnp.where(total > 0, total, 1.0)))
+        parts.append(unit * (values - mean / or_one(total)))
     return jnp.concatenate(parts, axis=1)
 
 
@@ -181,7 +181,7 @@ def unexplained(problem: Problem, way: Way, kicks: Array | float = 0.0) -> Array
     left = jnp.sum(weight * way.found.rows.residual[:, : way.kept.shape[1]] ** 2) + kicks
     left = left - jnp.sum(weight) if problem.options.noise_known else left
     signal = jnp.sum(weight * signal_of(problem, weight) ** 2)
-    return left / jnp.where(signal > 0, signal, 1.0)
+    return left / or_one(signal)
 
 
 def is_at_boundary(problem: Problem, found: Found) -> Array:

@@ -18,7 +18,7 @@ from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import findings_of
-from jrigid.identify._layout import Told, angle_turned, told_by
+from jrigid.identify._layout import Told, longest_turn, told_by
 from jrigid.identify._problem import in_any_order, whitened
 from jrigid.identify._records import Record, Samples, of_throws, samples_of
 from jrigid.rotation import exp, multiply, normalize
@@ -239,7 +239,7 @@ def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     at = jax.vmap(lambda x, i: x[i])
     unit = jnp.zeros((first.size, 4), samples.ts.dtype).at[:, 0].set(1)
     attitude = unit if told.attitude is None else at(told.attitude, first)
-    turn = jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
+    turn = longest_turn(told)
     data = _Data(samples, State(attitude, at(told.omega, first)))
     return _Observed(data, no if told.attitude is None else ~no, turn, told, result)
 
