@@ -19,8 +19,9 @@ from jaxtyping import Array
 
 from jrigid._checks import demand
 from jrigid._types import Readable
+from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
-from jrigid.identify._shapes import SIDES, AbstractShape, as_tensor, squared
+from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.mass import MassProperties
 from jrigid.torques import Sum, UniformGravity
 
