@@ -16,6 +16,11 @@ Positions = Real[Any, "*batch 3"]
 Pose = tuple[Float[Array, "*batch 4"], Float[Array, "*batch 3"]]
 
 
+def _one_of(kinds: str, rotation: Any, method: str) -> None:
+    kind = type(rotation).__name__
+    demand(hasattr(rotation, method), f"Argument `rotation` must be {kinds}, but it is a {kind}.")
+
+
 def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     """One of scipy's rotations, body to space, or rigid transforms where positions are given.
 
@@ -37,10 +42,6 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     turn = transform.Rotation.from_quat(np.roll(np.asarray(float_arrays(attitude)[0]), -1, -1))
     if position is None:
         return turn
-    demand(
-        hasattr(transform, "RigidTransform"),
-        "Argument `position` must be None with scipy older than 1.16, but it is not.",
-    )
     return transform.RigidTransform.from_components(np.asarray(position), turn)
 
 
@@ -63,15 +64,10 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     [[1. 0. 0. 0.]
      [0. 1. 0. 0.]]
     """
-    if hasattr(rotation, "as_components"):
-        position, turn = rotation.as_components()
-        return jnp.roll(jnp.asarray(turn.as_quat()), 1, axis=-1), jnp.asarray(position)
-    demand(
-        hasattr(rotation, "as_quat"),
-        "Argument `rotation` must be a scipy.spatial.transform.Rotation or RigidTransform, but it "
-        f"is a {type(rotation).__name__}.",
-    )
-    return jnp.roll(jnp.asarray(rotation.as_quat()), 1, axis=-1)
+    turn = rotation.rotation if hasattr(rotation, "translation") else rotation
+    _one_of("a scipy.spatial.transform.Rotation or RigidTransform", turn, "as_quat")
+    attitude = jnp.roll(jnp.asarray(turn.as_quat()), 1, axis=-1)
+    return attitude if turn is rotation else (attitude, jnp.asarray(rotation.translation))
 
 
 def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
@@ -110,11 +106,7 @@ def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     """
     if hasattr(rotation, "wxyz_xyz"):
         return rotation.wxyz_xyz[..., :4], rotation.wxyz_xyz[..., 4:]
-    demand(
-        hasattr(rotation, "wxyz"),
-        "Argument `rotation` must be a jaxlie.SO3 or jaxlie.SE3, but it is a "
-        f"{type(rotation).__name__}.",
-    )
+    _one_of("a jaxlie.SO3 or jaxlie.SE3", rotation, "wxyz")
     return rotation.wxyz
 
 

@@ -83,30 +83,20 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
     >>> print(body.mass, body.center_of_mass)
     4.0 [1.5 0.  0. ]
     """
-    parts, bodies, used = _parts(mesh), [], set()
+    parts, bodies = _parts(mesh), []
+    known: dict[str, Any] = {name: density for names, _ in parts for name in names}
+    densities = density if isinstance(density, Mapping) else known
+    message = f"Argument `density` must name parts, {list(known)}, but it names {list(densities)}."
+    demand(set(densities) <= set(known), message)
     for names, part in parts:
-        known = [x for x in names if not isinstance(density, Mapping) or x in density]
-        demand(bool(known), f"Argument `density` must have a density of {names[0]!r}, but has not.")
-        value = density[known[0]] if isinstance(density, Mapping) else density
-        used.update(names)
+        own = [densities[x] for x in names if x in densities]
+        demand(bool(own), f"Argument `density` must have one of {names[0]!r}, but it has not.")
         vertices, faces = mesh_arrays(part)
         try:
-            bodies.append(from_mesh(scale * vertices, faces, float(value)))
+            bodies.append(from_mesh(scale * vertices, faces, own[0]))
         except (RuntimeError, ValueError) as error:
-            holes = f"{_open_edges(faces)} of its edges are not shared by two faces."
-            text = f"Part {names[0]!r} of the mesh: {error} {holes} {_ADVICE}"
-            raise ValueError(text) from error
-    strange = set(density) - used if isinstance(density, Mapping) else ()
-    demand(
-        not strange, f"Argument `density` must name parts of the mesh, but {strange} are not among "
-        f"{sorted(used)}.",
-    )  # fmt: skip
+            raise ValueError(f"Part {names[0]!r} of the mesh: {error} {_ADVICE}") from error
     return sum(bodies[1:], bodies[0])
-
-
-def _open_edges(faces: np.ndarray) -> int:
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return int(np.sum(np.unique(edges, axis=0, return_counts=True)[1] != 2))
 
 
 def read_mesh(path: str | Path, density: Density = 1.0, *, scale: float = 1.0) -> MassProperties:

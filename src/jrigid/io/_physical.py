@@ -8,30 +8,24 @@ from jrigid._types import InertiaLike, Matrix, ScalarLike
 from jrigid.mass import MassProperties, tensor_function
 
 _ULPS = 64  # of the trace: as MassProperties allows
+_ROUNDING = 1e-6  # of the tensor, in its symmetry
 _DIGITS = 1e-3  # of the trace: what three digits in a file round
-_ABOUT_ITS_END = 0.75  # see `_doubts`
 _SIZES = 1e-3, 10.0  # radii of gyration of machines and their parts [m]
-_UNITS = {"kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 _FAR = 100.0  # radii of gyration
+# About the origin m c^T S^-1 c is at most 1 whatever the body, and about the centre of mass 3 for a
+# rod whose end is the origin, 5 for a ball that touches it: 3/4 and 5/6 where they are mistaken.
+_MISTAKEN = 0.7
 
 
-def _second_moment(tensor: np.ndarray) -> np.ndarray:
-    """The tensor of sum m r r^T, which has no negative moment."""
-    return 0.5 * np.trace(tensor) * np.eye(3) - tensor
+def _is_real(tensor: np.ndarray) -> bool:
+    """Whether no principal moment of the second moment of mass is below 0, to rounding."""
+    trace = np.trace(tensor)
+    least = np.linalg.eigvalsh(0.5 * trace * np.eye(3) - tensor)[0]
+    return bool(trace >= 0 and least >= -_ULPS * np.finfo(tensor.dtype).eps * trace)
 
 
-def is_real(tensor: np.ndarray, ulps: float = _ULPS) -> bool:
-    """Whether a body can have a tensor, to rounding."""
-    slack = ulps * np.finfo(tensor.dtype).eps * abs(np.trace(tensor))
-    return bool(np.trace(tensor) >= 0 and np.linalg.eigvalsh(_second_moment(tensor))[0] >= -slack)
-
-
-def _steiner(place: np.ndarray) -> np.ndarray:
-    return np.dot(place, place) * np.eye(3) - np.outer(place, place)
-
-
-def _shown(*values: float) -> str:
-    return ", ".join(f"{x:.4g}" for x in values)
+def _shift(mass: float, center: np.ndarray) -> np.ndarray:
+    return mass * (center @ center * np.eye(3) - np.outer(center, center))
 
 
 def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
@@ -45,83 +39,61 @@ def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
         "its numbers are in the order xx xy xz yy yz zz where MJCF's `fullinertia` is xx yy zz xy "
         "xz yz": np.array([[a, d, f], [d, b, c], [f, c, e]]),
         "it was already about the centre of mass when m (|d|^2 1 - d d^T) was subtracted to bring "
-        "it there (add it back)": tensor + mass * _steiner(center),
+        "it there (add it back)": tensor + _shift(mass, center),
     }
-    guesses = {k: x for k, x in guesses.items() if not np.allclose(x, tensor) and is_real(x)}
+    guesses = {k: x for k, x in guesses.items() if not np.allclose(x, tensor) and _is_real(x)}
     return "".join(f" It is that of a body if {words}." for words in guesses)
 
 
 def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ...]:
     """Why no body has these, each with what to do."""
     if not all(np.all(np.isfinite(x)) for x in (mass, center, tensor)):
-        return ("A number is not finite: write the missing ones, or delete the whole inertial.",)
-    words = []
-    if mass <= 0:
-        words.append(
-            f"The mass is {mass:.4g} kg, which is not positive: give what moves a mass, and a mere "
-            "frame no inertial at all."
-        )
-    trace, largest = np.trace(tensor), np.max(np.abs(tensor))
-    if np.max(np.abs(tensor - tensor.T)) > 1e-6 * largest:
-        words.append("The tensor is not symmetric: ixy is both (1, 2) and (2, 1).")
-    tensor = 0.5 * (tensor + tensor.T)
-    if is_real(tensor):
-        return tuple(words)
-    moments = np.linalg.eigvalsh(tensor)
-    over = moments[2] - moments[0] - moments[1]
-    if moments[0] < 0:
-        what = "of which one is negative"
-    else:
-        what = f"of which the largest exceeds the sum of the others by {over:.4g}"
+        return ("A number is not finite: write it, or delete the whole inertial.",)
+    moments = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
+    shown, over = ", ".join(f"{x:.4g}" for x in moments), 2 * moments[2] - np.sum(moments)
+    what = f"of which the largest exceeds the sum of the others by {over:.4g}"
     why = _explanations(tensor, mass, center)
-    if 0 < over < _DIGITS * trace:
+    if 0 < over < _DIGITS * np.sum(moments):
         why = " That is as little as rounding to few digits makes: write more digits."
-    change = np.linalg.norm(_nearest(tensor) - tensor) / largest
-    words.append(
-        f"The principal moments are {_shown(*moments)} kg m^2, {what}: no body has them, as each "
-        f"is a sum of m (y^2 + z^2).{why} Else take it from the mesh (`jrigid.io.read_mesh`), or "
-        "the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
-        f"{100 * change:.2g} %."
-    )
-    return tuple(words)
-
-
-def _nearest(tensor: np.ndarray) -> np.ndarray:
-    return np.asarray(nearest_physical(tensor))
+    size = np.linalg.norm(tensor)
+    change = 100 * np.linalg.norm(np.asarray(nearest_physical(tensor)) - tensor) / (size or 1.0)
+    words = {
+        f"The mass is {mass:.4g} kg, which is not positive: give a mass to what moves, and to a "
+        "mere frame no inertial at all.": mass <= 0,
+        "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T) > _ROUNDING * size,
+        f"The principal moments are {shown} kg m^2, "
+        f"{'of which one is negative' if moments[0] < 0 else what}: no body has them, as each is a "
+        f"sum of m (y^2 + z^2).{why} Else take the tensor from the mesh (`jrigid.io.read_mesh`), "
+        "or the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
+        f"{change:.2g} %.": not _is_real(tensor),
+    }
+    return tuple(text for text, wrong in words.items() if wrong)
 
 
 def doubts(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ...]:
     """What a real body's numbers look as though they were, each with what to do."""
-    words = []
-    if np.array_equal(tensor, np.eye(3)):
-        words.append("The tensor is 1 kg m^2 about every axis, which programs write for none.")
-    if mass <= 0 or np.trace(tensor) <= 0:
-        return tuple(words)
-    second = _second_moment(tensor)
-    radius = float(np.sqrt(0.5 * np.trace(tensor) / mass))
-    if not _SIZES[0] < radius < _SIZES[1]:
-        units = ", ".join(f"{k} {radius * x**0.5:.2g} m" for k, x in _UNITS.items())
-        words.append(
-            f"The radius of gyration is {radius:.2g} m. If the body is not that large, its units "
-            f"are not kg and kg m^2. Were the tensor in other units it would be: {units}; were the "
-            f"mass in g: {radius * 1000**0.5:.2g} m."
-        )
-    distance = float(np.linalg.norm(center))
-    if distance > _FAR * radius:
-        words.append(
-            f"The centre of mass is {distance:.2g} m from the origin, {distance / radius:.0f} "
-            "radii of gyration: its unit may be mm."
-        )
-    # About the origin m c^T S^-1 c is below 1 whatever the body, and about the centre of mass 3
-    # for a rod whose end is the origin, 5 for a ball that touches it.
-    inside = mass * center @ np.linalg.pinv(second, hermitian=True) @ center
-    if _ABOUT_ITS_END <= inside <= 1:
-        words.append(
-            "The tensor may be about the origin of the link, not about the centre of mass as it "
-            "should be: it holds m (|d|^2 1 - d d^T) of the way between them. If so, "
-            "`jrigid.to_center_of_mass(inertia, mass, center_of_mass)` mends it."
-        )
-    return tuple(words)
+    if np.trace(tensor) <= 0:
+        return ()
+    radius, distance = np.sqrt(0.5 * np.trace(tensor) / mass), np.linalg.norm(center)
+    shift = _shift(mass, center)
+    mistaken = _is_real(tensor - shift) and not _is_real(tensor - shift / _MISTAKEN)
+    words = {
+        "The tensor is 1 kg m^2 about every axis, which programs write where they know none: take "
+        "it from the mesh (`jrigid.io.read_mesh`).": np.array_equal(tensor, np.eye(3)),
+        f"The radius of gyration is {radius:.2g} m. If that is not about the size of the body, the "
+        f"units are not kg and kg m^2: it is {1e-3 * radius:.2g} m if the tensor is in kg mm^2, "
+        f"{1e-9**0.5 * radius:.2g} m if in g mm^2, {1e3**0.5 * radius:.2g} m if the mass is in g.": not _SIZES[
+            0
+        ]
+        < radius
+        < _SIZES[1],
+        f"The centre of mass is {distance:.2g} m from the origin, {distance / radius:.0f} radii of "
+        "gyration: is it in mm?": distance > _FAR * radius,
+        "The tensor may be about the origin of the link, not about the centre of mass as it should "
+        "be: it is larger than the m (|d|^2 1 - d d^T) between them, by little. If so, "
+        "`jrigid.to_center_of_mass(inertia, mass, center_of_mass)` mends it.": mistaken,
+    }
+    return tuple(text for text, odd in words.items() if odd)
 
 
 def diagnose(body: MassProperties | InertiaLike) -> tuple[str, ...]:
@@ -180,9 +152,8 @@ def nearest_physical(
     >>> print(jnp.diag(jr.io.nearest_physical(jnp.array([1.0, 1.0, 2.5]))))
     [1.25 1.25 2.5 ]
     """
-    tensor, mass, thickness = shaped(
-        inertia=(inertia, *INERTIA), mass=(mass,), thickness=(thickness,)
-    )
+    known = {"inertia": (inertia, *INERTIA), "mass": (mass,), "thickness": (thickness,)}
+    tensor, mass, thickness = shaped(**known)
     tensor = jnp.diag(tensor) if tensor.ndim == 1 else tensor
     tensor = 0.5 * (tensor + tensor.T)
     eye = jnp.eye(3, dtype=tensor.dtype)

@@ -13,97 +13,73 @@ from jrigid.io._extra import extra
 from jrigid.simulate import Trajectory
 from jrigid.sweep import SweepResult
 
-_COLUMNS = {  # of a state: the dimension along it, its unit, what it is
-    "attitude": ("component", "1", "unit quaternion, scalar first, body to space"),
-    "omega": ("axis", "rad/s", "angular velocity, body components"),
-    "position": ("axis", "m", "centre of mass, space components"),
-    "velocity": ("axis", "m/s", "velocity of the centre of mass, space components"),
-}
-_INVARIANTS = {
-    "energy": ((), "J", "total energy"),
-    "angular_momentum": (("axis",), "kg m^2/s", "total angular momentum, space components"),
-}
-_AXES = {"component": list("wxyz"), "axis": list("xyz"), "other_axis": list("xyz")}
-_AXES |= {"moment": ["I1", "I2", "I3"], "ratio": ["I2/I1", "I3/I1"]}
-
-
-def _about(unit: str, what: str) -> dict[str, str]:
-    return {"units": unit, "long_name": what}
+_UNITS = {"attitude": "1", "omega": "rad/s", "position": "m", "velocity": "m/s"}
+_LABELS = {"component": list("wxyz"), "axis": list("xyz"), "other_axis": list("xyz")}
+_LABELS |= {"moment": ["I1", "I2", "I3"], "ratio": ["I2/I1", "I3/I1"]}
 
 
 def _dataset(variables: dict[str, Any], **attributes: Any) -> Any:
     """Of (dimensions, values, attributes), with the labels of the dimensions."""
-    used = {d for dimensions, *_ in variables.values() for d in dimensions}
-    labels = {d: (d, labels) for d, labels in _AXES.items() if d in used}
+    used = {dimension for dimensions, *_ in variables.values() for dimension in dimensions}
+    labels = {k: x for k, x in _LABELS.items() if k in used}
     return extra("xarray").Dataset(variables, labels, attributes)
 
 
-def _of_trajectory(motion: Trajectory, invariants: bool) -> Any:
-    ts, code = np.asarray(motion.ts), motion.result
+def _of_trajectory(motion: Trajectory) -> Any:
+    ts, lanes = np.asarray(motion.ts), np.ndim(motion.result._value)
     front = tuple(f"lane{i or ''}" for i in range(ts.ndim - 1))
-    same = ts.ndim < 2 or bool(np.all(ts == ts[(0,) * (ts.ndim - 1)]))
-    along = (*front, *(("time" if same else "sample",) if ts.ndim else ()))
-    known = {k: getattr(motion.states, k, None) for k in _COLUMNS}
-    variables: dict[str, Any] = {
-        k: ((*along, _COLUMNS[k][0]), np.asarray(x), _about(*_COLUMNS[k][1:]))
-        for k, x in known.items()
-        if x is not None
-    }
-    for i, leaf in enumerate(jtu.tree_leaves(motion.states.internal)):
-        own = tuple(f"internal{i}_{j}" for j in range(leaf.ndim - ts.ndim))
-        variables[f"internal{i}"] = (*along, *own), np.asarray(leaf)
-    for name, (own, unit, what) in _INVARIANTS.items() if invariants else ():
-        values = np.asarray(getattr(motion, name))
-        variables[name] = (*along, *own), values, _about(unit, what)
-    text = RESULTS[code]
-    if np.ndim(code._value):
-        variables["result"] = front[: np.ndim(code._value)], text
-        text = "see the variable `result`"
-    dataset = _dataset(variables, result=text)
-    time = ts[(0,) * (ts.ndim - 1)] if same and ts.ndim else ts
-    return dataset.assign_coords(time=(along[-1:] if same else along, time, _about("s", "time")))
-
-
-def _of_fit(fit: FitResult) -> Any:
-    demand(
-        np.ndim(fit.chi_square) == 0,
-        "Argument `x` must be a single fit, but it is many: take one by `jax.tree.map`.",
-    )
+    first = ts[(0,) * len(front)]
+    shared = bool(np.all(ts == first))
+    along = (*front, *(("time" if shared else "sample",) if ts.ndim else ()))
     variables: dict[str, Any] = {}
-    unit, error = {"moments": "kg m^2"}, "standard error"
-    pairs = {
-        "moments": (("moment",), fit.moments, np.sqrt(np.diag(fit.moments_covariance))),
+    for name, unit in _UNITS.items():
+        if (x := getattr(motion.states, name, None)) is not None:
+            own = "component" if name == "attitude" else "axis"
+            variables[name] = (*along, own), np.asarray(x), {"units": unit}
+    for i, x in enumerate(jtu.tree_leaves(motion.states.internal)):
+        own = tuple(f"internal{i}_{j}" for j in range(x.ndim - ts.ndim))
+        variables[f"internal{i}"] = (*along, *own), np.asarray(x)
+    text = RESULTS[motion.result]
+    if lanes:
+        variables["result"] = front[:lanes], text
+    time = (along[-1:], first) if shared else (along, ts)
+    dataset = _dataset(variables, **({} if lanes else {"result": text}))
+    return dataset.assign_coords(time=(*time, {"units": "s"}))
+
+
+def _with_errors(fit: FitResult) -> dict[str, tuple[tuple[str, ...], Any, Any]]:
+    """Dimensions, values and standard errors of what a fit found."""
+    single = np.ndim(fit.chi_square) == 0
+    demand(single, "Argument `x` must be a single fit, but it is many: take one by `jax.tree.map`.")
+    picked = fit.leaves.items()
+    return {
+        "moments": (("moment",), fit.moments, np.sqrt(np.diagonal(fit.moments_covariance))),
         "ratios": (("ratio",), fit.ratios, fit.ratios_errors),
         "shares": (("moment",), fit.shares, fit.shares_errors),
         "numbers": (("number",), fit.numbers, fit.errors),
+        **{k: (tuple(f"{k}_{i}" for i in range(np.ndim(x))), x, e) for k, (x, e) in picked},
     }
-    for name, (value, errors) in fit.leaves.items():
-        pairs[name] = tuple(f"{name}_{i}" for i in range(np.ndim(value))), value, errors
-    for name, (dimensions, value, errors) in pairs.items():
-        about = {"units": unit[name]} if name in unit else {}
-        variables[name] = dimensions, np.asarray(value), about
-        variables[f"{name}_error"] = dimensions, np.asarray(errors), about | {"long_name": error}
-    inertia = _about("kg m^2", "inertia tensor, body axes")
-    variables["inertia"] = ("axis", "other_axis"), np.asarray(fit.inertia), inertia
-    covariance = np.asarray(fit.numbers_covariance)
-    variables["numbers_covariance"] = ("number", "other_number"), covariance
-    dataset = _dataset(
-        variables,
-        status=Status[fit.status],
-        reduced_chi_square=float(fit.reduced_chi_square),
-        degrees_of_freedom=int(fit.degrees_of_freedom),
-    )
-    names = list(fit.names)
-    return dataset.assign_coords(number=names, other_number=names)
 
 
-def to_xarray(x: Trajectory | FitResult | SweepResult, *, invariants: bool = False) -> Any:
+def _of_fit(fit: FitResult) -> Any:
+    variables: dict[str, Any] = {
+        "inertia": (("axis", "other_axis"), np.asarray(fit.inertia), {"units": "kg m^2"}),
+        "numbers_covariance": (("number", "other_number"), np.asarray(fit.numbers_covariance)),
+    }
+    for name, (dimensions, *pair) in _with_errors(fit).items():
+        about = {"units": "kg m^2"} if name == "moments" else {}
+        for key, x in zip((name, f"{name}_error"), pair, strict=True):
+            variables[key] = dimensions, np.asarray(x), about
+    dataset = _dataset(variables, status=Status[fit.status])
+    return dataset.assign_coords(number=list(fit.names), other_number=list(fit.names))
+
+
+def to_xarray(x: Trajectory | FitResult | SweepResult) -> Any:
     """A trajectory, fit or sweep as an `xarray.Dataset`, with units in the attributes.
 
     Args:
         x: A trajectory, of many lanes too (dimensions `lane`, `time`; where their times differ
             `lane`, `sample`); a single fit; a sweep.
-        invariants: Whether to add a trajectory's energy and angular momentum.
 
     Returns:
         The data set: of a trajectory its states, of a fit its moments, ratios, shares, numbers and
@@ -123,15 +99,14 @@ def to_xarray(x: Trajectory | FitResult | SweepResult, *, invariants: bool = Fal
     check_type("x", x, Trajectory, FitResult, SweepResult)
     if isinstance(x, SweepResult):
         return x.to_xarray()
-    return _of_fit(x) if isinstance(x, FitResult) else _of_trajectory(x, invariants)
+    return _of_fit(x) if isinstance(x, FitResult) else _of_trajectory(x)
 
 
-def to_pandas(x: Trajectory | FitResult | SweepResult, *, invariants: bool = False) -> Any:
+def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
     """A trajectory, fit or sweep as a `pandas.DataFrame`, with units in `attrs["units"]`.
 
     Args:
         x: A trajectory of one lane; a single fit; a sweep.
-        invariants: Whether to add a trajectory's energy and angular momentum.
 
     Returns:
         Of a trajectory a row for each time [s], columns `attitude_w`, ..., `omega_x`, ...; of a
@@ -149,42 +124,28 @@ def to_pandas(x: Trajectory | FitResult | SweepResult, *, invariants: bool = Fal
     >>> print(table.index.name, list(table.columns[-3:]), table.attrs["units"]["omega_x"])
     time ['omega_x', 'omega_y', 'omega_z'] rad/s
     """
-    pandas = extra("pandas")
-    dataset = to_xarray(x, invariants=invariants)
+    pandas, dataset = extra("pandas"), to_xarray(x)
     if isinstance(x, SweepResult):
         return dataset.to_dataframe()
     if isinstance(x, FitResult):
         names = [k for k in dataset if f"{k}_error" in dataset]
-        table = pandas.DataFrame(
+        parts = {"value": "", "error": "_error"}
+        return pandas.DataFrame(
             {
-                column: {k: v for n in names for k, v in _flat(dataset, n + of, n)}
-                for column, of in (("value", ""), ("error", "_error"))
+                c: {k: v for n in names for k, v in _flat(dataset[n + of], n)}
+                for c, of in parts.items()
             }
         )
-        table.attrs = {
-            "units": {f"moments_{k}": "kg m^2" for k in _AXES["moment"]},
-            **dataset.attrs,
-        }
-        return table
-    demand(
-        x.ts.ndim == 1,
-        "Argument `x` must be a trajectory of one lane, but it has more: use `to_xarray(x)`.",
-    )
-    columns = {k: (v, n) for n in dataset for k, v in _flat(dataset, n, n, skip=1)}
-    index = pandas.Index(np.asarray(x.ts), name="time")
-    table = pandas.DataFrame({k: v for k, (v, _) in columns.items()}, index)
-    units = {k: dataset[n].attrs.get("units", "") for k, (_, n) in columns.items()}
-    table.attrs = {"units": {"time": "s", **units}, **dataset.attrs}
+    message = "Argument `x` must be a trajectory of one lane, but it has more: use `to_xarray`."
+    demand(x.ts.ndim == 1, message)
+    columns = [(n, *pair) for n in dataset for pair in _flat(dataset[n], n, keep=1)]
+    table = pandas.DataFrame({k: v for _, k, v in columns}, dataset.indexes["time"])
+    table.attrs["units"] = {k: dataset[n].attrs.get("units", "") for n, k, _ in columns}
     return table
 
 
-def _flat(dataset: Any, name: str, called: str, skip: int = 0) -> Iterator[tuple[str, np.ndarray]]:
-    """Columns of a variable, each with a name made of that of the variable and its labels."""
-    variable = dataset[name]
-    labels = [
-        dataset[d].values if d in dataset.coords else range(dataset.sizes[d])
-        for d in variable.dims[skip:]
-    ]
-    flat = variable.values.reshape(*variable.shape[:skip], -1)
-    for i, each in enumerate(product(*labels)):
-        yield "_".join([called, *map(str, each)]), flat[..., i]
+def _flat(variable: Any, name: str, keep: int = 0) -> Iterator[tuple[str, np.ndarray]]:
+    """What a variable holds along its first dimensions, named by it and the labels of the rest."""
+    columns = variable.values.reshape(*variable.shape[:keep], -1)
+    for i, labels in enumerate(product(*(variable[d].values for d in variable.dims[keep:]))):
+        yield "_".join([name, *map(str, labels)]), columns[..., i]
