@@ -80,13 +80,10 @@ def doubts(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
     words = {
         "The tensor is 1 kg m^2 about every axis, which programs write where they know none: take "
         "it from the mesh (`jrigid.io.read_mesh`).": np.array_equal(tensor, np.eye(3)),
-        f"The radius of gyration is {radius:.2g} m. If that is not about the size of the body, the "
+        f"The radius of gyration is {radius:.2g} m. If that is not about the size of the body, its "
         f"units are not kg and kg m^2: it is {1e-3 * radius:.2g} m if the tensor is in kg mm^2, "
-        f"{1e-9**0.5 * radius:.2g} m if in g mm^2, {1e3**0.5 * radius:.2g} m if the mass is in g.": not _SIZES[
-            0
-        ]
-        < radius
-        < _SIZES[1],
+        f"{1e-9**0.5 * radius:.2g} m if in g mm^2, {1e3**0.5 * radius:.2g} m if the mass is in g."
+        "": not _SIZES[0] < radius < _SIZES[1],
         f"The centre of mass is {distance:.2g} m from the origin, {distance / radius:.0f} radii of "
         "gyration: is it in mm?": distance > _FAR * radius,
         "The tensor may be about the origin of the link, not about the centre of mass as it should "

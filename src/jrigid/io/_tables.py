@@ -148,4 +148,4 @@ def _flat(variable: Any, name: str, keep: int = 0) -> Iterator[tuple[str, np.nda
     """What a variable holds along its first dimensions, named by it and the labels of the rest."""
     columns = variable.values.reshape(*variable.shape[:keep], -1)
     for i, labels in enumerate(product(*(variable[d].values for d in variable.dims[keep:]))):
-        yield "_".join([name, *map(str, labels)]), columns[..., i]
+        yield "_".join([name, *map(str, labels)]), columns.T[i]
