@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jrigid._checks import check_type, demand
+from jrigid._types import ScalarLike
 from jrigid.io._extra import extra
 from jrigid.mass import MassProperties, from_mesh
 
-Density = float | Mapping[str, float]
+Density = ScalarLike | Mapping[str, float]
 _ADVICE = (
     "Corners at one place were merged already. `mesh.fill_holes()` of trimesh closes small holes, "
     "`mesh.fix_normals()` turns faces, `trimesh.boolean.union` joins parts that overlap."

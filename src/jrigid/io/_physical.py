@@ -25,7 +25,7 @@ def _is_real(tensor: np.ndarray) -> bool:
 
 
 def _shift(mass: float, center: np.ndarray) -> np.ndarray:
-    return mass * (center @ center * np.eye(3) - np.outer(center, center))
+    return mass * (center @ center * np.eye(3, dtype=center.dtype) - np.outer(center, center))
 
 
 def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
