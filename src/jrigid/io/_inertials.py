@@ -227,8 +227,7 @@ def write_inertials(
         check_option("path", Path(path).suffix, tuple(_NEW))
         file, link = _NEW[Path(path).suffix]
         template = file.format("".join(link.format(quoteattr(name)) for name in bodies))
-    root = _root(template)
-    links = _links(root)
+    links = _links(root := _root(template))
     strange = sorted(set(bodies) - set(links))
     message = f"Argument `bodies` must name links of the template, but {strange} are not in it."
     demand(not strange, message)

@@ -129,13 +129,8 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
         return dataset.to_dataframe()
     if isinstance(x, FitResult):
         names = [k for k in dataset if f"{k}_error" in dataset]
-        parts = {"value": "", "error": "_error"}
-        return pandas.DataFrame(
-            {
-                c: {k: v for n in names for k, v in _flat(dataset[n + of], n)}
-                for c, of in parts.items()
-            }
-        )
+        pair = [{k: v for n in names for k, v in _flat(dataset[n + x], n)} for x in ("", "_error")]
+        return pandas.DataFrame(dict(zip(("value", "error"), pair, strict=True)))
     message = "Argument `x` must be a trajectory of one lane, but it has more: use `to_xarray`."
     demand(x.ts.ndim == 1, message)
     columns = [(n, *pair) for n in dataset for pair in _flat(dataset[n], n, keep=1)]
