@@ -63,7 +63,7 @@ def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
         "mere frame no inertial at all.": mass <= 0,
         "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T) > _ROUNDING * size,
         f"The principal moments are {shown} kg m^2, of which the {what}: no body has them, as each "
-        f"is a sum of m (y^2 + z^2).{why} Else take the tensor from the mesh (`jrigid.io.read_mesh`), "
+        f"is a sum of m (y^2 + z^2).{why} Else take it from the mesh (`jrigid.io.read_mesh`), "
         "or the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
         f"{change:.3g} %.": not _is_real(tensor),
     }
