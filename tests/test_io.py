@@ -425,9 +425,16 @@ def test_mujoco_375_a_long_finger():
     assert "nearest_physical`), which changes it by" in text
 
 
+def test_gepetto_130_talos_has_its_products_negated():
+    text = complaint(0.0, [0, 0, 0], [1.15e-4, 1.53e-4, 1.9e-4, 5.2e-5, 2.5e-5, 3.4e-5])
+    assert "The mass is 0 kg" in text
+    assert "exceeds the sum of the others by 5.751e-06" in text  # as the complaint says
+    assert "if its products of inertia are negated" in text
+
+
 def test_compas_fab_486_a_shift_made_twice():
     text = complaint(40.0, [0, 0, 1.0], [-8.0, -8.0, 0.482, 0, 0, 0])
-    assert "of which one is negative" in text
+    assert "of which the smallest is negative" in text
     assert "already about the centre of mass when" in text
     assert "add it back" in text
     assert "products" not in text
@@ -552,7 +559,9 @@ def motion(ts):
 
 def test_a_trajectory_as_tables():
     pandas, xarray = pytest.importorskip("pandas"), pytest.importorskip("xarray")
-    moved = motion(jnp.linspace(0.0, 2.0, 5))(jnp.array([0.1, 1.0, 0.2]))
+    omegas = jnp.array([[0.1, 1.0, 0.2], [0.3, 0.1, 0.2]])
+    many = jax.vmap(motion(jnp.linspace(0.0, 2.0, 5)))(omegas)
+    moved = jax.tree.map(lambda x: x[0], many)
     table, data = jr.io.to_pandas(moved), jr.io.to_xarray(moved)
     assert isinstance(table, pandas.DataFrame)
     assert isinstance(data, xarray.Dataset)
@@ -566,13 +575,10 @@ def test_a_trajectory_as_tables():
     assert data.time.units == "s"
     assert data.attrs["result"] == "All went well."
     # Lanes, with their times in common and each with its own.
-    omegas = jnp.array([[0.1, 1.0, 0.2], [0.3, 0.1, 0.2]])
-    many = jax.vmap(motion(jnp.linspace(0.0, 2.0, 5)))(omegas)
     lanes = jr.io.to_xarray(many)
     assert dict(lanes.sizes) == {"lane": 2, "time": 5, "component": 4, "axis": 3}
     assert_allclose(lanes.omega.isel(lane=1), many.states.omega[1])
     assert list(lanes.result.values) == ["All went well."] * 2
-    own = jax.tree.map(lambda x: x, many)
     own = jr.Trajectory(many.ts + jnp.array([[0.0], [1.0]]), *list(vars(many).values())[1:])
     assert jr.io.to_xarray(own).time.dims == ("lane", "sample")
     with pytest.raises(ValueError, match="of one lane, but it has more: use `to_xarray`"):

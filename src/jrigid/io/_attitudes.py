@@ -73,8 +73,6 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
 def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
     """Rotations of jaxlie, or rigid transforms where positions are given; both are scalar first.
 
-    jaxlie is not among the packages of an extra: pip install jaxlie.
-
     Args:
         attitude: Unit quaternions, scalar first, body to space.
         position: Of the body's origin, space components [m].

@@ -51,7 +51,8 @@ def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
         return ("A number is not finite: write it, or delete the whole inertial.",)
     moments = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     shown, over = ", ".join(f"{x:.4g}" for x in moments), 2 * moments[2] - np.sum(moments)
-    what = f"of which the largest exceeds the sum of the others by {over:.4g}"
+    what = f"largest exceeds the sum of the others by {over:.4g}"
+    what = "smallest is negative" if moments[0] < 0 else what
     why = _explanations(tensor, mass, center)
     if 0 < over < _DIGITS * np.sum(moments):
         why = " That is as little as rounding to few digits makes: write more digits."
@@ -61,11 +62,10 @@ def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
         f"The mass is {mass:.4g} kg, which is not positive: give a mass to what moves, and to a "
         "mere frame no inertial at all.": mass <= 0,
         "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T) > _ROUNDING * size,
-        f"The principal moments are {shown} kg m^2, "
-        f"{'of which one is negative' if moments[0] < 0 else what}: no body has them, as each is a "
-        f"sum of m (y^2 + z^2).{why} Else take the tensor from the mesh (`jrigid.io.read_mesh`), "
+        f"The principal moments are {shown} kg m^2, of which the {what}: no body has them, as each "
+        f"is a sum of m (y^2 + z^2).{why} Else take it from the mesh (`jrigid.io.read_mesh`), "
         "or the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
-        f"{change:.2g} %.": not _is_real(tensor),
+        f"{change:.3g} %.": not _is_real(tensor),
     }
     return tuple(text for text, wrong in words.items() if wrong)
 
