@@ -42,7 +42,7 @@ def test_earth_pole_reads_the_published_digits(earth):
 
 def test_earth_pole_without_its_extra_says_which(monkeypatch):
     monkeypatch.setitem(sys.modules, "astropy_iers_data", None)
-    with pytest.raises(ImportError, match=r"pip install jrigid\[data\]"):
+    with pytest.raises(ImportError, match=r'astropy-iers-data: pip install "jrigid\[data\]"'):
         jr.datasets.earth_pole()
 
 

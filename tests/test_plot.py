@@ -394,13 +394,13 @@ def test_pictures_go_where_they_are_told(name, monkeypatch):
         assert (ax.elev, ax.azim) == (10, 20)
         with pytest.raises(ValueError, match="`ax` must have three dimensions"):
             CALLS[name](ax=figure.add_subplot(1, 2, 1))
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"jrigid\[plot\]"):
         CALLS[name]()
 
 
 def test_a_motion_without_the_extra_names_it(film, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"jrigid\[plot\]"):
         jr.plot.motion(SPUN, system=TOP, ts=TIMES)
     with pytest.raises(ImportError, match=r"jrigid\[plot\]"):

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jrigid._extra import extra
 from jrigid._types import Readable
 
 _ARCSECOND = math.pi / 648000.0
@@ -92,7 +93,7 @@ def earth_pole() -> EarthPole:
         The whole record, about 24 000 days; pole coordinates and their errors in rad.
 
     Raises:
-        ImportError: astropy-iers-data is not installed.
+        ImportError: Without the extra `jrigid[data]`.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.earth_pole()
@@ -102,16 +103,8 @@ def earth_pole() -> EarthPole:
     Source: IERS Earth Orientation Centre, Paris Observatory, EOP 20 C04, consistent with ITRF 2020;
     Bizouard et al., J. Geodesy 93, 621 (2019).
     """
-    try:
-        import astropy_iers_data
-    except ImportError as error:
-        raise ImportError(
-            "earth_pole needs the package astropy-iers-data, which carries the record: "
-            "`pip install jrigid[data]`."
-        ) from error
-    columns = np.loadtxt(
-        astropy_iers_data.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True
-    )
+    iers = extra("data", "astropy_iers_data")
+    columns = np.loadtxt(iers.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True)
     return EarthPole(columns[0], *(columns[1:] * _ARCSECOND))
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import array_of_shape, demand, float_arrays
+from jrigid._extra import extra
 from jrigid._types import Quaternion, QuaternionLike, Real, Vector, VectorLike
-from jrigid.io._extra import extra
 from jrigid.rotation import conjugate
 
 Attitudes = Real[Any, "*batch 4"]
@@ -38,7 +38,7 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     >>> print(turn.as_rotvec(degrees=True).round(6))
     [ 0.  0. 90.]
     """
-    transform = extra("scipy.spatial.transform")
+    transform = extra("io", "scipy.spatial.transform")
     turn = transform.Rotation.from_quat(np.roll(np.asarray(float_arrays(attitude)[0]), -1, -1))
     if position is None:
         return turn
@@ -82,7 +82,7 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
 
     Gradients: the identity.
     """
-    jaxlie = extra("jaxlie")
+    jaxlie = extra("io", "jaxlie")
     if position is None:
         return jaxlie.SO3(wxyz=float_arrays(attitude)[0])
     return jaxlie.SE3(wxyz_xyz=jnp.concatenate(float_arrays(attitude, position), axis=-1))

@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jrigid._checks import check_option, demand
-from jrigid.io._extra import extra
+from jrigid._extra import extra
 from jrigid.io._physical import faults, nearest_physical
 from jrigid.mass import MassProperties
 
@@ -66,7 +66,7 @@ def _numbers(text: str | None, count: int) -> np.ndarray:
 
 def _turn(said: Mapping[str, str | None], options: Mapping[str, str]) -> Any:
     """From the axes of the tensor to those of the link."""
-    turns = extra("scipy.spatial.transform").Rotation
+    turns = extra("io", "scipy.spatial.transform").Rotation
     unit = np.pi / 180 if options.get("angle", "degree") == "degree" else 1.0
     if text := said.get("quat"):
         return turns.from_quat(np.roll(_numbers(text, 4), -1))

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jrigid._checks import check_type, demand
+from jrigid._extra import extra
 from jrigid._types import ScalarLike
-from jrigid.io._extra import extra
 from jrigid.mass import MassProperties, from_mesh
 
 Density = ScalarLike | Mapping[str, float]
@@ -117,4 +117,4 @@ def read_mesh(path: str | Path, density: Density = 1.0, *, scale: float = 1.0) -
         ValueError: As `from_trimesh`.
     """
     check_type("path", path, str, Path)
-    return from_trimesh(extra("trimesh").load_scene(path), density, scale=scale)
+    return from_trimesh(extra("io", "trimesh").load_scene(path), density, scale=scale)

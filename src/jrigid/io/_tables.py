@@ -8,8 +8,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid._checks import RESULTS, check_type, demand
+from jrigid._extra import extra
 from jrigid.identify import FitResult, Status
-from jrigid.io._extra import extra
 from jrigid.simulate import Trajectory
 from jrigid.sweep import SweepResult
 
@@ -22,7 +22,7 @@ def _dataset(variables: dict[str, Any], **attributes: Any) -> Any:
     """Of (dimensions, values, attributes), with the labels of the dimensions."""
     used = {dimension for dimensions, *_ in variables.values() for dimension in dimensions}
     labels = {k: x for k, x in _LABELS.items() if k in used}
-    return extra("xarray").Dataset(variables, labels, attributes)
+    return extra("io", "xarray").Dataset(variables, labels, attributes)
 
 
 def _of_trajectory(motion: Trajectory) -> Any:
@@ -124,7 +124,7 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
     >>> print(table.index.name, list(table.columns[-3:]), table.attrs["units"]["omega_x"])
     time ['omega_x', 'omega_y', 'omega_z'] rad/s
     """
-    pandas, dataset = extra("pandas"), to_xarray(x)
+    pandas, dataset = extra("io", "pandas"), to_xarray(x)
     if isinstance(x, SweepResult):
         return dataset.to_dataframe()
     if isinstance(x, FitResult):

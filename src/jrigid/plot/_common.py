@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jrigid._checks import demand
+from jrigid._extra import extra
 from jrigid.mass import principal_axes
 
 # Okabe and Ito's colours, told apart by the colour-blind, with a marker each.
@@ -17,11 +18,7 @@ _VIEW = 25, 35  # elevation and azimuth of a new picture in space [degrees]
 
 def pyplot() -> Any:
     """`matplotlib.pyplot`, or an error that names the extra."""
-    try:
-        from matplotlib import pyplot
-    except ImportError as error:
-        raise ImportError('This needs matplotlib: pip install "jrigid[plot]".') from error
-    return pyplot
+    return extra("plot", "matplotlib.pyplot")
 
 
 def flat_axes(ax: Any) -> Any:

@@ -1,7 +1,6 @@
 """Files become tables with the units that their formats leave unsaid."""
 
 import csv
-import importlib
 import io
 import itertools
 import os
@@ -13,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jrigid._checks import demand
+from jrigid._extra import extra
 
 Source = str | os.PathLike[str] | io.TextIOBase
 _BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
@@ -57,12 +57,9 @@ def tables_of(path: Source, log: int) -> list[Table]:
 
 def _blackbox(path: str, name: str, log: int) -> Table:
     """A log of a flight controller, decoded by orangebox."""
-    try:
-        orangebox = importlib.import_module("orangebox")
-        # A parser for each log: one that goes on to another keeps the headers of the last.
+    orangebox = extra("records", "orangebox")
+    try:  # a parser for each log: one that goes on to another keeps the headers of the last
         parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
-    except ModuleNotFoundError as error:
-        raise ImportError('This needs orangebox: pip install "jrigid[records]".') from error
     except RuntimeError as error:
         raise ValueError(
             f"Arguments `path` and `log` must be of a log that can be decoded, but: {error}"

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax.tree_util as jtu
 import numpy as np
 
+from jrigid._extra import extra
 from jrigid.sweep._grid import leaves_of
 
 
@@ -73,7 +74,7 @@ class SweepResult(NamedTuple):
         Raises:
             ImportError: Without the extra `jrigid[sweep]`.
         """
-        xarray = extra("xarray")
+        xarray = extra("sweep", "xarray")
         if self.store is not None:
             dataset = xarray.open_zarr(self.store)
         else:
@@ -86,13 +87,3 @@ class SweepResult(NamedTuple):
         if self.classes is not None:
             dataset["classes"] = self.labels, self.classes
         return dataset
-
-
-def extra(name: str) -> Any:
-    """A package of the extra `sweep`, or an error that names it."""
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise ImportError(f'This needs {name}: pip install "jrigid[sweep]".') from error

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from jrigid._extra import extra
 from jrigid.sweep._grid import VALID, Grid, Leaf
-from jrigid.sweep._result import extra
 
 try:
     import fcntl
@@ -63,7 +63,7 @@ def _digest(*values: Any) -> str:
 
 
 def _checksum(numbers: Any) -> bytes:
-    return extra("google_crc32c").value(numbers).to_bytes(4, "little")
+    return extra("sweep", "google_crc32c").value(numbers).to_bytes(4, "little")
 
 
 def fingerprint(function: Any, jaxpr: Any) -> dict[str, Any]:
@@ -163,7 +163,9 @@ class Store:
         """The zarr arrays of the leaves, in their order."""
         if not self._arrays:
             try:
-                group = extra("zarr").open_group(self.path, mode="r+", use_consolidated=False)
+                group = extra("sweep", "zarr").open_group(
+                    self.path, mode="r+", use_consolidated=False
+                )
                 self._arrays = {x.name: group[x.name] for x in self.leaves}
                 self._axes = {name: group[name] for name in self.grid.axes}
             except (KeyError, ValueError) as error:
@@ -173,7 +175,7 @@ class Store:
 
     def _create(self, about: dict[str, Any], attributes: dict[str, dict]) -> None:
         """Write what describes the arrays; all of it appears at once."""
-        zarr, grid = extra("zarr"), self.grid
+        zarr, grid = extra("sweep", "zarr"), self.grid
         partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
         parts: list[Any] = [
             (x, n.shape, n.shape, n.dtype, 0, [x], {}) for x, n in grid.axes.items()
@@ -189,7 +191,7 @@ class Store:
                 group.create_array(
                     name, shape=shape, chunks=block, dtype=dtype, fill_value=fill,
                     dimension_names=dimensions, attributes=flags | attributes.get(name, {}),
-                    compressors=[extra("zarr.codecs").Crc32cCodec()],
+                    compressors=[extra("sweep", "zarr.codecs").Crc32cCodec()],
                 )  # fmt: skip
             with warnings.catch_warnings():
                 # So that xarray opens it in one look; the format's next version will have it.

@@ -1,0 +1,13 @@
+"""Packages of the extras, imported where they are used."""
+
+import importlib
+from typing import Any
+
+
+def extra(group: str, module: str) -> Any:
+    """A module of a package of an extra, or an error that names both."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0].replace("_", "-")
+        raise ImportError(f'This needs {package}: pip install "jrigid[{group}]".') from error
