@@ -322,7 +322,7 @@ def test_attitudes_are_drawn_on_the_models_side(found, pictures):
 
 
 def test_a_picture_without_the_extra_names_it(found, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"jrigid\[plot\]"):
         jr.plot.fit(found)
 
