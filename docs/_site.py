@@ -103,7 +103,8 @@ def mark_up(app, what, name, thing, options, lines) -> None:
         return f"``{match[1]}``"
 
     text = "\n".join(lines)
-    text = re.sub(r"^(Gradients|Source): (.*(?:\n +.*)*)", last_words, text, flags=re.M)
+    last = r"^(Gradients|Source): (.+(?:\n(?!Gradients:|Source:).*\S.*)*)"
+    text = re.sub(last, last_words, text, flags=re.M)
     parts = re.split(r"(`[^`]*`|\$[^$]+\$|^ *>>>(?:.*\S.*\n?)*)", text, flags=re.M)
     for i, part in enumerate(parts):
         if part.startswith("`") and not parts[i - 1].endswith(":"):
@@ -197,7 +198,7 @@ def gallery() -> str:
             image = Image.open(io.BytesIO(base64.b64decode(pictures[-1]))).convert("RGB")
             image.thumbnail((640, 640))
             image.save(THUMBNAILS / f"{path.stem}.png")
-            shown = f":img-bottom: thumbnails/{path.stem}.png\n:img-alt: {title}\n"
+            shown = f":img-top: thumbnails/{path.stem}.png\n:img-alt: {title}\n"
         cards.append(
             f":::{{grid-item-card}} {title}\n:link: ../notebooks/{path.stem}\n:link-type: doc\n"
             f"{shown}:::\n"

@@ -47,7 +47,9 @@ html_theme = "pydata_sphinx_theme"
 html_title = "jrigid"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_extra_path = ["_root"]  # index.html, which leads to docs/index.html
 html_show_sourcelink = html_copy_source = False
+html_context = {"default_mode": "auto"}
 html_theme_options = {
     "logo": {"text": "jrigid"},
     "navbar_end": ["theme-switcher"],

@@ -13,22 +13,27 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 ROOT = Path(__file__).parents[1]
 PAGES = [
     x
-    for x in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    for x in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
     if BLOCK.search(x.read_text())
 ]
+
+
+def name(page):
+    return str(page.relative_to(ROOT).with_suffix(""))
 
 
 LONG = "jr.identify.fit("  # the same lines are an example in the docstring of `fit`
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=name)
 def test_code_blocks_run(page):
     run(page, lambda code: LONG not in code)
 
 
 @pytest.mark.slow
-def test_code_blocks_that_fit_run():
-    run(ROOT / "docs" / "guide.md", lambda code: LONG in code)
+@pytest.mark.parametrize("page", [x for x in PAGES if LONG in x.read_text()], ids=name)
+def test_code_blocks_that_fit_run(page):
+    run(page, lambda code: True)
 
 
 def run(page, wanted):
