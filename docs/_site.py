@@ -57,7 +57,7 @@ def write_api(app) -> None:
         pages[name] = (
             heading(name)
             + f".. automodule:: {name}\n\n"
-            + listing([x for x in module.__all__])
+            + listing(module.__all__)
             + "".join(entry(name, x) for x in module.__all__)
         )
     own = [x for x in TOP if not home(x)]
@@ -138,7 +138,7 @@ class LinkNames(SphinxPostTransform):
 
     default_priority = 500
 
-    def run(self, **kwargs) -> None:
+    def run(self, **_) -> None:
         """Look at every literal outside a link."""
         objects = self.env.domains.python_domain.objects
         for node in list(self.document.findall(nodes.literal)):

@@ -31,6 +31,7 @@ autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 autodoc_class_signature = "mixed"
 autosummary_generate = False
+toc_object_entries_show_parents = "hide"
 maximum_signature_line_length = 80
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -61,4 +62,4 @@ html_theme_options = {
     "footer_end": [],
     "pygments_light_style": "a11y-light",
 }
-html_sidebars = {"docs/index": []}
+html_sidebars = {f"docs/{x}": [] for x in ("index", "getting_started", "physics")}

@@ -42,7 +42,9 @@ def execute(path: pathlib.Path) -> bool:
 def main() -> int:
     """Run the notebooks beside this file, one on each core; with --new those not run yet."""
     TARGET.mkdir(parents=True, exist_ok=True)
-    wanted = [x for x in sorted(HERE.glob("*.ipynb")) if "--new" not in sys.argv or not is_executed(x)]
+    wanted = [
+        x for x in sorted(HERE.glob("*.ipynb")) if "--new" not in sys.argv or not is_executed(x)
+    ]
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         return int(not all(list(pool.map(execute, wanted))))
 

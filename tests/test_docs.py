@@ -33,7 +33,7 @@ def test_code_blocks_run(page):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [x for x in PAGES if LONG in x.read_text()], ids=name)
 def test_code_blocks_that_fit_run(page):
-    run(page, lambda code: True)
+    run(page, bool)
 
 
 def run(page, wanted):
