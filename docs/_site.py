@@ -58,14 +58,14 @@ def write_api(app) -> None:
             heading(name)
             + f".. automodule:: {name}\n\n"
             + listing(module.__all__)
-            + "".join(entry(name, x) for x in module.__all__)
+            + "".join(directive(name, x) for x in module.__all__)
         )
     own = [x for x in TOP if not home(x)]
     pages["jrigid"] = (
         heading("jrigid")
         + ".. automodule:: jrigid\n\n"
         + listing(TOP)
-        + "".join(entry("jrigid", x) for x in own)
+        + "".join(directive("jrigid", x) for x in own)
     )
     for name, text in pages.items():
         page = API / f"{name}.rst"
@@ -76,7 +76,7 @@ def write_api(app) -> None:
             page.unlink()
 
 
-def entry(module: str, name: str) -> str:
+def directive(module: str, name: str) -> str:
     """The directive that documents a name."""
     shown = getattr(sys.modules[module], name)
     if inspect.isclass(shown):
@@ -112,7 +112,7 @@ def mark_up(app, what, name, thing, options, lines) -> None:
         elif part.startswith("$"):
             parts[i] = f":math:`{' '.join(part[1:-1].split())}`"
         elif not i % 2:  # stars, bars and underscores mean nothing there
-            parts[i] = re.sub(r"(?<!\*)\*(?!\*)|\||_\b", r"\\\g<0>", part)
+            parts[i] = re.sub(r"(?<!\*)\*(?=\w)|\||_\b", r"\\\g<0>", part)
     lines[:] = "".join(parts).split("\n")
 
 
@@ -155,9 +155,17 @@ class LinkNames(SphinxPostTransform):
                 node.replace_self(link)
 
 
+def mark_numbers(app, doctree) -> None:
+    """Numbers in tables are not broken at a minus sign."""
+    for entry in doctree.findall(nodes.entry):
+        if re.fullmatch(r"[-+.\de]+", entry.astext()):
+            entry["classes"].append("number")
+
+
 # Formulas: MathML, which needs neither script nor network.
 
 CONVERTER = math_core.LatexToMathML()
+_LONG = 50  # characters of LaTeX that are wider than a telephone
 
 
 def visit_formula(self, node) -> None:
@@ -168,7 +176,11 @@ def visit_formula(self, node) -> None:
     except math_core.LatexError as error:
         getLogger(__name__).warning("formula: %s", error, location=node)
         text = ""
-    self.body.append(f'<div class="formula">{text}</div>' if block else text)
+    if block:
+        text = f'<div class="formula">{text}</div>'
+    elif len(node.astext()) > _LONG:
+        text = f'<span class="formula">{text}</span>'
+    self.body.append(text)
     raise nodes.SkipNode
 
 
@@ -227,6 +239,7 @@ def setup(app) -> dict[str, bool]:
     app.connect("include-read", from_the_root)
     app.connect("autodoc-skip-member", skip_numbered_fields)
     app.connect("autodoc-process-docstring", mark_up)
+    app.connect("doctree-read", mark_numbers)
     app.connect("env-updated", name_in_the_package)
     app.add_post_transform(LinkNames)
     app.add_html_math_renderer("mathml", (visit_formula, None), (visit_formula, None))

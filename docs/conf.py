@@ -30,11 +30,12 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 autodoc_class_signature = "mixed"
+autodoc_preserve_defaults = True
 autosummary_generate = False
 toc_object_entries_show_parents = "hide"
 maximum_signature_line_length = 80
 napoleon_numpy_docstring = False
-napoleon_use_ivar = True
+napoleon_custom_sections = [("Attributes", "params_style")]
 
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "substitution", "attrs_inline"]
 myst_heading_anchors = 3
