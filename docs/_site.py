@@ -223,6 +223,14 @@ def fill_gallery(app, config) -> None:
     config.myst_substitutions["gallery"] = gallery()
 
 
+def to_the_front(app, docname: str, source: list[str]) -> None:
+    """README.md is in the front page and the start: links to it lead there."""
+    text = re.sub(
+        r"\]\((?:\.\./)*README\.md#install", "](/docs/getting_started.md#install", source[0]
+    )
+    source[0] = re.sub(r"\]\((?:\.\./)*README\.md", "](/docs/index.md", text)
+
+
 def from_the_root(app, path, parent, content: list[str]) -> None:
     """Links of README.md where a page of docs/ includes it."""
     if path.name == "README.md":
@@ -236,6 +244,7 @@ def setup(app) -> dict[str, bool]:
     app.connect("config-inited", fill_gallery)
     app.connect("builder-inited", write_api)
     app.connect("source-read", read_executed)
+    app.connect("source-read", to_the_front)
     app.connect("include-read", from_the_root)
     app.connect("autodoc-skip-member", skip_numbered_fields)
     app.connect("autodoc-process-docstring", mark_up)
