@@ -58,4 +58,4 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m pytest -m "" tests/test_site.py
 
 clean:
-	rm -rf $(VENV) build dist outputs
+	rm -rf $(VENV) build dist outputs docs/api docs/thumbnails

