@@ -275,6 +275,25 @@ def test_the_ellipse_is_that_of_the_covariance(found, pictures):
         np.testing.assert_allclose(np.einsum("ni,ij,nj->n", apart, inverse, apart), square, 1e-3)
 
 
+def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, pictures):
+    wide = {"inflation": found.inflation * 9, "ratios_covariance": found.ratios_covariance * 9}
+    derived = tuple(x | {"ratios_covariance": wide["ratios_covariance"]} for x in found.derived)
+    ax = pictures.figure().add_subplot()
+    jr.plot.fit(dataclasses.replace(found, derived=derived, **wide), {"ratios": ax})
+    dashed, dotted = ax.lines[2:4]
+    assert dotted.get_label() == "95 %, least"
+    apart = [line.get_xydata() - np.asarray(found.ratios) for line in (dashed, dotted)]
+    np.testing.assert_allclose(apart[0], 3 * apart[1], atol=1e-12)
+    plan = identify.Plan(found.system, found.start()[0], [identify.Rates(TS, None, SIGMA)])
+    least = np.linalg.inv(plan.bound.ratios_covariance)
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", apart[1], least, apart[1]), 5.991, 0.01)
+
+
+def test_what_a_record_does_not_tell_is_written(found, pictures):
+    ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
+    assert ax.texts[0].get_text() == "not told: overall scale"
+
+
 def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
     options = found.problem.options._replace(level="known")
     problem = dataclasses.replace(found.problem, options=options)

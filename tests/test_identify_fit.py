@@ -221,6 +221,21 @@ def test_residuals_are_those_of_the_motion_and_have_its_derivatives(one_fit):
     assert np.all(np.abs(slope[0]) < 0.01 * scale)
 
 
+@pytest.mark.parametrize("drag", [None, jr.torques.LinearDrag(0.05)], ids=["free", "dragged"])
+def test_residuals_are_late_by_what_a_gyro_is(drag):
+    body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]), drag)
+    start = jr.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.5, 1.0, 0.3]))
+    ts, zero = jnp.linspace(1.0, 5.0, 40), jnp.zeros((40, 3))
+
+    def rows(delay, ts):
+        gyro = identify.Gyro(delay=delay)
+        return identify.residuals(body, start, identify.Record(gyro, ts, zero, 1.0))
+
+    rows = quick_jit(rows)
+    np.testing.assert_allclose(rows(0.02, ts), rows(0.0, ts - 0.02), atol=1e-8)
+    assert np.abs(rows(0.02, ts) - rows(0.0, ts)).max() > 1e-3
+
+
 @quick_jit
 def bound(tensor, omega, ts, t0):
     """Of I3/I1 and of both ratios, and its slopes in the rate and in the times."""
@@ -712,6 +727,9 @@ def test_ten_numbers_of_a_body_about_its_pivot_of_which_two_are_known(rng):
     np.testing.assert_allclose(found.inertia, found.body.about(np.zeros(3)), rtol=1e-12)
     weighed = found.system.torque
     np.testing.assert_allclose(weighed.lever, found.body.center_of_mass, rtol=1e-12)
+    density = identify.log_density(found)  # flat in the numbers: ten do not make a tensor of six
+    expected = -0.5 * float(found.chi_square) / float(found.inflation)
+    np.testing.assert_allclose(quick_jit(density.function)(density.start), expected, rtol=1e-6)
     with pytest.raises(ValueError, match="scale"):
         identify.fit(body, readings, shape=ten, start=state)
     with pytest.raises(ValueError, match="frozen"):

@@ -579,6 +579,8 @@ def test_several_bodies_share_a_scale_of_the_gyro(rng):
     for i, tensor in enumerate(tensors):
         covers(found, tensor, i)
     near(found, "gyro.scale", 1.03)
+    density = identify.log_density(found)
+    assert np.isfinite(density.function(density.start))
 
 
 @pytest.mark.slow  # two programs of their own

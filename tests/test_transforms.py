@@ -24,6 +24,7 @@ from jrigid import (
     elliptic,
     free,
     identify,
+    io,
     lagrangian,
     rotation,
     solvers,
@@ -46,6 +47,7 @@ MODULES = {
     "top": top,
     "solvers": solvers,
     "identify": identify,
+    "io": io,
     "stability": stability,
 }
 # Abstract classes, aliases and records: nothing to call.
@@ -65,6 +67,10 @@ NOTHING_TO_CALL = {
     "stability.Megno", "stability.LyapunovSpectrum", "stability.Section", "stability.FinalSpin",
     "stability.STABILITY", "stability.ORDER", "stability.REGIONS",
     "stability.SIDES", "free.REGIMES",
+    # Files and other packages' objects: tests/test_io.py.
+    "io.from_jaxlie", "io.to_jaxlie", "io.from_scipy", "io.to_scipy", "io.from_trimesh",
+    "io.mesh_arrays", "io.read_mesh", "io.read_inertials", "io.write_inertials", "io.diagnose",
+    "io.to_pandas", "io.to_xarray",
 }  # fmt: skip
 # What answers with a code, not with numbers: tested where it belongs.
 CODES = {
@@ -353,6 +359,15 @@ CASES = {
     "rotation.from_euler": Case(rotation.from_euler, (ANGLES,)),
     "rotation.to_scipy": Case(rotation.to_scipy, (ATTITUDE,)),
     "rotation.from_scipy": Case(rotation.from_scipy, (ATTITUDE,)),
+    "io.to_spice": Case(io.to_spice, (ATTITUDE,)),
+    "io.from_spice": Case(io.from_spice, (ATTITUDE,)),
+    "io.to_mrp": Case(io.to_mrp, (ATTITUDE,)),
+    "io.shadow_mrp": Case(io.shadow_mrp, (VECTOR,)),
+    "io.from_mrp": Case(io.from_mrp, (VECTOR,)),
+    "io.nearest_physical": Case(
+        lambda i, m, h: io.nearest_physical(symmetric(i), m, h),
+        (np.array([[1.0, 0.3, 0.1], [0.3, 2.0, 0.2], [0.1, 0.2, 4.0]]), 3.0, 0.4),
+    ),
     "rotation.attitude_rate": Case(rotation.attitude_rate, (ATTITUDE, OMEGA)),
     "rotation.angular_velocity": Case(rotation.angular_velocity, (MATRIX, TENSOR)),
     "rotation.euler_rates_to_omega": Case(rotation.euler_rates_to_omega, (ANGLES, VECTOR)),

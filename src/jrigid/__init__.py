@@ -7,6 +7,7 @@ from jrigid import dynamics as dynamics
 from jrigid import elliptic as elliptic
 from jrigid import free as free
 from jrigid import identify as identify
+from jrigid import io as io
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
 from jrigid import plot as plot
@@ -51,6 +52,6 @@ from jrigid.top import top_motion as top_motion
 __version__ = _version("jrigid")
 
 _list_public_names(
-    *(datasets, dynamics, elliptic, free, identify, lagrangian, mass, plot, records, rotation),
+    *(datasets, dynamics, elliptic, free, identify, io, lagrangian, mass, plot, records, rotation),
     *(solids, solvers, stability, systems, top, torques),
 )

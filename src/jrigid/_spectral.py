@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._numerics import gauss_legendre, product
+from jrigid._numerics import gauss_legendre, power_of_two, product
 
 _ROTATIONS = 18  # six sweeps; convergence is quadratic and four reach float64 rounding
 _NEAR = 0.1  # gaps below this fraction of the moment are integrated, wider ones divided
@@ -54,8 +54,8 @@ def eigh(
     largest.
     """
     del distinct  # the derivatives need it
-    _, exponent = jnp.frexp(jnp.max(jnp.abs(tensor)))
-    scaled = jnp.ldexp(0.5 * (tensor + tensor.T), -exponent)
+    unit = power_of_two(jnp.max(jnp.abs(tensor)))
+    scaled = 0.5 * (tensor / unit + tensor.T / unit)
     entries = [scaled[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     identity = [jnp.asarray(x, tensor.dtype) for x in np.eye(3).ravel()]
     state = jax.lax.fori_loop(0, _ROTATIONS, _rotate, (*entries, *identity))
@@ -65,7 +65,7 @@ def eigh(
         pairs = list(zip(columns[low], columns[high], strict=True))
         columns[low] = [jnp.where(swap, y, x) for x, y in pairs]
         columns[high] = [jnp.where(swap, x, y) for x, y in pairs]
-    moments = jnp.ldexp(jnp.stack([column[0] for column in columns]), exponent)
+    moments = unit * jnp.stack([column[0] for column in columns])
     first, second, third = (jnp.stack(column[1:]) for column in columns)
     first, third = first * _sign(first), third * _sign(third)
     handed = jnp.sum(second * jnp.cross(third, first))

@@ -9,8 +9,8 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
-# A third of the time goes to code that on a CPU runs no faster for it.
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+# A third of the time goes to code that on a CPU runs no faster for it, or into many parts.
+_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 2}
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:

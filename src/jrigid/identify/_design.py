@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -307,20 +306,15 @@ def residuals(
     shapes = (state.attitude, (4,)), (state.omega, (3,)), (begin, ())
     q, w, begin = (jnp.broadcast_to(x, (throws, *shape)) for x, shape in shapes)
 
+    def motion(system: Any, start: State, ts: Array, t0: Array) -> State:
+        if system.is_free:
+            return free_rotation(system.inertia, start, ts, t0=t0).states
+        return simulate(system, start, ts, t0=t0, adjoint=adjoint).states
+
+    options = problems.Options(False, True, motion=motion)
+
     def throw(q: Array, w: Array, begin: Array, samples: Samples) -> Array:
-        def motion(ts: Array) -> State:
-            if system.is_free:
-                return free_rotation(system.inertia, State(q, w), ts, t0=begin).states
-            return simulate(system, State(q, w), ts, t0=begin, adjoint=adjoint).states
-
-        def shown(sensor: Any, part: slice) -> Array:
-            one = lambda t, q, w: sensor.predict(t, State(q, w), system)  # noqa: E731
-            return jax.vmap(one)(*(x[part] for x in seen))
-
-        find = motion if system.is_free else partial(problems.in_any_order, motion)
-        states = find(samples.ts)
-        seen = samples.ts, states.attitude, states.omega
-        values = list(map(shown, sensors, samples.parts))
+        values = problems.shown_by(options, system, sensors, State(q, w), begin, samples)
         return problems.whitened(sensors, samples, values).reshape(-1)
 
     return jax.vmap(throw)(q, w, begin, samples)

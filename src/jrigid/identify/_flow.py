@@ -56,11 +56,11 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def forced_flow(
-    system: AbstractSystem, state: State, t0: Array, t1: Array, on_attitude: bool
+    system: AbstractSystem, state: State, t0: Array, t1: Array, on_attitude: bool, reverse: bool
 ) -> State:
     """State at t1, by one fixed step: for times of a part of a turn, forward or back.
 
-    Where nothing depends on the attitude it stays as it is.
+    Where nothing depends on the attitude it stays as it is. What allows reverse mode is slower.
     """
     span, zero, one = t1 - t0, jnp.zeros_like(t0), jnp.ones_like(t0)
 
@@ -71,7 +71,7 @@ def forced_flow(
 
     term, start = diffrax.ODETerm(rate), (state.attitude, state.omega)[not on_attitude :]
     # 1e-7 of the state in a segment of 0.75 radians.
-    solver = diffrax.Dopri8(scan_kind="lax")
+    solver = diffrax.Dopri8(scan_kind="bounded" if reverse else "lax")
     begin = solver.init(term, zero, one, start, None)
     end, *_ = solver.step(term, zero, one, start, None, begin, False)
     return State(normalize(end[0]) if on_attitude else state.attitude, end[-1])

@@ -1,5 +1,7 @@
 """Numbers without bounds for the inertia of a real body: physical by construction."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -20,11 +22,14 @@ def from_second_moments(second_moments: Matrix) -> Matrix:
     return jnp.trace(second_moments) * jnp.eye(3, dtype=second_moments.dtype) - second_moments
 
 
-def _of_factor(diagonal: Array, sides: Array, places: list[list[int]]) -> Matrix:
-    """A tensor from a triangular factor, its places in (0, diagonal, sides)."""
-    numbers = jnp.concatenate([jnp.zeros_like(sides[:1]), diagonal, sides])
-    factor = numbers[np.array(places)]
-    return from_second_moments(product("ik,jk->ij", factor, factor))
+SIDES = [1, 2, 2], [0, 0, 1]  # of a lower triangle, below its diagonal
+_LOWER, _UPPER = ([1, 0, 0], [4, 2, 0], [5, 6, 3]), ([1, 4, 6], [0, 2, 5], [0, 0, 3])
+
+
+def squared(diagonal: Array, sides: Array, places: Any = _LOWER) -> Matrix:
+    """L L^T of a triangle, whose numbers have places in (0, diagonal, sides)."""
+    factor = jnp.concatenate([jnp.zeros_like(sides[:1]), diagonal, sides])[np.array(places)]
+    return product("ik,jk->ij", factor, factor)
 
 
 def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
@@ -57,7 +62,7 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
 
     def tensor(p: Array) -> Matrix:
         scale, sizes = jnp.exp(p[0]), jnp.exp(p[:3].at[0].set(0))
-        return _of_factor(scale * sizes, scale * p[3:], [[1, 0, 0], [4, 2, 0], [5, 6, 3]])
+        return from_second_moments(squared(scale * sizes, scale * p[3:]))
 
     return where_defined(all_finite(parameters), tensor, parameters)
 
@@ -90,7 +95,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
         lower = jnp.linalg.cholesky(second)
         diagonal, scale = jnp.diagonal(lower), lower[0, 0]
         sizes = jnp.log(diagonal / scale).at[0].set(jnp.log(scale))
-        return jnp.concatenate([sizes, lower[np.tril_indices(3, -1)] / scale])
+        return jnp.concatenate([sizes, lower[SIDES] / scale])
 
     return where_defined(solid, numbers, second)
 
@@ -123,8 +128,8 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     def body(p: Array) -> tuple[Scalar, Vector, Matrix]:
         mass = jnp.exp(2 * p[0])
         # About the centre of mass the column t drops out.
-        inertia = _of_factor(jnp.exp(p[1:4]), p[4:7], [[1, 4, 6], [0, 2, 5], [0, 0, 3]])
-        return mass, p[7:], mass * inertia
+        sigma = squared(jnp.exp(p[1:4]), p[4:7], _UPPER)
+        return mass, p[7:], mass * from_second_moments(sigma)
 
     return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
 

@@ -81,8 +81,8 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
 def _flow(options: Options, system: Any, before: State, start: Array, end: Array) -> State:
     """States a short time later, or earlier, each of its own start."""
     if not options.free_motion:
-        flow = lambda x, a, b: forced_flow(system, x, a, b, options.on_attitude)  # noqa: E731
-        return jax.vmap(flow)(before, start, end)
+        how = options.on_attitude, options.motion is not None
+        return jax.vmap(lambda x, a, b: forced_flow(system, x, a, b, *how))(before, start, end)
     turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(before.omega, end - start)
     if options.on_attitude:
         turn = jax.vmap(multiply)(before.attitude, turn)
@@ -153,14 +153,14 @@ def _seen(
 
 
 def shown_by(
-    options: Options, system: Any, sensor: Any, start: State, t0: Array, ts: Array
-) -> Array:
-    """What a sensor shows at times (n, k) of the motion from a state at t0."""
-    first, none = t0[None], jnp.zeros((ts.size, 0), ts.dtype)
+    options: Options, system: Any, sensors: Any, start: State, t0: Array, samples: Samples
+) -> list[Array]:
+    """What sensors show at their times (n, k) of the motion from a state at t0."""
+    first, ts = t0[None], samples.ts
     layout = Layout(ts, jnp.zeros(ts.shape, int), first, first, first > t0, ts)
-    throw = _Throw(layout, Samples(ts, (none,), none, none, none), t0, t0)
     nodes = State(start.attitude[None], start.omega[None])
-    return _seen(options._replace(shooting=False), system, [sensor], nodes, throw)[0][0]
+    throw = _Throw(layout, samples, t0, t0)
+    return _seen(options._replace(shooting=False), system, sensors, nodes, throw)[0]
 
 
 def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:

@@ -19,6 +19,7 @@ from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._intervals import interval
 from jrigid.identify._problem import Problem, shown_by
+from jrigid.identify._records import Samples
 from jrigid.identify._unknowns import AbstractSought, Unknowns
 from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
@@ -433,8 +434,10 @@ class FitResult(eqx.Module):
 @quick_jit
 def _predicted(result: FitResult, ts: Array, record: int, throw: Array) -> Array:
     system, *sensors = result.parts(throw)
-    shown = shown_by(result.problem.options, system, sensors[record], *result.start(throw), ts)
-    largest = sensors[record].largest()
+    sensor, none = sensors[record], jnp.zeros((ts.size, 0), ts.dtype)
+    samples, options = Samples(ts, (none,), none, none, none), result.problem.options
+    (shown,) = shown_by(options, system, [sensor], *result.start(throw), samples)
+    largest = sensor.largest()
     return shown if largest is None else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
 
 

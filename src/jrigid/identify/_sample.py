@@ -14,6 +14,7 @@ from jrigid.dynamics import State
 from jrigid.identify._layout import whole
 from jrigid.identify._problem import Problem, rows_at
 from jrigid.identify._result import FitResult
+from jrigid.identify._shapes import AbstractShape
 from jrigid.identify._smoother import Point
 from jrigid.simulate import simulate
 
@@ -38,14 +39,27 @@ def _simulated(system: Any, state: State, ts: Array, t0: Array) -> State:
     return simulate(system, state, ts, t0=t0, throw=False).states
 
 
+def _log_volume(shape: AbstractShape, numbers: Array) -> Array:
+    """Logarithm of the volume of tensors that a volume of a shape's numbers makes."""
+
+    def tensor(x: Array) -> Array:
+        inertia = shape.inertia(x)
+        return inertia if shape.absolute else inertia / jnp.trace(inertia)
+
+    if shape.body(numbers) is not None:  # more numbers than a tensor has
+        return jnp.zeros((), numbers.dtype)
+    slopes = jax.jacfwd(tensor)(numbers).reshape(9, -1) / jnp.trace(tensor(numbers))
+    return 0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]
+
+
 def log_density(result: FitResult) -> LogDensity:
     """The posterior of a fit as a function without bounds, for blackjax, numpyro and their like.
 
     Prior: what `prior` said in `free`; apart from that flat in the tensor (of a fixed trace, or,
-    where the scale is sought, in the logarithm of the scale too), in the arrays picked, and in the
-    states: the logarithms of the Jacobians that belong to the numbers are in the density. A record
-    that fits two bodies, the mirror one, or spins about any axis, has two modes: a sampler
-    that starts at a fit stays in its own.
+    where the scale is sought, in the logarithm of the scale too; of a `LogCholesky`, in its
+    numbers), in the arrays picked, and in the states: the logarithms of the Jacobians that belong
+    to the numbers are in the density. A record that fits two bodies, the mirror one, or spins about
+    any axis, has two modes: a sampler that starts at a fit stays in its own.
 
     Args:
         result: A single fit without an unmodelled torque. A noise that was not stated is as large
@@ -72,7 +86,7 @@ def log_density(result: FitResult) -> LogDensity:
     problem = Problem(options, problem.unknowns, problem.samples, problem.bodies, problem.noise)
     unknowns, layout = problem.unknowns, whole(problem.samples, 1, result.t0)
     states = result.state.attitude[:, None], result.state.omega[:, None]
-    size, end = result.numbers.size, unknowns.slices["shape"].stop
+    size = result.numbers.size
     (throws, own), local = result.own_numbers.shape, 6 if options.on_attitude else 3
     known = (0, 0), (0, problem.known - problem.held)
     weight = jnp.pad(jnp.where(result.kept, 1.0, 0.0), known, constant_values=1.0)
@@ -85,10 +99,8 @@ def log_density(result: FitResult) -> LogDensity:
         return -0.5 * chi_square / result.inflation + log_jacobian(numbers, rest[:, local:])
 
     def log_jacobian(numbers: Array, own: Array) -> Array:
-        inertia = lambda x: unknowns.inertia(jnp.concatenate([x, numbers[end:]]))  # noqa: E731
-        slopes = jax.jacfwd(inertia)(numbers[:end]).reshape(9, end)
-        slopes = slopes / jnp.trace(unknowns.inertia(numbers))
-        parts = [0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]]
+        pairs = zip(unknowns.shapes, unknowns.of_shapes(numbers), strict=True)
+        parts = [jnp.zeros((), numbers.dtype), *(_log_volume(*x) for x in pairs)]
         shared = [x for x in unknowns.sought if not x.own]
         parts += [x.log_volume(numbers[unknowns.slices[x.name]]) for x in shared]
         parts += [jnp.sum(jax.vmap(x.log_volume)(own[:, s])) for x, s in unknowns.own_slices]

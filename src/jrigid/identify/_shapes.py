@@ -39,17 +39,6 @@ def is_near_flat(tensor: Array) -> Array:
     return eigh(2 * _parameters.second_moments(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
 
 
-SIDES = [1, 2, 2], [0, 0, 1]  # of a lower triangle, below its diagonal
-_PLACES = np.eye(9)[[0, 4, 8, 3, 6, 7]].reshape(6, 3, 3)
-
-
-def squared(diagonal: Array, sides: Array) -> Array:
-    """L L^T of a lower triangle."""
-    numbers = jnp.concatenate([diagonal, sides])
-    lower = product("i,ijk->jk", numbers, jnp.asarray(_PLACES, numbers.dtype))
-    return product("ik,jk->ij", lower, lower)
-
-
 class AbstractShape(Readable):
     """What is known of a tensor: a few numbers without bounds, and the tensor that they make.
 
@@ -116,12 +105,12 @@ class Tensor(AbstractShape):
         """The numbers of the nearest real body."""
         sigma = real_body(tensor, flattest)
         lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
-        return self, jnp.concatenate([jnp.log(jnp.diagonal(lower)[1:]), lower[SIDES]])
+        return self, jnp.concatenate([jnp.log(jnp.diagonal(lower)[1:]), lower[_parameters.SIDES]])
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
         return _parameters.from_second_moments(
-            squared(jnp.exp(jnp.pad(numbers[:2], (1, 0))), numbers[2:])
+            _parameters.squared(jnp.exp(jnp.pad(numbers[:2], (1, 0))), numbers[2:])
         )
 
 
@@ -200,7 +189,7 @@ class Flat(_InFrame):
     def sigma(self, numbers: Array) -> Array:
         """L L^T, the third column of L zero."""
         sizes = jnp.exp(jnp.pad(numbers[:1], (1, 0)))
-        return squared(jnp.pad(sizes, (0, 1)), numbers[1:])
+        return _parameters.squared(jnp.pad(sizes, (0, 1)), numbers[1:])
 
 
 class Fixed(AbstractShape):

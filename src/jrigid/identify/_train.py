@@ -19,7 +19,7 @@ from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import findings_of
 from jrigid.identify._layout import Told, longest_turn, told_by
-from jrigid.identify._problem import in_any_order, whitened
+from jrigid.identify._problem import Options, shown_by, whitened
 from jrigid.identify._records import Record, Samples, of_throws, samples_of
 from jrigid.rotation import exp, multiply, normalize
 from jrigid.systems import RigidBody
@@ -296,21 +296,16 @@ def _chi_square(
     setting: _Setting, params: Any, rest: Any, sensors: Any, data: _Data
 ) -> tuple[Array, Array]:
     """Squares of a segment at the state that fits it best, and degrees of freedom."""
-    guess = data.guess
+    guess, steps = data.guess, setting.steps
+    motion = lambda system, start, ts, _: _motion(system, start, ts, steps)  # noqa: E731
+    options = Options(False, setting.on_attitude, motion=motion)
 
     def rows(params: Any, move: Array) -> Array:
         system, attitude = eqx.combine(params, rest), guess.attitude
         if setting.on_attitude:
             attitude = multiply(attitude, exp(move[3:]))
         state = State(attitude, guess.omega + move[:3])
-        motion = lambda ts: _motion(system, state, ts, setting.steps)  # noqa: E731
-        states = in_any_order(motion, data.samples.ts)
-        shown = [
-            jax.vmap(lambda t, q, w, sensor=sensor: _shown(system, sensor, t, State(q, w)))(
-                data.samples.ts[part], states.attitude[part], states.omega[part]
-            )
-            for sensor, part in zip(sensors, data.samples.parts, strict=True)
-        ]
+        shown = shown_by(options, system, sensors, state, data.samples.ts[0], data.samples)
         return whitened(sensors, data.samples, shown).reshape(-1)
 
     # The slope in the parameters at the best state is that with the state held.
@@ -325,16 +320,6 @@ def _chi_square(
     none = jnp.zeros(6 if setting.on_attitude else 3, guess.omega.dtype)
     move = jax.lax.fori_loop(0, _NEWTON, newton, none)
     return jnp.sum(rows(params, move) ** 2), jnp.sum(data.samples.weight) - move.size
-
-
-def _shown(system: RigidBody, sensor: Any, t: Array, state: State) -> Array:
-    """What a sensor shows, with its memory."""
-    memory = sensor.memory()
-    if memory is None:
-        return sensor.predict(t, state, system)
-    before = lambda lag: sensor.predict(t, _step(system, state, t, -lag), system)  # noqa: E731
-    lags, weights = (x.astype(state.omega.dtype) for x in memory)
-    return product("l,l...->...", weights, jax.vmap(before)(lags))
 
 
 def _motion(system: RigidBody, state: State, ts: Array, steps: int) -> State:

@@ -19,8 +19,9 @@ from jaxtyping import Array
 
 from jrigid._checks import demand
 from jrigid._types import Readable
+from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
-from jrigid.identify._shapes import SIDES, AbstractShape, as_tensor, squared
+from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.mass import MassProperties
 from jrigid.torques import Sum, UniformGravity
 
@@ -235,9 +236,13 @@ class Unknowns(eqx.Module):
         found += ["scale" + x for x in end] * self.scaled
         return (*found, *(name for x in self.shared for name in x.names))
 
+    def of_shapes(self, numbers: Array) -> list[Array]:
+        """The numbers of each body's shape."""
+        return jnp.split(numbers, np.cumsum([len(x.names) for x in self.shapes]))[:-1]
+
     def inertia(self, numbers: Array, body: int | Array = 0) -> Array:
         """The tensor of a body."""
-        parts = jnp.split(numbers, np.cumsum([len(x.names) for x in self.shapes]))
+        parts = self.of_shapes(numbers)
         scales, found = jnp.exp(numbers[self.slices["scale"]]), []
         for i, shape in enumerate(self.shapes):
             tensor = shape.inertia(parts[i]).astype(numbers.dtype)

@@ -7,20 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, PRNGKeyArray
 
 from jrigid._checks import array_of_shape, shaped, where_defined
-from jrigid._numerics import arctanc_sqrt, cos_sqrt, safe_norm, sinc_sqrt
+from jrigid._numerics import arctanc_sqrt, cos_sqrt, power_of_two, safe_norm, sinc_sqrt
 from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
 
 
 def _scale(vector: Array) -> Array:
-    """The power of two that brings the sum of a vector's magnitudes to [1, 2)."""
-    info = jnp.finfo(vector.dtype)
-    least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
-    greatest = ((1 << info.nexp) - 2) * least
-    size = functools.reduce(jnp.add, [jnp.abs(x) for x in jax.lax.stop_gradient(vector)])
-    # In the bits of the exponent: `frexp` and `ldexp` take twice as long as a rotation.
-    exponent = jax.lax.bitcast_convert_type(size, jnp.dtype(f"int{info.bits}")) & -least
-    reciprocal = jnp.maximum(greatest - exponent, least)
-    return jax.lax.bitcast_convert_type(reciprocal, vector.dtype)
+    return 1 / power_of_two(functools.reduce(jnp.add, [jnp.abs(x) for x in vector]))
 
 
 def rescaled(vector: Array) -> Array:

@@ -1,16 +1,15 @@
-"""Pictures, drawn by matplotlib, which is imported when the first is drawn (`jrigid[plot]`)."""
+"""A fit: record and model, what is left, and what the record tells of the ratios."""
 
 from collections.abc import Mapping
-from itertools import cycle
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from jrigid.identify import FitResult
+from jrigid.plot._common import LOOKS, TURN, label, looks, pyplot
 
-# Okabe and Ito's colours, told apart by the colour-blind, with a marker each.
-_LOOKS = ("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "d"), ("#CC79A7", "^")
-_COLOUR = _LOOKS[0][0]
+_COLOUR = LOOKS[0][0]
 _LAYOUT = [
     ["record"] * 3,
     ["residuals", "residuals", "histogram"],
@@ -26,6 +25,7 @@ _SHOWN = {
 _MOST = 5000  # times at which a model is drawn
 _WAVES, _BANDS = 1000, 40  # of a spectrum, at most
 _EDGE = 5.0  # of a histogram: what is beyond is counted in its last bins
+_WORDS = 44  # letters of a line of text
 _SURE = 1.96  # standard deviations: 95 %
 
 
@@ -39,7 +39,9 @@ def fit(
     began; of a noise that was not stated, in units of their own size. "spectrum": their power, 1
     at all frequencies for white noise, with the range of 95 %. "histogram": against the normal
     distribution. "ratios": I2/I1 and I3/I1 with ellipses of 68 % and 95 %, and the bounds of real
-    bodies in grey: I3 = I1 + I2 dotted, I3 = I2 dashed, I2 = I1.
+    bodies in grey: I3 = I1 + I2 dotted, I3 = I2 dashed, I2 = I1. Where errors are larger than the
+    noise stated makes them, also the ellipse of that noise, Cramer's and Rao's bound. What the
+    record does not tell is written there.
 
     Args:
         result: A single fit.
@@ -62,11 +64,7 @@ def fit(
     I2/I1
     """
     if axes is None:
-        try:
-            from matplotlib import pyplot
-        except ImportError as error:
-            raise ImportError('This needs matplotlib: pip install "jrigid[plot]".') from error
-        figure: Any = pyplot.figure(figsize=(10, 8), layout="constrained")
+        figure: Any = pyplot().figure(figsize=(10, 8), layout="constrained")
         figure.suptitle(str(result).partition(":")[0])
         axes = dict(figure.subplot_mosaic(_LAYOUT))
     draw = {"record": _record, "residuals": _residuals, "spectrum": _spectrum,
@@ -74,12 +72,6 @@ def fit(
     for name, ax in axes.items():
         draw[name](ax, result, record, throw)
     return dict(axes)
-
-
-def _label(ax: Any, title: str, across: str, up: str) -> None:
-    ax.set_title(title, loc="left")
-    ax.set(xlabel=across, ylabel=up)
-    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=10, frameon=False, borderaxespad=0)
 
 
 def _record(ax: Any, result: FitResult, record: int, throw: int) -> None:
@@ -101,15 +93,14 @@ def _record(ax: Any, result: FitResult, record: int, throw: int) -> None:
         near = np.stack([np.interp(ts, times, x) for x in model.T], axis=1)
         values = np.where(np.sum(near * values, axis=1, keepdims=True) < 0, -values, values)
     names = {3: "xyz", 4: "wxyz"}.get(values.shape[1], "0123456789")
-    for (colour, marker), name, column, line in zip(
-        cycle(_LOOKS), names, values.T, model.T, strict=False
-    ):
+    columns = zip(names, values.T, model.T, strict=False)
+    for (colour, marker), (name, column, line) in looks(columns):
         ax.plot(times, line, color=colour, lw=1)
         ax.plot(ts[kept], column[kept], marker, color=colour, ms=3, alpha=0.6, label=name)
         ax.plot(ts[~kept], column[~kept], "x", color=colour, ms=5)
     kind = type(sensor).__name__
     throws = f", throw {throw} of {len(samples.ts)}" if len(samples.ts) > 1 else ""
-    _label(ax, f"{kind}{throws}, and model", "time [s]", _SHOWN.get(kind, "value"))
+    label(ax, f"{kind}{throws}, and model", "time [s]", _SHOWN.get(kind, "value"))
 
 
 def _left(result: FitResult, record: int) -> tuple[np.ndarray, np.ndarray]:
@@ -125,9 +116,9 @@ def _left(result: FitResult, record: int) -> tuple[np.ndarray, np.ndarray]:
 def _residuals(ax: Any, result: FitResult, record: int, _: int) -> None:
     since, left = _left(result, record)
     ax.axhspan(-_SURE, _SURE, color="0.9", label="95 % of noise")
-    for (colour, marker), column in zip(cycle(_LOOKS), np.moveaxis(left, -1, 0), strict=False):
+    for (colour, marker), column in looks(np.moveaxis(left, -1, 0)):
         ax.plot(since.ravel(), column.ravel(), marker, color=colour, ms=3, alpha=0.5)
-    _label(ax, "Residuals", "time since the first sample [s]", "residual / noise")
+    label(ax, "Residuals", "time since the first sample [s]", "residual / noise")
 
 
 def _spectrum(ax: Any, result: FitResult, record: int, _: int) -> None:
@@ -156,7 +147,7 @@ def _spectrum(ax: Any, result: FitResult, record: int, _: int) -> None:
     ax.axhline(1, color="0.5", lw=1)
     least, most = ax.get_ylim()
     ax.set_ylim(min(least, 0.09), max(most, 11.0))
-    _label(ax, "Spectrum", "frequency [Hz]", "power / that of the noise")
+    label(ax, "Spectrum", "frequency [Hz]", "power / that of the noise")
 
 
 def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
@@ -164,20 +155,22 @@ def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
     values = np.clip(left[np.isfinite(left)], -_EDGE, _EDGE)
     ax.hist(values, edges, density=True, color=_COLOUR, alpha=0.5)
     ax.plot(edges, np.exp(-(edges**2) / 2) / np.sqrt(2 * np.pi), color="k", lw=1, label="normal")
-    _label(ax, "Histogram", "residual / noise", "density")
+    label(ax, "Histogram", "residual / noise", "density")
 
 
 def _ratios(ax: Any, result: FitResult, *_: int) -> None:
-    turn = np.linspace(0, 2 * np.pi, 200)
-    for (colour, marker), body in zip(cycle(_LOOKS), result.bodies, strict=False):
-        centre = np.asarray(body.ratios)
+    for (colour, marker), body in looks(result.bodies):
+        drawn = [(0.68, "-", colour, 1.0), (0.95, "--", colour, 1.0)]
+        if result.inflation > 1:
+            drawn.append((0.95, ":", "k", float(result.inflation)))
         values, vectors = np.linalg.eigh(body.ratios_covariance)
-        ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(turn), np.sin(turn)]
-        ax.plot(*centre, marker, color=colour)
-        for part, style in ((0.68, "-"), (0.95, "--")):
-            line = centre[:, None] + np.sqrt(-2 * np.log(1 - part)) * ellipse
-            label = f"{100 * part:.0f} %" if body.index == 0 else None
-            ax.plot(*line, style, color=colour, label=label)
+        ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
+        ax.plot(*body.ratios, marker, color=colour)
+        for part, style, ink, inflation in drawn:
+            line = np.sqrt(-2 * np.log(1 - part) / inflation) * ellipse
+            name = f"{100 * part:.0f} %" + ", least" * (inflation > 1)
+            line = np.asarray(body.ratios)[:, None] + line
+            ax.plot(*line, style, color=ink, label=name if body.index == 0 else None)
     view = ax.axis()
     ax.axline((1, 2), slope=1, color="0.5", ls=":")
     ax.axline((1, 1), slope=1, color="0.5", ls="--")
@@ -186,4 +179,6 @@ def _ratios(ax: Any, result: FitResult, *_: int) -> None:
     ax.ticklabel_format(useOffset=False)
     ax.locator_params(nbins=4)
     told = not result.pure_spin and np.all(result.ratios_errors < result.ratios)
-    _label(ax, "Ratios" if told else "Ratios: not determined", "I2/I1", "I3/I1")
+    label(ax, "Ratios" if told else "Ratios: not determined", "I2/I1", "I3/I1")
+    untold = "\n".join(wrap("not told: " + "; ".join(result.null_directions), _WORDS))
+    ax.text(0.02, 0.98, untold * bool(result.null_directions), transform=ax.transAxes, va="top")

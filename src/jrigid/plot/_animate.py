@@ -1,0 +1,143 @@
+"""A body in motion: a page that any browser plays, or a gif or a film."""
+
+import html
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jrigid._checks import check_option, demand
+from jrigid.plot import _common as common
+from jrigid.plot._body import Surface, place, surface_of
+from jrigid.plot._common import LOOKS, turned
+from jrigid.rotation import slerp
+from jrigid.top import SymmetricTop
+
+_DIGITS = 4  # of what is written into a page
+
+
+class Animation(NamedTuple):
+    """A body in motion. A notebook shows it; `save` writes it.
+
+    Attributes:
+        surface: What is drawn.
+        times: Of the frames [s].
+        attitudes: Quaternions of the frames (frames, 4).
+        trace: The point of the body whose path is drawn, None for none.
+        fps: Frames a second.
+    """
+
+    surface: Surface
+    times: np.ndarray
+    attitudes: np.ndarray
+    trace: np.ndarray | None
+    fps: float
+
+    @property
+    def html(self) -> str:
+        """A page by itself, which asks for no server and no network: drag it to look around."""
+        arrays = self.surface._asdict() | {"attitudes": self.attitudes}
+        arrays |= {} if self.trace is None else {"trace": self.trace}
+        data: dict[str, Any] = {name: x.round(_DIGITS).tolist() for name, x in arrays.items()}
+        data |= {"fps": self.fps, "times": [float(x) for x in self.times[[0, -1]]]}
+        data["colours"] = [colour for colour, _ in LOOKS]
+        page = resources.files("jrigid.plot").joinpath("animation.html").read_text()
+        return page.replace("/* data */ null", json.dumps(data, separators=(",", ":")))
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        frame = '<iframe width="480" height="540" style="border:0" srcdoc="{}"></iframe>'
+        return frame.format(html.escape(self.html))
+
+    def save(self, path: str | Path) -> Path:
+        """Write a page (.html, a few kB), a gif, or a film (.mp4, with ffmpeg).
+
+        Args:
+            path: Where.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: Another suffix.
+            ImportError: A gif or a film without the extra `jrigid[plot]`.
+            RuntimeError: A film without ffmpeg.
+        """
+        path = Path(path)
+        check_option("path", path.suffix, (".html", ".gif", ".mp4"))
+        if path.suffix == ".html":
+            path.write_text(self.html, encoding="utf-8")
+            return path
+        plt = common.pyplot()
+        from matplotlib import animation as film
+
+        writer = film.PillowWriter if path.suffix == ".gif" else film.FFMpegWriter
+        if not writer.isAvailable():
+            raise RuntimeError("A film needs ffmpeg, which is not found; a .gif or .html does not.")
+        figure, recorder = plt.figure(figsize=(4.6, 4.6)), writer(fps=int(self.fps))
+        ax = figure.add_axes((0, 0, 1, 1), projection="3d", elev=25, azim=35)
+        ax, drawn = common.space_axes(ax, 1.1), []
+        clock = ax.text2D(0.04, 0.04, "", transform=ax.transAxes)
+        (line,) = ax.plot([], [], [], color=LOOKS[1][0], lw=1.5)
+        point = np.full(3, np.nan) if self.trace is None else self.trace
+        trail = turned(self.attitudes, point[None])[:, 0]
+        with recorder.saving(figure, path, dpi=100):
+            for i, (time, attitude) in enumerate(zip(self.times, self.attitudes, strict=True)):
+                clock.set_text(f"t = {time:.3g} s")
+                line.set_data_3d(*trail[: i + 1].T)
+                for artist in drawn:
+                    artist.remove()
+                drawn = place(ax, self.surface, attitude)
+                recorder.grab_frame()
+        plt.close(figure)
+        return path
+
+
+def animate(
+    body: Any, motion: Any, *, ts: Any = None, kind: str = "box", trace: Any = None,
+    seconds: float = 10.0, fps: float = 20.0,
+) -> Animation:  # fmt: skip
+    """A body along a motion.
+
+    Args:
+        body: As for `body`: a mesh (vertices, faces), a `SymmetricTop`, or what has an inertia.
+        motion: What `simulate`, `free_rotation` or `top_motion` returned: no more than half a turn
+            from state to state.
+        ts: Times of the states [s]; of a trajectory its own.
+        kind: "box" or "ellipsoid".
+        trace: Point of the body whose path is drawn, in body components, the farthest corner at 1;
+            by default the axis of a top, (0, 0, 1), and none of others.
+        seconds: How long it plays.
+        fps: Frames a second.
+
+    Returns:
+        An `Animation`: a notebook shows it, `.save("top.html")` (or .gif, .mp4) writes it.
+
+    Raises:
+        ValueError: No times, or fewer than two states to show.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    >>> ts = jnp.linspace(0.0, 20.0, 500)
+    >>> motion = jr.top_motion(top, jr.top.initial_state(top, 0.5, omega3=5.0), ts)
+    >>> film = jr.plot.animate(top, motion, ts=ts)
+    >>> print(film.attitudes.shape, film._repr_html_()[:7])
+    (200, 4) <iframe
+    """
+    attitudes = np.asarray(common.states_of(motion).attitude, float).reshape(-1, 4)
+    ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=1)
+    demand(
+        bool(np.sum(seen) > 1), "Argument `motion` must hold two states at least, but it does not."
+    )
+    ts, attitudes = ts[seen], attitudes[seen]
+    times = np.linspace(ts[0], ts[-1], max(round(seconds * fps), 2))
+    before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
+    part = (times - ts[before]) / np.diff(ts)[before]
+    attitudes = np.asarray(jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part))
+    if trace is None and isinstance(body, SymmetricTop):
+        trace = (0.0, 0.0, 1.0)
+    trace = None if trace is None else np.asarray(trace, float)
+    return Animation(surface_of(body, kind), times, attitudes, trace, fps)

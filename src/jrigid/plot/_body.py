@@ -1,0 +1,141 @@
+"""A body in space: its mesh, the box or the ellipsoid that has its inertia, or a top."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jrigid._checks import check_option
+from jrigid.mass import from_mesh
+from jrigid.plot import _common as common
+from jrigid.plot._common import LOOKS, turned
+from jrigid.top import SymmetricTop
+
+_LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from
+_FLAT = 1e-6  # least square of a side, of the largest
+# Radius and height along a top's outline, from its tip, in units of its height.
+_TOP = np.array([[0.03, 0.4, 0.44, 0.36, 0.05, 0.04, 1e-3], [0, 0.45, 0.55, 0.64, 0.7, 0.98, 1]])
+_SIDES = 16
+_POLAR = np.linspace(np.pi - 1e-3, 1e-3, 13)  # along the outline of a ball
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+_QUADS = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)
+
+
+class Surface(NamedTuple):
+    """What is drawn of a body, the farthest corner at 1.
+
+    Attributes:
+        vertices: Corners, body components (n, 3).
+        faces: The corners of each face (m, 3 or 4), counter-clockwise from outside.
+        normals: Of the faces, outward (m, 3).
+        kinds: Which colour each face has (m,).
+        lines: What of each principal axis sticks out, from its inner to its outer end (3, 2, 3).
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    kinds: np.ndarray
+    lines: np.ndarray
+
+    def colours(self, attitude: Any) -> np.ndarray:
+        """Of the faces of a body that is turned, with light and shade (m, 3)."""
+        from matplotlib.colors import to_rgb
+
+        base = np.array([to_rgb(colour) for colour, _ in LOOKS])[self.kinds]
+        light = 0.5 + 0.5 * np.maximum(turned(attitude, self.normals) @ _LIGHT, 0)
+        return light[:, None] * (0.55 * base + 0.45)
+
+
+def _rings(radii: np.ndarray, heights: np.ndarray, sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and faces, four corners each, of a body of revolution."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = [np.outer(radii, np.cos(turn)), np.outer(radii, np.sin(turn))]
+    vertices = np.stack([*ring, np.outer(heights, np.ones(sides))], axis=-1).reshape(-1, 3)
+    row, k = np.meshgrid(np.arange(radii.size - 1) * sides, np.arange(sides), indexing="ij")
+    after = (k + 1) % sides
+    faces = np.stack([row + k, row + after, row + sides + after, row + sides + k], axis=-1)
+    return vertices, faces.reshape(-1, 4)
+
+
+_BALL = _rings(np.sin(_POLAR), np.cos(_POLAR), 24)
+
+
+def surface_of(body: Any, kind: str) -> Surface:
+    """The surface of a mesh, of a top, or of the box or ellipsoid with a body's inertia."""
+    check_option("kind", kind, ("box", "ellipsoid"))
+    if isinstance(body, SymmetricTop):
+        vertices, faces = _rings(_TOP[0], _TOP[1], _SIDES)
+        axes, sides = np.eye(3), np.full(3, _TOP[0, 2])
+        center = np.array([0, 0, 1 - sides[2]])
+    elif isinstance(body, tuple):
+        vertices, faces = np.asarray(body[0], float), np.asarray(body[1])
+        solid = from_mesh(vertices, faces)
+        center, (_, axes) = np.asarray(solid.center_of_mass), common.principal(solid)
+        sides = np.max(np.abs((vertices - center) @ axes), axis=0)
+    else:
+        (moments, axes), center = common.principal(body), np.zeros(3)
+        squares = np.sum(moments) / 2 - moments
+        sides = np.sqrt(np.maximum(squares, _FLAT * np.max(squares)))
+        vertices, faces = (_CORNERS, _QUADS) if kind == "box" else _BALL
+        vertices = vertices * sides @ axes.T
+    size = np.max(np.linalg.norm(vertices, axis=1))
+    first, second, third = np.moveaxis(vertices[faces[:, :3]], 1, 0)
+    normals = np.cross(second - first, third - first)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    kinds = np.argmax(np.abs(normals @ axes), axis=1)
+    ends = np.stack([sides / size, sides / size + 0.25], axis=1)[..., None] * axes.T[:, None]
+    return Surface(vertices / size, faces, normals, kinds, center / size + ends)
+
+
+def body(body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str = "box") -> Any:
+    """A body with its principal axes.
+
+    Args:
+        body: A mesh (vertices, faces) as for `from_mesh`, drawn about the origin of its vertices;
+            a `SymmetricTop`, drawn as one, standing on its tip; or whatever has an inertia, drawn
+            as the homogeneous box or ellipsoid that has it (as thin as a sheet where none has).
+        attitude: Quaternion, or a state.
+        ax: Axes of three dimensions.
+        kind: "box" or "ellipsoid".
+
+    Returns:
+        The axes; the farthest corner is at 1.
+
+    Raises:
+        ImportError: Without the extra `jrigid[plot]`.
+        ValueError: Axes of two dimensions, or no such kind.
+        RuntimeError: A mesh that is not closed.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> book = jr.solids.box(0.6, jnp.array([0.13, 0.2, 0.03]))
+    >>> print(jr.plot.body(book).get_title())
+    Box of the same inertia
+    """
+    ax, attitude = common.space_axes(ax, 1.1), common.states_of(attitude)
+    place(ax, surface_of(body, kind), np.asarray(getattr(attitude, "attitude", attitude)))
+    if isinstance(body, tuple):
+        ax.set_title("Mesh, with the axes of a homogeneous body")
+        return ax
+    top = isinstance(body, SymmetricTop)
+    ax.set_title("Top" if top else f"{kind.capitalize()} of the same inertia")
+    moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]
+    shown = ",  ".join(f"$I_{i + 1}$ = {x:.3g} kg m$^2$" for i, x in enumerate(moments))
+    ax.text2D(0.5, 0.02, shown, transform=ax.transAxes, ha="center")
+    return ax
+
+
+def place(ax: Any, surface: Surface, attitude: np.ndarray) -> list[Any]:
+    """Draw a surface and its axes as they are turned; the artists."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    corners = turned(attitude, surface.vertices)[surface.faces]
+    colours = surface.colours(attitude)
+    faces = Poly3DCollection(corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4)
+    artists = [ax.add_collection3d(faces)]
+    for name, line in zip("123", turned(attitude, surface.lines), strict=True):
+        front = common.FRONT * ((line[1] - line[0]) @ common.eye(ax) > 0)  # or behind all
+        artists += ax.plot(*line.T, color="k", lw=1, zorder=front)
+        artists.append(ax.text(*(1.2 * line[1] - 0.2 * line[0]), name, zorder=front))
+    return artists

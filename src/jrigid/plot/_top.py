@@ -1,0 +1,111 @@
+"""Pictures of a heavy top: the path of its tip, and the well in which its axis nods."""
+
+from typing import Any
+
+import numpy as np
+
+from jrigid.dynamics import State
+from jrigid.plot import _common as common
+from jrigid.plot._common import looks, on_surface, states_of
+from jrigid.top import SymmetricTop, conserved, nutation_bounds
+from jrigid.top import effective_potential as potential
+
+_LEAST = np.radians(4.0)  # of tilts on either side of a top that hardly nods
+_ELEVATION = 25, 55  # of the eye, least and most [degrees]
+_BAND = 12  # lines across the band of nutation
+
+
+def _start(motion: Any) -> State:
+    """The first state of a motion, or the state itself."""
+    state = states_of(motion)
+    return State(state.attitude.reshape(-1, 4)[0], state.omega.reshape(-1, 3)[0])
+
+
+def _words(band: np.ndarray) -> str:
+    return " to ".join(dict.fromkeys(f"{x:.1f}°" for x in np.degrees(band)))
+
+
+def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
+    """Paths of the top's axis on the unit sphere, each with the two circles that it touches.
+
+    Args:
+        top: The top.
+        motion: What `top_motion` or `simulate` returned.
+        more: Others.
+        ax: Axes of three dimensions.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ImportError: Without the extra `jrigid[plot]`.
+        ValueError: Axes of two dimensions.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    >>> state = jr.top.initial_state(top, 0.5, omega3=5.0)
+    >>> motion = jr.top_motion(top, state, jnp.linspace(0.0, 20.0, 500))
+    >>> print(jr.plot.tip(top, motion).get_title())
+    Tip of the top, tilts 28.6° to 43.4°
+    """
+    motions = (motion, *more)
+    bounds = np.array([nutation_bounds(top, _start(x)) for x in motions], float).reshape(-1, 2)
+    up = 90 - np.degrees(np.mean(bounds))  # look at the band from the side of its pole
+    ax = common.space_axes(ax, 1.1, np.copysign(np.clip(abs(up), *_ELEVATION), up))
+    common.globe(ax, np.ones(3), np.eye(3))
+    vertical = np.array([[0, 0, 1.0], [0, 0, 1.2]])
+    on_surface(ax, vertical, vertical, color="k", lw=1)
+    ax.text(0, 0, 1.25, "up", ha="center", zorder=common.FRONT)
+    for (colour, marker), (motion, band) in looks(zip(motions, bounds, strict=True)):
+        for circle in common.circles(band):
+            on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
+        x, y, z = np.moveaxis(common.circles(np.linspace(band[0], band[1], _BAND)), -1, 0)
+        ax.plot_surface(x, y, z, color=colour, alpha=0.15, lw=0, rasterized=True)
+        attitudes = np.asarray(states_of(motion).attitude).reshape(-1, 4)
+        path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
+        on_surface(ax, path, path, color=colour, lw=1.5)
+        on_surface(ax, path[:1], path[:1], color=colour, marker=marker, ls="none")
+    ax.set_title(f"Tip of the top, tilts {', '.join(map(_words, bounds))}")
+    return ax
+
+
+def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
+    """The well in which the axis nods, and the energy's level between the turning points.
+
+    Args:
+        top: The top.
+        motion: A state, or what `top_motion` or `simulate` returned.
+        more: Others.
+        ax: Axes.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ImportError: Without the extra `jrigid[plot]`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    >>> ax = jr.plot.effective_potential(top, jr.top.initial_state(top, 0.5, omega3=5.0))
+    >>> print(ax.get_xlabel(), ax.get_ylabel())
+    tilt [degrees] energy of the tilt [J]
+    """
+    ax, starts = common.flat_axes(ax), [_start(x) for x in (motion, *more)]
+    bounds = np.array([nutation_bounds(top, x) for x in starts], float).reshape(-1, 2)
+    margin = max(0.6 * np.ptp(bounds), _LEAST)
+    ends = np.clip([np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3)
+    tilts, heights = np.linspace(ends[0], ends[1], 400), []
+    for (colour, marker), (state, band) in looks(zip(starts, bounds, strict=True)):
+        p_phi, p_psi, energy = conserved(top, state)
+        well = np.asarray(potential(top, tilts, p_phi, p_psi))
+        level = float(energy - p_psi**2 / (2 * top.I3))
+        ax.plot(np.degrees(tilts), well, color=colour, lw=1.2)
+        style = {"color": colour, "lw": 2, "clip_on": False, "label": _words(band)}
+        ax.plot(np.degrees(band), [level, level], marker + "-", **style)
+        low = np.min(well)
+        depth = max(level - low, 0.3 * (np.median(well) - low))
+        heights += [low - 0.3 * depth, level + 1.5 * depth]
+    ax.set(xlim=np.degrees(ends), ylim=(min(heights), max(heights)))
+    ax.ticklabel_format(axis="y", scilimits=(-2, 4), useOffset=False)
+    common.label(ax, "Effective potential", "tilt [degrees]", "energy of the tilt [J]")
+    return ax
