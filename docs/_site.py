@@ -91,7 +91,7 @@ def skip_numbered_fields(app, what, name, thing, skip, options):
 
 def mark_up(app, what, name, thing, options, lines) -> None:
     """Formulas, code, names and last words of docstrings, as reStructuredText has them."""
-    module = next((k for k in MODULES if name.startswith(f"{k}.")), "jrigid")
+    module = next((k for k in MODULES if f"{name}.".startswith(f"{k}.")), "jrigid")
 
     def code(match: re.Match) -> str:
         """A link where it is a name of this module, or of one that it names."""
