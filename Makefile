@@ -4,10 +4,10 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 CONSTRAINTS ?= constraints.txt
 INSTALL = $(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS)
-SOURCES := src tests benchmarks examples
+SOURCES := src tests benchmarks examples docs/conf.py docs/_site.py
 export MPLBACKEND := Agg
 
-.PHONY: demo test lint types doctest bench notebooks slow clean
+.PHONY: demo test lint types doctest bench notebooks docs slow clean
 
 # pip's dependency groups (25.1) install what pyproject.toml lists for developers.
 $(VENV)/.base: pyproject.toml constraints.txt
@@ -19,6 +19,10 @@ $(VENV)/.base: pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.base
 	$(INSTALL) --group dev
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.dev
+	$(INSTALL) --group docs
 	touch $@
 
 demo: $(VENV)/.base
@@ -47,5 +51,11 @@ bench: $(VENV)/.dev
 notebooks: $(VENV)/.dev
 	$(BIN)/python notebooks/execute.py
 
+# The site, in build/docs/index.html; then every page of it is opened where there is a chromium.
+docs: $(VENV)/.docs
+	$(BIN)/python notebooks/execute.py --new
+	$(BIN)/sphinx-build -W --keep-going --quiet -b html -c docs . build/docs
+	$(BIN)/python -m pytest -m "" tests/test_site.py
+
 clean:
-	rm -rf $(VENV) build dist outputs
+	rm -rf $(VENV) build dist outputs docs/api docs/thumbnails

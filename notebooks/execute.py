@@ -11,6 +11,17 @@ import nbformat
 
 HERE = pathlib.Path(__file__).parent
 TARGET = HERE.parent / "outputs" / "notebooks"
+FIGURES = {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}  # into the executed copy
+
+
+def is_executed(path: pathlib.Path) -> bool:
+    """Whether outputs/ holds a copy of this one, as it is now."""
+    copy = TARGET / path.name
+    if not copy.exists():
+        return False
+    cells = [nbformat.read(x, as_version=4).cells for x in (path, copy)]
+    here, there = ([x.source for x in notebook] for notebook in cells)
+    return here == there
 
 
 def execute(path: pathlib.Path) -> bool:
@@ -21,17 +32,21 @@ def execute(path: pathlib.Path) -> bool:
             print(f"{path.name} holds outputs: strip them before committing", flush=True)
             return False
     start = time.perf_counter()
-    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": HERE}}).execute()
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": HERE}})
+    client.execute(env={**os.environ, **FIGURES})
     nbformat.write(notebook, TARGET / path.name)
     print(f"{path.name}: {time.perf_counter() - start:.1f} s", flush=True)
     return True
 
 
 def main() -> int:
-    """Run the notebooks beside this file, one on each core."""
+    """Run the notebooks beside this file, one on each core; with --new those not run yet."""
     TARGET.mkdir(parents=True, exist_ok=True)
+    wanted = [
+        x for x in sorted(HERE.glob("*.ipynb")) if "--new" not in sys.argv or not is_executed(x)
+    ]
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        return int(not all(list(pool.map(execute, sorted(HERE.glob("*.ipynb"))))))
+        return int(not all(list(pool.map(execute, wanted))))
 
 
 if __name__ == "__main__":

@@ -46,6 +46,12 @@ class ExactStates(Readable):
         states: State at each time; the leading axes of its leaves are those of the times.
         result: `jrigid.RESULTS.successful`, or what is wrong with the arguments; one for each lane
             under vmap. `jrigid.RESULTS[motion.result]` is its text.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+    >>> motion = jr.free_rotation(jnp.array([1.0, 1.0, 2.0]), state0, jnp.array([0.0, jnp.pi]))
+    >>> print(motion.omega[1, 2], motion.result == jr.RESULTS.successful)
+    1.0 True
     """
 
     states: State

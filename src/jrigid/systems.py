@@ -31,7 +31,15 @@ from jrigid.torques import AbstractTorque, Sum, TorqueFunction, as_torque
 
 
 class AbstractSystem(Readable):
-    """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants."""
+    """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> bodies = jr.RigidBody(jnp.ones(3)), jr.FloatingBody(jr.solids.sphere(1.0, 0.1))
+    >>> print([isinstance(x, jr.AbstractSystem) for x in bodies])
+    [True, True]
+    >>> print([x.state_type.__name__ for x in bodies])
+    ['State', 'FloatingState']
+    """
 
     state_type: eqx.AbstractClassVar[type]
     inertia: eqx.AbstractVar[Float[Array, "..."]]

@@ -341,6 +341,14 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
 
     Raises:
         ValueError: No rates.
+
+    >>> import numpy as np
+    >>> import jrigid as jr
+    >>> rates = 0.01 * np.random.default_rng(0).normal(size=(600, 3))
+    >>> rates[200:400] += 5.0  # turned for two seconds
+    >>> parts = jr.records.rests(jr.records.Reading(np.arange(600) / 100, rates))
+    >>> print([x.times[[0, -1]].round(1).tolist() for x in parts])
+    [[0.0, 2.0], [4.0, 6.0]]
     """
     rates, times = reading.rates, reading.times
     if rates is None:

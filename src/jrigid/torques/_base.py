@@ -17,6 +17,7 @@ from jrigid._checks import RESULTS, Findings, all_finite, all_positive, array_of
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 
+#: `(t, state, args) -> (3,)`: the torque on a body, body components [N m].
 TorqueFunction = Callable[[Any, Any, Any], Any]
 
 
