@@ -33,8 +33,8 @@ def fit(
     at all frequencies for white noise, with the range of 95 %. "histogram": against the normal
     distribution. "ratios": I2/I1 and I3/I1 with ellipses of 68 % and 95 %, and the bounds of real
     bodies in grey: I3 = I1 + I2 dotted, I3 = I2 dashed, I2 = I1. Where errors are larger than the
-    noise stated makes them, also the ellipse of 95 % of that noise, Cramer's and Rao's bound. What the
-    record does not tell is written there.
+    noise stated makes them, also the ellipse of 95 % of that noise, Cramer's and Rao's bound. What
+    the record does not tell is written there.
 
     Args:
         result: A single fit.
