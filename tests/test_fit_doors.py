@@ -281,7 +281,7 @@ def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, picture
     ax = pictures.figure().add_subplot()
     jr.plot.fit(dataclasses.replace(found, derived=derived, **wide), {"ratios": ax})
     dashed, dotted = ax.lines[2:4]
-    assert dotted.get_label() == "95 %, least"
+    assert dotted.get_label() == "bound"
     apart = [line.get_xydata() - np.asarray(found.ratios) for line in (dashed, dotted)]
     np.testing.assert_allclose(apart[0], 3 * apart[1], atol=1e-12)
     plan = identify.Plan(found.system, found.start()[0], [identify.Rates(TS, None, SIGMA)])

@@ -12,7 +12,6 @@ import numpy as np
 from jrigid._checks import check_option, demand
 from jrigid.plot import _common as common
 from jrigid.plot._body import Surface, place, surface_of
-from jrigid.plot._common import LOOKS, turned
 from jrigid.rotation import slerp
 from jrigid.top import SymmetricTop
 
@@ -26,24 +25,23 @@ class Animation(NamedTuple):
         surface: What is drawn.
         times: Of the frames [s].
         attitudes: Quaternions of the frames (frames, 4).
-        trace: The point of the body whose path is drawn, None for none.
+        trace: Points of the body whose paths are drawn, body components (n, 3).
         fps: Frames a second.
     """
 
     surface: Surface
     times: np.ndarray
     attitudes: np.ndarray
-    trace: np.ndarray | None
+    trace: np.ndarray
     fps: float
 
     @property
     def html(self) -> str:
         """A page by itself, which asks for no server and no network: drag it to look around."""
-        arrays = self.surface._asdict() | {"attitudes": self.attitudes}
-        arrays |= {} if self.trace is None else {"trace": self.trace}
+        arrays = self.surface._asdict() | {"attitudes": self.attitudes, "trace": self.trace}
         data: dict[str, Any] = {name: x.round(_DIGITS).tolist() for name, x in arrays.items()}
         data |= {"fps": self.fps, "times": [float(x) for x in self.times[[0, -1]]]}
-        data["colours"] = [colour for colour, _ in LOOKS]
+        data["colours"] = [colour for colour, _ in common.LOOKS]
         page = resources.files("jrigid.plot").joinpath("animation.html").read_text()
         return page.replace("/* data */ null", json.dumps(data, separators=(",", ":")))
 
@@ -81,13 +79,13 @@ class Animation(NamedTuple):
         ax = figure.add_axes((0, 0, 1, 1), projection="3d", elev=25, azim=35)
         ax, drawn = common.space_axes(ax, 1.1), []
         clock = ax.text2D(0.04, 0.04, "", transform=ax.transAxes)
-        (line,) = ax.plot([], [], [], color=LOOKS[1][0], lw=1.5)
-        point = np.full(3, np.nan) if self.trace is None else self.trace
-        trail = turned(self.attitudes, point[None])[:, 0]
+        lines = [ax.plot([], [], [], color="#D55E00", lw=1.5)[0] for _ in self.trace]
+        trails = np.moveaxis(common.turned(self.attitudes, self.trace), 1, 0)
         with recorder.saving(figure, path, dpi=100):
             for i, (time, attitude) in enumerate(zip(self.times, self.attitudes, strict=True)):
                 clock.set_text(f"t = {time:.3g} s")
-                line.set_data_3d(*trail[: i + 1].T)
+                for line, trail in zip(lines, trails, strict=True):
+                    line.set_data_3d(*trail[: i + 1].T)
                 for artist in drawn:
                     artist.remove()
                 drawn = place(ax, self.surface, attitude)
@@ -108,8 +106,8 @@ def animate(
             from state to state.
         ts: Times of the states [s]; of a trajectory its own.
         kind: "box" or "ellipsoid".
-        trace: Point of the body whose path is drawn, in body components, the farthest corner at 1;
-            by default the axis of a top, (0, 0, 1), and none of others.
+        trace: A point of the body, or several (n, 3), whose paths are drawn: body components, the
+            farthest corner at 1; by default the end of a top's axis, (0, 0, 1), and none of others.
         seconds: How long it plays.
         fps: Frames a second.
 
@@ -129,15 +127,12 @@ def animate(
     """
     attitudes = np.asarray(common.states_of(motion).attitude, float).reshape(-1, 4)
     ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=1)
-    demand(
-        bool(np.sum(seen) > 1), "Argument `motion` must hold two states at least, but it does not."
-    )
+    demand(len(ts[seen]) > 1, "Argument `motion` must hold two states at least, but it does not.")
     ts, attitudes = ts[seen], attitudes[seen]
     times = np.linspace(ts[0], ts[-1], max(round(seconds * fps), 2))
     before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
     part = (times - ts[before]) / np.diff(ts)[before]
     attitudes = np.asarray(jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part))
-    if trace is None and isinstance(body, SymmetricTop):
-        trace = (0.0, 0.0, 1.0)
-    trace = None if trace is None else np.asarray(trace, float)
+    point = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
+    trace = point if trace is None else np.reshape(np.asarray(trace, float), (-1, 3))
     return Animation(surface_of(body, kind), times, attitudes, trace, fps)

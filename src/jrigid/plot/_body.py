@@ -7,7 +7,6 @@ import numpy as np
 from jrigid._checks import check_option
 from jrigid.mass import from_mesh
 from jrigid.plot import _common as common
-from jrigid.plot._common import LOOKS, turned
 from jrigid.top import SymmetricTop
 
 _LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from
@@ -17,9 +16,7 @@ _TOP = np.array([[0.03, 0.4, 0.44, 0.36, 0.05, 0.04, 1e-3], [0, 0.45, 0.55, 0.64
 _SIDES = 16
 _POLAR = np.linspace(np.pi - 1e-3, 1e-3, 13)  # along the outline of a ball
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-_QUADS = np.array(
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-)
+_QUADS = np.array([int(x) for x in "013246750451237602641573"]).reshape(6, 4)
 
 
 class Surface(NamedTuple):
@@ -43,8 +40,8 @@ class Surface(NamedTuple):
         """Of the faces of a body that is turned, with light and shade (m, 3)."""
         from matplotlib.colors import to_rgb
 
-        base = np.array([to_rgb(colour) for colour, _ in LOOKS])[self.kinds]
-        light = 0.5 + 0.5 * np.maximum(turned(attitude, self.normals) @ _LIGHT, 0)
+        base = np.array([to_rgb(colour) for colour, _ in common.LOOKS])[self.kinds]
+        light = 0.5 + 0.5 * np.maximum(common.turned(attitude, self.normals) @ _LIGHT, 0)
         return light[:, None] * (0.55 * base + 0.45)
 
 
@@ -112,17 +109,16 @@ def body(body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str
     >>> book = jr.solids.box(0.6, jnp.array([0.13, 0.2, 0.03]))
     >>> print(jr.plot.body(book).get_title())
     Box of the same inertia
+    I = 0.00089, 0.00205, 0.00285 kg m$^2$
     """
     ax, attitude = common.space_axes(ax, 1.1), common.states_of(attitude)
     place(ax, surface_of(body, kind), np.asarray(getattr(attitude, "attitude", attitude)))
-    if isinstance(body, tuple):
-        ax.set_title("Mesh, with the axes of a homogeneous body")
-        return ax
-    top = isinstance(body, SymmetricTop)
-    ax.set_title("Top" if top else f"{kind.capitalize()} of the same inertia")
-    moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]
-    shown = ",  ".join(f"$I_{i + 1}$ = {x:.3g} kg m$^2$" for i, x in enumerate(moments))
-    ax.text2D(0.5, 0.02, shown, transform=ax.transAxes, ha="center")
+    mesh, top = isinstance(body, tuple), isinstance(body, SymmetricTop)
+    title = "Mesh" if mesh else "Top" if top else f"{kind.capitalize()} of the same inertia"
+    if not mesh:
+        moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]
+        title += "\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
+    ax.set_title(title)
     return ax
 
 
@@ -130,11 +126,11 @@ def place(ax: Any, surface: Surface, attitude: np.ndarray) -> list[Any]:
     """Draw a surface and its axes as they are turned; the artists."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    corners = turned(attitude, surface.vertices)[surface.faces]
+    corners = common.turned(attitude, surface.vertices)[surface.faces]
     colours = surface.colours(attitude)
     faces = Poly3DCollection(corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4)
     artists = [ax.add_collection3d(faces)]
-    for name, line in zip("123", turned(attitude, surface.lines), strict=True):
+    for name, line in zip("123", common.turned(attitude, surface.lines), strict=True):
         front = common.FRONT * ((line[1] - line[0]) @ common.eye(ax) > 0)  # or behind all
         artists += ax.plot(*line.T, color="k", lw=1, zorder=front)
         artists.append(ax.text(*(1.2 * line[1] - 0.2 * line[0]), name, zorder=front))

@@ -47,8 +47,7 @@ def chart(
     ['Lagrange', 'undefined', 'unstable']
     """
     (names, points, values), ax = _parts(values, grid), flat_axes(ax)
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
+    from matplotlib import colors, patches
     from scipy import ndimage
 
     if numbers := values.dtype.kind == "f":
@@ -57,10 +56,9 @@ def chart(
     else:
         kinds, shown = np.unique(values, return_inverse=True)
         shown, regions = shown.reshape(values.shape), regions or [str(x) for x in kinds]
-        low, high, cmap = -0.5, kinds.size - 0.5, ListedColormap(_TINTS[: kinds.size])
+        low, high, cmap = -0.5, kinds.size - 0.5, colors.ListedColormap(_TINTS[: kinds.size])
         levels, masks = np.arange(kinds.size - 1) + 0.5, [values == x for x in kinds]
-    look = {"shading": "nearest", "rasterized": True}
-    mesh = ax.pcolormesh(*points, shown.T, vmin=low, vmax=high, cmap=cmap, **look)
+    mesh = ax.pcolormesh(*points, shown.T, vmin=low, vmax=high, cmap=cmap, rasterized=True)
     if numbers:
         ax.figure.colorbar(mesh, ax=ax, label=title, extend="both")
     if levels := [x for x in levels if x is not None and np.nanmin(shown) < x < np.nanmax(shown)]:
@@ -74,7 +72,7 @@ def chart(
             at = [x[k - 1] for x, k in zip(points, place, strict=True)]
             ax.text(*at, name, ha="center", va="center", bbox=box)
         elif not numbers:
-            small.append(Patch(facecolor=tint, edgecolor="k", label=name))
+            small.append(patches.Patch(facecolor=tint, edgecolor="k", label=name))
     if small:
         ax.legend(handles=small, loc="lower right", bbox_to_anchor=(1, 1), ncols=4, frameon=False)
     ax.set(xlabel=names[0], ylabel=names[1])
@@ -98,4 +96,4 @@ def _parts(values: Any, grid: Mapping[str, Any] | None) -> tuple[Any, Any, np.nd
     demand(ok, "Argument `values` must be over two axes, of few regions, but it is not.")
     units = [about.get(x, {}).get("units") for x in axes]
     names = [f"{x} [{unit}]" if unit else x for x, unit in zip(grid or axes, units, strict=True)]
-    return names, [np.asarray(x) for x in axes.values()], values
+    return names, list(axes.values()), values

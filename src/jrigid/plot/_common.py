@@ -31,8 +31,7 @@ def space_axes(ax: Any, size: float, elevation: float = _VIEW[0]) -> Any:
     if ax is None:
         figure = pyplot().figure(figsize=(5.5, 5.5), layout="constrained")
         ax = figure.add_subplot(projection="3d", elev=elevation, azim=_VIEW[1])
-    text = "Argument `ax` must have three dimensions (projection='3d'), but it has not."
-    demand(ax.name == "3d", text)
+    demand(ax.name == "3d", "Argument `ax` must be 3-d (projection='3d'), but it is not.")
     ax.set(proj_type="ortho", xlim=(-size, size), ylim=(-size, size), zlim=(-size, size))
     ax.set_box_aspect((1, 1, 1), zoom=1.45)
     ax.set_axis_off()
@@ -120,4 +119,4 @@ def label(ax: Any, title: str, across: str, up: str) -> None:
     ax.set(xlabel=across, ylabel=up)
     if handles := ax.get_legend_handles_labels()[0]:
         place = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0}
-        ax.legend(ncols=len(handles), frameon=False, **place)
+        ax.legend(ncols=len(handles), frameon=False, handlelength=1.4, columnspacing=1.0, **place)

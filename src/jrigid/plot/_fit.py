@@ -9,19 +9,12 @@ import numpy as np
 from jrigid.identify import FitResult
 from jrigid.plot._common import LOOKS, TURN, label, looks, pyplot
 
-_COLOUR = LOOKS[0][0]
-_LAYOUT = [
-    ["record"] * 3,
-    ["residuals", "residuals", "histogram"],
-    ["spectrum", "spectrum", "ratios"],
-]
+_LAYOUT = [["record"] * 3, ["residuals"] * 2 + ["histogram"], ["spectrum"] * 2 + ["ratios"]]
 _SHOWN = {
-    "Gyro": "rate [rad/s]",
-    "Accelerometer": "specific force [m/s$^2$]",
-    "AttitudeSensor": "attitude, quaternion",
-    "DirectionSensor": "direction, unit vector",
+    "Gyro": "rate [rad/s]", "Accelerometer": "specific force [m/s$^2$]",
+    "AttitudeSensor": "attitude, quaternion", "DirectionSensor": "direction, unit vector",
     "MomentumSensor": "angular momentum [kg m$^2$/s]",
-}
+}  # fmt: skip
 _MOST = 5000  # times at which a model is drawn
 _WAVES, _BANDS = 1000, 40  # of a spectrum, at most
 _EDGE = 5.0  # of a histogram: what is beyond is counted in its last bins
@@ -40,8 +33,8 @@ def fit(
     at all frequencies for white noise, with the range of 95 %. "histogram": against the normal
     distribution. "ratios": I2/I1 and I3/I1 with ellipses of 68 % and 95 %, and the bounds of real
     bodies in grey: I3 = I1 + I2 dotted, I3 = I2 dashed, I2 = I1. Where errors are larger than the
-    noise stated makes them, also the ellipse of that noise, Cramer's and Rao's bound. What the
-    record does not tell is written there.
+    noise stated makes them, also the ellipse of 95 % of that noise, Cramer's and Rao's bound. What
+    the record does not tell is written there.
 
     Args:
         result: A single fit.
@@ -143,7 +136,7 @@ def _spectrum(ax: Any, result: FitResult, record: int, _: int) -> None:
     spread = 1 / (9 * np.count_nonzero(number) * np.array([np.sum(x) for x in bands]))
     low, high = ((1 - spread + side * np.sqrt(spread)) ** 3 for side in (-_SURE, _SURE))
     ax.fill_between(frequencies, low, high, color="0.9", label="95 % of white noise")
-    ax.semilogy(frequencies, [np.mean(power[x]) for x in bands], "o-", color=_COLOUR, ms=3, lw=1)
+    ax.semilogy(frequencies, [np.mean(power[x]) for x in bands], "o-", color="#0072B2", ms=3, lw=1)
     ax.axhline(1, color="0.5", lw=1)
     least, most = ax.get_ylim()
     ax.set_ylim(min(least, 0.09), max(most, 11.0))
@@ -153,23 +146,22 @@ def _spectrum(ax: Any, result: FitResult, record: int, _: int) -> None:
 def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
     left, edges = _left(result, record)[1], np.linspace(-_EDGE, _EDGE, 41)
     values = np.clip(left[np.isfinite(left)], -_EDGE, _EDGE)
-    ax.hist(values, edges, density=True, color=_COLOUR, alpha=0.5)
+    ax.hist(values, edges, density=True, color=LOOKS[0][0], alpha=0.5)
     ax.plot(edges, np.exp(-(edges**2) / 2) / np.sqrt(2 * np.pi), color="k", lw=1, label="normal")
     label(ax, "Histogram", "residual / noise", "density")
 
 
 def _ratios(ax: Any, result: FitResult, *_: int) -> None:
     for (colour, marker), body in looks(result.bodies):
-        drawn = [(0.68, "-", colour, 1.0), (0.95, "--", colour, 1.0)]
+        # the chi-square of two numbers at 68 % and 95 %
+        drawn = [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
         if result.inflation > 1:
-            drawn.append((0.95, ":", "k", float(result.inflation)))
+            drawn.append(("bound", ":", "k", 5.9915 / float(result.inflation)))
         values, vectors = np.linalg.eigh(body.ratios_covariance)
         ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
         ax.plot(*body.ratios, marker, color=colour)
-        for part, style, ink, inflation in drawn:
-            line = np.sqrt(-2 * np.log(1 - part) / inflation) * ellipse
-            name = f"{100 * part:.0f} %" + ", least" * (inflation > 1)
-            line = np.asarray(body.ratios)[:, None] + line
+        for name, style, ink, square in drawn:
+            line = np.asarray(body.ratios)[:, None] + np.sqrt(square) * ellipse
             ax.plot(*line, style, color=ink, label=name if body.index == 0 else None)
     view = ax.axis()
     ax.axline((1, 2), slope=1, color="0.5", ls=":")

@@ -93,8 +93,8 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
             if end @ common.eye(ax) >= 0:
                 ax.text(*(1.22 * end), name, ha="center", va="center", zorder=common.FRONT)
     scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
-    shown = ", ".join(f"{x:.3g}" for x in moments)
-    ax.set_title(f"Angular momentum in the body, L/{scale}\nI = {shown} kg m$^2$")
+    title = "Angular momentum in the body, L/{}\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$"
+    ax.set_title(title.format(scale, *moments))
     ax.legend(loc="lower center", ncols=4, frameon=False)
     return ax
 

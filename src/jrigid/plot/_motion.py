@@ -8,7 +8,7 @@ import numpy as np
 
 from jrigid._checks import demand
 from jrigid._types import VectorLike
-from jrigid.plot._common import LOOKS, label, looks, pyplot, states_of, times_of
+from jrigid.plot._common import label, looks, pyplot, states_of, times_of
 
 
 def motion(
@@ -55,18 +55,17 @@ def motion(
             axes["omega"].plot(ts, column, style, color=colour, lw=1.2, label=name)
         label(axes["omega"], "Angular velocity", "time [s]", "in the body [rad/s]")
     if "drift" in axes:
-        args, eps = getattr(motion, "args", None), np.finfo(np.asarray(states.omega).dtype).eps
-        for i, of in enumerate((system.energy, system.angular_momentum)):
+        args, times = getattr(motion, "args", None), jax.numpy.asarray(ts, states.omega.dtype)
+        kept = {"energy": system.energy, "angular momentum": system.angular_momentum}
+        for (colour, marker), (name, of) in looks(kept.items()):
             each = jax.vmap(lambda t, state, of=of: of(t, state, args))
-            values = np.asarray(each(jax.numpy.asarray(ts, states.omega.dtype), states)).reshape(
-                ts.size, -1
-            )
-            if i and along is not None:
+            values = np.asarray(each(times, states)).reshape(ts.size, -1)
+            if along is not None and values.shape[1] > 1:
                 values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
             sizes, changes = (np.linalg.norm(x, axis=1) for x in (values, values - values[0]))
             changes = np.where(changes > 0, changes, np.nan) / (np.nanmax(sizes) or 1.0)
-            (colour, marker), name = LOOKS[i], ("energy", "angular momentum")[i]
             axes["drift"].plot(ts, changes, marker, color=colour, ms=3, label=name)
+        eps = np.finfo(times.dtype).eps
         axes["drift"].axhline(eps, color="0.5", lw=1, ls=":", label="rounding")
         axes["drift"].set_yscale("log")
         label(axes["drift"], "Drift", "time [s]", "relative change")

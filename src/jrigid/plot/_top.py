@@ -6,7 +6,6 @@ import numpy as np
 
 from jrigid.dynamics import State
 from jrigid.plot import _common as common
-from jrigid.plot._common import looks, on_surface, states_of
 from jrigid.top import SymmetricTop, conserved, nutation_bounds
 from jrigid.top import effective_potential as potential
 
@@ -17,7 +16,7 @@ _BAND = 12  # lines across the band of nutation
 
 def _start(motion: Any) -> State:
     """The first state of a motion, or the state itself."""
-    state = states_of(motion)
+    state = common.states_of(motion)
     return State(state.attitude.reshape(-1, 4)[0], state.omega.reshape(-1, 3)[0])
 
 
@@ -54,17 +53,17 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
     ax = common.space_axes(ax, 1.1, np.copysign(np.clip(abs(up), *_ELEVATION), up))
     common.globe(ax, np.ones(3), np.eye(3))
     vertical = np.array([[0, 0, 1.0], [0, 0, 1.2]])
-    on_surface(ax, vertical, vertical, color="k", lw=1)
+    common.on_surface(ax, vertical, vertical, color="k", lw=1)
     ax.text(0, 0, 1.25, "up", ha="center", zorder=common.FRONT)
-    for (colour, marker), (motion, band) in looks(zip(motions, bounds, strict=True)):
+    for (colour, marker), (motion, band) in common.looks(zip(motions, bounds, strict=True)):
         for circle in common.circles(band):
-            on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
+            common.on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
         x, y, z = np.moveaxis(common.circles(np.linspace(band[0], band[1], _BAND)), -1, 0)
         ax.plot_surface(x, y, z, color=colour, alpha=0.15, lw=0, rasterized=True)
-        attitudes = np.asarray(states_of(motion).attitude).reshape(-1, 4)
+        attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
         path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
-        on_surface(ax, path, path, color=colour, lw=1.5)
-        on_surface(ax, path[:1], path[:1], color=colour, marker=marker, ls="none")
+        common.on_surface(ax, path, path, color=colour, lw=1.5)
+        common.on_surface(ax, path[:1], path[:1], color=colour, marker=marker, ls="none")
     ax.set_title(f"Tip of the top, tilts {', '.join(map(_words, bounds))}")
     return ax
 
@@ -91,11 +90,13 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
     tilt [degrees] energy of the tilt [J]
     """
     ax, starts = common.flat_axes(ax), [_start(x) for x in (motion, *more)]
+    from matplotlib.ticker import EngFormatter
+
     bounds = np.array([nutation_bounds(top, x) for x in starts], float).reshape(-1, 2)
     margin = max(0.6 * np.ptp(bounds), _LEAST)
     ends = np.clip([np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3)
     tilts, heights = np.linspace(ends[0], ends[1], 400), []
-    for (colour, marker), (state, band) in looks(zip(starts, bounds, strict=True)):
+    for (colour, marker), (state, band) in common.looks(zip(starts, bounds, strict=True)):
         p_phi, p_psi, energy = conserved(top, state)
         well = np.asarray(potential(top, tilts, p_phi, p_psi))
         level = float(energy - p_psi**2 / (2 * top.I3))
@@ -106,6 +107,7 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
         depth = max(level - low, 0.3 * (np.median(well) - low))
         heights += [low - 0.3 * depth, level + 1.5 * depth]
     ax.set(xlim=np.degrees(ends), ylim=(min(heights), max(heights)))
-    ax.ticklabel_format(axis="y", scilimits=(-2, 4), useOffset=False)
-    common.label(ax, "Effective potential", "tilt [degrees]", "energy of the tilt [J]")
+    ax.yaxis.set_major_formatter(EngFormatter("J"))
+    ax.set(xlabel="tilt [degrees]", ylabel="energy of the tilt [J]", title="Effective potential")
+    ax.legend(loc="lower right", frameon=False)
     return ax
