@@ -1,14 +1,17 @@
 """Code in README and docs/ runs: the blocks of a page, after the usual imports."""
 
 import re
+import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib
 import pytest
 
 import jrigid as jr
 
+matplotlib.use("Agg")
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -44,3 +47,5 @@ def run(page, wanted):
         code = compile("\n" * above + block[1], str(page), "exec")
         with jax.numpy_dtype_promotion("standard"):  # as users have it, and as optax needs it
             exec(code, namespace)
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")

@@ -9,6 +9,7 @@ import pytest
 from helpers import ATTITUDE, MOMENTS, OMEGA, in_a_process, quick_jit
 
 import jrigid as jr
+from jrigid.simulate._event import event_of_states
 
 FORWARD = diffrax.ForwardMode()
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -144,6 +145,21 @@ def test_conditions_true_or_false_end_at_a_step_and_a_root_finder_is_used_if_giv
     late = _spun(2.0, truth)
     assert late.result == jr.RESULTS.event_occurred
     assert exact < late.final_time < exact + 0.2
+
+
+def test_a_condition_is_given_what_it_asks_for():
+    def plain(t, state, args):
+        return t, state, args
+
+    def named(t, state, args, terms):
+        return terms
+
+    def every(t, state, args, **options):
+        return options
+
+    event = event_of_states(diffrax.Event([plain, named, every]), jnp.array(1.0), lambda y: 2 * y)
+    found = [condition(jnp.array(2.0), 3.0, 4, terms=5, solver=6) for condition in event.cond_fn]
+    assert found == [(3.0, 6.0, 4), 5, {"terms": 5, "solver": 6}]
 
 
 def test_an_event_ends_the_motion_in_si_units():

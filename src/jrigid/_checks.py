@@ -66,8 +66,8 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "coefficients must not be negative, but one is."
     )
     invalid_attitude = (
-        "Argument `attitude` must be a unit quaternion, but its norm is not 1: "
-        "use `jrigid.rotation.normalize`."
+        "Argument `attitude` must be a unit quaternion, scalar first, but its norm is not 1. "
+        "(`jrigid.rotation.normalize` makes it 1.)"
     )
     invalid_state = "Argument `state0` must be finite, but a component is not."
     invalid_times = (
@@ -138,7 +138,23 @@ def check_shape(name: str, value: Array | np.ndarray, *shapes: tuple[int | None,
         if len(shape) == value.ndim and all(wanted in (None, length) for length, wanted in pairs):
             return
     wanted = " or ".join(str(shape).replace("None", "n") for shape in shapes)
-    raise ValueError(f"Argument `{name}` must have shape {wanted}, but it has shape {value.shape}.")
+    hint = _hint(name, value.shape, shapes)
+    raise ValueError(
+        f"Argument `{name}` must have shape {wanted}, but it has shape {value.shape}.{hint}"
+    )
+
+
+def _hint(name: str, shape: tuple[int, ...], wanted: Sequence[tuple[int | None, ...]]) -> str:
+    """What a wrong shape may come from."""
+    if any(x and shape[len(shape) - len(x) :] == x for x in wanted):
+        return " (For many, `jax.vmap`.)"
+    if wanted == INERTIA and shape == (6,):
+        return (
+            " (Six numbers make [[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]], whose Ixy is "
+            "minus the sum of m x y; programs differ in order and sign.)"
+        )
+    is_omega = name.endswith("attitude") and shape == (3,)
+    return " (`State(attitude, omega)`, the attitude as (w, x, y, z).)" if is_omega else ""
 
 
 def array_of_shape(name: str, value: Any, *shape: Any) -> Array:
@@ -177,13 +193,24 @@ def check_type(name: str, value: Any, *types: type) -> None:
     """Raise ValueError unless `value` is of one of the types."""
     if not isinstance(value, types):
         wanted = " or a ".join(x.__name__ for x in types)
-        raise ValueError(
-            f"Argument `{name}` must be a {wanted}, but it is a {type(value).__name__}."
-        )
+        raise ValueError(f"Argument `{name}` must be a {wanted}, but it is {kind_of(value)}.")
+
+
+def kind_of(value: Any) -> str:
+    """What a wrong argument is, in words."""
+    if isinstance(value, type):
+        return f"the class `{value.__name__}`, not `{value.__name__}(...)`"
+    is_array = eqx.is_array(value) or isinstance(value, np.ndarray)
+    return f"an array of shape {value.shape}" if is_array else f"a {type(value).__name__}"
 
 
 def whole_number(name: str, value: Any, least: int = 1) -> int:
     """A Python integer of some size, which fixes a cost at trace time, or ValueError."""
+    demand(
+        not isinstance(value, jax.core.Tracer),
+        f"Argument `{name}` must be known when it is compiled, but it is traced: hand it past "
+        "`jit`, `vmap` and `sweep`, in a closure or a Python loop.",
+    )
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(
             f"Argument `{name}` must be an integer and at least {least}, but it is {value!r}."

@@ -24,6 +24,7 @@ from jrigid._checks import (
     float_arrays,
     harmless,
     is_unit,
+    kind_of,
     nan_where,
     settle,
     where_defined,
@@ -68,9 +69,7 @@ def motion_arguments(
     if not isinstance(system, kind):
         names = "jrigid system (a RigidBody, a FloatingBody)"
         wanted = names if kind is AbstractSystem else kind.__name__
-        raise ValueError(
-            f"Argument `system` must be a {wanted}, but it is {type(system).__name__}."
-        )
+        raise ValueError(f"Argument `system` must be a {wanted}, but it is {kind_of(system)}.")
     check_type(name, state, system.state_type)
     state, _ = _in_one_dtype(name, state)
     return system, system.with_parts(state), numbers(**times)

@@ -20,7 +20,7 @@ from jrigid.torques import Rotor, SpinningMass, Sum
 GUESS = 0.02  # of the size of values, for a noise that is not known
 _COARSE = (
     "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a turn, "
-    "but the body turns more between samples: are the rates in degrees a second?"
+    "but the body turns more between samples: rates in degrees a second, times not in seconds?"
 )
 
 

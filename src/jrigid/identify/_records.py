@@ -264,7 +264,7 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
     demand(
         isinstance(observations, Sequence) and len(observations) > 0,
         "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, or a "
-        f"list with one entry for each throw, but it is {observations!r}.",
+        f"list with one entry for each throw, but it is {type(observations).__name__}.",
     )
     for x in observations:
         check_type("observations", x, Record)

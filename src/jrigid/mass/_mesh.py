@@ -41,6 +41,26 @@ def is_closed(faces: Int[np.ndarray, "faces 3"], vertices: int) -> bool:
     return not (edges.size % 2 or np.any(forth % 2) or np.any(back != forth + 1))
 
 
+def _why_open(faces: Any, vertices: int) -> str:
+    """What may have left known faces open, and what mends it."""
+    if not isinstance(faces, np.ndarray):
+        return ""
+    least, most = faces.min(), faces.max()
+    if least < 0 or most >= vertices:
+        return (
+            f" (Indices count from 0 to {vertices - 1} here, but they go from {least} to {most}.)"
+        )
+    if np.unique(faces).size == faces.size:
+        return (
+            " (No two faces share a vertex, as in an STL file. This merges them: `vertices, same = "
+            "np.unique(vertices, axis=0, return_inverse=True)`, `faces = same.ravel()[faces]`.)"
+        )
+    runs = faces.astype(np.int64) * vertices + np.roll(faces, -1, axis=1)
+    if np.unique(runs).size < runs.size:
+        return " (A face is there twice or flipped: `trimesh.repair.fix_winding` turns it.)"
+    return " (A face is missing, or vertices at one place are not merged.)"
+
+
 def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array, ""]:
     """As `is_closed`, at run time."""
     if faces.shape[0] % 2:
@@ -146,7 +166,8 @@ def from_mesh(
     findings.require(jnp.all(finite), None, message, vertices[jnp.argmin(finite)])
     message = "Argument `density` must be positive and finite, but it is not."
     findings.require((density > 0) & jnp.isfinite(density), None, message, density)
-    findings.require(jnp.asarray(closed(indices, vertices.shape[0])), None, _OPEN)
+    open_message = _OPEN + _why_open(indices, vertices.shape[0])
+    findings.require(jnp.asarray(closed(indices, vertices.shape[0])), None, open_message)
     vertices, density = harmless(findings.ok, (vertices, density))
     volume, magnitude, center, tensor = _mesh_integrals(vertices, indices)
     rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude

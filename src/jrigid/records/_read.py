@@ -274,6 +274,7 @@ def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None,
         why = f"their median {'step ' * (kind == 'times')}is {size:.4g}"
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
     doubt = f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}."
+    doubt += f" (`unit={{'{kind}': ...}}`, one of {', '.join(_UNITS[kind])}.)"
     demand(unit is not None or kind not in ("times", "rates"), doubt)
     return unit, why
 

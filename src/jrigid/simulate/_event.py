@@ -1,6 +1,7 @@
 """Events: conditions on states, and where between two steps one changed its sign."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -21,8 +22,13 @@ def event_of_states(event: Any, t0: Array, to_state: Callable) -> Any:
         return None
 
     def of_states(condition: Callable) -> Callable:
+        known = inspect.signature(condition).parameters.values()
+        every = any(x.kind is x.VAR_KEYWORD for x in known)
+        names = {x.name for x in known}
+
         def wrapped(t: Array, y: Any, args: Any, **options: Any) -> Any:
-            return condition(t0 + t, to_state(y), args, **options)
+            asked = {name: x for name, x in options.items() if every or name in names}
+            return condition(t0 + t, to_state(y), args, **asked)
 
         return wrapped
 

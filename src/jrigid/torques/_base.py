@@ -5,6 +5,7 @@
 
 import abc
 import dataclasses
+import inspect
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -13,7 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import RESULTS, Findings, all_finite, all_positive, array_of_shape, check_shape
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    all_positive,
+    array_of_shape,
+    check_shape,
+    demand,
+)
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 
@@ -72,7 +81,10 @@ def value_of(
     name: str, source: Any, state: Any, *arguments: Any, shape: tuple[int, ...] = (3,)
 ) -> Array:
     """The value of an array, or of a function of the arguments, in the dtype of a state."""
-    value = jnp.asarray(source(*arguments) if callable(source) else source, state.omega.dtype)
+    found = source(*arguments) if callable(source) else source
+    text = f"Argument `{name}` must return an array, but it returns None: without `return`?"
+    demand(found is not None, text)
+    value = jnp.asarray(found, state.omega.dtype)
     check_shape(name, value, shape)
     return value
 
@@ -185,7 +197,25 @@ def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
         raise ValueError(
             f"Argument `torque` must be a callable (t, state, args) -> (3,), but it is {torque!r}."
         )
-    return torque if isinstance(torque, AbstractTorque) else Torque(torque)
+    if isinstance(torque, AbstractTorque):
+        return torque
+    demand(
+        _takes_three(torque),
+        "Argument `torque` must be a callable (t, state, args) -> (3,), but it does not take these "
+        f"three: {torque!r}.",
+    )
+    return Torque(torque)
+
+
+def _takes_three(function: Callable[..., Any]) -> bool:
+    """Whether a function can be called with three arguments, as far as its signature is known."""
+    try:
+        inspect.signature(function).bind(None, None, None)
+    except ValueError:  # as of functions written in C
+        return True
+    except TypeError:
+        return False
+    return True
 
 
 class Sum(AbstractTorque):
