@@ -94,7 +94,7 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
                 ax.text(*(1.22 * end), name, ha="center", va="center", zorder=common.FRONT)
     scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
     title = "Angular momentum in the body, L/{}\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$"
-    ax.set_title(title.format(scale, *moments))
+    ax.set_title(title.format(scale, *moments), y=0.95)
     ax.legend(loc="lower center", ncols=4, frameon=False)
     return ax
 
