@@ -174,6 +174,14 @@ def fits(trials):
     return rows
 
 
+def together(rows):
+    """Of all bodies, by gap: fits that are OK, and the mean of what they cover."""
+    mean = {gap: np.mean([[float(x) for x in r[2:7]] for r in rows if r[1] == gap], axis=0)
+            for gap in dict.fromkeys(r[1] for r in rows)}  # fmt: skip
+    return [[gap, round(x[0] * len(BODIES)), *(f"{y:.1f}" for y in x[1:])]
+            for gap, x in mean.items()]  # fmt: skip
+
+
 def speed():
     """Milliseconds of an interval, and of compiling one."""
     rows = []
@@ -195,16 +203,25 @@ def main():
     parser = common.arguments(__doc__)
     parser.add_argument("--trials", type=int, default=500, help="of tensors, in each cell")
     parser.add_argument("--fits", type=int, default=300, help="in each cell")
+    parser.add_argument("--speed", action="store_true", help="print the times of a call alone")
     given = parser.parse_args()
+    times = common.table(["one interval", "first call ms", "min ms", "median ms"], speed())
+    if given.speed:
+        print(common.machine(["jax"]), times, sep="\n\n")
+        return
     ratios = ["I2/I1 covered %", "by derivatives", "I3/I1 covered %", "by derivatives",
               "width to that by derivatives", "of I3/I1"]  # fmt: skip
+    fitted, all_fits = fits(given.fits), given.fits * len(BODIES)
     text = "\n\n".join([
-        common.table(["one interval", "first call ms", "min ms", "median ms"], speed()),
+        times,
         f"Tensors, {given.trials} in each cell (a standard error of 95 % is "
         f"{100 * np.sqrt(0.0475 / given.trials):.1f} points).",
         common.table(["errors", "gap 1, 2", "gap 2, 3", *ratios], tensors(given.trials)),
         f"Fits, {given.fits} in each cell ({100 * np.sqrt(0.0475 / given.fits):.1f} points).",
-        common.table(["moments, noise", "gap", "OK", *ratios], fits(given.fits)),
+        common.table(["moments, noise", "gap", "OK", *ratios], fitted),
+        "The bodies together (a standard error of "
+        f"{100 * np.sqrt(0.0475 / all_fits):.1f} points):",
+        common.table(["gap", "OK", *ratios[:4]], together(fitted)),
     ])  # fmt: skip
     packages = ("jax", "equinox", "numpy")
     common.report("intervals", "Intervals of the ratios where moments coincide", text, packages,
