@@ -135,6 +135,10 @@ def fit(
     """
     records = of_throws(observations)
     throws, shape = records[0].ts.shape[0], Tensor() if shape is None else shape
+    demand(
+        bodies is None or len(bodies) == throws,
+        f"Argument `bodies` must have one number for each of {throws} throws, but it is {bodies}.",
+    )
     systems = systems_of(system, throws)
     check_type("shape", shape, AbstractShape)
     check_option("loss", loss, ("squares", "robust"))
