@@ -56,7 +56,7 @@ def has_units(ax):
 def test_polhodes_keep_momentum_and_energy():
     omegas = OMEGA, jnp.array([1.0, 0.1, 0.05]), jnp.array([1e-7, 1.0, 0.0])
     ax = jr.plot.polhode(TENSOR, *omegas)
-    assert "kg m$^2$" in ax.get_title()
+    assert "kg m$^2$" in ax.get_legend().get_title().get_text()
     inverse = np.linalg.inv(TENSOR)
     drawn = [x for x in curves(ax) if len(x) > 2]
     for curve, omega in zip(drawn[-3:], omegas, strict=True):

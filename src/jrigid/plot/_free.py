@@ -56,7 +56,6 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
     >>> ax = jr.plot.polhode(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.05, 1.0, 0.0]))
     >>> print(ax.get_title())
     Angular momentum in the body, L/|L|
-    I = 1, 2, 3 kg m$^2$
     """
     check_option("surface", surface, ("sphere", "ellipsoid"))
     (moments, axes), inertia = common.principal(body), common.tensor_of(body)
@@ -93,9 +92,9 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
             if end @ common.eye(ax) >= 0:
                 ax.text(*(1.22 * end), name, ha="center", va="center", zorder=common.FRONT)
     scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
-    title = "Angular momentum in the body, L/{}\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$"
-    ax.set_title(title.format(scale, *moments), y=0.95)
-    ax.legend(loc="lower center", ncols=4, frameon=False)
+    ax.set_title(f"Angular momentum in the body, L/{scale}")
+    title = "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
+    ax.legend(loc="lower center", ncols=4, frameon=False, title=title)
     return ax
 
 
