@@ -100,16 +100,16 @@ def sinhc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The power of two at or next below |x|, to scale by without rounding; 1 at 0.
+    """The power of two next above |x|, to scale by without rounding; 1 at 0.
 
     In the bits of the exponent: `frexp` and `ldexp` take longer than what is scaled, to compile
     too. It and its inverse are normal numbers also where |x| is not, is infinite or NaN.
     """
     info = jnp.finfo(x.dtype)
     least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
-    greatest = ((1 << info.nexp) - 3) * least
+    greatest = ((1 << info.nexp) - 4) * least
     bits = jax.lax.bitcast_convert_type(jnp.abs(x), jnp.dtype(f"int{info.bits}")) & -least
-    power = jax.lax.bitcast_convert_type(jnp.clip(bits, least, greatest), x.dtype)
+    power = jax.lax.bitcast_convert_type(jnp.clip(bits, least, greatest) + least, x.dtype)
     return jax.lax.stop_gradient(jnp.where(x == 0, 1.0, power))
 
 

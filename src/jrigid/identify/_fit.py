@@ -16,6 +16,7 @@ from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import (
     GUESS,
+    bodies_of,
     findings_of,
     noise_of,
     refuse,
@@ -135,10 +136,6 @@ def fit(
     """
     records = of_throws(observations)
     throws, shape = records[0].ts.shape[0], Tensor() if shape is None else shape
-    demand(
-        bodies is None or len(bodies) == throws,
-        f"Argument `bodies` must have one number for each of {throws} throws, but it is {bodies}.",
-    )
     systems = systems_of(system, throws)
     check_type("shape", shape, AbstractShape)
     check_option("loss", loss, ("squares", "robust"))
@@ -157,7 +154,7 @@ def fit(
         doublings=doublings, max_steps=max_steps, progress=progress,
     )  # fmt: skip
     options = options._replace(shooting=_shoots(options, systems[0], records, state))
-    each_body = jnp.zeros(throws, int) if bodies is None else jnp.asarray(bodies)
+    each_body = bodies_of(bodies, throws)
     given = systems, records, tensor, state, options.on_attitude
     prepared = _prepare(*given)
     prepared = settle(prepared, throw, lambda: findings_of(*given[:-1], prepared.told))

@@ -41,6 +41,16 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
     return systems
 
 
+def bodies_of(bodies: Sequence[int] | None, throws: int) -> Array:
+    """Which body each throw is of."""
+    chosen = [0] * throws if bodies is None else bodies
+    demand(
+        len(chosen) == throws,
+        f"Argument `bodies` must have one number for each of {throws} throws, but it is {bodies}.",
+    )
+    return jnp.asarray(chosen)
+
+
 def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     """The tensor to start from, if one is given, and the state of each throw."""
     inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)

@@ -12,7 +12,7 @@ from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector
 
 
 def _scale(vector: Array) -> Array:
-    return 1 / power_of_two(functools.reduce(jnp.add, [jnp.abs(x) for x in vector]))
+    return 2 / power_of_two(functools.reduce(jnp.add, [jnp.abs(x) for x in vector]))
 
 
 def rescaled(vector: Array) -> Array:
