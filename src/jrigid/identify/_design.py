@@ -228,7 +228,8 @@ def profile(
     >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
     >>> largest = lambda inertia: jnp.linalg.eigvalsh(inertia)[2] / jnp.trace(inertia)
     >>> best, error = found.moments[2] / 3, found.moments_covariance[2, 2] ** 0.5 / 3
-    >>> print(jr.identify.profile(found, largest, best + error * jnp.array([-1.0, 0, 1])).round(1))
+    >>> growth = jr.identify.profile(found, largest, best + error * jnp.array([-1.0, 0.0, 1.0]))
+    >>> print(growth.round(1) + 0)
     [1. 0. 1.]
     """
     values = jnp.asarray(values, result.numbers.dtype)
