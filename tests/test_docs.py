@@ -1,5 +1,6 @@
 """Code in README and docs/ runs: the blocks of a page, after the usual imports."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -49,3 +50,18 @@ def run(page, wanted):
             exec(code, namespace)
     if pyplot := sys.modules.get("matplotlib.pyplot"):
         pyplot.close("all")
+
+
+DRAWS = re.compile(r"\b(plt|jr\.plot|ax|axes)\.\w")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem
+)
+def test_notebooks_draw_in_ten_lines(path):
+    """A cell draws last: from where it begins to its end there are ten lines of code at most."""
+    for cell in json.loads(path.read_text())["cells"]:
+        code = [line for line in map(str.strip, cell["source"]) if line and line[0] != "#"]
+        drawing = [i for i, line in enumerate(code) if DRAWS.search(line)]
+        if cell["cell_type"] == "code" and drawing:
+            assert len(code) - drawing[0] <= 10, (cell["id"], code[drawing[0]])
