@@ -279,6 +279,7 @@ def linear_misfit(pole: Pole) -> Callable[[Any], Any]:
     def misfit(ellipticity):
         wobble = np.exp(1j * np.multiply.outer(ellipticity, tau))
         norm = len(tau) - np.sum(np.abs(wobble.conj() @ others) ** 2, axis=-1)
+        norm = np.maximum(norm, 1e-9 * len(tau))  # what hardly turns is drift already
         explained = np.abs(wobble.conj() @ rest) ** 2 / norm
         return np.sqrt((np.vdot(rest, rest).real - explained) / len(tau)) * SCALE / MAS
 
