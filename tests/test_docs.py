@@ -29,13 +29,15 @@ LONG_PAGES.remove(ROOT / "docs" / "identify.md")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_code_blocks_run(page):
+def test_code_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where they write their pictures
     run(page, lambda code: not LONG.search(code))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", LONG_PAGES, ids=lambda page: page.stem)
-def test_code_blocks_that_take_long_run(page):
+def test_code_blocks_that_take_long_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     run(page, lambda _: True)
 
 
