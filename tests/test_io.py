@@ -48,8 +48,6 @@ def test_scipy_turns_vectors_as_attitudes_do(rng):
 
 
 def test_scipys_rigid_transforms(rng):
-    if not hasattr(scipy_transform, "RigidTransform"):
-        pytest.skip("scipy older than 1.16")
     q, place, v = attitudes(rng), rng.normal(size=(20, 3)), rng.normal(size=3)
     pose = jr.io.to_scipy(q, place)
     assert_allclose(pose.apply(v), matrices(q) @ v + place, atol=1e-14)

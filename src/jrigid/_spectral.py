@@ -55,7 +55,8 @@ def eigh(
     """
     del distinct  # the derivatives need it
     unit = power_of_two(jnp.max(jnp.abs(tensor)))
-    scaled = 0.5 * (tensor / unit + tensor.T / unit)
+    scaled = tensor / unit
+    scaled = 0.5 * (scaled + scaled.T)
     entries = [scaled[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     identity = [jnp.asarray(x, tensor.dtype) for x in np.eye(3).ravel()]
     state = jax.lax.fori_loop(0, _ROTATIONS, _rotate, (*entries, *identity))

@@ -41,10 +41,8 @@ def is_closed(faces: Int[np.ndarray, "faces 3"], vertices: int) -> bool:
     return not (edges.size % 2 or np.any(forth % 2) or np.any(back != forth + 1))
 
 
-def _why_open(faces: Any, vertices: int) -> str:
-    """What may have left known faces open, and what mends it."""
-    if not isinstance(faces, np.ndarray):
-        return ""
+def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
+    """What may have left faces open, and what mends it."""
     least, most = faces.min(), faces.max()
     if least < 0 or most >= vertices:
         return (
@@ -159,15 +157,15 @@ def from_mesh(
     """
     vertices, density = shaped(vertices=(vertices, None, 3), density=(density,))
     indices = _index_array(faces)
-    closed: Any = is_closed if isinstance(indices, np.ndarray) else is_closed_traced
-    findings = Findings()
+    known, findings = isinstance(indices, np.ndarray), Findings()
+    closed: Any = (is_closed if known else is_closed_traced)(indices, vertices.shape[0])
     finite = jnp.all(jnp.isfinite(vertices), axis=1)
     message = "Argument `vertices` must be finite, but it is not."
     findings.require(jnp.all(finite), None, message, vertices[jnp.argmin(finite)])
     message = "Argument `density` must be positive and finite, but it is not."
     findings.require((density > 0) & jnp.isfinite(density), None, message, density)
-    open_message = _OPEN + _why_open(indices, vertices.shape[0])
-    findings.require(jnp.asarray(closed(indices, vertices.shape[0])), None, open_message)
+    why = _why_open(indices, vertices.shape[0]) if known and not closed else ""
+    findings.require(jnp.asarray(closed), None, _OPEN + why)
     vertices, density = harmless(findings.ok, (vertices, density))
     volume, magnitude, center, tensor = _mesh_integrals(vertices, indices)
     rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude
