@@ -55,21 +55,11 @@ def is_told(name, shown):
     )
 
 
-# What no example shows yet: the list may only become shorter. Of `io`: what takes a package that
-# the tests do without.
-_OWED = {
-    *("identify.AngularMomenta", "identify.AttitudeSensor", "identify.Bound"),
-    *("identify.DirectionSensor", "identify.Fixed", "identify.Flat", "identify.FunctionSensor"),
-    *("identify.MomentumSensor", "identify.Status", "identify.Symmetric", "identify.Tensor"),
-    *("identify.Top", "io.from_jaxlie", "io.to_jaxlie", "io.read_mesh"),
-}
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_public_name_is_in_an_example(name):
     shown = NAMES[name]
     if inspect.isclass(shown) or inspect.isroutine(shown):  # not an alias of types
-        assert is_told(name, shown) != (name.removeprefix("jrigid.") in _OWED)
+        assert is_told(name, shown)
 
 
 LOOK = """(async () => {

@@ -75,7 +75,7 @@ class Plan(Readable):
     >>> def error(omega):
     ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
     ...     plan = jr.identify.Plan(body, start, jr.identify.Rates(ts, None, 0.01))
-    ...     return plan.bound.ratios_covariance[1, 1] ** 0.5
+    ...     return plan.bound.ratios_covariance[1, 1] ** 0.5  # of a `Bound`
     >>> print(f"{error(jnp.array([0.5, 1.0, 0.3])):.5f}")
     0.00378
     """

@@ -155,7 +155,11 @@ def Directions(
 def AngularMomenta(
     ts: Times, values: Values, sigma: Noise = None, *, axes: str = "space", **noise: Any
 ) -> Record:
-    """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`."""
+    """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> seen = jr.identify.AngularMomenta(jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, axes="body")
+    """
     return Record(sensors.MomentumSensor(axes), ts, values, sigma, **noise)
 
 

@@ -126,6 +126,8 @@ class FitResult(eqx.Module):
     >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
     >>> print(found.shares.round(3), found.shares_errors.round(4))
     [0.223 0.333 0.444] [0.0004 0.0004 0.0004]
+    >>> print(found.status == jr.identify.Status.OK)
+    True
     """
 
     status: Any

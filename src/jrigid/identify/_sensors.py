@@ -225,6 +225,13 @@ class AttitudeSensor(AbstractSensor):
 
     Attributes:
         misalignment: Rotation vector, from the body's axes to those whose attitude is seen [rad].
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> tracker = jr.identify.AttitudeSensor(misalignment=jnp.array([0.0, 0.0, 0.1]))
+    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    >>> seen = tracker.predict(0.0, start, jr.RigidBody(jnp.ones(3)))
+    >>> print(tracker.difference(start.attitude, seen))
+    [0.  0.  0.1]
     """
 
     width: ClassVar[int | None] = 4
@@ -256,6 +263,12 @@ class DirectionSensor(AbstractSensor):
         of: What is seen: a vector in space axes (a star, the Sun), or, with `seen_from="space"`, a
             vector in body axes (a mark on the body).
         seen_from: "body" or "space": the axes of the values.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> sun = jr.identify.DirectionSensor(jnp.array([2.0, 0.0, 0.0]))
+    >>> start = jr.State(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3))
+    >>> print(sun.predict(0.0, start, jr.RigidBody(jnp.ones(3))))
+    [-1.  0.  0.]
     """
 
     degrees: ClassVar[int | None] = 2
@@ -291,6 +304,12 @@ class MomentumSensor(AbstractSensor):
 
     Attributes:
         axes: "space" or "body": the axes of the values.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> start = jr.State(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0]))
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 2.5]))
+    >>> print(jr.identify.MomentumSensor().predict(0.0, start, body))
+    [-1.  -4.   7.5]
     """
 
     axes: str = eqx.field(static=True, default="space")
@@ -313,6 +332,12 @@ class FunctionSensor(AbstractSensor):
     Attributes:
         function: `(t, state, system) -> (k,)`. Define it once: a new function is compiled anew.
         looks_at_attitude: Whether the function looks at the attitude.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> rpm = jr.identify.FunctionSensor(lambda t, state, system: 9.549297 * state.omega[2:], False)
+    >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
+    >>> print(rpm.predict(0.0, start, jr.RigidBody(jnp.ones(3))))
+    [19.098594]
     """
 
     width: ClassVar[int | None] = None

@@ -97,6 +97,12 @@ class Tensor(AbstractShape):
     """Nothing is known: any real body, by five numbers.
 
     The second moments of the mass are L L^T with L11 = 1: log L22, log L33, L21, L31, L32.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.identify.Tensor().inertia(jnp.array([0.0, 0.0, 0.5, 0.0, 0.0])))
+    [[ 2.25 -0.5   0.  ]
+     [-0.5   2.    0.  ]
+     [ 0.    0.    2.25]]
     """
 
     names: ClassVar[tuple[str, ...]] = _names(5)
@@ -145,7 +151,15 @@ class Moments(_InFrame):
 
 
 class Symmetric(_InFrame):
-    """Two moments are equal, about an axis that is sought: three numbers."""
+    """Two moments are equal, about an axis that is sought: three numbers.
+
+    The logarithm of the odd second moment over the others, and where axis 3 of the frame turns to.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> shape = jr.identify.Symmetric(jnp.eye(3))
+    >>> print(jnp.linalg.eigvalsh(shape.inertia(jnp.array([jnp.log(2.0), 0.1, -0.2]))).round(6))
+    [2. 3. 3.]
+    """
 
     names: ClassVar[tuple[str, ...]] = _names(3)
 
@@ -166,7 +180,12 @@ class Symmetric(_InFrame):
 
 
 class Top(_InFrame):
-    """Two moments are equal, and the axis is body axis 3: one number."""
+    """Two moments are equal, and the axis is body axis 3: one number.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diagonal(jr.identify.Top().inertia(jnp.log(jnp.array([2.0])))))
+    [3. 3. 2.]
+    """
 
     names: ClassVar[tuple[str, ...]] = _names(1)
 
@@ -177,7 +196,14 @@ class Top(_InFrame):
 
 
 class Flat(_InFrame):
-    """All mass is in a plane, which is sought: four numbers."""
+    """All mass is in a plane, which is sought: four numbers.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> tensor = jr.identify.Flat(jnp.eye(3)).inertia(jnp.array([0.3, 0.1, 0.2, -0.1]))
+    >>> small, middle, large = jnp.linalg.eigvalsh(tensor)
+    >>> print((large - small - middle).round(6) + 0.0)
+    0.0
+    """
 
     names: ClassVar[tuple[str, ...]] = _names(4)
 
@@ -197,6 +223,10 @@ class Fixed(AbstractShape):
 
     Attributes:
         known: The tensor [kg m^2]; `fit` sets it.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diagonal(jr.identify.Fixed(jnp.eye(3)).inertia(jnp.zeros(0))))
+    [1. 1. 1.]
     """
 
     absolute: ClassVar[bool] = True

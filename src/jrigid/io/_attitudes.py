@@ -81,6 +81,11 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
         A `jaxlie.SO3` or `jaxlie.SE3`; `apply` takes body components to space components.
 
     Gradients: the identity.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> turn = jr.io.to_jaxlie(jnp.array([0.0, 0.0, 0.0, 1.0]))
+    >>> print(turn.apply(jnp.array([1.0, 2.0, 3.0])))
+    [-1. -2.  3.]
     """
     jaxlie = extra("io", "jaxlie")
     if position is None:
@@ -101,6 +106,10 @@ def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
         ValueError: Of what is neither.
 
     Gradients: the identity.
+
+    >>> import jaxlie, jrigid as jr
+    >>> print(jr.io.from_jaxlie(jaxlie.SO3.from_x_radians(3.14159265)).round(6))
+    [0. 1. 0. 0.]
     """
     if hasattr(rotation, "wxyz_xyz"):
         return rotation.wxyz_xyz[..., :4], rotation.wxyz_xyz[..., 4:]

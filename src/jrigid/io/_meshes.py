@@ -115,6 +115,13 @@ def read_mesh(path: str | Path, density: Density = 1.0, *, scale: float = 1.0) -
     Raises:
         ImportError: Without the extra `jrigid[io]`.
         ValueError: As `from_trimesh`.
+
+    >>> import jrigid as jr, tempfile, trimesh
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = trimesh.creation.box((100, 200, 300)).export(f"{folder}/box.stl")
+    ...     body = jr.io.read_mesh(f"{folder}/box.stl", 500.0, scale=1e-3)
+    >>> print(body.mass.round(6))
+    3.0
     """
     check_type("path", path, str, Path)
     return from_trimesh(extra("io", "trimesh").load_scene(path), density, scale=scale)
