@@ -724,6 +724,8 @@ def every_function(x):
         "principal_axes": principal.moments,
         "PrincipalAxes": principal.axes,
         "tensor_function": jr.tensor_function(jnp.log, tensor),
+        "second_moment": jr.mass.second_moment(tensor),
+        "inertia_of_second_moment": jr.mass.inertia_of_second_moment(tensor),
         "MassProperties": body,
         "MassProperties.unchecked": jr.MassProperties.unchecked(x[0], x, tensor),
         "MassProperties.about": body.about(2 * x),

@@ -9,18 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jrigid._checks import INERTIA, all_finite, check_type, is_inertia, shaped, where_defined
 from jrigid._numerics import product
 from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
-from jrigid.mass import MassProperties
-
-
-def second_moments(tensor: Matrix) -> Matrix:
-    """Sigma = (trace I / 2) 1 - I, the integral of r r^T over the mass."""
-    return 0.5 * jnp.trace(tensor) * jnp.eye(3, dtype=tensor.dtype) - tensor
-
-
-def from_second_moments(second_moments: Matrix) -> Matrix:
-    """I = (trace Sigma) 1 - Sigma."""
-    return jnp.trace(second_moments) * jnp.eye(3, dtype=second_moments.dtype) - second_moments
-
+from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
 
 SIDES = [1, 2, 2], [0, 0, 1]  # of a lower triangle, below its diagonal
 _LOWER, _UPPER = ([1, 0, 0], [4, 2, 0], [5, 6, 3]), ([1, 4, 6], [0, 2, 5], [0, 0, 3])
@@ -62,7 +51,7 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
 
     def tensor(p: Array) -> Matrix:
         scale, sizes = jnp.exp(p[0]), jnp.exp(p[:3].at[0].set(0))
-        return from_second_moments(squared(scale * sizes, scale * p[3:]))
+        return inertia_of_second_moment(squared(scale * sizes, scale * p[3:]))
 
     return where_defined(all_finite(parameters), tensor, parameters)
 
@@ -88,7 +77,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     """
     (inertia,) = shaped(inertia=(inertia, *INERTIA))
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-    second = second_moments(0.5 * (tensor + tensor.T))
+    second = second_moment(0.5 * (tensor + tensor.T))
     solid = is_inertia(tensor) & is_inertia(second)
 
     def numbers(second: Matrix) -> Array:
@@ -129,7 +118,7 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
         mass = jnp.exp(2 * p[0])
         # About the centre of mass the column t drops out.
         sigma = squared(jnp.exp(p[1:4]), p[4:7], _UPPER)
-        return mass, p[7:], mass * from_second_moments(sigma)
+        return mass, p[7:], mass * inertia_of_second_moment(sigma)
 
     return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
 
@@ -151,7 +140,7 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     [ 1.0397 -1.2425 -0.5493 -0.1438]
     """
     check_type("body", body, MassProperties)
-    second = second_moments(body.inertia)
+    second = second_moment(body.inertia)
     solid = (body.mass > 0) & all_finite(body) & is_inertia(second + second.T)
 
     def numbers(mass: Scalar, center_of_mass: Vector, second: Matrix) -> Array:

@@ -15,7 +15,7 @@ from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import Readable
 from jrigid.identify import _parameters
-from jrigid.mass import MassProperties
+from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 # Second moments of the mass, of their trace, below which a fit has run into a boundary.
@@ -29,14 +29,14 @@ def as_tensor(inertia: Array) -> Array:
 
 def real_body(tensor: Array, flattest: float) -> Array:
     """The nearest shape of a body with extent in three directions: second moments of trace 1."""
-    values, axes = eigh(2 * _parameters.second_moments(tensor) / jnp.trace(tensor))
+    values, axes = eigh(2 * second_moment(tensor) / jnp.trace(tensor))
     values = jnp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / jnp.sum(values), axes)
 
 
 def is_near_flat(tensor: Array) -> Array:
     """Whether a fit has run into the boundary of real bodies."""
-    return eigh(2 * _parameters.second_moments(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
+    return eigh(2 * second_moment(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
 
 
 class AbstractShape(Readable):
@@ -115,7 +115,7 @@ class Tensor(AbstractShape):
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
-        return _parameters.from_second_moments(
+        return inertia_of_second_moment(
             _parameters.squared(jnp.exp(jnp.pad(numbers[:2], (1, 0))), numbers[2:])
         )
 
@@ -132,9 +132,7 @@ class _InFrame(AbstractShape):
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
         frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
-        return _parameters.from_second_moments(
-            product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
-        )
+        return inertia_of_second_moment(product("ik,kl,jl->ij", frame, self.sigma(numbers), frame))
 
 
 class Moments(_InFrame):

@@ -5,7 +5,12 @@ import numpy as np
 
 from jrigid._checks import INERTIA, shaped
 from jrigid._types import InertiaLike, Matrix, ScalarLike
-from jrigid.mass import MassProperties, tensor_function
+from jrigid.mass import (
+    MassProperties,
+    inertia_of_second_moment,
+    second_moment,
+    tensor_function,
+)
 
 _ULPS = 64  # of the trace: as MassProperties allows
 _ROUNDING = 1e-6  # of the tensor, in its symmetry
@@ -153,8 +158,6 @@ def nearest_physical(
     tensor, mass, thickness = shaped(**known)
     tensor = jnp.diag(tensor) if tensor.ndim == 1 else tensor
     tensor = 0.5 * (tensor + tensor.T)
-    eye = jnp.eye(3, dtype=tensor.dtype)
     least = mass * thickness * thickness / 12
-    second = 0.5 * jnp.trace(tensor) * eye - tensor
-    added = tensor_function(lambda x: jnp.maximum(least - x, 0), second)
-    return tensor + jnp.trace(added) * eye - added
+    added = tensor_function(lambda x: jnp.maximum(least - x, 0), second_moment(tensor))
+    return tensor + inertia_of_second_moment(added)

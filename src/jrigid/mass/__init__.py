@@ -6,8 +6,10 @@ their symmetric functions are right to first order through `principal_axes`, and
 through `tensor_function`.
 """
 
+from jrigid.mass._axes import inertia_of_second_moment as inertia_of_second_moment
 from jrigid.mass._axes import parallel_axis as parallel_axis
 from jrigid.mass._axes import principal_axes as principal_axes
+from jrigid.mass._axes import second_moment as second_moment
 from jrigid.mass._axes import tensor_function as tensor_function
 from jrigid.mass._axes import to_center_of_mass as to_center_of_mass
 from jrigid.mass._body import MassProperties as MassProperties

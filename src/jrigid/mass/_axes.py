@@ -31,10 +31,39 @@ def as_tensor(inertia: Array) -> Matrix:
 
 
 def inertia_of_second_moment(second: Matrix) -> Matrix:
-    """tr(S) 1 - S; sums of two moments, as differences of three would leave none to a needle."""
+    """Inertia tensor of a second moment of the mass, tr(S) 1 - S.
+
+    Diagonal elements are sums of two, as differences of three would leave no digits to a needle.
+
+    Args:
+        second: S, the integral of r r^T over the mass [kg m^2].
+
+    Gradients: linear.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.mass.inertia_of_second_moment(jnp.diag(jnp.array([1.0, 2.0, 3.0])))))
+    [5. 4. 3.]
+    """
     x, y, z = jnp.diagonal(second)
     outside = jnp.where(np.eye(3, dtype=bool), 0.0, second)
     return jnp.diag(jnp.stack([y + z, x + z, x + y])) - outside
+
+
+def second_moment(inertia: Matrix) -> Matrix:
+    """Second moment of the mass of an inertia tensor, (tr(I) / 2) 1 - I.
+
+    A body is real if it is positive semi-definite, flat if it is singular.
+
+    Args:
+        inertia: Tensor [kg m^2].
+
+    Gradients: linear.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jnp.diag(jr.mass.second_moment(jnp.diag(jnp.array([5.0, 4.0, 3.0])))))
+    [1. 2. 3.]
+    """
+    return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
 
 
 def steiner(displacement: Vector) -> Matrix:
@@ -66,8 +95,8 @@ def is_physical(tensor: Matrix) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     tensor = jax.lax.stop_gradient(tensor)
     (unit,) = scaled_together(tensor)
     trace = jnp.trace(unit)
-    second = 0.5 * trace * jnp.eye(3, dtype=unit.dtype) - unit
-    return is_symmetric(tensor) & is_semidefinite(unit, trace), is_semidefinite(second, trace)
+    second = is_semidefinite(second_moment(unit), trace)
+    return is_symmetric(tensor) & is_semidefinite(unit, trace), second
 
 
 def body_arrays(
