@@ -71,6 +71,19 @@ def test_each_throw_or_group_is_left_out_once():
         identify.cross_validate(sum, [1], refit=refit)
 
 
+def test_a_throw_left_out_is_judged_by_the_fit_s_own_model(rng):
+    kicked = throws(rng, count=3)
+    spoilt = [identify.Rates(x.ts, x.values.at[40].add(1.0), x.sigma) for x in kicked]
+    robust = lambda x: identify.fit(BLIND, x, loss="robust", throw=False)  # noqa: E731
+    assert np.all(identify.cross_validate(robust, spoilt) < 1.3 * 237)
+    with pytest.raises(ValueError, match="must state the noise"):
+        identify.cross_validate(without_drag, [identify.Rates(x.ts, x.values) for x in kicked])
+    with pytest.raises(ValueError, match="`refit` must be given where there are several bodies"):
+        identify.cross_validate(
+            lambda x: identify.fit(BLIND, x, bodies=(0, 1), throw=False), kicked
+        )
+
+
 DRAGGED = jr.RigidBody(np.ones(3), jr.torques.QuadraticDrag(0.003))
 
 

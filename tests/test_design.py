@@ -102,6 +102,8 @@ def test_a_plan_that_says_too_little_is_refused():
         identify.Plan(NEARLY_SYMMETRIC, plan.state, identify.Rates(TS, None))
     with pytest.raises(ValueError, match="scale"):
         plan_of(np.ones(3), scale="known")
+    with pytest.raises(ValueError, match="nothing of `each` throw"):
+        _ = plan_of(np.ones(3), free=lambda _, gyro: identify.each(gyro.bias)).bound
 
 
 @pytest.mark.slow  # 300 fits

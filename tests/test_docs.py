@@ -1,5 +1,6 @@
 """Code in README and docs/ runs: the blocks of a page, after the usual imports."""
 
+import functools
 import json
 import re
 import sys
@@ -22,16 +23,22 @@ PAGES = [
 ]
 
 
+# What takes long in CI; recipes are all run.
 LONG = re.compile(r"jr\.identify\.(fit|optimal_throw)\(|optax.*jr\.simulate", re.DOTALL)
-LONG_PAGES = [x for x in PAGES if any(map(LONG.search, BLOCK.findall(x.read_text())))]
-# The block of this page is the example in the docstring of `fit`, but for what it seeks beside.
-LONG_PAGES.remove(ROOT / "docs" / "identify.md")
+LONG_PAGES = [
+    x
+    for x in PAGES
+    # The block of identify.md is the example in the docstring of `fit`, but for what it seeks.
+    if x.parent.name != "recipes" and x.stem != "identify"
+    if any(map(LONG.search, BLOCK.findall(x.read_text())))
+]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_code_blocks_run(page, tmp_path, monkeypatch):
+def test_code_blocks_run_and_print_what_is_written_beside(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where they write their pictures
-    run(page, lambda code: not LONG.search(code))
+    is_short = page.parent.name == "recipes"
+    assert run(page, lambda code: is_short or not LONG.search(code))
 
 
 @pytest.mark.slow
@@ -42,7 +49,10 @@ def test_code_blocks_that_take_long_run(page, tmp_path, monkeypatch):
 
 
 def run(page, wanted):
-    text, namespace = page.read_text(), {"jax": jax, "jnp": jnp, "jr": jr}
+    """How many blocks of a page were run."""
+    text, count = page.read_text(), 0
+    said = functools.partial(compare, text.splitlines())
+    namespace = {"jax": jax, "jnp": jnp, "jr": jr, "print": said}
     for block in BLOCK.finditer(text):
         if not wanted(block[1]):
             continue
@@ -50,8 +60,28 @@ def run(page, wanted):
         code = compile("\n" * above + block[1], str(page), "exec")
         with jax.numpy_dtype_promotion("standard"):  # as users have it, and as optax needs it
             exec(code, namespace)
+        count += 1
     if pyplot := sys.modules.get("matplotlib.pyplot"):
         pyplot.close("all")
+    return count
+
+
+NUMBER = re.compile(r"(?<![\w.^])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+
+
+def compare(page, *printed):
+    """`print` in a block: numbers are those of the comment beside it, or on the next line."""
+    line = sys._getframe(1).f_lineno
+    comment = "#".join(page[line - 1].split("#")[1:]) or page[line].strip().partition("# ")[2]
+    found, written = NUMBER.findall(" ".join(map(str, printed))), NUMBER.findall(comment)
+    for x in found[: len(written)]:  # a loop's comment has the numbers of all its turns
+        assert any(is_rounded(x, y) for y in written), (page[line - 1], printed)
+
+
+def is_rounded(x, y):
+    digits, _, power = y.partition("e")
+    last = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
+    return abs(float(x) - float(y)) <= last
 
 
 DRAWS = re.compile(r"\b(plt|jr\.plot|ax|axes)\.\w")

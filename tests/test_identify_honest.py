@@ -405,15 +405,16 @@ def test_a_drag_alone_does_not_tell_scale_and_itself(rng):
 
 
 @pytest.mark.slow  # a program of its own, of many stages
-def test_a_torque_that_no_model_has_is_estimated(rng):
-    """White, then smooth, then none."""
+@pytest.mark.parametrize("sigma", [0.01, None])
+def test_a_torque_that_no_model_has_is_estimated(sigma, rng):
+    """White, then smooth, then none; beside a noise that is stated or sought."""
     for kind in ("white", "smooth", "none"):
         tensor = body_of(rng)
         omega0 = spin_of(rng, tensor)
         torque = worlds.wobble_torque(rng, tensor, omega0, 0.03) if kind == "smooth" else None
         kick = 0.02 if kind == "white" else 0.0
         _, values = seen(rng, tensor, omega0=omega0, torque=torque, kick=kick)
-        found = fitted(values, unmodelled="estimate")
+        found = fitted(values, sigma, unmodelled="estimate")
         text = words(found)
         assert is_in(found, (Status.OK,)), text
         covers(found, tensor)
@@ -426,7 +427,29 @@ def test_a_torque_that_no_model_has_is_estimated(rng):
             assert level > 3 * error, text
 
 
+def test_what_no_fit_answers_is_refused(untyped):
+    rates = functools.partial(identify.Rates, TS, np.ones((200, 3)))
+    for bodies in ((-1, 0), (0, 2), (1, 1), (0, 1.5)):
+        with pytest.raises(ValueError, match=r"`bodies` must hold 0, 1, \.\.\. up to"):
+            identify.fit(BLIND, [rates(0.1)] * 2, bodies=bodies)
+    with pytest.raises(ValueError, match="`unmodelled` must be 0 or estimated"):
+        identify.fit(BLIND, rates(), unmodelled=0.1)
+    with pytest.raises(ValueError, match=r"`covariance` .* beside a sensor's `limit`"):
+        identify.Record(identify.Gyro(limit=2.0), TS, np.ones((200, 3)), covariance=np.eye(3))
+
+
 # Sensors
+
+
+def test_the_drift_of_a_gyro_begins_with_its_record():
+    state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    drifting = identify.Gyro(drift=jnp.ones(3))
+    for since, late in ((None, 2.0), (1e9 + 1.0, 1.0)):
+        sensor = identify.Gyro(drift=jnp.ones(3), since=since)
+        record = identify.Record(sensor, 1e9 + np.arange(3.0), np.zeros((3, 3)), 0.1)
+        rows = identify.residuals(BLIND, state, record, t0=1e9)
+        np.testing.assert_allclose(rows[0, -3:], late / 0.1)
+    np.testing.assert_array_equal(drifting.predict(jnp.asarray(3.0), state, BLIND), 3 * np.ones(3))
 
 
 def gyro_of(rng, moved, ts, sigma, **errors):
@@ -450,13 +473,14 @@ def test_errors_of_a_gyro_are_found(name, rng):
         picked = getattr(gyro, name)
         return identify.prior(picked, 0.05) if name == "bias" else picked
 
-    grid = grid_for(TS)
+    grid, epoch = grid_for(TS), 1.7e9 if name == "drift" else 0.0  # of a telephone's clock
     for _ in range(2):
         tensor = body_of(rng)
         moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
         errors = {"matrix": true * np.eye(3)} if name == "scale" else {name: true}
         values = gyro_of(rng, moved, TS, 0.005, **errors)
-        found = identify.fit(BLIND, identify.Record(sensor, TS, values, 0.005), free=free)
+        record = identify.Record(sensor, epoch + TS, values, 0.005)
+        found = identify.fit(BLIND, record, free=free)
         assert is_in(found, (Status.OK,)), words(found)
         covers(found, tensor)
         # The memory of the filter is a quadrature.
@@ -587,8 +611,7 @@ def test_several_bodies_share_a_scale_of_the_gyro(rng):
 @pytest.mark.parametrize("sought", [False, True])
 def test_a_wheel_as_each_throw_recorded_it(sought, rng):
     """With 1 % of scale and 5 ms of delay in the record, sought or none."""
-    spin, sigma = 5.0, 0.02
-    ts, clock = np.arange(60) * 0.02, np.arange(61) * 0.02
+    spin, sigma, ts = 5.0, 0.02, np.arange(60) * 0.02
     tensor = body_of(rng)
     scale, delay = (1.01, 0.005) if sought else (1.0, 0.0)
     systems, records = [], []
@@ -596,6 +619,7 @@ def test_a_wheel_as_each_throw_recorded_it(sought, rng):
         true, told = worlds.wheel_profile(rng.normal(size=3), 1.5, 0.1 + 0.1 * i, 0.6, scale, delay)
         moved = worlds.tumble(tensor, spin_of(rng, tensor, spin), ts, wheel=true)
         values = moved.omega + sigma * rng.normal(size=moved.omega.shape)
+        clock = np.arange(61 + i) * 0.02  # of another length in each throw
         wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
         systems.append(jr.RigidBody(np.ones(3), wheel))
         records.append(identify.Rates(ts, values, sigma))

@@ -114,6 +114,9 @@ def test_bad_arguments_are_named(scene, untyped):
     key = jax.random.key(0)
     with pytest.raises(ValueError, match="`observations` must hold two throws or more"):
         identify.train(body, scene.throws[:1], ADAM, key=key)
+    unsaid = [eqx.tree_at(lambda x: x.sigma, r, None) for r in scene.throws]
+    with pytest.raises(ValueError, match="must state the noise"):
+        identify.train(body, unsaid, ADAM, key=key)
     with pytest.raises(ValueError, match="`validation` must be indices of some of 30 throws"):
         train(validation=[30])
     with pytest.raises(ValueError, match=r"`validation` must be indices .* not all"):

@@ -13,6 +13,7 @@ from jrigid.identify._fit import fit
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import Fixed
 
+_LEAST = 1e-3  # of the largest level, where one of an axis is zero
 _TOLD = 1e-9  # of the largest singular value, as in the fit
 
 
@@ -94,10 +95,18 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
 
 
 def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
+    one, options = len(found.bodies) == 1, found.problem.options
+    demand(one, "Argument `refit` must be given where there are several bodies, but it is not.")
     system, *sensors = found.parts()
     records = [x if isinstance(x, tuple) else (x,) for x in throws]
     records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
-    return fit(system, records, shape=Fixed(), throw=False)
+    records = [tuple(x) for x in records]
+    stated = all(x.states_noise for throw in records for x in throw)
+    demand(stated, "Argument `throws` must state the noise, but one does not.")
+    level = jnp.maximum(found.level, _LEAST * jnp.max(found.level))
+    loss = "robust" if options.robust else "squares"
+    rest = {"unmodelled": level, "loss": loss, "motion": options.motion}
+    return fit(system, records, shape=Fixed(), throw=False, **rest)
 
 
 def cross_validate(
@@ -114,8 +123,9 @@ def cross_validate(
         fit_function: Fits a list of throws: `lambda throws: jr.identify.fit(body, throws, ...)`.
         throws: Of each a record or a tuple of records; a list of throws is left out as a group.
         refit: What finds the states of throws left out from the fit of the others, where the
-            default cannot: wheels that each throw has its own record of, numbers sought by `each`,
-            a motion that depends on an attitude that was not observed.
+            default cannot: several bodies, wheels that each throw has its own record of, numbers
+            sought by `each`, a motion that depends on an attitude that was not observed. The
+            default keeps the level of an unmodelled torque, the loss and the motion.
 
     Returns:
         Chi-square of each throw or group.

@@ -174,6 +174,8 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Found, Layout]:
     sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
     scaled = plan.scale != "trace" and not shape.absolute
     unknowns = unknowns_of((system,), sensors, sizes, plan.free, (shape,), scaled, rate)
+    shared = not any(x.own for x in unknowns.sought)
+    demand(shared, "Argument `free` must pick nothing of `each` throw, but it does.")
     unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
@@ -220,6 +222,9 @@ def profile(
     Returns:
         Growth of chi-square, in units of the noise; NaN where no fit was found.
 
+    Raises:
+        ValueError: A fit with an unmodelled torque.
+
     Gradients: none to be relied on.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -234,6 +239,8 @@ def profile(
     """
     values = jnp.asarray(values, result.numbers.dtype)
     check_shape("values", values, (None,))
+    text = "Argument `result` must be of a fit without an unmodelled torque, but it is not."
+    demand(not result.problem.options.dense, text)
     return _profile(result, function, values)
 
 
@@ -241,7 +248,7 @@ def profile(
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
     options = result.problem.options._replace(shooting=False, level="none", nodes=1)
     problem = dataclasses.replace(result.problem, options=options)
-    of_numbers = lambda x: function(result.unknowns.inertia(x))  # noqa: E731
+    of_numbers = lambda x: function(result.unknowns.inertia(x, result.index))  # noqa: E731
     slope, noise = jax.grad(of_numbers)(result.numbers), result.inflation
     unit = 1e-3 * jnp.sqrt(slope @ result.numbers_covariance @ slope / noise)
     layout, dtype = whole(problem.samples, 1, result.t0), result.numbers.dtype

@@ -18,6 +18,7 @@ from jrigid.identify._result import LARGEST_ERROR, FitResult, Status, derive, er
 from jrigid.identify._smoother import Blocks, Links, Rows, blocks_of, eliminated, reduced
 
 _TOLD = 1e-9  # of the largest singular value: a change of the state that the record shows
+_TRIED = 0.03  # of the level that moves a rate by its noise: where one of zero is judged
 _WHITE = 6.0  # standard deviations of the correlation of neighbouring residuals
 _COLOURED = 0.25  # ... and its size, for residuals that are no noise
 
@@ -133,16 +134,22 @@ def conclude(problem: Problem, layout: Layout, way: stages.Way, input_result: An
         white = stages.link_whitener(problem, layout, numbers, end.weight, level)
         blocks = blocks_of(found.rows, found.links, weight, white)
         told, scores = told_by_equations(blocks, own, units)
-        information = stages.evidence_of(problem, found, weight, white).information
-        level_errors = 0.5 * level / jnp.sqrt(information)
         first = stages.first_level(problem, layout, numbers)
-        level = jnp.where(stages.is_faint(level, first), 0.0, level)
+        faint = stages.is_faint(level, first)
+        tried = jnp.where(faint, _TRIED * first, level)
+        tell = stages.link_whitener(problem, layout, numbers, end.weight, tried)
+        information = stages.evidence_of(problem, found, weight, tell).information
+        # That of a level near zero is in proportion to its fourth power: the least to be seen.
+        level_errors = tried * jnp.where(faint, information**-0.25, 0.5 * information**-0.5)
+        level = jnp.where(faint, 0.0, level)
         kicks = jnp.sum(product("tsij,tsj->tsi", white, found.links.gap) ** 2)
     jacobian = jnp.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
     residuals, jacobian = (x[:, : kept.shape[1]] for x in (rows.residual, jacobian))
     judged = _judged(problem, way, told, kicks, units, residuals)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
     status, good = judged["status"], input_result == RESULTS.successful
+    if not problem.options.noise_known:  # the level was relative to the noise
+        level, level_errors = (jnp.sqrt(inflation) * x for x in (level, level_errors))
     count = len(unknowns.shapes)
     derived = tuple(derive(unknowns, i, numbers, covariance) for i in range(count))
     loose = [jnp.any(x["ratios_errors"] > LARGEST_ERROR * x["ratios"]) for x in derived]

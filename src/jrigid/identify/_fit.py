@@ -141,7 +141,8 @@ def fit(
     check_option("loss", loss, ("squares", "robust"))
     refuse(systems[0], records, scale, shape)
     tensor, state = start_of(start, throws)
-    (kind, level), stated = _level(unmodelled), all(x.states_noise for x in records)
+    stated = all(x.states_noise for x in records)
+    kind, level = _level(unmodelled, stated)
     demand(
         stated or len(records) == 1,
         "Argument `observations` must state the noise of each kind where there are several, but "
@@ -185,7 +186,7 @@ def _guarded(found: FitResult) -> FitResult:
     return findings.guard(found, True)
 
 
-def _level(unmodelled: Any) -> tuple[str, Any]:
+def _level(unmodelled: Any, stated: bool) -> tuple[str, Any]:
     """What is to be done about the unmodelled torque, and its level for each axis."""
     if isinstance(unmodelled, str):
         check_option("unmodelled", unmodelled, ("estimate", "estimate per axis"))
@@ -197,6 +198,8 @@ def _level(unmodelled: Any) -> tuple[str, Any]:
         "Argument `unmodelled` must be 0, a positive level, one for each body axis, 'estimate' or "
         f"'estimate per axis', but it is {unmodelled!r}.",
     )
+    text = "0 or estimated where the noise of the record is not stated: they cannot be weighed"
+    demand(stated or np.all(level == 0), f"Argument `unmodelled` must be {text}, but it is given.")
     return ("known" if np.any(level > 0) else "none"), np.broadcast_to(level, 3)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
@@ -15,12 +16,12 @@ from jrigid.identify._records import Record, Samples, check_records
 from jrigid.identify._sensors import AbstractSensor, MomentumSensor
 from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
-from jrigid.torques import Rotor, SpinningMass, Sum
+from jrigid.torques import Rotor, Sampled, SpinningMass, Sum
 
 GUESS = 0.02  # of the size of values, for a noise that is not known
 _COARSE = (
     "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a turn, "
-    "but the body turns more between samples: rates in degrees a second, times not in seconds?"
+    "but the body turns more between samples: are rates in degrees a second, times not in seconds"
 )
 
 
@@ -38,7 +39,20 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
         f"Argument `system` must hold one body for each of {throws} throws, but it holds "
         f"{len(systems)}.",
     )
-    return systems
+    return _padded(systems) if len(set(map(jtu.tree_structure, systems))) == 1 else systems
+
+
+def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
+    """With samples of one length where those of throws differ."""
+    is_sampled = lambda x: isinstance(x, Sampled)  # noqa: E731
+    leaves, trees = zip(*(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True)
+
+    def alike(*column: Any) -> tuple[Any, ...]:
+        sizes = [x.ts.size for x in column if is_sampled(x)]
+        return tuple(x.padded(max(sizes)) if is_sampled(x) else x for x in column)
+
+    columns = map(alike, *leaves)
+    return tuple(map(jtu.tree_unflatten, trees, zip(*columns, strict=True)))
 
 
 def bodies_of(bodies: Sequence[int] | None, throws: int) -> Array:
@@ -48,6 +62,8 @@ def bodies_of(bodies: Sequence[int] | None, throws: int) -> Array:
         len(chosen) == throws,
         f"Argument `bodies` must have one number for each of {throws} throws, but it is {bodies}.",
     )
+    text = f"Argument `bodies` must hold 0, 1, ... up to the last body, but it is {bodies}."
+    demand(set(chosen) == set(range(len(set(chosen)))), text)
     return jnp.asarray(chosen)
 
 

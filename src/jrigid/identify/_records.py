@@ -75,6 +75,9 @@ class Record(Readable):
         demand(width in (None, values.shape[-1]), f"Argument `values` {of} {text}")
         text = f"Arguments `sigma` and `covariance` {of} not both be given, but they are."
         demand(sigma is None or covariance is None, text)
+        text = "not be given beside a sensor's `limit`, but it is: give `sigma`."
+        limited = sensor.largest() is not None
+        demand(covariance is None or not limited, f"Argument `covariance` {of} {text}")
         self.sensor, self.ts, self.values = sensor, ts, values
         k, n, self.sigma, self.covariance = self.degrees, ts.shape[-1], None, None
         if sigma is not None:
@@ -254,12 +257,19 @@ def of_throws(observations: Any) -> tuple[Record, ...]:
         kinds = [[jtu.tree_structure(x.sensor) for x in throw] for throw in throws]
         text = "hold records of the same sensors for each throw, but it does not."
         demand(all(x == kinds[0] for x in kinds), f"Argument `observations` must {text}")
-        return tuple(map(_stacked, zip(*throws, strict=True)))
+        return tuple(map(_begun, map(_stacked, zip(*throws, strict=True))))
     single = _as_tuple(observations)
     shapes = {x.ts.shape[:-1] for x in single}
     text = f"Arguments `observations` must have the same throws, but they have {shapes}."
     demand(len(shapes) == 1, text)
-    return tuple(_stacked([x]) for x in single) if shapes == {()} else single
+    return tuple(_begun(_stacked([x]) if shapes == {()} else x) for x in single)
+
+
+def _begun(record: Record) -> Record:
+    """Its sensor told when the record begins."""
+    first = jnp.min(jnp.where(jnp.isfinite(record.ts), record.ts, jnp.inf))
+    sensor = record.sensor.begun(jnp.where(jnp.isfinite(first), first, 0.0))
+    return eqx.tree_at(lambda x: x.sensor, record, sensor)
 
 
 def _as_tuple(observations: Any) -> tuple[Record, ...]:

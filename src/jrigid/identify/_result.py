@@ -97,7 +97,8 @@ class FitResult(eqx.Module):
         t0: Time of each throw's state [s]: that of its first sample, in a fit.
         residuals: Whitened, records side by side; zero where nothing was seen.
         jacobian: Their derivatives in the numbers and in the state of the throw.
-        chi_square: Sum of their squares.
+        chi_square: Sum of their squares; if no noise was stated, in units of 2 % of the rms of
+            what was observed.
         degrees_of_freedom: Residuals less what was sought.
         reduced_chi_square: Chi-square for each degree of freedom.
         chi_square_by_throw: Mean square of the residuals of each throw.
@@ -345,8 +346,8 @@ class FitResult(eqx.Module):
         Raises:
             ValueError: The shape that was sought was another one.
         """
-        shape = self.unknowns.shapes[0]
-        body = shape.body(self.numbers[: len(shape.names)])
+        numbers = self.unknowns.of_shapes(self.numbers)[self.index]
+        body = self.unknowns.shapes[self.index].body(numbers)
         if body is None:
             raise ValueError(
                 "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
@@ -375,15 +376,19 @@ class FitResult(eqx.Module):
     def left(self, record: int = 0) -> Float[Array, "throws n degrees"]:
         """What is left of a record: predicted less observed, in its own units; of a single fit.
 
+        NaN where nothing was seen, and of samples that are saturated or were left out.
+
         Args:
             record: Which record.
         """
         samples = self.problem.samples
+        used = self.kept[..., None] & (samples.weight > 0) & (samples.sign == 0)
         white = samples.whitener[:, samples.parts[record]]
         eye = jnp.eye(white.shape[-1], dtype=white.dtype)
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
         rows = self.residuals[:, samples.parts[record], :, None]
-        return jnp.linalg.solve(white, rows)[..., 0]
+        left = jnp.linalg.solve(white, rows)[..., 0]
+        return jnp.where(used[:, samples.parts[record]], left, jnp.nan)
 
     @property
     def leaves(self) -> dict[str, tuple[Array, Array]]:

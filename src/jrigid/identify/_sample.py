@@ -68,7 +68,7 @@ def log_density(result: FitResult) -> LogDensity:
     Raises:
         ValueError: A fit with an unmodelled torque.
 
-    Gradients: of all modes.
+    Gradients: in every mode; in reverse mode under a torque.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()

@@ -101,7 +101,8 @@ def search(
     final = cut if options.dense or not options.free_motion else single
     steps = jnp.asarray([0.0] * count + _PROBES, dtype)
     most = count if options.dense else steps.size  # squares beside levels of their own differ
-    begin = _begun(problem, cut, point, 10 * first, coarse)
+    # Beside a noise that is not known a level far too large is nearly as likely as another.
+    begin = _begun(problem, cut, point, (10 if options.noise_known else 1) * first, coarse)
 
     def attempt(hunt: _Hunt) -> _Hunt:
         best, weakest, step = hunt.best.found, hunt.weakest, steps[hunt.tried]

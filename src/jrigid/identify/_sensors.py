@@ -69,6 +69,10 @@ class AbstractSensor(Readable):
         """Predicted less observed, one number for each degree of freedom."""
         return predicted - value
 
+    def begun(self, t: Array) -> "AbstractSensor":
+        """The sensor of a record whose first sample is at a time."""
+        return self
+
     def memory(self) -> tuple[Array, Array] | None:
         """How long before a time the motion is shown at it [s], and with what weights."""
         return None
@@ -103,18 +107,19 @@ class AbstractSensor(Readable):
 class Gyro(AbstractSensor):
     """Angular velocity in the axes of the sensor, which are the body axes unless it is turned.
 
-    The reading is matrix scale R(misalignment)^-1 omega + bias + drift t, late by `delay` and a
-    first-order filter, and ends at `limit`.
+    The reading is matrix scale R(misalignment)^-1 omega + bias + drift (t - since), late by `delay`
+    and a first-order filter, and ends at `limit`.
 
     Attributes:
         bias: [rad/s].
-        drift: Of the bias, about t = 0 of the record's clock [rad/s^2].
+        drift: Of the bias [rad/s^2].
         scale: One factor (), or one an axis (3,).
         misalignment: Rotation vector, from the body's axes to the sensor's [rad].
         matrix: Whatever else is linear (3, 3); `diag(1, 1, -1)` is a left-handed gyro.
         delay: Of its clock behind that of the record [s]; None: none.
         time_constant: Of a first-order filter [s], a small part of a turn; None: none.
         limit: Readings of this size are saturated and say "at least" [rad/s], () or (3,).
+        since: When the bias is `bias` [s]; None: at the first sample of the record.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> gyro = jr.identify.Gyro(bias=jnp.array([0.1, 0.0, 0.0]))
@@ -134,6 +139,7 @@ class Gyro(AbstractSensor):
         "time_constant", (-1, 0), None, (), positive=True
     )
     limit: Float[Array, "..."] | None = _array("limit", None, None, (), (3,))
+    since: Float[Array, ""] | None = _array("since", None, None, ())
 
     def _matrix(self, dtype: Any) -> Array:
         turn = rotation.to_matrix(rotation.exp(self.misalignment.astype(dtype)))
@@ -143,8 +149,13 @@ class Gyro(AbstractSensor):
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The reading [rad/s], without delay and limit."""
         dtype = state.omega.dtype
-        offset = self.bias.astype(dtype) + self.drift.astype(dtype) * jnp.asarray(t, dtype)
+        since = jnp.asarray(t - (0.0 if self.since is None else self.since), dtype)
+        offset = self.bias.astype(dtype) + self.drift.astype(dtype) * since
         return product("ij,j->i", self._matrix(dtype), state.omega) + offset
+
+    def begun(self, t: Array) -> "Gyro":
+        """With its bias at that time, unless another was given."""
+        return dataclasses.replace(self, since=t) if self.since is None else self
 
     def memory(self) -> tuple[Array, Array] | None:
         """Its delay, and the fading memory of its filter."""

@@ -255,7 +255,8 @@ class Evidence(NamedTuple):
 def evidence_of(problem: Problem, found: Found, weights: Array, whitener: Array) -> Evidence:
     """By the marginal likelihood of the smoother: -2 log p has log det of its normal equations.
 
-    Its derivatives in the logarithm of the kicks' precision are differences: it is smooth.
+    Its derivatives in the logarithm of the kicks' precision are differences: it is smooth. A noise
+    that is not known is at its most likely beside each level, which is then relative to it.
     """
     inner, h = found.point.own.shape[-1] + found.links.gap.shape[-1], 0.1
     gap, kinds = product("tsij,tsj->tsi", whitener, found.links.gap), whitener.shape[-1] // 3
@@ -271,7 +272,14 @@ def evidence_of(problem: Problem, found: Found, weights: Array, whitener: Array)
     slope, bend = (up - down) / (2 * h), (up - 2 * middle + down) / h**2
     links = kinds * jnp.sum(jnp.any(whitener != 0, axis=(2, 3))).astype(gap.dtype)
     squares = jnp.sum(gap * gap, axis=(0, 1)).reshape(kinds, 3).sum(axis=0)
-    seen = Evidence(squares, links - slope, 0.5 * jnp.maximum(links - slope - bend, 1e-12))
+    effective, information = links - slope, 0.5 * jnp.maximum(links - slope - bend, 1e-12)
+    if not problem.options.noise_known:
+        rows = product("tn,tnd->tnd", jnp.sqrt(weights), found.rows.residual)
+        unknown = found.point.numbers.size + inner * weights.shape[0]
+        freedom = jnp.maximum(jnp.sum(rows != 0).astype(gap.dtype) - unknown, 1.0)
+        squares = squares * freedom / (jnp.sum(rows * rows) + jnp.sum(squares))
+        information = information - effective**2 / (2 * freedom)
+    seen = Evidence(squares, effective, jnp.maximum(information, 1e-12))
     if problem.options.level == "estimate per axis":
         return seen
     return Evidence(*(jnp.broadcast_to(jnp.sum(x), (3,)) for x in seen))  # one for all axes

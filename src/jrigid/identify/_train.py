@@ -133,6 +133,8 @@ def train(
     whole_number("epochs", epochs)
     params, rest = _parameters(system, free)
     records = of_throws(observations)
+    stated = all(x.states_noise for x in records)
+    demand(stated, "Argument `observations` must state the noise, but it does not.")
     held_out = _held_out(validation, records[0].ts.shape[0])
     records, throw = _segments(records, segment)
     data, on_attitude, steps = _prepared(system, records)

@@ -1,5 +1,7 @@
 """A function of time from samples: a wheel's measured momentum, a commanded torque."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -21,7 +23,8 @@ class Sampled(Readable):
         ts: Times [s] (n,), increasing; repeated ones at the end pad.
         values: One row for each time (n, ...).
         scale: Factor of the values, positive.
-        delay: By which the samples are late [s].
+        delay: By which the function is later than the samples [s], as a torque that follows its
+            command; of samples that lag behind what they measure it is negative.
 
     Gradients: those of the cubics, in everything; the second derivative in time jumps.
 
@@ -39,6 +42,13 @@ class Sampled(Readable):
     def __check_init__(self) -> None:
         """Raise ValueError for shapes that do not belong together."""
         check_shape("values", self.values, (*self.ts.shape, *self.values.shape[1:]))
+
+    def padded(self, size: int) -> "Sampled":
+        """With so many samples, the last one repeated: the same function."""
+        more = size - self.ts.size
+        longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)])  # noqa: E731
+        both = {"ts": longer(self.ts), "values": longer(self.values)}
+        return dataclasses.replace(self, **both) if more else self
 
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
