@@ -83,6 +83,14 @@ def test_jaxlie_turns_vectors_as_attitudes_do(rng):
     assert_allclose(slope, [0, 1, 0, 0])
 
 
+@pytest.mark.parametrize("door", ["to_scipy", "to_jaxlie"])
+def test_what_is_no_attitude_is_told_so(door, untyped):
+    with pytest.raises(ValueError, match=r"`attitude` must have shape \(4,\), but .* \(3,\)"):
+        getattr(jr.io, door)(np.ones(3))
+    with pytest.raises(ValueError, match=r"`position` must have shape \(3,\), but .* \(5, 3\)"):
+        getattr(jr.io, door)(HALF, np.ones((5, 3)))
+
+
 def m2q(matrix):
     """NAIF's SPICE quaternion of a matrix: Q2M's formula of its header, solved for q0 > 0."""
     q0 = 0.5 * np.sqrt(1 + np.trace(matrix))
@@ -220,6 +228,15 @@ def test_a_part_that_is_no_body_is_named_with_what_to_do(rng):
     mesh.invert()
     with pytest.raises(ValueError, match=r"inside out.*fix_normals"):
         jr.io.from_trimesh(mesh)
+    with pytest.raises(ValueError, match=r"`density` must be positive and finite, .*: -1.0\.$"):
+        jr.io.from_trimesh(lump(rng), -1.0)
+    with pytest.raises(ValueError, match=r"`scale` must be positive, but it is -1.0"):
+        jr.io.from_trimesh(lump(rng), scale=-1.0)
+    for door in (jr.io.from_trimesh, jr.io.mesh_arrays):
+        with pytest.raises(
+            ValueError, match=r"scene of trimesh, but it is a tuple.*`jrigid.from_m"
+        ):
+            door((mesh.vertices, mesh.faces))
 
 
 # Inertials
@@ -296,10 +313,30 @@ def test_mujoco_reads_what_is_written(rng, tmp_path, suffix):
         assert_same(jr.io.read_inertials(path)[name], body, 0)
 
 
+def test_what_is_written_in_single_precision_is_read_again(tmp_path):
+    with jax.enable_x64(False):
+        for numbers in ("ixx='0.1' iyy='0.2' izz='0.3' ixy='0' ixz='0' iyz='0'",
+                        "ixx='.1' iyy='.2' izz='.7' ixy='.05' ixz='.02' iyz='-.03'"):  # fmt: skip
+            text = urdf(f"<inertial><mass value='0.1'/><inertia {numbers}/></inertial>")
+            body = jr.io.read_inertials(text, unphysical="nearest")["b"]
+            jr.io.write_inertials(tmp_path / "b.urdf", {"b": body}, template=text)
+            assert_same(jr.io.read_inertials(tmp_path / "b.urdf")["b"], body, 0)
+            assert 'mass value="0.1"' in (tmp_path / "b.urdf").read_text()
+        with pytest.raises(ValueError, match=r"0\.1, 0\.2, 0\.3001 kg m"):
+            jr.io.read_inertials(urdf(
+                "<inertial><mass value='1'/><inertia ixx='.1' iyy='.2' izz='.3001' ixy='0' ixz='0' "
+                "iyz='0'/></inertial>"
+            ))  # fmt: skip
+
+
 @pytest.mark.parametrize("pose", [
     "<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
+    "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
     "<pose degrees='true'>0.1 -0.2 0.3 10 -50 120</pose>",
+    "<pose degrees='True'>0.1 -0.2 0.3 10 -50 120</pose>",
     "<pose rotation_format='quat_xyzw'>0.1 -0.2 0.3 0.1 0.7 -0.5 0.5</pose>",
+    "<pose rotation_format='quat_xyzw'/>",
+    "<pose/>",
     "",
 ])  # fmt: skip
 def test_sdf_is_read_as_drake_does(pose):
@@ -324,21 +361,25 @@ def sdf(pose, more=""):
 
 def test_sdf_turns_by_roll_pitch_yaw_about_fixed_axes_as_urdf():
     for pose in ("<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
-                 "<pose degrees='1'>0.1 -0.2 0.3 22.918311805232932 -63.02535746439056 "
+                 "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
+                 "<pose degrees='True'>0.1 -0.2 0.3 22.918311805232932 -63.02535746439056 "
                  "114.59155902616465</pose>"):  # fmt: skip
         assert_same(jr.io.read_inertials(sdf(pose))["b"], in_mujoco(FILES["urdf"]))
     x, y, z, w = scipy_transform.Rotation.from_euler("xyz", [0.4, -1.1, 2]).as_quat()
     pose = f"<pose rotation_format='quat_xyzw'>0.1 -0.2 0.3 {x} {y} {z} {w}</pose>"
     assert_same(jr.io.read_inertials(sdf(pose))["b"], in_mujoco(FILES["urdf"]))
-    nothing = "<sdf><model name='m'><link name='b'><inertial/></link><link name='c'/></model></sdf>"
-    read = jr.io.read_inertials(nothing)  # SDF's defaults
-    assert list(read) == ["b"]
-    assert_same(read["b"], jr.MassProperties(1.0, np.zeros(3), np.ones(3)))
+    for empty in ("", "<pose/><mass/><inertia/>", "<pose rotation_format='quat_xyzw'/>"):
+        link = f"<link name='b'><inertial>{empty}</inertial></link><link name='c'/>"
+        read = jr.io.read_inertials(f"<sdf><model name='m'>{link}</model></sdf>")  # SDF's defaults
+        assert list(read) == ["b"]
+        assert_same(read["b"], jr.MassProperties(1.0, np.zeros(3), np.ones(3)))
 
 
-def test_links_of_several_models_have_their_model_in_the_name():
-    more = "<model name='n'><link name='b'/></model>"
-    assert list(jr.io.read_inertials(sdf("", more))) == ["m::b"]
+def test_links_of_several_models_have_their_models_in_the_name():
+    """As in Drake."""
+    inner = "<model name='x'><link name='b'><inertial/></link></model>"
+    more = f"<world name='w'><model name='n'>{inner}</model><model name='k'>{inner}</model></world>"
+    assert set(jr.io.read_inertials(sdf("", more))) == {"m::b", "n::x::b", "k::x::b"}
 
 
 @pytest.mark.parametrize("text", [FILES["urdf"], FILES["euler"], sdf("<pose>1 2 3 1 2 3</pose>")])
@@ -356,6 +397,20 @@ def test_a_template_keeps_all_but_its_inertials(rng, tmp_path, text):
     assert_same(jr.io.read_inertials(path)["b"], body.translated(np.ones(3)), 0)
     with pytest.raises(ValueError, match=r"`bodies` must name links of the template, but \['c'\]"):
         jr.io.write_inertials(path, {"c": body}, template=path)
+
+
+@pytest.mark.parametrize("space", ["xmlns:drake='drake.mit.edu'", "xmlns:ns0='other'"])
+def test_a_template_keeps_what_is_around_its_root_and_its_prefixes(rng, tmp_path, space):
+    prefix = space[6:].partition("=")[0]
+    before, after = "<!-- Licence: yes --><?note by hand?>", "<!-- old: <robot/></robot> -->"
+    text = f"{before}<robot {space}><?keep me?><{prefix}:plate/><link name='b'/></robot>{after}"
+    jr.io.write_inertials(tmp_path / "b.urdf", {"b": bodies(rng)["a"]}, template=f"\n {text}\n")
+    lines = (tmp_path / "b.urdf").read_text().splitlines()
+    assert lines[1:3] == ["<!-- Licence: yes -->", "<?note by hand?>"]
+    assert lines[3].startswith(f"<robot xmlns:{prefix}=")
+    assert lines[4].strip() == "<?keep me?>"
+    assert lines[5].strip() == f"<{prefix}:plate />"
+    assert lines[-1] == after
 
 
 def test_sdf_written_is_read(rng, tmp_path):
@@ -387,11 +442,64 @@ def test_mjcf_in_several_files(tmp_path):
     assert_same(read["b"], in_mujoco((tmp_path / "whole.xml").read_text()), 1e-5)
 
 
+@pytest.mark.parametrize(("name", "mass"), [("sub/b.xml", 3.0), ("b.xml", 3.0), ("c.xml", 2.0)])
+def test_included_files_are_looked_for_where_mujoco_does(tmp_path, name, mass):
+    def include(file):
+        return f"<mujocoinclude><include file='{file}'/></mujocoinclude>"
+
+    def body(mass):
+        return mjcf(f"<inertial pos='0 0 0' mass='{mass}' diaginertia='1 1 1'/>")
+
+    path, inner = tmp_path / "main.xml", tmp_path / "sub"
+    inner.mkdir()
+    path.write_text("<mujoco><include file='sub/a.xml'/></mujoco>")
+    (inner / "a.xml").write_text(include(name))
+    (inner / "b.xml").write_text(body(3.0).replace("mujoco>", "mujocoinclude>"))
+    (inner / "c.xml").write_text(body(3.0).replace("mujoco>", "mujocoinclude>"))
+    (tmp_path / "c.xml").write_text(body(2.0).replace("mujoco>", "mujocoinclude>"))
+    assert mujoco.MjModel.from_xml_path(str(path)).body("b").mass == mass
+    assert jr.io.read_inertials(path)["b"].mass == mass
+
+
+DIAGONAL = "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1' {}/>"
+FULL = "<inertial mass='1' pos='0 0 0' fullinertia='1 1 1 0 0 0' {}/>"
+
+
+@pytest.mark.parametrize(("text", "match"), [
+    (mjcf(DIAGONAL.format("quat='1 0 0 0' euler='1 2 3'")), "takes only one of quat, euler"),
+    (mjcf(FULL.format("zaxis='0 0 1'")), "takes only one of zaxis, fullinertia"),
+    (mjcf(FULL.format("diaginertia='1 1 1'")), "takes only one of fullinertia, diaginertia"),
+    (mjcf("<inertial pos='0 0 0' diaginertia='1 1 1'/>"), "'b' cannot be read: it has no mass"),
+    (mjcf("<inertial mass='1' diaginertia='1 1 1'/>"), "it has no pos"),
+    (mjcf("<inertial mass='1' pos='0 0 0'/>"), "it has no diaginertia"),
+])  # fmt: skip
+def test_what_mujoco_refuses_is_refused(text, match):
+    with pytest.raises(ValueError):
+        mujoco.MjModel.from_xml_string(text.replace("<inertial", "<freejoint/><inertial"))
+    with pytest.raises(ValueError, match=match):
+        jr.io.read_inertials(text)
+
+
 @pytest.mark.parametrize(("text", "match"), [
     (urdf(f"<inertial><mass value='${{m}}'/><inertia {SIX}/></inertial>"),
      r"of 'b' cannot be read: '\$\{m\}' is a formula"),
-    (urdf("<inertial><mass value='1'/></inertial>"), "'     ' must be 6 numbers"),
-    (urdf(f"<inertial><inertia {SIX}/></inertial>"), "None must be 1 numbers"),
+    (urdf("<inertial><mass value='1'/><inertia ixx='1' ixz='0' iyy='1' izz='1' iyz='0'/>"
+          "</inertial>"), r"of 'b' cannot be read: it has no inertia ixy\.$"),
+    (urdf("<inertial/>"), r"it has no mass value, no inertia ixx, no inertia iyy"),
+    *((f"<robot xmlns:xacro='{uri}'><link name='a'><xacro:box_inertia m='1'/></link></robot>",
+       "it has macros: `xacro a.xacro > a.urdf` first")
+      for uri in ("http://www.ros.org/wiki/xacro", "http://wiki.ros.org/xacro")),
+    ("<mujoco><include file='a.xml'/></mujoco>", "must be a path, but it is the text of a file"),
+    (sdf("", "<world name='w'><include><uri>model://x</uri></include></world>"), "gz sdf -p"),
+    ("<mujoco><worldbody><replicate count='2'><frame><body name='b'/></frame></replicate>"
+     "</worldbody></mujoco>", "`<replicate>` makes bodies: save the compiled model"),
+    ("<mujoco><worldbody><attach model='b'/></worldbody></mujoco>", "`<attach>` adds bodies"),
+    *((mjcf("<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>", f"{option}='3'"),
+       f"`{option}` makes MuJoCo change it: save .*, delete `{option}` there and read that")
+      for option in ("settotalmass", "boundmass", "boundinertia")),
+    (sdf("<pose degrees='yes'>0 0 0 0 0 0</pose>"), "`degrees` must be one of 'true', '1'"),
+    (sdf("<pose rotation_format='rpy'>0 0 0 0 0 0</pose>"), "one of 'euler_rpy', 'quat_xyzw'"),
+    (sdf("<pose>1 2 3</pose>"), "'1 2 3' must be 6 numbers"),
     (mjcf("<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>", "inertiafromgeom='true'"),
      "overlook"),
     (sdf("<pose relative_to='m'>0 0 0 0 0 0</pose>"), "relative to the link"),
@@ -579,8 +687,9 @@ def test_a_trajectory_as_tables():
     assert list(lanes.result.values) == ["All went well."] * 2
     own = jr.Trajectory(many.ts + jnp.array([[0.0], [1.0]]), *list(vars(many).values())[1:])
     assert jr.io.to_xarray(own).time.dims == ("lane", "sample")
-    with pytest.raises(ValueError, match="of one lane, but it has more: use `to_xarray`"):
-        jr.io.to_pandas(many)
+    for several in (many, jax.tree.map(lambda x: x[0, 0] if x.ndim > 1 else x[0], many)):
+        with pytest.raises(ValueError, match=r"shape \(n,\), but they have .*: use `to_xarray`"):
+            jr.io.to_pandas(several)
 
 
 def test_a_flight_with_a_wheel_as_tables():

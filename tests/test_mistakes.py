@@ -231,6 +231,14 @@ MISTAKES = {
         lambda: jr.records.read(io.StringIO("a,b,c,d\n0,1,2,3\n1,1,2,3\n")),
         "`path` must hold three columns of a sensor, .*: name them by `columns`. There are a, b",
     ),
+    "a system for its mass properties": (
+        lambda: jr.io.write_inertials("none.urdf", {"a": BODY}),
+        r"`bodies\['a'\]` must be a MassProperties, but it is a RigidBody",
+    ),
+    "mass properties without a name": (
+        lambda: jr.io.write_inertials("none.urdf", jr.solids.sphere(1.0, 0.1)),
+        "`bodies` must be a Mapping, but it is a MassProperties",
+    ),
     "no matplotlib": (
         lambda: without("matplotlib", lambda: jr.plot.fit(None)),
         r'pip install "jrigid\[plot\]"',

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._checks import array_of_shape, demand, float_arrays
+from jrigid._checks import array_of_shape, check_shape, demand, float_arrays
 from jrigid._extra import extra
 from jrigid._types import Quaternion, QuaternionLike, Real, Vector, VectorLike
 from jrigid.rotation import conjugate
@@ -21,6 +21,14 @@ def _one_of(kinds: str, rotation: Any, method: str) -> None:
     demand(hasattr(rotation, method), f"Argument `rotation` must be {kinds}, but it is a {kind}.")
 
 
+def _arrays(attitude: Attitudes, position: Positions | None) -> tuple[Array, ...]:
+    """Attitudes, and as many positions where there are any."""
+    arrays = float_arrays(*(x for x in (attitude, position) if x is not None))
+    for name, length, x in zip(("attitude", "position"), (4, 3), arrays, strict=False):
+        check_shape(name, x, (*arrays[0].shape[:-1], length))
+    return arrays
+
+
 def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     """One of scipy's rotations, body to space, or rigid transforms where positions are given.
 
@@ -33,13 +41,17 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     Returns:
         A `scipy.spatial.transform.Rotation`, or a `RigidTransform` (scipy 1.16), of as many.
 
+    Raises:
+        ValueError: Other than four numbers in each attitude, or not three of a position for each.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> turn = jr.io.to_scipy(jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2])))
     >>> print(turn.as_rotvec(degrees=True).round(6))
     [ 0.  0. 90.]
     """
     transform = extra("io", "scipy.spatial.transform")
-    turn = transform.Rotation.from_quat(np.roll(np.asarray(float_arrays(attitude)[0]), -1, -1))
+    quaternions = np.asarray(_arrays(attitude, position)[0])
+    turn = transform.Rotation.from_quat(np.roll(quaternions, -1, -1))
     if position is None:
         return turn
     return transform.RigidTransform.from_components(np.asarray(position), turn)
@@ -80,6 +92,9 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
     Returns:
         A `jaxlie.SO3` or `jaxlie.SE3`; `apply` takes body components to space components.
 
+    Raises:
+        ValueError: Other than four numbers in each attitude, or not three of a position for each.
+
     Gradients: the identity.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -88,9 +103,10 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
     [-1. -2.  3.]
     """
     jaxlie = extra("io", "jaxlie")
+    arrays = _arrays(attitude, position)
     if position is None:
-        return jaxlie.SO3(wxyz=float_arrays(attitude)[0])
-    return jaxlie.SE3(wxyz_xyz=jnp.concatenate(float_arrays(attitude, position), axis=-1))
+        return jaxlie.SO3(wxyz=arrays[0])
+    return jaxlie.SE3(wxyz_xyz=jnp.concatenate(arrays, axis=-1))
 
 
 def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jrigid._checks import check_type, demand
+from jrigid._checks import check_type, demand, kind_of
 from jrigid._extra import extra
 from jrigid._types import ScalarLike
 from jrigid.mass import MassProperties, from_mesh
@@ -36,6 +36,8 @@ def mesh_arrays(mesh: Any) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndar
     >>> print(vertices.shape, faces.shape, jr.from_mesh(vertices, faces).mass)
     (8, 3) (12, 3) 6.0
     """
+    message = f"Argument `mesh` must be a mesh or scene of trimesh, but it is {kind_of(mesh)}."
+    demand(hasattr(mesh, "merge_vertices"), f"{message} (`jrigid.from_mesh` takes arrays.)")
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = np.asarray(merged.faces, np.int64)
@@ -46,7 +48,7 @@ def mesh_arrays(mesh: Any) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndar
 def _parts(shape: Any) -> list[tuple[tuple[str, ...], Any]]:
     """Meshes in the coordinates of the whole, each with the names it goes by."""
     if not hasattr(shape, "graph"):
-        return [((str(shape.metadata.get("name", "mesh")),), shape)]
+        return [((str(getattr(shape, "metadata", {}).get("name", "mesh")),), shape)]
     parts = []
     for node in shape.graph.nodes_geometry:
         transform, geometry = shape.graph[node]
@@ -72,8 +74,8 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
         The body, in the coordinates of the mesh or scene, in metres.
 
     Raises:
-        ValueError: A part has no density or a name none of the parts, or a part is no closed
-            surface; the text says which part and what to do.
+        ValueError: A part has no density or a name none of the parts, a part is no closed
+            surface, or a value is wrong; the text says which part and what to do.
 
     >>> import jrigid as jr, trimesh
     >>> scene = trimesh.Scene({"hull": trimesh.creation.box((1, 1, 1))})
@@ -84,6 +86,7 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
     >>> print(body.mass, body.center_of_mass)
     4.0 [1.5 0.  0. ]
     """
+    demand(scale > 0, f"Argument `scale` must be positive, but it is {scale}.")
     parts, bodies = _parts(mesh), []
     known: dict[str, Any] = {name: density for names, _ in parts for name in names}
     densities = density if isinstance(density, Mapping) else known
@@ -96,7 +99,8 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
         try:
             bodies.append(from_mesh(scale * vertices, faces, own[0]))
         except (RuntimeError, ValueError) as error:
-            raise ValueError(f"Part {names[0]!r} of the mesh: {error} {_ADVICE}") from error
+            advice = f" {_ADVICE}" if "`faces`" in str(error) else ""
+            raise ValueError(f"Part {names[0]!r} of the mesh: {error}{advice}") from error
     return sum(bodies[1:], bodies[0])
 
 

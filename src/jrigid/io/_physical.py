@@ -98,6 +98,11 @@ def doubts(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
     return tuple(text for text, odd in words.items() if odd)
 
 
+def values_of(body: MassProperties) -> tuple[float, np.ndarray, np.ndarray]:
+    """What `faults` and `doubts` judge, in the precision of the body."""
+    return float(body.mass), np.asarray(body.center_of_mass), np.asarray(body.inertia)
+
+
 def diagnose(body: MassProperties | InertiaLike) -> tuple[str, ...]:
     """What is wrong, or looks wrong, with a body's mass properties, in words that say what to do.
 
@@ -124,7 +129,7 @@ def diagnose(body: MassProperties | InertiaLike) -> tuple[str, ...]:
         (inertia,) = shaped(inertia=(body, *INERTIA))
         tensor = np.asarray(jnp.diag(inertia) if inertia.ndim == 1 else inertia)
         return faults(1.0, np.zeros(3), tensor)
-    known = float(body.mass), np.asarray(body.center_of_mass), np.asarray(body.inertia)
+    known = values_of(body)
     return faults(*known) or doubts(*known)
 
 

@@ -115,7 +115,7 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
 
     Raises:
         ImportError: Without the extra `jrigid[io]`.
-        ValueError: Of many fits or lanes.
+        ValueError: Of many fits or lanes, of a single state.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -131,8 +131,8 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
         names = [k for k in dataset if f"{k}_error" in dataset]
         pair = [{k: v for n in names for k, v in _flat(dataset[n + x], n)} for x in ("", "_error")]
         return pandas.DataFrame(dict(zip(("value", "error"), pair, strict=True)))
-    message = "Argument `x` must be a trajectory of one lane, but it has more: use `to_xarray`."
-    demand(x.ts.ndim == 1, message)
+    message = "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), but they have"
+    demand(x.ts.ndim == 1, f"{message} shape {x.ts.shape}: use `to_xarray`.")
     columns = [(n, *pair) for n in dataset for pair in _flat(dataset[n], n, keep=1)]
     table = pandas.DataFrame({k: v for _, k, v in columns}, dataset.indexes["time"])
     table.attrs["units"] = {k: dataset[n].attrs.get("units", "") for n, k, _ in columns}
