@@ -32,7 +32,8 @@ def test_any_six_numbers_are_a_real_body_s(rng):
                 [1, 0, 0],
                 [numbers[3], np.exp(numbers[1]), 0],
                 [numbers[4], numbers[5], np.exp(numbers[2])],
-            ]
+            ],
+            np.longdouble,  # a needle's moment is a small difference
         )
         sigma = lower @ lower.T
         np.testing.assert_allclose(tensor, np.trace(sigma) * np.eye(3) - sigma, rtol=1e-13)
