@@ -142,7 +142,7 @@ def fit(
     refuse(systems[0], records, scale, shape)
     tensor, state = start_of(start, throws)
     stated = all(x.states_noise for x in records)
-    kind, level = _level(unmodelled, stated)
+    kind, level = _level(unmodelled, absolute_sigma and stated)
     demand(
         stated or len(records) == 1,
         "Argument `observations` must state the noise of each kind where there are several, but "
@@ -198,9 +198,10 @@ def _level(unmodelled: Any, stated: bool) -> tuple[str, Any]:
         "Argument `unmodelled` must be 0, a positive level, one for each body axis, 'estimate' or "
         f"'estimate per axis', but it is {unmodelled!r}.",
     )
-    text = "0 or estimated where the noise of the record is not stated: they cannot be weighed"
-    demand(stated or np.all(level == 0), f"Argument `unmodelled` must be {text}, but it is given.")
-    return ("known" if np.any(level > 0) else "none"), np.broadcast_to(level, 3)
+    kind, text = "known" if np.any(level > 0) else "none", "where the noise is not known"
+    text = f"Argument `unmodelled` must be 0 or estimated {text}, but it is given."
+    demand(stated or kind == "none", text)
+    return kind, np.broadcast_to(level, 3)
 
 
 def _shoots(
