@@ -47,7 +47,7 @@ def chart(
     >>> ratios = jnp.linspace(0.02, 1.2, 60)
     >>> ax = jr.plot.chart(jr.stability.stability_map(kind, {"yaw": ratios, "roll": ratios}))
     >>> print([text.get_text() for text in ax.texts])
-    ['Lagrange', 'undefined', 'unstable']
+    ['unstable', 'Lagrange', 'undefined']
     """
     from matplotlib import colors, patches
     from scipy import ndimage

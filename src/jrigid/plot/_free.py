@@ -39,6 +39,7 @@ def _momentum(body: Any, motion: Any) -> tuple[np.ndarray, bool]:
     states = None if np.ndim(motion) else states_of(motion)
     omega = np.asarray(motion if states is None else states.omega, float)
     check_shape("motions", omega, (3,), (None, 3))
+    demand(bool(np.any(omega)), "Arguments `motions` must turn, but one is at rest.")
     system, own = getattr(motion, "system", body), omega @ common.tensor_of(body)
     if states is None or not hasattr(system, "torque"):
         return own, False
@@ -80,8 +81,6 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
     """
     check_option("surface", surface, ("sphere", "ellipsoid"))
     (moments, axes), momenta = common.principal(body), [_momentum(body, x) for x in motions]
-    turning = all(bool(np.any(x)) for x, _ in momenta)
-    demand(turning, "Arguments `motions` must turn, but one is at rest.")
     inner = any(x for _, x in momenta)
     surface = "sphere" if inner else surface
     semi_axes = np.ones(3) if surface == "sphere" else np.sqrt(moments / moments[2])
@@ -119,9 +118,8 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
                 ax.text(*(1.22 * end), name, ha="center", va="center", zorder=common.FRONT)
     scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
     ax.set_title(f"Angular momentum in the body, L/{scale}")
-    title = "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
-    handles = ax.get_legend_handles_labels()[0]
-    ax.legend(handles=handles, loc="lower center", ncols=4, frameon=False, title=title)
+    style = {"title": "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments), "ncols": 4}
+    ax.legend(*ax.get_legend_handles_labels(), loc="lower center", frameon=False, **style)
     return ax
 
 
