@@ -196,8 +196,8 @@ def test_what_is_not_finite_at_first_is_passed_over():
 
 def test_of_several_tops_each_path_is_named_by_its_tilts():
     other = jr.top_motion(TOP, jr.top.initial_state(TOP, 0.9, omega3=6.0), TIMES)
-    ax = jr.plot.tip(TOP, SPUN, other)
-    assert len(ax.get_legend().get_texts()) == 2
+    ax = jr.plot.tip(TOP, SPUN, other, SPUN)
+    assert len(ax.get_legend().get_texts()) == 3
     (low, high), path = jr.top.nutation_bounds(TOP, TILTED), curves(ax)[3]
     np.testing.assert_array_equal(
         path, named(ax, f"{np.degrees(low):.1f}° to {np.degrees(high):.1f}°")

@@ -61,11 +61,12 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
         ax.plot_surface(x, y, z, color=colour, alpha=0.15, lw=0, rasterized=True)
         attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
         path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
-        common.on_surface(ax, path, path, color=colour, lw=1.5, label=_words(band))
+        common.on_surface(ax, path, path, color=colour, lw=1.5)
+        ax.lines[-2].set_label(_words(band))  # the part in front, also of tilts that are there
         start = path[np.isfinite(path[:, 0])][:1]
         common.on_surface(ax, start, start, color=colour, marker=marker, ls="none")
     if more:
-        ax.legend(loc="lower center", ncols=4, frameon=False, title="tilts")
+        ax.legend(loc="lower center", ncols=4, frameon=False, handlelength=1.0, columnspacing=1.0)
     ax.set_title("Tip of the top" if more else f"Tip of the top, tilts {_words(bounds[0])}")
     return ax
 
