@@ -120,6 +120,7 @@ def test_bodies_of_revolution_and_spheres_have_polhodes(moments):
     for curve in drawn[:4] if alone is not None else ():
         assert np.ptp(curve[:, alone]) < 1e-12
     assert "separatrix" not in [line.get_label() for line in ax.lines]
+    jr.plot.polhode(jnp.array(moments))  # a sphere has nothing to name
     ax.figure.canvas.draw()
 
 
