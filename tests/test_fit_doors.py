@@ -294,6 +294,23 @@ def test_what_a_record_does_not_tell_is_written(found, pictures):
     assert ax.texts[0].get_text() == "not told: overall scale"
 
 
+def test_ratios_that_are_not_told_have_no_ellipse(found, pictures):
+    spun = dataclasses.replace(found, pure_spin=jnp.array(True))
+    ax = jr.plot.fit(spun, {"ratios": pictures.figure().add_subplot()})["ratios"]
+    assert ax.get_title("left") == "Ratios: not determined"
+    assert len(ax.lines) == 4  # a point, and the bounds of real bodies
+    assert ax.get_legend() is None
+    assert min(ax.axis()) > 0.5
+    assert "spin is pure" in ax.texts[0].get_text()
+
+
+@pytest.mark.parametrize("wrong", [{"record": 1}, {"throw": -1}, {"axes": {"wrong": None}}])
+def test_what_is_not_in_a_fit_is_not_drawn(found, pictures, wrong):
+    with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must be one of"):
+        jr.plot.fit(found, **({"axes": {}} | wrong))
+    assert not pictures.get_fignums()
+
+
 def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
     options = found.problem.options._replace(level="known")
     problem = dataclasses.replace(found.problem, options=options)

@@ -240,8 +240,20 @@ MISTAKES = {
         "`bodies` must be a Mapping, but it is a MassProperties",
     ),
     "no matplotlib": (
-        lambda: without("matplotlib", lambda: jr.plot.fit(None)),
+        lambda: without("matplotlib", lambda: jr.plot.polhode(MOMENTS)),
         r'pip install "jrigid\[plot\]"',
+    ),
+    "a record for its fit": (
+        lambda: jr.plot.fit(RECORD),
+        "`result` must be a FitResult, but it is a GyroRecord",
+    ),
+    "many motions in one picture": (
+        lambda: jr.plot.polhode(MOMENTS, jr.State(np.ones((2, 9, 4)), np.ones((2, 9, 3)))),
+        r"one motion, but it is several: take one by `jax.tree.map\(lambda x: x\[i\], motion\)`",
+    ),
+    "a motion before the body": (
+        lambda: jr.plot.polhode(STATE, MOMENTS),
+        "`body` must have or be an inertia, but it is a State",
     ),
     "no zarr": (
         lambda: without("zarr", lambda: jr.sweep(lambda a: a, {"a": TS}, store="none.zarr")),

@@ -3,6 +3,8 @@
 import json
 import sys
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -14,6 +16,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backend_bases import MouseEvent
+from matplotlib.colors import to_hex
 
 MOMENTS = jnp.array([1.0, 2.0, 3.0])
 OMEGA = jnp.array([0.3, 1.0, 0.2])
@@ -113,9 +116,11 @@ def test_bodies_of_revolution_and_spheres_have_polhodes(moments):
     np.testing.assert_allclose(named(ax, "motion 1")[0], momentum / np.linalg.norm(momentum))
     drawn = [x for x in curves(ax) if len(x) > 2]
     alone = {1.0: 2, 0.2: 0}.get(moments[0])  # the axis of revolution
-    assert len(drawn) == (0 if alone is None else 11)
+    assert len(drawn) == (0 if alone is None else 9)
     for curve in drawn[:4] if alone is not None else ():
         assert np.ptp(curve[:, alone]) < 1e-12
+    assert "separatrix" not in [line.get_label() for line in ax.lines]
+    jr.plot.polhode(jnp.array(moments))  # a sphere has nothing to name
     ax.figure.canvas.draw()
 
 
@@ -160,7 +165,45 @@ def test_a_pure_spin_and_a_separatrix_have_herpolhodes():
     assert np.hypot(*ax.lines[0].get_data())[0] == 0
 
 
+ROTOR = jr.RigidBody(MOMENTS, jr.torques.Rotor(jnp.array([0.0, 0.0, 3.0])))
+
+
+def test_of_a_rotor_the_whole_momentum_is_drawn_alone():
+    motion = jr.simulate(ROTOR, START, TIMES[:200])
+    ax = jr.plot.polhode(ROTOR, motion, surface="ellipsoid")
+    whole = np.asarray(motion.states.omega) * [1, 2, 3] + [0, 0, 3]
+    path = whole / np.linalg.norm(whole, axis=1, keepdims=True)
+    (drawn,) = [x for x in curves(ax) if len(x) > 2]
+    np.testing.assert_allclose(drawn, path, atol=1e-12)
+    assert "|L|" in ax.get_title()
+    ax = jr.plot.polhode(ROTOR, START)  # which way it goes is not known
+    assert [len(x) for x in curves(ax)[:2]] == [1, 1]
+
+
+def test_what_is_not_finite_at_first_is_passed_over():
+    motion = jr.simulate(jr.RigidBody(MOMENTS), START, TIMES[:50])
+    late = jax.tree.map(lambda x: x.at[:2].set(jnp.nan), motion.states)
+    late = eqx.tree_at(lambda x: x.states, motion, late)
+    drift = jr.plot.motion(late)["drift"].lines[0].get_ydata()
+    assert np.any(np.isfinite(drift))
+    assert np.isfinite(jr.plot.herpolhode(MOMENTS, late).get_xlim()[1])
+    first = np.asarray(motion.states.omega)[2] * [1, 2, 3]
+    start = named(jr.plot.polhode(MOMENTS, late), "motion 1")
+    np.testing.assert_allclose(start[0], first / np.linalg.norm(first))
+
+
 # Tops
+
+
+def test_of_several_tops_each_path_is_named_by_its_tilts():
+    other = jr.top_motion(TOP, jr.top.initial_state(TOP, 0.9, omega3=6.0), TIMES)
+    ax = jr.plot.tip(TOP, SPUN, other, SPUN)
+    assert len(ax.get_legend().get_texts()) == 3
+    (low, high), path = jr.top.nutation_bounds(TOP, TILTED), curves(ax)[3]
+    np.testing.assert_array_equal(
+        path, named(ax, f"{np.degrees(low):.1f}° to {np.degrees(high):.1f}°")
+    )
+    assert "tilts" not in ax.get_title()
 
 
 def test_the_tip_stays_between_its_turning_points_and_touches_them():
@@ -230,8 +273,7 @@ def test_a_sweep_an_xarray_and_an_array_of_regions_give_one_map():
     names = [[text.get_text() for text in ax.texts] for ax in drawn]
     assert {x.replace("_", "-") for x in names[1]} == set(names[0]) == set(names[2])
     codes = drawn[0].collections[0].get_array().reshape(30, 41)
-    kinds = np.unique(texts)
-    np.testing.assert_array_equal(kinds[codes], texts.T)
+    np.testing.assert_array_equal(np.array(jr.stability.REGIONS.texts)[codes], texts.T)
     assert [ax.get_xlabel() for ax in drawn] == ["a [kg m^2]", "a [kg m^2]", "first"]
 
 
@@ -242,13 +284,40 @@ def test_narrow_regions_are_named_beside_the_map():
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["between"]
 
 
-def test_what_is_no_map_is_refused():
-    with pytest.raises(ValueError, match="`values` must be over two axes"):
-        jr.plot.chart(MAP[0], {"a": AREA["b"]})
-    with pytest.raises(ValueError, match="`values` must be over two axes"):
-        jr.plot.chart(MAP)
-    with pytest.raises(ValueError, match="of few regions"):
-        jr.plot.chart(np.arange(41 * 31).reshape(41, 31), AREA)
+HALVES = np.where(MAP > 0, 2, 0)
+TINTS = "#f6cda8", "#a6cee8", "#e4f0c8", "#ebc8dc"
+MARGINAL = jax.tree.map(lambda x: np.full(MAP.shape, x), jr.stability.REGIONS.marginal)
+
+
+def colour_at(ax, x, y):
+    """Of a pixel of the picture."""
+    ax.figure.canvas.draw()
+    column, row = np.round(ax.transData.transform((x, y))).astype(int)
+    return to_hex(np.asarray(ax.figure.canvas.buffer_rgba())[-1 - row, column] / 255)
+
+
+@pytest.mark.parametrize(
+    ("values", "regions", "expected"),
+    [
+        (HALVES, ("sleeps", "nods", "falls"), {"sleeps": 0, "falls": 2}),
+        (HALVES > -1, ("stable", "unstable"), {"unstable": 1}),
+        (HALVES > 0, (), {"False": 0, "True": 1}),
+        (MARGINAL, (), {"marginal": 3}),
+        (MARGINAL, "abcde", {"d": 3}),
+        (HALVES + 7, (), {"7": 0, "9": 1}),  # more than there are tints
+        (np.where(HALVES, "up", "down"), (), {"down": 0, "up": 1}),
+    ],
+)
+def test_a_code_has_its_own_name_and_its_own_tint(values, regions, expected):
+    ax = jr.plot.chart(values, AREA, regions=regions)
+    assert [text.get_text() for text in ax.texts] == list(expected)
+    tints = [TINTS[code] for code in expected.values()]
+    assert [colour_at(ax, x, 0.1) for x in (-0.9, 0.9)] == [tints[0], tints[-1]]
+
+
+def test_what_is_not_known_is_white():
+    ax = jr.plot.chart(np.where(MAP > 0, np.nan, MAP), AREA, level=-0.5, regions=("low", "high"))
+    assert colour_at(ax, 0.9, 0.1) == "#ffffff" != colour_at(ax, -0.9, 0.1)
 
 
 # Motions and bodies
@@ -308,13 +377,109 @@ def test_a_body_is_drawn_as_it_is_turned():
     np.testing.assert_allclose(
         faces_of(turned), faces_of(ax)[:, [1, 0, 2]] * [-1, 1, 1], atol=1e-15
     )
-    for body, title in ((TOP, "Top"), (jr.solids.rod(1.0, 2.0), "Box of the same inertia")):
+    for body, title in (
+        (TOP, "Top"),
+        ((1.0, 2.0, 3.0), "Box of the same inertia"),
+        (jr.solids.rod(1.0, 2.0), "Box of the same inertia"),
+    ):
         ax = jr.plot.body(body)
         assert ax.get_title().startswith(title + "\nI = ")
         assert ax.get_title().endswith("kg m$^2$")
     assert jr.plot.body(TOP, TILTED, kind="ellipsoid").get_title().startswith("Top")
     with pytest.raises(ValueError, match="`kind` must be one of 'box', 'ellipsoid'"):
         jr.plot.body(TOP, kind="cone")
+
+
+ALL = jax.tree.map(lambda x: jnp.stack([x, x, x]), SPUN)
+DRAGGED = jr.simulate(jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1)), START, TIMES[::40])
+REST = jr.State(START.attitude, jnp.zeros(3))
+PLOT = jr.plot
+ONE = "must be one motion, but it is several: take one"
+WRONG = {
+    "batch: animate": (lambda: PLOT.animate(TOP, ALL, ts=TIMES), ONE),
+    "batch: tip": (lambda: PLOT.tip(TOP, ALL), ONE),
+    "batch: potential": (lambda: PLOT.effective_potential(TOP, ALL), ONE),
+    "batch: polhode": (lambda: PLOT.polhode(MOMENTS, ALL), ONE),
+    "batch: herpolhode": (lambda: PLOT.herpolhode(MOMENTS, ALL), ONE),
+    "batch: motion": (lambda: PLOT.motion(ALL, system=TOP, ts=TIMES), ONE),
+    "batch of rates": (
+        lambda: PLOT.polhode(MOMENTS, np.ones((2, 5, 3))),
+        r"`motions` must have shape \(3,\) or \(n, 3\)",
+    ),
+    "times": (
+        lambda: PLOT.animate(TOP, SPUN, ts=TIMES[:7]),
+        r"`ts` must be a time for each of 801 states, but it has shape \(7,\)",
+    ),
+    "times back": (
+        lambda: PLOT.animate(TOP, SPUN, ts=TIMES[::-1]),
+        "`ts` must not decrease",
+    ),
+    "no frames": (lambda: PLOT.animate(TOP, SPUN, ts=TIMES, fps=0.0), "`fps` must be positive"),
+    "a state": (
+        lambda: PLOT.motion(START, system=TOP, ts=0.0),
+        "`motion` must hold many states, but it is a single one",
+    ),
+    "one frame": (
+        lambda: PLOT.animate(TOP, jr.State(SPUN.attitude[:1], SPUN.omega[:1]), ts=TIMES[:1]),
+        "two states at least",
+    ),
+    "polhode at rest": (lambda: PLOT.polhode(MOMENTS, REST), "must turn, but one is at rest"),
+    "herpolhode at rest": (lambda: PLOT.herpolhode(MOMENTS, REST), "must turn"),
+    "herpolhode of rates": (
+        lambda: PLOT.herpolhode(MOMENTS, OMEGA),
+        r"`motion` must be a motion or a State, but it is an array of shape \(3,\)",
+    ),
+    "herpolhode with drag": (lambda: PLOT.herpolhode(MOMENTS, DRAGGED), "must be free and keep"),
+    "swapped": (
+        lambda: PLOT.polhode(START, MOMENTS),
+        "`body` must have or be an inertia, but it is a State",
+    ),
+    "no finite state": (
+        lambda: PLOT.effective_potential(TOP, jr.State(START.attitude, OMEGA * jnp.nan)),
+        "must have a finite state",
+    ),
+    "no top": (lambda: PLOT.tip(TOP, MOMENTS), "`motion` must be a motion or a State"),
+    "body along a path": (lambda: PLOT.body(MOMENTS, SPUN), "`attitude` must be one quaternion"),
+    "map without grid": (lambda: PLOT.chart(MAP), r"its shape is \(41, 31\) .* `grid` \(\)"),
+    "map over one axis": (
+        lambda: PLOT.chart(MAP[0], {"b": AREA["b"]}),
+        r"over two axes .* its shape is \(31,\)",
+    ),
+    "map and another grid": (
+        lambda: PLOT.chart(MAP[:30], AREA),
+        r"its shape is \(30, 31\) and that of `grid` \(41, 31\)",
+    ),
+    "narrow map": (
+        lambda: PLOT.chart(MAP[:, :1], AREA | {"b": [0.0]}),
+        r"two at least, but its shape is \(41, 1\)",
+    ),
+    "two quantities": (lambda: PLOT.chart({"u": MAP, "v": MAP}, AREA), "several: u, v"),
+    "too many regions": (
+        lambda: PLOT.chart(np.arange(41 * 31).reshape(41, 31), AREA),
+        "of few regions, but it has 1271",
+    ),
+    "too few names": (
+        lambda: PLOT.chart(HALVES, AREA, regions=("sleeps", "nods")),
+        "`regions` must name the codes 0 to 2",
+    ),
+    "names without a level": (
+        lambda: PLOT.chart(MAP, AREA, regions=("below", "above")),
+        "`regions` must name what is below and above a `level`",
+    ),
+    "names of texts": (
+        lambda: PLOT.chart(HALVES.astype(str), AREA, regions=("a", "b")),
+        "`regions` must be left out for texts",
+    ),
+    "level of codes": (lambda: PLOT.chart(HALVES, AREA, level=1.0), "`level` must be left out"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_be_drawn_is_told(name, untyped):
+    call, message = WRONG[name]
+    with pytest.raises(ValueError, match=message):
+        call()
+    assert not pyplot.get_fignums()  # no empty figure is left
 
 
 # Animations
@@ -350,8 +515,10 @@ def test_frames_are_the_motion_between_its_states(film):
     short = jr.plot.animate(MOMENTS, jr.State(cut, trajectory.states.omega), ts=TIMES[:20])
     assert short.times[-1] == TIMES[9]
     assert short.trace.shape == (0, 3)
-    with pytest.raises(ValueError, match="two states at least"):
-        jr.plot.animate(TOP, TILTED, ts=TIMES[:1])
+    twice = jnp.array([0, 1, 2, 2])
+    states = jr.State(SPUN.attitude[twice], SPUN.omega[twice])
+    twice = jr.plot.animate(TOP, states, ts=TIMES[twice])
+    assert np.all(np.isfinite(twice.attitudes))
 
 
 def test_a_gif_has_all_frames(film, tmp_path):
@@ -359,6 +526,10 @@ def test_a_gif_has_all_frames(film, tmp_path):
 
     with Image.open(film.save(tmp_path / "top.gif")) as picture:
         assert picture.n_frames == 12
+        assert picture.info["duration"] == pytest.approx(1000 / 6, abs=10)
+    slow = film._replace(fps=0.5, times=film.times[:2], attitudes=film.attitudes[:2])
+    with Image.open(slow.save(tmp_path / "slow.gif")) as picture:
+        assert picture.info["duration"] == 2000
     assert not pyplot.get_fignums()
 
 

@@ -51,7 +51,7 @@ class Animation(NamedTuple):
         return frame.format(html.escape(self.html))
 
     def save(self, path: str | Path) -> Path:
-        """Write a page (.html, a few kB), a gif, or a film (.mp4, with ffmpeg).
+        """Write a page (.html, 10 to 30 kB), a gif, or a film (.mp4, with ffmpeg).
 
         Args:
             path: Where.
@@ -72,10 +72,10 @@ class Animation(NamedTuple):
         plt = common.pyplot()
         from matplotlib import animation as film
 
-        writer = film.PillowWriter if path.suffix == ".gif" else film.FFMpegWriter
+        writer: Any = film.PillowWriter if path.suffix == ".gif" else film.FFMpegWriter
         if not writer.isAvailable():
             raise RuntimeError("A film needs ffmpeg, which is not found; a .gif or .html does not.")
-        figure, recorder = plt.figure(figsize=(4.6, 4.6)), writer(fps=int(self.fps))
+        figure, recorder = plt.figure(figsize=(4.6, 4.6)), writer(fps=self.fps)
         ax = figure.add_axes((0, 0, 1, 1), projection="3d", elev=25, azim=35)
         ax, drawn = common.space_axes(ax, 1.1), []
         clock = ax.text2D(0.04, 0.04, "", transform=ax.transAxes)
@@ -115,7 +115,8 @@ def animate(
         An `Animation`: a notebook shows it, `.save("top.html")` (or .gif, .mp4) writes it.
 
     Raises:
-        ValueError: No times, or fewer than two states to show.
+        ValueError: Not one time for each state of one motion, in their order, or fewer than two
+            finite states.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
@@ -125,13 +126,15 @@ def animate(
     >>> print(film.attitudes.shape, film._repr_html_()[:7])
     (200, 4) <iframe
     """
-    attitudes = np.asarray(common.states_of(motion).attitude, float).reshape(-1, 4)
-    ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=1)
-    demand(len(ts[seen]) > 1, "Argument `motion` must hold two states at least, but it does not.")
+    attitudes = np.asarray(common.states_of(motion).attitude, float)
+    ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=-1)
     ts, attitudes = ts[seen], attitudes[seen]
+    demand(len(ts) > 1, "Argument `motion` must hold two states at least, but it does not.")
+    demand(bool(np.all(np.diff(ts) >= 0)), "Argument `ts` must not decrease, but it does.")
+    demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
     times = np.linspace(ts[0], ts[-1], max(round(seconds * fps), 2))
     before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
-    part = (times - ts[before]) / np.diff(ts)[before]
+    part = (times - ts[before]) / np.maximum(np.diff(ts)[before], np.finfo(float).tiny)
     attitudes = np.asarray(jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part))
     point = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
     trace = point if trace is None else np.reshape(np.asarray(trace, float), (-1, 3))

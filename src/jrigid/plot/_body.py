@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jrigid._checks import check_option
+from jrigid._checks import check_option, demand, kind_of
 from jrigid.mass import from_mesh
 from jrigid.plot import _common as common
 from jrigid.top import SymmetricTop
@@ -66,7 +66,7 @@ def surface_of(body: Any, kind: str) -> Surface:
         vertices, faces = _rings(_TOP[0], _TOP[1], _SIDES)
         axes, sides = np.eye(3), np.full(3, _TOP[0, 2])
         center = np.array([0, 0, 1 - sides[2]])
-    elif isinstance(body, tuple):
+    elif isinstance(body, tuple) and len(body) == 2:
         vertices, faces = np.asarray(body[0], float), np.asarray(body[1])
         solid = from_mesh(vertices, faces)
         center, (_, axes) = np.asarray(solid.center_of_mass), common.principal(solid)
@@ -111,9 +111,12 @@ def body(body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str
     Box of the same inertia
     I = 0.00089, 0.00205, 0.00285 kg m$^2$
     """
-    ax, attitude = common.space_axes(ax, 1.1), common.states_of(attitude)
-    place(ax, surface_of(body, kind), np.asarray(getattr(attitude, "attitude", attitude)))
-    mesh, top = isinstance(body, tuple), isinstance(body, SymmetricTop)
+    found = np.asarray(getattr(attitude, "attitude", attitude))
+    wrong = f"Argument `attitude` must be one quaternion or State, but it is {kind_of(attitude)}."
+    demand(found.shape == (4,), wrong)
+    surface, ax = surface_of(body, kind), common.space_axes(ax, 1.1)
+    place(ax, surface, found)
+    mesh, top = isinstance(body, tuple) and len(body) == 2, isinstance(body, SymmetricTop)
     title = "Mesh" if mesh else "Top" if top else f"{kind.capitalize()} of the same inertia"
     if not mesh:
         moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]

@@ -28,7 +28,9 @@ def chart(
             others new names.
         ax: Axes.
         level: Of numbers, where the border runs: 0 for a growth rate squared.
-        regions: Names of what is below and above the level; of integers, of each in its order.
+        regions: Names of what is below and above the level; of integers, booleans and codes, that
+            of code 0, of code 1 and so on, be they on the map or not. A code keeps its tint on
+            every map; where codes exceed seven, and of texts, tints go by the order of those there.
         title: What the numbers are, with their unit.
 
     Returns:
@@ -36,7 +38,8 @@ def chart(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
-        ValueError: A map that is not over two axes, or of more than eight regions.
+        ValueError: A map that is not over two axes, of several quantities, or of more than eight
+            regions, or regions without names.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> def kind(yaw, roll):
@@ -44,28 +47,33 @@ def chart(
     >>> ratios = jnp.linspace(0.02, 1.2, 60)
     >>> ax = jr.plot.chart(jr.stability.stability_map(kind, {"yaw": ratios, "roll": ratios}))
     >>> print([text.get_text() for text in ax.texts])
-    ['Lagrange', 'undefined', 'unstable']
+    ['unstable', 'Lagrange', 'undefined']
     """
-    (names, points, values), ax = _parts(values, grid), flat_axes(ax)
     from matplotlib import colors, patches
     from scipy import ndimage
 
+    names, points, values, kinds = _parts(values, grid)
     if numbers := values.dtype.kind == "f":
-        shown, (low, high), cmap = values, np.nanpercentile(values, _SHOWN), "cividis"
-        levels, masks = [level], [] if level is None else [values <= level, values > level]
+        masks = [] if level is None else [values <= level, values > level]
+        wrong = "Argument `regions` must name what is below and above a `level`, but it does not."
+        demand(len(regions) in (0, len(masks)), wrong)
+        (low, high), cmap, tints = np.nanpercentile(values, _SHOWN), "cividis", _TINTS
+        borders = [(values, level)] * bool(min(map(np.any, masks), default=False))
     else:
-        kinds, shown = np.unique(values, return_inverse=True)
-        shown, regions = shown.reshape(values.shape), regions or [str(x) for x in kinds]
-        low, high, cmap = -0.5, kinds.size - 0.5, colors.ListedColormap(_TINTS[: kinds.size])
-        levels, masks = np.arange(kinds.size - 1) + 0.5, [values == x for x in kinds]
-    mesh = ax.pcolormesh(*points, shown.T, vmin=low, vmax=high, cmap=cmap, rasterized=True)
+        demand(level is None, "Argument `level` must be left out for regions, but it is not.")
+        values, present, regions = _regions(values, kinds, regions)
+        low, high, cmap = -0.5, len(_TINTS) - 0.5, colors.ListedColormap(_TINTS)
+        masks, tints = [values == x for x in present], [_TINTS[x] for x in present]
+        borders = [(mask, 0.5) for mask in masks[:-1]]
+    ax = flat_axes(ax)
+    mesh = ax.pcolormesh(*points, values.T, vmin=low, vmax=high, cmap=cmap, rasterized=True)
     if numbers:
         ax.figure.colorbar(mesh, ax=ax, label=title, extend="both")
-    if levels := [x for x in levels if x is not None and np.nanmin(shown) < x < np.nanmax(shown)]:
-        ax.contour(*points, shown.T, levels, colors="k", linewidths=1.0)
+    for field, border in borders:
+        ax.contour(*points, field.T, [border], colors="k", linewidths=1.0)
     box = {"facecolor": "w", "alpha": 0.75 * numbers, "lw": 0, "boxstyle": "round,pad=0.2"}
     small: list[Any] = []
-    for mask, name, tint in zip(masks, regions, _TINTS, strict=False):
+    for mask, name, tint in zip(masks, regions, tints, strict=False):
         room: Any = ndimage.distance_transform_edt(np.pad(mask, 1))
         if np.max(room) > _NARROW * min(values.shape):
             place = np.unravel_index(np.argmax(room), room.shape)
@@ -80,20 +88,41 @@ def chart(
     return ax
 
 
-def _parts(values: Any, grid: Mapping[str, Any] | None) -> tuple[Any, Any, np.ndarray]:
-    """Names of the axes with units, their points, and the values as numbers or texts."""
-    axes, about = dict(grid or {}), {}
+def _regions(values: Any, kinds: Any, regions: Sequence[str]) -> tuple[np.ndarray, Any, list[str]]:
+    """The number of the tint everywhere, the numbers that are there, and their names."""
+    if values.dtype.kind not in "biu":
+        demand(not regions, "Argument `regions` must be left out for texts, but it is not.")
+        kinds, values = np.unique(values, return_inverse=True)
+    present, ranks = np.unique(values.astype(int), return_inverse=True)
+    least, most, few = present[0], present[-1], present.size <= len(_TINTS)
+    demand(few, f"Argument `values` must be of few regions, but it has {present.size}.")
+    named = not regions or bool(0 <= least <= most < len(regions))
+    demand(named, f"Argument `regions` must name the codes 0 to {most}, but it does not.")
+    texts = regions or kinds
+    names = [str(x if texts is None else texts[x]) for x in present]
+    if least < 0 or most >= len(_TINTS):  # more codes than tints
+        return ranks.reshape(values.shape), range(present.size), names
+    return values, present, names
+
+
+def _parts(values: Any, grid: Mapping[str, Any] | None) -> tuple[Any, Any, np.ndarray, Any]:
+    """Names of the axes with units, their points, numbers, codes or texts, names of the codes."""
+    axes, about, kinds = dict(grid or {}), {}, None
     if hasattr(values, "axes"):  # a SweepResult
         axes, about, values = values.axes, values.attributes, values.values
-    elif hasattr(values, "coords"):  # xarray's
+    several = ", ".join(values) if hasattr(values, "keys") else ""  # also xarray's Dataset
+    demand(not several, f"Argument `values` must be one quantity, but it is several: {several}.")
+    if hasattr(values, "coords"):  # xarray's
         axes, texts = {x: values[x].values for x in values.dims}, values.attrs.get("flag_meanings")
-        about = {x: values[x].attrs for x in axes}
-        values = values.values if texts is None else np.array(texts.split())[values.values]
-    codes = getattr(values, "_enumeration", None)
-    values = np.asarray(values if codes is None else codes[values])
-    ok = values.ndim == 2 and values.shape == tuple(np.size(x) for x in axes.values())
-    ok &= values.dtype.kind == "f" or np.unique(values).size <= len(_TINTS)
-    demand(ok, "Argument `values` must be over two axes, of few regions, but it is not.")
+        about, kinds = {x: values[x].attrs for x in axes}, texts and texts.split()
+        values = values.values
+    if hasattr(values, "_enumeration"):
+        kinds, values = values._enumeration.texts, values._value
+    values, shape = np.asarray(values), tuple(np.size(x) for x in axes.values())
+    kinds = ("False", "True") if values.dtype.kind == "b" else kinds
+    ok = len(grid or axes) == values.ndim == 2 and values.shape == shape and min(shape) > 1
+    wanted = "Argument `values` must be over two axes with the points of `grid`, two at least"
+    demand(ok, f"{wanted}, but its shape is {values.shape} and that of `grid` {shape}.")
     units = [about.get(x, {}).get("units") for x in axes]
     names = [f"{x} [{unit}]" if unit else x for x, unit in zip(grid or axes, units, strict=True)]
-    return names, list(axes.values()), values
+    return names, list(axes.values()), values, kinds

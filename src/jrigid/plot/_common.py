@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from jrigid._checks import demand
+from jrigid._checks import INERTIA, demand, kind_of
 from jrigid._extra import extra
+from jrigid.dynamics import State
 from jrigid.mass import principal_axes
 
 # Okabe and Ito's colours, told apart by the colour-blind, with a marker each.
@@ -45,9 +46,11 @@ def looks(things: Any) -> Any:
 
 def tensor_of(body: Any) -> np.ndarray:
     """The tensor of moments, a tensor, or of whatever has one."""
-    body = body.as_rigid_body() if hasattr(body, "as_rigid_body") else body
-    inertia = np.asarray(getattr(body, "inertia", body), float)
-    return np.diag(inertia) if inertia.ndim == 1 else inertia
+    system = body.as_rigid_body() if hasattr(body, "as_rigid_body") else body
+    inertia = np.asarray(getattr(system, "inertia", system))
+    wrong = f"Argument `body` must have or be an inertia, but it is {kind_of(body)}."
+    demand(inertia.dtype.kind in "iuf" and inertia.shape in INERTIA, wrong)
+    return (np.diag(inertia) if inertia.ndim == 1 else inertia).astype(float)
 
 
 def principal(body: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -58,14 +61,31 @@ def principal(body: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def states_of(motion: Any) -> Any:
     """The states of what `simulate`, `free_rotation` or `top_motion` returned, or a state."""
-    return getattr(motion, "states", motion)
+    states = getattr(motion, "states", motion)
+    wrong = f"Argument `motion` must be a motion or a State, but it is {kind_of(motion)}."
+    demand(hasattr(states, "attitude"), wrong)
+    one = "Argument `motion` must be one motion, but it is several: take one by "
+    demand(np.ndim(states.attitude) <= 2, one + "`jax.tree.map(lambda x: x[i], motion)`.")
+    return states
+
+
+def start_of(motion: Any) -> State:
+    """The first finite state of a motion, or the state itself."""
+    states = states_of(motion)
+    attitudes, omegas = states.attitude.reshape(-1, 4), states.omega.reshape(-1, 3)
+    seen = np.isfinite(np.sum(attitudes, axis=1) + np.sum(omegas, axis=1))
+    demand(bool(np.any(seen)), "Argument `motion` must have a finite state, but it has none.")
+    return State(attitudes[np.argmax(seen)], omegas[np.argmax(seen)])
 
 
 def times_of(motion: Any, ts: Any) -> np.ndarray:
-    """The times given, or those of a trajectory [s]."""
-    ts = getattr(motion, "ts", None) if ts is None else ts
+    """The times given, or those of a trajectory [s]: one for each state."""
+    ts, shape = getattr(motion, "ts", None) if ts is None else ts, states_of(motion).omega.shape
     demand(ts is not None, "Argument `ts` must be given for a motion without times, but it is not.")
-    return np.asarray(ts, float).reshape(-1)
+    demand(len(shape) == 2, "Argument `motion` must hold many states, but it is a single one.")
+    wrong = f"Argument `ts` must be a time for each of {shape[0]} states, but it has shape"
+    demand(np.shape(ts) == shape[:1], f"{wrong} {np.shape(ts)}.")
+    return np.asarray(ts, float)
 
 
 def turned(attitudes: Any, vectors: Any) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jrigid._checks import check_option, check_type
 from jrigid.identify import FitResult
 from jrigid.plot._common import LOOKS, TURN, label, looks, pyplot
 
@@ -47,6 +48,7 @@ def fit(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
+        ValueError: No such picture, record or throw.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -56,6 +58,9 @@ def fit(
     >>> print(axes["ratios"].get_xlabel())
     I2/I1
     """
+    check_type("result", result, FitResult)
+    check_option("record", record, range(len(result.problem.samples.parts)))
+    check_option("throw", throw, range(len(result.t0)))
     if axes is None:
         figure: Any = pyplot().figure(figsize=(10, 8), layout="constrained")
         figure.suptitle(str(result).partition(":")[0])
@@ -63,6 +68,7 @@ def fit(
     draw = {"record": _record, "residuals": _residuals, "spectrum": _spectrum,
             "histogram": _histogram, "ratios": _ratios}  # fmt: skip
     for name, ax in axes.items():
+        check_option("axes", name, tuple(draw))
         draw[name](ax, result, record, throw)
     return dict(axes)
 
@@ -152,10 +158,11 @@ def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
 
 
 def _ratios(ax: Any, result: FitResult, *_: int) -> None:
+    told = not result.pure_spin and all(np.all(x.ratios_errors < x.ratios) for x in result.bodies)
     for (colour, marker), body in looks(result.bodies):
         # the chi-square of two numbers at 68 % and 95 %
-        drawn = [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
-        if result.inflation > 1:
+        drawn = told * [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
+        if told and result.inflation > 1:
             drawn.append(("bound", ":", "k", 5.9915 / float(result.inflation)))
         values, vectors = np.linalg.eigh(body.ratios_covariance)
         ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
@@ -163,14 +170,14 @@ def _ratios(ax: Any, result: FitResult, *_: int) -> None:
         for name, style, ink, square in drawn:
             line = np.asarray(body.ratios)[:, None] + np.sqrt(square) * ellipse
             ax.plot(*line, style, color=ink, label=name if body.index == 0 else None)
-    view = ax.axis()
+    left, right, low, high = ax.axis() if told else (0.8, 3.0, 0.8, 4.0)
     ax.axline((1, 2), slope=1, color="0.5", ls=":")
     ax.axline((1, 1), slope=1, color="0.5", ls="--")
     ax.axvline(1, color="0.5", lw=1)
-    ax.axis(view)
+    ax.axis((max(left, 0.8), right, max(low, 0.8), high))
     ax.ticklabel_format(useOffset=False)
     ax.locator_params(nbins=4)
-    told = not result.pure_spin and np.all(result.ratios_errors < result.ratios)
     label(ax, "Ratios" if told else "Ratios: not determined", "I2/I1", "I3/I1")
     untold = "\n".join(wrap("not told: " + "; ".join(result.null_directions), _WORDS))
-    ax.text(0.02, 0.98, untold * bool(result.null_directions), transform=ax.transAxes, va="top")
+    style = {"transform": ax.transAxes, "va": "top", "bbox": {"facecolor": "w", "lw": 0, "pad": 1}}
+    ax.text(0.02, 0.98, untold * bool(result.null_directions), **style)

@@ -3,15 +3,17 @@
 from itertools import product
 from typing import Any
 
+import jax
 import numpy as np
 
-from jrigid._checks import check_option
+from jrigid._checks import check_option, check_shape, demand
 from jrigid.free import free_rotation, mean_precession_rate, polhode_period
 from jrigid.plot import _common as common
 from jrigid.plot._common import LOOKS, TURN, looks, on_surface, states_of
 
 _FAMILY = np.radians([20, 40, 60, 78])  # widths of the polhodes drawn of any body
 _EQUAL = 1e-9  # relative difference of moments below which no polhode goes round their axes
+_KEPT = 1e-3  # relative change of the momentum of a free motion
 _MOST, _TURNS, _PERIODS = 4000, 20, 3  # points, precessions and polhodes of a herpolhode
 
 
@@ -32,11 +34,31 @@ def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int
     return curve, about
 
 
+def _momentum(body: Any, motion: Any) -> tuple[np.ndarray, bool]:
+    """Angular momentum in the body, of parts within too, and whether these have any."""
+    states = None if np.ndim(motion) else states_of(motion)
+    omega = np.asarray(motion if states is None else states.omega, float)
+    check_shape("motions", omega, (3,), (None, 3))
+    demand(bool(np.any(omega)), "Arguments `motions` must turn, but one is at rest.")
+    system, own = getattr(motion, "system", body), omega @ common.tensor_of(body)
+    if states is None or not hasattr(system, "torque"):
+        return own, False
+
+    def of(t: Any, state: Any, args: Any) -> Any:
+        return system.torque.internal_momentum(t, system.with_parts(state), args)
+
+    ts, args = getattr(motion, "ts", np.zeros(omega.shape[:-1])), getattr(motion, "args", None)
+    inner = np.asarray((of if own.ndim == 1 else jax.vmap(of, (0, 0, None)))(ts, states, args))
+    return own + inner, bool(np.any(inner))
+
+
 def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -> Any:
     """Paths of the angular momentum in the body, with the separatrix.
 
     On the sphere L / |L|, or on the ellipsoid of energy L / sqrt(2 E I3). With no motion given,
-    polhodes of all kinds.
+    polhodes of all kinds of a free rigid body with this inertia. Where parts within the body have
+    momentum (a rotor), L has it, only motions of `simulate` have paths, on the sphere, and the
+    polhodes of the rigid body are left out.
 
     Args:
         body: Whatever has an inertia, or moments or a tensor [kg m^2].
@@ -50,7 +72,7 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
-        ValueError: Axes of two dimensions, or no such surface.
+        ValueError: Axes of two dimensions, no such surface, or a motion at rest.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ax = jr.plot.polhode(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.05, 1.0, 0.0]))
@@ -58,7 +80,9 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
     Angular momentum in the body, L/|L|
     """
     check_option("surface", surface, ("sphere", "ellipsoid"))
-    (moments, axes), inertia = common.principal(body), common.tensor_of(body)
+    (moments, axes), momenta = common.principal(body), [_momentum(body, x) for x in motions]
+    inner = any(x for _, x in momenta)
+    surface = "sphere" if inner else surface
     semi_axes = np.ones(3) if surface == "sphere" else np.sqrt(moments / moments[2])
     ax, rates = common.space_axes(ax, 1.15), 1 / moments
     common.globe(ax, semi_axes, axes)
@@ -69,19 +93,20 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
         on_surface(ax, points @ axes.T, points / semi_axes**2 @ axes.T, **style)
 
     parted = rates[0] - rates[2] > _EQUAL * rates[0]  # else momenta stay where they are
-    for about, side in product((0, 2), (1, -1)) if parted else ():
+    for about, side in product((0, 2), (1, -1)) if parted and not inner else ():
         style = {"color": LOOKS[about // 2][0], "ls": "--" if about else "-", "lw": 1.1}
         style |= {"color": "0.6", "lw": 0.7} if motions else {"label": f"about axis {about + 1}"}
         gap = rates[1] - rates[about]
         for width in _FAMILY if abs(gap) > _EQUAL * rates[0] else ():
             draw(_cone(moments, rates[about] + gap * np.sin(width) ** 2, side)[0], **style)
-        if about:
+        if about and min(rates[0] - rates[1], gap) > _EQUAL * rates[0]:
             draw(_cone(moments, rates[1], side)[0], color="k", lw=1.6, label="separatrix")
-    for (colour, marker), (i, motion) in looks(enumerate(motions)):
-        momentum = np.asarray(getattr(states_of(motion), "omega", motion), float) @ inertia @ axes
-        path = np.atleast_2d(momentum / np.linalg.norm(momentum, axis=-1, keepdims=True))
-        draw(path[:1], color=colour, marker=marker, ls="none", label=f"motion {i + 1}")
-        if momentum.ndim == 1 and parted:
+    for (colour, marker), (i, (momentum, _)) in looks(enumerate(momenta)):
+        sizes = np.linalg.norm(momentum, axis=-1, keepdims=True)
+        path = np.atleast_2d(momentum / np.where(sizes > 0, sizes, np.nan)) @ axes
+        style = {"color": colour, "marker": marker, "ls": "none", "label": f"motion {i + 1}"}
+        draw(path[np.isfinite(path[:, 0])][:1], **style)
+        if momentum.ndim == 1 and parted and not inner:
             curve, about = _cone(moments, np.sum(path**2 * rates), 1)
             curve[:, about] *= np.sign(path[0, about])
             path = curve
@@ -93,8 +118,8 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
                 ax.text(*(1.22 * end), name, ha="center", va="center", zorder=common.FRONT)
     scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
     ax.set_title(f"Angular momentum in the body, L/{scale}")
-    title = "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
-    ax.legend(loc="lower center", ncols=4, frameon=False, title=title)
+    style = {"title": "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments), "ncols": 4}
+    ax.legend(*ax.get_legend_handles_labels(), loc="lower center", frameon=False, **style)
     return ax
 
 
@@ -103,7 +128,7 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
 
     Args:
         body: Whatever has an inertia, or moments or a tensor [kg m^2].
-        motion: A state, or what `free_rotation` returned.
+        motion: A state, or what `free_rotation` returned, or `simulate` of a free body.
         ax: Axes.
         ts: Times since the state [s]; by default three polhode periods, or twenty turns about the
             momentum if that is less.
@@ -114,6 +139,7 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
+        ValueError: At rest, or a motion that does not keep I omega in space: it is not free.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.3, 1.0, 0.2]))
@@ -122,15 +148,21 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
     angular velocity across the momentum [rad/s]
     """
     state, inertia = states_of(motion), common.tensor_of(body)
-    omega = np.asarray(state.omega, float).reshape(-1, 3)[0]
+    start = common.start_of(motion)
+    omega = np.asarray(start.omega, float)
+    demand(bool(np.any(omega)), "Argument `motion` must turn, but it is at rest.")
     if state.omega.ndim == 1:
         turn = 2 * np.pi / float(mean_precession_rate(inertia, omega))
         most = min(_PERIODS * float(polhode_period(inertia, omega)), _TURNS * turn)
         ts = np.linspace(0, most, _MOST) if ts is None else ts
-        state = free_rotation(inertia, motion, ts).states
+        state = free_rotation(inertia, start, ts).states
     vectors = np.stack([np.asarray(state.omega), np.asarray(state.omega) @ inertia], axis=-2)
-    curve, (momentum, *_) = np.moveaxis(common.turned(state.attitude, vectors), -2, 0)
-    size = np.linalg.norm(momentum)
+    curve, momenta = np.moveaxis(common.turned(state.attitude, vectors), -2, 0)
+    seen = np.isfinite(np.sum(curve, axis=1))
+    curve, momenta, momentum = curve[seen], momenta[seen], momenta[seen][0]
+    size, changes = np.linalg.norm(momentum), np.linalg.norm(momenta - momentum, axis=1)
+    free = bool(np.max(changes) < _KEPT * size)
+    demand(free, "Argument `motion` must be free and keep I omega in space, but it does not.")
     up, across = momentum / size, np.cross(momentum / size, curve[0])
     if np.linalg.norm(across) < _EQUAL * np.linalg.norm(omega):  # a pure spin: any will do
         across = np.cross(up, np.roll(up, 1) + np.eye(3)[0])
@@ -152,4 +184,5 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
     title = "Herpolhode, {:.3g} to {:.3g} rad/s from the momentum (+)".format(*bounds)
     names = "angular velocity across the momentum [rad/s]", "and across that [rad/s]"
     common.label(ax, title, *names)
+    ax.locator_params(nbins=6)
     return ax

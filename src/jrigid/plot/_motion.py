@@ -17,7 +17,7 @@ def motion(
 ) -> dict[str, Any]:  # fmt: skip
     """The angular velocity of a motion, and the drift of its energy and angular momentum.
 
-    "omega": body components. "drift": changes since the first time, relative to the largest
+    "omega": body components. "drift": changes since the first finite state, relative to the largest
     value on the way: rounding and the errors of the integration where they are conserved, the work
     of the torques where they are not.
 
@@ -34,6 +34,7 @@ def motion(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
+        ValueError: No system, no times, or more than one motion.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 1.0, 0.2]))
@@ -42,13 +43,13 @@ def motion(
     >>> print(axes["drift"].get_ylabel())
     relative change
     """
-    if axes is None:
-        figure: Any = pyplot().figure(figsize=(8, 6), layout="constrained")
-        axes = dict(figure.subplot_mosaic([["omega"], ["drift"]], sharex=True))
     system = getattr(motion, "system", None) if system is None else system
     demand(system is not None, "Argument `system` must be given for this motion, but it is not.")
     system = system.as_rigid_body() if hasattr(system, "as_rigid_body") else system
     ts, states = times_of(motion, ts), states_of(motion)
+    if axes is None:
+        figure: Any = pyplot().figure(figsize=(8, 6), layout="constrained")
+        axes = dict(figure.subplot_mosaic([["omega"], ["drift"]], sharex=True))
     if "omega" in axes:
         columns = zip("xyz", ("-", "--", "-."), np.asarray(states.omega).T, strict=True)
         for (colour, _), (name, style, column) in looks(columns):
@@ -62,7 +63,8 @@ def motion(
             values = np.asarray(each(times, states)).reshape(ts.size, -1)
             if along is not None and values.shape[1] > 1:
                 values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
-            sizes, changes = (np.linalg.norm(x, axis=1) for x in (values, values - values[0]))
+            first = values[np.argmax(np.all(np.isfinite(values), axis=1))]
+            sizes, changes = (np.linalg.norm(x, axis=1) for x in (values, values - first))
             changes = np.where(changes > 0, changes, np.nan) / (np.nanmax(sizes) or 1.0)
             axes["drift"].plot(ts, changes, marker, color=colour, ms=3, label=name)
         eps = np.finfo(times.dtype).eps

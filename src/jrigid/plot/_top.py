@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from jrigid.dynamics import State
 from jrigid.plot import _common as common
 from jrigid.top import SymmetricTop, conserved, nutation_bounds
 from jrigid.top import effective_potential as potential
@@ -14,10 +13,9 @@ _ELEVATION = 25, 55  # of the eye, least and most [degrees]
 _BAND = 12  # lines across the band of nutation
 
 
-def _start(motion: Any) -> State:
-    """The first state of a motion, or the state itself."""
-    state = common.states_of(motion)
-    return State(state.attitude.reshape(-1, 4)[0], state.omega.reshape(-1, 3)[0])
+def _bounds(top: SymmetricTop, *motions: Any) -> np.ndarray:
+    """The least and the largest tilt of each motion (n, 2) [rad]."""
+    return np.array([nutation_bounds(top, common.start_of(x)) for x in motions], float)
 
 
 def _words(band: np.ndarray) -> str:
@@ -26,6 +24,8 @@ def _words(band: np.ndarray) -> str:
 
 def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
     """Paths of the top's axis on the unit sphere, each with the two circles that it touches.
+
+    Of several each is named by its tilts.
 
     Args:
         top: The top.
@@ -47,8 +47,7 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
     >>> print(jr.plot.tip(top, motion).get_title())
     Tip of the top, tilts 28.6° to 43.4°
     """
-    motions = (motion, *more)
-    bounds = np.array([nutation_bounds(top, _start(x)) for x in motions], float).reshape(-1, 2)
+    motions, bounds = (motion, *more), _bounds(top, motion, *more)
     up = 90 - np.degrees(np.mean(bounds))  # look at the band from the side of its pole
     ax = common.space_axes(ax, 1.1, np.copysign(np.clip(abs(up), *_ELEVATION), up))
     common.globe(ax, np.ones(3), np.eye(3))
@@ -63,8 +62,12 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
         attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
         path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
         common.on_surface(ax, path, path, color=colour, lw=1.5)
-        common.on_surface(ax, path[:1], path[:1], color=colour, marker=marker, ls="none")
-    ax.set_title(f"Tip of the top, tilts {', '.join(map(_words, bounds))}")
+        ax.lines[-2].set_label(_words(band))  # the part in front, also of tilts that are there
+        start = path[np.isfinite(path[:, 0])][:1]
+        common.on_surface(ax, start, start, color=colour, marker=marker, ls="none")
+    if more:
+        ax.legend(loc="lower center", ncols=4, frameon=False, handlelength=1.0, columnspacing=1.0)
+    ax.set_title("Tip of the top" if more else f"Tip of the top, tilts {_words(bounds[0])}")
     return ax
 
 
@@ -89,10 +92,8 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
     >>> print(ax.get_xlabel(), ax.get_ylabel())
     tilt [degrees] energy of the tilt [J]
     """
-    ax, starts = common.flat_axes(ax), [_start(x) for x in (motion, *more)]
-    from matplotlib.ticker import EngFormatter
-
-    bounds = np.array([nutation_bounds(top, x) for x in starts], float).reshape(-1, 2)
+    bounds, starts = _bounds(top, motion, *more), map(common.start_of, (motion, *more))
+    ax = common.flat_axes(ax)
     margin = max(0.6 * np.ptp(bounds), _LEAST)
     ends = np.clip([np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3)
     tilts, heights = np.linspace(ends[0], ends[1], 400), []
@@ -107,7 +108,6 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
         depth = max(level - low, 0.3 * (np.median(well) - low))
         heights += [low - 0.3 * depth, level + 1.5 * depth]
     ax.set(xlim=np.degrees(ends), ylim=(min(heights), max(heights)))
-    ax.yaxis.set_major_formatter(EngFormatter("J"))
     ax.set(xlabel="tilt [degrees]", ylabel="energy of the tilt [J]", title="Effective potential")
     ax.legend(loc="lower right", frameon=False)
     return ax
