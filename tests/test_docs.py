@@ -84,7 +84,7 @@ def is_rounded(x, y):
     return abs(float(x) - float(y)) <= last
 
 
-DRAWS = re.compile(r"\b(plt|jr\.plot|ax|axes)\.\w")
+DRAWS = re.compile(r"\b(plt|jr\.plot)\.\w|\.(plot|legend|annotate|scatter|hist|axvline)\(")
 
 
 @pytest.mark.parametrize(

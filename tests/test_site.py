@@ -25,7 +25,12 @@ MODULES = {
 NAMES = {
     f"{module}.{name}": getattr(x, name) for module, x in MODULES.items() for name in x.__all__
 }
-TOP = {k: x for k, x in vars(jr).items() if not k.startswith("_") and not inspect.ismodule(x)}
+TOP = {
+    f"jrigid.{k}": x
+    for k, x in vars(jr).items()
+    if not k.startswith("_") and not inspect.ismodule(x)
+}
+ALL = NAMES | TOP
 
 
 @built
@@ -34,7 +39,7 @@ def test_the_index_has_every_public_name():
     packed = (SITE / "objects.inv").read_bytes().split(b"\n", 4)[4]
     lines = zlib.decompress(packed).decode().splitlines()
     listed = {x.split(" ", 1)[0] for x in lines if " py:" in x}
-    wanted = {*MODULES, *NAMES, *(f"jrigid.{name}" for name in TOP)}
+    wanted = {*MODULES, *NAMES, *TOP}
     assert not wanted - listed
 
 
@@ -42,10 +47,10 @@ def is_told(name, shown):
     """Its own example, or that of a function of the module that returns it or speaks of it."""
     text = inspect.getdoc(shown) or ""
     module, _, short = name.rpartition(".")
-    others = [inspect.getdoc(x) or "" for k, x in NAMES.items() if k.startswith(f"{module}.")]
+    others = [inspect.getdoc(x) or "" for k, x in ALL.items() if k.startswith(f"{module}.")]
     returning = [
         inspect.getdoc(x) or ""
-        for k, x in NAMES.items()
+        for k, x in ALL.items()
         if k.startswith(f"{module}.")
         and inspect.isroutine(x)
         and short in str(inspect.signature(x).return_annotation)
@@ -55,9 +60,9 @@ def is_told(name, shown):
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALL)
 def test_every_public_name_is_in_an_example(name):
-    shown = NAMES[name]
+    shown = ALL[name]
     if inspect.isclass(shown) or inspect.isroutine(shown):  # not an alias of types
         assert is_told(name, shown)
 

@@ -18,13 +18,14 @@ RECIPES = ROOT / "docs" / "recipes"
 EXTRAS = "demo,records,dask,io"
 OTHERS = ["blackjax>=1.2"]  # what a recipe tells to install beside
 # What needs each extra, and a word of the error without it.
-MISSING = {
-    "plot": "jr.plot.polhode(np.array([1.0, 2.0, 3.0]))",
-    "io": "jr.io.to_jaxlie(np.array([1.0, 0.0, 0.0, 0.0]))",
-    "sweep": "jr.sweep(lambda x: x, {'x': np.arange(3.0)}, store='map.zarr')",
-    "records": "jr.records.read('flight.bbl')",
-    "data": "jr.datasets.earth_pole()",
-}
+MISSING = (
+    ("plot", "jr.plot.polhode(np.array([1.0, 2.0, 3.0]))"),
+    ("io", "jr.io.to_jaxlie(np.array([1.0, 0.0, 0.0, 0.0]))"),
+    ("io", "jr.io.read_mesh('part.stl')"),
+    ("sweep", "jr.sweep(lambda x: x, {'x': np.arange(3.0)}, store='map.zarr')"),
+    ("records", "jr.records.read('flight.bbl')"),
+    ("data", "jr.datasets.earth_pole()"),
+)
 # A cluster of this machine's own, in the place of a queue's.
 CLUSTER = """
 from distributed import LocalCluster
@@ -50,7 +51,7 @@ def main() -> int:
         (here / "flight.bbl").write_text(
             "H Product:Blackbox flight data recorder by Nicholas Sherlock"
         )
-        failed = [name for name, call in MISSING.items() if not names(python, here, name, call)]
+        failed = [name for name, call in MISSING if not names(python, here, name, call)]
         subprocess.run([*pip, f"{wheel}[{EXTRAS}]", *OTHERS], check=True)
         (here / "part.stl").write_bytes(box())
         (here / "dask_jobqueue.py").write_text(CLUSTER)
