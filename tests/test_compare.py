@@ -71,6 +71,7 @@ def test_each_throw_or_group_is_left_out_once():
         identify.cross_validate(sum, [1], refit=refit)
 
 
+@pytest.mark.slow  # programs of its own
 def test_a_throw_left_out_is_judged_by_the_fit_s_own_model(rng):
     kicked = throws(rng, count=3)
     spoilt = [identify.Rates(x.ts, x.values.at[40].add(1.0), x.sigma) for x in kicked]

@@ -3,12 +3,22 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_option,
+    demand,
+    is_inertia,
+    is_unit,
+    kind_of,
+)
 from jrigid._numerics import or_one, rms
 from jrigid.dynamics import State
 from jrigid.identify._layout import Told
@@ -29,11 +39,9 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
     """One body, or one for each throw."""
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
-        demand(
-            isinstance(x, RigidBody),
-            "Argument `system` must be a RigidBody (of a body in flight, rotation about its centre "
-            f"of mass), but it is {type(x).__name__}.",
-        )
+        of_flight = " (of a body in flight, rotation about its centre of mass)"
+        text = f"Argument `system` must be a RigidBody{of_flight}, but it is {kind_of(x)}."
+        demand(isinstance(x, RigidBody), text)
     demand(
         len(systems) in (1, throws),
         f"Argument `system` must hold one body for each of {throws} throws, but it holds "
@@ -47,12 +55,19 @@ def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
     is_sampled = lambda x: isinstance(x, Sampled)  # noqa: E731
     leaves, trees = zip(*(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True)
 
-    def alike(*column: Any) -> tuple[Any, ...]:
-        sizes = [x.ts.size for x in column if is_sampled(x)]
-        return tuple(x.padded(max(sizes)) if is_sampled(x) else x for x in column)
+    def alike(*column: Any) -> list[Any]:
+        counts = [x.ts.size if is_sampled(x) else 0 for x in column]
+        return [_longer(x, max(counts) - n) for x, n in zip(column, counts, strict=True)]
 
     columns = map(alike, *leaves)
     return tuple(map(jtu.tree_unflatten, trees, zip(*columns, strict=True)))
+
+
+def _longer(function: Any, count: int) -> Any:
+    """With the last sample repeated so many times: the same function."""
+    longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], count, axis=0)])  # noqa: E731
+    arrays = lambda x: (x.ts, x.values)  # noqa: E731
+    return eqx.tree_at(arrays, function, replace_fn=longer) if count else function
 
 
 def bodies_of(bodies: Sequence[int] | None, throws: int) -> Array:

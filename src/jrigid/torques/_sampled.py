@@ -1,7 +1,5 @@
 """A function of time from samples: a wheel's measured momentum, a commanded torque."""
 
-import dataclasses
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -42,13 +40,6 @@ class Sampled(Readable):
     def __check_init__(self) -> None:
         """Raise ValueError for shapes that do not belong together."""
         check_shape("values", self.values, (*self.ts.shape, *self.values.shape[1:]))
-
-    def padded(self, size: int) -> "Sampled":
-        """With so many samples, the last one repeated: the same function."""
-        more = size - self.ts.size
-        longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)])  # noqa: E731
-        both = {"ts": longer(self.ts), "values": longer(self.values)}
-        return dataclasses.replace(self, **both) if more else self
 
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
