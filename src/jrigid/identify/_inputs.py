@@ -9,16 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import (
-    RESULTS,
-    Findings,
-    all_finite,
-    check_option,
-    demand,
-    is_inertia,
-    is_unit,
-    kind_of,
-)
+from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
 from jrigid._numerics import or_one, rms
 from jrigid.dynamics import State
 from jrigid.identify._layout import Told
@@ -40,7 +31,7 @@ def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
         of_flight = " (of a body in flight, rotation about its centre of mass)"
-        text = f"Argument `system` must be a RigidBody{of_flight}, but it is {kind_of(x)}."
+        text = f"Argument `system` must be a RigidBody{of_flight}, but it is {type(x).__name__}."
         demand(isinstance(x, RigidBody), text)
     demand(
         len(systems) in (1, throws),
