@@ -76,7 +76,8 @@ def test_a_throw_left_out_is_judged_by_the_fit_s_own_model(rng):
     kicked = throws(rng, count=3)
     spoilt = [identify.Rates(x.ts, x.values.at[40].add(1.0), x.sigma) for x in kicked]
     robust = lambda x: identify.fit(BLIND, x, loss="robust", throw=False)  # noqa: E731
-    assert np.all(identify.cross_validate(robust, spoilt) < 1.3 * 237)
+    squares = identify.cross_validate(robust, spoilt)
+    assert np.all((squares > 0.7 * 237) & (squares < 1.3 * 237)), squares
     with pytest.raises(ValueError, match="must state the noise"):
         identify.cross_validate(without_drag, [identify.Rates(x.ts, x.values) for x in kicked])
     with pytest.raises(ValueError, match="`refit` must be given where there are several bodies"):

@@ -61,6 +61,10 @@ def test_a_prediction_is_the_record_less_its_noise(found, readings):
     np.testing.assert_allclose(backward, again, atol=1e-12)
 
 
+def test_a_fit_without_an_unmodelled_torque_has_none(found):
+    np.testing.assert_array_equal(np.stack([found.level, found.level_errors]), 0)
+
+
 def test_times_of_a_prediction_may_have_any_shape(found):
     flat = found.predict(LATER)
     assert found.predict(LATER[1]).shape == (3,)

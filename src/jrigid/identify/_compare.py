@@ -100,7 +100,6 @@ def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
     system, *sensors = found.parts()
     records = [x if isinstance(x, tuple) else (x,) for x in throws]
     records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
-    records = [tuple(x) for x in records]
     stated = all(x.states_noise for throw in records for x in throw)
     demand(stated, "Argument `throws` must state the noise, but one does not.")
     level = jnp.maximum(found.level, _LEAST * jnp.max(found.level))

@@ -130,6 +130,7 @@ def conclude(problem: Problem, layout: Layout, way: stages.Way, input_result: An
     rows = condensed(Rows(*scaled, node=found.rows.node), found.links)
     sensor, scores = told_by_rows(rows, own, units)
     told, kicks, level_errors = sensor, jnp.zeros((), numbers.dtype), jnp.zeros_like(level)
+    level = level if problem.options.dense else level_errors
     if problem.options.dense:
         white = stages.link_whitener(problem, layout, numbers, end.weight, level)
         blocks = blocks_of(found.rows, found.links, weight, white)
