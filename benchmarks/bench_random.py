@@ -54,7 +54,7 @@ def row(record):
 
 if __name__ == "__main__":
     parser = common.arguments(__doc__)
-    parser.add_argument("--records", type=int, default=100, help="how many (1000 take half an hour)")
+    parser.add_argument("--records", type=int, default=100, help="1000 take half an hour")
     options = parser.parse_args()
     start = time.perf_counter()
     seeds = range(options.records)
