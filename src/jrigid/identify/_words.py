@@ -208,9 +208,9 @@ def report(result: FitResult) -> str:
         return f"{value.size} fits: {text}"
     throws, steps = result.state.omega.shape[0], np.sum(np.isfinite(result.history))
     seen = f"{np.sum(result.kept)} samples" + f" of {throws} throws" * (throws > 1)
-    left = jnp.sqrt(jnp.nanmean(result.left() ** 2))
-    noise = f" (noise taken from the residuals: {left:.3g} rms)"
-    noise = noise * (not result.problem.options.noise_known)
+    known = result.problem.options.noise_known
+    left = None if known else jnp.sqrt(jnp.nanmean(result.left() ** 2))
+    noise = "" if known else f" (noise taken from the residuals: {left:.3g} rms)"
     lines = [
         f"{codes[int(value)]}: {Status[result.status]}",
         f"  {seen}, {steps} steps; chi-square {result.chi_square:.1f} for "
