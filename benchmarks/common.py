@@ -5,6 +5,7 @@ import importlib.metadata
 import os
 import pathlib
 import platform
+import re
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -78,3 +79,20 @@ def report(name: str, title: str, text: str, packages: Sequence[str], write: boo
         path.parent.mkdir(exist_ok=True)
         command = f"`python benchmarks/bench_{name}.py --write`"
         path.write_text(f"# {title}\n\n{command} on {machine(packages)}.\n\n{text}\n")
+
+
+def report_by_jax(name: str, title: str, text: str, packages: Sequence[str], write: bool) -> None:
+    """As `report`; the file has one section for each version of jax and keeps the others."""
+    print(machine(packages), text, sep="\n\n")
+    if not write:
+        return
+    path = pathlib.Path(__file__).parent / "results" / f"{name}.md"
+    path.parent.mkdir(exist_ok=True)
+    old = path.read_text() if path.exists() else ""
+    parts = re.split(r"^## (jax \S+)\n", old, flags=re.MULTILINE)
+    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    own = f"jax {jax.__version__}"
+    sections[own] = f"\nOn {machine(packages)}.\n\n{text}\n\n"
+    command = f"`python benchmarks/bench_{name}.py --write`"
+    body = "".join(f"## {x}\n{sections[x]}" for x in sorted(sections))
+    path.write_text(f"# {title}\n\n{command}.\n\n{body.rstrip()}\n")

@@ -1,6 +1,7 @@
 """Tolerances by dtype, and motions that several test files share."""
 
 import os
+import re
 import subprocess
 import sys
 from functools import wraps
@@ -32,6 +33,15 @@ def central_difference(function, x, direction, step=None):
         step = float(np.finfo(x.dtype).eps) ** (1 / 3)
     up, down = function(x + step * direction), function(x - step * direction)
     return (np.asarray(up) - np.asarray(down)) / (2 * step)
+
+
+_KERNEL = re.compile(r"\s(fusion|call|conditional|while|custom-call)\(")
+
+
+def kernels(optimised_hlo):
+    """Count fusions, calls, conditionals, loops and custom calls in the optimised HLO."""
+    instructions = (line.split(", metadata=")[0] for line in optimised_hlo.splitlines())
+    return sum(bool(_KERNEL.search(line)) for line in instructions)
 
 
 def quick_jit(function):

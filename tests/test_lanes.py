@@ -9,8 +9,10 @@ import pytest
 from helpers import in_a_process, quick_jit
 
 import jrigid as jr
-from jrigid._lanes_last import lanes_last
-from jrigid.simulate import _pull
+from jrigid._core.lanes_last import lanes_last
+from jrigid._stepping import replay
+from jrigid._stepping.method import method_of
+from jrigid._stepping.step import error_of, pull_back, stages
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 GRAVITY = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
@@ -68,45 +70,78 @@ def test_a_function_in_lanes_equals_its_vmap(rng):
     jax.tree_util.tree_map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, wanted)
 
 
-# Stages written out -------------------------------------------------------------------------
+# Steps of a method --------------------------------------------------------------------------
+
+METHODS = {
+    "Verner9": (jr.solvers.Verner9(), 9, 4),
+    "Dopri8": (diffrax.Dopri8(), 8, 8),
+    "Tsit5": (diffrax.Tsit5(), 5, 40),
+    "Bosh3": (diffrax.Bosh3(), 3, 40),
+    "Heun": (diffrax.Heun(), 2, 40),
+}
 
 
-@pytest.mark.parametrize(
-    ("method", "order", "steps"),
-    [
-        (jr.solvers.Verner9, 9, 4),
-        (diffrax.Dopri8, 8, 8),
-        (diffrax.Tsit5, 5, 40),
-        (diffrax.Bosh3, 3, 40),
-        (diffrax.Heun, 2, 40),
-    ],
-)
-def test_unrolled_takes_the_steps_of_its_method(method, order, steps):
-    """In a pytree, with dense output, at its order."""
+def _field(t, y):
+    return jnp.stack([1.3 * y[1], -y[0] * jnp.cos(t)])
 
-    def field(t, y, args):
-        return {"u": args * y["v"], "v": (-y["u"] * jnp.cos(t)[None])}
 
-    def solves(solver):
-        def solve(steps):
-            start = {"u": jnp.ones(1), "v": jnp.zeros(1)}
-            return diffrax.diffeqsolve(
-                diffrax.ODETerm(field), solver, 0.0, 2.0, 2 / steps, start, jnp.array([1.3]),
-                saveat=diffrax.SaveAt(ts=jnp.array([0.77, 2.0])),
-            ).ys["u"][:, 0]  # fmt: skip
+@pytest.mark.parametrize("in_lanes", [False, True])
+@pytest.mark.parametrize("name", METHODS)
+def test_a_step_is_that_of_its_method(name, in_lanes):
+    """State and error estimate, as diffrax computes them."""
+    solver, _, _ = METHODS[name]
+    method = method_of(solver)
+    t, h, y = jnp.array(0.3), jnp.array(0.4), jnp.array([1.0, 0.2])
 
-        return quick_jit(solve)
+    @quick_jit
+    def ours(t, h, y):
+        rates, y1 = stages(method, _field, t, h, y, in_lanes)
+        return y1, error_of(method, rates, h)
 
-    unrolled = solves(jr.solvers.Unrolled(method()))
-    np.testing.assert_allclose(unrolled(8.0), solves(method())(8.0), rtol=1e-13)
-    ends = [unrolled(many * float(steps))[1] for many in (1, 2, 64)]
+    term = diffrax.ODETerm(lambda t, y, _: _field(t, y))
+    memory = solver.init(term, t, t + h, y, None)
+    theirs = solver.step(term, t, t + h, y, None, memory, False)[:2]
+    for found, wanted in zip(ours(t, h, y), theirs, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_steps_are_of_the_order_of_their_method(name):
+    solver, order, count = METHODS[name]
+    method = method_of(solver)
+
+    @quick_jit
+    def end(count):
+        h = 2.0 / count
+
+        def step(i, y):
+            return stages(method, _field, i * h, h, y)[1]
+
+        return jax.lax.fori_loop(0, count.astype(int), step, jnp.array([1.0, 0.0]))[0]
+
+    ends = [end(jnp.array(many * float(count))) for many in (1, 2, 64)]
     assert np.log2(abs(ends[0] - ends[2]) / abs(ends[1] - ends[2])) > order - 0.4
 
 
-@pytest.mark.usefixtures("untyped")
-def test_unrolled_is_for_explicit_methods():
-    with pytest.raises(ValueError, match=r"Argument `solver` must be a AbstractERK"):
-        jr.solvers.Unrolled(diffrax.Kvaerno5())
+@pytest.mark.parametrize("in_lanes", [False, True])
+def test_the_reverse_of_a_step_is_its_transpose(in_lanes):
+    """Beside the derivative that JAX takes of the loop over the stages."""
+    method = method_of(jr.solvers.Verner9())
+
+    def field(strength, t, y):
+        return strength * _field(t, y)
+
+    t, h, y = jnp.array(0.3), jnp.array(0.4), jnp.array([1.0, 0.2])
+    strength, change = jnp.array([0.7, 1.1]), jnp.array([0.3, -2.0])
+
+    def end(strength, y):
+        return stages(method, lambda t, y: field(strength, t, y), t, h, y)[1]
+
+    rates, _ = stages(method, lambda t, y: field(strength, t, y), t, h, y)
+    found = pull_back(method, field, strength, (t, h, y), rates, change, in_lanes)
+    wanted = jax.vjp(end, strength, y)[1](change)
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15)
 
 
 # Motions -------------------------------------------------------------------------------------
@@ -342,6 +377,8 @@ def test_what_is_not_kept_is_run_again(monkeypatch):
         return quick_jit(jax.grad(total))(np.array([1.0, 2.0, 3.0]))
 
     kept = gradient(100_000)
-    monkeypatch.setattr(_pull, "_MOST", 6)
+    monkeypatch.setattr(replay, "_MOST", 6)
+    monkeypatch.setattr(replay, "_FEWEST", 6)
+    monkeypatch.setattr(replay, "_KEPT", 3)
     again = gradient(100_001)
     np.testing.assert_allclose(again, kept, rtol=1e-11)

@@ -161,7 +161,9 @@ def test_a_pure_spin_and_a_separatrix_have_herpolhodes():
     ax = jr.plot.herpolhode(MOMENTS, jr.State(START.attitude, jnp.array([0.0, 0.0, 2.0])))
     assert np.max(np.hypot(*ax.lines[2].get_data())) < 1e-12
     assert ax.get_xlim()[1] > 0.1
-    ax = jr.plot.herpolhode(MOMENTS, jr.State(START.attitude, jnp.array([1.0, 0.2, 1 / 3**0.5])))
+    # These numbers are on the separatrix to the last bit.
+    moments = jnp.array([1.0, 2.5, 4.0])
+    ax = jr.plot.herpolhode(moments, jr.State(START.attitude, jnp.array([1.0, 0.25, 0.5])))
     assert np.hypot(*ax.lines[0].get_data())[0] == 0
 
 

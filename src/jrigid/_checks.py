@@ -1,10 +1,11 @@
-"""The door: arguments become arrays, shapes are checked, values judged, and what is wrong raised.
+"""Input validation: converts arguments, checks shapes and values, raises errors.
 
-Shapes, dtypes and options are checked when a call is traced (ValueError). Values are judged by
+Shapes, dtypes and options are checked when a call is traced (ValueError). Values are checked by
 `Findings`, in three ways that `docs/design.md` tells apart: a formula is NaN outside its domain
-(`where_defined`), a builder raises or is NaN (`Findings.guard`), a working call raises or returns
-its result code (`settle`). An error is raised in Python where the values are known, which leaves
-the compiled function without callbacks, and by `equinox.error_if` inside of someone's jit.
+(`where_defined`), a builder raises or is NaN (`Findings.guard`), a solver or an estimator raises
+or returns its result code (`settle`). An error is raised in Python where the values are known,
+which leaves the compiled function without callbacks, and by `equinox.error_if` inside of someone's
+jit. Calls that raise compile nothing after the first (tests/test_no_leak.py).
 """
 
 import functools
@@ -13,7 +14,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -21,26 +21,36 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jrigid._core.third_party import (
+    EnumerationMeta,
+    code_of,
+    messages_of,
+    names_of,
+    unvmap_any,
+)
+
 Tree = TypeVar("Tree")
 
 INERTIA = (3,), (3, 3)  # shapes of an inertia: principal moments or a tensor
 
 
-class _Listed(type(eqx.Enumeration)):
+class _Listed(EnumerationMeta):
     """Lists the names of an enumeration, each with a text."""
 
     def __dir__(cls) -> list[str]:
-        return [*super().__dir__(), *vars(cls)["_name_to_item"]]
+        return [*super().__dir__(), *names_of(cls)]
 
     def __getitem__(cls, item: Any) -> Any:
-        if isinstance(item, cls) and item._value.ndim and is_concrete(item._value):
-            return np.array(cls.texts)[np.asarray(item._value)]  # a text for each lane
+        if isinstance(item, cls):
+            code = code_of(item)
+            if code.ndim and is_concrete(code):
+                return np.array(cls.texts)[np.asarray(code)]  # a text for each lane
         return super().__getitem__(item) or "All went well."
 
     @property
     def texts(cls) -> list[str]:
         """The texts in the order of the codes."""
-        return [x or "All went well." for x in vars(cls)["_index_to_message"]]
+        return [x or "All went well." for x in messages_of(cls)]
 
 
 class Enumeration(eqx.Enumeration, metaclass=_Listed):
@@ -312,10 +322,12 @@ def where_defined(ok: Bool[Array, ""], formula: Callable[..., Tree], *arguments:
     return nan_where(~ok, formula(*harmless(ok, arguments)))
 
 
-class _Finding(NamedTuple):
-    failed: Array
-    message: str
-    value: Any = None
+class _Diagnosis(NamedTuple):
+    """Which condition fails first, and what each condition would report."""
+
+    first: Array  # index into the other two
+    messages: tuple[str, ...]
+    values: tuple[Any, ...]  # shown behind the message; None for no value
 
 
 class Findings:
@@ -325,69 +337,112 @@ class Findings:
         """Start with nothing found."""
         self.ok: Bool[Array, ""] = jnp.array(True)
         self.result: Any = RESULTS.successful
-        self.all: list[_Finding] = []
+        self._failed: list[Bool[Array, ""]] = []
+        self._messages: list[str] = []
+        self._values: list[Any] = []
 
     def require(
         self, ok: Bool[Array, ""], code: Any, message: str | None = None, value: Any = None
     ) -> None:
-        """Note what is wrong where `ok` is False: a code, a sentence, and the value to show.
+        """Note what is wrong where `ok` is False.
 
-        A builder, which keeps no code, has None and a sentence.
+        Args:
+            ok: Whether the condition holds.
+            code: The result code, or None in a builder, which keeps no code.
+            message: The sentence to report; by default that of the code.
+            value: The value to show behind it.
         """
         if code is not None:
             self.result = RESULTS.where(self.ok & ~ok, code, self.result)
         self.ok = self.ok & ok
-        message = RESULTS[code] if message is None else message
-        self.all.append(_Finding(~ok, str(message), value))
+        self._failed.append(~ok)
+        self._messages.append(str(RESULTS[code] if message is None else message))
+        self._values.append(value)
 
     def guard(self, tree: Tree, throw: bool) -> Tree:
-        """What a builder made: an error where something was found, or NaN without `throw`."""
+        """Return what a builder made; raise if something is wrong, or NaN without `throw`."""
         if not throw:
             return nan_where(~self.ok, tree)
-        return _refuse(tree, ~self.ok, lambda: self.all)
+        return _refuse(tree, ~self.ok, self.diagnosis)
+
+    def diagnosis(self) -> _Diagnosis:
+        """Find out which condition fails first; at least one must have been required."""
+        first = _first_failed(self._failed)
+        return _Diagnosis(first, tuple(self._messages), tuple(self._values))
+
+    def diagnosis_of(self, result: RESULTS) -> _Diagnosis:
+        """As `diagnosis`, but where no condition fails the result code tells what is wrong."""
+        code = code_of(result)
+        first = jnp.where(self.ok, len(self._failed) + code, _first_failed(self._failed))
+        messages = (*self._messages, *RESULTS.texts)
+        values = (*self._values, *[None] * len(RESULTS.texts))
+        return _Diagnosis(first, messages, values)
 
 
-def settle(answer: Tree, throw: bool, findings: Callable[[], Findings]) -> Tree:
-    """What a working call found: an error where its `result` is none to go on with, if `throw`.
+@jax.jit
+def _first_failed(failed: list[Bool[Array, ""]]) -> Array:
+    """The index of the first True; 0 if there is none."""
+    first = jnp.argmax(jax.lax.stop_gradient(jnp.stack(failed)))
+    return first.astype(jnp.int32)  # the type of result codes
+
+
+def settle(
+    answer: Tree,
+    throw: bool,
+    findings: Callable[..., Findings],
+    *arguments: Any,
+) -> Tree:
+    """Return the answer of a solver or an estimator, or raise if it failed and `throw`.
+
+    What is wrong is looked up by a compiled program of its own, which the next failing call uses
+    again. So `findings` must be a function of the module and all else be in the arguments: a
+    closure would be compiled, and kept in memory, anew for each error.
 
     Args:
         answer: With a `result` of `RESULTS`.
         throw: Whether to raise.
-        findings: Looks at the arguments again, to say which of them is wrong.
+        findings: Checks the arguments once more, to tell which of them is wrong.
+        arguments: Passed to `findings`: pytrees of arrays and of hashable configuration.
     """
     if not throw:
         return answer
     result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]
     good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-
-    def found() -> list[_Finding]:
-        ends = [_Finding(~good & (result._value == i), x) for i, x in enumerate(RESULTS.texts)]
-        return findings().all + ends  # what became of the work itself last
-
-    return _refuse(answer, ~good, found)
+    return _refuse(answer, ~good, lambda: _diagnosis(findings, ~good, result, *arguments))
 
 
-def _refuse(tree: Tree, bad: Array, findings: Callable[[], list[_Finding]]) -> Tree:
-    """The tree; an error where `bad`, in Python if that is known now, as under vmap and grad."""
-    some = eqxi.unvmap_any(bad)
-    traced = isinstance(some, jax.core.Tracer)
-    if not traced and not some:
+@eqx.filter_jit
+def _diagnosis(
+    findings: Callable[..., Findings], bad: Array, result: RESULTS, *arguments: Any
+) -> _Diagnosis:
+    """What `findings` and the result code tell of a failed call."""
+    found = findings(*arguments).diagnosis_of(result)
+    first = jnp.where(bad, found.first, 0)
+    values = jax.lax.stop_gradient(jtu.tree_map(jnp.asarray, found.values))
+    return _Diagnosis(first, found.messages, values)
+
+
+def _refuse(tree: Tree, bad: Array, diagnose: Callable[[], _Diagnosis]) -> Tree:
+    """Return the tree; raise where `bad`, in Python if that is known, as under vmap and grad."""
+    some = unvmap_any(bad)
+    if isinstance(some, jax.core.Tracer):
+        found = diagnose()
+        # Of several bad lanes the last message wins.
+        return eqx.branched_error_if(tree, bad, found.first, list(found.messages))
+    if not some:
         return tree
-    found = findings() if traced else eqx.filter_jit(findings)()
-    failed = jnp.stack([jax.lax.stop_gradient(x.failed) for x in found])
-    if traced:  # of several bad lanes the last message wins
-        return eqx.branched_error_if(tree, bad, jnp.argmax(failed), [x.message for x in found])
-    known, each = _all_lanes(bad, failed)
+    found = diagnose()
+    known, firsts = _all_lanes(bad, found.first)
     lane = tuple(np.argwhere(known)[0].tolist())
-    first = found[int(np.argmax(each[lane]))]
+    first = int(firsts[lane])
     details = []
-    if first.value is not None:
-        value = _all_lanes(bad, jax.lax.stop_gradient(jnp.asarray(first.value)))[1][lane]
-        details.append(str(value))
+    if found.values[first] is not None:
+        value = jax.lax.stop_gradient(jnp.asarray(found.values[first]))
+        details.append(str(_all_lanes(bad, value)[1][lane]))
     if lane:
         others = f" and {known.sum() - 1} more" if known.sum() > 1 else ""
         details.append(f"in lane {lane[0] if len(lane) == 1 else lane}{others}")
-    sentence, stop, hint = first.message.partition(". (")
+    sentence, stop, hint = found.messages[first].partition(". (")
     shown = f": {' '.join(details)}" if details else ""
     raise RuntimeError(sentence.rstrip(".") + shown + (stop or ".") + hint)
 

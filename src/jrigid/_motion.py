@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array
 
 from jrigid._checks import (
@@ -29,6 +28,7 @@ from jrigid._checks import (
     settle,
     where_defined,
 )
+from jrigid._core.third_party import used_inputs
 from jrigid._numerics import safe_norm
 from jrigid.dynamics import ExactStates, State
 from jrigid.rotation import normalize
@@ -142,7 +142,7 @@ def check_motion(findings: Findings, system: Any, state: Any, t: Array, args: An
     system.check(findings)
     _check_state(findings, state)
     field = system.vector_field(t, state, args)
-    turning, spinning_up = (safe_norm(x) for x in (state.omega, field.omega))
+    turning, spinning_up = safe_norm(jnp.stack([state.omega, field.omega]))
     rate = jnp.maximum(turning, jnp.where(spinning_up < jnp.inf, jnp.sqrt(spinning_up), 0.0))
     # Rates whose squares, and the last bits of those, are within the range of the dtype.
     info = np.finfo(rate.dtype)
@@ -175,9 +175,7 @@ def solver_of(solver: Any, default: diffrax.AbstractSolver, or_else: str = "") -
 
 def depends_on(function: Callable[[Array], Any], x: Array) -> bool:
     """Whether a function looks at its argument, as far as its program shows."""
-    program = jax.make_jaxpr(function)(x).jaxpr
-    _, (used, *_) = dce_jaxpr(program, [True] * len(program.outvars))
-    return used
+    return used_inputs(jax.make_jaxpr(function)(x))[0]
 
 
 def exact_motion(check: Callable, flow: Callable, throw: bool, *motion: Any) -> ExactStates:
@@ -192,7 +190,7 @@ def exact_motion(check: Callable, flow: Callable, throw: bool, *motion: Any) -> 
     """
     check_shape("t0", motion[-1], ())
     answer = _exact_states(check, flow, *motion)
-    return settle(answer, throw, lambda: _motion_findings(check, *motion))
+    return settle(answer, throw, _motion_findings, check, *motion)
 
 
 def _motion_findings(check: Callable, body: Any, state0: State, ts: Array, t0: Array) -> Findings:

@@ -19,12 +19,12 @@ _SERIES_BELOW = 0.5
 _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
 
-def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector)))
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
     scale = jnp.where(largest == 0, 1.0, largest)
-    scaled = vector / scale
-    return scale * root_of_positive(jnp.sum(scaled * scaled))
+    scaled = vector / scale[..., None]
+    return scale * root_of_positive(jnp.sum(scaled * scaled, axis=-1))
 
 
 def or_one(size: Float[Array, "..."]) -> Float[Array, "..."]:

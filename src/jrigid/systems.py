@@ -73,6 +73,11 @@ class AbstractSystem(Readable):
         self._inertia_and_torque(state)  # which looks at the parts
         return state
 
+    @property
+    def jumps(self) -> Float[Array, " jumps"]:
+        """Times at which the torque says that it is not smooth [s]."""
+        return self.torque.jumps
+
     def torque_on(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """The torque on this body [N m], body components, of torques that know its inertia."""
         return self._inertia_and_torque(state)[1](t, state, args)

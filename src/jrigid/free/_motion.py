@@ -6,10 +6,8 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from equinox.internal import unvmap_any
 from jaxtyping import Array, ArrayLike
 
-from jrigid._as_lanes import as_lanes, some_at_a_time
 from jrigid._checks import (
     INERTIA,
     RESULTS,
@@ -20,6 +18,8 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.lanes import as_lanes, some_at_a_time
+from jrigid._core.third_party import unvmap_any
 from jrigid._motion import exact_motion, plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, from_principal_axes

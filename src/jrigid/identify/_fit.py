@@ -158,7 +158,7 @@ def fit(
     each_body = bodies_of(bodies, throws)
     given = systems, records, tensor, state, options.on_attitude
     prepared = _prepare(*given)
-    prepared = settle(prepared, throw, lambda: findings_of(*given[:-1], prepared.told))
+    prepared = settle(prepared, throw, findings_of, *given[:-1], prepared.told)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and prepared.told is not None:
         count = prepared.told.ts.shape[1]

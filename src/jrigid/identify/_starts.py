@@ -109,6 +109,10 @@ def _samples(padded: bool, ts: Array, *columns: Array) -> tuple[Findings, Array,
     return findings, known, [ts, *(jnp.where(good, x, 0.0) for x in columns)]
 
 
+def _findings(padded: bool, *given: Array) -> Findings:
+    return _samples(padded, *given)[0]
+
+
 @eqx.filter_jit
 def _solved(solve: Callable[..., Any], padded: bool, size: Any, *given: Array) -> LinearStart:
     findings, known, samples = _samples(padded, *given)
@@ -127,7 +131,7 @@ def _answer(
     demand(count >= 4, f"Argument `ts` must hold four times at least, but it holds {count}.")
     given = [ts, *arrays] if ts.ndim == 2 else [x[None] for x in (ts, *arrays)]
     found = _solved(solve, padded, size, *given)
-    return settle(found, throw, lambda: _samples(padded, *given)[0])
+    return settle(found, throw, _findings, padded, *given)
 
 
 def _null_vector(rows: Array) -> tuple[Array, Array]:

@@ -249,7 +249,7 @@ def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
 def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
     """Segments, whether the attitude matters, and steps between two samples."""
     seen = _observed(system, records)
-    settle(seen, True, lambda: findings_of((system,), records, None, None, seen.told))
+    settle(seen, True, findings_of, (system,), records, None, None, seen.told)
     on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
     inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     if seen.data is None or inside or (on_attitude and not seen.has_attitude):

@@ -8,6 +8,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jrigid._core.third_party import code_of, names_of
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._shapes import Fixed, Flat, Symmetric, Tensor, Top
 
@@ -200,8 +201,8 @@ def report(result: FitResult) -> str:
     """The fit in words."""
     if isinstance(result.chi_square, jax.core.Tracer):
         return "FitResult under a transformation"
-    codes = {int(getattr(Status, x)._value): x for x in dir(Status) if x.isupper()}
-    value = np.asarray(result.status._value)
+    codes = dict(enumerate(names_of(Status)))
+    value = np.asarray(code_of(result.status))
     if value.ndim:
         counts = {codes[code]: np.sum(value == code) for code in sorted(codes)}
         text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)

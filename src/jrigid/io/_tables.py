@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid._checks import RESULTS, check_type, demand
+from jrigid._core.third_party import code_of
 from jrigid._extra import extra
 from jrigid.identify import FitResult, Status
 from jrigid.simulate import Trajectory
@@ -26,7 +27,7 @@ def _dataset(variables: dict[str, Any], **attributes: Any) -> Any:
 
 
 def _of_trajectory(motion: Trajectory) -> Any:
-    ts, lanes = np.asarray(motion.ts), np.ndim(motion.result._value)
+    ts, lanes = np.asarray(motion.ts), np.ndim(code_of(motion.result))
     front = tuple(f"lane{i or ''}" for i in range(ts.ndim - 1))
     first = ts[(0,) * len(front)]
     shared = bool(np.all(ts == first))

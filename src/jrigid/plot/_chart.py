@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jrigid._checks import demand
+from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of
 from jrigid.plot._common import flat_axes
 
 # Pale tints of Okabe and Ito's colours, on which black reads.
@@ -116,8 +117,9 @@ def _parts(values: Any, grid: Mapping[str, Any] | None) -> tuple[Any, Any, np.nd
         axes, texts = {x: values[x].values for x in values.dims}, values.attrs.get("flag_meanings")
         about, kinds = {x: values[x].attrs for x in axes}, texts and texts.split()
         values = values.values
-    if hasattr(values, "_enumeration"):
-        kinds, values = values._enumeration.texts, values._value
+    if isinstance(values, EnumerationItem):
+        kinds = enumeration_of(values).texts
+        values = code_of(values)
     values, shape = np.asarray(values), tuple(np.size(x) for x in axes.values())
     kinds = ("False", "True") if values.dtype.kind == "b" else kinds
     ok = len(grid or axes) == values.ndim == 2 and values.shape == shape and min(shape) > 1

@@ -1,6 +1,5 @@
-"""Events: conditions on states, and where between two steps one changed its sign."""
+"""Events: conditions that end a motion, and the exact time at which one is met."""
 
-import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -8,72 +7,92 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
 
-from jrigid._checks import harmless
+from jrigid._stepping.events import Conditions
 
-# Each Newton step doubles the orders of the derivatives that are right: two serve the second.
+# Each Newton step doubles the orders of the derivatives that are right: two serve the
+# second derivative.
 _NEWTON_STEPS = 2
 
 
-def event_of_states(event: Any, t0: Array, to_state: Callable) -> Any:
-    """The event with its conditions called with the time since `t0` and a state as one array."""
-    if event is None:
-        return None
+def condition_of_states(
+    condition: Callable, t0: Array, to_state: Callable, options: dict[str, Any]
+) -> Callable[[Array, Any, Any], Any]:
+    """A condition, called with the time since `t0` and a state as one array.
 
-    def of_states(condition: Callable) -> Callable:
-        known = inspect.signature(condition).parameters.values()
-        every = any(x.kind is x.VAR_KEYWORD for x in known)
-        names = {x.name for x in known}
+    Like diffrax, it is given those of the options by name that it asks for.
+    """
+    known = inspect.signature(condition).parameters.values()
+    every = any(x.kind is x.VAR_KEYWORD for x in known)
+    names = {x.name for x in known}
+    asked = {name: x for name, x in options.items() if every or name in names}
 
-        def wrapped(t: Array, y: Any, args: Any, **options: Any) -> Any:
-            asked = {name: x for name, x in options.items() if every or name in names}
-            return condition(t0 + t, to_state(y), args, **asked)
+    def of_array(t: Array, y: Any, args: Any) -> Any:
+        return condition(t0 + t, to_state(y), args, **asked)
 
-        return wrapped
-
-    conditions = jtu.tree_map(of_states, event.cond_fn, is_leaf=callable)
-    return dataclasses.replace(event, cond_fn=conditions)
+    return of_array
 
 
-def where_it_happened(final: Any, event: Any, args: Any, options: Any) -> tuple[Array, Any]:
-    """Time and state at which a real condition changed its sign within the last step.
+def conditions_of(
+    each: list[Callable],
+    direction: Any,
+    values: Callable,
+    example: tuple[Array, Array],
+    args: Any,
+) -> Conditions:
+    """The conditions of an event.
 
-    By bisection, which cannot miss. Where no condition ended the loop, or a boolean one did, they
-    are those of its end.
+    Args:
+        each: Functions of (t, y, args).
+        direction: As that of `diffrax.Event`.
+        values: Of (arrays, t, y): one value for each condition.
+        example: A time and a state.
+        args: Passed to the conditions.
+    """
+    shapes = [jax.eval_shape(x, *example, args) for x in each]
+    boolean = tuple(jnp.issubdtype(x.dtype, jnp.bool_) for x in shapes)
+    directions = tuple(jtu.tree_leaves(direction, is_leaf=lambda x: x is None))
+    return Conditions(values, boolean, directions)
+
+
+def place_of_event(
+    field: Callable[[Array, Array], Array],
+    value: Callable[[Array, Array], Array],
+    finder: optx.AbstractRootFinder | None,
+    t: Float[Array, ""],
+    y: Float[Array, " n"],
+    met: Bool[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    """Time and state at which a condition is zero, from a place very near to it.
 
     Gradients: those of the implicit function, of first and second order, in every mode.
+
+    Args:
+        field: The vector field, of time and state.
+        value: Of the condition, of time and state.
+        finder: A root finder to use in place of Newton's method.
+        t: The time; it has no derivatives.
+        y: The state at that time.
+        met: Whether such a condition ended the motion.
     """
-    conditions, masks, values = (
-        jtu.tree_leaves(x, is_leaf=callable)
-        for x in (event.cond_fn, final.event_mask, final.event_values)
-    )
-    real = jnp.array([jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in values])
-    ended = jnp.stack(masks) & real
-    happened = jnp.any(ended)
-    late = jnp.where(happened, final.event_tnext, final.event_tprev + 1)
-    interpolant = options["solver"].interpolation_cls(
-        t0=final.event_tprev, t1=late, **harmless(happened, final.event_dense_info)
-    )
-    early, late = jax.lax.stop_gradient((final.event_tprev, late))
 
-    def distance(t: Array) -> Array:
-        y = interpolant.evaluate(t)
-        values = [jnp.asarray(f(t, y, args, **options), t.dtype) for f in conditions]
-        return jnp.sum(jnp.where(ended, jnp.stack(values), 0.0))
+    def later(dt: Array) -> Array:
+        """By the midpoint rule, whose derivatives are right to second order."""
+        middle = y + 0.5 * dt * field(t, y)
+        return y + dt * field(t + 0.5 * dt, middle)
 
-    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        middle = low + 0.5 * (high - low)
-        beyond = jnp.sign(jax.lax.stop_gradient(distance(middle))) == sign
-        return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
+    def distance(dt: Array, _: Any = None) -> Array:
+        return value(t + dt, later(dt))
 
-    sign = jnp.sign(jax.lax.stop_gradient(distance(late)))
-    bits = jnp.finfo(late.dtype).nmant + 8
-    t = jax.lax.fori_loop(0, bits, halve, (early, late))[1]
-    level = jax.lax.stop_gradient(distance(t))
-    for _ in range(_NEWTON_STEPS):  # these leave the value as it is
-        value, slope = jax.jvp(distance, (t,), (jnp.ones_like(t),))
-        t = t - jnp.where(slope == 0, 0.0, (value - level) / jnp.where(slope == 0, 1.0, slope))
-    y = jtu.tree_map(lambda x, end: jnp.where(happened, x, end), interpolant.evaluate(t), final.y)
-    return jnp.where(happened, t, final.tprev), y
+    dt = jnp.zeros_like(t)
+    if finder is not None:
+        found = optx.root_find(distance, finder, dt, throw=False)
+        dt = jnp.where(met, found.value, 0.0)
+    else:
+        for _ in range(_NEWTON_STEPS):
+            now, slope = jax.jvp(distance, (dt,), (jnp.ones_like(dt),))
+            usable = met & (slope != 0)
+            dt = dt - jnp.where(usable, now / jnp.where(usable, slope, 1.0), 0.0)
+    return t + dt, later(dt)

@@ -5,23 +5,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._checks import RESULTS, Findings, check_type, is_concrete, whole_number
-from jrigid._motion import check_motion, numbers, resolves, solver_of
-from jrigid._scales import spectral_radius, undamped_rate, units
-from jrigid.simulate._controller import constant
-from jrigid.solvers import ExactFree, Splitting, Unrolled, Verner9
+from jrigid._checks import check_type, is_concrete, whole_number
+from jrigid._motion import numbers, solver_of
+from jrigid._stepping.scales import spectral_radius, undamped_rate
+from jrigid.solvers import ExactFree, Splitting, Verner9
 from jrigid.systems import AbstractSystem, RigidBody
 
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
-_SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
+SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
-_CHECKPOINTS = 100
-_RATE_BITS = 16  # of the rate that bounds the steps
 _ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
 
 
@@ -33,6 +29,15 @@ class Inputs(NamedTuple):
     ts: Array
     t0: Array
     args: Any
+    jumps: Array
+
+    @property
+    def jumps_since_start(self) -> Array:
+        """Times at which the vector field is not smooth, since the start, in order."""
+        if self.jumps.size == 0:
+            return jnp.zeros(0, self.state0.omega.dtype)
+        jumps = (self.jumps - self.t0).astype(self.state0.omega.dtype)
+        return jnp.sort(jnp.where(jnp.isfinite(jumps), jumps, jnp.inf))
 
     @property
     def since_start(self) -> Array:
@@ -56,13 +61,6 @@ class Options(NamedTuple):
     meter: Any
 
     @property
-    def in_lanes(self) -> bool:
-        """Whether an explicit method is to run in lanes, alone in one or under vmap with others."""
-        plain = self.event is None and isinstance(self.meter, diffrax.NoProgressMeter)
-        direct = isinstance(self.adjoint, diffrax.DirectAdjoint)
-        return plain and not direct
-
-    @property
     def is_implicit(self) -> bool:
         """True of a solver that may step over what is damped."""
         return isinstance(self.solver, diffrax.AbstractImplicitSolver)
@@ -84,14 +82,13 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
             )
     elif not isinstance(solver, ExactFree):
         solver = solver_of(solver, Verner9(), ", or ExactFree() or Splitting()")
-        solver = solver.solver if isinstance(solver, Unrolled) else solver
     elif not (isinstance(system, RigidBody) and system.is_free):
         raise ValueError(
             "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
             "torque, but it is."
         )
     if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_CHECKPOINTS)
+        adjoint = diffrax.RecursiveCheckpointAdjoint()
     check_type("adjoint", adjoint, *_ADJOINTS)
     if max_steps is None:
         direct = isinstance(adjoint, diffrax.DirectAdjoint)
@@ -105,7 +102,7 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
     rtol = _DEFAULT_RTOL[size] if rtol is None else rtol
     limits = {"rtol": rtol, "atol": rtol if atol is None else atol}
     arrays = numbers(**limits, max_step=jnp.inf if max_step is None else max_step)
-    smallest = _SMALLEST_RTOL[size]
+    smallest = SMALLEST_RTOL[size]
     for name, value in limits.items():  # what is known now; the rest is judged
         if is_concrete(value) and not smallest <= float(value) < 1:
             raise ValueError(
@@ -121,27 +118,3 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
     rtol, atol, max_step = (x.astype(dtype) for x in arrays)
     max_steps = whole_number("max_steps", max_steps)
     return Options(solver, rtol, atol, adjoint, max_steps, max_step, event, meter)
-
-
-def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, ...]]:
-    """Every bad value that goes into an integration; the units in which it is measured."""
-    inputs = constant(inputs)
-    system, state0, ts, t0, args = inputs
-    findings, flat, since_start = Findings(), ts.reshape(-1), inputs.since_start
-    smallest = _SMALLEST_RTOL[since_start.dtype.itemsize]
-    for x in (options.rtol, options.atol):
-        findings.require((x >= smallest) & (x < 1), RESULTS.invalid_tolerance, value=x)
-    findings.require(options.max_step > 0, RESULTS.invalid_max_step, value=options.max_step)
-    before = jnp.concatenate([t0[None], flat[:-1]])
-    wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
-    findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=flat[jnp.argmax(wrong)])
-    start = t0.astype(since_start.dtype)
-    check_motion(findings, system, state0, start, args)
-    fastest, scales = jax.lax.stop_gradient(
-        units(system, state0, since_start[-1], start, args, options.fastest_of)
-    )
-    # A compiler rounds differently in different lanes of a vmap; their steps are to be the same.
-    bits = jnp.finfo(fastest.dtype).nexp
-    fastest = jax.lax.reduce_precision(fastest, exponent_bits=bits, mantissa_bits=_RATE_BITS)
-    findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
-    return findings, (fastest, scales)

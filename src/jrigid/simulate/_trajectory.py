@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from jrigid._core.third_party import code_of
 from jrigid._types import Readable
 from jrigid.systems import AbstractSystem
 
@@ -61,7 +62,7 @@ class Trajectory(Readable):
         return self._each(lambda system, t, state, args: system.angular_momentum(t, state, args))
 
     def _each(self, fn: Callable[..., Array]) -> Array:
-        lanes = jnp.ndim(self.result._value)
+        lanes = jnp.ndim(code_of(self.result))
 
         def one(ts: Array, states: Any, system: Any, args: Any) -> Array:
             flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[ts.ndim :]), states)

@@ -3,5 +3,4 @@
 from jrigid.solvers._exact import ExactFree as ExactFree
 from jrigid.solvers._exact import FreeRotation as FreeRotation
 from jrigid.solvers._splitting import Splitting as Splitting
-from jrigid.solvers._unrolled import Unrolled as Unrolled
 from jrigid.solvers._verner import Verner9 as Verner9

@@ -20,7 +20,7 @@ from jrigid._checks import (
 )
 from jrigid._motion import harmless_motion
 from jrigid._numerics import safe_norm
-from jrigid._scales import spread
+from jrigid._stepping.scales import spread
 from jrigid._types import Readable, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.rotation import exp, multiply, rotate, rotate_inverse
@@ -146,7 +146,7 @@ def linearize(
             "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
             "but it is not."
         )
-    return settle(_linearize(frame), throw, lambda: _findings(frame)[0])
+    return settle(_linearize(frame), throw, _findings, frame)
 
 
 class _Frame(NamedTuple):
@@ -230,7 +230,11 @@ def _accuracy(dtype: Any) -> Scalar:
     return 64 * jnp.sqrt(jnp.finfo(dtype).eps)
 
 
-def _findings(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
+def _findings(frame: _Frame) -> Findings:
+    return _looked_at(frame)[0]
+
+
+def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
     """What is wrong; the frame, harmless where it is, the matrix in it, and the rate."""
     findings = findings_of(frame.motion)
     for name, value in (("body_rate", frame.own), ("space_axis", frame.up)):
@@ -260,7 +264,7 @@ def _findings(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
 
 @eqx.filter_jit
 def _linearize(frame: _Frame) -> Linearization:
-    findings, frame, matrix, rate = _findings(frame)
+    findings, frame, matrix, rate = _looked_at(frame)
     ok, units, accuracy = findings.ok, frame.units(rate), _accuracy(rate.dtype)
     known = jax.lax.stop_gradient
     eye = jnp.eye(units.size, dtype=units.dtype)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
-from jrigid._as_lanes import in_blocks
 from jrigid._checks import RESULTS, Enumeration, Findings, array_of_shape, settle, whole_number
+from jrigid._core.lanes import in_blocks
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._steps import Motion, Walk, findings_of, motion_of, orthonormal, verdict, walk
@@ -209,7 +209,7 @@ def lyapunov_spectrum(
     """
     motion = motion_of(system, state0, args, t0, duration, solver)
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
-    return settle(_growth(motion, plan, rows)[0], throw, lambda: _findings(motion, rows))
+    return settle(_growth(motion, plan, rows)[0], throw, _findings, motion, rows)
 
 
 def megno(
@@ -268,4 +268,4 @@ def megno(
     if vector is not None:
         vector = array_of_shape("vector", vector, motion.dimension)[None]
     plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vector, 1)
-    return settle(_growth(motion, plan, rows)[1], throw, lambda: _findings(motion, rows))
+    return settle(_growth(motion, plan, rows)[1], throw, _findings, motion, rows)

@@ -128,14 +128,14 @@ def boundary(
     ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     falls = known[0] > known[1]
 
-    def rising(x: Array, args: tuple) -> Array:
-        value = jnp.asarray(function(lower + (upper - lower) * x, *args), lower.dtype)
-        return jnp.where(ok, jnp.where(falls, -value, value), x - 0.5)
-
+    # No closure, which would be compiled anew, and kept in memory, at each call.
+    rising = eqx.Partial(_rising, function)
+    interval = lower, upper, ok, falls
     tolerance = 64 * float(jnp.finfo(lower.dtype).eps) if rtol is None else rtol
-    place = place_of_root(rising, args, tolerance, lower.dtype)
+    place = place_of_root(rising, (interval, args), tolerance, lower.dtype)
     # At a pole, or a jump, or where it is NaN between the ends, there is no root.
-    left = jnp.abs(jax.lax.stop_gradient(rising(jax.lax.stop_gradient(place), fixed)))
+    at_root = rising(jax.lax.stop_gradient(place), (interval, fixed))
+    left = jnp.abs(jax.lax.stop_gradient(at_root))
     findings = Findings()
     message = (
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
@@ -143,3 +143,13 @@ def boundary(
     )
     findings.require(ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends)
     return findings.guard(lower + (upper - lower) * place, throw)
+
+
+def _rising(function: Callable[..., Any], x: Array, arguments: tuple[Any, Any]) -> Array:
+    """The function at a place in the interval, its sign such that it rises.
+
+    Where the interval holds no change of sign it is some function that has a root.
+    """
+    (lower, upper, ok, falls), args = arguments
+    value = jnp.asarray(function(lower + (upper - lower) * x, *args), lower.dtype)
+    return jnp.where(ok, jnp.where(falls, -value, value), x - 0.5)

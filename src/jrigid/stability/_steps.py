@@ -12,8 +12,9 @@ from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, all_positive, nan_where
 from jrigid._motion import check_motion, harmless_motion, motion_arguments, solver_of
-from jrigid._runge_kutta import kept_apart, runge_kutta_step
-from jrigid._scales import units
+from jrigid._stepping.method import method_of
+from jrigid._stepping.scales import units
+from jrigid._stepping.step import error_of, stages
 from jrigid.dynamics import State
 from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import RigidBody
@@ -123,16 +124,12 @@ class Walk(NamedTuple):
         memory = solver.init(term, t, end, y, None)
         return solver.step(term, t, end, y, None, memory, made_jump=False)[:3]
 
-    def advance(self, t: Array, y: Array, true: Array) -> tuple[Array, Array]:
-        """One step, and the local error of the state. `true`: as of `kept_apart`."""
+    def advance(self, t: Array, y: Array, in_lanes: bool = False) -> tuple[Array, Array]:
+        """One step, and the local error of the state."""
         if isinstance(self.motion.solver, diffrax.AbstractERK):
-            rates = kept_apart(self._together, true)
-
-            def rate_at(fraction: float, y: Array) -> Array:
-                return rates(t + fraction * self.step, y)
-
-            tableau, before = self.motion.solver.tableau, rate_at(0.0, y)
-            after, error, *_ = runge_kutta_step(tableau, rate_at, self.step, y, before)
+            method = method_of(self.motion.solver)
+            rates, after = stages(method, self._together, t, self.step, y, in_lanes)
+            error = error_of(method, rates, self.step)
         else:
             after, error, _ = self._solve(t, y)
         return self.on_sphere(after), jnp.max(jnp.abs(error[: self.scales.size]) / self.scales)
@@ -151,7 +148,7 @@ class Walk(NamedTuple):
             y, error = carry
             number = first + i
             t = self.motion.t0 + self.step * number.astype(y.dtype)
-            y, local = self.advance(t, y, number >= 0)
+            y, local = self.advance(t, y, in_lanes=True)
             return (y, jnp.maximum(error, local)), None
 
         return jax.lax.scan(step, (y, jnp.zeros((), y.dtype)), jnp.arange(count))[0]

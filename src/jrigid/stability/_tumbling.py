@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
-from jrigid._as_lanes import in_blocks
 from jrigid._checks import (
     INERTIA,
     RESULTS,
@@ -27,6 +26,7 @@ from jrigid._checks import (
     where_defined,
     whole_number,
 )
+from jrigid._core.lanes import in_blocks
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
@@ -121,7 +121,7 @@ def poincare_section(
     crossings, steps = whole_number("crossings", crossings), whole_number("steps", steps)
     motion = motion_of(system, state0, args, t0, step, solver)
     section = _section(motion, condition, crossings, direction, steps)
-    return settle(section, throw, lambda: _section_findings(motion, condition))
+    return settle(section, throw, _section_findings, motion, condition)
 
 
 def _section_findings(motion: Motion, condition: Callable) -> Findings:
@@ -158,7 +158,7 @@ def _section(
 
         def step(search: tuple[_Place, Array]) -> tuple[_Place, Array]:
             (t, y, above, _, error), count = search
-            after, local = path.advance(t, y, count >= 0)
+            after, local = path.advance(t, y)
             later = start.t + path.step * (count + 1).astype(t.dtype)
             higher = value(later, after) >= 0
             crosses = (higher != above) & (direction is None or higher == direction)
@@ -310,7 +310,7 @@ def final_spin(
     """
     steps = whole_number("steps", steps)
     motion = motion_of(system, state0, args, t0, duration, solver)
-    return settle(_final_spin(motion, steps), throw, lambda: findings_of(motion))
+    return settle(_final_spin(motion, steps), throw, findings_of, motion)
 
 
 @eqx.filter_jit

@@ -12,9 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jrigid._checks import RESULTS, all_finite, float_arrays
-
-_Code = type(RESULTS.successful)  # an item of any enumeration
+from jrigid._checks import all_finite, float_arrays
+from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of, names_of
 
 
 class Grid(NamedTuple):
@@ -125,8 +124,8 @@ def _list_of(points: Any) -> Grid:
 
 def _defined(values: Any) -> Bool[Array, ""]:
     """Whether all numbers are finite and no code is `undefined`."""
-    leaves = jtu.tree_leaves(values, is_leaf=lambda x: isinstance(x, _Code))
-    codes = [x for x in leaves if isinstance(x, _Code)]
+    leaves = jtu.tree_leaves(values, is_leaf=lambda x: isinstance(x, EnumerationItem))
+    codes = [x for x in leaves if isinstance(x, EnumerationItem)]
     if not codes and not any(eqx.is_inexact_array(x) for x in leaves):
         raise ValueError(
             "Argument `function` must return floats, NaN where it is undefined, or codes, but it "
@@ -134,7 +133,7 @@ def _defined(values: Any) -> Bool[Array, ""]:
         )
     defined = all_finite(leaves)
     for code in codes:
-        undefined = getattr(code._enumeration, "undefined", None)
+        undefined = getattr(enumeration_of(code), "undefined", None)
         defined = defined if undefined is None else defined & (code != undefined)
     return defined
 
@@ -203,12 +202,12 @@ def leaves_of(values: Any, axes: Iterable[str]) -> list[Leaf]:
     found: list[Leaf] = []
     names = {*axes, VALID.name}
     beyond = len(names) - 1
-    paths, _ = jtu.tree_flatten_with_path(values, is_leaf=lambda x: isinstance(x, _Code))
+    paths, _ = jtu.tree_flatten_with_path(values, is_leaf=lambda x: isinstance(x, EnumerationItem))
     for path, value in paths:
         codes: tuple[str, ...] = ()
-        if isinstance(value, _Code):
-            codes = tuple(vars(value._enumeration)["_name_to_item"])
-            value = value._value
+        if isinstance(value, EnumerationItem):
+            codes = names_of(enumeration_of(value))
+            value = code_of(value)
         dtype = np.dtype(value.dtype)
         if codes:
             fill: Any = codes.index("undefined") if "undefined" in codes else -1

@@ -16,11 +16,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from jrigid._core.third_party import ClosedJaxpr, Jaxpr, Literal
 from jrigid._extra import extra
 from jrigid.sweep._grid import VALID, Grid, Leaf
 
@@ -36,18 +36,18 @@ _CONVENTIONS = {"Conventions": "CF-1.11"}
 
 def _constants(jaxpr: Any) -> Iterator[Any]:
     """Arrays that a traced function holds, also in what it calls."""
-    if isinstance(jaxpr, jex.ClosedJaxpr):
+    if isinstance(jaxpr, ClosedJaxpr):
         yield from jaxpr.consts
         jaxpr = jaxpr.jaxpr
     for eqn in jaxpr.eqns:
-        yield from (x.val for x in eqn.invars if isinstance(x, jex.Literal))
+        yield from (x.val for x in eqn.invars if isinstance(x, Literal))
         for value in jtu.tree_leaves(list(eqn.params.values()), is_leaf=_is_jaxpr):
             if _is_jaxpr(value):
                 yield from _constants(value)
 
 
 def _is_jaxpr(value: Any) -> bool:
-    return isinstance(value, jex.ClosedJaxpr | jex.Jaxpr)
+    return isinstance(value, ClosedJaxpr | Jaxpr)
 
 
 def _digest(*values: Any) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import (
@@ -132,6 +133,18 @@ class AbstractTorque(Readable):
         `RigidBody` and `FloatingBody` ask for it at every use, with their own inertia.
         """
         return self
+
+    @property
+    def jumps(self) -> Float[Array, " jumps"]:
+        """Times at which the torque is not smooth [s]; steps of `simulate` end there.
+
+        By default they are those that its parts declare: torques in a sum, a `Sampled` in
+        a field. A subclass that switches at known times returns these.
+        """
+        parts = jtu.tree_leaves(self, is_leaf=lambda x: x is not self and hasattr(x, "jumps"))
+        known = [jnp.zeros(0), *(x.jumps for x in parts if hasattr(x, "jumps"))]
+        dtype = jnp.result_type(*known)
+        return jnp.concatenate([x.astype(dtype) for x in known])
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if the torque has none."""

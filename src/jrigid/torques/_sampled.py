@@ -41,6 +41,11 @@ class Sampled(Readable):
         """Raise ValueError for shapes that do not belong together."""
         check_shape("values", self.values, (*self.ts.shape, *self.values.shape[1:]))
 
+    @property
+    def jumps(self) -> Float[Array, " n"]:
+        """Times at which the function is not smooth: those of the samples [s]."""
+        return self.ts + self.delay.astype(self.ts.dtype)
+
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
         ts, values = self.ts, self.values

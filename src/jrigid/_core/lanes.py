@@ -1,7 +1,8 @@
 """What `jax.vmap` of a motion calls: lanes, some at a time."""
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._lanes_last import lanes_last
+from jrigid._core.lanes_last import lanes_last
 
 # So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
 # Elsewhere than on a CPU many more are needed to keep it busy.
@@ -58,87 +59,129 @@ def some_at_a_time(function: Callable[..., Any], order: Array, *lanes: Any) -> A
     return jtu.tree_map(in_place, jax.lax.map(block, order.reshape(-1, width)))
 
 
-def as_lanes(function: Callable[..., Any], problem: Any, *own: Any, tangents: Any = None) -> Any:
+def as_lanes(
+    function: Callable[..., Any],
+    problem: Any,
+    *own: Any,
+    tangents: Any = None,
+    alone: Callable[..., Any] | None = None,
+) -> Any:
     """`function(problem, nothing, *own)`; under vmap `function(shared, each, *own)` of all lanes.
 
     The leaves of `each` and of `own` have a lane to each index in front; what is shared has none.
     With tangents `function` takes one argument more and gives a pair, of which the second depends
-    on it: where only they have another axis it is they alone that are mapped.
+    on it: where only they have another axis it is they alone that are mapped. `alone` serves what
+    is not mapped, as `alone(problem, *own)`, where that is another function.
     """
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, structure = jtu.tree_flatten((arrays, own, tangents))
     motions = len(leaves) - len(jtu.tree_leaves(tangents))
+    call = _Call(function, alone, static, structure, motions, tangents is not None)
+    of_one = jax.custom_batching.custom_vmap(call.single)
 
-    def called(problem: Any, each: Any, own: Any, tangents: Any) -> Any:
-        with_tangents = () if tangents is None else (tangents,)
-        return function(eqx.combine(problem, static), each, *own, *with_tangents)
-
-    def single(*leaves: Any) -> Any:
-        problem, *own = structure.unflatten(leaves)
-        nothing = jtu.tree_map(lambda _: None, problem)
-        found = called(problem, nothing, *jtu.tree_map(lambda x: x[None], own))
-        return jtu.tree_map(lambda x: x[0], found)
-
-    def several(*leaves: Any) -> Any:
-        """Tangents of one motion."""
-        problem, own, tangents = structure.unflatten(leaves)
-
-        def push(shared: Any, each: Any, *own: Any) -> Any:
-            shared = eqx.filter(shared, eqx.is_array)
-            along = lambda x: called(shared, each, own[:-1], x)  # noqa: E731
-            return jax.vmap(along, in_axes=1, out_axes=(None, 1))(own[-1])
-
-        return as_lanes(push, eqx.combine(problem, static), *own, tangents=tangents)
-
-    def of_all(leaves: Any, batched: Any) -> Any:
-        count = next(x.shape[0] for x, has in zip(leaves, batched, strict=True) if has)
-        (problem, *own), (has, *own_has) = structure.unflatten(leaves), structure.unflatten(batched)
-        each, shared = eqx.partition(problem, has)
-        own = jtu.tree_map(
-            lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), own, own_has
-        )
-        return called(shared, each, *own)
-
-    def batch(leaves: Any, batched: Any) -> Any:
-        @jax.custom_batching.custom_vmap
-        def lanes(*leaves: Any) -> Any:
-            return of_all(leaves, batched)
-
-        @lanes.def_vmap
-        def _(size: int, again: Any, *leaves: Any) -> tuple[Any, Any]:
-            """Lanes of lanes are lanes."""
-            if not any(again):
-                return _without_axis(of_all(leaves, batched))
-            if not any(again[:motions]):
-                axes = [0 if has else None for has in again]
-                found = jax.vmap(lambda *x: of_all(x, batched), axes, (None, 0))(*leaves)
-                return _of_tangents(found)
-            flags = list(zip(leaves, batched, again, strict=True))
-            count = next(x.shape[1 if out else 0] for x, has, out in flags if has)
-
-            flat = [_flat(*x, size, count) for x in flags]
-            found = batch(flat, [has or out for _, has, out in flags])
-            found = jtu.tree_map(lambda x: x.reshape(size, count, *x.shape[1:]), found)
-            return found, jtu.tree_map(lambda _: True, found)
-
-        return lanes(*leaves)
-
-    alone = jax.custom_batching.custom_vmap(single)
-
-    @alone.def_vmap
+    @of_one.def_vmap
     def _(size: int, batched: Any, *leaves: Any) -> tuple[Any, Any]:
         if not any(batched):
-            return _without_axis(single(*leaves))
+            return _without_axis(call.single(*leaves))
         if not any(batched[:motions]):
             spread = [
                 x if has or i < motions else jnp.broadcast_to(x, (size, *x.shape))
                 for i, (x, has) in enumerate(zip(leaves, batched, strict=True))
             ]
-            return _of_tangents(several(*spread))
-        found = batch(leaves, batched)
+            return _of_tangents(call.several(*spread))
+        found = call.batch(leaves, batched)
         return found, jtu.tree_map(lambda _: True, found)
 
-    return alone(*leaves)
+    return of_one(*leaves)
+
+
+class _Call(NamedTuple):
+    """A call of `as_lanes`, whose arguments come as their leaves.
+
+    Attributes:
+        function: Of what lanes share, what is their own, and more that is their own.
+        alone: In place of it for one motion, or None.
+        static: The parts of the problem that are no arrays.
+        structure: Of the arguments: the problem, what is a lane's own, tangents.
+        motions: How many of the leaves are no tangents.
+        with_tangents: Whether there are tangents.
+    """
+
+    function: Callable[..., Any]
+    alone: Callable[..., Any] | None
+    static: Any
+    structure: Any
+    motions: int
+    with_tangents: bool
+
+    def called(self, problem: Any, each: Any, own: Any, tangents: Any) -> Any:
+        """The function's result for lanes."""
+        more = (tangents,) if self.with_tangents else ()
+        return self.function(eqx.combine(problem, self.static), each, *own, *more)
+
+    def single(self, *leaves: Any) -> Any:
+        """The result for one motion."""
+        problem, own, tangents = self.structure.unflatten(leaves)
+        if self.alone is not None:
+            more = (tangents,) if self.with_tangents else ()
+            return self.alone(eqx.combine(problem, self.static), *own, *more)
+        own = (own, tangents)
+        nothing = jtu.tree_map(lambda _: None, problem)
+        found = self.called(problem, nothing, *jtu.tree_map(lambda x: x[None], own))
+        return jtu.tree_map(lambda x: x[0], found)
+
+    def several(self, *leaves: Any) -> Any:
+        """The result for several tangents of one motion."""
+        problem, own, tangents = self.structure.unflatten(leaves)
+
+        def push(shared: Any, each: Any, *own: Any) -> Any:
+            shared = eqx.filter(shared, eqx.is_array)
+            along = lambda x: self.called(shared, each, own[:-1], x)  # noqa: E731
+            return jax.vmap(along, in_axes=1, out_axes=(None, 1))(own[-1])
+
+        def push_alone(problem: Any, *own: Any) -> Any:
+            assert self.alone is not None
+            along = partial(self.alone, problem, *own[:-1])
+            return jax.vmap(along, out_axes=(None, 0))(own[-1])
+
+        problem = eqx.combine(problem, self.static)
+        one = None if self.alone is None else push_alone
+        return as_lanes(push, problem, *own, tangents=tangents, alone=one)
+
+    def of_all(self, leaves: Any, batched: Any) -> Any:
+        """The result for lanes, from leaves some of which have an axis of lanes in front."""
+        count = next(x.shape[0] for x, has in zip(leaves, batched, strict=True) if has)
+        (problem, *own), (has, *own_has) = (self.structure.unflatten(x) for x in (leaves, batched))
+        each, shared = eqx.partition(problem, has)
+        own = jtu.tree_map(
+            lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), own, own_has
+        )
+        return self.called(shared, each, *own)
+
+    def batch(self, leaves: Any, batched: Any) -> Any:
+        """The same, which can be mapped again."""
+
+        @jax.custom_batching.custom_vmap
+        def lanes(*leaves: Any) -> Any:
+            return self.of_all(leaves, batched)
+
+        @lanes.def_vmap
+        def _(size: int, again: Any, *leaves: Any) -> tuple[Any, Any]:
+            """Lanes of lanes are lanes."""
+            if not any(again):
+                return _without_axis(self.of_all(leaves, batched))
+            if not any(again[: self.motions]):
+                axes = [0 if has else None for has in again]
+                each = jax.vmap(lambda *x: self.of_all(x, batched), axes, (None, 0))
+                return _of_tangents(each(*leaves))
+            flags = list(zip(leaves, batched, again, strict=True))
+            count = next(x.shape[1 if out else 0] for x, has, out in flags if has)
+            flat = [_flat(*x, size, count) for x in flags]
+            found = self.batch(flat, [has or out for _, has, out in flags])
+            found = jtu.tree_map(lambda x: x.reshape(size, count, *x.shape[1:]), found)
+            return found, jtu.tree_map(lambda _: True, found)
+
+        return lanes(*leaves)
 
 
 def _without_axis(found: Any) -> tuple[Any, Any]:
@@ -157,4 +200,5 @@ def _flat(x: Array, has: bool, out: bool, size: int, count: int) -> Array:
         return x
     x = x if out else x[None]
     x = x if has else x[:, None]
-    return jnp.broadcast_to(x, (size, count, *x.shape[2:])).reshape(-1, *x.shape[2:])
+    x = jnp.broadcast_to(x, (size, count, *x.shape[2:]))
+    return x.reshape(size * count, *x.shape[2:])

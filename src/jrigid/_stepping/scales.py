@@ -7,69 +7,86 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jrigid._checks import internal_parts
 from jrigid._numerics import power_of_two, safe_norm
 from jrigid.systems import AbstractSystem, FloatingState
 
+# Squarings of the Jacobian whose norm estimates its spectral radius.
+_SQUARINGS = 6
 
-def jacobian(vector_field: Callable, t: Array, y: Array, args: Any, scales: Array) -> Array:
-    """Jacobian of the vector field by differences, which ask nothing of a torque but its value.
 
-    Of the components in their scales. A row for each of y: the transpose of the usual one.
+def jacobian(
+    field: Callable[[Array], Array], y: Float[Array, " n"], scales: Float[Array, " n"]
+) -> Float[Array, "n n"]:
+    """Jacobian of a vector field by differences, which need nothing but its values.
+
+    Of the components in their scales; a row for each component of the state.
     """
-    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, jnp.abs(y / scales))
-    nudges = jnp.concatenate([jnp.zeros_like(y)[None], jnp.diag(step * scales)])
-    rates = jax.vmap(lambda nudge: vector_field(t, y + nudge, args))(nudges)
+    largest = jnp.maximum(1.0, jnp.abs(y / scales))
+    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest
+    # The first row is the place itself.
+    which = np.eye(y.size + 1, y.size, k=-1, dtype=y.dtype)
+    rates = jax.vmap(lambda row: field(y + row * step * scales))(which)
     return (rates[1:] - rates[:1]) / (step[:, None] * scales[None])
 
 
 def rate_along(
-    field: Callable[[Array], Array], y: Array, base: Array, direction: Array, scales: Array
-) -> tuple[Array, Array]:
-    """Rate of the linearised motion from a small displacement, and where that points in the end.
+    field: Callable[[Array], Array],
+    y: Float[Array, " n"],
+    base: Float[Array, " n"],
+    direction: Float[Array, " n"],
+    scales: Float[Array, " n"],
+) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    """Rate of the linearised motion from a small displacement, and where that points then.
 
-    Called from step to step it is a power iteration, which finds the fastest rate. Twice the
-    Jacobian, since once does not tell the rate of an oscillation.
+    Called from step to step it is a power iteration, which finds the fastest rate. It
+    takes the Jacobian twice: once does not tell the rate of an oscillation.
 
     Args:
-        field: Rates at a place: of one motion, or of lanes, which are last.
+        field: Rates at a place.
         y: The place.
         base: The rates there.
         direction: Of the displacement, of length 1 in the scales.
         scales: Of the components.
     """
-    largest = jnp.max(jnp.abs(y / scales), axis=0)
-    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * jnp.maximum(1.0, largest)[None] * scales
+    largest = jnp.maximum(1.0, jnp.max(jnp.abs(y / scales)))
+    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest * scales
 
-    def change(direction: Array) -> tuple[Array, Array]:
-        there = y + nudge * direction
-        rates = (field(there) - base) / nudge
-        length = jnp.sqrt(jnp.sum(rates * rates, axis=0))
-        unit = rates / jnp.where(length > 0, length, 1.0)[None]
-        return length, jnp.where((length > 0)[None], unit, direction)
+    def change(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        rate, direction = carry
+        rates = (field(y + nudge * direction) - base) / nudge
+        length = jnp.sqrt(jnp.sum(rates * rates))
+        usable = (length > 0) & (length < jnp.inf)
+        unit = rates / jnp.where(usable, length, 1.0)
+        return rate * jnp.sqrt(length), jnp.where(usable, unit, direction)
 
-    first, once = change(direction)
-    second, twice = change(once)
-    return jnp.sqrt(first * second), twice
+    return jax.lax.fori_loop(0, 2, change, (jnp.ones_like(nudge[0]), direction))
 
 
-def spectral_radius(matrix: Array, rounds: int = 2) -> Array:
-    """Upper estimate of the largest magnitude of an eigenvalue: ||J^n||^(1/n), n = 8^rounds.
+def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Upper estimate of the largest magnitude of an eigenvalue: ||J^64||^(1/64).
 
-    It does not depend much on the scales of the components, as a norm would. Products are written
-    out: a dot of this size costs several times more.
+    It does not depend much on the scales of the components, as a norm would. Products
+    are written out: a dot of this size costs several times more.
     """
-    if rounds == 0:
-        return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
-    largest = jnp.max(jnp.abs(matrix))
-    scale = jnp.where(largest > 0, largest, 1.0)
-    matrix = matrix / scale
-    for _ in range(3):
+
+    def square(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        matrix, log_factor = carry
+        largest = jnp.max(jnp.abs(matrix))
+        scale = jnp.where(largest > 0, largest, 1.0)
+        matrix = matrix / scale
         matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
-    return scale * jnp.sqrt(jnp.sqrt(jnp.sqrt(spectral_radius(matrix, rounds - 1))))
+        return matrix, 2.0 * (log_factor + jnp.log(scale))
+
+    # The power is exp(log_factor) times the matrix that is carried along.
+    start = matrix, jnp.zeros_like(matrix[0, 0])
+    power, log_factor = jax.lax.fori_loop(0, _SQUARINGS, square, start)
+    norm = jnp.max(jnp.sum(jnp.abs(power), axis=1))
+    return jnp.exp((log_factor + jnp.log(norm)) / 2**_SQUARINGS)
 
 
 def undamped_rate(matrix: Array) -> Array:
@@ -118,7 +135,8 @@ def units(
     """
     rates = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
-    rate = jnp.maximum(safe_norm(state0.omega), jnp.sqrt(safe_norm(rates.omega)))
+    turning, spinning_up = safe_norm(jnp.stack([state0.omega, rates.omega]))
+    rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
     rate = jnp.where(rate > 0, rate, 1 / span)
     flat, unravel = ravel_pytree(state0)
 
@@ -126,10 +144,10 @@ def units(
         return power_of_two(spread(system, state0, rate, length, speed))
 
     def fastest(scales: Array) -> Array:
-        def vector_field(t: Array, y: Array, args: Any) -> Array:
-            return ravel_pytree(system.vector_field(t, unravel(y), args))[0]
+        def field(y: Array) -> Array:
+            return ravel_pytree(system.vector_field(t0, unravel(y), args))[0]
 
-        radius = fastest_of(jacobian(vector_field, t0, flat, args, scales))
+        radius = fastest_of(jacobian(field, flat, scales))
         return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
 
     if not isinstance(state0, FloatingState):

@@ -1,0 +1,223 @@
+"""A function of one lane, on many lanes along the last axis.
+
+`jax.vmap(..., in_axes=-1, out_axes=-1)` means the same, but its rules move the lanes to the front
+and back again, which takes longer than the work where the work is a few numbers a lane. Here what
+goes number by number, or takes arrays apart and puts them together, leaves the lanes where they
+are; all else is left to `vmap`.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from jrigid._core import third_party
+
+# Of so few terms sums are written out, to be computed with what is around them.
+_FEW = 8
+
+
+def _spread(x: Any, has_lanes: bool, shape: tuple[int, ...], lanes: int) -> Any:
+    """A value in all lanes, and of this shape in each if it is a number."""
+    x = x if has_lanes else jnp.asarray(x)[..., None]
+    x = x.reshape((1,) * (len(shape) + 1 - x.ndim) + x.shape)
+    return jnp.broadcast_to(x, (*shape, lanes))
+
+
+def _apply(equation: Any, values: list, batched: list[bool], lanes: int) -> list:
+    """The results, with lanes, of an operation on values some of which have lanes."""
+    primitive, parameters = equation.primitive, equation.params
+    pairs = list(zip(values, batched, strict=True))
+    if third_party.is_elementwise(equation):
+        shape = equation.outvars[0].aval.shape
+        values = [_spread(x, has, shape, lanes) for x, has in pairs]
+        return third_party.apply(primitive, parameters, *values)
+    with_lanes = third_party.with_last_axis(equation, lanes)
+    if with_lanes is None:
+        axis = 0 if primitive in third_party.LANES_IN_FRONT else -1
+        axes = [axis if has else None for has in batched]
+        values = [jnp.moveaxis(x, -1, axis) if has else x for x, has in pairs]
+        alone = functools.partial(third_party.apply, primitive, parameters)
+        return jax.vmap(alone, axes, -1)(*values)
+    shapes = [x.aval.shape for x in equation.invars]
+    triples = zip(values, batched, shapes, strict=True)
+    values = [_spread(x, has, shape, lanes) for x, has, shape in triples]
+    fold = third_party.FOLDS.get(primitive)
+    few = values[0].ndim == 2 and 0 < values[0].shape[0] <= _FEW
+    if fold is not None and few and parameters["axes"] == (0,):
+        return [functools.reduce(fold, values[0])]
+    return third_party.apply(primitive, with_lanes, *values)
+
+
+def _in_lanes(x: Any, has: bool, lanes: int) -> Any:
+    return x if has else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+
+
+def _results_vary(jaxpr: Any, batched: Sequence[bool]) -> list[bool]:
+    """Which results of a program have lanes, if these of its arguments have."""
+    known = dict(zip(jaxpr.invars, batched, strict=True))
+
+    def has_lanes(x: Any) -> bool:
+        return not isinstance(x, third_party.Literal) and known.get(x, False)
+
+    for equation in jaxpr.eqns:
+        flags = [has_lanes(x) for x in equation.invars]
+        called = third_party.called_program(equation)
+        scan = third_party.scan_of(equation)
+        if not any(flags):
+            results = [False] * len(equation.outvars)
+        elif scan is not None:
+            results = _vary(scan, flags)
+        elif called is not None:
+            inner = getattr(called, "jaxpr", called)
+            results = _results_vary(inner, flags)
+        else:
+            results = [True] * len(equation.outvars)
+        known.update(zip(equation.outvars, results, strict=True))
+    return [has_lanes(x) for x in jaxpr.outvars]
+
+
+def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
+    """Which results of a scan have lanes.
+
+    What it carries has lanes if one trip gives it lanes.
+    """
+    flags = list(batched)
+    while True:
+        results = _results_vary(scan.body.jaxpr, flags)
+        before = flags[scan.carry]
+        carried = [a or b for a, b in zip(before, results, strict=False)]
+        if carried == before:
+            return carried + results[len(carried) :]
+        flags[scan.carry] = carried
+
+
+class _Evaluation:
+    """A jaxpr on values some of which have lanes."""
+
+    def __init__(self, lanes: int):
+        """So many lanes."""
+        self.lanes = lanes
+        self.functions: dict[Any, Any] = {}
+
+    def __call__(self, jaxpr: Any, consts: Any, arguments: Any) -> list[tuple[Any, bool]]:
+        """Values, and whether they have lanes."""
+        known: dict[Any, tuple[Any, bool]] = {}
+
+        def read(x: Any) -> tuple[Any, bool]:
+            return (x.val, False) if isinstance(x, third_party.Literal) else known[x]
+
+        known.update(zip(jaxpr.constvars, ((x, False) for x in consts), strict=True))
+        known.update(zip(jaxpr.invars, arguments, strict=True))
+        for eqn in jaxpr.eqns:
+            pairs = [read(x) for x in eqn.invars]
+            known.update(zip(eqn.outvars, self.results(eqn, pairs), strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def results(self, eqn: Any, pairs: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+        """The results of an operation, and whether they have lanes."""
+        values = [x for x, _ in pairs]
+        batched = [has for _, has in pairs]
+        if not any(batched):
+            alone = third_party.apply(eqn.primitive, eqn.params, *values)
+            return [(x, False) for x in alone]
+        scan = third_party.scan_of(eqn)
+        if scan is not None:
+            return self.scan(scan, pairs)
+        branches = third_party.branches_of(eqn)
+        if branches is not None and not batched[0]:
+            return self.cond(branches, values, batched)
+        arrays = third_party.dynamic_slice_of(eqn)
+        if arrays is not None and not any(batched[arrays:]):
+            values = [
+                *(_in_lanes(*x, self.lanes) for x in pairs[:arrays]),
+                *values[arrays:],
+            ]
+            found = third_party.slice_with_last_axis(eqn, self.lanes, *values)
+            return [(found, True)]
+        called = third_party.called_program(eqn)
+        if called is not None:
+            return self.call(called, values, tuple(batched))
+        return [(x, True) for x in _apply(eqn, values, batched, self.lanes)]
+
+    def call(self, called: Any, values: list, batched: tuple[bool, ...]) -> list[tuple[Any, bool]]:
+        """A function's; one that is called often is traced once."""
+        key = id(called), batched
+        if key not in self.functions:
+            closed = isinstance(called, third_party.ClosedJaxpr)
+            inner, consts = (called.jaxpr, called.consts) if closed else (called, ())
+            flags: list[bool] = []
+
+            @jax.jit
+            def function(*values: Any) -> list:
+                found = self(inner, consts, zip(values, batched, strict=True))
+                flags[:] = [has for _, has in found]
+                return [x for x, _ in found]
+
+            self.functions[key] = function, flags
+        function, flags = self.functions[key]
+        return list(zip(function(*values), flags, strict=True))
+
+    def whole(self, closed: Any, arguments: Any) -> list:
+        """All results of a branch or a body, in all lanes."""
+        found = self(closed.jaxpr, closed.consts, arguments)
+        return [_in_lanes(*x, self.lanes) for x in found]
+
+    def scan(
+        self,
+        scan: third_party.Scan,
+        pairs: list[tuple[Any, bool]],
+    ) -> list[tuple[Any, bool]]:
+        """A loop of a known length."""
+        consts, carry, rows = pairs[scan.constants], pairs[scan.carry], pairs[scan.rows]
+
+        varies = _vary(scan, [has for _, has in pairs])
+
+        def in_lanes(found: list[tuple[Any, bool]]) -> list:
+            """Values, in lanes where what the loop carries has lanes."""
+            return [
+                _in_lanes(x, has, self.lanes) if vary else x
+                for (x, has), vary in zip(found, varies, strict=False)
+            ]
+
+        def step(carry: list, values: list) -> tuple[list, list]:
+            kept = zip(carry, varies, strict=False)
+            row = zip(values, (has for _, has in rows), strict=True)
+            arguments = [*consts, *kept, *row]
+            found = in_lanes(self(scan.body.jaxpr, scan.body.consts, arguments))
+            return found[: len(carry)], found[len(carry) :]
+
+        rows_alone = [x for x, _ in rows]
+        end, stacked = jax.lax.scan(step, in_lanes(carry), rows_alone, scan.length, scan.reverse)
+        return list(zip((*end, *stacked), varies, strict=True))
+
+    def cond(
+        self,
+        branches: Sequence[third_party.ClosedJaxpr],
+        values: list,
+        batched: list[bool],
+    ) -> list[tuple[Any, bool]]:
+        """A branch that all lanes take."""
+
+        def branch(closed: Any) -> Callable[..., list]:
+            return lambda *values: self.whole(closed, zip(values, batched[1:], strict=True))
+
+        in_lanes = [branch(x) for x in branches]
+        return [(x, True) for x in jax.lax.switch(values[0], in_lanes, *values[1:])]
+
+
+def lanes_last(function: Callable[..., Any], *arguments: Any) -> Any:
+    """The results of a function of arrays, all of which have lanes along their last axis."""
+    leaves, structure = jtu.tree_flatten(arguments)
+    lanes = leaves[0].shape[-1]
+    shapes = [jax.ShapeDtypeStruct(x.shape[:-1], x.dtype) for x in leaves]
+
+    def flat(*leaves: Any) -> Any:
+        return function(*structure.unflatten(leaves))
+
+    jaxpr, results = jax.make_jaxpr(flat, return_shape=True)(*shapes)
+    found = _Evaluation(lanes).whole(jaxpr, [(x, True) for x in leaves])
+    return jtu.tree_structure(results).unflatten(found)

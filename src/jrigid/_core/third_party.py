@@ -1,0 +1,314 @@
+"""Every use of what jax, equinox and diffrax do not document.
+
+Such parts may change with any release. So all of them are here, with the versions that
+they were tested with, and pyproject.toml bounds equinox and diffrax below the next
+minor release. `tests/test_third_party.py` goes through the tables of primitives, and
+`tests/test_house.py` checks that no other module reaches for private parts itself.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+from equinox.internal import unvmap_any as unvmap_any
+from jax.extend import core
+from jax.interpreters import ad as ad
+from jax.interpreters import batching, partial_eval
+from jax.interpreters import mlir as mlir
+
+#: Oldest and newest versions with which the test suite has passed.
+TESTED_WITH = {
+    "jax": ("0.9.0", "0.12.0.1"),
+    "equinox": ("0.13.3", "0.13.8"),
+    "diffrax": ("0.7.2", "0.7.2"),
+}
+
+# equinox: enumerations ----------------------------------------------------------------
+
+#: The class of the class `equinox.Enumeration`, to derive one with more abilities.
+EnumerationMeta = type(eqx.Enumeration)
+
+#: The class of the items of every enumeration.
+EnumerationItem = type(diffrax.RESULTS.successful)
+
+
+def code_of(item: Any) -> Any:
+    """The integer code of an item of an enumeration, or the codes of many lanes.
+
+    An array, or what stands for one in a tree of shapes.
+    """
+    return item._value
+
+
+def enumeration_of(item: Any) -> Any:
+    """The enumeration that an item belongs to."""
+    return item._enumeration
+
+
+def names_of(enumeration: Any) -> tuple[str, ...]:
+    """The names of an enumeration's items, in the order of their codes."""
+    return tuple(vars(enumeration)["_name_to_item"])
+
+
+def messages_of(enumeration: Any) -> tuple[str, ...]:
+    """The messages of an enumeration's items, in the order of their codes."""
+    return tuple(vars(enumeration)["_index_to_message"])
+
+
+# jax: programs ------------------------------------------------------------------------
+
+ClosedJaxpr = core.ClosedJaxpr
+Jaxpr = core.Jaxpr
+Literal = core.Literal
+Primitive = core.Primitive
+jaxpr_as_fun = core.jaxpr_as_fun
+
+#: The parameters of an operation, by their names.
+Parameters = dict[str, Any]
+
+
+def used_inputs(program: core.ClosedJaxpr) -> list[bool]:
+    """For each input of a program, whether an output depends on it."""
+    jaxpr = program.jaxpr
+    _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return used
+
+
+def set_vmap_rule(primitive: core.Primitive, rule: Callable[..., Any]) -> None:
+    """What `jax.vmap` does with a primitive: `rule(arguments, axes)`, the result and its axis."""
+    batching.primitive_batchers[primitive] = rule
+
+
+def apply(primitive: core.Primitive, parameters: Parameters, *values: Any) -> list[Any]:
+    """The results of a primitive with the parameters that it has in a program."""
+    bound = primitive.get_bind_params(parameters)
+    # jax 0.9 returns functions beside the parameters.
+    functions, parameters = bound if isinstance(bound, tuple) else ((), bound)
+    results = primitive.bind(*functions, *values, **parameters)
+    return list(results) if primitive.multiple_results else [results]
+
+
+def known_primitives(names: str) -> frozenset[core.Primitive]:
+    """The primitives of these names, as far as this version of jax has them.
+
+    Primitives are compared as objects, since another package may use the same name.
+    """
+    found = set()
+    for name in names.split():
+        attribute = f"{name}_p"
+        for module in (core.primitives, jax.lax):
+            if hasattr(module, attribute):
+                found.add(getattr(module, attribute))
+    return frozenset(found)
+
+
+# jax: primitives on arrays with one more axis, at the end -----------------------------
+
+#: These compute each number of the result from the numbers at the same place of the
+#: arguments, unless the shapes differ (see `is_elementwise`).
+ELEMENTWISE_NAMES = """
+abs acos acosh add add_jaxvals and asin asinh atan atan2 atanh bitcast_convert_type cbrt
+ceil clamp convert_element_type copy cos cosh div eq erf exp exp2 expm1 floor ge gt
+integer_pow is_finite le log log1p log2 logistic lt max min mul ne neg nextafter not or
+pow reduce_precision rem round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor
+"""
+ELEMENTWISE = known_primitives(ELEMENTWISE_NAMES)
+
+#: These count axes from the front, so that one more at the end changes nothing.
+AXES_FROM_FRONT_NAMES = """
+concatenate reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rev split
+squeeze stack unstack
+"""
+AXES_FROM_FRONT = known_primitives(AXES_FROM_FRONT_NAMES)
+
+
+def _broadcast_with_axis(parameters: Parameters, size: int) -> Parameters:
+    shape = parameters["shape"]
+    return {
+        "shape": (*shape, size),
+        "broadcast_dimensions": (*parameters["broadcast_dimensions"], len(shape)),
+    }
+
+
+def _reshape_with_axis(parameters: Parameters, size: int) -> Parameters:
+    order = parameters["dimensions"]
+    return {
+        "new_sizes": (*parameters["new_sizes"], size),
+        "dimensions": None if order is None else (*order, len(order)),
+    }
+
+
+def _transpose_with_axis(parameters: Parameters, size: int) -> Parameters:
+    del size
+    permutation = parameters["permutation"]
+    return {"permutation": (*permutation, len(permutation))}
+
+
+def _slice_with_axis(parameters: Parameters, size: int) -> Parameters:
+    strides = parameters["strides"]
+    return {
+        "start_indices": (*parameters["start_indices"], 0),
+        "limit_indices": (*parameters["limit_indices"], size),
+        "strides": None if strides is None else (*strides, 1),
+    }
+
+
+#: The parameters of these hold an entry for each axis: the entries with one axis more.
+CHANGED_BY_AXIS = {
+    "broadcast_in_dim": _broadcast_with_axis,
+    "reshape": _reshape_with_axis,
+    "transpose": _transpose_with_axis,
+    "slice": _slice_with_axis,
+}
+
+#: Slices at places that are computed, and how many arrays come before the places.
+DYNAMIC_SLICES = {"dynamic_slice": 1, "dynamic_update_slice": 2}
+
+#: Calls of other programs, and the parameter that holds the program. What a call holds
+#: beside it, such as a derivative rule, does not matter to its values.
+CALLS = {
+    "jit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "remat": "jaxpr",
+}
+
+
+def _by_primitive(table: dict[str, Any]) -> dict[core.Primitive, Any]:
+    """A table by primitives instead of their names."""
+    found = {}
+    for name, value in table.items():
+        for primitive in known_primitives(name):
+            found[primitive] = value
+    return found
+
+
+#: What reductions do with two numbers.
+FOLDS = _by_primitive(
+    {
+        "reduce_max": jax.lax.max,
+        "reduce_min": jax.lax.min,
+        "reduce_prod": jax.lax.mul,
+        "reduce_sum": jax.lax.add,
+    }
+)
+
+_CHANGED_BY_AXIS = _by_primitive(CHANGED_BY_AXIS)
+_DYNAMIC_SLICES = _by_primitive(DYNAMIC_SLICES)
+_CALLS = _by_primitive(CALLS)
+#: The rule that vmap has for these is right only where the mapped axis is the first.
+LANES_IN_FRONT = known_primitives("bitcast_convert_type")
+
+_SHARDINGS = ("sharding", "out_sharding")
+
+
+def _is_sharded(parameters: dict[str, Any]) -> bool:
+    """Whether a layout over devices is asked for, which has an entry for each axis."""
+    return any(parameters.get(name) is not None for name in _SHARDINGS)
+
+
+def is_elementwise(equation: Any) -> bool:
+    """Whether each number of the result depends on those at the same place alone.
+
+    Arguments have the shape of the result, or are single numbers. This excludes a
+    `bitcast_convert_type` to numbers of another size, which changes the shape.
+    """
+    if equation.primitive not in ELEMENTWISE or _is_sharded(equation.params):
+        return False
+    shape = equation.outvars[0].aval.shape
+    shapes = [x.aval.shape for x in equation.invars]
+    return shape in shapes and all(x in ((), shape) for x in shapes)
+
+
+def with_last_axis(equation: Any, size: int) -> Parameters | None:
+    """Parameters with which an operation does the same to arrays with one more axis.
+
+    The axis is the last one and of this size. None for a primitive that is not in the
+    tables.
+    """
+    primitive, parameters = equation.primitive, equation.params
+    if _is_sharded(parameters):
+        return None
+    if primitive in AXES_FROM_FRONT:
+        return parameters
+    if primitive in _CHANGED_BY_AXIS:
+        return parameters | _CHANGED_BY_AXIS[primitive](parameters, size)
+    return None
+
+
+def dynamic_slice_of(equation: Any) -> int | None:
+    """How many arrays a slice at a computed place takes, or None for anything else."""
+    return _DYNAMIC_SLICES.get(equation.primitive)
+
+
+def slice_with_last_axis(equation: Any, size: int, *values: Any) -> Any:
+    """A slice, read or written, of arrays with one more axis at their end."""
+    arrays = _DYNAMIC_SLICES[equation.primitive]
+    starts = [*values[arrays:], jax.numpy.zeros_like(values[-1])]
+    if arrays == 1:
+        sizes = (*equation.params["slice_sizes"], size)
+        return jax.lax.dynamic_slice(values[0], starts, sizes)
+    return jax.lax.dynamic_update_slice(values[0], values[1], starts)
+
+
+def called_program(equation: Any) -> Any:
+    """The program that an operation calls, a `ClosedJaxpr` or a `Jaxpr`, or None."""
+    return equation.params.get(_CALLS.get(equation.primitive, ""))
+
+
+class Scan(NamedTuple):
+    """The parts of a `jax.lax.scan` in a program."""
+
+    body: core.ClosedJaxpr
+    length: int
+    reverse: bool
+    constants: slice  # of the arguments
+    carry: slice
+    rows: slice
+
+
+_SCANS = known_primitives("scan")
+_CONDS = known_primitives("cond")
+
+
+def _scan_counts(parameters: Parameters) -> tuple[int, int] | None:
+    """How many constants and how many arrays of the carry a scan takes first."""
+    if "num_consts" in parameters and "num_carry" in parameters:
+        return parameters["num_consts"], parameters["num_carry"]
+    if "ft_in" in parameters:  # from jax 0.12 on
+        constants, carry, _ = parameters["ft_in"].unpack()
+        return len(constants), len(carry)
+    return None
+
+
+def scan_of(equation: Any) -> Scan | None:
+    """The parts of a loop of a known length; None for anything else."""
+    if equation.primitive not in _SCANS:
+        return None
+    parameters = equation.params
+    counts = _scan_counts(parameters)
+    if counts is None:
+        return None
+    first = counts[0]
+    last = first + counts[1]
+    return Scan(
+        body=parameters["jaxpr"],
+        length=parameters["length"],
+        reverse=parameters["reverse"],
+        constants=slice(first),
+        carry=slice(first, last),
+        rows=slice(last, None),
+    )
+
+
+def branches_of(equation: Any) -> Sequence[core.ClosedJaxpr] | None:
+    """The branches of a `jax.lax.cond` or `switch`, or None.
+
+    The first argument chooses the branch; the others are its arguments.
+    """
+    if equation.primitive not in _CONDS:
+        return None
+    return equation.params.get("branches")

@@ -1,0 +1,1 @@
+"""Steps of explicit methods: their control, motions alone and in lanes, derivatives."""

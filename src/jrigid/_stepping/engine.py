@@ -1,0 +1,189 @@
+"""How motions are integrated: one attempt at a step after another."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jrigid._stepping.control import Limits
+from jrigid._stepping.events import Conditions
+from jrigid._stepping.motion import (
+    ENDED,
+    EVENT,
+    NOT_FINITE,
+    RUNNING,
+    STUCK,
+    TOO_MANY_STEPS,
+    Motion,
+    Progress,
+    first_direction,
+)
+from jrigid._stepping.steppers import Field, Stepper, Stretch, Trial
+
+
+class Attempt(NamedTuple):
+    """What an attempt at a step leads to.
+
+    Attributes:
+        progress: Where the motion is now.
+        h: Length of the step; 0 if it was not accepted.
+        rates: Of the stages.
+        output: The number of the output time that was reached; as many as there are
+            where none was.
+    """
+
+    progress: Progress
+    h: Float[Array, ""]
+    rates: Float[Array, "stages n"]
+    output: Int[Array, ""]
+
+
+def _entry(times: Float[Array, " times"], number: Int[Array, ""]) -> Float[Array, ""]:
+    """One of the times; infinity after the last."""
+    last = times.size - 1
+    return jnp.where(number <= last, times[jnp.minimum(number, last)], jnp.inf)
+
+
+class Engine(NamedTuple):
+    """How motions are integrated: all that is known when they are compiled.
+
+    Attributes:
+        field: The vector field.
+        stepper: How a step is tried.
+        max_steps: Most attempts at a step.
+        conditions: Of an event, or None.
+        in_lanes: Whether many motions are integrated at once.
+        replays: Whether the rates of the stages are handed on, for the reverse mode.
+    """
+
+    field: Field
+    stepper: Stepper
+    max_steps: int
+    conditions: Conditions | None = None
+    in_lanes: bool = False
+    replays: bool = False
+
+    @property
+    def keeps_rates(self) -> bool:
+        """Whether an attempt hands on the rates of all stages."""
+        return self.replays or self.conditions is not None
+
+    def begin(self, motion: Motion) -> Progress:
+        """The motion at its start."""
+        limits = Limits(*motion.limits)
+        zero = jnp.zeros_like(limits.end)
+        first = limits.longest * self.stepper.first
+        counts = [
+            jnp.where(limits.end > 0, RUNNING, ENDED),
+            0,
+            0,
+            jnp.sum(motion.times <= 0),
+            jnp.sum(motion.jumps <= 0),
+            0,
+        ]
+        values = jnp.zeros(0, motion.y0.dtype)
+        if self.conditions is not None:
+            values = self.conditions.values(motion.observed, zero, motion.y0)
+        return Progress(
+            motion.y0,
+            first_direction(motion.y0),
+            jnp.stack([zero, first, limits.start_rate, limits.end]),
+            jnp.stack([jnp.asarray(x, jnp.int32) for x in counts]),
+            values,
+        )
+
+    def smooth_field(self, motion: Motion, jump: Int[Array, ""]) -> Field:
+        """The vector field between two jumps, of which `jump` is the later one.
+
+        A step that ends at a jump must not see what is beyond it, nor one that starts
+        there what was before.
+        """
+        if motion.jumps.size == 0:
+            return self.field
+        beside = motion.beside[0]
+        padded = jnp.concatenate([jnp.full_like(motion.jumps[:1], -jnp.inf), motion.jumps])
+        padded = jnp.append(padded, jnp.inf)
+        low, high = padded[jump] + beside, padded[jump + 1] - beside
+
+        def field(parameters: list[Array], t: Array, y: Array) -> Array:
+            return self.field(parameters, jnp.clip(t, low, high), y)
+
+        return field
+
+    def attempt(self, motion: Motion, progress: Progress) -> Attempt:
+        """Try one step."""
+        t, step, _, end = progress.clock
+        output, jump = progress.counts[3], progress.counts[4]
+        goal = jnp.minimum(_entry(motion.times, output), end)
+        if motion.jumps.size:
+            goal = jnp.minimum(goal, _entry(motion.jumps, jump))
+        t1 = self.stepper.end(t, step, goal)
+        field = self.smooth_field(motion, jump)
+        trial = self.stepper.attempt(field, motion, progress, t1, self.in_lanes, self.keeps_rates)
+        return self._settled(motion, progress, t1, trial)
+
+    def _settled(self, motion: Motion, progress: Progress, t1: Array, trial: Trial) -> Attempt:
+        """Where the motion is after a step was tried."""
+        y, _, clock, counts, values = progress
+        t, step, _, end = clock
+        state, tried, accepted, output, jump, which = counts
+        y1, along, verdict, infinite, rates = trial
+        running = state == RUNNING
+        keep, following = verdict.accepted & running, verdict.step
+        stuck = jnp.where(infinite, NOT_FINITE, STUCK)
+        new_state = jnp.where(verdict.stuck, stuck, RUNNING)
+        # The last of the output times may be there several times.
+        hit = keep & (t1 >= _entry(motion.times, output))
+        again = t1 >= _entry(motion.times, output + hit.astype(output.dtype))
+        new_state = jnp.where(keep & (t1 >= end) & ~again, ENDED, new_state)
+        if self.conditions is not None:
+            limits = Limits(*motion.limits)
+            now = self.conditions.values(motion.observed, t1, y1)
+            now = jax.lax.stop_gradient(now)
+            happened = self.conditions.happened(values, now)
+            sought = keep & (end == limits.end) & jnp.any(happened)
+            taken = Stretch(t, t1, y, y1, rates)
+            exact, crossed = self.conditions.crossing(
+                motion.observed,
+                happened,
+                now,
+                (t, t1),
+                lambda t: self.stepper.state_at(motion.parameters, taken, t),
+                sought,
+            )
+            # A step that passes the place is repeated, up to it.
+            repeat = sought & (exact < t1)
+            at_event = (sought & ~repeat) | (keep & (t1 >= end) & (end < limits.end))
+            keep = keep & ~repeat
+            end = jnp.where(repeat, exact, end)
+            which = jnp.where(sought, jnp.argmax(crossed).astype(which.dtype), which)
+            new_state = jnp.where(at_event, EVENT, new_state)
+            new_state = jnp.where(repeat, RUNNING, new_state)
+            following = jnp.where(repeat, step, following)
+            values = jnp.where(keep, now, values)
+        too_many = (new_state == RUNNING) & (tried + 1 >= self.max_steps)
+        new_state = jnp.where(too_many, TOO_MANY_STEPS, new_state)
+        hit = hit & keep
+        reached = jnp.where(hit, output, motion.times.size)
+        if motion.jumps.size:
+            passed = keep & (t1 >= _entry(motion.jumps, jump))
+            jump = jump + passed.astype(jump.dtype)
+        new_clock = jnp.stack([jnp.where(keep, t1, t), following, verdict.rate, end])
+        new_counts = [
+            new_state,
+            tried + 1,
+            accepted + keep.astype(accepted.dtype),
+            output + hit.astype(output.dtype),
+            jump,
+            which,
+        ]
+        new_counts = jnp.stack([x.astype(counts.dtype) for x in new_counts])
+        progress = Progress(
+            jnp.where(keep, y1, y),
+            along,
+            jnp.where(running, new_clock, clock),
+            jnp.where(running, new_counts, counts),
+            values,
+        )
+        return Attempt(progress, jnp.where(keep, t1 - t, 0.0), rates, reached)

@@ -1,0 +1,82 @@
+"""Conditions that end a motion, and when the first of them is met."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+# Halvings of a step that find when a condition came to hold.
+_BISECTIONS = {8: 60, 4: 31}
+
+
+class Conditions(NamedTuple):
+    """Conditions that end a motion.
+
+    Attributes:
+        values: Of (arrays, t, y): one value for each condition.
+        boolean: Which of them are true or false.
+        direction: Which change of sign ends the motion: any for None, up for True.
+    """
+
+    values: Callable[[list[Array], Array, Array], Float[Array, " conditions"]]
+    boolean: tuple[bool, ...]
+    direction: tuple[bool | None, ...]
+
+    def happened(self, before: Array, after: Array) -> Bool[Array, " conditions"]:
+        """Which conditions end the motion, by their values before and after a step."""
+        old, new = jnp.sign(before), jnp.sign(after)
+        each = []
+        for i, (boolean, up) in enumerate(zip(self.boolean, self.direction, strict=True)):
+            if boolean:
+                each.append(new[i] > 0)
+            elif up is None:
+                each.append(old[i] != new[i])
+            elif up:
+                each.append((old[i] <= 0) & (new[i] > 0))
+            else:
+                each.append((old[i] > 0) & (new[i] <= 0))
+        return jnp.stack(each)
+
+    def crossing(
+        self,
+        observed: list[Array],
+        happened: Bool[Array, " conditions"],
+        last: Float[Array, " conditions"],
+        ends: tuple[Array, Array],
+        state_at: Callable[[Array], Float[Array, " n"]],
+        sought: Bool[Array, ""],
+    ) -> tuple[Float[Array, ""], Bool[Array, " conditions"]]:
+        """When the first of the conditions that happened in a step came to hold.
+
+        A number changes its sign there, a boolean becomes true. It is found by bisection,
+        which cannot miss it.
+
+        Args:
+            observed: Arrays that the conditions depend on.
+            happened: Which conditions are asked for.
+            last: Their values at the end of the step.
+            ends: Times at which the step starts and ends.
+            state_at: The state within the step, of the time.
+            sought: Whether it is to be found at all.
+
+        Returns:
+            The time, and the conditions that hold there.
+        """
+        t0, t1 = ends
+
+        def changed(t: Array) -> Bool[Array, " conditions"]:
+            values = self.values(observed, t, state_at(t))
+            return happened & (jnp.sign(values) == jnp.sign(last))
+
+        def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            low, high = bracket
+            middle = low + 0.5 * (high - low)
+            late = jnp.any(changed(middle))
+            return jnp.where(late, low, middle), jnp.where(late, middle, high)
+
+        count = jnp.where(sought, _BISECTIONS[t0.dtype.itemsize], 0)
+        bracket = jax.lax.fori_loop(0, count, halve, (t0, t1))
+        exact = jax.lax.stop_gradient(bracket[1])
+        return exact, changed(exact)

@@ -1,0 +1,102 @@
+"""A motion that is integrated: its data, and how far it has come."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+# States of a motion that is integrated.
+RUNNING, ENDED, STUCK, NOT_FINITE, EVENT, TOO_MANY_STEPS, EMPTY = range(7)
+
+
+class Motion(NamedTuple):
+    """What is integrated, from time 0 on.
+
+    Attributes:
+        parameters: Arrays that the vector field depends on.
+        observed: Arrays that the conditions of an event depend on.
+        y0: State at the start.
+        times: Output times, in order.
+        jumps: Times at which the vector field is not smooth, in order; infinite ones
+            are none.
+        beside: For each jump, the distance from it at which the vector field is evaluated.
+        scales: Scales of the components of the state.
+        limits: `Limits` as one array.
+    """
+
+    parameters: list[Array]
+    observed: list[Array]
+    y0: Float[Array, " n"]
+    times: Float[Array, " times"]
+    jumps: Float[Array, " jumps"]
+    beside: Float[Array, " jumps"]
+    scales: Float[Array, " n"]
+    limits: Float[Array, " limits"]
+
+
+def constant(tree: Any) -> Any:
+    """The same without derivatives: what decides on steps is not differentiated."""
+    arrays, others = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), others)
+
+
+def steps_fixed(motion: Motion) -> Motion:
+    """A motion whose parameters and start alone have derivatives."""
+    fixed = constant(motion._replace(parameters=[], y0=motion.y0[:0]))
+    return fixed._replace(parameters=motion.parameters, y0=motion.y0)
+
+
+class Progress(NamedTuple):
+    """A motion between two steps.
+
+    Attributes:
+        y: The state.
+        direction: Of a small displacement, which finds the fastest rate.
+        clock: The time; the length of the next step; the fastest rate; where the motion
+            ends, which an event may change.
+        counts: One of the states above; steps tried; steps accepted; the next of the
+            output times; the next of the jumps; the condition that ends the motion.
+        values: Of the conditions of an event.
+    """
+
+    y: Float[Array, " n"]
+    direction: Float[Array, " n"]
+    clock: Float[Array, " 4"]
+    counts: Int[Array, " 6"]
+    values: Float[Array, " conditions"]
+
+    @property
+    def t(self) -> Float[Array, "*lanes"]:
+        """The time."""
+        return self.clock[0]
+
+    @property
+    def running(self) -> Bool[Array, "*lanes"]:
+        """Whether the motion has not ended yet."""
+        return self.counts[0] == RUNNING
+
+
+def first_direction(y: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A direction to which no motion keeps, of length 1."""
+    direction = np.cos(np.arange(y.size))
+    return jnp.asarray(direction / np.linalg.norm(direction), y.dtype)
+
+
+def fastest_rate(scales: Array, omega: int, y: Array, other: Array) -> Array:
+    """The rate that bounds the steps: that of turning, or another if it is faster.
+
+    Args:
+        scales: Of the components of the state.
+        omega: Where in the state the angular velocity starts.
+        y: The state.
+        other: Rate of the linearised motion.
+    """
+    # In its unit: rates are within the range of numbers, their squares need not be.
+    unit = scales[omega]
+    turning = unit * jnp.sqrt(jnp.sum((y[omega : omega + 3] / unit) ** 2))
+    rate = jnp.maximum(other, turning)
+    tiny = jnp.finfo(rate.dtype).tiny
+    return jnp.maximum(jnp.where(jnp.isfinite(rate), rate, 0.0), tiny)

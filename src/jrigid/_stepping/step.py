@@ -1,0 +1,179 @@
+"""A step of an explicit Runge-Kutta method as a loop over its stages, and its reverse.
+
+The vector field stands once in the loop, so the compiled program does not grow with the
+number of stages. The reverse of a step is another Runge-Kutta step (E. Hairer, C. Lubich,
+G. Wanner, Geometric Numerical Integration, 2nd ed., section VI.3): it is written out here,
+as a loop too.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._stepping.method import Method
+
+Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
+
+
+def combine(
+    method: Method,
+    rates: Float[Array, "stages n"],
+    row: int | Array,
+    in_lanes: bool = False,
+) -> Float[Array, " n"]:
+    """The sum of the rates of the stages with the coefficients of a row.
+
+    A row that is not known when it is compiled is summed with its zeros. In lanes, where
+    that takes most of the time of a step, a sum has the terms of its group of rows.
+    """
+    if isinstance(row, int):
+        used = np.flatnonzero(method.rows[row])
+        return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
+    weights = _row(method.rows, row, rates.dtype)
+    if not in_lanes:
+        return jnp.sum(weights[:, None] * rates, axis=0)
+
+    def of_group(used: tuple[int, ...]) -> Callable[[Array, Array], Array]:
+        def total(weights: Array, rates: Array) -> Array:
+            return _sum([weights[i] for i in used], [rates[i] for i in used])
+
+        return total
+
+    group = jnp.zeros((), jnp.int32)
+    for first, _ in method.groups[1:]:
+        group = group + (row >= first).astype(group.dtype)
+    branches = [of_group(used) for _, used in method.groups]
+    return jax.lax.switch(group, branches, weights, rates)
+
+
+def _sum(weights: list, rates: list[Array]) -> Array:
+    """A sum written out, which is compiled together with what is around it."""
+    terms = [jnp.asarray(a, k.dtype) * k for a, k in zip(weights, rates, strict=True)]
+    return sum(terms[1:], terms[0])
+
+
+def _row(table: np.ndarray, row: Array, dtype: Any) -> Array:
+    """A row of a table of constants."""
+    return jax.lax.dynamic_index_in_dim(jnp.asarray(table, dtype), row, keepdims=False)
+
+
+def apart(function: Callable[..., Any], true: Array, *arguments: Any) -> Any:
+    """A function's result, computed as a program of its own within a loop.
+
+    XLA's CPU runtime executes the operations of a loop one after the other, at 25 ns
+    each, only where all of their arrays are small (512 bytes) or there are few; others
+    cost several times more. Operations in a branch are judged apart from the loop
+    around it.
+
+    Args:
+        function: Of the arguments.
+        true: A condition that holds, though the compiler cannot know it.
+        arguments: Of the function.
+    """
+    shapes = jax.eval_shape(function, *arguments)
+
+    def never(*arguments: Any) -> Any:
+        given = jtu.tree_leaves(arguments)
+
+        def anything(shape: Any) -> Array:
+            # An array that is there already costs no kernel, as a new one would.
+            alike = (x for x in given if x.shape == shape.shape and x.dtype == shape.dtype)
+            return next(alike, jnp.zeros(shape.shape, shape.dtype))
+
+        return jtu.tree_map(anything, shapes)
+
+    return jax.lax.cond(true, function, never, *arguments)
+
+
+def stages(
+    method: Method,
+    field: Field,
+    t: Float[Array, ""],
+    h: Float[Array, ""],
+    y: Array,
+    in_lanes: bool = False,
+) -> tuple[Float[Array, "stages n"], Float[Array, " n"]]:
+    """The rates of all stages of a step, and its result.
+
+    Args:
+        method: The method.
+        field: The vector field.
+        t: Where the step starts.
+        h: Its length.
+        y: The state there.
+        in_lanes: Whether it will have many lanes.
+    """
+
+    def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        rates, place = carry
+        at = t + _row(method.times, i, y.dtype) * h
+        rate = field(at, place) if in_lanes else apart(field, i >= 0, at, place)
+        rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
+        following = jnp.minimum(i + 1, method.stages - 1)
+        return rates, y + h * combine(method, rates, following, in_lanes)
+
+    rates = jnp.zeros((method.stages, *y.shape), y.dtype)
+    return jax.lax.fori_loop(0, method.stages, stage, (rates, y))
+
+
+def error_of(method: Method, rates: Float[Array, "stages n"], h: Array) -> Array:
+    """The estimate of the error of a step."""
+    return h * combine(method, rates, method.stages)
+
+
+def pull_back(
+    method: Method,
+    field: Callable[[Any, Array, Array], Array],
+    parameters: Any,
+    step: tuple[Float[Array, ""], Float[Array, ""], Float[Array, " n"]],
+    rates: Float[Array, "stages n"],
+    change: Float[Array, " n"],
+    in_lanes: bool = False,
+) -> tuple[Any, Float[Array, " n"]]:
+    """Cotangents of the parameters and of the start of a step, from that of its result.
+
+    With the places Y_i of the stages, p_i the cotangent of Y_i, and p of the last place
+    given: u_i = h sum_j a_ji p_j, p_i = J(Y_i)^T u_i, and that of the start is the sum of
+    all p_i.
+
+    Args:
+        method: The method.
+        field: The vector field, of parameters, time and state.
+        parameters: Those whose cotangents are asked for.
+        step: Where it starts, its length, the state at its start. A step of length 0 was
+            not taken: its rates do not matter.
+        rates: Of its stages.
+        change: Cotangent of its result.
+        in_lanes: Whether it will have many lanes.
+    """
+    t, h, y = step
+    last = method.stages - 1
+
+    def of_rate(weighted: Array, at: Array, place: Array) -> tuple[Any, Array]:
+        _, pull = jax.vjp(lambda x, y: field(x, at, y), parameters, place)
+        return pull(weighted)
+
+    def stage(k: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        places, total = carry
+        i = last - 1 - k
+        moved = h * combine(method, rates, i, in_lanes)
+        place = y + jnp.where(h != 0, moved, 0.0)
+        weights = _row(method.rows[:-1].T, i, y.dtype)
+        weighted = h * jnp.sum(weights[:, None] * places, axis=0)
+        of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
+        if in_lanes:
+            of_parameters, of_place = of_rate(*of_stage)
+        else:
+            of_parameters, of_place = apart(of_rate, i >= 0, *of_stage)
+        places = jax.lax.dynamic_update_index_in_dim(places, of_place, i, 0)
+        return places, jtu.tree_map(jnp.add, total, of_parameters)
+
+    places = jnp.zeros_like(rates).at[last].set(change)
+    zeros = jtu.tree_map(jnp.zeros_like, parameters)
+    places, total = jax.lax.fori_loop(0, last, stage, (places, zeros))
+    return total, jnp.sum(places, axis=0)

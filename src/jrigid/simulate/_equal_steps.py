@@ -1,0 +1,63 @@
+"""Solvers that make no error estimate: steps of equal length, which are all accepted."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from jrigid._motion import depends_on
+from jrigid._stepping.control import SMALLEST_BOUND, Limits
+from jrigid._stepping.engine import Engine
+from jrigid._stepping.motion import Motion
+from jrigid._stepping.steppers import EqualSteps
+from jrigid.simulate._options import Options
+from jrigid.simulate._prepare import Prepared, opened
+from jrigid.solvers import FreeRotation, Splitting
+from jrigid.systems import RigidBody
+
+
+def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
+    """An engine for the steps of a solver, and the motion with its parameters."""
+    system, args = given.inputs.system, given.inputs.args
+    motion, solver = given.motion, options.solver
+    limits = Limits(*motion.limits)
+    if isinstance(solver, Splitting):
+        longest = options.max_step
+
+        def torque(t: Any, state: Any, args: Any) -> Array:
+            return system.torque_on(given.start + t, state, args)
+
+        _check_splitting(torque, limits.end, given.inputs.state0, args)
+        terms: Any = solver.terms(RigidBody(system.inertia, torque))
+    else:
+        # Short steps, so that no change of sign is missed.
+        longest = jnp.minimum(SMALLEST_BOUND / given.fastest, options.max_step)
+        terms = FreeRotation(system.inertia.astype(motion.y0.dtype))
+
+    def advance(t: Array, h: Array, y: Array) -> Array:
+        state = given.to_state(y)
+        after = solver.step(terms, t, t + h, state, args, None, False)[0]
+        return ravel_pytree(after)[0]
+
+    plain, parameters = opened(advance, limits.end, limits.end, motion.y0)
+    longest = jnp.where(given.findings.ok, longest, 1.0)
+    limits = jnp.stack(limits._replace(longest=longest))
+    motion = motion._replace(parameters=parameters, limits=limits)
+    return Engine(given.field, EqualSteps(plain), options.max_steps), motion
+
+
+def _check_splitting(torque: Callable, t: Array, state0: Any, args: Any) -> None:
+    """Raise ValueError for a torque that splitting cannot serve."""
+
+    def of_omega(omega: Array) -> Array:
+        return torque(t, dataclasses.replace(state0, omega=omega), args)
+
+    if depends_on(of_omega, state0.omega) or jtu.tree_leaves(state0.internal):
+        raise ValueError(
+            "Argument `solver` must not be Splitting where the torque depends on the "
+            "angular velocity or the body has moving parts, but it is."
+        )
