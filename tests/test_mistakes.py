@@ -4,6 +4,7 @@
 # ruff: noqa: ARG005
 
 import io
+import math
 import re
 import sys
 
@@ -54,6 +55,11 @@ def without(package, call):
         sys.modules.pop(package)
         if kept is not None:
             sys.modules[package] = kept
+
+
+class Spring(jr.torques.AbstractTorque):
+    def __call__(self, _t, state, _args):
+        return -np.asarray(state.attitude)[1:]
 
 
 flip = np.array(FACES)
@@ -167,11 +173,47 @@ MISTAKES = {
     ),
     "an `if` in a torque": (
         lambda: forced(lambda t, state, args: state.omega if t > 0.5 else 0 * state.omega),
-        "boolean conversion of traced array",
+        r"Use `jnp.where` or `jax.lax.cond` in a torque, not `if`, `and` or `max` of Python",
     ),
     "numpy in a torque": (
         lambda: forced(lambda t, state, args: np.sin(t) * state.omega),
-        r"conversion method __array__\(\) was called on traced array",
+        r"Use `jax.numpy` in a torque, not numpy \(`jnp.sin`, not `np.sin`\)",
+    ),
+    "numpy in a torque of one's own": (
+        lambda: forced(Spring()),
+        "Use `jax.numpy` in a torque, not numpy",
+    ),
+    "math in a torque": (
+        lambda: forced(lambda t, state, args: math.sin(t) * state.omega),
+        "Use `jax.numpy` in a torque, not `math`, `float` or `int`",
+    ),
+    "a list in a torque": (
+        lambda: forced(lambda t, state, args: [0.0, 1.0][jnp.int32(t)] * state.omega),
+        "Use `jax.numpy` in a torque, not `math`, `float` or `int`",
+    ),
+    "numpy in a torque that is linearised": (
+        lambda: jr.stability.linearize(jr.RigidBody(MOMENTS, Spring()), STATE),
+        "Use `jax.numpy` in a torque, not numpy",
+    ),
+    "numpy in a force": (
+        lambda: simulate(
+            jr.FloatingBody(jr.solids.sphere(1.0, 0.1), lambda t, state, args: np.sin(t)),
+            jr.FloatingState(np.zeros(3), np.zeros(3), UPRIGHT, OMEGA),
+            TS,
+        ),
+        "Use `jax.numpy` in a force, not numpy",
+    ),
+    "numpy in an event": (
+        lambda: simulate(
+            BODY, STATE, TS, event=diffrax.Event(lambda t, state, args, **_: np.sin(t) - 0.5)
+        ),
+        "Use `jax.numpy` in the condition of an event, not numpy",
+    ),
+    "numpy in the condition of a section": (
+        lambda: jr.stability.poincare_section(
+            BODY, STATE, lambda t, state: np.sin(state.omega[0]), 3, 0.1
+        ),
+        "Use `jax.numpy` in a condition, not numpy",
     ),
     "forward mode through reverse mode": (
         lambda: jax.jacfwd(turned)(OMEGA),
@@ -181,6 +223,14 @@ MISTAKES = {
     "a count through vmap": (
         lambda: jax.vmap(lambda n: jr.stability.megno(BODY, STATE, 1.0, steps=n))(np.arange(9)),
         "`steps` must be known when it is compiled, but it is traced: hand it past",
+    ),
+    "an option through jit": (
+        lambda: jax.jit(lambda axis: jr.stability.growth_rate(MOMENTS, axis, 1.0))(1),
+        "`axis` must be known when it is compiled, but it is traced: hand it past",
+    ),
+    "`throw` through jit": (
+        lambda: jax.jit(lambda throw: free(MOMENTS, STATE, TS, throw=throw).omega)(False),
+        "`throw` must be known when it is compiled, but it is traced: hand it past",
     ),
     # records and fits
     "an array for a record": (
@@ -267,6 +317,12 @@ def test_a_mistake_is_told_with_what_to_do(name, untyped):
     call, message = MISTAKES[name]
     with pytest.raises(Exception, match=re.compile(message, re.DOTALL)):
         call()
+
+
+def test_an_error_in_a_torque_is_chained_to_that_of_jax(untyped):
+    with pytest.raises(ValueError, match=r"Use `jax\.numpy`") as error:
+        forced(Spring())
+    assert isinstance(error.value.__cause__, jax.errors.TracerArrayConversionError)
 
 
 def test_single_precision_is_told():

@@ -9,6 +9,7 @@ import pytest
 from helpers import ATTITUDE, MOMENTS, OMEGA, in_a_process, quick_jit
 
 import jrigid as jr
+from jrigid._stepping.control import _LARGEST_BOUND as LONGEST_STEP
 from jrigid.simulate._event import condition_of_states
 
 FORWARD = diffrax.ForwardMode()
@@ -178,6 +179,45 @@ def test_an_event_ends_the_motion_in_si_units():
     assert list(reached) == [True, False]
 
 
+# Runs that are too long ----------------------------------------------------------------------
+
+SLOWING = jr.RigidBody(MOMENTS, jr.torques.LinearDrag(1.0))
+
+
+def test_a_run_that_needs_more_than_the_default_steps_fails_before_its_first_one():
+    rates = np.stack([OMEGA, 1e7 * OMEGA])
+    motion = jax.vmap(lambda w: jr.simulate(BODY, jr.State(UPRIGHT, w), 50.0, throw=False))(rates)
+    assert [int(x) for x in motion.result._value] == [0, _pick("max_steps_reached")]
+    assert int(motion.stats["num_steps"][1]) == 0
+    assert np.all(np.isfinite(motion.states.omega[0]))
+    assert np.all(np.isnan(motion.states.omega[1]))
+
+
+def test_no_run_is_refused_that_would_succeed():
+    """Few steps may do where an event ends the motion, or where splitting takes long ones."""
+    state0 = jr.State(UPRIGHT, 2.0 * np.array([0, 0, 1.0]))
+    ended = jr.simulate(BODY, state0, np.array([0.5, 1e9]), event=TURNED)
+    np.testing.assert_allclose(ended.final_time, 0.65, atol=1e-8)
+    weight = jr.torques.UniformGravity(1.0, np.array([0, 0, 1e-3]), np.array([0, 0, -1.0]))
+    kicked = jr.simulate(
+        jr.RigidBody(MOMENTS, weight),
+        jr.State(UPRIGHT, 1e8 * OMEGA),
+        10.0,
+        solver=jr.solvers.Splitting(),
+        max_step=1.0,
+    )
+    assert kicked.result == jr.RESULTS.successful
+
+
+def test_steps_are_never_longer_than_the_fastest_rate_at_the_start_allows():
+    """What foresees that steps will be too few: drag makes the rate fall, but no step longer."""
+    rate = 100.0
+    state0 = jr.State(UPRIGHT, np.array([0, 0, rate]))
+    motion = jr.simulate(SLOWING, state0, 30.0)
+    assert motion.final_state.omega[2] < 1e-3 * rate
+    assert int(motion.stats["num_steps"]) > rate * 30.0 / LONGEST_STEP
+
+
 # Stiffness -----------------------------------------------------------------------------------
 
 
@@ -244,7 +284,8 @@ def _pick(code):
         ),
         (
             lambda: _in_twenty_steps(np.stack([OMEGA, OMEGA]), np.array([0.1, 100.0])),
-            r"maximum number of solver steps.*: in lane 1\.",
+            r"maximum number of solver steps .* fastest rate .* the radians requested: "
+            r"\[ *0\.989\d* +98\.9\d*\] in lane 1\. \(.*`jrigid.free_rotation` of a free body",
         ),
     ],
 )  # fmt: skip

@@ -1,3 +1,5 @@
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +37,58 @@ FIELD = np.array([0.3, 0.8, -0.5])
 POTENTIALS["dipole"] = tq.MagneticDipole(LEVER, FIELD)
 POTENTIALS["dipole, field of time"] = tq.MagneticDipole(LEVER, lambda t, _: orbit(t))
 POTENTIALS["both and a drag"] = POTENTIALS["gravity"] + POTENTIALS["gradient, tensor"]
+
+
+# --- torques that are not smooth --------------------------------------------------------------
+
+PUSH = np.array([0.0, 0.0, 1.0])
+TURNING = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, 0.01]))
+ON, OFF = 1000.0, 1000.1
+
+
+class Pulse(tq.AbstractTorque):
+    torque: jax.Array = eqx.field(converter=jnp.asarray)
+    start: jax.Array = eqx.field(converter=jnp.asarray)
+    end: jax.Array = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, t, _state, _args):
+        return jnp.where((t > self.start) & (t < self.end), self.torque, 0.0)
+
+    @property
+    def jumps(self):
+        return jnp.stack([self.start, self.end])
+
+
+def thruster(t, state, args):
+    return jnp.where((t > ON) & (t < OFF), jnp.asarray(PUSH), 0.0)
+
+
+@pytest.mark.parametrize("way", ["jumps", "a torque's own", "implicit"])
+def test_a_pulse_that_is_shorter_than_a_step_acts(way):
+    """A tenth of a second in an hour, in which the body turns by 36 rad."""
+    own = tq.LinearDrag(0.0) + Pulse(PUSH, ON, OFF)
+    torque = thruster if way == "jumps" else own
+    jumps = np.array([OFF, ON]) if way == "jumps" else None
+    solver, rtol = (diffrax.Kvaerno5(), 1e-6) if way == "implicit" else (None, None)
+    body = jr.RigidBody(MOMENTS, torque)
+    motion = jr.simulate(body, TURNING, 3600.0, jumps=jumps, solver=solver, rtol=rtol)
+    expected = TURNING.omega + PUSH * (OFF - ON) / MOMENTS
+    np.testing.assert_allclose(motion.final_state.omega, expected, atol=1e-9)
+
+
+def test_jumps_are_collected_from_all_parts_of_a_torque_and_a_force():
+    table = tq.Sampled(np.array([1.0, 2.0, 4.0]), np.ones((3, 3)), delay=0.5)
+    light = tq.SolarPressure(np.ones(1), PUSH[None], PUSH[None], table)
+    known = {
+        "a function": (thruster, []),
+        "a sum": (Pulse(PUSH, ON, OFF) + tq.Rotor(table), [ON, OFF, 1.5, 2.5, 4.5]),
+        "an orbit": (tq.GravityGradient(MU, table), [1.5, 2.5, 4.5]),
+        "a module in a function's place": (tq.Torque(Pulse(PUSH, ON, OFF)), [ON, OFF]),
+    }
+    for torque, expected in known.values():
+        np.testing.assert_array_equal(jr.RigidBody(MOMENTS, torque).jumps, expected)
+    flying = jr.FloatingBody(jr.solids.sphere(1.0, 0.1), light.force, Pulse(PUSH, ON, OFF))
+    np.testing.assert_array_equal(flying.jumps, [ON, OFF, 1.5, 2.5, 4.5])
 
 
 # --- torques that have a potential ------------------------------------------------------------

@@ -9,7 +9,8 @@ jit. Calls that raise compile nothing after the first (tests/test_no_leak.py).
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import diffrax
@@ -131,6 +132,14 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 
+def jumps_within(parts: Any) -> Float[Array, " jumps"]:
+    """Times at which something in a pytree declares, by `jumps`, that it is not smooth [s]."""
+    leaves = jtu.tree_leaves(parts, is_leaf=lambda x: hasattr(x, "jumps"))
+    declared = [x.jumps for x in leaves if hasattr(x, "jumps")]
+    known = float_arrays(jnp.zeros(0), *declared)
+    return jnp.concatenate([x.reshape(-1) for x in known])
+
+
 def state_array(value: Any) -> Any:
     """A floating point array; None and integers pass, for the `in_axes` of a state under vmap."""
     return value if value is None or isinstance(value, int) else float_arrays(value)[0]
@@ -194,6 +203,7 @@ def demand(ok: bool, message: str) -> None:
 
 def check_option(name: str, value: Any, options: Sequence[Any]) -> None:
     """Raise ValueError unless `value` is one of `options`."""
+    check_known(name, value)
     if value not in options:
         listed = ", ".join(map(repr, options))
         raise ValueError(f"Argument `{name}` must be one of {listed}, but it is {value!r}.")
@@ -214,13 +224,47 @@ def kind_of(value: Any) -> str:
     return f"an array of shape {value.shape}" if is_array else f"a {type(value).__name__}"
 
 
-def whole_number(name: str, value: Any, least: int = 1) -> int:
-    """A Python integer of some size, which fixes a cost at trace time, or ValueError."""
+def check_known(name: str, value: Any) -> None:
+    """Raise ValueError for an option that is traced: it fixes what is compiled."""
     demand(
         not isinstance(value, jax.core.Tracer),
         f"Argument `{name}` must be known when it is compiled, but it is traced: hand it past "
         "`jit`, `vmap` and `sweep`, in a closure or a Python loop.",
     )
+
+
+@contextmanager
+def traced_by_jax(function: str) -> Iterator[None]:
+    """Raise ValueError with what to write instead where a user's function cannot be traced.
+
+    Args:
+        function: What it is, in words: "a torque".
+    """
+    try:
+        yield
+    except jax.errors.TracerArrayConversionError as error:
+        raise ValueError(
+            f"Use `jax.numpy` in {function}, not numpy (`jnp.sin`, not `np.sin`): its arguments "
+            "are traced by JAX and have no values yet."
+        ) from error
+    except jax.errors.TracerBoolConversionError as error:
+        raise ValueError(
+            f"Use `jnp.where` or `jax.lax.cond` in {function}, not `if`, `and` or `max` of Python: "
+            "its arguments are traced by JAX and have no values yet."
+        ) from error
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        raise ValueError(
+            f"Use `jax.numpy` in {function}, not `math`, `float` or `int` (`jnp.sin`, not "
+            "`math.sin`): its arguments are traced by JAX and have no values yet."
+        ) from error
+
+
+def whole_number(name: str, value: Any, least: int = 1) -> int:
+    """A Python integer of some size, which fixes a cost at trace time, or ValueError."""
+    check_known(name, value)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(
             f"Argument `{name}` must be an integer and at least {least}, but it is {value!r}."
@@ -361,6 +405,7 @@ class Findings:
 
     def guard(self, tree: Tree, throw: bool) -> Tree:
         """Return what a builder made; raise if something is wrong, or NaN without `throw`."""
+        check_known("throw", throw)
         if not throw:
             return nan_where(~self.ok, tree)
         return _refuse(tree, ~self.ok, self.diagnosis)
@@ -404,6 +449,7 @@ def settle(
         findings: Checks the arguments once more, to tell which of them is wrong.
         arguments: Passed to `findings`: pytrees of arrays and of hashable configuration.
     """
+    check_known("throw", throw)
     if not throw:
         return answer
     result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]

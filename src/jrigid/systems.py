@@ -21,7 +21,9 @@ from jrigid._checks import (
     check_type,
     internal_parts,
     is_inertia,
+    jumps_within,
     state_array,
+    traced_by_jax,
 )
 from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
@@ -178,10 +180,13 @@ class RigidBody(AbstractSystem):
         Gradients: finite for any non-zero attitude quaternion.
         """
         inertia, torque = self._inertia_and_torque(state)
+        with traced_by_jax("a torque"):
+            acting = torque(t, state, args)
+            internal_rate = torque.internal_rate(t, state, args)
         return State(
             attitude_rate(state.attitude, state.omega),
-            euler_equations(inertia, state.omega, torque(t, state, args)),
-            torque.internal_rate(t, state, args),
+            euler_equations(inertia, state.omega, acting),
+            internal_rate,
         )
 
     def energy(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Scalar:
@@ -287,6 +292,11 @@ class FloatingBody(AbstractSystem):
         return self.mass_properties.inertia
 
     @property
+    def jumps(self) -> Float[Array, " jumps"]:
+        """Times at which the torque or the force says that it is not smooth [s]."""
+        return jumps_within([self.torque, self.force])
+
+    @property
     def rotation(self) -> RigidBody:
         """The body that turns about the centre of mass as this one does."""
         return RigidBody(self.inertia, self.torque)
@@ -318,7 +328,9 @@ class FloatingBody(AbstractSystem):
         check_shape("velocity", state.velocity, (3,))
         force = jnp.zeros_like(state.velocity)
         if self.force is not None:
-            force = jnp.asarray(self.force(t, state, args), force.dtype)
+            with traced_by_jax("a force"):
+                acting = self.force(t, state, args)
+            force = jnp.asarray(acting, force.dtype)
             check_shape("force", force, (3,))
         acceleration = force / self.mass_properties.mass.astype(force.dtype)
         turning = self.rotation.vector_field(t, state, args)

@@ -91,9 +91,9 @@ def in_tolerances(
     limits: Limits, scales: Array, y0: Array, y1: Array, error: Array
 ) -> Float[Array, ""]:
     """Root mean square of the components of an error, as multiples of their tolerances."""
-    size = jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-    scaled = error / (limits.atol * scales + size * limits.rtol)
-    norm = jnp.sqrt(jnp.mean(scaled * scaled))
+    size = jnp.maximum(jnp.abs(y0 / scales), jnp.abs(y1 / scales))
+    multiples = (error / scales) / (limits.atol + size * limits.rtol)
+    norm = jnp.sqrt(jnp.mean(multiples * multiples))
     return jnp.where(jnp.isnan(norm), jnp.inf, norm)
 
 

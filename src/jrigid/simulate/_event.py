@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jrigid._checks import traced_by_jax
 from jrigid._stepping.events import Conditions
 
 # Each Newton step doubles the orders of the derivatives that are right: two serve the
@@ -30,7 +31,8 @@ def condition_of_states(
     asked = {name: x for name, x in options.items() if every or name in names}
 
     def of_array(t: Array, y: Any, args: Any) -> Any:
-        return condition(t0 + t, to_state(y), args, **asked)
+        with traced_by_jax("the condition of an event"):
+            return condition(t0 + t, to_state(y), args, **asked)
 
     return of_array
 

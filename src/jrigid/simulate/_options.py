@@ -66,9 +66,27 @@ class Options(NamedTuple):
         return isinstance(self.solver, diffrax.AbstractImplicitSolver)
 
     @property
+    def is_worth_foreseeing(self) -> bool:
+        """Whether a motion that needs too many steps is to fail before its first one.
+
+        It runs for minutes before it has used up the default number. A smaller one bounds
+        the work: such a run hands out what it reached. Where an event ends a motion,
+        nothing is known beforehand, and the closed form takes no steps.
+        """
+        if self.event is not None or isinstance(self.solver, ExactFree):
+            return False
+        return self.max_steps >= _default_max_steps(self.adjoint)
+
+    @property
     def fastest_of(self) -> Callable[[Array], Array]:
         """What bounds the steps, of the Jacobian: its fastest rate, or that which nothing damps."""
         return undamped_rate if self.is_implicit else spectral_radius
+
+
+def _default_max_steps(adjoint: diffrax.AbstractAdjoint) -> int:
+    """The largest number of steps, unless it is given."""
+    direct = isinstance(adjoint, diffrax.DirectAdjoint)
+    return _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
 
 
 def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Options:
@@ -91,8 +109,7 @@ def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Optio
         adjoint = diffrax.RecursiveCheckpointAdjoint()
     check_type("adjoint", adjoint, *_ADJOINTS)
     if max_steps is None:
-        direct = isinstance(adjoint, diffrax.DirectAdjoint)
-        max_steps = _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
+        max_steps = _default_max_steps(adjoint)
     if event is not None:
         check_type("event", event, diffrax.Event)
     check_type("progress", meter, bool, diffrax.AbstractProgressMeter)

@@ -15,6 +15,7 @@ from jrigid._stepping.control import Limits, largest_steps
 from jrigid._stepping.motion import Motion, constant
 from jrigid._stepping.scales import units
 from jrigid.simulate._options import SMALLEST_RTOL, Inputs, Options
+from jrigid.solvers import Splitting
 from jrigid.systems import AbstractSystem
 
 # One step may commit this fraction of rtol, less with methods of lower order than 8,
@@ -31,6 +32,14 @@ _SHORTEST = 64.0
 # The vector field is evaluated so many eps of the time beside a jump.
 _BESIDE = 4.0
 _RATE_BITS = 16  # of the rate that bounds the steps
+# By rounding a run may take fewer steps than the fewest it needs, by this fraction.
+_SAVED = 1e-2
+_TOO_FEW_STEPS = (
+    "The maximum number of solver steps is too small for the fastest rate at the start [rad/s] "
+    "and the radians requested. (Closed forms cost no more for more turns: `jrigid.free_rotation` "
+    "of a free body, `jrigid.top_motion` of a symmetric top. Else check the units, shorten `ts` or "
+    "pass a larger `max_steps`.)"
+)
 
 
 class Prepared(NamedTuple):
@@ -67,8 +76,8 @@ class Prepared(NamedTuple):
         return self.motion._replace(parameters=self.parameters, times=self.times)
 
 
-def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, Array]]:
-    """Every invalid value among the arguments; the fastest rate, and scales."""
+def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
+    """Every invalid value among the arguments; what holds the steps, and scales."""
     inputs = constant(inputs)
     system, state0, ts, t0, args, _ = inputs
     findings, flat, since_start = Findings(), ts.reshape(-1), inputs.since_start
@@ -91,7 +100,25 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, tuple[Array, Arr
     bits = jnp.finfo(fastest.dtype).nexp
     fastest = jax.lax.reduce_precision(fastest, bits, _RATE_BITS)
     findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
-    return findings, (fastest, scales)
+    limits = limits_of(since_start[-1], fastest, options)
+    if options.is_worth_foreseeing:
+        require_enough_steps(findings, _can_be_enough(limits, options), limits)
+    return findings, limits, scales
+
+
+def require_enough_steps(findings: Findings, ok: Array, limits: Limits) -> None:
+    """Note that the steps are too few for a motion, with its fastest rate and its radians."""
+    value = jnp.stack([limits.start_rate, limits.start_rate * limits.end])
+    findings.require(ok, RESULTS.max_steps_reached, _TOO_FEW_STEPS, value)
+
+
+def _can_be_enough(limits: Limits, options: Options) -> Array:
+    """Whether the largest number of steps can lead to the end of a motion.
+
+    No step is longer than the longest at the start, even where the rate falls.
+    """
+    longest = options.max_step if isinstance(options.solver, Splitting) else limits.longest
+    return ~((1 - _SAVED) * limits.end > options.max_steps * longest)
 
 
 def opened(function: Callable[..., Array], *example: Array) -> tuple[Callable, list[Array]]:
@@ -107,7 +134,7 @@ def opened(function: Callable[..., Array], *example: Array) -> tuple[Callable, l
 
 def prepared(inputs: Inputs, options: Options) -> Prepared:
     """The motion that the arguments ask for."""
-    findings, (fastest, scales) = judged(inputs, options)
+    findings, limits, scales = judged(inputs, options)
     usable = harmless_motion(findings.ok, inputs)
     y0, to_state = ravel_pytree(usable.state0)
     times = jnp.where(findings.ok, inputs.since_start, 0.0)
@@ -130,7 +157,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         jumps=jumps,
         beside=jnp.full_like(jumps, beside),
         scales=scales,
-        limits=jnp.stack(limits_of(end, fastest, options)),
+        limits=jnp.where(findings.ok, jnp.stack(limits), 0.0),
     )
     return Prepared(
         findings=findings,
@@ -143,7 +170,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         to_state=to_state,
         omega=_place_of_omega(usable.state0),
         start=start,
-        fastest=fastest,
+        fastest=limits.start_rate,
     )
 
 
@@ -159,7 +186,7 @@ def _place_of_omega(state: Any) -> int:
 
 def jumps_of(system: AbstractSystem, jumps: Any, dtype: Any) -> Array:
     """Times at which the vector field is not smooth: those given and the system's."""
-    own = system.jumps
+    own = array_of_shape("jumps", system.jumps, None)
     if jumps is None:
         return own.astype(dtype)
     given = array_of_shape("jumps", jumps, None)

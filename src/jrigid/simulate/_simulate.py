@@ -40,7 +40,14 @@ from jrigid.rotation import normalize
 from jrigid.simulate._equal_steps import equal_steps
 from jrigid.simulate._event import condition_of_states, conditions_of, place_of_event
 from jrigid.simulate._options import Inputs, Options, checked_options
-from jrigid.simulate._prepare import Prepared, judged, jumps_of, opened, prepared
+from jrigid.simulate._prepare import (
+    Prepared,
+    judged,
+    jumps_of,
+    opened,
+    prepared,
+    require_enough_steps,
+)
 from jrigid.simulate._through_diffrax import solve_by_diffrax
 from jrigid.simulate._trajectory import Trajectory
 from jrigid.solvers import ExactFree, FreeRotation, Splitting
@@ -67,8 +74,9 @@ def simulate(
 ) -> Trajectory:
     r"""Integrate the motion of a body and return its states at the times `ts`.
 
-    Nothing needs tuning: the variables are measured in their own scales, so the answer does not
-    depend on the unit of time, and the error control is set for the promises below.
+    The variables are measured in their own scales, so the answer does not depend on the unit of
+    time, and the error control is set for the promises below. One thing it cannot know: a pulse
+    of torque that is shorter than a step is missed, unless `jumps` or `max_step` tell of it.
 
     Args:
         system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or what has a method
@@ -102,15 +110,19 @@ def simulate(
             `jax.jacrev`) works; `diffrax.ForwardMode()` gives `jax.jvp`, `jax.jacfwd` and forward
             over forward; `diffrax.DirectAdjoint()` every mode and order.
         max_steps: Largest number of steps; by default 2e7, enough for some 5e5 turns, but 4096
-            for `DirectAdjoint`, whose cost grows with it.
-        max_step: Longest step [s]. Steps follow the fastest rate of the motion, which is looked
-            at where each begins and ends. A pulse of torque much shorter than a radian of
-            turning, or than the run if the body is at rest, can fall between two such looks:
-            bound the step by its length, or name its start and end as `jumps`.
+            for `DirectAdjoint`, whose cost grows with it. A motion that certainly needs more
+            than the default fails before its first step; with a smaller number it goes as far
+            as that leads. For a free body `jrigid.free_rotation` has no such bound.
+        max_step: Longest step [s]. Steps follow the fastest rate of the motion, which is
+            evaluated where each begins and ends. A pulse of torque much shorter than a radian
+            of turning, or than the run if the body is at rest, can fall between two
+            evaluations and is then missed: bound the step by the length of the pulse, or name
+            its start and end as `jumps`.
         jumps: Times [s] at which a torque or a force is not smooth: where it is switched, or
-            the knots of a table that it is interpolated in. Steps end exactly there. Torques
-            of `jrigid.torques` declare their own. Without them such a motion is as accurate,
-            in more steps.
+            the knots of a table that it is interpolated in. Steps end exactly there. A torque
+            that has a property `jumps`, as those of `jrigid.torques`, declares its own; a
+            plain function cannot. A switch or a knot that is not named is found and costs
+            more steps; a pulse shorter than a step is missed.
         event: A `diffrax.Event` that ends the motion; its condition functions are called with
             (t, state, args), in SI units. The time at which a number changes its sign, or a
             boolean becomes true, is found by bisection, unless the event brings a root finder.
@@ -158,7 +170,9 @@ def simulate(
 
 def _findings(inputs: Inputs, options: Options, result: Any, final_time: Array) -> Findings:
     """What is wrong with the arguments, and where a torque became NaN."""
-    findings, _ = judged(inputs, options)
+    findings, limits, _ = judged(inputs, options)
+    enough = result != RESULTS.max_steps_reached
+    require_enough_steps(findings, enough, limits)
     stopped = result == RESULTS.nonfinite_torque
     findings.require(~stopped, RESULTS.nonfinite_torque, value=final_time)
     return findings

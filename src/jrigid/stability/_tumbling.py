@@ -23,6 +23,7 @@ from jrigid._checks import (
     nan_where,
     settle,
     shaped,
+    traced_by_jax,
     where_defined,
     whole_number,
 )
@@ -126,7 +127,8 @@ def poincare_section(
 
 def _section_findings(motion: Motion, condition: Callable) -> Findings:
     findings = findings_of(motion)
-    value = jnp.asarray(condition(motion.t0, motion.state0), motion.t0.dtype)
+    with traced_by_jax("a condition"):
+        value = jnp.asarray(condition(motion.t0, motion.state0), motion.t0.dtype)
     check_shape("condition", value, ())
     message = "Argument `condition` must be finite at the start, but it is not."
     findings.require(jnp.isfinite(value), RESULTS.invalid_vector_field, message, value)

@@ -12,7 +12,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import (
@@ -23,6 +22,7 @@ from jrigid._checks import (
     array_of_shape,
     check_shape,
     demand,
+    jumps_within,
 )
 from jrigid._numerics import safe_norm
 from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
@@ -139,12 +139,26 @@ class AbstractTorque(Readable):
         """Times at which the torque is not smooth [s]; steps of `simulate` end there.
 
         By default they are those that its parts declare: torques in a sum, a `Sampled` in
-        a field. A subclass that switches at known times returns these.
+        a field. A subclass that switches at known times returns these:
+
+        >>> import equinox as eqx, jax, jax.numpy as jnp, jrigid as jr
+        >>> class Pulse(jr.torques.AbstractTorque):
+        ...     torque: jax.Array
+        ...     start: jax.Array = eqx.field(converter=jnp.asarray)
+        ...     end: jax.Array = eqx.field(converter=jnp.asarray)
+        ...
+        ...     def __call__(self, t, state, args):
+        ...         return jnp.where((t > self.start) & (t < self.end), self.torque, 0.0)
+        ...
+        ...     @property
+        ...     def jumps(self):
+        ...         return jnp.stack([self.start, self.end])
+        >>> first = Pulse(jnp.array([0.0, 0.0, 1.0]), 10.0, 10.5)
+        >>> second = Pulse(jnp.array([0.0, 0.0, -1.0]), 20.0, 20.5)
+        >>> print((first + second + jr.torques.LinearDrag(0.1)).jumps)
+        [10.  10.5 20.  20.5]
         """
-        parts = jtu.tree_leaves(self, is_leaf=lambda x: x is not self and hasattr(x, "jumps"))
-        known = [jnp.zeros(0), *(x.jumps for x in parts if hasattr(x, "jumps"))]
-        dtype = jnp.result_type(*known)
-        return jnp.concatenate([x.astype(dtype) for x in known])
+        return jumps_within([getattr(self, x.name) for x in dataclasses.fields(self)])
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Potential energy [J]; zero if the torque has none."""
