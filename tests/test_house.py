@@ -84,6 +84,91 @@ def test_undocumented_parts_of_other_packages_are_used_in_one_module():
     assert users == {_THIRD_PARTY}
 
 
+# Steps are taken in `_stepping`. Others may call a solver's step for these reasons alone.
+_STEPPING = "_stepping."
+_CALLS_OF_A_STEP = {
+    "simulate._equal_steps": "Splitting and FreeRotation are made for rotation: no tableau",
+    "stability._steps": "a user's solver that is no explicit Runge-Kutta method",
+}
+_TABLEAUS = {
+    "solvers._verner": "defines one",
+}
+_OF_A_TABLEAU = {"tableau", "a_lower", "b_sol", "b_error", "scan_kind", "ButcherTableau"}
+
+
+def _calls_of_a_step(tree):
+    """Calls `x.step(...)`."""
+    calls = [x for x in ast.walk(tree) if isinstance(x, ast.Call)]
+    return [x for x in calls if isinstance(x.func, ast.Attribute) and x.func.attr == "step"]
+
+
+def _names_of_tableaus(tree):
+    """Names that only who evaluates a Runge-Kutta method, or defines one, needs."""
+    for node in ast.walk(tree):
+        names = {getattr(node, x, None) for x in ("id", "attr", "arg")}
+        yield from names & _OF_A_TABLEAU
+
+
+def _is_field(callee, function):
+    """Whether a call may be one of a vector field: given, defined on the spot, or a body's."""
+    arguments = [x.arg for x in function.args.args]
+    inside = [x.name for x in ast.walk(function) if isinstance(x, ast.FunctionDef)]
+    return callee in [*arguments, *inside] or callee.endswith((".vector_field", ".rates"))
+
+
+def _longest_chain(function):
+    """The most calls of a field of which each takes the result of the one before.
+
+    Stages written by hand are such a chain: two = rate(t + h / 2, y + h / 2 * one).
+    """
+    depths = {}
+
+    def depth(node, callee):
+        if isinstance(node, ast.Name):
+            return depths.get((node.id, callee), 0)
+        inside = [depth(x, callee) for x in ast.iter_child_nodes(node)]
+        own = isinstance(node, ast.Call) and ast.unparse(node.func) == callee
+        return max(inside, default=0) + own
+
+    longest = 0
+    for node in function.body:
+        if not isinstance(node, ast.Assign):
+            continue
+        calls = [ast.unparse(x.func) for x in ast.walk(node.value) if isinstance(x, ast.Call)]
+        names = [x.id for x in ast.walk(node.targets[0]) if isinstance(x, ast.Name)]
+        for callee in {x for x in calls if _is_field(x, function)}:
+            found = depth(node.value, callee)
+            longest = max(longest, found)
+            depths |= {(name, callee): found for name in names}
+    return longest
+
+
+def test_steps_are_taken_in_one_place():
+    elsewhere = [x for x in house.modules() if not x[0].startswith(_STEPPING)]
+    callers = {name for name, _, tree in elsewhere if _calls_of_a_step(tree)}
+    assert callers == set(_CALLS_OF_A_STEP)
+    readers = {name for name, _, tree in elsewhere if list(_names_of_tableaus(tree))}
+    assert readers == set(_TABLEAUS)
+    chains = [
+        name
+        for name, node, _, _ in house.functions()
+        if not name.startswith(_STEPPING) and _longest_chain(node) > 2
+    ]
+    assert not chains
+
+
+def test_stages_written_by_hand_are_seen():
+    source = """
+def step(rate, t, h, y):
+    one = rate(t, y)
+    two = rate(t + h / 2, y + h / 2 * one)
+    three = rate(t + h / 2, y + h / 2 * two)
+    four = rate(t + h, y + h * three)
+    return y + h / 6 * (one + 2 * two + 2 * three + four)
+"""
+    assert _longest_chain(ast.parse(source).body[0]) == 4
+
+
 def test_no_circle_between_packages():
     above = {}
     for module, source, _ in house.imports():

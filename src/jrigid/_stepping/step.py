@@ -34,7 +34,7 @@ def combine(
     if isinstance(row, int):
         used = np.flatnonzero(method.rows[row])
         return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
-    weights = _row(method.rows, row, rates.dtype)
+    weights = _row(method.rows[:, : len(rates)], row, rates.dtype)
     if not in_lanes:
         return jnp.sum(weights[:, None] * rates, axis=0)
 
@@ -108,6 +108,21 @@ def stages(
         y: The state there.
         in_lanes: Whether it will have many lanes.
     """
+    return _loop(method, field, (t, h, y), method.stages, in_lanes)
+
+
+def _loop(
+    method: Method,
+    field: Field,
+    step: tuple[Float[Array, ""], Float[Array, ""], Array],
+    count: int,
+    in_lanes: bool,
+) -> tuple[Float[Array, "count n"], Float[Array, " n"]]:
+    """The rates of the first `count` stages, and the place of the stage after them.
+
+    The place of the last stage is the result of the step.
+    """
+    t, h, y = step
 
     def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rates, place = carry
@@ -117,8 +132,42 @@ def stages(
         following = jnp.minimum(i + 1, method.stages - 1)
         return rates, y + h * combine(method, rates, following, in_lanes)
 
-    rates = jnp.zeros((method.stages, *y.shape), y.dtype)
-    return jax.lax.fori_loop(0, method.stages, stage, (rates, y))
+    rates = jnp.zeros((count, *y.shape), y.dtype)
+    return jax.lax.fori_loop(0, count, stage, (rates, y))
+
+
+def equal_steps(
+    method: Method,
+    field: Field,
+    t: Float[Array, ""],
+    h: Float[Array, ""],
+    y: Array,
+    count: int = 1,
+) -> Float[Array, " n"]:
+    """The state after a fixed number of equal steps, without an error estimate.
+
+    All loops have a known length, so JAX differentiates them as scans.
+
+    Args:
+        method: The method.
+        field: The vector field.
+        t: Where the first step starts.
+        h: Length of a step, negative for one back in time.
+        y: The state at the start.
+        count: Number of steps.
+
+    Gradients: in every mode, of every order.
+    """
+    # The rate of the last stage, at the end of a step, serves the error estimate alone.
+    needed = method.stages - 1
+
+    def step(i: Array, y: Array) -> Array:
+        start = t + i.astype(h.dtype) * h
+        return _loop(method, field, (start, h, y), needed, True)[1]
+
+    if count == 1:
+        return step(jnp.zeros((), int), y)
+    return jax.lax.fori_loop(0, count, step, y)
 
 
 def error_of(method: Method, rates: Float[Array, "stages n"], h: Array) -> Array:

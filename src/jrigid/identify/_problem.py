@@ -81,8 +81,11 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
 def _flow(options: Options, system: Any, before: State, start: Array, end: Array) -> State:
     """States a short time later, or earlier, each of its own start."""
     if not options.free_motion:
-        how = options.on_attitude, options.motion is not None
-        return jax.vmap(lambda x, a, b: forced_flow(system, x, a, b, *how))(before, start, end)
+
+        def flow(state: State, start: Array, end: Array) -> State:
+            return forced_flow(system, state, start, end, options.on_attitude)
+
+        return jax.vmap(flow)(before, start, end)
     turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(before.omega, end - start)
     if options.on_attitude:
         turn = jax.vmap(multiply)(before.attitude, turn)

@@ -45,7 +45,7 @@ def motion_of(
     """A motion with shapes checked and internal parts, its times in the precision of the state."""
     system, state0, times = motion_arguments(system, state0, RigidBody, t0=t0, duration=duration)
     t0, duration = (x.astype(state0.omega.dtype) for x in times)
-    solver = solver_of(solver, diffrax.Dopri8(scan_kind="lax"))
+    solver = solver_of(solver, diffrax.Dopri8())
     return Motion(system, state0, args, t0, duration, solver)
 
 
@@ -117,26 +117,33 @@ class Walk(NamedTuple):
             return self.with_tangents(*beside(tangents[0]))
         return self.with_tangents(*jax.vmap(beside, out_axes=(None, 0))(tangents))
 
-    def _solve(self, t: Array, y: Array) -> tuple[Array, Array, Any]:
-        """One step of the solver: its end, its error, and what interpolates it."""
+    def _by_solver(self, t: Array, y: Array) -> tuple[Array, Array, Any]:
+        """One step of a solver that is no explicit Runge-Kutta method.
+
+        Its end, its error, and what interpolates it.
+        """
         term = diffrax.ODETerm(lambda t, y, _: self._together(t, y))  # pyright: ignore
         solver, end = self.motion.solver, t + self.step
         memory = solver.init(term, t, end, y, None)
         return solver.step(term, t, end, y, None, memory, made_jump=False)[:3]
 
+    def _step(self, t: Array, y: Array, in_lanes: bool = False) -> tuple[Array, Array, Any]:
+        """One step: its end, its error, and what interpolates it."""
+        if not isinstance(self.motion.solver, diffrax.AbstractERK):
+            return self._by_solver(t, y)
+        method = method_of(self.motion.solver)
+        rates, after = stages(method, self._together, t, self.step, y, in_lanes)
+        known = self.step * rates[: method.own]
+        return after, error_of(method, rates, self.step), {"y0": y, "y1": after, "k": known}
+
     def advance(self, t: Array, y: Array, in_lanes: bool = False) -> tuple[Array, Array]:
         """One step, and the local error of the state."""
-        if isinstance(self.motion.solver, diffrax.AbstractERK):
-            method = method_of(self.motion.solver)
-            rates, after = stages(method, self._together, t, self.step, y, in_lanes)
-            error = error_of(method, rates, self.step)
-        else:
-            after, error, _ = self._solve(t, y)
+        after, error, _ = self._step(t, y, in_lanes)
         return self.on_sphere(after), jnp.max(jnp.abs(error[: self.scales.size]) / self.scales)
 
     def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
         """States within one step, by the fraction of it that has passed."""
-        *_, dense = self._solve(t, y)
+        *_, dense = self._step(t, y)
         zero = jnp.zeros_like(t)
         curve = self.motion.solver.interpolation_cls(t0=zero, t1=zero + 1, **dense)
         return lambda fraction: self.on_sphere(curve.evaluate(fraction))
