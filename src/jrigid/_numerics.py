@@ -4,6 +4,7 @@ Functions of an angle or a norm that are even in it are written as functions of 
 makes them analytic where `sqrt`, `norm` and `sin(x) / x` have none or NaN derivatives.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,16 +16,32 @@ from jaxtyping import Array, Float
 
 Components = tuple[Array, ...]
 
+_FEW = 4
 _SERIES_BELOW = 0.5
 _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
 
 def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
+    largest = jax.lax.stop_gradient(_over_components(jnp.maximum, jnp.abs(vector)))
     scale = jnp.where(largest == 0, 1.0, largest)
-    scaled = vector / scale[..., None]
-    return scale * root_of_positive(jnp.sum(scaled * scaled, axis=-1))
+    return scale * root_of_positive(sum_of_squares(vector / scale[..., None]))
+
+
+def sum_of_squares(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
+    """Square of the Euclidean norm."""
+    return _over_components(jnp.add, vector * vector)
+
+
+def _over_components(combine: Any, vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
+    """A reduction over the last axis, by a ufunc.
+
+    Of few components it is written out: XLA then computes it together with what is around
+    it, where a reduction is a program of its own.
+    """
+    if vector.shape[-1] > _FEW:
+        return combine.reduce(vector, axis=-1)
+    return functools.reduce(combine, [vector[..., i] for i in range(vector.shape[-1])])
 
 
 def or_one(size: Float[Array, "..."]) -> Float[Array, "..."]:

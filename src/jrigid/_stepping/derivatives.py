@@ -11,7 +11,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._core.lanes import as_lanes
-from jrigid._stepping.control import Limits
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.guards import guard_derivative
 from jrigid._stepping.motion import Motion, constant, steps_fixed
@@ -21,8 +20,7 @@ from jrigid._stepping.run import Ends, record_alone, run_alone, run_in_lanes
 
 def _finely(motion: Motion) -> Motion:
     """A motion in steps for derivatives."""
-    limits = Limits(*motion.limits).for_derivatives()
-    return motion._replace(limits=jnp.stack(limits))
+    return motion._replace(limits=motion.limits.for_derivatives())
 
 
 def solve(engine: Engine, motion: Motion) -> Ends:
@@ -56,7 +54,7 @@ def solve_reverse(engine: Engine, motion: Motion) -> Ends:
         )
         # Run again, the motion ends where it ended: at an event, or where it failed.
         motion = _finely(motion)
-        motion = motion._replace(limits=motion.limits.at[0].set(t))
+        motion = motion._replace(limits=motion.limits._replace(end=t))
         moved, rest = _split(motion, perturbed)
         alone, together = (partial(x, engine) for x in (pull_alone, pull_in_lanes))
         total, y0 = as_lanes(together, rest, moved, changes, tried, alone=alone)

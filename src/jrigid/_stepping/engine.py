@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jrigid._stepping.control import Limits
 from jrigid._stepping.events import Conditions
 from jrigid._stepping.motion import (
     ENDED,
@@ -71,11 +70,11 @@ class Engine(NamedTuple):
 
     def begin(self, motion: Motion) -> Progress:
         """The motion at its start."""
-        limits = Limits(*motion.limits)
+        limits = motion.limits
         zero = jnp.zeros_like(limits.end)
         first = limits.longest * self.stepper.first
         counts = [
-            jnp.where(limits.end > 0, RUNNING, ENDED),
+            jnp.where((limits.end > 0) & (limits.start_rate > 0), RUNNING, ENDED),
             0,
             0,
             jnp.sum(motion.times <= 0),
@@ -138,7 +137,7 @@ class Engine(NamedTuple):
         again = t1 >= _entry(motion.times, output + hit.astype(output.dtype))
         new_state = jnp.where(keep & (t1 >= end) & ~again, ENDED, new_state)
         if self.conditions is not None:
-            limits = Limits(*motion.limits)
+            limits = motion.limits
             now = self.conditions.values(motion.observed, t1, y1)
             now = jax.lax.stop_gradient(now)
             happened = self.conditions.happened(values, now)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jrigid._stepping.control import Limits
+
 # States of a motion that is integrated.
 RUNNING, ENDED, STUCK, NOT_FINITE, EVENT, TOO_MANY_STEPS, EMPTY = range(7)
 
@@ -24,7 +26,7 @@ class Motion(NamedTuple):
             are none.
         beside: For each jump, the distance from it at which the vector field is evaluated.
         scales: Scales of the components of the state.
-        limits: `Limits` as one array.
+        limits: What holds the steps. A motion whose fastest rate is zero ends at its start.
     """
 
     parameters: list[Array]
@@ -34,7 +36,7 @@ class Motion(NamedTuple):
     jumps: Float[Array, " jumps"]
     beside: Float[Array, " jumps"]
     scales: Float[Array, " n"]
-    limits: Float[Array, " limits"]
+    limits: Limits
 
 
 def constant(tree: Any) -> Any:

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._core.lanes import width_of
 from jrigid._core.lanes_last import lanes_last
-from jrigid._stepping.control import Limits
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import EMPTY, Motion, Progress, steps_fixed
 
@@ -245,8 +244,7 @@ def run_in_lanes(engine: Engine, shared: Any, each: Any) -> Ends:
 
     def at_start(own: Any) -> tuple[Array, Array]:
         motion = motion_of(own)
-        limits = Limits(*motion.limits)
-        return _states_at_start(motion), limits.end * limits.start_rate
+        return _states_at_start(motion), motion.limits.end * motion.limits.start_rate
 
     ys, radians = jax.vmap(at_start)(table)
     # Long motions come first, so that none is left at the end with few beside it.

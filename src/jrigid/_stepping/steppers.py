@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jrigid._stepping.control import Limits, Verdict, in_tolerances, judge
+from jrigid._stepping.control import Verdict, in_tolerances, judge
 from jrigid._stepping.method import Method
 from jrigid._stepping.motion import Motion, Progress, fastest_rate
 from jrigid._stepping.scales import rate_along
@@ -144,7 +144,7 @@ class ErrorControlled(NamedTuple):
     ) -> Trial:
         """The result, judged by its error and by the fastest rate at its end."""
         y, direction, (t, step, rate0, _), counts, _ = progress
-        limits = Limits(*motion.limits)
+        limits = motion.limits
 
         def rates_at(t: Array, y: Array) -> Array:
             return field(motion.parameters, t, y)

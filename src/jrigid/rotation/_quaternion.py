@@ -7,7 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, PRNGKeyArray
 
 from jrigid._checks import array_of_shape, shaped, where_defined
-from jrigid._numerics import arctanc_sqrt, cos_sqrt, power_of_two, safe_norm, sinc_sqrt
+from jrigid._numerics import (
+    arctanc_sqrt,
+    cos_sqrt,
+    power_of_two,
+    safe_norm,
+    sinc_sqrt,
+    sum_of_squares,
+)
 from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
 
 
@@ -90,7 +97,7 @@ def normalize(quaternion: QuaternionLike) -> Quaternion:
 def _direction(vector: Array) -> Array:
     """Vector over its norm; at zero the value is zero and the gradient zero."""
     vector = rescaled(vector)
-    square = jnp.sum(vector * vector)
+    square = sum_of_squares(vector)
     zero = square == 0
     return jnp.where(zero, jnp.zeros_like(vector), vector / jnp.sqrt(jnp.where(zero, 1.0, square)))
 

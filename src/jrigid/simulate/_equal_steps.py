@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._motion import depends_on
-from jrigid._stepping.control import SMALLEST_BOUND, Limits
+from jrigid._stepping.control import SMALLEST_BOUND
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import Motion
 from jrigid._stepping.steppers import EqualSteps
@@ -24,7 +24,7 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     """An engine for the steps of a solver, and the motion with its parameters."""
     system, args = given.inputs.system, given.inputs.args
     motion, solver = given.motion, options.solver
-    limits = Limits(*motion.limits)
+    limits = motion.limits
     if isinstance(solver, Splitting):
         longest = options.max_step
 
@@ -45,7 +45,7 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
 
     plain, parameters = opened(advance, limits.end, limits.end, motion.y0)
     longest = jnp.where(given.findings.ok, longest, 1.0)
-    limits = jnp.stack(limits._replace(longest=longest))
+    limits = limits._replace(longest=longest)
     motion = motion._replace(parameters=parameters, limits=limits)
     return Engine(given.field, EqualSteps(plain), options.max_steps), motion
 

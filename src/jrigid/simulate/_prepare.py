@@ -49,7 +49,7 @@ class Prepared(NamedTuple):
         findings: What is wrong with the arguments.
         inputs: The arguments, harmless where they are wrong.
         motion: In numbers, its parameters and times as they were given: what lanes share
-            stays shared. Where an argument is wrong it ends at its start.
+            stays shared. Where an argument is wrong its fastest rate is zero.
         field: Vector field of (parameters, t, y).
         parameters: Those of the field, harmless where an argument is wrong.
         times: The output times, all zero where an argument is wrong.
@@ -73,7 +73,8 @@ class Prepared(NamedTuple):
     @property
     def harmless_motion(self) -> Motion:
         """The motion with parameters and times of each lane, harmless where one is wrong."""
-        return self.motion._replace(parameters=self.parameters, times=self.times)
+        limits = self.motion.limits._replace(end=jax.lax.stop_gradient(self.times[-1]))
+        return self.motion._replace(parameters=self.parameters, times=self.times, limits=limits)
 
 
 def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
@@ -157,7 +158,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         jumps=jumps,
         beside=jnp.full_like(jumps, beside),
         scales=scales,
-        limits=jnp.where(findings.ok, jnp.stack(limits), 0.0),
+        limits=limits._replace(start_rate=jnp.where(findings.ok, limits.start_rate, 0.0)),
     )
     return Prepared(
         findings=findings,

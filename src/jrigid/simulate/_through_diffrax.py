@@ -92,7 +92,7 @@ def solve_by_diffrax(
 ) -> tuple[Array, Array, Array, Any, dict[str, Any]]:
     """States at the output times, the end and the state there, what became of it."""
     fixed = constant(motion)
-    limits = Limits(*fixed.limits)
+    limits = fixed.limits
     controller: Any = RateController(
         limits=limits,
         scales=fixed.scales,
