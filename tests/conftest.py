@@ -28,14 +28,34 @@ gc.set_threshold(100_000, 50, 50)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-# Compiled tests are found again by the next run on the same machine.
-jax.config.update("jax_compilation_cache_dir", os.environ.get("JRIGID_TEST_CACHE"))
+# What was compiled is found again by the next run with the same folder, small programs too.
+if os.environ.get("JRIGID_TEST_CACHE"):
+    jax.config.update("jax_compilation_cache_dir", os.environ["JRIGID_TEST_CACHE"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 with install_import_hook("jrigid", "beartype.beartype"):
     import jrigid  # noqa: F401
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from hypothesis import given, settings  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+
+
+@pytest.fixture(scope="session", autouse=True)
+def first_hypothesis():
+    """Hypothesis collects garbage before its first test: here, while there is little to go through.
+
+    In a process that has run for long it takes eight seconds.
+    """
+
+    @settings(max_examples=1, database=None, deadline=None)
+    @given(st.none())
+    def nothing(_):
+        pass
+
+    nothing()
 
 
 @pytest.fixture

@@ -106,8 +106,8 @@ def short_program():
     return jax.jit(lambda ts, y, s: identify.fit(BLIND, identify.Rates(ts, y, s), throw=False))
 
 
-def padded(ts, values):
-    rest = 64 - len(ts)
+def padded(ts, values, size=64):
+    rest = size - len(ts)
     return (
         np.pad(ts, (0, rest), constant_values=np.nan),
         np.pad(values, ((0, rest), (0, 0)), constant_values=np.nan),
@@ -179,7 +179,9 @@ def test_500_random_records_are_never_ok_and_wrong():
     for seed in range(500):
         record = worlds.random_record(np.random.default_rng([1, seed]), largest=60)
         tensor = 3 * record.tensor / np.trace(record.tensor)
-        ok, square, ratio = judged(*padded(record.ts, record.readings), record.sigma, tensor)
+        size = 16 if len(record.ts) <= 16 else 64  # half of them, in a third of the time
+        given = padded(record.ts, record.readings, size)
+        ok, square, ratio = judged(*given, record.sigma, tensor)
         right += bool(ok & (square < 53) & (ratio < 6))
         if ok and not (square < 53 and ratio < 6):
             wrong.append(f"{seed}: {float(square)} {float(ratio)}")
