@@ -613,7 +613,7 @@ CASES = {
         (
             *methods("systems.FloatingBody", "vector_field", "energy", "angular_momentum"),
             *methods("systems.FloatingBody", "translational_energy", "rotational_energy"),
-            *methods("systems.FloatingBody", "momentum", "inertia", "rotation"),
+            *methods("systems.FloatingBody", "momentum", "inertia", "rotation", "jumps"),
             *("systems.Force", "systems.Force.__call__"),
         ),
     ),

@@ -23,9 +23,8 @@ _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
 def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
-    largest = jax.lax.stop_gradient(_over_components(jnp.maximum, jnp.abs(vector)))
-    scale = jnp.where(largest == 0, 1.0, largest)
-    return scale * root_of_positive(sum_of_squares(vector / scale[..., None]))
+    scale = power_of_two(_over_components(jnp.maximum, jnp.abs(vector)))
+    return scale * root_of_positive(sum_of_squares(vector * (1 / scale)[..., None]))
 
 
 def sum_of_squares(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:

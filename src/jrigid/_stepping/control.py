@@ -33,7 +33,7 @@ _WHOLE = 1.0
 _SMALLEST_PART = 3e-3
 _AT_A_JUMP = 8.0
 # Factors by which a step may shrink and grow.
-_SAFETY, _SHRINK, _GROW = 0.9, 0.2, 1e3
+_SAFETY, _SHRINK, _GROW = 0.88, 0.2, 1e3
 # An error estimate below so many eps of the state is rounding noise.
 _NOISE = 8.0
 
@@ -126,10 +126,10 @@ def judge(
     radians = h * rate0 / _WHOLE
     part = jnp.clip(radians * radians, _SMALLEST_PART, 1.0)
     part = jnp.where(h < _AT_A_JUMP * limits.shortest, 1.0, part)
-    error = error / part
-    small = error < 1
-    # Of a very short step the estimate is rounding noise, which must not choose the next.
+    # An estimate may be rounding noise, which must not decide on a step or on the next.
     noise = _NOISE * jnp.finfo(error.dtype).eps
+    small = (error < part) | (error * limits.rtol < noise)
+    error = error / part
     beyond_noise = jnp.maximum(error * limits.rtol, noise) / limits.rtol
     factor = _SAFETY * beyond_noise ** (-1 / order)
     factor = jnp.where(small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY))

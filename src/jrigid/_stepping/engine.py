@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._stepping.events import Conditions
 from jrigid._stepping.motion import (
@@ -36,6 +36,26 @@ class Attempt(NamedTuple):
     h: Float[Array, ""]
     rates: Float[Array, "stages n"]
     output: Int[Array, ""]
+
+
+class _Passage(NamedTuple):
+    """What a step means for the conditions of an event.
+
+    Attributes:
+        keep: Whether the step is accepted; one that passes the place is repeated, up to it.
+        repeat: Whether it is repeated.
+        ended: Whether the motion ends with it.
+        end: Where the motion ends now.
+        which: The condition that ends it.
+        values: Of the conditions, where the motion is now.
+    """
+
+    keep: Bool[Array, ""]
+    repeat: Bool[Array, ""]
+    ended: Bool[Array, ""]
+    end: Float[Array, ""]
+    which: Int[Array, ""]
+    values: Float[Array, " conditions"]
 
 
 def _entry(times: Float[Array, " times"], number: Int[Array, ""]) -> Float[Array, ""]:
@@ -137,30 +157,12 @@ class Engine(NamedTuple):
         again = t1 >= _entry(motion.times, output + hit.astype(output.dtype))
         new_state = jnp.where(keep & (t1 >= end) & ~again, ENDED, new_state)
         if self.conditions is not None:
-            limits = motion.limits
-            now = self.conditions.values(motion.observed, t1, y1)
-            now = jax.lax.stop_gradient(now)
-            happened = self.conditions.happened(values, now)
-            sought = keep & (end == limits.end) & jnp.any(happened)
             taken = Stretch(t, t1, y, y1, rates)
-            exact, crossed = self.conditions.crossing(
-                motion.observed,
-                happened,
-                now,
-                (t, t1),
-                lambda t: self.stepper.state_at(motion.parameters, taken, t),
-                sought,
-            )
-            # A step that passes the place is repeated, up to it.
-            repeat = sought & (exact < t1)
-            at_event = (sought & ~repeat) | (keep & (t1 >= end) & (end < limits.end))
-            keep = keep & ~repeat
-            end = jnp.where(repeat, exact, end)
-            which = jnp.where(sought, jnp.argmax(crossed).astype(which.dtype), which)
+            passage = self._passage(self.conditions, motion, progress, taken, keep)
+            keep, repeat, at_event, end, which, values = passage
             new_state = jnp.where(at_event, EVENT, new_state)
             new_state = jnp.where(repeat, RUNNING, new_state)
             following = jnp.where(repeat, step, following)
-            values = jnp.where(keep, now, values)
         too_many = (new_state == RUNNING) & (tried + 1 >= self.max_steps)
         new_state = jnp.where(too_many, TOO_MANY_STEPS, new_state)
         hit = hit & keep
@@ -186,3 +188,38 @@ class Engine(NamedTuple):
             values,
         )
         return Attempt(progress, jnp.where(keep, t1 - t, 0.0), rates, reached)
+
+    def _passage(
+        self,
+        conditions: Conditions,
+        motion: Motion,
+        progress: Progress,
+        taken: Stretch,
+        keep: Bool[Array, ""],
+    ) -> _Passage:
+        """Look for an event in a step that would be accepted if `keep`."""
+        end, which = progress.clock[3], progress.counts[5]
+        now = conditions.values(motion.observed, taken.t1, taken.y1)
+        now = jax.lax.stop_gradient(now)
+        happened = conditions.happened(progress.values, now)
+        # Once it is found, the end of the motion is there.
+        sought = keep & (end == motion.limits.end) & jnp.any(happened)
+        exact, crossed = conditions.crossing(
+            motion.observed,
+            happened,
+            now,
+            (taken.t0, taken.t1),
+            lambda t: self.stepper.state_at(motion.parameters, taken, t),
+            sought,
+        )
+        repeat = sought & (exact < taken.t1)
+        reached = keep & (taken.t1 >= end) & (end < motion.limits.end)
+        keep = keep & ~repeat
+        return _Passage(
+            keep=keep,
+            repeat=repeat,
+            ended=(sought & ~repeat) | reached,
+            end=jnp.where(repeat, exact, end),
+            which=jnp.where(sought, jnp.argmax(crossed).astype(which.dtype), which),
+            values=jnp.where(keep, now, progress.values),
+        )

@@ -20,7 +20,16 @@ from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import corners_of, refined
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
-from jrigid.sweep._work import Call, Surroundings, Work, Worker, packed, settings, traced
+from jrigid.sweep._work import (
+    Call,
+    Surroundings,
+    Work,
+    Worker,
+    end_with_driver,
+    packed,
+    settings,
+    traced,
+)
 
 # Blocks that an executor has at a time.
 _AHEAD = 1024
@@ -209,6 +218,10 @@ def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tu
             "Argument `executor` must not fork, beside the threads of jax, but it does: pass it "
             '`mp_context=multiprocessing.get_context("spawn")`.'
         )
+    pool: Any = executor
+    if getattr(pool, "_initializer", end_with_driver) is None:
+        # A pool's worker that has no block yet would outlive a driver that is killed.
+        pool._initializer = end_with_driver
     share = getattr(executor, "_max_workers", None)  # of a pool on this machine
     cores = share and max(1, (os.cpu_count() or 1) // share)
     surroundings, payload = Surroundings(os.getpid(), cores, work.settings), packed(work)

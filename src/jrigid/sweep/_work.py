@@ -211,19 +211,28 @@ def _about_here(work: bytes, part: Any) -> dict[str, Any]:
 @functools.lru_cache(maxsize=1)
 def _settle_in(cores: int | None) -> None:
     """Once in a process, before its backend starts: what it may use, and when it ends."""
-    import multiprocessing
-
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    end_with_driver()
     _take_cores(cores or _threads_of_dask())
     if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", str(_own_directory() / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+@functools.cache
+def end_with_driver() -> None:
+    """End this process when the one that started it ends, if it is a worker of a pool.
+
+    It would wait forever for a driver that was killed.
+    """
+    import multiprocessing
+
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
 def _end_with(sentinel: Any) -> None:
-    """A pool's worker would wait for a driver that was killed for ever."""
+    """End this process when another one has ended."""
     from multiprocessing import connection
 
     connection.wait([sentinel])
