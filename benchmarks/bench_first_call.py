@@ -15,8 +15,7 @@ times are CPU seconds of the process. Every repetition traces new function objec
 first 100 lanes, against the peer at 1e-13. "At equal error" interpolates the peer's run time
 between the two tolerances (powers of ten) whose errors enclose ours.
 
-Functions run with `throw=False`, as in shared/FIRST_CALL.md; `--throw` leaves both at
-their defaults.
+Functions run with `throw=False`; `--throw` leaves both at their defaults.
 """
 
 import gc
@@ -71,7 +70,7 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """One problem, twice; `targets` are those of issue 27."""
+    """One problem, twice, and the figures to reach."""
 
     title: str
     parameter: np.ndarray
