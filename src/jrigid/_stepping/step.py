@@ -20,35 +20,56 @@ from jrigid._stepping.method import Method
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
 
 
-def combine(
-    method: Method,
-    rates: Float[Array, "stages n"],
-    row: int | Array,
-    in_lanes: bool = False,
-) -> Float[Array, " n"]:
+def combine(method: Method, rates: Float[Array, "stages n"], row: int | Array) -> Array:
     """The sum of the rates of the stages with the coefficients of a row.
 
-    A row that is not known when it is compiled is summed with its zeros. In lanes, where
-    that takes most of the time of a step, a sum has the terms of its group of rows.
+    A row that is not known when it is compiled is summed with its zeros.
     """
     if isinstance(row, int):
         used = np.flatnonzero(method.rows[row])
         return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
     weights = _row(method.rows[:, : len(rates)], row, rates.dtype)
+    return jnp.sum(weights[:, None] * rates, axis=0)
+
+
+def _with_sum(
+    function: Callable[..., Array],
+    method: Method,
+    rates: Float[Array, "stages n"],
+    stage: Array,
+    later: int,
+    in_lanes: bool,
+    *arguments: Array,
+) -> Array:
+    """`function(total, *arguments)`, where `total` combines rates for the place of a stage.
+
+    It is the stage that many `later`, or the last one. In lanes, where sums take a large
+    part of the time of a step, this one has the terms of its group of rows.
+
+    XLA's CPU runtime executes up to 8 operations of a loop one after the other; where
+    there are more, each costs several times as much. So what can be computed in the
+    branch of a group is computed there.
+    """
+
+    def row_of(stage: Array) -> Array:
+        return jnp.minimum(stage + later, method.stages - 1)
+
     if not in_lanes:
-        return jnp.sum(weights[:, None] * rates, axis=0)
+        return function(combine(method, rates, row_of(stage)), *arguments)
 
-    def of_group(used: tuple[int, ...]) -> Callable[[Array, Array], Array]:
-        def total(weights: Array, rates: Array) -> Array:
-            return _sum([weights[i] for i in used], [rates[i] for i in used])
+    def of_group(used: tuple[int, ...]) -> Callable[..., Array]:
+        def result(stage: Array, rates: Array, *arguments: Array) -> Array:
+            weights = _row(method.rows[:, : len(rates)], row_of(stage), rates.dtype)
+            total = _sum([weights[i] for i in used], [rates[i] for i in used])
+            return function(total, *arguments)
 
-        return total
+        return result
 
     group = jnp.zeros((), jnp.int32)
     for first, _ in method.groups[1:]:
-        group = group + (row >= first).astype(group.dtype)
+        group = group + (row_of(stage) >= first).astype(group.dtype)
     branches = [of_group(used) for _, used in method.groups]
-    return jax.lax.switch(group, branches, weights, rates)
+    return jax.lax.switch(group, branches, stage, rates, *arguments)
 
 
 def _sum(weights: list, rates: list[Array]) -> Array:
@@ -124,13 +145,15 @@ def _loop(
     """
     t, h, y = step
 
+    def place_of(total: Array, h: Array, y: Array) -> Array:
+        return y + h * total
+
     def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rates, place = carry
         at = t + _row(method.times, i, y.dtype) * h
         rate = field(at, place) if in_lanes else apart(field, i >= 0, at, place)
         rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
-        following = jnp.minimum(i + 1, method.stages - 1)
-        return rates, y + h * combine(method, rates, following, in_lanes)
+        return rates, _with_sum(place_of, method, rates, i, 1, in_lanes, h, y)
 
     rates = jnp.zeros((count, *y.shape), y.dtype)
     return jax.lax.fori_loop(0, count, stage, (rates, y))
@@ -203,6 +226,9 @@ def pull_back(
     t, h, y = step
     last = method.stages - 1
 
+    def place_of(total: Array, h: Array, y: Array) -> Array:
+        return y + jnp.where(h != 0, h * total, 0.0)
+
     def of_rate(weighted: Array, at: Array, place: Array) -> tuple[Any, Array]:
         _, pull = jax.vjp(lambda x, y: field(x, at, y), parameters, place)
         return pull(weighted)
@@ -210,8 +236,7 @@ def pull_back(
     def stage(k: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
         places, total = carry
         i = last - 1 - k
-        moved = h * combine(method, rates, i, in_lanes)
-        place = y + jnp.where(h != 0, moved, 0.0)
+        place = _with_sum(place_of, method, rates, i, 0, in_lanes, h, y)
         weights = _row(method.rows[:-1].T, i, y.dtype)
         weighted = h * jnp.sum(weights[:, None] * places, axis=0)
         of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
