@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 # The rows of a tableau are summed in so many groups, by the number of stages.
 _GROUPS = {4: 1, 8: 2}
-_MOST_GROUPS = 3
+_MOST_GROUPS = 5
 
 
 class Method(NamedTuple):
