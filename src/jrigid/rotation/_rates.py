@@ -30,12 +30,14 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     [-2.4 -1.   2.   1.8]
     """
     (w, x, y, z), (a, b, c) = shaped(attitude=(attitude, 4), omega=(omega, 3))
+    # No two sums are built alike: LLVM merges such sums into one whose operands are chosen
+    # lane by lane, and then does not vectorise it.
     return 0.5 * jnp.stack(
         [
             -x * a - y * b - z * c,
             w * a + y * c - z * b,
-            w * b + z * a - x * c,
-            w * c + x * b - y * a,
+            w * b - x * c + z * a,
+            x * b - y * a + w * c,
         ]
     )
 
