@@ -195,8 +195,23 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     >>> print(jr.rotation.rotate(quarter, jnp.array([1.0, 0.0, 0.0])).round(6))
     [0. 1. 0.]
     """
-    quaternion, (a, b, c) = shaped(attitude=(attitude, 4), vector=(vector, 3))
-    w, x, y, z = rescaled(quaternion)
+    quaternion, vector = shaped(attitude=(attitude, 4), vector=(vector, 3))
+    w, x, y, z = _rescaled_components(quaternion)
+    return _rotated(w, x, y, z, vector)
+
+
+def _rescaled_components(quaternion: Array) -> list[Array]:
+    """The components of `rescaled`, which are no array.
+
+    One more array on the way to a result is one more program to compile and to run.
+    """
+    scale = _scale(quaternion)
+    return [component * scale for component in quaternion]
+
+
+def _rotated(w: Array, x: Array, y: Array, z: Array, vector: Array) -> Vector:
+    """A vector rotated by a quaternion of any norm, given by its components."""
+    a, b, c = vector
     # v + 2 (w u x v + u x (u x v)) / |q|^2
     scale = 2 / (w * w + x * x + y * y + z * z)
     p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
@@ -226,7 +241,9 @@ def rotate_inverse(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     >>> print(jr.rotation.rotate_inverse(quarter, jnp.array([0.0, 1.0, 0.0])).round(6))
     [1. 0. 0.]
     """
-    return rotate(conjugate(attitude), vector)
+    quaternion, vector = shaped(attitude=(attitude, 4), vector=(vector, 3))
+    w, x, y, z = _rescaled_components(quaternion)
+    return _rotated(w, -x, -y, -z, vector)
 
 
 def exp(rotation_vector: VectorLike) -> Quaternion:
