@@ -118,6 +118,7 @@ def stages(
     h: Float[Array, ""],
     y: Array,
     in_lanes: bool = False,
+    large_field: bool = False,
 ) -> tuple[Float[Array, "stages n"], Float[Array, " n"]]:
     """The rates of all stages of a step, and its result.
 
@@ -128,8 +129,9 @@ def stages(
         h: Its length.
         y: The state there.
         in_lanes: Whether it will have many lanes.
+        large_field: Whether the field is a long computation.
     """
-    return _loop(method, field, (t, h, y), method.stages, in_lanes)
+    return _loop(method, field, (t, h, y), method.stages, in_lanes, large_field)
 
 
 def _loop(
@@ -138,11 +140,15 @@ def _loop(
     step: tuple[Float[Array, ""], Float[Array, ""], Array],
     count: int,
     in_lanes: bool,
+    large_field: bool = False,
 ) -> tuple[Float[Array, "count n"], Float[Array, " n"]]:
     """The rates of the first `count` stages, and the place of the stage after them.
 
     The place of the last stage is the result of the step.
     """
+    # In lanes a rate goes into the table as it is computed, by the same kernel. If the
+    # field is large, LLVM does not vectorise that kernel, and two kernels take less time.
+    joined = in_lanes and not large_field
     t, h, y = step
 
     def place_of(total: Array, h: Array, y: Array) -> Array:
@@ -151,7 +157,7 @@ def _loop(
     def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rates, place = carry
         at = t + _row(method.times, i, y.dtype) * h
-        rate = field(at, place) if in_lanes else apart(field, i >= 0, at, place)
+        rate = field(at, place) if joined else apart(field, i >= 0, at, place)
         rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
         return rates, _with_sum(place_of, method, rates, i, 1, in_lanes, h, y)
 

@@ -132,7 +132,8 @@ class Walk(NamedTuple):
         if not isinstance(self.motion.solver, diffrax.AbstractERK):
             return self._by_solver(t, y)
         method = method_of(self.motion.solver)
-        rates, after = stages(method, self._together, t, self.step, y, in_lanes)
+        large = y.size > self.scales.size
+        rates, after = stages(method, self._together, t, self.step, y, in_lanes, large)
         known = self.step * rates[: method.own]
         return after, error_of(method, rates, self.step), {"y0": y, "y1": after, "k": known}
 
