@@ -7,7 +7,7 @@ as a loop too.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,61 +15,80 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._stepping.method import Method
+from jrigid._stepping.method import Groups, Method
 
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
 
 
-def combine(method: Method, rates: Float[Array, "stages n"], row: int | Array) -> Array:
-    """The sum of the rates of the stages with the coefficients of a row.
-
-    A row that is not known when it is compiled is summed with its zeros.
-    """
-    if isinstance(row, int):
-        used = np.flatnonzero(method.rows[row])
-        return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
-    weights = _row(method.rows[:, : len(rates)], row, rates.dtype)
-    return jnp.sum(weights[:, None] * rates, axis=0)
+def combine(method: Method, rates: Float[Array, "stages n"], row: int) -> Array:
+    """The sum of the rates of the stages with the coefficients of a row."""
+    used = np.flatnonzero(method.rows[row])
+    return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
 
 
-def _with_sum(
-    function: Callable[..., Array],
-    method: Method,
-    rates: Float[Array, "stages n"],
-    stage: Array,
-    later: int,
-    in_lanes: bool,
-    *arguments: Array,
-) -> Array:
-    """`function(total, *arguments)`, where `total` combines rates for the place of a stage.
-
-    It is the stage that many `later`, or the last one. In lanes, where sums take a large
-    part of the time of a step, this one has the terms of its group of rows.
+class _Sums(NamedTuple):
+    """Sums over the stages, of which a loop computes one after another.
 
     XLA's CPU runtime executes up to 8 operations of a loop one after the other; where
     there are more, each costs several times as much. So what can be computed in the
-    branch of a group is computed there.
+    branch of a group is computed there, the number of the row too.
+
+    Attributes:
+        tables: A row of coefficients for each sum. Those of several tables are computed
+            together.
+        groups: Of the rows. In lanes, where sums take a large part of the time of a step,
+            a sum has the terms of its group. Elsewhere it has all of its zeros.
+        row: The row for a trip of the loop.
+        in_lanes: Whether there are many lanes.
     """
 
-    def row_of(stage: Array) -> Array:
-        return jnp.minimum(stage + later, method.stages - 1)
+    tables: tuple[np.ndarray, ...]
+    groups: Groups
+    row: Callable[[Array], Array]
+    in_lanes: bool
 
-    if not in_lanes:
-        return function(combine(method, rates, row_of(stage)), *arguments)
+    def then(
+        self,
+        function: Callable[..., Any],
+        trip: Array,
+        terms: tuple[Array, ...],
+        *arguments: Array,
+    ) -> Any:
+        """`function(*totals, *arguments)` of the sums for a trip of the loop.
 
-    def of_group(used: tuple[int, ...]) -> Callable[..., Array]:
-        def result(stage: Array, rates: Array, *arguments: Array) -> Array:
-            weights = _row(method.rows[:, : len(rates)], row_of(stage), rates.dtype)
-            total = _sum([weights[i] for i in used], [rates[i] for i in used])
-            return function(total, *arguments)
+        Args:
+            function: Of the sum by each table, and of the arguments.
+            trip: The number of the trip.
+            terms: What the rows of each table sum.
+            arguments: Of the function.
+        """
 
-        return result
+        def weighted(trip: Array, terms: tuple[Array, ...]) -> list[tuple[Array, Array]]:
+            number = self.row(trip)
+            return [
+                (_row(table[:, : len(x)], number, x.dtype), x)
+                for table, x in zip(self.tables, terms, strict=True)
+            ]
 
-    group = jnp.zeros((), jnp.int32)
-    for first, _ in method.groups[1:]:
-        group = group + (row_of(stage) >= first).astype(group.dtype)
-    branches = [of_group(used) for _, used in method.groups]
-    return jax.lax.switch(group, branches, stage, rates, *arguments)
+        if not self.in_lanes:
+            pairs = weighted(trip, terms)
+            return function(*(jnp.sum(a[:, None] * x, axis=0) for a, x in pairs), *arguments)
+
+        def of_group(columns: tuple[tuple[int, ...], ...]) -> Callable[..., Any]:
+            def result(trip: Array, terms: tuple[Array, ...], *arguments: Array) -> Any:
+                pairs = zip(weighted(trip, terms), columns, strict=True)
+                totals = [
+                    _sum([a[i] for i in used], [x[i] for i in used]) for (a, x), used in pairs
+                ]
+                return function(*totals, *arguments)
+
+            return result
+
+        group = jnp.zeros((), jnp.int32)
+        for first, _ in self.groups[1:]:
+            group = group + (self.row(trip) >= first).astype(group.dtype)
+        branches = [of_group(columns) for _, columns in self.groups]
+        return jax.lax.switch(group, branches, trip, terms, *arguments)
 
 
 def _sum(weights: list, rates: list[Array]) -> Array:
@@ -151,6 +170,11 @@ def _loop(
     joined = in_lanes and not large_field
     t, h, y = step
 
+    def following(i: Array) -> Array:
+        return jnp.minimum(i + 1, method.stages - 1)
+
+    sums = _Sums((method.rows,), method.groups, following, in_lanes)
+
     def place_of(total: Array, h: Array, y: Array) -> Array:
         return y + h * total
 
@@ -159,7 +183,7 @@ def _loop(
         at = t + _row(method.times, i, y.dtype) * h
         rate = field(at, place) if joined else apart(field, i >= 0, at, place)
         rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
-        return rates, _with_sum(place_of, method, rates, i, 1, in_lanes, h, y)
+        return rates, sums.then(place_of, i, (rates,), h, y)
 
     rates = jnp.zeros((count, *y.shape), y.dtype)
     return jax.lax.fori_loop(0, count, stage, (rates, y))
@@ -232,8 +256,15 @@ def pull_back(
     t, h, y = step
     last = method.stages - 1
 
-    def place_of(total: Array, h: Array, y: Array) -> Array:
-        return y + jnp.where(h != 0, h * total, 0.0)
+    def number(k: Array) -> Array:
+        return last - 1 - k
+
+    sums = _Sums(method.reverse_rows, method.reverse_groups, number, in_lanes)
+
+    def place_and_weighted(
+        total: Array, total_back: Array, h: Array, y: Array
+    ) -> tuple[Array, Array]:
+        return y + jnp.where(h != 0, h * total, 0.0), h * total_back
 
     def of_rate(weighted: Array, at: Array, place: Array) -> tuple[Any, Array]:
         _, pull = jax.vjp(lambda x, y: field(x, at, y), parameters, place)
@@ -241,15 +272,11 @@ def pull_back(
 
     def stage(k: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
         places, total = carry
-        i = last - 1 - k
-        place = _with_sum(place_of, method, rates, i, 0, in_lanes, h, y)
-        weights = _row(method.rows[:-1].T, i, y.dtype)
-        weighted = h * jnp.sum(weights[:, None] * places, axis=0)
+        i = number(k)
+        place, weighted = sums.then(place_and_weighted, k, (rates, places), h, y)
         of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
-        if in_lanes:
-            of_parameters, of_place = of_rate(*of_stage)
-        else:
-            of_parameters, of_place = apart(of_rate, i >= 0, *of_stage)
+        # The reverse of a field is a long computation (see `_loop`).
+        of_parameters, of_place = apart(of_rate, k >= 0, *of_stage)
         places = jax.lax.dynamic_update_index_in_dim(places, of_place, i, 0)
         return places, jtu.tree_map(jnp.add, total, of_parameters)
 
