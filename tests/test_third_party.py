@@ -334,3 +334,27 @@ def test_versions_are_bounded_by_those_tested():
         assert lower == {oldest}
         assert upper == {f"{major}.{minor + 1}"}
         assert Version(modules[name].__version__) in bounds[name]
+
+
+def count_arithmetic(function, *arguments):
+    return third_party.arithmetic_operations(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def test_operations_of_called_programs_are_counted():
+    def twice(x):
+        return x + jax.jit(lambda y: y * y - x)(x)
+
+    assert count_arithmetic(twice, 1.0) == 3
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        jnp.cos,
+        jax.jit(lambda x: 1 + jnp.exp(x)),
+        lambda x: jax.lax.cond(x > 0, jnp.square, jnp.negative, x),
+        lambda x: jax.lax.fori_loop(0, 2, lambda _, y: y * y, x),
+    ],
+)
+def test_functions_of_the_c_library_and_loops_are_not_arithmetic(function):
+    assert count_arithmetic(function, 1.0) is None

@@ -312,3 +312,30 @@ def branches_of(equation: Any) -> Sequence[core.ClosedJaxpr] | None:
     if equation.primitive not in _CONDS:
         return None
     return equation.params.get("branches")
+
+
+#: For elementary functions XLA's CPU compiler calls the C library, number by number.
+_NO_ARITHMETIC = known_primitives(
+    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p "
+    "log2 logistic pow sin sinh tan tanh cond scan while"
+)
+
+
+def arithmetic_operations(jaxpr: Any) -> int | None:
+    """How many operations a program has if all are arithmetic, else None.
+
+    Elementary functions, loops and branches are not arithmetic.
+    """
+    total = 0
+    for equation in jaxpr.eqns:
+        if equation.primitive in _NO_ARITHMETIC:
+            return None
+        called = called_program(equation)
+        if called is None:
+            total += 1
+            continue
+        count = arithmetic_operations(getattr(called, "jaxpr", called))
+        if count is None:
+            return None
+        total += count
+    return total

@@ -15,7 +15,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from jrigid._core.third_party import arithmetic_operations
 from jrigid._stepping.method import Groups, Method
+
+# A computation of so many operations is short. The field of a heavy top has 179, that of a
+# heavy top with a tangent beside it 474.
+_SHORT = 250
 
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
 
@@ -130,6 +135,13 @@ def apart(function: Callable[..., Any], true: Array, *arguments: Any) -> Any:
     return jax.lax.cond(true, function, never, *arguments)
 
 
+def _is_short(field: Field, t: Array, y: Array) -> bool:
+    """Whether a vector field is a short computation without elementary functions."""
+    program = jax.make_jaxpr(field)(t, y)
+    count = arithmetic_operations(program.jaxpr)
+    return count is not None and count <= _SHORT
+
+
 def stages(
     method: Method,
     field: Field,
@@ -137,7 +149,6 @@ def stages(
     h: Float[Array, ""],
     y: Array,
     in_lanes: bool = False,
-    large_field: bool = False,
 ) -> tuple[Float[Array, "stages n"], Float[Array, " n"]]:
     """The rates of all stages of a step, and its result.
 
@@ -148,9 +159,8 @@ def stages(
         h: Its length.
         y: The state there.
         in_lanes: Whether it will have many lanes.
-        large_field: Whether the field is a long computation.
     """
-    return _loop(method, field, (t, h, y), method.stages, in_lanes, large_field)
+    return _loop(method, field, (t, h, y), method.stages, in_lanes)
 
 
 def _loop(
@@ -159,16 +169,15 @@ def _loop(
     step: tuple[Float[Array, ""], Float[Array, ""], Array],
     count: int,
     in_lanes: bool,
-    large_field: bool = False,
 ) -> tuple[Float[Array, "count n"], Float[Array, " n"]]:
     """The rates of the first `count` stages, and the place of the stage after them.
 
     The place of the last stage is the result of the step.
     """
-    # In lanes a rate goes into the table as it is computed, by the same kernel. If the
-    # field is large, LLVM does not vectorise that kernel, and two kernels take less time.
-    joined = in_lanes and not large_field
     t, h, y = step
+    # In lanes the kernel that computes a rate puts it into the table, if it is a short one.
+    # Of others LLVM makes code that takes more time than two kernels.
+    joined = in_lanes and _is_short(field, t, y)
 
     def following(i: Array) -> Array:
         return jnp.minimum(i + 1, method.stages - 1)
@@ -275,7 +284,7 @@ def pull_back(
         i = number(k)
         place, weighted = sums.then(place_and_weighted, k, (rates, places), h, y)
         of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
-        # The reverse of a field is a long computation (see `_loop`).
+        # The reverse of a field is not short (see `_loop`).
         of_parameters, of_place = apart(of_rate, k >= 0, *of_stage)
         places = jax.lax.dynamic_update_index_in_dim(places, of_place, i, 0)
         return places, jtu.tree_map(jnp.add, total, of_parameters)

@@ -132,8 +132,7 @@ class Walk(NamedTuple):
         if not isinstance(self.motion.solver, diffrax.AbstractERK):
             return self._by_solver(t, y)
         method = method_of(self.motion.solver)
-        large = y.size > self.scales.size
-        rates, after = stages(method, self._together, t, self.step, y, in_lanes, large)
+        rates, after = stages(method, self._together, t, self.step, y, in_lanes)
         known = self.step * rates[: method.own]
         return after, error_of(method, rates, self.step), {"y0": y, "y1": after, "k": known}
 
