@@ -160,7 +160,8 @@ def stages(
         y: The state there.
         in_lanes: Whether it will have many lanes.
     """
-    return _loop(method, field, (t, h, y), method.stages, in_lanes)
+    joined = in_lanes and _is_short(field, t, y)
+    return _loop(method, field, (t, h, y), method.stages, in_lanes, joined)
 
 
 def _loop(
@@ -169,15 +170,15 @@ def _loop(
     step: tuple[Float[Array, ""], Float[Array, ""], Array],
     count: int,
     in_lanes: bool,
+    joined: bool,
 ) -> tuple[Float[Array, "count n"], Float[Array, " n"]]:
     """The rates of the first `count` stages, and the place of the stage after them.
 
-    The place of the last stage is the result of the step.
+    The place of the last stage is the result of the step. If `joined`, the kernel that
+    computes a rate also puts it into the table: this takes less time in lanes, unless the
+    field is not short. Of such a kernel LLVM makes slow code.
     """
     t, h, y = step
-    # In lanes the kernel that computes a rate puts it into the table, if it is a short one.
-    # Of others LLVM makes code that takes more time than two kernels.
-    joined = in_lanes and _is_short(field, t, y)
 
     def following(i: Array) -> Array:
         return jnp.minimum(i + 1, method.stages - 1)
@@ -225,7 +226,7 @@ def equal_steps(
 
     def step(i: Array, y: Array) -> Array:
         start = t + i.astype(h.dtype) * h
-        return _loop(method, field, (start, h, y), needed, True)[1]
+        return _loop(method, field, (start, h, y), needed, True, True)[1]
 
     if count == 1:
         return step(jnp.zeros((), int), y)
@@ -284,7 +285,7 @@ def pull_back(
         i = number(k)
         place, weighted = sums.then(place_and_weighted, k, (rates, places), h, y)
         of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
-        # The reverse of a field is not short (see `_loop`).
+        # The reverse of a field is never short (see `_loop`).
         of_parameters, of_place = apart(of_rate, k >= 0, *of_stage)
         places = jax.lax.dynamic_update_index_in_dim(places, of_place, i, 0)
         return places, jtu.tree_map(jnp.add, total, of_parameters)
