@@ -65,7 +65,7 @@ def report(ratio: float, error: float) -> str:
 def main() -> None:
     """Recover one top and print it."""
     jax.config.update("jax_enable_x64", True)
-    ratio, error, converged = jax.jit(lambda key: recover(read_gyro(key)))(jax.random.key(0))
+    ratio, error, converged = recover(read_gyro(jax.random.key(0)))
     if not bool(converged):
         raise RuntimeError("The fit of the synthetic top did not converge.")
     print(report(float(ratio), float(error)))

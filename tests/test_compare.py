@@ -80,10 +80,6 @@ def test_a_throw_left_out_is_judged_by_the_fit_s_own_model(rng):
     assert np.all((squares > 0.7 * 237) & (squares < 1.3 * 237)), squares
     with pytest.raises(ValueError, match="must state the noise"):
         identify.cross_validate(without_drag, [identify.Rates(x.ts, x.values) for x in kicked])
-    with pytest.raises(ValueError, match="`refit` must be given where there are several bodies"):
-        identify.cross_validate(
-            lambda x: identify.fit(BLIND, x, bodies=(0, 1), throw=False), kicked
-        )
 
 
 DRAGGED = jr.RigidBody(np.ones(3), jr.torques.QuadraticDrag(0.003))

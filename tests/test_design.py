@@ -110,14 +110,13 @@ def test_a_plan_that_says_too_little_is_refused():
 def test_fits_of_the_best_throw_scatter_as_it_promises(best, rng):
     """Ratios over those of the truth, in units of the bound: a covariance of 1."""
     first = plan_of(np.array([0.0, 0.4, 1.0]))
-    fits = quick_jit(
-        jax.vmap(lambda y: identify.fit(NEARLY_SYMMETRIC, identify.Rates(TS, y, NOISE)).ratios)
-    )
     spread = []
     for plan in (best.plan, first):
         motion = jr.free_rotation(NEARLY_SYMMETRIC.inertia, plan.state, TS)
         values = np.asarray(motion.omega) + NOISE * rng.normal(size=(300, 60, 3))
-        off = np.asarray(fits(values)) - np.array([1.05, 1.6])
+        records = [identify.Rates(TS, y, NOISE) for y in values]
+        found = identify.fit_each(NEARLY_SYMMETRIC, records)
+        off = np.asarray(found.ratios) - np.array([1.05, 1.6])
         spread.append(np.sqrt(np.trace(np.cov(off.T))))
         if plan is best.plan:
             half = np.linalg.inv(np.linalg.cholesky(np.asarray(plan.bound.ratios_covariance)))

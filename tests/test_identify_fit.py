@@ -66,12 +66,9 @@ def spread_of_elements(result):
 
 @pytest.fixture(scope="module")
 def blind_fit():
-    """One body after the other, from rates alone, in one compiled and vmapped call."""
-    return jax.jit(
-        jax.vmap(
-            lambda y, sigma: identify.fit(BLIND, identify.Rates(TS, y, sigma), throw=False),
-            in_axes=(0, None),
-        )
+    """Many bodies from rates alone, side by side."""
+    return lambda values, sigma: identify.fit_each(
+        BLIND, [identify.Rates(TS, y, sigma) for y in values]
     )
 
 
@@ -249,7 +246,6 @@ def bound(tensor, omega, ts, t0):
     return jax.value_and_grad(variance, argnums=(0, 1), has_aux=True)(omega, ts)
 
 
-@quick_jit
 def told_and_information(tensor, omega, ts, sigma, t0):
     start, record = jr.State(UNTURNED, omega), identify.Rates(ts, None, sigma)
     plan = identify.Plan(jr.RigidBody(tensor), start, record, t0=t0)
@@ -351,15 +347,10 @@ def program(name=None, prior=None, factors=None):
     if name is None:
         return lambda tensor, omega: told_and_information(tensor, omega, TS, 0.01, np.zeros(()))[0]
     gyro = identify.Gyro(scale=np.ones(factors) if factors else 1.0)
-    return quick_jit(
-        lambda tensor, omega: (
-            identify.Plan(
-                jr.RigidBody(tensor),
-                jr.State(UNTURNED, omega),
-                identify.Record(gyro, TS, None, 0.01),
-                free=lambda _, gyro: picked(gyro, name, prior),
-            ).told
-        )
+    free = lambda _, gyro: picked(gyro, name, prior)  # noqa: E731
+    record = identify.Record(gyro, TS, None, 0.01)
+    return lambda tensor, omega: (
+        identify.Plan(jr.RigidBody(tensor), jr.State(UNTURNED, omega), record, free=free).told
     )
 
 
@@ -377,9 +368,7 @@ def test_free_motion_tells_everything_but_the_scale():
     plan = identify.Attitudes(TS, None, 0.01)
     omega = TURN @ np.array([0.5, 1.0, 0.4])
     body = jr.RigidBody(turned(ASYMMETRIC[0]))
-    found = quick_jit(lambda omega: identify.Plan(body, jr.State(UNTURNED, omega), plan).told)(
-        omega
-    )
+    found = identify.Plan(body, jr.State(UNTURNED, omega), plan).told
     assert found.null_directions == ("overall scale",)
 
 
@@ -463,7 +452,7 @@ def test_a_sleeping_top_tells_nothing_and_a_nutating_one_its_ratios():
     plan = identify.Rates(np.arange(300) * 0.05, None, 0.01)
     options = {"shape": identify.Top(), "free": lambda body: body.torque.mass}
 
-    told_of = quick_jit(lambda state: identify.Plan(top, state, plan, **options).told)
+    told_of = lambda state: identify.Plan(top, state, plan, **options).told  # noqa: E731
 
     def words(tilt):
         return told_of(jr.top.initial_state(jr.SymmetricTop(1.0, 0.6, 2.0), tilt, omega3=6.0))
@@ -643,11 +632,9 @@ WHEEL = jr.torques.Rotor(lambda t: jnp.stack([0.1 + 0 * t, 0.2 * jnp.sin(0.7 * t
 
 def test_a_rotor_of_known_momentum_tells_the_scale():
     plan, start = identify.Rates(TS / 2, None, 0.01), jr.State(UNTURNED, np.array([0.5, 1.0, 0.4]))
-    told_of = quick_jit(
-        lambda tensor: identify.Plan(jr.RigidBody(tensor, WHEEL), start, plan, scale="rotor").told
-    )
     for tensor in (turned(ASYMMETRIC[0]), 1.3 * np.eye(3)):
-        found = told_of(tensor)
+        body = jr.RigidBody(tensor, WHEEL)
+        found = identify.Plan(body, start, plan, scale="rotor").told
         assert bool(found.status == Status.OK)
         assert found.null_directions == ()
         np.testing.assert_allclose(found.inertia, tensor, atol=1e-6)

@@ -249,10 +249,6 @@ MISTAKES = {
         lambda: fit(BLIND, rates(1000 * RECORD.times)),
         "rates in degrees a second, times not in seconds?",
     ),
-    "an entry of `bodies` too many": (
-        lambda: fit(BLIND, [rates(), rates()], bodies=(0, 1, 1)),
-        r"`bodies` must have one number for each of 2 throws",
-    ),
     "bodies that are not as many as throws": (
         lambda: fit([BLIND] * 3, [rates(), rates()]),
         "`system` must hold one body for each of 2 throws, but it holds 3",

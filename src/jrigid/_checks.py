@@ -118,6 +118,11 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
     )
 
 
+def is_good(result: Any) -> bool:
+    """Whether a result that is known now is that of a computation which went well."""
+    return int(code_of(result)) == int(code_of(RESULTS.successful))
+
+
 def float_arrays(*values: Any) -> tuple[Array, ...]:
     """Convert to arrays of one floating point dtype, that of the inputs taken together."""
     for value in values:

@@ -24,7 +24,11 @@ InertiaLike = TypeAliasType("InertiaLike", _Real[ArrayLike, "3"] | _Real[ArrayLi
 
 if TYPE_CHECKING:
     from jaxtyping import Real as Real
+
+    AnyArray = Any
 else:
+    #: An array of JAX, or of numpy on the host: to a type checker the two have nothing in common.
+    AnyArray = Array | np.ndarray | np.generic
 
     class Real:
         """`jaxtyping.Real[ArrayLike, "..."]`, shown as it is written."""

@@ -8,6 +8,7 @@ from jrigid.identify._design import Plan as Plan
 from jrigid.identify._design import profile as profile
 from jrigid.identify._design import residuals as residuals
 from jrigid.identify._fit import fit as fit
+from jrigid.identify._fit import fit_each as fit_each
 from jrigid.identify._noise import block_bootstrap as block_bootstrap
 from jrigid.identify._noise import coloured_covariance as coloured_covariance
 from jrigid.identify._optimal import Optimum as Optimum

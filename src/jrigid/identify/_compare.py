@@ -95,8 +95,7 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
 
 
 def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
-    one, options = len(found.bodies) == 1, found.problem.options
-    demand(one, "Argument `refit` must be given where there are several bodies, but it is not.")
+    options = found.problem.options
     system, *sensors = found.parts()
     records = [x if isinstance(x, tuple) else (x,) for x in throws]
     records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
@@ -122,7 +121,7 @@ def cross_validate(
         fit_function: Fits a list of throws: `lambda throws: jr.identify.fit(body, throws, ...)`.
         throws: Of each a record or a tuple of records; a list of throws is left out as a group.
         refit: What finds the states of throws left out from the fit of the others, where the
-            default cannot: several bodies, wheels that each throw has its own record of, numbers
+            default cannot: wheels that each throw has its own record of, numbers
             sought by `each`, a motion that depends on an attitude that was not observed. The
             default keeps the level of an unmodelled torque, the loss and the motion.
 

@@ -9,26 +9,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import INERTIA, RESULTS, check_shape, check_type, demand, nan_where
+from jrigid._checks import INERTIA, check_shape, check_type, demand, nan_where
 from jrigid._numerics import or_one, product
 from jrigid._types import Readable, Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify import _problem as problems
-from jrigid.identify._compile import quick_jit
-from jrigid.identify._errors import conclude, in_rows
+from jrigid.identify._compile import Static, program, quick_jit
+from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
+from jrigid.identify._minimise import FIRST_DAMPING, STEPS, Minimum, Settings
+from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples, of_throws, samples_of
 from jrigid.identify._result import FitResult
+from jrigid.identify._search import ACCURACY, Request, minima
 from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
-from jrigid.identify._smoother import Found, Point, Rows, minimise, unevaluated
-from jrigid.identify._stages import ACCURACY, Way, schedule, weigher
-from jrigid.identify._unknowns import unknowns_of
+from jrigid.identify._smoother import Point, Rows
+from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
 
@@ -141,9 +144,8 @@ class Plan(Readable):
         return Bound(*(product("ij,kj->ik", x, x) for x in (half, of_ratios)))
 
     @property
-    @quick_jit
     def told(self) -> FitResult:
-        """A result before there is a record, of chi-square 0; no gradients.
+        """A result before there is a record, of chi-square 0; no gradients, outside of jit.
 
         Its errors are those of `bound`, its `status` says whether all that is sought is told, and
         `null_directions` what is not, in words.
@@ -156,14 +158,15 @@ class Plan(Readable):
         >>> print(plan.told.null_directions)
         ('overall scale', 'I3/I1 against gyro scale')
         """
-        problem, found, layout = _planned(self)
-        dtype, no, seen = layout.ts.dtype, jnp.asarray(False), problem.samples.seen
-        scales, none = jnp.ones(len(problem.samples.values), dtype), jnp.zeros(3, dtype)
-        way = Way(found, seen.astype(dtype), scales, none, no, no, none[0])
-        return conclude(problem, layout, way, RESULTS.successful)
+        problem, minimum, layout = jtu.tree_map(np.asarray, _planned_once(self))
+        dtype, samples = layout.ts.dtype, problem.samples
+        kept, scales = samples.seen.astype(dtype), np.ones(len(samples.values), dtype)
+        found = Fit(minimum, kept, scales, np.zeros(3, dtype), np.zeros(0, dtype))
+        lengths = [x.shape[1] for x in samples.values]
+        return FitResult(**jax.device_put(conclude(problem, layout, found, lengths)))
 
 
-def _planned(plan: Plan) -> tuple[problems.Problem, Found, Layout]:
+def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
     """Derivatives of a record that is what the body and the state say."""
     system, state, shape = plan.system, plan.state, plan.shape
     records = of_throws(plan.observations)
@@ -173,17 +176,16 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Found, Layout]:
     (throws, _), dtype = samples.ts.shape, samples.ts.dtype
     sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
     scaled = plan.scale != "trace" and not shape.absolute
-    unknowns = unknowns_of((system,), sensors, sizes, plan.free, (shape,), scaled, rate)
+    unknowns = unknowns_of((system,), sensors, sizes, plan.free, shape, scaled, rate)
     shared = not any(x.own for x in unknowns.sought)
     demand(shared, "Argument `free` must pick nothing of `each` throw, but it does.")
-    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype))[None], 1e-9)
+    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype)), 1e-9)
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
     point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
     on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
     options, layout = problems.Options(system.is_free, on_attitude), whole(samples, 1, plan.t0)
-    bodies, noise = jnp.zeros(throws, int), jnp.ones(6, dtype)
-    problem = problems.Problem(options, unknowns, samples, bodies, noise)
+    problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
     # Values as they would be seen: a residual of zero.
     seen = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
     records = [x.with_values(y) for x, y in zip(records, seen, strict=True)]
@@ -192,15 +194,36 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Found, Layout]:
     if not system.is_free:  # which is followed forward only
         first = first_and_last(samples.ts, samples.seen)[0]
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
-    yes = jnp.asarray(True)
-    found = Found(point, rows, links, ~yes, yes, jnp.asarray(0), jnp.full(1, jnp.nan))
-    return problem, found, layout
+    prior = problem.known - problem.held
+    weight = jnp.pad(samples.seen.astype(dtype), ((0, 0), (0, prior)), constant_values=1)
+    none, local = jnp.zeros((), dtype), links.gap.shape[-1]
+    minimum = Minimum(
+        point=point,
+        rows=rows,
+        links=links,
+        weight=jnp.pad(weight, ((0, 0), (0, problem.held))),
+        whitener=jnp.zeros((*links.gap.shape, local), dtype),
+        square=none,
+        settled=jnp.asarray(True),
+        steps=jnp.asarray(0),
+        history=none[None],
+        damping=none,
+        tensor=unknowns.inertia(numbers),
+        units=unknowns.natural_units(numbers),
+    )
+    return problem, minimum, layout
+
+
+_planned_once = quick_jit(_planned)
 
 
 def _jacobian(rows: Rows) -> Array:
     """Of all residuals in the numbers and in each throw's state."""
-    jg, jl, _ = in_rows(rows, 0)
-    throws, count, locals_ = jl.shape
+    throws, samples, width = rows.residual.shape
+    count = samples * width
+    jg = rows.of_border.reshape(throws, count, -1)
+    jl = rows.of_state.reshape(throws, count, -1)
+    locals_ = jl.shape[-1]
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
     return jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
@@ -244,33 +267,57 @@ def profile(
     return _profile(result, function, values)
 
 
-@quick_jit
+@program
+def _held_on(unknowns: Unknowns, numbers: Array, function: Static) -> Array:
+    """The slope of a function of the tensor in the numbers."""
+    return jax.grad(lambda x: function.value(unknowns.inertia(x)))(numbers)
+
+
+class _Held(eqx.Module):
+    """Holds a function of the tensor at a value: a residual that is zero there."""
+
+    function: Callable[[Array], Array] = eqx.field(static=True)
+    value: Any
+    unit: Any
+
+    def __call__(self, unknowns: Unknowns, numbers: Array) -> Array:
+        return (self.function(unknowns.inertia(numbers)) - self.value) / self.unit
+
+
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
+    """Fit anew at each value, all of them side by side."""
     options = result.problem.options._replace(shooting=False, level="none", nodes=1)
+    result = jtu.tree_map(np.asarray, result)
     problem = dataclasses.replace(result.problem, options=options)
-    of_numbers = lambda x: function(result.unknowns.inertia(x, result.index))  # noqa: E731
-    slope, noise = jax.grad(of_numbers)(result.numbers), result.inflation
-    unit = 1e-3 * jnp.sqrt(slope @ result.numbers_covariance @ slope / noise)
-    layout, dtype = whole(problem.samples, 1, result.t0), result.numbers.dtype
+    unknowns, numbers, dtype = result.unknowns, result.numbers, result.numbers.dtype
+    slope = np.asarray(_held_on(unknowns, numbers, Static(function)))
+    unit = 1e-3 * np.sqrt(slope @ result.numbers_covariance @ slope / result.inflation)
+    single = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
     states = result.state.attitude[:, None], result.state.omega[:, None]
-    point = Point(result.numbers, result.own_numbers, *states)
-    last = jtu.tree_map(lambda x: x[0, -1], schedule(options, dtype))
-    kept = result.kept.astype(dtype)
+    one = np.ones((), dtype)
+    settings = Settings(
+        kept=result.kept.astype(dtype),
+        scales=result.scales,
+        level=np.ones(3, dtype),
+        weight=0 * one,
+        horizon=2 * one,
+        soft=np.asarray(False),
+        enough=(ACCURACY * result.inflation).astype(dtype),
+        steps=np.asarray(STEPS),
+        damping=FIRST_DAMPING * one,
+    )
+    point = Point(numbers, result.own_numbers, *states)
 
-    def at(value: Array) -> Array:
-        hold = lambda x: (of_numbers(x) - value) / unit  # noqa: E731
-        now = dataclasses.replace(problem, unknowns=problem.unknowns.holding(hold))
-        weigh = weigher(now, layout, kept, result.scales, last)
-        evaluate = problems.evaluation(now, layout)
-        begin = unevaluated(evaluate, point, 1)
-        gap = begin.links.gap
-        white = jnp.zeros((*gap.shape, gap.shape[-1]), dtype)
-        enough = lambda _: ACCURACY * noise  # noqa: E731
-        found = minimise(evaluate, weigh, white, begin, enough, jnp.asarray(100))
-        growth = weigh(found.rows)[1] - result.chi_square
-        return jnp.where(found.settled, growth / noise, jnp.nan)
+    def request(value: Any) -> Request:
+        hold = _Held(function, value.astype(dtype), unit.astype(dtype))
+        held = dataclasses.replace(problem, unknowns=unknowns.holding(hold))
+        return Request(held, single, point, settings)
 
-    return jax.lax.map(at, values)
+    growth = []
+    for found in minima([request(x) for x in np.asarray(values)], len(values)):
+        more = (found.square - result.chi_square) / result.inflation
+        growth.append(more if found.settled else np.nan)
+    return jnp.asarray(np.asarray(growth, dtype))
 
 
 def residuals(

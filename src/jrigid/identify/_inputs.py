@@ -61,18 +61,6 @@ def _longer(function: Any, count: int) -> Any:
     return eqx.tree_at(arrays, function, replace_fn=longer) if count else function
 
 
-def bodies_of(bodies: Sequence[int] | None, throws: int) -> Array:
-    """Which body each throw is of."""
-    chosen = [0] * throws if bodies is None else bodies
-    demand(
-        len(chosen) == throws,
-        f"Argument `bodies` must have one number for each of {throws} throws, but it is {bodies}.",
-    )
-    text = f"Argument `bodies` must hold 0, 1, ... up to the last body, but it is {bodies}."
-    demand(set(chosen) == set(range(len(set(chosen)))), text)
-    return jnp.asarray(chosen)
-
-
 def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
     """The tensor to start from, if one is given, and the state of each throw."""
     inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)
@@ -97,8 +85,14 @@ def refuse(system: RigidBody, records: Sequence[Record], scale: str, shape: Abst
         "whose numbers hold the scale, but it is 'trace'.",
     )
     terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
+    has_rotor = any(isinstance(x, Rotor | SpinningMass) for x in terms)
     demand(
-        scale != "rotor" or any(isinstance(x, Rotor | SpinningMass) for x in terms),
+        scale != "trace" or not has_rotor or shape.absolute,
+        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose momentum sets "
+        "the scale of the tensor, but it is 'trace', which would keep the trace of `system`.",
+    )
+    demand(
+        scale != "rotor" or has_rotor,
         "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it is: "
         "nothing sets the scale of the tensor.",
     )

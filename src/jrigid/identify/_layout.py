@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from jrigid._checks import is_concrete
 from jrigid._numerics import safe_norm
+from jrigid._types import AnyArray
 from jrigid.identify._records import Record, Samples, first_and_last
 from jrigid.rotation import conjugate, exp, log, multiply, normalize
 
@@ -22,12 +23,12 @@ class Layout(NamedTuple):
     An unused node has no samples and no links.
     """
 
-    ts: Array
-    node: Array
-    start: Array
-    end: Array
-    linked: Array
-    since: Array  # fraction of the record at each sample
+    ts: AnyArray
+    node: AnyArray
+    start: AnyArray
+    end: AnyArray
+    linked: AnyArray
+    since: AnyArray  # fraction of the record at each sample
 
 
 class Told(NamedTuple):
@@ -131,7 +132,7 @@ def longest_turn(told: Told) -> Array:
     return jnp.max(jnp.diff(angle_turned(told), axis=1), initial=0.0)
 
 
-def whole(samples: Samples, nodes: int, t0: Array | None = None) -> Layout:
+def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
     """One segment a throw, in the first of so many nodes; its state at t0, or the first sample."""
     ts = samples.ts
     first, last = first_and_last(ts, samples.seen)
@@ -183,4 +184,6 @@ def segments_needed(angle: Array, n: int, length: float) -> int:
     most = n // 2 + 2
     if not is_concrete(angle) or not 0 <= float(angle) < math.inf:
         return most
-    return min(2 ** math.ceil(math.log2(float(angle) / length + 2)), most)
+    # 8, 32, 128, ...: few programs serve all records.
+    needed = max(float(angle) / length + 2, 8.0)
+    return min(2 * 4 ** math.ceil(math.log(needed / 2, 4)), most)

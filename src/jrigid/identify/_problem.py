@@ -1,6 +1,7 @@
 """The least-squares problem of a record: residuals, their derivatives, and what links may gap."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -10,7 +11,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from jrigid._core.inline import inlined
 from jrigid._numerics import product
+from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._flow import forced_flow, free_flow
 from jrigid.identify._layout import Layout
@@ -35,9 +38,6 @@ class Options(NamedTuple):
     robust: bool = False
     noise_known: bool = True
     motion: Any = None
-    doublings: int = 0
-    max_steps: int = 0
-    progress: bool = False
 
     @property
     def dense(self) -> bool:
@@ -51,8 +51,7 @@ class Problem(eqx.Module):
     options: Options = eqx.field(static=True)
     unknowns: Unknowns
     samples: Samples
-    bodies: Array  # of each throw
-    noise: Array  # of rates [rad/s] and turns [rad], (6,), for the links
+    noise: AnyArray  # of rates [rad/s] and turns [rad], (6,), for the links
 
     @property
     def known(self) -> int:
@@ -112,7 +111,6 @@ class _Throw(NamedTuple):
 
     layout: Layout
     samples: Samples
-    body: Array
     first: Array  # 1 for the first throw
 
 
@@ -162,7 +160,7 @@ def shown_by(
     first, ts = t0[None], samples.ts
     layout = Layout(ts, jnp.zeros(ts.shape, int), first, first, first > t0, ts)
     nodes = State(start.attitude[None], start.omega[None])
-    throw = _Throw(layout, samples, t0, t0)
+    throw = _Throw(layout, samples, t0)
     return _seen(options._replace(shooting=False), system, sensors, nodes, throw)[0]
 
 
@@ -189,12 +187,12 @@ def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
 def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
     """Values of each record (throws, n, k) as its sensor would show them, one body for all."""
     unknowns = problem.unknowns
-    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves, 0)
+    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves)
 
     def throw(attitude: Array, omega: Array, data: _Throw) -> list[Array]:
         return _seen(problem.options, system, sensors, State(attitude, omega), data)[0]
 
-    data = _Throw(layout, problem.samples, problem.bodies, problem.bodies)
+    data = _Throw(layout, problem.samples, layout.start[:, 0])
     return jax.vmap(throw)(point.attitude, point.omega, data)
 
 
@@ -207,7 +205,7 @@ def _of_throw(
     numbers themselves, which hold a fit near its start.
     """
     options, unknowns, (numbers, own, move) = problem.options, problem.unknowns, moves
-    system, *sensors = unknowns.parts(numbers, own, leaves, throw.body)
+    system, *sensors = unknowns.parts(numbers, own, leaves)
     attitude = point.attitude
     if options.on_attitude:
         attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
@@ -231,12 +229,13 @@ def _over_throws(function: Callable[..., Any], problem: Problem, layout: Layout)
     """A function of a throw's point, arrays and data, and of moves, over all throws."""
     stacked = tuple(0 if own else None for own in problem.unknowns.stacked)
     first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
-    data = _Throw(layout, problem.samples, problem.bodies, first)
+    data = _Throw(layout, problem.samples, first)
     of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
 
     def over(point: Point, *moves: Array) -> Any:
         axes = of_throws, stacked, 0, *(0 for _ in moves)
-        return jax.vmap(function, in_axes=axes)(point, problem.unknowns.leaves, data, *moves)
+        one = partial(inlined, function)
+        return jax.vmap(one, in_axes=axes)(point, problem.unknowns.leaves, data, *moves)
 
     return over
 

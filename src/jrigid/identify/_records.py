@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, check_type, demand, float_arrays, is_concrete
-from jrigid._types import Readable, Real, VectorLike
+from jrigid._types import AnyArray, Readable, Real, VectorLike
 from jrigid.identify import _sensors as sensors
 
 Times = Real[_ArrayLike, "*throws n"]
@@ -87,13 +88,13 @@ class Record(Readable):
             demand(sigma.shape in shapes, f"Argument `sigma` {of} {text}")
             of_samples = sigma.shape in ((n,), ts.shape) and sigma.shape != (k,)
             sigma = sigma[..., None] if of_samples else sigma
-            self.sigma = jnp.broadcast_to(sigma, (*ts.shape, k))
+            self.sigma = _repeated(sigma, (*ts.shape, k))
         if covariance is not None:
             (covariance,) = float_arrays(covariance)
             text = f"shape ({k}, {k}) or ({n}, {k}, {k}), but it has shape {covariance.shape}."
             shapes = (k, k), (n, k, k), (*ts.shape, k, k)
             demand(covariance.shape in shapes, f"Argument `covariance` {of} have {text}")
-            self.covariance = jnp.broadcast_to(covariance, (*ts.shape, k, k))
+            self.covariance = _repeated(covariance, (*ts.shape, k, k))
 
     @property
     def degrees(self) -> int:
@@ -117,6 +118,13 @@ class Record(Readable):
         """With other values, where there are times."""
         values = jnp.where(jnp.isfinite(self.ts)[..., None], values, jnp.nan)
         return eqx.tree_at(lambda x: x.values, self, values)
+
+
+def _repeated(x: Array, shape: tuple[int, ...]) -> Array:
+    """Broadcast; without a compiled program where the numbers are known."""
+    if not is_concrete(x):
+        return jnp.broadcast_to(x, shape)
+    return jnp.asarray(np.broadcast_to(np.asarray(x), shape))
 
 
 def Rates(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
@@ -185,7 +193,7 @@ def one_after_another(sizes: Iterable[int]) -> list[slice]:
     return list(map(slice, ends, ends[1:]))
 
 
-def first_and_last(ts: Array, there: Array) -> tuple[Array, Array]:
+def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[Array, Array]:
     """Times of the first and last samples of each throw; zero for one without samples."""
     first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1)
     last = jnp.max(jnp.where(there, ts, -jnp.inf), axis=1)
@@ -199,16 +207,16 @@ class Samples(NamedTuple):
     into units of its noise; `sign` (throws, n, D) is that of a saturated number, 0 elsewhere.
     """
 
-    ts: Array  # (throws, n)
-    values: tuple[Array, ...]  # of each record
-    whitener: Array
-    weight: Array  # (throws, n, D)
-    sign: Array
+    ts: AnyArray  # (throws, n)
+    values: tuple[AnyArray, ...]  # of each record
+    whitener: AnyArray
+    weight: AnyArray  # (throws, n, D)
+    sign: AnyArray
 
     @property
-    def seen(self) -> Array:
+    def seen(self) -> AnyArray:
         """Which samples are there."""
-        return jnp.any(self.weight > 0, axis=-1)
+        return (self.weight > 0).any(axis=-1)
 
     @property
     def parts(self) -> list[slice]:
@@ -266,10 +274,37 @@ def of_throws(observations: Any) -> tuple[Record, ...]:
 
 
 def _begun(record: Record) -> Record:
-    """Its sensor told when the record begins."""
-    first = jnp.min(jnp.where(jnp.isfinite(record.ts), record.ts, jnp.inf))
-    sensor = record.sensor.begun(jnp.where(jnp.isfinite(first), first, 0.0))
-    return eqx.tree_at(lambda x: x.sensor, record, sensor)
+    """With a sensor that knows when the record begins."""
+    ts = np.asarray(record.ts) if is_concrete(record.ts) else record.ts
+    xp = ts.__array_namespace__()
+    first = xp.min(xp.where(xp.isfinite(ts), ts, xp.inf))
+    first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), ts.dtype)
+    return eqx.tree_at(lambda x: x.sensor, record, record.sensor.begun(first))
+
+
+def rounded(count: int) -> int:
+    """The number of samples to which a record is filled up: few programs serve all lengths.
+
+    16, 64, 256, where more samples cost little; above, a power of two or half as much again.
+    """
+    if count <= 256:
+        return next(x for x in (16, 64, 256) if count <= x)
+    power = 1 << (count - 1).bit_length()
+    return 3 * power // 4 if count <= 3 * power // 4 else power
+
+
+def lengthened(record: Record) -> Record:
+    """With samples at its end in which nothing was seen."""
+    more = rounded(record.ts.shape[-1]) - record.ts.shape[-1]
+
+    def filled(x: Any, axis: int) -> Any:
+        x = np.asarray(x)
+        widths = [(0, more if i == axis else 0) for i in range(x.ndim)]
+        return np.pad(x, widths, constant_values=np.nan)
+
+    arrays = lambda x: [x.ts, x.values, x.sigma, x.covariance]  # noqa: E731
+    wanted = [None if x is None else filled(x, 1) for x in arrays(record)]
+    return eqx.tree_at(arrays, record, wanted, is_leaf=lambda x: x is None)
 
 
 def _as_tuple(observations: Any) -> tuple[Record, ...]:
@@ -301,8 +336,14 @@ def _stacked(parts: Sequence[Record]) -> Record:
     longest = max(x.ts.size for x in parts)
 
     def stack(*throws: Array) -> Array:
-        wide = (jnp.full((longest, *x.shape[1:]), jnp.nan, x.dtype) for x in throws)
-        return jnp.stack([x.at[: len(y)].set(y) for x, y in zip(wide, throws, strict=True)])
+        known = all(map(is_concrete, throws))
+        xp, rows = jnp, list(throws)
+        if known:  # no compiled programs for each length
+            xp, rows = np, [np.asarray(x) for x in throws]
+        missing = [[(0, longest - x.shape[0])] + [(0, 0)] * (x.ndim - 1) for x in rows]
+        pairs = zip(rows, missing, strict=True)
+        stacked = xp.stack([xp.pad(x, y, constant_values=np.nan) for x, y in pairs])
+        return jnp.asarray(stacked)
 
     stacked = jtu.tree_map(stack, *map(arrays, parts))
     return eqx.tree_at(arrays, parts[0], stacked, is_leaf=lambda x: x is None)

@@ -1,6 +1,5 @@
 """FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -57,9 +56,10 @@ _FAR = 1.0  # a change of a number beyond which the tensor is another one
 LARGEST_ERROR = 0.3
 
 
-def errors_of(covariance: Array) -> Array:
+def errors_of(covariance: Any) -> Any:
     """Standard errors."""
-    return jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    xp = covariance.__array_namespace__()
+    return xp.sqrt(xp.maximum(xp.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
 class FitResult(eqx.Module):
@@ -80,6 +80,7 @@ class FitResult(eqx.Module):
         moments_covariance: Of the moments.
         ratios_covariance: Of the ratios.
         shares_covariance: Of the shares; singular, as their sum is 1.
+        moments_errors: Standard errors of `moments`.
         ratios_errors: Standard errors of `ratios`.
         shares_errors: Standard errors of `shares`.
         axes_errors: Errors of the turn about each principal axis [rad].
@@ -115,11 +116,9 @@ class FitResult(eqx.Module):
         kept: Which samples were, records side by side.
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
-        doubtful: Whether bodies far from this one describe the record nearly as well.
+        ambiguous: Whether bodies far from this one describe the record nearly as well.
         input_result: `jrigid.RESULTS` of the input.
         problem: The record as it was fitted, and how.
-        derived: What follows of the tensor of each body.
-        index: Which body this is.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -141,6 +140,7 @@ class FitResult(eqx.Module):
     moments_covariance: Matrix
     ratios_covariance: Float[Array, "2 2"]
     shares_covariance: Matrix
+    moments_errors: Vector
     ratios_errors: Float[Array, "2"]
     shares_errors: Vector
     axes_errors: Vector
@@ -172,11 +172,9 @@ class FitResult(eqx.Module):
     kept: Bool[Array, "throws samples"]
     history: Float[Array, " steps"]
     pure_spin: Bool[Array, ""]
-    doubtful: Bool[Array, ""]
+    ambiguous: Bool[Array, ""]
     input_result: Any
     problem: Problem
-    derived: tuple[dict[str, Array], ...]
-    index: int = eqx.field(static=True, default=0)
 
     @property
     def unknowns(self) -> Unknowns:
@@ -193,12 +191,6 @@ class FitResult(eqx.Module):
         """What each of `numbers` is."""
         return self.unknowns.names()
 
-    @property
-    def bodies(self) -> tuple["FitResult", ...]:
-        """The result for each body."""
-        pairs = enumerate(self.derived)
-        return tuple(dataclasses.replace(self, index=i, **of_body) for i, of_body in pairs)
-
     def spread(self, function: Callable[[Array], Array]) -> Array:
         """Covariance of a function of the tensor, to a vector; of a single fit.
 
@@ -209,7 +201,7 @@ class FitResult(eqx.Module):
         Args:
             function: Of the tensor.
         """
-        return _spread(self.unknowns, self.index, self.numbers, self.numbers_covariance, function)
+        return _spread(self.unknowns, self.numbers, self.numbers_covariance, function)
 
     def interval(self, function: Callable[[Array], Array], level: float = 0.95) -> Array:
         """Lower and upper limit of a scalar function of the tensor; of a single fit.
@@ -277,9 +269,9 @@ class FitResult(eqx.Module):
         Args:
             index: Which throw.
         """
-        given, body = (self.unknowns.leaves, self.unknowns.stacked), self.problem.bodies[index]
+        given = self.unknowns.leaves, self.unknowns.stacked
         leaves = jtu.tree_map(lambda x, own: x[index] if own else x, *given)
-        return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves, body)
+        return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves)
 
     def start(self, index: Int[_ArrayLike, ""] = 0) -> tuple[State, Float[Array, "*fits"]]:
         """The state of a throw and its time [s], which whoever moves the state needs.
@@ -346,8 +338,8 @@ class FitResult(eqx.Module):
         Raises:
             ValueError: The shape that was sought was another one.
         """
-        numbers = self.unknowns.of_shapes(self.numbers)[self.index]
-        body = self.unknowns.shapes[self.index].body(numbers)
+        numbers = self.numbers[..., self.unknowns.slices["shape"]]
+        body = self.unknowns.shape.body(numbers)
         if body is None:
             raise ValueError(
                 "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
@@ -456,38 +448,15 @@ def _of_moments(which: Any, tensor: Array) -> Array:
 
 
 def _spread(
-    unknowns: Unknowns, index: int, numbers: Array, covariance: Array, function: Callable[..., Any]
+    unknowns: Unknowns, numbers: Array, covariance: Array, function: Callable[..., Any]
 ) -> Array:
     size = unknowns.slices["scale"].stop  # the others do not move the tensor
     values, axes = jnp.linalg.eigh(covariance[:size, :size])
     sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
     near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
     steps = jnp.pad(product("ij,j->ji", axes, near), ((0, 0), (0, numbers.size - size)))
-    of_numbers = lambda x: function(unknowns.inertia(x, index))  # noqa: E731
+    of_numbers = lambda x: function(unknowns.inertia(x))  # noqa: E731
     moves = jax.vmap(of_numbers)(numbers[None] + jnp.concatenate([steps, -steps]))
     moves = moves - of_numbers(numbers)[None]
     moves = product("ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2))
     return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
-
-
-def derive(unknowns: Unknowns, index: int, numbers: Array, covariance: Array) -> dict[str, Any]:
-    """What follows from the numbers and their covariance for a body."""
-    tensor_of = lambda x: unknowns.inertia(x, index)  # noqa: E731
-    tensor, slopes = tensor_of(numbers), jax.jacfwd(tensor_of)(numbers)
-    (moments, axes), elements = eigh(tensor), slopes.reshape(9, -1)
-    gaps = jnp.roll(moments, -1) - jnp.roll(moments, 1)
-    floor = jnp.finfo(gaps.dtype).eps * moments[2]
-    gaps = jnp.where(jnp.abs(gaps) > floor, gaps, floor)
-    sides = jnp.roll(axes, -1, axis=1), jnp.roll(axes, 1, axis=1)
-    turns = product("ki,kln,li->in", sides[0], slopes, sides[1]) / gaps[:, None]
-    spread = _spread(unknowns, index, numbers, covariance, jtu.Partial(_of_moments, ...))
-    errors = errors_of(spread)
-    return {
-        "inertia": tensor, "moments": moments, "axes": axes,
-        "ratios": moments[1:] / moments[:1], "shares": moments / jnp.sum(moments),
-        "inertia_covariance": product("in,nm,jm->ij", elements, covariance, elements),
-        "moments_covariance": spread[:3, :3], "ratios_covariance": spread[3:5, 3:5],
-        "shares_covariance": spread[5:, 5:], "ratios_errors": errors[3:5],
-        "shares_errors": errors[5:],
-        "axes_errors": jnp.sqrt(product("in,nm,im->i", turns, covariance, turns)),
-    }  # fmt: skip

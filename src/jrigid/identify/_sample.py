@@ -83,7 +83,7 @@ def log_density(result: FitResult) -> LogDensity:
     demand(not options.dense, text)
     motion = options.motion or (None if options.free_motion else _simulated)
     options = options._replace(shooting=False, nodes=1, motion=motion)
-    problem = Problem(options, problem.unknowns, problem.samples, problem.bodies, problem.noise)
+    problem = Problem(options, problem.unknowns, problem.samples, problem.noise)
     unknowns, layout = problem.unknowns, whole(problem.samples, 1, result.t0)
     states = result.state.attitude[:, None], result.state.omega[:, None]
     size = result.numbers.size
@@ -99,8 +99,7 @@ def log_density(result: FitResult) -> LogDensity:
         return -0.5 * chi_square / result.inflation + log_jacobian(numbers, rest[:, local:])
 
     def log_jacobian(numbers: Array, own: Array) -> Array:
-        pairs = zip(unknowns.shapes, unknowns.of_shapes(numbers), strict=True)
-        parts = [jnp.zeros((), numbers.dtype), *(_log_volume(*x) for x in pairs)]
+        parts = [_log_volume(unknowns.shape, numbers[unknowns.slices["shape"]])]
         shared = [x for x in unknowns.sought if not x.own]
         parts += [x.log_volume(numbers[unknowns.slices[x.name]]) for x in shared]
         parts += [jnp.sum(jax.vmap(x.log_volume)(own[:, s])) for x, s in unknowns.own_slices]

@@ -20,7 +20,7 @@ def save(path: str | os.PathLike[str], result: FitResult) -> None:
 
     Args:
         path: Of the file.
-        result: A fit, or many from vmap.
+        result: A fit, or many by `fit_each`.
 
     Raises:
         ValueError: A function that has no name to be found by: a lambda, or one within another.

@@ -1,248 +1,416 @@
-"""The search for the minimum: attempts from several bodies, and probes of what is told least."""
+"""The search for the minimum: stages, attempts from several bodies, probes of the weakest.
 
-from typing import NamedTuple
+The search is plain Python. Whatever it wants minimised it yields as a `Request`, and is sent the
+`Minimum`; so one driver serves a single record and many, whose requests share compiled calls.
+"""
+
+import dataclasses
+from collections.abc import Callable, Generator, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
-from jrigid._numerics import or_one, product
-from jrigid.identify._layout import Layout
-from jrigid.identify._problem import Problem, evaluation
-from jrigid.identify._result import LARGEST_ERROR
-from jrigid.identify._smoother import Point, blocks_of, eliminated, minimise, reduced, unevaluated
-from jrigid.identify._stages import (
-    EXPLAINED,
-    Stage,
-    Way,
+from jrigid.identify._errors import (
+    FAINT,
+    Weakest,
     evidence_of,
     first_level,
+    weakest,
+)
+from jrigid.identify._layout import Layout
+from jrigid.identify._minimise import (
+    FIRST_DAMPING,
+    STEPS,
+    Minimum,
+    Settings,
+    minimise,
+    tensors_at,
+)
+from jrigid.identify._problem import Problem
+from jrigid.identify._quality import (
+    FOLLOWED,
+    Fit,
     is_at_boundary,
     is_pure,
-    link_whitener,
     misfit,
-    next_level,
-    rejected,
     scales_of,
-    schedule,
     unexplained,
-    weigher,
     weights_of,
+    without_outliers,
 )
+from jrigid.identify._result import LARGEST_ERROR
+from jrigid.identify._smoother import Point
+from jrigid.identify._unknowns import Unknowns
 
-_HISTORY = 1024
+ACCURACY = 1e-6  # of the sum of squares a step would gain: a thousandth of the standard errors
+_ROUGH = 0.3  # ... where a stage only has to start the next one
+# Weights of the links, in units of the noise; and a slower way for fits that went wrong.
+_WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
+_SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
+_LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
+_IN_A_STAGE = 15
+_LEVELS = 40  # stages in which the level of a torque is sought
+_LEVEL_STEPS = 6  # stages in which a level that is known is reached
+
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
-_PROBES = [-1.0, 1.0, -0.25, 0.25]  # natural units, along what is told least
+_PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
 _BENT = 2.0  # times what Fisher's information says: a valley that no covariance describes
-_RIVAL = 25.0  # growth of chi-square at which another minimum is none
+_RIVAL = 25.0  # growth of chi-square beyond which another minimum does not matter
 
 
 class Line(eqx.Module):
     """Holds the numbers on a plane: a residual that is zero there."""
 
-    direction: Array
-    value: Array
+    direction: Any
+    value: Any
 
-    def __call__(self, numbers: Array) -> Array:
+    def __call__(self, unknowns: Unknowns, numbers: Array) -> Array:
+        """The residual."""
+        del unknowns
         return jnp.sum(self.direction * numbers) - self.value
 
 
-class _Weakest(NamedTuple):
-    """Chi-square of an answer, its unit, and what it tells least."""
+class Stage(NamedTuple):
+    """One minimisation of an attempt.
 
-    square: Array
-    noise: Array
-    error: Array  # in natural units
-    direction: Array  # a natural unit along it, in numbers
-    normal: Array  # whose product with that is one
+    Attributes:
+        weight: Of the links, in units of the noise; of a level that is known, how far it has come.
+        steps: The largest number of steps.
+        enough: A gain that is not worth a step.
+        horizon: Fraction of the record that takes part.
+        whole: From one state a throw.
+        soft: With Cauchy's loss.
+        reject: Samples too far off are left out from here on.
+        last: The level of the torque is no longer changed.
+    """
+
+    weight: float
+    steps: int
+    enough: float
+    horizon: float = 2.0
+    whole: bool = False
+    soft: bool = False
+    reject: bool = False
+    last: bool = False
 
 
-class _Hunt(NamedTuple):
-    """Where a search stands."""
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How hard to try.
 
-    tried: Array  # the next attempt: a start, then a probe
-    best: Way
-    wrong: Array  # 0 for an answer that may be kept, else how far off it is
-    weakest: _Weakest
-    pure: Array
+    Attributes:
+        max_steps: Of the last stage.
+        doublings: The first stage without shooting sees 2^-doublings of the record.
+        report: Called with a line of text after each stage, or None.
+    """
+
+    max_steps: int = 400
+    doublings: int = 8
+    report: Callable[[str], None] | None = None
 
 
-def search(
-    problem: Problem, single: Layout, cut: Layout, point: Point, starts: Array, known: Array,
-    coarse: Array, long: Array,
-) -> Way:  # fmt: skip
-    """Through all stages; if that ends wrong, again, more slowly, from other numbers.
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A record and where its search begins.
 
-    Fisher's information at a minimum knows nothing of a valley that bends, nor of other minima. So
-    an answer that tells some direction weakly is probed: that direction is held a natural unit, and
-    a quarter of one, to either side, and all else is fitted anew. By how little chi-square grows
-    says what the error is. Of coarse records, which have aliases, several attempts are compared.
-
-    Args:
+    Attributes:
         problem: The record.
         single: One segment a throw.
-        cut: Many.
+        cut: Many segments.
         point: States at their starts, as observed.
-        starts: Numbers for each attempt.
-        known: Level of the unmodelled torque, if it is known.
+        starts: Numbers for each attempt (attempts, numbers).
+        tensor: The inertia of the first start.
+        level: Of the unmodelled torque, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
         long: Whether it turns many times, so that probes must go slowly too.
+        effort: How hard to try.
     """
-    options, dtype, count = problem.options, point.omega.dtype, starts.shape[0]
-    stages, first = schedule(options, dtype), first_level(problem, cut, point.numbers)
-    last = jtu.tree_map(lambda x: x[0, -1], stages)
-    final = cut if options.dense or not options.free_motion else single
-    steps = jnp.asarray([0.0] * count + _PROBES, dtype)
-    most = count if options.dense else steps.size  # squares beside levels of their own differ
+
+    problem: Problem
+    single: Layout
+    cut: Layout
+    point: Point
+    starts: np.ndarray
+    tensor: np.ndarray
+    level: np.ndarray
+    coarse: bool
+    long: bool
+    effort: Effort
+
+    @property
+    def final(self) -> Layout:
+        """The layout of the last stage."""
+        options = self.problem.options
+        return self.cut if options.dense or not options.free_motion else self.single
+
+
+class Request(NamedTuple):
+    """The arguments of `minimise`, without lanes."""
+
+    problem: Problem
+    layout: Layout
+    point: Point
+    settings: Settings
+
+
+Search = Generator[Request, Minimum, Fit]
+
+
+def stages_of(case: Case, slow: bool) -> list[Stage]:
+    """The stages of an attempt."""
+    options, effort = case.problem.options, case.effort
+    whole = not options.dense and (options.free_motion or not options.shooting)
+    largest = _LARGEST[case.point.omega.dtype.itemsize]
+    end = Stage(largest, effort.max_steps, ACCURACY, whole=whole, last=True)
+    if options.dense:
+        count = _LEVEL_STEPS if options.level == "known" else _LEVELS
+        stages = [Stage(float(x), 8, 0.01) for x in np.linspace(0, 1, count)]
+        end = end._replace(weight=1.0)
+    elif not options.shooting:
+        horizons = [2.0**-k for k in range(effort.doublings, 0, -1)]
+        stages = [Stage(0.0, _IN_A_STAGE, ACCURACY, horizon=x) for x in horizons]
+    else:
+        weights = _SLOW if slow else _WEIGHTS[options.free_motion]
+        steps = 2 * _IN_A_STAGE if slow else _IN_A_STAGE
+        stages = [Stage(min(x, largest), steps, _ROUGH) for x in weights]
+    stages = [x._replace(soft=options.robust) for x in (*stages, end)]
+    if options.robust:
+        stages.append(end._replace(soft=False, reject=True))
+    return stages
+
+
+def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Search:
+    """All stages from some numbers, each from where the one before ended."""
+    options, dtype = problem.options, case.point.omega.dtype
+    first = first_level(problem, case.cut, case.tensor)
     # Beside a noise that is not known a level far too large is nearly as likely as another.
-    begin = _begun(problem, cut, point, (10 if options.noise_known else 1) * first, coarse)
-
-    def attempt(hunt: _Hunt) -> _Hunt:
-        best, weakest, step = hunt.best.found, hunt.weakest, steps[hunt.tried]
-        probing = hunt.tried >= count
-        numbers = best.point.numbers + step * weakest.direction
-        numbers = jnp.where(probing, numbers, starts[jnp.minimum(hunt.tried, count - 1)])
-        normal = jnp.where(probing, _HARD * weakest.normal, 0.0)
-        held = problem.unknowns.holding(Line(normal, jnp.sum(normal * numbers)))
-        now = eqx.tree_at(lambda x: x.unknowns, problem, held)
-        slow = jnp.where(probing, long, hunt.tried > 0).astype(int)
-        way = jtu.tree_map(lambda x: x[slow % x.shape[0]], stages)
-
-        def one(way: Way, stage: Stage) -> tuple[Way, None]:
-            skip = (stage.steps == 0) | (way.done & ~stage.last)
-            run = lambda way: _stage(now, single, cut, way, stage, first, known)  # noqa: E731
-            return jax.lax.cond(skip, lambda way: way, run, way), None
-
-        at = begin.found._replace(point=point._replace(numbers=numbers))
-        at = at._replace(steps=best.steps, history=best.history)
-        return _next(hunt, jax.lax.scan(one, begin._replace(found=at), way)[0], probing, step)
-
-    def _next(hunt: _Hunt, end: Way, probing: Array, step: Array) -> _Hunt:
-        """What an attempt says, and what comes after it."""
-        best, weakest, wrong = hunt.best, hunt.weakest, hunt.wrong
-        off, seen = misfit(problem, end), _weakest(problem, final, end, last)
-        fall = (weakest.square - seen.square) / weakest.noise
-        better = ~probing & ((off < wrong) | ((off <= wrong) & (fall > 0)))
-        points = best.found.point.numbers, end.found.point.numbers
-        apart = _are_apart(problem, *points, jnp.maximum(weakest.error, seen.error))
-        rival = ~probing & apart & (jnp.abs(fall) < _RIVAL)
-        doubtful = (best.doubtful & ~(better & (fall > _RIVAL))) | rival | begin.doubtful
-        wide = _error_by_probe(problem, *points, weakest.direction, step, -fall)
-        wide = jnp.maximum(best.wide, jnp.where(probing & (-fall < _SURE), wide, 0.0))
-        bent = wide > _BENT * weakest.error
-
-        best, weakest, wrong = jtu.tree_map(
-            lambda a, b: jnp.where(better, a, b), (end, seen, off), (best, weakest, wrong)
+    level = (10 if options.noise_known else 1) * first
+    kept = problem.samples.seen.astype(dtype)
+    scales = np.ones(len(problem.samples.values), dtype)
+    point, histories, at_rest, minimum = case.point._replace(numbers=numbers), [], False, None
+    for stage in stages_of(case, slow):
+        if at_rest and not stage.last:
+            continue
+        if options.robust and minimum is not None:
+            residual = minimum.rows.residual[:, : kept.shape[1]]
+            scales = scales_of(problem, residual, kept)
+            if stage.reject:
+                kept = without_outliers(problem, residual, kept, scales)
+        if options.level == "known":
+            level = first * (case.level / first) ** stage.weight
+        settings = Settings(
+            kept=kept,
+            scales=scales,
+            level=level.astype(dtype),
+            weight=np.asarray(stage.weight, dtype),
+            horizon=np.asarray(stage.horizon, dtype),
+            soft=np.asarray(stage.soft),
+            enough=np.asarray(stage.enough, dtype),
+            steps=np.asarray(stage.steps),
+            damping=np.asarray(FIRST_DAMPING, dtype),
         )
-        best = best._replace(doubtful=doubtful | bent, wide=wide)
-        # A misfit that follows the record has two attempts, any other failure all.
-        lost = (wrong > _FAR) | is_at_boundary(problem, best.found)
-        lost = lost | (unexplained(problem, best) > EXPLAINED)
-        pure = is_pure(problem, best, weakest.noise) & (wrong < 0.5)  # no misfit
-        few = jnp.where(wrong > 0, jnp.where(lost, count, 2), jnp.where(coarse, 4, 1))
-        few = jnp.minimum(jnp.where(pure | (doubtful & (wrong == 0)), 1, few), count)
-        after = hunt.tried + 1
-        after = jnp.where(after < few, after, jnp.maximum(after, count))
-        return _Hunt(after, best, wrong, weakest, pure)
-
-    def going(hunt: _Hunt) -> Array:
-        weak = (hunt.weakest.error > _WEAK) & (hunt.weakest.error < LARGEST_ERROR)
-        probes = weak & (hunt.wrong == 0) & ~hunt.best.doubtful & (hunt.tried < most)
-        return (hunt.tried < count) | (probes & ~hunt.pure & (hunt.best.wide < LARGEST_ERROR))
-
-    far, none = jnp.asarray(jnp.inf, dtype), jnp.zeros_like(point.numbers)
-    nothing = _Weakest(far, jnp.ones((), dtype), far, none, none)
-    hunt = _Hunt(jnp.asarray(0), begin, far, nothing, jnp.asarray(False))
-    return jax.lax.while_loop(going, attempt, hunt).best
+        layout = case.single if stage.whole else case.cut
+        minimum, history = yield from _stage(Request(problem, layout, point, settings))
+        point = minimum.point
+        histories.append(history)
+        fit = Fit(minimum, kept, scales, level, np.concatenate(histories))
+        if case.effort.report is not None:
+            case.effort.report(_progress(stage, fit))
+        if options.level.startswith("estimate") and not stage.last:
+            new, at_rest = _next_level(problem, fit, first)
+            level = new.astype(dtype)
+    return fit
 
 
-def _begun(problem: Problem, cut: Layout, point: Point, level: Array, coarse: Array) -> Way:
-    """Before anything is known; few samples of a coarse record follow any alias."""
-    found, dtype = unevaluated(evaluation(problem, cut), point, _HISTORY), level.dtype
-    kept, scales = problem.samples.seen.astype(dtype), jnp.ones(len(problem.samples.values), dtype)
-    few = coarse & (jnp.sum(weights_of(problem, kept)) < _FEW)
-    return Way(found, kept, scales, level, jnp.asarray(False), few, jnp.zeros((), dtype))
+def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
+    """One stage, in calls of a few steps each: the minimum and the sums of squares of all."""
+    settings, left, histories = request.settings, int(request.settings.steps), []
+    while True:
+        steps = np.asarray(min(left, STEPS))
+        minimum = yield request._replace(settings=settings._replace(steps=steps))
+        taken = int(minimum.steps)
+        histories.append(minimum.history[:taken])
+        left -= taken
+        if bool(minimum.settled) or taken < steps or not left:
+            return minimum, np.concatenate(histories)
+        request = request._replace(point=minimum.point)
+        settings = settings._replace(damping=minimum.damping)
 
 
-def _weakest(problem: Problem, layout: Layout, way: Way, last: Stage) -> _Weakest:
-    """By the normal equations."""
-    found = way.found
-    numbers, own = found.point.numbers, found.point.own.shape[-1]
-    weight, square = weigher(problem, layout, way.kept, way.scales, last)(found.rows)
-    white = link_whitener(problem, layout, numbers, last.weight, way.level)
-    gap = product("tsij,tsj->tsi", white, found.links.gap)
-    square = square + jnp.sum(gap * gap)
-    freedom = jnp.sum(weights_of(problem, way.kept)) - numbers.size - gap.shape[-1] * gap.shape[0]
-    noise = jnp.ones_like(square)
-    if not problem.options.noise_known:
-        noise = square / jnp.maximum(freedom, 1.0)
-    if not numbers.size:
-        return _Weakest(square, noise, jnp.zeros_like(square), numbers, numbers)
-    left = reduced(blocks_of(found.rows, found.links, weight, white), jnp.zeros_like(square))
-    matrix = eliminated(left, own + gap.shape[-1]).numbers
-    units = problem.unknowns.natural_units(numbers)
-    matrix = matrix * units[:, None] * units[None, :]
-    sound = jnp.all(jnp.isfinite(matrix))
-    values, axes = jnp.linalg.eigh(jnp.where(sound, matrix, jnp.eye(units.size, dtype=units.dtype)))
-    error = jnp.sqrt(noise / jnp.maximum(values[0], 1e-30))
-    return _Weakest(square, noise, error, axes[:, 0] * units, axes[:, 0] / units)
+def _progress(stage: Stage, fit: Fit) -> str:
+    part = min(stage.horizon, 1.0)
+    return (
+        f"fit: {fit.history.size} steps, links {stage.weight:g}, record {part:.3g}: "
+        f"chi-square {float(fit.minimum.square):.6g}"
+    )
 
 
-def _are_apart(problem: Problem, one: Array, other: Array, error: Array) -> Array:
-    """Whether two points are different minima."""
-    apart = jnp.abs(one - other) / problem.unknowns.natural_units(other)
-    return jnp.max(apart, initial=0.0) > jnp.maximum(_APART, 6 * error)
+def _next_level(problem: Problem, fit: Fit, first: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Fisher's scoring for the logarithm of the level; and whether it has come to rest."""
+    seen = evidence_of(problem, fit, fit.minimum.whitener)
+    score = 0.5 * (seen.squares - seen.effective)
+    move = np.clip(score / np.maximum(seen.information, 1e-9), -3.0, 3.0)
+    move = np.where(np.isfinite(move), move, 0.0)
+    # Kicks of which less than one is determined, and of those too many: there is no torque.
+    none = (seen.effective < 1) & (score < 0)
+    new = np.where(none, 0.0, fit.level * np.exp(move / 2))
+    new = np.maximum(new, FAINT * first)
+    return new, bool(np.all(np.abs(np.log(new / fit.level)) < 0.01))
+
+
+def search(case: Case) -> Search:
+    """Through all stages; if that ends wrong, again, more slowly, from other numbers.
+
+    Fisher's information at a minimum knows nothing of a valley that bends, nor of other minima.
+    So a fit whose weakest direction is poorly determined is probed: that direction is held a
+    natural unit, and a quarter of one, to either side, and all else is fitted anew. How little
+    chi-square grows tells the error. Of coarse records, which have aliases, several attempts are
+    compared.
+    """
+    problem = case.problem
+    # Few samples of a coarse record follow any alias.
+    counted = np.sum(weights_of(problem, problem.samples.seen.astype(float)))
+    few = case.coarse and bool(counted < _FEW)
+    best = yield from attempt(case, problem, case.starts[0], slow=False)
+    wrong, weak = misfit(problem, best), weakest(problem, best)
+    ambiguous, index = few, 1
+    while index < _attempts(case, best, wrong, weak.noise, ambiguous):
+        end = yield from attempt(case, problem, case.starts[index], slow=True)
+        off, seen = misfit(problem, end), weakest(problem, end)
+        fall = (weak.square - seen.square) / seen.noise
+        better = off < wrong or (off <= wrong and fall > 0)
+        rival = _are_apart(best, end, max(weak.error, seen.error)) and abs(fall) < _RIVAL
+        ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
+        if better:
+            best, wrong, weak = end, off, seen
+        index += 1
+    best = best._replace(ambiguous=ambiguous)
+    if wrong == 0 and not ambiguous and not problem.options.dense:
+        # Squares beside levels of their own differ, so fits with a level are not probed.
+        best = yield from _probed(case, best, weak)
+    return best
+
+
+def no_search(case: Case) -> Search:
+    """Evaluate nothing: for a record that cannot be used."""
+    dtype, samples = case.point.omega.dtype, case.problem.samples
+    one, scales = np.ones((), dtype), np.ones(len(samples.values), dtype)
+    kept, level = np.zeros(samples.ts.shape, dtype), np.ones(3, dtype)
+    yes, none = np.asarray(False), np.asarray(0)
+    settings = Settings(kept, scales, level, one, one, yes, one, none, one)
+    minimum = yield Request(case.problem, case.final, case.point, settings)
+    return Fit(minimum, kept, scales, level, np.zeros(0, dtype))
+
+
+def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool) -> int:
+    """How many attempts to make: two of a misfit that follows the record, all of other failures."""
+    problem, count = case.problem, len(case.starts)
+    if is_pure(problem, best, noise) and wrong < 0.5:  # no misfit
+        return 1
+    if ambiguous and wrong == 0:
+        return 1
+    if wrong > 0:
+        lost = wrong > _FAR or is_at_boundary(problem, best)
+        lost = lost or unexplained(problem, best) > FOLLOWED
+        return count if lost else min(2, count)
+    return min(4, count) if case.coarse else 1
+
+
+def _probed(case: Case, best: Fit, at: Weakest) -> Search:
+    """The same fit, with the error of its weakest direction as probes see it."""
+    problem = case.problem
+    if not _WEAK < at.error < LARGEST_ERROR or is_pure(problem, best, at.noise):
+        return best
+    before = best.minimum.point.numbers
+    largest = 0.0
+    for step in _PROBES:
+        numbers = before + step * at.direction
+        normal = _HARD * at.normal
+        line = Line(normal, np.sum(normal * numbers))
+        held = dataclasses.replace(problem, unknowns=problem.unknowns.holding(line))
+        end = yield from attempt(case, held, numbers, slow=case.long)
+        growth = (weakest(problem, end).square - at.square) / at.noise
+        error = _error_by_probe(problem, best, end, at.direction, step, growth)
+        if growth < _SURE:
+            largest = max(largest, error)
+        if largest > _BENT * at.error:
+            return best._replace(ambiguous=True, probed_error=largest)
+        if largest >= LARGEST_ERROR:
+            break
+    return best._replace(probed_error=largest)
+
+
+def _are_apart(one: Fit, other: Fit, error: float) -> bool:
+    """Whether two fits are different minima."""
+    apart = np.abs(one.minimum.point.numbers - other.minimum.point.numbers)
+    far = np.max(apart / other.minimum.units, initial=0.0)
+    return bool(far > max(_APART, 6 * error))
 
 
 def _error_by_probe(
-    problem: Problem, before: Array, after: Array, direction: Array, step: Array, growth: Array
-) -> Array:
+    problem: Problem, best: Fit, end: Fit, direction: np.ndarray, step: float, growth: float
+) -> float:
     """In natural units, by how far the tensor moved: numbers are logarithms."""
-    unknowns = problem.unknowns
-    tensors = lambda x: jnp.stack([unknowns.inertia(x, i) for i in range(len(unknowns.shapes))])  # noqa: E731
-    slope = jax.jvp(tensors, (before,), (direction,))[1]
-    square = jnp.sum(slope * slope)
-    along = jnp.sum((tensors(after) - tensors(before)) * slope)
-    step = jnp.where(square > 0, along / or_one(square), step)
-    return jnp.abs(step) / jnp.sqrt(jnp.maximum(growth, 1e-6))
+    before, after = best.minimum, end.minimum
+    h = 1e-4
+    near = before.point.numbers + h * np.stack([direction, -direction])
+    ahead, back = np.asarray(tensors_at(problem.unknowns, near))
+    slope = (ahead - back) / (2 * h)
+    square = np.sum(slope * slope)
+    if square > 0:
+        step = float(np.sum((after.tensor - before.tensor) * slope) / square)
+    return abs(step) / np.sqrt(max(growth, 1e-6))
 
 
-def _stage(
-    problem: Problem, single: Layout, cut: Layout, way: Way, stage: Stage, first: Array,
-    known: Array,
-) -> Way:  # fmt: skip
-    """One minimisation, and what follows from it."""
-    options, (found, kept, scales, level, done, *_) = problem.options, way
-    layout = jtu.tree_map(lambda a, b: jnp.where(stage.whole, a, b), single, cut)
-    if options.robust:
-        scales = scales_of(problem, found, kept)
-        fewer = rejected(problem, found.rows, kept, scales)
-        kept = jnp.where(stage.reject, fewer, kept)
-    if options.level == "known":
-        level = first * (known / first) ** stage.weight
-    weigh = weigher(problem, layout, kept, scales, stage)
-    white = link_whitener(problem, layout, found.point.numbers, stage.weight, level)
+@np.errstate(all="ignore")  # attempts may run out of the range of numbers
+def run(searches: Iterable[Search]) -> list[Fit]:
+    """Carry out a search, or many side by side: their requests share compiled calls."""
+    searches = list(searches)
+    fits: list[Any] = [None] * len(searches)
+    answers: dict[int, Any] = dict.fromkeys(range(len(searches)))
+    while answers:
+        requests = {}
+        for index, answer in answers.items():
+            try:
+                requests[index] = searches[index].send(answer)
+            except StopIteration as end:
+                fits[index] = end.value
+        answers = {}
+        for group in _alike(requests):
+            lanes = 1 if len(searches) == 1 else LANES
+            for first in range(0, len(group), lanes):
+                part = group[first : first + lanes]
+                found = minima([requests[i] for i in part], lanes)
+                answers |= dict(zip(part, found, strict=True))
+    return fits
 
-    def enough(cost: Array) -> Array:
-        count = jnp.maximum(jnp.sum(kept[..., None] * problem.samples.weight), 1.0)
-        return stage.enough * jnp.where(options.noise_known, 1.0, cost / count)
 
-    found = found._replace(fresh=found.fresh | stage.fresh)
-    found = minimise(evaluation(problem, layout), weigh, white, found, enough, stage.steps)
-    if options.progress:
-        jax.debug.print(
-            "fit: {} steps, links {}, record {}: chi-square {}",
-            found.steps, stage.weight, jnp.minimum(stage.horizon, 1.0), weigh(found.rows)[1],
-        )  # fmt: skip
-    if options.level.startswith("estimate"):
-        seen = evidence_of(problem, found, weigh(found.rows)[0], white)
-        new, still = next_level(level, first, seen)
-        level, done = jnp.where(stage.last, level, new), done | still
-    return way._replace(found=found, kept=kept, scales=scales, level=level, done=done)
+LANES = 8  # records of one compiled call
+
+
+def _alike(requests: dict[int, Request]) -> Iterable[Sequence[int]]:
+    """Requests that one compiled call can answer: of the same shapes."""
+    groups: dict[Any, list[int]] = {}
+    for index, request in requests.items():
+        leaves, tree = jtu.tree_flatten(request)
+        key = tree, tuple(np.shape(x) for x in leaves)
+        groups.setdefault(key, []).append(index)
+    return groups.values()
+
+
+def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
+    """Minimise side by side; unused lanes repeat the first one, without steps."""
+    idle = requests[0]._replace(settings=requests[0].settings._replace(steps=np.asarray(0)))
+    padded = [*requests, *[idle] * (lanes - len(requests))]
+    stacked = jtu.tree_map(lambda *x: np.stack([np.asarray(y) for y in x]), *padded)
+    found = jtu.tree_map(np.asarray, minimise(*stacked))
+    return [jtu.tree_map(lambda x, i=i: x[i], found) for i in range(len(requests))]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand
 from jrigid._numerics import product
 from jrigid._spectral import eigh
-from jrigid._types import Readable
+from jrigid._types import Readable, ScalarLike
 from jrigid.identify import _parameters
 from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
 
@@ -27,16 +27,11 @@ def as_tensor(inertia: Array) -> Array:
     return jnp.diag(inertia) if inertia.ndim == 1 else inertia
 
 
-def real_body(tensor: Array, flattest: float) -> Array:
+def real_body(tensor: Array, flattest: ScalarLike) -> Array:
     """The nearest shape of a body with extent in three directions: second moments of trace 1."""
     values, axes = eigh(2 * second_moment(tensor) / jnp.trace(tensor))
     values = jnp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / jnp.sum(values), axes)
-
-
-def is_near_flat(tensor: Array) -> Array:
-    """Whether a fit has run into the boundary of real bodies."""
-    return eigh(2 * second_moment(tensor) / jnp.trace(tensor))[0][0] < BOUNDARY
 
 
 class AbstractShape(Readable):
@@ -67,7 +62,7 @@ class AbstractShape(Readable):
     names: eqx.AbstractClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple[Any, Array]:
+    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple[Any, Array]:
         """The shape, in a frame chosen for a tensor, and its numbers there.
 
         Args:
@@ -107,7 +102,7 @@ class Tensor(AbstractShape):
 
     names: ClassVar[tuple[str, ...]] = _names(5)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Tensor", Array]:
+    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Tensor", Array]:
         """The numbers of the nearest real body."""
         sigma = real_body(tensor, flattest)
         lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
@@ -140,7 +135,9 @@ class Moments(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(2)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Moments", Array]:
+    def start(
+        self, tensor: Array, known: Array, flattest: Array | float
+    ) -> tuple["Moments", Array]:
         """Logarithms of ratios of second moments, in the system's axes."""
         eye = jnp.eye(3, dtype=tensor.dtype)
         frame = jnp.where(jnp.all(known * (1 - eye) == 0), eye, eigh(known)[1])
@@ -161,7 +158,9 @@ class Symmetric(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(3)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Symmetric", Array]:
+    def start(
+        self, tensor: Array, known: Array, flattest: Array | float
+    ) -> tuple["Symmetric", Array]:
         """The odd moment's axis as axis 3 of the frame."""
         values, frame = eigh(real_body(tensor, flattest))
         last = values[2] - values[1] > values[1] - values[0]
@@ -187,7 +186,7 @@ class Top(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(1)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Top", Array]:
+    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Top", Array]:
         """Of the body's own axes."""
         values = jnp.diagonal(real_body(tensor, flattest))
         return self, jnp.log(2 * values[2:] / (values[0] + values[1]))
@@ -205,7 +204,7 @@ class Flat(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(4)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Flat", Array]:
+    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Flat", Array]:
         """The largest second moment first, the thickness last."""
         values, frame = eigh(real_body(tensor, flattest))
         return Flat(frame[:, ::-1]), jnp.pad(0.5 * jnp.log(values[1:2] / values[2:]), (0, 3))
@@ -231,7 +230,7 @@ class Fixed(AbstractShape):
     names: ClassVar[tuple[str, ...]] = ()
     known: Float[Array, "3 3"] | None = None
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["Fixed", Array]:
+    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Fixed", Array]:
         """No numbers."""
         return Fixed(known), jnp.zeros(0, tensor.dtype)
 
@@ -294,7 +293,9 @@ class LogCholesky(AbstractShape):
         of_length = np.array([name[0] in "st" for name in self.names])
         return jnp.where(of_length, jnp.sqrt(square), 1.0)
 
-    def start(self, tensor: Array, known: Array, flattest: float) -> tuple["LogCholesky", Array]:
+    def start(
+        self, tensor: Array, known: Array, flattest: Array | float
+    ) -> tuple["LogCholesky", Array]:
         """The numbers sought, as they were given."""
         return self, self.parameters[self._indices()].astype(tensor.dtype)
 

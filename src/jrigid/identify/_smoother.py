@@ -11,46 +11,41 @@ Optimization, 2nd ed., section 10.3, for the damping), so that a step costs a ti
 the record. The border of a throw holds its own numbers first, then those of all throws.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array
 
 from jrigid._numerics import product
+from jrigid._types import AnyArray
 from jrigid.rotation import exp, multiply, normalize
-
-_FIRST_DAMPING = 1e-3
-_LEAST_DAMPING = 1e-12
-_STUCK = 1e8
 
 
 class Point(NamedTuple):
     """Where a fit stands: numbers of all throws, of each, and the state at each node."""
 
-    numbers: Array
-    own: Array  # (throws, n)
-    attitude: Array  # (throws, nodes, 4)
-    omega: Array
+    numbers: AnyArray
+    own: AnyArray  # (throws, n)
+    attitude: AnyArray  # (throws, nodes, 4)
+    omega: AnyArray
 
 
 class Rows(NamedTuple):
     """Whitened residuals (throws, n, D), and derivatives in the border and the state of a node."""
 
-    residual: Array
-    of_border: Array
-    of_state: Array
-    node: Array
+    residual: AnyArray
+    of_border: AnyArray
+    of_state: AnyArray
+    node: AnyArray
 
 
 class Links(NamedTuple):
     """End of a segment less the next one's start, (throws, nodes, local), and derivatives."""
 
-    gap: Array
-    of_border: Array
-    of_state: Array
+    gap: AnyArray
+    of_border: AnyArray
+    of_state: AnyArray
 
 
 class Blocks(NamedTuple):
@@ -223,110 +218,3 @@ def moved(point: Point, move: tuple[Array, Array, Array]) -> Point:
         turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
         attitude = turn(attitude, states[..., 3:])
     return Point(point.numbers + numbers, point.own + own, attitude, point.omega + states[..., :3])
-
-
-class Found(NamedTuple):
-    """Where a minimisation stands, with the rows and links there."""
-
-    point: Point
-    rows: Rows
-    links: Links
-    fresh: Array  # nothing is known yet: rows and links are to be evaluated
-    settled: Array
-    steps: Array
-    history: Array  # sum of squares of the record after each step
-
-
-def unevaluated(
-    evaluate: Callable[[Point], tuple[Rows, Links]], point: Point, history: int
-) -> Found:
-    """A minimisation that stands at a point where nothing is known yet, and will note its steps."""
-    shapes = jax.eval_shape(evaluate, point)
-    rows, links = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    no, notes = jnp.asarray(False), jnp.full(history, jnp.nan, point.omega.dtype)
-    return Found(point, rows, links, ~no, no, jnp.asarray(0), notes)
-
-
-class _Carry(NamedTuple):
-    found: Found
-    weight: Array
-    cost: Array
-    move: tuple[Array, Array, Array]
-    gain: Array
-    damping: Array
-    growth: Array
-    since: Array
-
-
-def minimise(
-    evaluate: Callable[[Point], tuple[Rows, Links]],
-    weigh: Callable[[Rows], tuple[Array, Array]],
-    whitener: Array,
-    found: Found,
-    enough: Callable[[Array], Array],
-    steps: Array,
-) -> Found:
-    """The minimum of a sum of squares by Levenberg and Marquardt, from a point with its rows.
-
-    Args:
-        evaluate: Rows and links at a point.
-        weigh: Weights of rows, and the sum of squares, or what stands for it.
-        whitener: Of the links.
-        found: Where to start.
-        enough: What a step that is not worth taking would gain, from the sum of squares.
-        steps: How many are allowed.
-    """
-    own = found.point.own.shape[-1]
-
-    def costs(rows: Rows, links: Links) -> tuple[Array, Array, Array]:
-        weight, record = weigh(rows)
-        gap = product("tsij,tsj->tsi", whitener, links.gap)
-        return weight, record, record + jnp.sum(gap * gap)
-
-    def next_step(rows: Rows, links: Links, weight: Array, damping: Array) -> tuple[Any, Array]:
-        return step_of(blocks_of(rows, links, weight, whitener), own, damping)
-
-    def going(carry: _Carry) -> Array:
-        return ~carry.found.settled & (carry.since < steps)
-
-    def settled(gain: Array, damping: Array, cost: Array) -> Array:
-        small = (gain <= enough(cost)) & (damping <= 1e-2)
-        return small | (damping > _STUCK) | ~(gain > 1e-6 * enough(cost))
-
-    def body(carry: _Carry) -> _Carry:
-        old = carry.found
-        trial = moved(old.point, carry.move)
-        rows, links = evaluate(trial)
-        weight, record, cost = costs(rows, links)
-        sound = jnp.isfinite(cost) & jnp.all(jnp.isfinite(rows.of_border))
-        better = sound & (cost <= carry.cost)
-        point, rows, links, weight, cost = jtu.tree_map(
-            lambda new, old: jnp.where(better, new, old),
-            (trial, rows, links, weight, cost),
-            (old.point, old.rows, old.links, carry.weight, carry.cost),
-        )
-        # Nielsen's rule: by how well the gain was foretold, and ever faster while it is not.
-        told = jnp.where(old.fresh, 0.5, carry.cost - cost)
-        told = told / jnp.where(carry.gain > 0, carry.gain, 1.0)
-        ease = jnp.clip(1 - (2 * told - 1) ** 3, 0.1, 2.0)
-        damping = carry.damping * jnp.where(better, ease, carry.growth)
-        damping = jnp.maximum(damping, _LEAST_DAMPING)
-        growth = jnp.where(better, 2.0, 2 * carry.growth)
-        move, gain = next_step(rows, links, weight, damping)
-        history = old.history.at[old.steps].set(record, mode="drop")
-        end = settled(gain, damping, cost)
-        now = Found(point, rows, links, jnp.asarray(False), end, old.steps + 1, history)
-        return _Carry(now, weight, cost, move, gain, damping, growth, carry.since + 1)
-
-    weight, _, cost = costs(found.rows, found.links)
-    damping = jnp.asarray(_FIRST_DAMPING, cost.dtype)
-    move, gain = next_step(found.rows, found.links, weight, damping)
-    move = jtu.tree_map(lambda x: jnp.where(found.fresh, 0.0, x), move)
-    gain = jnp.where(found.fresh, 1.0, gain)
-    cost = jnp.where(found.fresh, jnp.inf, cost)
-    # The first step is worth a try at any gain: nothing says yet that the point is a minimum.
-    growth = jnp.asarray(2.0, cost.dtype)
-    found = found._replace(settled=jnp.isnan(cost))
-    carry = _Carry(found, weight, cost, move, gain, damping, growth, jnp.asarray(0))
-    end = jax.lax.while_loop(going, body, carry)
-    return end.found._replace(settled=end.found.settled & jnp.isfinite(end.cost))

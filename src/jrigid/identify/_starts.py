@@ -293,20 +293,17 @@ def _singular(rows: Array) -> tuple[Array, ...]:
     return left, values, vt, values > 64 * jnp.finfo(values.dtype).eps * values[0]
 
 
-def linear_starts(
-    options: Any, unknowns: Any, told: Told | None, bodies: Array, given: Array | None
-) -> Array:
-    """Tensors of each body (attempts, bodies, 3, 3) to start from, one attempt after the other.
+def linear_starts(options: Any, unknowns: Any, told: Told | None, given: Array | None) -> Array:
+    """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
-    By attitudes, if there are few, R I omega is constant in each throw of a free body; else by the
-    weak form, torques as they are at the samples.
+    From attitudes, if there are few, since R I omega is constant in each throw of a free body;
+    else from the weak form, with torques as they are at the samples.
     """
-    dtype, count, free = unknowns.rate.dtype, len(unknowns.shapes), options.free_motion
+    dtype, free = unknowns.rate.dtype, options.free_motion
     known = as_tensor(unknowns.original(0)[0].inertia.astype(dtype))
-    sought = any(x.names and not isinstance(x, LogCholesky) for x in unknowns.shapes)
+    sought = unknowns.shape.names and not isinstance(unknowns.shape, LogCholesky)
     if given is not None or told is None or not sought or options.motion is not None:
-        tensor = known if given is None else given.astype(dtype)
-        first = jnp.broadcast_to(tensor, (count, 3, 3))
+        first = known if given is None else given.astype(dtype)
         return jnp.stack([first, _rounder(first)])
     there, first = told.there[..., None], first_and_last(told.ts, told.there)[0]
     omegas, zero = jnp.where(there, told.omega, 0.0), jnp.zeros_like(told.omega)
@@ -322,32 +319,25 @@ def linear_starts(
         ts = jax.lax.cummax(jnp.where(told.there, told.ts, first[:, None]), axis=1)
         of_throw = partial(_weak_rows, _WINDOWS, _RADIANS)
         rows = jax.vmap(of_throw)(ts, told.there, omegas, zero, torques)
-    rows = rows.reshape(bodies.size, -1, 7)
     trace = None if unknowns.scaled and not free else jnp.trace(known)
-
-    def starts(body: Array) -> tuple[Array, Array]:
-        own = jnp.where((bodies == body)[:, None, None], rows, 0.0).reshape(-1, 7)
-        return _least_squares(own, trace, jnp.trace(known))
-
-    firsts, leaning = jax.vmap(starts)(jnp.arange(count))
-    both = [firsts, leaning] if trace is None else [leaning, _rounder(leaning)]
+    plain, leaning = _least_squares(rows.reshape(-1, 7), trace, jnp.trace(known))
+    both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
     return jnp.concatenate([jnp.stack(both), _plain_bodies(told, leaning)])
 
 
-def _rounder(tensors: Array) -> Array:
-    """Of bodies half way to a sphere."""
-    third = jnp.trace(tensors, axis1=1, axis2=2)[:, None, None] / 3
-    return 0.5 * (tensors + third * jnp.eye(3, dtype=tensors.dtype)[None])
+def _rounder(tensor: Array) -> Array:
+    """Of a body half way to a sphere."""
+    third = jnp.trace(tensor) / 3
+    return 0.5 * (tensor + third * jnp.eye(3, dtype=tensor.dtype))
 
 
 def _plain_bodies(told: Told, like: Array) -> Array:
-    """A sphere, and bodies of revolution along the axes of the rates, as large as those given."""
+    """A sphere, and bodies of revolution along the axes of the rates, as large as the one given."""
     shown = jnp.where(told.there[..., None], told.omega, 0.0)
     axes = jnp.linalg.eigh(product("tni,tnj->ij", shown, shown))[1]
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
     shapes = jnp.asarray(shapes / shapes.sum(axis=1, keepdims=True), axes.dtype)
-    size = jnp.trace(like, axis1=1, axis2=2)
-    return product("b,ik,sk,jk->sbij", size, axes, shapes, axes)
+    return product("ik,sk,jk->sij", axes, jnp.trace(like) * shapes, axes)
 
 
 def _torques(unknowns: Any, told: Told) -> Array:

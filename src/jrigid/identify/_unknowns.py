@@ -17,8 +17,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from jrigid._checks import demand
-from jrigid._types import Readable
+from jrigid._checks import demand, is_concrete
+from jrigid._types import AnyArray, Readable
 from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
 from jrigid.identify._shapes import AbstractShape, as_tensor
@@ -67,9 +67,9 @@ class AbstractSought(Readable):
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
     own: bool = eqx.field(static=True)
-    base: Array
-    unit: Array
-    sigma: Array | None
+    base: AnyArray
+    unit: AnyArray
+    sigma: AnyArray | None
 
     @property
     def size(self) -> int:
@@ -198,11 +198,11 @@ class Unknowns(eqx.Module):
     rest: tuple[Any, ...] = eqx.field(static=True)  # what is no array
     stacked: tuple[bool, ...] = eqx.field(static=True)  # which arrays have
     sought: tuple[AbstractSought, ...]
-    shapes: tuple[AbstractShape, ...]  # of each body
+    shape: AbstractShape
     scaled: bool = eqx.field(static=True)
-    trace: Array
-    rate: Array  # rms of the rates [rad/s]
-    hold: Any = None  # what of the numbers is held at zero: a function that is a pytree
+    trace: AnyArray
+    rate: AnyArray  # rms of the rates [rad/s]
+    hold: Any = None  # held at zero: a pytree that is called with these unknowns and numbers
 
     @property
     def shared(self) -> tuple[AbstractSought, ...]:
@@ -212,8 +212,7 @@ class Unknowns(eqx.Module):
     @property
     def slices(self) -> dict[str, slice]:
         """Where each part is in the vector for all throws."""
-        sizes = {"shape": sum(len(x.names) for x in self.shapes)}
-        sizes["scale"] = len(self.shapes) * self.scaled
+        sizes = {"shape": len(self.shape.names), "scale": int(self.scaled)}
         sizes |= {x.name: x.size for x in self.shared}
         return dict(zip(sizes, one_after_another(sizes.values()), strict=True))
 
@@ -230,36 +229,27 @@ class Unknowns(eqx.Module):
 
     def names(self) -> tuple[str, ...]:
         """One for each number."""
-        several = len(self.shapes) > 1
-        end = [f" of body {i}" if several else "" for i in range(len(self.shapes))]
-        found = [name + end[i] for i, x in enumerate(self.shapes) for name in x.names]
-        found += ["scale" + x for x in end] * self.scaled
-        return (*found, *(name for x in self.shared for name in x.names))
+        scale = ("scale",) * self.scaled
+        return (*self.shape.names, *scale, *(name for x in self.shared for name in x.names))
 
-    def of_shapes(self, numbers: Array) -> list[Array]:
-        """The numbers of each body's shape."""
-        return jnp.split(numbers, np.cumsum([len(x.names) for x in self.shapes]))[:-1]
+    def inertia(self, numbers: AnyArray) -> Array:
+        """The tensor."""
+        tensor = self.shape.inertia(numbers[self.slices["shape"]]).astype(numbers.dtype)
+        if not self.shape.absolute:
+            tensor = self.trace * tensor / jnp.trace(tensor)
+        return tensor * jnp.exp(numbers[self.slices["scale"].start]) if self.scaled else tensor
 
-    def inertia(self, numbers: Array, body: int | Array = 0) -> Array:
-        """The tensor of a body."""
-        parts = self.of_shapes(numbers)
-        scales, found = jnp.exp(numbers[self.slices["scale"]]), []
-        for i, shape in enumerate(self.shapes):
-            tensor = shape.inertia(parts[i]).astype(numbers.dtype)
-            tensor = tensor if shape.absolute else self.trace * tensor / jnp.trace(tensor)
-            found.append(tensor * scales[i] if self.scaled else tensor)
-        return found[0] if len(found) == 1 else jnp.stack(found)[body]
-
-    def start(self, tensors: Array, flattest: float = 1e-3) -> tuple["Unknowns", Array]:
-        """Numbers for the bodies' tensors; the frames of their shapes are chosen for them."""
-        known = as_tensor(self.original(0)[0].inertia.astype(tensors.dtype))
-        pairs = zip(self.shapes, tensors, strict=True)
-        shapes, numbers = zip(*(x.start(y, known, flattest) for x, y in pairs), strict=True)
-        factors = jnp.trace(tensors, axis1=-2, axis2=-1) / self.trace
-        scales = jnp.log(jnp.where(factors > 0, factors, 1.0))[: len(shapes) * self.scaled]
-        numbers = [*numbers, scales, *(x.start() for x in self.shared)]
-        numbers = jnp.concatenate([x.astype(tensors.dtype) for x in numbers])
-        return dataclasses.replace(self, shapes=shapes), numbers
+    def start(
+        self, tensor: AnyArray, flattest: AnyArray | float = 1e-3
+    ) -> tuple["Unknowns", Array]:
+        """Numbers for a tensor; the frame of the shape is chosen for it."""
+        known = as_tensor(self.original(0)[0].inertia.astype(tensor.dtype))
+        shape, numbers = self.shape.start(tensor, known, flattest)
+        factor = jnp.trace(tensor) / self.trace
+        scale = jnp.log(jnp.where(factor > 0, factor, 1.0))[None][: int(self.scaled)]
+        parts = [numbers, scale, *(x.start() for x in self.shared)]
+        numbers = jnp.concatenate([x.astype(tensor.dtype) for x in parts])
+        return dataclasses.replace(self, shape=shape), numbers
 
     def own_start(self, throws: int, dtype: Any) -> Array:
         """Numbers of each throw."""
@@ -267,45 +257,45 @@ class Unknowns(eqx.Module):
         return jnp.tile(jnp.concatenate(parts), (throws, 1))
 
     @property
-    def leaves(self) -> tuple[Array, ...]:
+    def leaves(self) -> tuple[AnyArray, ...]:
         """The arrays of the system and the sensors."""
         return tuple(jtu.tree_leaves(self.given))
 
-    def original(self, throw: int | Array) -> tuple[Any, ...]:
+    def original(self, throw: int | AnyArray) -> tuple[Any, ...]:
         """System and sensors of a throw as they were given."""
         pairs = zip(self.leaves, self.stacked, strict=True)
         return self._built([x[throw] if own else x for x, own in pairs])
 
-    def _built(self, leaves: Sequence[Array]) -> tuple[Any, ...]:
+    def _built(self, leaves: Sequence[AnyArray]) -> tuple[Any, ...]:
         return eqx.combine(jtu.tree_structure(self.given).unflatten(leaves), self.rest)
 
     def parts(
-        self, numbers: Array, own: Array, leaves: tuple[Array, ...], body: int | Array
+        self, numbers: AnyArray, own: AnyArray, leaves: tuple[AnyArray, ...]
     ) -> tuple[Any, ...]:
-        """System and sensors of a throw: of its own numbers, the arrays given for it, its body."""
-        leaves_, slices = list(leaves), self.slices
+        """System and sensors of a throw: of its own numbers and the arrays given for it."""
+        arrays, slices = list(leaves), self.slices
         found = [(x, numbers[slices[x.name]]) for x in self.shared]
         for x, part in found + [(x, own[s]) for x, s in self.own_slices]:
-            leaves_[x.index] = x.value(part).astype(numbers.dtype)
-        system, *sensors = self._built(leaves_)
-        mass = self.shapes[0].body(numbers[slices["shape"]]) if len(self.shapes) == 1 else None
-        changed = self.inertia(numbers, body), _of_body(system.torque, mass)
+            arrays[x.index] = x.value(part).astype(numbers.dtype)
+        system, *sensors = self._built(arrays)
+        mass = self.shape.body(numbers[slices["shape"]])
+        changed = self.inertia(numbers), _of_body(system.torque, mass)
         return eqx.tree_at(lambda x: (x.inertia, x.torque), system, changed), *sensors
 
-    def natural_units(self, numbers: Array) -> Array:
+    def natural_units(self, numbers: AnyArray) -> Array:
         """Units in which an error is large or small: for what is picked, its size."""
-        units = [x.units() for x in self.shapes] + [jnp.ones(len(self.shapes) * self.scaled)]
+        units = [self.shape.units(), jnp.ones(int(self.scaled))]
         units += [x.natural_units(numbers[self.slices[x.name]]) for x in self.shared]
         return jnp.concatenate([x.astype(numbers.dtype) for x in units])
 
-    def prior_rows(self, numbers: Array) -> Array:
+    def prior_rows(self, numbers: AnyArray) -> Array:
         """What is known beforehand of the numbers for all throws, as residuals."""
         rows = [jnp.zeros(0, numbers.dtype)]
         rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.shared]
-        rows += [] if self.hold is None else [self.hold(numbers)[None]]
+        rows += [] if self.hold is None else [self.hold(self, numbers)[None]]
         return jnp.concatenate(rows)
 
-    def own_prior_rows(self, own: Array) -> Array:
+    def own_prior_rows(self, own: AnyArray) -> Array:
         """What is known beforehand of a throw's own numbers."""
         rows = [x.prior_rows(own[s]) for x, s in self.own_slices]
         return jnp.concatenate([jnp.zeros(0, own.dtype), *rows])
@@ -326,7 +316,7 @@ def _of_body(torque: Any, body: MassProperties | None) -> Any:
 
 def unknowns_of(
     systems: Sequence[Any], sensors: tuple[Any, ...], sizes: Sequence[Array],
-    free: Callable[..., Any] | None, shapes: tuple[AbstractShape, ...], scaled: bool, rate: Array,
+    free: Callable[..., Any] | None, shape: AbstractShape, scaled: bool, rate: Array,
 ) -> Unknowns:  # fmt: skip
     """Set up the numbers.
 
@@ -335,7 +325,7 @@ def unknowns_of(
         sensors: Those of the records.
         sizes: Rms of the values of each.
         free: What is sought beside the inertia.
-        shapes: Of each body.
+        shape: What is known of the tensor.
         scaled: Whether the tensor's scale is sought.
         rate: Rms of the rates.
     """
@@ -361,6 +351,8 @@ def unknowns_of(
         positive = _Definite if base.shape == (3, 3) else _Positive
         kind = positive if _field(parts, path).get("positive") else _Any
         sought.append(kind(pick.index, _named(parts, path), pick.own, base, unit, sigma))
-    trace = jnp.trace(as_tensor(systems[0].inertia.astype(dtype)))
+    inertia = systems[0].inertia
+    inertia = np.asarray(inertia, dtype) if is_concrete(inertia) else inertia.astype(dtype)
+    trace = inertia.sum() if inertia.ndim == 1 else inertia.trace()
     given = tree.unflatten(leaves)
-    return Unknowns(given, rest, stacked, tuple(sought), shapes, scaled, trace, rate)
+    return Unknowns(given, rest, stacked, tuple(sought), shape, scaled, trace, rate)

@@ -13,12 +13,13 @@ from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._shapes import Fixed, Flat, Symmetric, Tensor, Top
 
 _NEARLY_A_SPHERE = 1.03  # degrees for radians shrink the gaps of the moments by 57
+_LIKE, _SURE = 0.1, 5.0  # correlation of neighbours, and its standard deviations, of no noise
 _FAINT = 0.02  # relative change of a tensor by a unit of one of its numbers: of a thickness
 
 
 def _of_shape(result: FitResult, direction: np.ndarray) -> str:
     """What a change of the shape's numbers does to the body."""
-    tensor_of = lambda x: result.unknowns.inertia(x, result.index)  # noqa: E731
+    tensor_of = lambda x: result.unknowns.inertia(x)  # noqa: E731
     slope = jax.jvp(tensor_of, (result.numbers,), (jnp.asarray(direction),))[1]
     axes, moments = np.asarray(result.axes), np.asarray(result.moments)
     inside = axes.T @ np.asarray(slope) @ axes
@@ -42,7 +43,7 @@ def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
     names, sizes, (owner, _, field) = result.names[s], np.abs(direction[s]), name.rpartition(".")
     if name == "scale":
         return "overall scale"
-    if name == "shape" and not unknowns.shapes[0].absolute:
+    if name == "shape" and not unknowns.shape.absolute:
         only = np.where(np.arange(direction.size) < s.stop, direction, 0.0)
         return "" if result.pure_spin else _of_shape(result, only)
     if sizes.size == 3 and field == "bias":
@@ -65,7 +66,7 @@ def _untold(result: FitResult, direction: np.ndarray) -> str:
 def null_directions(result: FitResult) -> tuple[str, ...]:
     """What the record does not tell."""
     unknowns, options = result.unknowns, result.problem.options
-    known = unknowns.scaled or any(x.absolute for x in unknowns.shapes)
+    known = unknowns.scaled or unknowns.shape.absolute
     driven = any(x.name.startswith("torque") for x in unknowns.sought)
     follow = "" if options.free_motion else ", which what is sought of the torque follows"
     found = ["overall scale" + follow] * (not known and (driven or options.free_motion))
@@ -73,9 +74,9 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
     directions = np.asarray(result.directions).T
     weak = math.sqrt(result.inflation) > LARGEST_ERROR * np.asarray(result.singular_values)
     found += [_untold(result, x) for x in directions[weak]]
-    loose = any(np.any(x.ratios_errors > LARGEST_ERROR * x.ratios) for x in result.bodies)
+    loose = bool(np.any(result.ratios_errors > LARGEST_ERROR * result.ratios))
     found += ["I1's ratio to the others"] * (loose and not weak.any() and not result.pure_spin)
-    if result.doubtful and not result.pure_spin:
+    if result.ambiguous and not result.pure_spin:
         found.append(f"{_untold(result, directions[-1])}: others far from it are nearly as good")
     of_state = np.asarray(result.state_singular_values)
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
@@ -99,7 +100,7 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
         worst = math.sqrt(np.max(ratios, initial=0.0))
     notes = [
         (known and size > 1.3, f"residuals are {size:.2g} times the stated noise"),
-        (abs(like) > 0.1 and sure > 5, "residuals are not white: neighbours correlate by "
+        (abs(like) > _LIKE and sure > _SURE, "residuals are not white: neighbours correlate by "
          f"{like:.2f}, {sure:.0f} standard deviations from none"),
         (by_throw.size > 2 and high > 4 * low,
          f"throws differ: chi-square of nine tenths spreads by {high / low:.2g}"),
@@ -120,12 +121,30 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     return notes
 
 
+def _reason(result: FitResult) -> str:
+    """Why residuals are not of the size stated, as far as they show it, and what to pass."""
+    if bool(result.status != Status.MISFIT) or not result.problem.options.noise_known:
+        return ""
+    size = math.sqrt(result.reduced_chi_square)
+    found = f"The residuals are {size:.2g} times the stated noise"
+    if size < 1:
+        degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
+        return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
+    like, sure = result.whiteness
+    if like < _LIKE or sure < _SURE:
+        return (
+            f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
+            "`absolute_sigma=False`."
+        )
+    return f"{found}, and neighbours correlate by {like:.2f}: see `unmodelled` and `free`."
+
+
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
     notes, free_motion = _of_record(result), result.problem.options.free_motion
     covariance = np.asarray(result.moments_covariance)
     by_rates = not any(x.on_attitude for x in result.parts()[1:])
-    if not isinstance(result.unknowns.shapes[result.index], Symmetric | Top | Fixed):
+    if not isinstance(result.unknowns.shape, Symmetric | Top | Fixed):
         ratios, moments = np.asarray(result.ratios), np.asarray(result.moments)
         loose = (np.asarray(result.ratios_errors) > 0.03 * ratios).any()
         notes.append((loose, "the ratios are weakly constrained: errors of 3 % or more"))
@@ -165,7 +184,7 @@ def _with_errors(values: Any, errors: Any, between: str = ", ") -> str:
 
 
 def _of_tensor(result: FitResult) -> list[str]:
-    shape = result.unknowns.shapes[result.index]
+    shape = result.unknowns.shape
     unit = " kg m^2" if result.unknowns.scaled or shape.absolute else " (trace as declared)"
     errors = np.sqrt(np.diagonal(np.asarray(result.moments_covariance)))
     lines = [
@@ -213,15 +232,13 @@ def report(result: FitResult) -> str:
     left = None if known else jnp.sqrt(jnp.nanmean(result.left() ** 2))
     noise = "" if known else f" (noise taken from the residuals: {left:.3g} rms)"
     lines = [
-        f"{codes[int(value)]}: {Status[result.status]}",
+        " ".join(filter(None, [f"{codes[int(value)]}: {Status[result.status]}", _reason(result)])),
         f"  {seen}, {steps} steps; chi-square {result.chi_square:.1f} for "
         f"{result.degrees_of_freedom} degrees of freedom{noise}",
     ]
     spoilt = ", ".join(map(str, np.flatnonzero(result.spoilt)))
     lines += [f"  throws left out: {spoilt}"] * bool(spoilt)
-    for i, body in enumerate(result.bodies):
-        lines += [f"  body {i}"] * (len(result.bodies) > 1)
-        lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(body)
+    lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(result)
     lines += _of_level(result)
     own = [x for x in result.unknowns.sought if x.own and x.base.ndim]
     each = {x.name for x in own if throws > 1}  # too many to print

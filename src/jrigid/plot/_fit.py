@@ -158,18 +158,18 @@ def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
 
 
 def _ratios(ax: Any, result: FitResult, *_: int) -> None:
-    told = not result.pure_spin and all(np.all(x.ratios_errors < x.ratios) for x in result.bodies)
-    for (colour, marker), body in looks(result.bodies):
-        # the chi-square of two numbers at 68 % and 95 %
-        drawn = told * [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
-        if told and result.inflation > 1:
-            drawn.append(("bound", ":", "k", 5.9915 / float(result.inflation)))
-        values, vectors = np.linalg.eigh(body.ratios_covariance)
-        ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
-        ax.plot(*body.ratios, marker, color=colour)
-        for name, style, ink, square in drawn:
-            line = np.asarray(body.ratios)[:, None] + np.sqrt(square) * ellipse
-            ax.plot(*line, style, color=ink, label=name if body.index == 0 else None)
+    told = not result.pure_spin and bool(np.all(result.ratios_errors < result.ratios))
+    colour, marker = LOOKS[0]
+    # the chi-square of two numbers at 68 % and 95 %
+    drawn = told * [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
+    if told and result.inflation > 1:
+        drawn.append(("bound", ":", "k", 5.9915 / float(result.inflation)))
+    values, vectors = np.linalg.eigh(result.ratios_covariance)
+    ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
+    ax.plot(*result.ratios, marker, color=colour)
+    for name, style, ink, square in drawn:
+        line = np.asarray(result.ratios)[:, None] + np.sqrt(square) * ellipse
+        ax.plot(*line, style, color=ink, label=name)
     left, right, low, high = ax.axis() if told else (0.8, 3.0, 0.8, 4.0)
     ax.axline((1, 2), slope=1, color="0.5", ls=":")
     ax.axline((1, 1), slope=1, color="0.5", ls="--")

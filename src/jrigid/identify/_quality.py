@@ -1,0 +1,160 @@
+"""How well a fit describes its record: scales, outliers, misfits, boundaries. Plain numpy."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jrigid.identify._minimise import Minimum
+from jrigid.identify._problem import Problem
+from jrigid.identify._shapes import BOUNDARY, Fixed, Flat
+
+GATE = 5.0  # standard deviations of chi-square
+FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
+_REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
+_SPOILT = 0.25  # fraction of samples rejected that excludes a throw
+_AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
+_MAD = 1.4826  # standard deviations of a normal number in its median size
+
+
+class Fit(NamedTuple):
+    """A minimum and what was decided on the way to it.
+
+    Attributes:
+        minimum: Of one record.
+        kept: 1 for each sample that took part, 0 for the others (throws, samples).
+        scales: Sizes of the residuals of each record, in units of the noise.
+        level: Of the unmodelled torque about each axis.
+        history: Sums of squares after each step of all stages.
+        ambiguous: Whether bodies far from this one describe the record nearly as well.
+        probed_error: Error of the weakest direction, by probes, in natural units.
+    """
+
+    minimum: Minimum
+    kept: np.ndarray
+    scales: np.ndarray
+    level: np.ndarray
+    history: np.ndarray
+    ambiguous: bool = False
+    probed_error: float = 0.0
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Whitened residuals of the samples (throws, samples, degrees)."""
+        return self.minimum.rows.residual[:, : self.kept.shape[1]]
+
+    @property
+    def kicks(self) -> float:
+        """Sum of squares of the whitened gaps of the links."""
+        gap = self.minimum.whitener @ self.minimum.links.gap[..., None]
+        return float(np.sum(gap * gap))
+
+
+def or_one(size: np.ndarray) -> np.ndarray:
+    """A size to divide by: 1 where it is not positive."""
+    return np.where(size > 0, size, 1.0)
+
+
+def of_samples(problem: Problem, of_records: np.ndarray) -> np.ndarray:
+    """Repeat a number of each record for each of its samples."""
+    return np.repeat(of_records, [x.stop - x.start for x in problem.samples.parts])
+
+
+def scales_of(problem: Problem, residual: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """By how much residuals exceed the noise, in the median, of each record.
+
+    At least 1 where the noise is known.
+    """
+    counted = (kept[..., None] > 0) & (problem.samples.weight > 0)
+    sizes = [np.abs(residual[:, x])[counted[:, x]] for x in problem.samples.parts]
+    scales = np.array([_MAD * np.median(x) if x.size else 1.0 for x in sizes])
+    scales = np.where(scales > 0, scales, 1.0).astype(residual.dtype)
+    return np.maximum(scales, 1.0) if problem.options.noise_known else scales
+
+
+def without_outliers(
+    problem: Problem, residual: np.ndarray, kept: np.ndarray, scales: np.ndarray
+) -> np.ndarray:
+    """Which samples are kept of those that were, by how far off they are."""
+    width = np.sum(problem.samples.weight, axis=-1)
+    square = np.sum(residual**2, axis=-1)
+    good = square / of_samples(problem, scales**2) < width + _REJECTED
+    spoilt = np.zeros(kept.shape[0], bool)
+    for part in problem.samples.parts:  # a throw that one record excludes is excluded
+        bad = np.sum(np.where(good, 0.0, kept)[:, part], axis=1)
+        spoilt |= bad > _SPOILT * np.sum(kept[:, part], axis=1)
+    return np.where(good & ~spoilt[:, None], kept, 0.0)
+
+
+def weights_of(problem: Problem, kept: np.ndarray) -> np.ndarray:
+    """1 for each number that is there, is kept and is not saturated, else 0."""
+    samples = problem.samples
+    return np.where(samples.sign == 0, samples.weight, 0.0) * kept[..., None]
+
+
+def misfit(problem: Problem, fit: Fit) -> float:
+    """0 for a fit that may be kept; else how wrong it is."""
+    weight = weights_of(problem, fit.kept)
+    square = np.sum(weight * fit.residual**2)
+    numbers = fit.minimum.point.numbers.size
+    freedom = max(np.sum(weight) - numbers - 3.0 * fit.kept.shape[0], 1.0)
+    ratio = float(square / freedom)
+    good = bool(fit.minimum.settled) and np.isfinite(ratio)
+    if problem.options.noise_known and not problem.options.robust:
+        good = good and ratio < 1 + GATE * np.sqrt(2 / freedom)
+    if good:
+        return _AT_BOUNDARY if is_at_boundary(problem, fit) else 0.0
+    return ratio if np.isfinite(ratio) else np.finfo(float).max
+
+
+def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
+    """What there is to explain, in units of the noise: a radian, or the variation of values."""
+    white = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
+    signals = []
+    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
+        w, unit = weight[:, part], white[:, part]
+        if values.shape[-1] > w.shape[-1]:  # quaternions
+            signals.append(unit)
+            continue
+        values = np.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
+        total = np.sum(w * unit**2, axis=1, keepdims=True)
+        mean = np.sum(w * unit**2 * values, axis=1, keepdims=True)
+        signals.append(unit * (values - mean / or_one(total)))
+    return np.concatenate(signals, axis=1)
+
+
+def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
+    """Fraction of the square of the record that is left, beyond the noise if that is known."""
+    weight = weights_of(problem, fit.kept)
+    left = np.sum(weight * fit.residual**2) + kicks
+    if problem.options.noise_known:
+        left = left - np.sum(weight)
+    signal = float(np.sum(weight * signal_of(problem, weight) ** 2))
+    return float(left) / (signal if signal > 0 else 1.0)
+
+
+def is_at_boundary(problem: Problem, fit: Fit) -> bool:
+    """Whether a body that need not be is flat: its mass lies in a plane or on a line."""
+    if isinstance(problem.unknowns.shape, Fixed | Flat):
+        return False
+    tensor = np.asarray(fit.minimum.tensor, float)
+    if not np.all(np.isfinite(tensor)):
+        return False
+    shares = np.linalg.eigvalsh(tensor) / np.trace(tensor)
+    return bool(1 - 2 * shares[-1] < BOUNDARY)
+
+
+def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
+    """Whether a constant rate in each throw describes a gyro's record as well.
+
+    Where the rates do not vary the Fisher information at the estimate is no guide: a motion
+    fitted to the noise seems to determine what the true one does not. The best of many wobbles
+    gains something from any noise, the more the longer the record.
+    """
+    sensors = problem.unknowns.original(0)[1:]
+    if not problem.unknowns.shape.names or any(x.on_attitude or x.width != 3 for x in sensors):
+        return False
+    weight = weights_of(problem, fit.kept)
+    constant = np.sum(weight * signal_of(problem, weight) ** 2)
+    fitted = np.sum(weight * fit.residual**2)
+    chance = 5 + GATE * 10**0.5 + 4 * np.log(max(np.sum(weight), 1.0))  # of five numbers
+    return bool(constant - fitted < noise * chance)
