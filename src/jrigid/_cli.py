@@ -20,6 +20,12 @@ _EXIT = {
     "OK": 0, "UNIDENTIFIABLE": 3, "MISFIT": 4, "AT_BOUNDARY": 5, "WRONG_BASIN": 6,
     "NOT_CONVERGED": 7,
 }  # fmt: skip
+_OPTIONS = {
+    "`unmodelled`": "`--unmodelled`",
+    "`free`": "`--bias`",
+    "`sigma`": "`--sigma`",
+    "`absolute_sigma=False`": "no `--sigma`",
+}
 _SHAPES = "tensor", "moments", "symmetric", "top", "flat"  # of `jrigid.identify`
 
 
@@ -53,6 +59,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)")
     add("--save", metavar="PKL", help="where to keep the fit, for `jrigid.identify.load`")
     return parser
+
+
+def _with_options(report: str) -> str:
+    """A report that names options of the command line instead of arguments of `fit`."""
+    for argument, option in _OPTIONS.items():
+        report = report.replace(argument, option)
+    return report
 
 
 def _throws(reading: records.Reading, fly: bool) -> list[records.Reading]:
@@ -109,7 +122,7 @@ def _fit(options: argparse.Namespace) -> int:
     found = fit(throw=False)
     if found.status == Status.BAD_INPUT:
         found = fit(throw=True)  # says what is wrong
-    print(found)
+    print(_with_options(str(found)))
     if options.save:
         identify.save(options.save, found)
     if options.plot:
