@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jrigid as jr
-from jrigid.identify import Plan, Rates, Status, fit
+from jrigid.identify import Plan, Rates, Status, fit_each
 from jrigid.identify._intervals import interval
 
 GAPS, WIDE = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), 50.0
@@ -82,17 +82,12 @@ def of_tensors(tensors, roots):
     return jax.lax.map(one, (tensors, roots))
 
 
-@jax.jit
 def of_fits(values, noise):
     """Intervals of fits, by their own method and by derivatives, and how they ended."""
-
-    def one(y):
-        found = fit(SPHERE, Rates(TS, y, noise), throw=False)
-        slopes = jax.jacfwd(found.unknowns.inertia)(found.numbers).reshape(9, -1)
-        covariance = slopes @ found.numbers_covariance @ slopes.T
-        return found.ratios_intervals, both(found.inertia, covariance)[1], found.status
-
-    return jax.vmap(one)(values)
+    found = fit_each(SPHERE, [Rates(TS, y, noise) for y in values])
+    intervals = jax.jit(jax.vmap(lambda x: x.ratios_intervals))(found)
+    plain = jax.jit(jax.vmap(lambda x, y: both(x, y)[1]))
+    return intervals, plain(found.inertia, found.inertia_covariance), found.status
 
 
 def judged(limits, truth):
