@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 # The rows of a tableau are summed in so many groups, by the number of stages.
 _GROUPS = {4: 1, 8: 2}
-_MOST_GROUPS = 5
+_MOST_GROUPS = 4
 
 
 #: Of consecutive rows of tables: the first row of each, and for each table the columns that
