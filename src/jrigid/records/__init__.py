@@ -2,11 +2,11 @@
 
 from jrigid.records._clock import Clock as Clock
 from jrigid.records._clock import repair as repair
+from jrigid.records._flights import flights as flights
 from jrigid.records._read import read as read
 from jrigid.records._reading import Allan as Allan
 from jrigid.records._reading import Noise as Noise
 from jrigid.records._reading import Reading as Reading
 from jrigid.records._reading import allan as allan
-from jrigid.records._reading import flights as flights
 from jrigid.records._reading import noise as noise
 from jrigid.records._reading import rests as rests

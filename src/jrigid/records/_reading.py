@@ -1,26 +1,15 @@
-"""A reading, and what is found in it: flights, rests, and the noise of the gyro at rest."""
+"""A reading, and what is found in it: rests, and the noise of the gyro at rest."""
 
-import dataclasses
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jrigid._checks import check_option, check_shape, demand
+from jrigid._checks import check_shape, demand
 from jrigid._types import Readable
 
-_WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
-_GUESSES = 300  # windows that are tried, at most
-_SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
-_REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
-_USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
-_FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
-_KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
-_SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
-_LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
 _REST = 0.25  # [s] over which it is judged whether the body rests
 _STILL = 0.1, 0.2  # [rad/s] standard deviation, and mean, above which a body does not rest
 _FLOOR = 0.1, 3.0  # the quietest tenth of the windows, and how much noisier others at rest may be
@@ -94,156 +83,7 @@ class Reading(Readable):
         return "\n".join([*lines, *(f"  - {note}" for note in self.notes)])
 
 
-def flights(
-    reading: Reading, *, least: float = 0.2, margin: float = 0.01, by: str | None = None
-) -> list[Reading]:
-    r"""The parts of a reading in which nothing touches the body: throws, without hand and catch.
-
-    With an accelerometer: in free fall it shows $\dot\omega \times r + \omega \times (\omega \times
-    r)$, where $r$ is its lever from the mass centre, whatever that is; a hand adds gravity and
-    more. Without: the momentum of one tensor stays the same in space, $I (\omega_b - \omega_a) +
-    \int \omega \times I \omega\, dt = 0$ from any time to any other. Lever or tensor, both linear
-    here, are those that explain the longest part of the record. By its momentum a smooth slow turn
-    in the hand, or a spin in a bearing, looks like a flight.
-
-    Args:
-        reading: With rates, and specific forces if there are any. No flight goes over a break.
-        least: Shorter parts are dropped [s].
-        margin: Cut off at both ends of each [s].
-        by: `"forces"`, `"momentum"`, or None for forces where there are any.
-
-    Returns:
-        A reading for each flight, with a note. The list is empty where there is none.
-
-    Raises:
-        ValueError: No rates, or no specific forces for `by="forces"`.
-
-    >>> import numpy as np
-    >>> import jrigid as jr
-    >>> times = np.arange(200) / 100
-    >>> flying = (times > 0.5) & (times < 1.2)
-    >>> forces = np.where(flying[:, None], 0.0, [0.0, 0.0, 9.8])
-    >>> reading = jr.records.Reading(times, np.zeros((200, 3)), forces)
-    >>> [flight] = jr.records.flights(reading)
-    >>> print(*flight.notes)
-    flight 1 of 1, 0.52 s to 1.18 s: no contact by the specific forces
-
-    Source: the consensus of guesses is that of Fischler and Bolles, Comm. ACM 24, 381 (1981).
-    """
-    check_option("by", by, (None, "forces", "momentum"))
-    rates, forces, t = reading.rates, reading.specific_forces, reading.times
-    if rates is None or (by == "forces" and forces is None):
-        needed = "rates" if rates is None else "specific forces"
-        raise ValueError(f"Argument `reading` must have {needed}, but it has none.")
-    by = "momentum" if forces is None else by or "forces"
-    size = max(4, round(_WINDOW / reading.interval)) if t.size > 4 else t.size
-    if t.size <= size:
-        return []
-    reach = max(1, round(_REACH[by] / reading.interval))
-    if forces is None or by == "momentum":
-        law = _of_a_tensor(t, rates, reach)
-    else:
-        law = _of_a_lever(t, rates, forces, reach)
-    for row in (0, *reading.breaks, t.size):
-        law[1][max(row - reach, 0) : row + reach] = np.nan
-    free = _consensus(*law, size, max(2, round(least / reading.interval)) - 2 * reach)
-    if by == "momentum":  # an equation holds for all that it looks at, and hardly for its ends
-        free = np.convolve(free, np.ones(2 * (4 * reach // 5) + 1), mode="same") > 0.5
-    flown = []
-    for first, last in _runs(free):
-        rows = np.flatnonzero((t >= t[first] + margin) & (t <= t[last - 1] - margin))
-        if rows.size and t[last - 1] - t[first] >= least:
-            flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
-    for i, x in enumerate(flown):
-        note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
-        note += f"no contact by the {by.replace('forces', 'specific forces')}"
-        flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
-    return flown
-
-
-# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over their errors.
-_Law = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray, slice], np.ndarray | float]]
-
-
-def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int) -> _Law:
-    """The specific force is that of a lever."""
-
-    def cross(vectors: np.ndarray) -> np.ndarray:
-        return np.cross(np.eye(3), vectors[:, None])
-
-    slope = _across(rates, reach) / _across(t, reach)[:, None]
-    absolute, relative = _FORCE
-    tolerance = absolute + relative * np.linalg.norm(forces, axis=1, keepdims=True)
-    model = (cross(slope) + cross(rates) @ cross(rates)) / tolerance[..., None]
-    return model, forces / tolerance, lambda *_: 1.0
-
-
-def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
-    """The momentum of a tensor of trace 1 stays, in parts of itself."""
-    # A sphere and five tensors without a trace, which make up all others; their angular momenta.
-    x, y, z = np.eye(3)
-    off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
-    tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
-    momenta = np.einsum("kij,tj->tik", tensors, rates)
-    turning = np.cross(rates[:, :, None], momenta, axis=1)
-    steps = turning * np.gradient(t)[:, None, None]
-    whole = momenta + np.cumsum(steps, axis=0) - steps / 2
-    spin = np.linalg.norm(rates, axis=1)
-    # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
-    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
-    relative, times_noise = _KEPT
-    tolerance = np.where(spin > _SPIN, (relative * spin + times_noise * noise) / 3, np.nan)
-    change = _across(whole, reach) / tolerance[:, None, None]
-
-    def bound(x: np.ndarray, rows: slice) -> np.ndarray | float:
-        """The momentum, in parts of the sphere's; moments are positive and none exceeds others."""
-        tensor = tensors[0] + np.tensordot(x, tensors[1:], 1)
-        moments = np.linalg.eigvalsh(tensor)
-        if moments[0] <= 0 or moments[2] > _LARGEST:
-            return 0.0
-        return 3 * np.linalg.norm(rates[rows] @ tensor, axis=1) / np.maximum(spin[rows], _SPIN)
-
-    return change[..., 1:], -change[..., 0], bound
-
-
-def _across(x: np.ndarray, reach: int) -> np.ndarray:
-    """Changes from some rows before to as many after; of no meaning at the ends."""
-    return np.roll(x, -reach, axis=0) - np.roll(x, reach, axis=0)
-
-
-def _consensus(
-    model: np.ndarray, wanted: np.ndarray, bound: Callable, size: int, least: int
-) -> np.ndarray:
-    """Rows that the best unknowns explain: those that explain the longest part in long runs."""
-    known = np.isfinite(wanted.sum(axis=1) + model.sum(axis=(1, 2)))
-    model = np.where(known[:, None, None], model, 0.0)
-    wanted = np.where(known[:, None], wanted, 0.0)
-    drawn = np.eye(model.shape[2]) / _USUAL**2
-
-    def solve(rows: slice | np.ndarray) -> np.ndarray:
-        """Least squares, drawn to zero by what is usual where the rows do not tell."""
-        a = model[rows].reshape(-1, len(drawn))
-        return np.linalg.solve(a.T @ a + drawn, a.T @ wanted[rows].ravel())
-
-    def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
-        beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
-        return known[rows] & (beside < bound(x, rows))
-
-    def in_runs(x: np.ndarray) -> np.ndarray:
-        kept = explained(x)
-        for first, last in _runs(kept):
-            kept[first:last] = last - first >= least
-        return kept
-
-    windows = range(0, len(known) - size, max(size // 2, len(known) // _GUESSES))
-    windows = [slice(first, first + size) for first in windows]
-    guesses = [np.zeros(len(drawn)), *map(solve, windows)]
-    sound = [explained(x, w).mean() >= _SOUND for x, w in zip(guesses[1:], windows, strict=True)]
-    best = max(map(in_runs, itertools.compress(guesses, [True, *sound])), key=np.sum)
-    return max(in_runs(solve(best)), best, key=np.sum)
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """First and last plus one of each run of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -364,7 +204,7 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
     quiet = spreads <= min(spread, factor * np.quantile(spreads, quantile))
     quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < mean
     still = np.isin(np.arange(times.size), windows[quiet])
-    parts = [part for first, last in _runs(still) for part in reading[first:last].pieces()]
+    parts = [part for first, last in runs(still) for part in reading[first:last].pieces()]
     return [part for part in parts if np.ptp(part.times) >= least - reading.interval]
 
 

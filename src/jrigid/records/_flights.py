@@ -1,0 +1,403 @@
+"""Flights: the parts of a reading in which nothing touches the body."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jrigid._checks import check_option
+from jrigid.records._reading import Reading, runs
+
+_WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
+_GUESSES = 300  # windows that are tried, at most
+_SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
+_REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
+_USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
+_FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
+_KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
+_SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
+_LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
+# Delays of the accelerometer after the gyro [s]: both have filters, and their own.
+_DELAYS = (0.0, 0.002, -0.002, 0.004, -0.004, 0.006, -0.006, 0.008, -0.008)
+_BETTER = 1.05  # times the rows that a delay must explain to be preferred to none
+_BIAS = 1.0  # [m/s^2] of an accelerometer; more is no bias but a hand
+_QUIET = 1.5  # [m/s^2] what a flight may differ from its own lever without any noise
+_NOISY = 3.5, 7.0  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
+_EDGE = 1.0, 2.0, 0.03  # [m/s^2], medians, and of the force: allowed at the ends of a flight
+_JUMP = 8.0, 0.15  # medians of what slopes leave of a step, and parts of the rate: a blow
+_HOLE = 0.06  # [s] of a flight that may be unexplained, if by less than twice what is allowed
+_ROUNDS = 3  # of fitting a lever to a flight and finding where the flight ends
+
+
+def flights(
+    reading: Reading, *, least: float = 0.2, margin: float = 0.01, by: str | None = None
+) -> list[Reading]:
+    r"""Find the parts of a reading in which nothing touches the body: throws.
+
+    With an accelerometer: in free fall it shows $\dot\omega \times r + \omega \times (\omega \times
+    r)$, where $r$ is its lever from the mass centre, whatever that is; a hand adds gravity and
+    more. The lever that explains the longest part of the record gives the flights; then each
+    flight gets a lever and a bias of its own, and ends where these no longer explain the readings.
+    A delay of up to 8 ms between gyro and accelerometer is accounted for.
+
+    Without an accelerometer: the momentum of one tensor stays the same in space, $I (\omega_b -
+    \omega_a) + \int \omega \times I \omega\, dt = 0$ from any time to any other. This fails where
+    drag or a wheel changes the momentum, and a smooth slow turn in the hand, or a spin in a
+    bearing, looks like a flight.
+
+    Args:
+        reading: With rates, and specific forces if there are any. No flight goes over a break.
+        least: Shorter parts are dropped [s].
+        margin: Readings closer than this to one with contact are cut off [s].
+        by: `"forces"`, `"momentum"`, or None for forces where there are any.
+
+    Returns:
+        A reading for each flight, with a note. The list is empty where there is none.
+
+    Raises:
+        ValueError: No rates, or no specific forces for `by="forces"`.
+
+    >>> import numpy as np
+    >>> import jrigid as jr
+    >>> times = np.arange(200) / 100
+    >>> flying = (times > 0.5) & (times < 1.2)
+    >>> forces = np.where(flying[:, None], 0.0, [0.0, 0.0, 9.8])
+    >>> reading = jr.records.Reading(times, np.zeros((200, 3)), forces)
+    >>> [flight] = jr.records.flights(reading)
+    >>> print(*flight.notes)
+    flight 1 of 1, 0.51 s to 1.19 s: no contact by the specific forces
+
+    Source: the consensus of guesses is that of Fischler and Bolles, Comm. ACM 24, 381 (1981).
+    """
+    check_option("by", by, (None, "forces", "momentum"))
+    rates, forces, t = reading.rates, reading.specific_forces, reading.times
+    if rates is None or (by == "forces" and forces is None):
+        needed = "rates" if rates is None else "specific forces"
+        raise ValueError(f"Argument `reading` must have {needed}, but it has none.")
+    by = "momentum" if forces is None else by or "forces"
+    size = max(4, round(_WINDOW / reading.interval)) if t.size > 4 else t.size
+    if t.size <= size:
+        return []
+    if forces is None or by == "momentum":
+        spans = _by_momentum(reading, rates, size, least)
+    else:
+        spans = _by_forces(reading, rates, forces, size, least)
+    flown = []
+    for first, last in spans:
+        rows = _inside(reading, first, last, margin)
+        if rows.size and t[last - 1] - t[first] >= least:
+            flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
+    for i, x in enumerate(flown):
+        note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
+        note += f"no contact by the {by.replace('forces', 'specific forces')}"
+        flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
+    return flown
+
+
+def _inside(reading: Reading, first: int, last: int, margin: float) -> np.ndarray:
+    """Rows of a flight that are farther than the margin from readings outside it."""
+    t = reading.times
+    # Across a break the reading before tells nothing; the margin counts from the edge then.
+    before = first if first in (0, *reading.breaks) else first - 1
+    after = last - 1 if last in (t.size, *reading.breaks) else last
+    rows = np.arange(first, last)
+    return rows[(t[rows] >= t[before] + margin) & (t[rows] <= t[after] - margin)]
+
+
+def _by_momentum(
+    reading: Reading, rates: np.ndarray, size: int, least: float
+) -> list[tuple[int, int]]:
+    """Spans of rows in which one tensor keeps its momentum."""
+    reach = max(1, round(_REACH["momentum"] / reading.interval))
+    law = _of_a_tensor(reading.times, rates, reach)
+    _forget_breaks(law, reading, reach)
+    free = _consensus(*law, size, max(2, round(least / reading.interval)) - 2 * reach)
+    # An equation holds for all that it looks at, and hardly for its ends.
+    free = np.convolve(free, np.ones(2 * (4 * reach // 5) + 1), mode="same") > 0.5
+    return runs(free)
+
+
+def _by_forces(
+    reading: Reading, rates: np.ndarray, forces: np.ndarray, size: int, least: float
+) -> list[tuple[int, int]]:
+    """Spans of rows in which a lever explains the specific forces."""
+    t = reading.times
+    reach = max(1, round(_REACH["forces"] / reading.interval))
+    shortest = max(2, round(least / 2 / reading.interval)) - 2 * reach
+    best = np.zeros(t.size, bool)
+    delay = 0.0
+    for tried in _DELAYS[::2] if reach > 1 else _DELAYS:
+        shifted = _shifted(reading, forces, tried)
+        law = _of_a_lever(t, rates, shifted, reach)
+        _forget_breaks(law, reading, reach)
+        free = _consensus(*law, size, max(2, shortest))
+        if free.sum() > (_BETTER if tried else 1.0) * best.sum():
+            best = free
+            delay = tried
+    spans = []
+    for piece in itertools.pairwise((0, *reading.breaks, t.size)):
+        rows = slice(*piece)
+        part = _Part.of(reading[rows], delay, best[rows])
+        for first, last in part.parted(best[rows]):
+            span = part.span(first, last)
+            if span:
+                spans.append((span[0] + piece[0], span[1] + piece[0]))
+    return _joined(spans)
+
+
+def _shifted(reading: Reading, forces: np.ndarray, delay: float) -> np.ndarray:
+    """Specific forces of an accelerometer that lags by a delay, at the times of the gyro."""
+    if delay == 0.0:
+        return forces
+    t = reading.times
+    columns = [np.interp(t + delay, t, column) for column in forces.T]
+    return np.stack(columns, axis=1)
+
+
+def _forget_breaks(law: "_Law", reading: Reading, reach: int) -> None:
+    """Drop, in place, the equations that look across a break or an end."""
+    for row in (0, *reading.breaks, reading.times.size):
+        law[1][max(row - reach, 0) : row + reach] = np.nan
+
+
+def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Spans in order, those that overlap as one."""
+    joined: list[tuple[int, int]] = []
+    for first, last in sorted(spans):
+        if joined and first < joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return joined
+
+
+class _Part(NamedTuple):
+    """A part of a reading without a break, and the equations of a lever in it.
+
+    Attributes:
+        times: [s].
+        forces: Specific forces at the times of the gyro [m/s^2].
+        models: What a lever of 1 m along each axis shows, (slopes, rows, 3, 3), for angular
+            accelerations from readings on both sides, before and after alone.
+        hole: Rows that a flight may lack within.
+        jumps: Rows before which the rates jump: the body hit something between two readings.
+    """
+
+    times: Float[np.ndarray, " rows"]
+    forces: Float[np.ndarray, "rows 3"]
+    models: Float[np.ndarray, "slopes rows 3 3"]
+    hole: int
+    jumps: Bool[np.ndarray, " rows"]
+
+    @classmethod
+    def of(cls, reading: Reading, delay: float, free: Bool[np.ndarray, " rows"]) -> "_Part":
+        """Prepare the equations of a part of a reading, of which some rows are known to be free."""
+        rates, forces, t = reading.rates, reading.specific_forces, reading.times
+        assert rates is not None
+        assert forces is not None
+        reach = max(1, round(_REACH["forces"] / reading.interval)) if t.size > 1 else 1
+        slopes = [_slope(t, rates, reach), *_one_sided(t, rates, reach)]
+        models = np.array([_cross(x) + _cross(rates) @ _cross(rates) for x in slopes])
+        hole = round(_HOLE / reading.interval) if t.size > 1 else 0
+        jumps = _jumps(t, rates, slopes[1:], free) if reach == 1 else np.zeros(t.size, bool)
+        return cls(t, _shifted(reading, forces, delay), models, hole, jumps)
+
+    def parted(self, free: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
+        """Runs of rows without a jump inside."""
+        spans = []
+        for first, last in runs(free):
+            inside = first + 1 + np.flatnonzero(self.jumps[first + 1 : last])
+            spans += itertools.pairwise((first, *inside.tolist(), last))
+        return spans
+
+    def span(self, first: int, last: int) -> tuple[int, int] | None:
+        """The rows that belong to a flight of which some rows are known; None if it is none."""
+        core = np.zeros(self.times.size, bool)
+        core[first:last] = True
+        for _ in range(_ROUNDS):
+            fit = self.fit(core)
+            besides = self.beside(fit)
+            beside = besides.min(axis=0)
+            median = float(np.median(beside[core]))
+            allowed = min(max(_QUIET, _NOISY[0] * median), _NOISY[1])
+            shown = np.nan_to_num(np.linalg.norm(self.forces, axis=1))
+            allowed = allowed + _FORCE[1] * shown
+            free = self.without_holes(beside < allowed, beside < 2 * allowed)
+            spans = self.parted(free)
+            if not spans:
+                return None
+            first, last = max(spans, key=lambda span: core[slice(*span)].sum())
+            if not core[first:last].any():
+                return None
+            # At its ends a flight is judged by slopes from inside it, and by less.
+            allowed = max(_EDGE[0], _EDGE[1] * median) + _EDGE[2] * shown
+            first += int(np.argmax((besides[[0, 2]].min(axis=0) < allowed)[first:last]))
+            last -= int(np.argmax((besides[[0, 1]].min(axis=0) < allowed)[first:last][::-1]))
+            same = core.sum() == last - first and core[first:last].all()
+            core[:] = False
+            core[first:last] = True
+            if same:
+                break
+        return first, last
+
+    def fit(self, core: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, "6"]:
+        """Lever [m] and bias [m/s^2] by least squares, twice without the rows that fit worst."""
+        model = np.concatenate([self.models[0], np.broadcast_to(np.eye(3), (core.size, 3, 3))], 2)
+        known = core & np.isfinite(self.forces.sum(axis=1) + model.sum(axis=(1, 2)))
+        noise = _FORCE[0]
+        drawn = np.repeat([_USUAL, _BIAS / 2], 3) ** -2.0
+        fit = np.zeros(6)
+        use = known
+        for _ in range(3):
+            if use.sum() < 3:
+                break
+            a = model[use].reshape(-1, 6) / noise
+            b = self.forces[use].ravel() / noise
+            fit = np.linalg.solve(a.T @ a + np.diag(drawn), a.T @ b)
+            beside = np.linalg.norm(model @ fit - self.forces, axis=1)
+            use = known & (beside <= 3 * np.median(beside[use]))
+        size = np.linalg.norm(fit[3:])
+        fit[3:] *= min(1.0, _BIAS / size) if size > 0 else 1.0
+        return fit
+
+    def beside(self, fit: Float[np.ndarray, "6"]) -> Float[np.ndarray, "slopes rows"]:
+        """What the lever and bias leave unexplained [m/s^2]; infinite where nothing is read."""
+        shown = self.models @ fit[:3] + fit[3:]
+        # An accelerometer at the end of its range shows that end.
+        shown = np.clip(shown, np.nanmin(self.forces), np.nanmax(self.forces))
+        beside = np.linalg.norm(shown - self.forces, axis=2)
+        return np.where(np.isfinite(beside), beside, np.inf)
+
+    def without_holes(
+        self, free: Bool[np.ndarray, " rows"], nearly: Bool[np.ndarray, " rows"]
+    ) -> Bool[np.ndarray, " rows"]:
+        """Rows that fit, and short stretches between them that nearly do."""
+        filled = free.copy()
+        for first, last in runs(~free):
+            inside = first > 0 and last < free.size
+            if inside and last - first <= self.hole and nearly[first:last].all():
+                filled[first:last] = True
+        return filled
+
+
+def _jumps(
+    t: np.ndarray, rates: np.ndarray, slopes: list[np.ndarray], free: np.ndarray
+) -> np.ndarray:
+    """Rows before which rates change by more than the slopes on either side explain."""
+    before, after = slopes
+    steps = np.diff(t)[:, None]
+    beside = np.diff(rates, axis=0) - steps / 2 * (before[:-1] + after[1:])
+    size = np.append(0.0, np.nan_to_num(np.linalg.norm(beside, axis=1)))
+    usual = float(np.median(size[free])) if free.any() else 0.0
+    return size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1))
+
+
+# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over their errors.
+_Law = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray, slice], np.ndarray | float]]
+
+
+def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int) -> _Law:
+    """The specific force is that of a lever."""
+    absolute, relative = _FORCE
+    tolerance = absolute + relative * np.linalg.norm(forces, axis=1, keepdims=True)
+    model = _cross(_slope(t, rates, reach)) + _cross(rates) @ _cross(rates)
+    return model / tolerance[..., None], forces / tolerance, lambda *_: 1.0
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Matrices that take the cross product with vectors, one for each row."""
+    return np.cross(np.eye(3), vectors[:, None])
+
+
+def _slope(t: np.ndarray, rates: np.ndarray, reach: int) -> np.ndarray:
+    """Angular accelerations from readings on both sides."""
+    near = _across(rates, reach) / _across(t, reach)[:, None]
+    if reach > 1:
+        return near
+    # Slow clocks miss curvature: the error of fourth order instead of second.
+    far = _across(rates, 2) / _across(t, 2)[:, None]
+    return (4 * near - far) / 3
+
+
+def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]:
+    """Angular accelerations from readings before alone, and after alone: of parabolas."""
+    slopes = []
+    for shift in (reach, -reach):
+        t1, t2 = np.roll(t, shift), np.roll(t, 2 * shift)
+        w1, w2 = np.roll(rates, shift, axis=0), np.roll(rates, 2 * shift, axis=0)
+        a = (2 * t - t1 - t2) / ((t - t1) * (t - t2))
+        b = (t - t2) / ((t1 - t) * (t1 - t2))
+        c = (t - t1) / ((t2 - t) * (t2 - t1))
+        slope = a[:, None] * rates + b[:, None] * w1 + c[:, None] * w2
+        edge = slice(0, 2 * reach) if shift > 0 else slice(max(t.size - 2 * reach, 0), None)
+        slope[edge] = np.nan  # rolled in from the other end
+        slopes.append(slope)
+    return slopes
+
+
+def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
+    """The momentum of a tensor of trace 1 stays, in parts of itself."""
+    # A sphere and five tensors without a trace, which make up all others; their angular momenta.
+    x, y, z = np.eye(3)
+    off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
+    tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
+    momenta = np.einsum("kij,tj->tik", tensors, rates)
+    turning = np.cross(rates[:, :, None], momenta, axis=1)
+    steps = turning * np.gradient(t)[:, None, None]
+    whole = momenta + np.cumsum(steps, axis=0) - steps / 2
+    spin = np.linalg.norm(rates, axis=1)
+    # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
+    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
+    relative, times_noise = _KEPT
+    tolerance = np.where(spin > _SPIN, (relative * spin + times_noise * noise) / 3, np.nan)
+    change = _across(whole, reach) / tolerance[:, None, None]
+
+    def bound(x: np.ndarray, rows: slice) -> np.ndarray | float:
+        """The momentum, in parts of the sphere's; moments are positive and none exceeds others."""
+        tensor = tensors[0] + np.tensordot(x, tensors[1:], 1)
+        moments = np.linalg.eigvalsh(tensor)
+        if moments[0] <= 0 or moments[2] > _LARGEST:
+            return 0.0
+        return 3 * np.linalg.norm(rates[rows] @ tensor, axis=1) / np.maximum(spin[rows], _SPIN)
+
+    return change[..., 1:], -change[..., 0], bound
+
+
+def _across(x: np.ndarray, reach: int) -> np.ndarray:
+    """Changes from some rows before to as many after; of no meaning at the ends."""
+    return np.roll(x, -reach, axis=0) - np.roll(x, reach, axis=0)
+
+
+def _consensus(
+    model: np.ndarray, wanted: np.ndarray, bound: Callable, size: int, least: int
+) -> np.ndarray:
+    """Rows that the best unknowns explain: those that explain the longest part in long runs."""
+    known = np.isfinite(wanted.sum(axis=1) + model.sum(axis=(1, 2)))
+    model = np.where(known[:, None, None], model, 0.0)
+    wanted = np.where(known[:, None], wanted, 0.0)
+    drawn = np.eye(model.shape[2]) / _USUAL**2
+
+    def solve(rows: slice | np.ndarray) -> np.ndarray:
+        """Least squares, drawn to zero by what is usual where the rows do not tell."""
+        a = model[rows].reshape(-1, len(drawn))
+        return np.linalg.solve(a.T @ a + drawn, a.T @ wanted[rows].ravel())
+
+    def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
+        return known[rows] & (beside < bound(x, rows))
+
+    def in_runs(x: np.ndarray) -> np.ndarray:
+        kept = explained(x)
+        for first, last in runs(kept):
+            kept[first:last] = last - first >= least
+        return kept
+
+    windows = range(0, len(known) - size, max(size // 2, len(known) // _GUESSES))
+    windows = [slice(first, first + size) for first in windows]
+    guesses = [np.zeros(len(drawn)), *map(solve, windows)]
+    sound = [explained(x, w).mean() >= _SOUND for x, w in zip(guesses[1:], windows, strict=True)]
+    best = max(map(in_runs, itertools.compress(guesses, [True, *sound])), key=np.sum)
+    return max(in_runs(solve(best)), best, key=np.sum)
