@@ -4,7 +4,8 @@ A rigid body lies in a hand, is shaken, wound up and thrown. It flies for 0.3 to
 2 to 30 rad/s and is caught, or bounces (40 %) and flies again. In flight there may be drag on the
 spin (60 %), drag of the air on the flight, and a wheel that is switched on and vibrates (25 %). The
 clock has 50 to 500 Hz. The accelerometer is at a lever of up to 12 cm; it has noise, a bias, a
-wrong scale, a wrong alignment, a delay of up to 6 ms against the gyro, and a range of 8 or 16 g.
+wrong scale, a wrong alignment, a range of 4, 8 or 16 g, a low-pass filter of up to 6 ms and a delay
+of up to 3 ms; the gyro has a low-pass filter of up to 3 ms.
 The integrator is an explicit Runge-Kutta method of this file, with steps of 1 ms.
 
 Missed: of the flights of at least 0.25 s, those of which less than half is found. False: parts
@@ -18,6 +19,7 @@ import time
 
 import common
 import numpy as np
+import scipy.signal
 
 import jrigid as jr
 
@@ -231,6 +233,13 @@ class Case:
     bounces: bool
 
 
+def low_passed(values, time_constant):
+    """What a sensor of first order shows; the filter starts at the first value."""
+    decay = np.exp(-STEP / max(time_constant, 1e-6))
+    start = decay * values[:1]
+    return scipy.signal.lfilter([1 - decay], [1, -decay], values, axis=0, zi=start)[0]
+
+
 def read_by_sensors(rng, fine, rates, changes, forces, vibration, frequency):
     """What a gyro and an accelerometer at a lever show of a motion."""
     rate = 50.0 * 10.0 ** rng.uniform()
@@ -239,13 +248,15 @@ def read_by_sensors(rng, fine, rates, changes, forces, vibration, frequency):
     lever = rng.uniform(0, 0.12) * directions(rng, 1)[0]
     shown = forces + np.cross(changes, lever) + np.cross(rates, np.cross(rates, lever))
     wrong = np.eye(3) + 0.01 * rng.normal(size=(3, 3))
-    delay = rng.uniform(-0.006, 0.006)
+    shown = low_passed(shown, rng.uniform(0, 0.006))
+    delay = rng.uniform(-0.003, 0.003)
     columns = [np.interp(times - delay, fine, x) for x in shown.T]
     force = np.stack(columns, axis=1) @ wrong.T + 0.15 * rng.normal(size=3)
     force += rng.uniform(0.03, 0.3) * rng.normal(size=force.shape)
     wave = np.interp(times, fine, vibration) * np.sin(2 * np.pi * frequency * times)
     force += wave[:, None] * directions(rng, 1)
-    reach = GRAVITY * rng.choice([8, 16], p=[0.25, 0.75])
+    reach = GRAVITY * rng.choice([4, 8, 16], p=[0.1, 0.2, 0.7])
+    rates = low_passed(rates, rng.uniform(0, 0.003))
     omega = np.stack([np.interp(times, fine, x) for x in rates.T], axis=1)
     omega += 0.01 * rng.normal(size=3) + rng.uniform(0.003, 0.03) * rng.normal(size=omega.shape)
     omega += 0.01 * wave[:, None] * directions(rng, 1)

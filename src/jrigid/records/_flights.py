@@ -27,6 +27,7 @@ _BIAS = 1.0  # [m/s^2] of an accelerometer; more is no bias but a hand
 _QUIET = 1.5  # [m/s^2] what a flight may differ from its own lever without any noise
 _NOISY = 3.5, 7.0  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
 _EDGE = 1.0, 2.0, 0.03  # [m/s^2], medians, and of the force: allowed at the ends of a flight
+_CLIPPED = 4  # readings equal to the largest: the accelerometer was at the end of its range
 _JUMP = 8.0, 0.15  # medians of what slopes leave of a step, and parts of the rate: a blow
 _HOLE = 0.06  # [s] of a flight that may be unexplained, if by less than twice what is allowed
 _ROUNDS = 3  # of fitting a lever to a flight and finding where the flight ends
@@ -254,10 +255,12 @@ class _Part(NamedTuple):
         for _ in range(3):
             if use.sum() < 3:
                 break
-            a = model[use].reshape(-1, 6) / noise
-            b = self.forces[use].ravel() / noise
+            read = ~_at_the_end(self.forces)[use] / noise
+            a = (model[use] * read[..., None]).reshape(-1, 6)
+            b = (self.forces[use] * read).ravel()
             fit = np.linalg.solve(a.T @ a + np.diag(drawn), a.T @ b)
-            beside = np.linalg.norm(model @ fit - self.forces, axis=1)
+            shown = model @ fit
+            beside = np.linalg.norm(self.clipped(shown) - self.forces, axis=1)
             use = known & (beside <= 3 * np.median(beside[use]))
         size = np.linalg.norm(fit[3:])
         fit[3:] *= min(1.0, _BIAS / size) if size > 0 else 1.0
@@ -266,10 +269,13 @@ class _Part(NamedTuple):
     def beside(self, fit: Float[np.ndarray, "6"]) -> Float[np.ndarray, "slopes rows"]:
         """What the lever and bias leave unexplained [m/s^2]; infinite where nothing is read."""
         shown = self.models @ fit[:3] + fit[3:]
-        # An accelerometer at the end of its range shows that end.
-        shown = np.clip(shown, np.nanmin(self.forces), np.nanmax(self.forces))
-        beside = np.linalg.norm(shown - self.forces, axis=2)
+        beside = np.linalg.norm(self.clipped(shown) - self.forces, axis=2)
         return np.where(np.isfinite(beside), beside, np.inf)
+
+    def clipped(self, shown: np.ndarray) -> np.ndarray:
+        """Specific forces within the range of the accelerometer, which shows its end beyond."""
+        most = np.nanmax(np.abs(self.forces), initial=0.0)
+        return np.clip(shown, -most, most)
 
     def without_holes(
         self, free: Bool[np.ndarray, " rows"], nearly: Bool[np.ndarray, " rows"]
@@ -304,7 +310,17 @@ def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int
     absolute, relative = _FORCE
     tolerance = absolute + relative * np.linalg.norm(forces, axis=1, keepdims=True)
     model = _cross(_slope(t, rates, reach)) + _cross(rates) @ _cross(rates)
-    return model / tolerance[..., None], forces / tolerance, lambda *_: 1.0
+    # An axis at the end of its range tells nothing here: 0 = 0.
+    read = ~_at_the_end(forces)
+    model = model * read[..., None]
+    return model / tolerance[..., None], forces * read / tolerance, lambda *_: 1.0
+
+
+def _at_the_end(forces: np.ndarray) -> np.ndarray:
+    """Where an accelerometer shows the end of its range, which it does several times or never."""
+    size = np.abs(np.nan_to_num(forces))
+    at_end = size >= (1 - 1e-6) * size.max(initial=0.0)
+    return at_end & (at_end.sum() >= _CLIPPED) & (size > 0)
 
 
 def _cross(vectors: np.ndarray) -> np.ndarray:
