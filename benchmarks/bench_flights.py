@@ -348,7 +348,7 @@ GROUPS = {
 def main():
     parser = common.arguments(__doc__)
     parser.add_argument("--count", type=int, default=400, help="throws")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=7, help="0 and 1 were used for tuning")
     parser.add_argument("--by", nargs="+", default=["forces", "momentum"])
     given = parser.parse_args()
     made = cases(given.count, given.seed)

@@ -16,7 +16,7 @@ _GUESSES = 300  # windows that are tried, at most
 _SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
 _REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
 _USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
-_FORCE = 2.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
+_FORCE = 3.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
 _KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
@@ -252,14 +252,18 @@ class _Part(NamedTuple):
         drawn = np.repeat([_USUAL, _BIAS / 2], 3) ** -2.0
         fit = np.zeros(6)
         use = known
+        at_end = _at_the_end(self.forces)
+        read = ~at_end
         for _ in range(3):
             if use.sum() < 3:
                 break
-            read = ~_at_the_end(self.forces)[use] / noise
-            a = (model[use] * read[..., None]).reshape(-1, 6)
-            b = (self.forces[use] * read).ravel()
+            weights = read[use] / noise
+            a = (model[use] * weights[..., None]).reshape(-1, 6)
+            b = (self.forces[use] * weights).ravel()
             fit = np.linalg.solve(a.T @ a + np.diag(drawn), a.T @ b)
             shown = model @ fit
+            # The end of the range bounds the force from below: it counts where less is shown.
+            read = ~at_end | (np.sign(self.forces) * shown < np.abs(self.forces))
             beside = np.linalg.norm(self.clipped(shown) - self.forces, axis=1)
             use = known & (beside <= 3 * np.median(beside[use]))
         size = np.linalg.norm(fit[3:])
@@ -298,7 +302,10 @@ def _jumps(
     beside = np.diff(rates, axis=0) - steps / 2 * (before[:-1] + after[1:])
     size = np.append(0.0, np.nan_to_num(np.linalg.norm(beside, axis=1)))
     usual = float(np.median(size[free])) if free.any() else 0.0
-    return size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1))
+    # The parabolas of the neighbours look across a jump, too: it is where most is left.
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 2), 5)
+    largest = size == around.max(axis=1)
+    return largest & (size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1)))
 
 
 # Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over their errors.
