@@ -44,10 +44,11 @@ def flights(
     flight gets a lever and a bias of its own, and ends where these no longer explain the readings.
     A delay of up to 8 ms between gyro and accelerometer is accounted for.
 
-    Without an accelerometer: the momentum of one tensor stays the same in space, $I (\omega_b -
-    \omega_a) + \int \omega \times I \omega\, dt = 0$ from any time to any other. This fails where
-    drag or a wheel changes the momentum, and a smooth slow turn in the hand, or a spin in a
-    bearing, looks like a flight.
+    Without an accelerometer: the momentum of one tensor stays the same in space but for a linear
+    drag, $I (\omega_b - \omega_a) + \int \omega \times I \omega\, dt + c \int \omega\, dt = 0$ from
+    any time to any other. This misses a fifth of the flights, and most of those in which a wheel
+    changes the momentum; a smooth slow turn in the hand, or a spin in a bearing, looks like a
+    flight.
 
     Args:
         reading: With rates, and specific forces if there are any. No flight goes over a break.
@@ -88,7 +89,7 @@ def flights(
         spans = _by_forces(reading, rates, forces, size, least)
     flown = []
     for first, last in spans:
-        rows = _inside(reading, first, last, margin)
+        rows = _inside(reading, first, last, margin, by)
         if rows.size and t[last - 1] - t[first] >= least:
             flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
     for i, x in enumerate(flown):
@@ -98,12 +99,16 @@ def flights(
     return flown
 
 
-def _inside(reading: Reading, first: int, last: int, margin: float) -> np.ndarray:
-    """Rows of a flight that are farther than the margin from readings outside it."""
+def _inside(reading: Reading, first: int, last: int, margin: float, by: str) -> np.ndarray:
+    """Rows of a flight that are farther than the margin from readings with contact."""
     t = reading.times
-    # Across a break the reading before tells nothing; the margin counts from the edge then.
-    before = first if first in (0, *reading.breaks) else first - 1
-    after = last - 1 if last in (t.size, *reading.breaks) else last
+    before = first
+    after = last - 1
+    if by == "forces":
+        # The readings outside have contact, but across a break nobody knows. By the momentum the
+        # edges themselves are uncertain, and the margin counts from there.
+        before -= first not in (0, *reading.breaks)
+        after += last not in (t.size, *reading.breaks)
     rows = np.arange(first, last)
     return rows[(t[rows] >= t[before] + margin) & (t[rows] <= t[after] - margin)]
 
@@ -362,15 +367,19 @@ def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]
 
 
 def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
-    """The momentum of a tensor of trace 1 stays, in parts of itself."""
+    """The momentum of a tensor of trace 1 stays, but for a drag in proportion to the rates.
+
+    The unknowns are five numbers of the tensor and the drag [1/s]; errors are in parts of the
+    momentum.
+    """
     # A sphere and five tensors without a trace, which make up all others; their angular momenta.
     x, y, z = np.eye(3)
     off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
     tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
     momenta = np.einsum("kij,tj->tik", tensors, rates)
     turning = np.cross(rates[:, :, None], momenta, axis=1)
-    steps = turning * np.gradient(t)[:, None, None]
-    whole = momenta + np.cumsum(steps, axis=0) - steps / 2
+    dragged = _integral(t, rates)
+    whole = np.concatenate([momenta + _integral(t, turning), dragged[..., None]], axis=2)
     spin = np.linalg.norm(rates, axis=1)
     # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
     noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
@@ -380,13 +389,19 @@ def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
 
     def bound(x: np.ndarray, rows: slice) -> np.ndarray | float:
         """The momentum, in parts of the sphere's; moments are positive and none exceeds others."""
-        tensor = tensors[0] + np.tensordot(x, tensors[1:], 1)
+        tensor = tensors[0] + np.tensordot(x[:-1], tensors[1:], 1)
         moments = np.linalg.eigvalsh(tensor)
         if moments[0] <= 0 or moments[2] > _LARGEST:
             return 0.0
         return 3 * np.linalg.norm(rates[rows] @ tensor, axis=1) / np.maximum(spin[rows], _SPIN)
 
     return change[..., 1:], -change[..., 0], bound
+
+
+def _integral(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Integrals up to each time, by the trapezoidal rule."""
+    steps = np.gradient(t).reshape(-1, *(1,) * (x.ndim - 1)) * x
+    return np.cumsum(steps, axis=0) - steps / 2
 
 
 def _across(x: np.ndarray, reach: int) -> np.ndarray:
