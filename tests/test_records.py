@@ -208,9 +208,79 @@ def test_blackbox_decode_writes_degrees_and_counts():
     assert "flightModeFlags (flags)" not in reading.columns
 
 
+def raw_counts(most, settings="", integers=True, header=""):
+    """A log of counts of a gyro that turns slowly, then as fast as `most` says."""
+    shares = np.sin(np.linspace(0, 6, 200))
+    values = np.round(most * shares) if integers else most * shares
+    rows = "".join(f"{i}, {1000 * i}, 0, {x:.7g}, 0, 5, 0, 0, 2048, 158, 0\n"
+                   for i, x in enumerate(values))  # fmt: skip
+    return settings + BETAFLIGHT.format(r=header, a="") + rows, values
+
+
+def test_blackbox_raw_counts_are_recognised_by_their_range():
+    """12,100 deg/s is no reading of a gyro of 2000 deg/s; 738 deg/s are."""
+    text, values = raw_counts(12100)
+    reading = read(text)
+    np.testing.assert_allclose(reading.rates[:, 0], values / 16.4 * DEGREE, rtol=1e-9)
+    said(reading, "taken as counts: no gyro of 2000 deg/s reads 12100 deg/s")
+    said(reading, "if they are tenths of deg/s, pass unit=0.00174533")
+    one = '"gyro_scale","0x3f800000"\n'  # the bits of 1.0
+    np.testing.assert_allclose(read(raw_counts(12100, one)[0]).rates, reading.rates)
+    slow = read(raw_counts(900)[0])
+    np.testing.assert_allclose(slow.rates[:, 0], raw_counts(900)[1] * DEGREE, rtol=1e-9)
+    said(slow, "so Betaflight logs it")
+
+
+def test_blackbox_unfiltered_rates_alone_are_recognised():
+    text, values = raw_counts(12100)
+    reading = read(text.replace("gyroADC", "gyroUnfilt"))
+    np.testing.assert_allclose(reading.rates[:, 0], values / 16.4 * DEGREE, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scale", "factor"),
+    [
+        ("0x3d79c190", 1 / 16.4),  # degrees per second for each count
+        ("0x3295ec32", 1.0),  # radians per microsecond: of 1 deg/s
+        ("0x30924418", 1 / 16.4),  # radians per microsecond: of one count
+    ],
+)
+def test_blackbox_scales_of_old_firmware(scale, factor):
+    text, values = raw_counts(1900, f'"gyro_scale","{scale}"\n')
+    reading = read(text)
+    np.testing.assert_allclose(reading.rates[:, 0], values * factor * DEGREE, rtol=1e-4)
+    assert any("gyro_scale" in x for x in reading.notes)
+
+
+def test_blackbox_high_resolution_logs_tenths():
+    settings = '"gyro_scale","0x3f800000"\n"blackbox_high_resolution","1"\n'
+    text, values = raw_counts(15000, settings)
+    reading = read(text)
+    np.testing.assert_allclose(reading.rates[:, 0], values / 10 * DEGREE, rtol=1e-9)
+    said(reading, "blackbox_high_resolution: tenths")
+
+
+def test_what_the_caller_says_of_blackbox_counts():
+    text, values = raw_counts(12100)
+    for unit, factor in (("counts", DEGREE / 16.4), (DEGREE / 10, DEGREE / 10)):
+        reading = read(text, unit=unit)
+        np.testing.assert_allclose(reading.rates[:, 0], values * factor, rtol=1e-9)
+    reading = read(text, unit="deg/s")
+    np.testing.assert_allclose(reading.rates[:, 0], values * DEGREE)
+    said(reading, "`unit` says so, though no common gyro reads 211 rad/s")
+
+
+def test_blackbox_numbers_that_are_no_counts_are_asked_about():
+    with pytest.raises(ValueError, match=r"Argument `unit` must say the unit of the rates"):
+        read(raw_counts(12100.5, integers=False)[0])
+    with pytest.raises(ValueError, match=r"Argument `unit` must say the unit of the rates"):
+        read(raw_counts(40000)[0])
+
+
 def test_blackbox_decode_with_units_asked_for():
-    reading = read(blackbox_csv(" (rad/s)", " (m/s/s)", 9.5))
-    np.testing.assert_allclose(reading.rates[4], [4, -90, 180])
+    text = blackbox_csv(" (rad/s)", " (m/s/s)", 9.5).replace("-90, 180", "-9, 18")
+    reading = read(text)
+    np.testing.assert_allclose(reading.rates[4], [4, -9, 18])
     np.testing.assert_allclose(reading.specific_forces[:, 2], 9.5)
 
 
@@ -398,6 +468,40 @@ def test_times_of_an_epoch_count_from_the_first_reading():
 def test_spellings_of_units(stated, factor):
     names = ["time (seconds)", *(f"gyro {a} [{stated}]" for a in "xyz")]
     np.testing.assert_allclose(read(table(names, ROWS)).rates, factor * ROWS[:, 1:])
+
+
+@pytest.mark.parametrize(("stated", "most"), [("deg/s", 12100), ("rad/s", 200)])
+def test_rates_beyond_every_gyro_are_asked_about(stated, most):
+    names = ["t (s)", *(f"gyro {a} ({stated})" for a in "xyz")]
+    rows = ROWS * [1, 1, 1, most / 1.5]
+    with pytest.raises(ValueError, match=r"Argument `unit` must .* no common gyro reads") as error:
+        read(table(names, rows))
+    for words in (f"number, {most}, is", "`unit='rad/s'`", "`unit='deg/s'`", "`unit='counts'`"):
+        assert words in str(error.value), words
+    reading = read(table(names, rows), unit=stated)
+    assert reading.rates[0, 2] == pytest.approx(most * (DEGREE if stated == "deg/s" else 1))
+    said(reading, "though no common gyro reads")
+
+
+def test_a_unit_may_be_a_factor():
+    names = ["t", "gx", "gy", "gz", "ax", "ay", "az"]
+    rows = np.column_stack([ROWS, np.tile([0, 0, 2048], (6, 1))])
+    reading = read(table(names, rows), unit=0.001)
+    np.testing.assert_allclose(reading.rates, 0.001 * ROWS[:, 1:])
+    said(reading, "rates (gx, gy, gz) multiplied by 0.001: `unit` says so")
+    reading = read(table(names, rows), unit={"rates": 2, "specific_forces": GRAVITY / 2048})
+    np.testing.assert_allclose(reading.rates, 2 * ROWS[:, 1:])
+    np.testing.assert_allclose(reading.specific_forces[0], [0, 0, GRAVITY])
+    for wrong in (0.0, -1.0, np.nan, np.inf, True):
+        with pytest.raises(ValueError, match=r"Argument `unit` must be a unit or a positive"):
+            read(table(names, rows), unit=wrong)
+
+
+def test_rows_without_numbers_are_counted():
+    rows = np.vstack([ROWS, [0.06, np.nan, 1, 2], [0.07, 1, 1, 1], [0.08, np.nan, np.nan, np.nan]])
+    reading = read(table(["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"], rows))
+    assert reading.times.size == 7
+    said(reading, "2 rows without numbers of all three axes dropped")
 
 
 def test_degrees_are_recognised_by_the_range_of_gyros():
@@ -749,7 +853,8 @@ def test_short_flights_breaks_and_silence(rng):
     assert len(jr.records.flights(reading)) == 1
     assert jr.records.flights(reading, least=0.7) == []
     [wide], [narrow] = (jr.records.flights(reading, margin=m) for m in (0.0, 0.1))
-    assert narrow.times[0] - wide.times[0] == pytest.approx(0.1)
+    # The margin counts from the last reading with contact, one interval before the first without.
+    assert narrow.times[0] - wide.times[0] == pytest.approx(0.09)
     broken = jr.records.Reading(times, np.zeros((300, 3)), forces, breaks=(130,))
     assert [x.times.size > 20 for x in jr.records.flights(broken)] == [True, True]
     forces = np.where(np.arange(300)[:, None] == 130, np.nan, forces)

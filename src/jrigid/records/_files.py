@@ -6,7 +6,9 @@ import itertools
 import os
 import pathlib
 import re
+import types
 import zipfile
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +19,27 @@ from jrigid._extra import extra
 Source = str | os.PathLike[str] | io.TextIOBase
 _BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
 _MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have their settings there
+_NOTHING: Mapping[int, float] = types.MappingProxyType({})
+# Flight controllers run their gyros at 2000 deg/s, which 16 bits divide into 16.4 counts a deg/s.
+_FULL_SCALE = 2000.0  # [deg/s]
+_OVER = 1.05  # of the full scale: zero offsets and filters add a little
+_MOST_COUNTS = 1 << 15
+_PER_MICROSECOND = 1e-6  # smaller scales are in radians per microsecond, as Baseflight has them
 
 
 class Table(NamedTuple):
-    """Numbers under headers; what the file says `about` itself, notes, and who states its units."""
+    """Numbers under headers.
+
+    Attributes:
+        name: Of the file.
+        headers: Of the columns.
+        values: As the file has them.
+        about: What the file says about itself, by key.
+        notes: In words.
+        source: Who states the units in the headers.
+        scales: Factors from the file's numbers to the units in the headers, by column; 1 if absent.
+        sources: Who states the unit of a column, where it is not `source`, by column.
+    """
 
     name: str
     headers: list[str]
@@ -28,6 +47,8 @@ class Table(NamedTuple):
     about: dict[str, str]
     notes: list[str]
     source: str = "the header says so"
+    scales: Mapping[int, float] = _NOTHING
+    sources: Mapping[int, str] = types.MappingProxyType({})
 
 
 def tables_of(path: Source, log: int) -> list[Table]:
@@ -122,23 +143,26 @@ def _number(cell: str) -> float:
 
 def _with_units(table: Table) -> Table:
     """The table with units in its headers that Sensor Logger and Betaflight leave to the reader."""
-    about, rules = table.about, []
     if "seconds_elapsed" in table.headers:
-        table = table._replace(source="so Sensor Logger writes it")
-        ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
-        sign = -1.0 if ios else 1.0
-        rules = [("^gyro|^rotationrate", "{} (rad/s)", 1.0), ("^magnetometer", "{} (uT)", 1.0)]
-        rules += [("^total", "{} (m/s^2)", sign), ("uncalibrated|^gravity", "{}", sign)]
-        rules += [("acc", "linear {}", sign), ("^seconds", "{} (s)", 1.0)]
-    elif any(x.startswith("gyroADC") for x in table.headers):
-        table = table._replace(source="so Betaflight logs it")
-        text = about.get("gyro_scale", about.get("gyro.scale", "1"))
-        scale = float(int(text, 0) if text.isalnum() else text)
-        if scale > 1 << 20:  # a float written as the integer of the same bits
-            scale = float(np.uint32(scale).view(np.float32))
-        rules = [(r"^gyro(ADC|Unfilt)\[.\]$", "{} (deg/s)", scale)]
-        if "acc_1G" in about:
-            rules += [(r"^accSmooth\[.\]$", "{} (g)", 1 / float(about["acc_1G"]))]
+        return _with_units_of_sensor_logger(table)
+    if any(x.startswith(("gyroADC", "gyroUnfilt")) for x in table.headers):
+        return _with_units_of_blackbox(table)
+    return table
+
+
+def _with_units_of_sensor_logger(table: Table) -> Table:
+    """Rates are in rad/s; iOS gives accelerations the other sign."""
+    about = table.about
+    ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
+    sign = -1.0 if ios else 1.0
+    rules = [
+        ("^gyro|^rotationrate", "{} (rad/s)", 1.0),
+        ("^magnetometer", "{} (uT)", 1.0),
+        ("^total", "{} (m/s^2)", sign),
+        ("uncalibrated|^gravity", "{}", sign),
+        ("acc", "linear {}", sign),
+        ("^seconds", "{} (s)", 1.0),
+    ]
     for j, header in enumerate(table.headers):
         name = f"{table.name} {header}" if len(header) == 1 else header
         fits = [rule for rule in rules if re.search(rule[0], name, re.IGNORECASE)]
@@ -147,4 +171,71 @@ def _with_units(table: Table) -> Table:
             table.values[:, j] *= factor
             if factor < 0:
                 table.notes.append("turned about: iOS gives accelerations the other sign")
-    return table
+    return table._replace(source="so Sensor Logger writes it")
+
+
+def _with_units_of_blackbox(table: Table) -> Table:
+    """Rates are in deg/s times a scale, or counts; accelerations in parts of `acc_1G`.
+
+    Firmware up to the end of 2016 logs counts, and later firmware deg/s. The settings say which by
+    `gyro_scale`; a CSV of `blackbox_decode` has no settings, so the range of the gyro decides.
+    """
+    scale, said = _gyro_scale(table.about)
+    scales = {}
+    sources = {}
+    if "acc_1G" in table.about:
+        for j in _columns(table, "accSmooth"):
+            table.headers[j] += " (g)"
+            scales[j] = 1 / float(table.about["acc_1G"])
+    for stem in ("gyroADC", "gyroUnfilt"):
+        columns = _columns(table, stem)
+        if not columns:
+            continue
+        values = table.values[:, columns]
+        values = values[np.isfinite(values)]
+        most = float(np.abs(values).max(initial=0.0))
+        unit = "deg/s"
+        # A scale of 1 is written by firmware that scales itself, and by some that does not.
+        if scale == 1.0 and most > _OVER * _FULL_SCALE:
+            whole = bool(np.all(values == np.round(values)))
+            if whole and most <= _MOST_COUNTS:
+                unit = "counts"
+                said = f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a "
+                said += f"deg/s; if they are tenths of deg/s, pass unit={np.pi / 1800:.6g}"
+        for j in columns:
+            table.headers[j] += f" ({unit})"
+            scales[j] = scale
+            if said:
+                sources[j] = said
+    source = "so Betaflight logs it"
+    return table._replace(source=source, scales=scales, sources=sources)
+
+
+def _columns(table: Table, stem: str) -> list[int]:
+    """Columns of the three axes of a field of a blackbox log, if the file states no unit."""
+    fits = re.compile(rf"^{stem}\[[012]\]$")
+    return [j for j, header in enumerate(table.headers) if fits.match(header)]
+
+
+def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
+    """Degrees per second of the number 1, by the settings, and a note unless they are usual.
+
+    Source: betaflight/blackbox-tools, `parser.c`; blackbox-log-viewer, `flightlog_parser.js` and
+    `flightlog_fields_presenter.js`.
+    """
+    text = about.get("gyro_scale", about.get("gyro.scale", "1"))
+    scale = float(int(text, 0) if text.isalnum() else text)
+    if scale > 1 << 20:  # a float written as the integer of the same bits
+        scale = float(np.uint32(scale).view(np.float32))
+    said = ""
+    if 0 < scale < _PER_MICROSECOND:
+        scale = float(np.degrees(1e6 * scale))
+        # Half a hundredth of a per mille is what single precision leaves of a scale of 1.
+        scale = 1.0 if abs(scale - 1) < 1e-5 else scale
+        said = f"gyro_scale says {scale:.4g} deg/s, in radians per microsecond"
+    elif scale != 1.0:
+        said = f"gyro_scale says {scale:.4g} deg/s for each count"
+    if about.get("blackbox_high_resolution", "0") not in ("0", "", "null"):
+        scale /= 10
+        said = "blackbox_high_resolution: tenths of deg/s"
+    return scale, said

@@ -1,5 +1,6 @@
 """Tables become a reading: which columns are of which sensor, in which unit, on whose clock."""
 
+import numbers
 import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -16,11 +17,13 @@ _UNITS: dict[str, dict[str, float]] = {
     "times": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "rates": dict.fromkeys(("rad/s", "rads", "rad_s", "radians/s"), 1.0)
     | dict.fromkeys(("deg/s", "°/s", "dps", "deg_s", "degs", "degrees/s"), np.pi / 180)
-    | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi},
+    | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi}
+    | {"counts": np.pi / 180 / 16.4},  # of 16 bits for 2000 deg/s
     "specific_forces": dict.fromkeys(("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0)
     | {"g": 9.80665, "mg": 9.80665e-3},
     "magnetic_fields": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "g": 1e-4, "gauss": 1e-4},
 }
+Unit = str | float | int  # a name, or a factor to SI
 Columns = Mapping[str, str | Sequence[str]]
 _MEASURED = ("rates", "specific_forces", "magnetic_fields")
 # What a column measures, by words in its name; the first that fits.
@@ -36,7 +39,9 @@ _AXIS = re.compile(r"^(.*?)[\s_.\-]*(\[[012]\]|[xyz])$", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
 _SUFFIX = re.compile(r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE)
 _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from 0
-_RANGE = 70.0, 4100.0  # [rad/s] no common gyro measures beyond; larger numbers are not deg/s either
+# No common gyro measures more: 4000 deg/s is the widest range of those in phones, loggers and
+# flight controllers. In rad/s, and in deg/s with a margin for what a filter or an offset adds.
+_RANGE = 70.0, 4100.0
 # Medians of what each row says: steps of 8 Hz to 8 kHz, and sizes at hand.
 _USUAL = {
     "times": {"s": (125e-6, 0.125), "ms": (0.125, 125), "us": (125, 125e3), "ns": (125e3, 125e6)},
@@ -47,49 +52,98 @@ _LIKE = 0.4  # correlation of the two from which their ratio is believed
 
 
 class _Sensor(NamedTuple):
-    """Times and three axes of a table, in the rows where all axes are numbers."""
+    """Times and three axes of a table, in the rows where all axes are numbers; others `missed`."""
 
     label: str
     table: Table
     columns: list[int]
     rows: np.ndarray
+    missed: int = 0
 
 
 class _Units(NamedTuple):
     """What the caller `asked` for, and the notes on who says a unit."""
 
-    asked: dict[str, str]
+    asked: dict[str, Unit]
     notes: list[str]
 
     def factor(
         self, kind: str, sensor: _Sensor, values: np.ndarray, turned: str = ""
     ) -> float | None:
         """The factor to SI by the caller, the file or the numbers; None where nobody says it."""
-        header = sensor.table.headers[sensor.columns[kind != "times"]]
-        unit, source = _split(header)[1], sensor.table.source
+        table, column = sensor.table, sensor.columns[kind != "times"]
+        unit = _split(table.headers[column])[1]
+        scale = table.scales.get(column, 1.0)
+        what = f"{kind.replace('_', ' ')} ({_label(kind, sensor)})"
+        if unit == "counts":
+            turned = ""  # gravity tells rad/s from deg/s alone
         if kind in self.asked:
-            heard = "" if unit in (None, self.asked[kind]) else f", though the file says {unit}"
-            unit, source = self.asked[kind], f"`unit` says so{heard}"
-        elif unit is None:
-            unit, source = _recognised(kind, values, turned)
-        label = header if kind == "times" else sensor.label
-        what = f"{kind.replace('_', ' ')} ({label})"
-        if unit is None:
-            self.notes.append(f"{what} left out: their unit is not stated")
-            return None
-        other = f"but it does not, and the file's {unit!r} is not known."
-        demand(unit in _UNITS[kind], f"Argument `unit` must say the unit of `{kind}`, {other}")
-        self.notes.append(f"{what} taken as {unit}: {source}")
-        factor = _UNITS[kind][unit]
-        if turned and not 0.2 < factor / _UNITS["rates"][turned] < 5:  # headers can be wrong
+            factor, said = self._as_asked(kind, unit, scale, column in table.sources)
+        else:
+            source = table.sources.get(column, table.source)
+            if unit is None:
+                unit, source = _recognised(kind, values, turned)
+            if unit is None:
+                self.notes.append(f"{what} left out: their unit is not stated")
+                return None
+            other = f"but it does not, and the file's {unit!r} is not known."
+            # How much a count is only the caller can tell, unless the format does.
+            known = unit in _UNITS[kind] and (unit != "counts" or column in table.sources)
+            demand(known, f"Argument `unit` must say the unit of `{kind}`, {other}")
+            factor, said = scale * _UNITS[kind][unit], f"taken as {unit}: {source}"
+        if kind == "rates":
+            said += _range_checked(values, factor, "rates" in self.asked)
+        self.notes.append(f"{what} {said}")
+        if turned and not 0.2 < factor / scale / _UNITS["rates"][turned] < 5:
+            # Headers can be wrong.
             self.notes.append(f"yet gravity turns in the body as if the rates were in {turned}")
         return factor
+
+    def _as_asked(
+        self, kind: str, unit: str | None, scale: float, guessed: bool
+    ) -> tuple[float, str]:
+        """The factor that the caller states, and a note; `unit` is what the file says."""
+        asked = self.asked[kind]
+        if not isinstance(asked, str):
+            return float(asked), f"multiplied by {asked:g}: `unit` says so"
+        differs = unit not in (None, asked) and not guessed
+        heard = f", though the file says {unit}" if differs else ""
+        # Where the caller names another unit than the file, the numbers are meant as they are.
+        factor = _UNITS[kind][asked] * (scale if unit == asked else 1.0)
+        return factor, f"taken as {asked}: `unit` says so{heard}"
+
+
+def _label(kind: str, sensor: _Sensor) -> str:
+    """What a note calls the columns of a sensor, or its column of times."""
+    return sensor.table.headers[sensor.columns[0]] if kind == "times" else sensor.label
+
+
+def _range_checked(values: np.ndarray, factor: float, asked: bool) -> str:
+    """A note on rates that no gyro reads, where the caller states a unit; else an error."""
+    most = float(np.abs(values).max(initial=0.0))
+    if most * factor <= _RANGE[0]:
+        return ""
+    beyond = f"no common gyro reads {most * factor:.0f} rad/s"
+    if asked:
+        return f", though {beyond}"
+    raise ValueError(_question(most, beyond))
+
+
+def _question(most: float, why: str) -> str:
+    """Ask for the unit of rates, and say what their largest number is in the usual ones."""
+    degree, count = np.pi / 180, _UNITS["rates"]["counts"]
+    return (
+        f"Argument `unit` must say the unit of the rates, but it does not, and {why}. The largest "
+        f"number, {most:.6g}, is {most:.4g} rad/s by `unit='rad/s'`, {most * degree:.4g} rad/s by "
+        f"`unit='deg/s'`, {most * count:.4g} rad/s by `unit='counts'` (of a gyro of 2000 deg/s, "
+        "16.4 to a deg/s); a number is a factor to rad/s."
+    )
 
 
 def read(
     path: Source,
     *,
-    unit: str | Mapping[str, str] | None = None,
+    unit: Unit | Mapping[str, Unit] | None = None,
     columns: Columns | None = None,
     clock: str | None = None,
     log: int = 1,
@@ -105,7 +159,9 @@ def read(
     Args:
         path: A file (.csv, .txt, .zip, .bbl, .bfl), a folder, or a text open for reading.
         unit: Of the rates (`"deg/s"`), or by what is measured: `{"times": "ms", "rates": "dps",
-            "specific_forces": "g", "magnetic_fields": "uT"}`.
+            "specific_forces": "g", "magnetic_fields": "uT"}`. A number is a factor to SI: `unit=`
+            `np.pi / 1800` for tenths of deg/s. `"counts"` are those of a gyro with a range of 2000
+            deg/s in 16 bits, 16.4 to a deg/s. Rates above 70 rad/s need a unit from the caller.
         columns: Which columns to take, by their headers with or without a unit: `{"times": "t",
             "rates": ("gx", "gy", "gz"), "specific_forces": ...}`; any other key is the new name of
             a column, as in `{"wheel": "speed (rpm)"}`. What is not named is recognised.
@@ -116,7 +172,8 @@ def read(
         Times in s, rates in rad/s, specific forces in m/s^2, magnetic fields in T.
 
     Raises:
-        ValueError: No times, no sensor, no such column, or a unit that is not known.
+        ValueError: No times, no sensor, no such column, a unit that is not known, or rates beyond
+            the range of gyros (70 rad/s) without `unit`.
         ImportError: A blackbox log without the extra `jrigid[records]`.
 
     >>> import io
@@ -132,11 +189,7 @@ def read(
     Source: phyphox-android, `DataExport.java`; awesome-sensor-logger, `UNITS.md` and
     `COORDINATES.md`; betaflight/blackbox-tools, `units.h` and `parser.c`.
     """
-    given = {"rates": unit} if isinstance(unit, str) else dict(unit or {})
-    units = _Units({kind: _plain(said) for kind, said in given.items()}, [])
-    for kind, said in units.asked.items():
-        check_option("unit", kind, tuple(_UNITS))
-        check_option("unit", said, tuple(_UNITS[kind]))
+    units = _Units(_asked(unit), [])
     tables = tables_of(path, log)
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns or {})
@@ -157,16 +210,39 @@ def read(
         if kind in chosen:
             sensor, turned = chosen[kind], ""
             if kind == "rates" and "specific_forces" in found:
-                turned = _turned(own.times, raw[kind], found["specific_forces"])
+                scale = sensor.table.scales.get(sensor.columns[1], 1.0)
+                turned = _turned(own.times, scale * raw[kind], found["specific_forces"])
             factor = units.factor(kind, sensor, raw[kind], turned)
             if factor is not None:
                 found[kind] = factor * raw[kind]
                 used.update(sensor.columns if sensor.table is main.table else ())
     rest = zip(main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True)
-    rest = [(header, x) for j, (header, x) in enumerate(rest) if header and j not in used]
+    scales = main.table.scales
+    rest = [
+        (header, scales.get(j, 1.0) * x)
+        for j, (header, x) in enumerate(rest)
+        if header and j not in used
+    ]
     others = {header: x for header, x in rest if np.isfinite(x).any()}
     said = tuple(dict.fromkeys(units.notes))
     return Reading(own.times, **found, columns=others, breaks=own.breaks, notes=said)
+
+
+def _asked(unit: Unit | Mapping[str, Unit] | None) -> dict[str, Unit]:
+    """Units that the caller states, by what is measured; checked."""
+    given = dict(unit) if isinstance(unit, Mapping) else {"rates": unit}
+    asked: dict[str, Unit] = {}
+    for kind, said in given.items():
+        check_option("unit", kind, tuple(_UNITS))
+        if isinstance(said, str):
+            asked[kind] = _plain(said)
+            check_option("unit", asked[kind], tuple(_UNITS[kind]))
+        elif said is not None:
+            real = isinstance(said, numbers.Real) and not isinstance(said, bool)
+            needed = "Argument `unit` must be a unit or a positive factor to SI"
+            demand(real and 0 < said < np.inf, f"{needed}, but it is {said!r}.")
+            asked[kind] = said
+    return asked
 
 
 def _rename(tables: list[Table], columns: Columns) -> None:
@@ -210,9 +286,13 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
         needed = "Argument `columns` must name the column of the times, but it does not, and none "
         demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
         time = max((j for j in times if j < three[0]), default=times[0])
-        rows = np.flatnonzero(known[:, three].all(axis=1))
+        whole = known[:, three].all(axis=1)
+        rows = np.flatnonzero(whole)
         if rows.size:
-            sensors.append((kind, _Sensor(label, table, [time, *three], rows)))
+            # Below the last row the column is padded, unless there are times.
+            missed = ~whole & (known[:, time] | (np.arange(whole.size) < rows[-1]))
+            sensor = _Sensor(label, table, [time, *three], rows, int(missed.sum()))
+            sensors.append((kind, sensor))
     return sensors
 
 
@@ -231,15 +311,19 @@ def _on_one_clock(
     clocks = {kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen}
     own = clocks[next(kind for kind, x in chosen.items() if x is main)]
     several = any(x.table is not main.table for x in chosen.values())
-    for kind, (label, table, _, _) in chosen.items():
+    for kind, (label, table, _, _, missed) in chosen.items():
         said = [*table.notes, *clocks[kind].notes]
+        if missed:
+            count = f"{missed} row{'s' if missed > 1 else ''}"
+            said.insert(0, f"{count} without numbers of all three axes dropped")
         raw[kind] = raw[kind][clocks[kind].rows, 1:]
         if not np.array_equal(own.times, clocks[kind].times):
             said.append("times of its own; brought to those of the rest linearly")
             raw[kind] = _onto(own.times, clocks[kind], raw[kind])
         units.notes.extend(f"{label}: {x}" if several else x for x in said)
     if "linear" in chosen:
-        (label, table, columns, rows), gravity = chosen["linear"], chosen.get("gravity")
+        label, table, columns, rows, _ = chosen["linear"]
+        gravity = chosen.get("gravity")
         if gravity is None:
             units.notes.append(f"{label}: without gravity, no specific force; left out")
         else:
@@ -261,22 +345,26 @@ def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
 def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None, str]:
     """The unit in which alone numbers make sense, and why."""
     if kind == "rates":
-        most = float(np.abs(values).max())
-        unit, why = turned or None, "so gravity turns in the body"
-        if most > _RANGE[0]:
-            unit, why = "deg/s" if most < _RANGE[1] else None, f"no gyro reads {most:.0f} rad/s"
-        doubt = f"numbers up to {most:.6g} do not tell"
-    else:
-        size = np.diff(values) if kind == "times" else np.linalg.norm(values, axis=1)
-        size = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
-        usual = _USUAL.get(kind, {}).items()
-        unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
-        why = f"their median {'step ' * (kind == 'times')}is {size:.4g}"
+        return _recognised_rates(values, turned)
+    size = np.diff(values) if kind == "times" else np.linalg.norm(values, axis=1)
+    size = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
+    usual = _USUAL.get(kind, {}).items()
+    unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
+    if unit is None and kind == "times":
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
-    doubt = f"Argument `unit` must say the unit of the {kind}, but it does not, and {doubt}."
-    doubt += f" (`unit={{'{kind}': ...}}`, one of {', '.join(_UNITS[kind])}.)"
-    demand(unit is not None or kind not in ("times", "rates"), doubt)
-    return unit, why
+        doubt = f"Argument `unit` must say the unit of the times, but it does not, and {doubt}."
+        raise ValueError(f"{doubt} (`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)")
+    return unit, f"their median {'step ' * (kind == 'times')}is {size:.4g}"
+
+
+def _recognised_rates(values: np.ndarray, turned: str) -> tuple[str, str]:
+    """The unit of rates by the range of gyros or by how gravity turns, and why."""
+    most = float(np.abs(values).max())
+    if _RANGE[0] < most < _RANGE[1]:
+        return "deg/s", f"no gyro reads {most:.0f} rad/s"
+    if most >= _RANGE[1] or not turned:
+        raise ValueError(_question(most, f"numbers up to {most:.6g} do not tell"))
+    return turned, "so gravity turns in the body"
 
 
 def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
