@@ -40,7 +40,7 @@ def test_nothing_flies_before_the_throw(thrown):
 
 
 def flying(times, start=1.0, end=1.8, spin=12.0, lever=(0.05, 0.0, 0.02)):
-    """A body that turns steadily about an axis through its mass centre, at rest before and after."""
+    """A body that turns steadily about its mass centre, at rest before and after."""
     free = ((times >= start) & (times < end))[:, None]
     rates = np.where(free, [0.0, spin, 0.0], 0.0)
     forces = np.cross(rates, np.cross(rates, np.array(lever)))
@@ -99,3 +99,30 @@ def test_a_bias_is_no_contact_and_gravity_is_no_bias():
     assert 1.0 <= flight.times[0] <= 1.02
     held = jr.records.Reading(times, rates, np.tile([0.0, 0.0, 9.8], (300, 1)))
     assert jr.records.flights(held) == []
+
+
+def test_pieces_of_a_few_readings_between_breaks():
+    times = np.arange(0, 3, 0.01)
+    rates, forces = flying(times)
+    reading = jr.records.Reading(times, rates, forces, breaks=(1, 3, 6, 298))
+    [flight] = jr.records.flights(reading)
+    assert 1.0 <= flight.times[0] <= 1.02
+
+
+def test_drag_is_allowed_for_where_there_is_no_accelerometer(rng):
+    """A spin that loses a third a second."""
+    times = np.arange(0, 3, 0.005)
+    moments = np.array([1.0, 2.0, 2.5])
+    rates = np.zeros((times.size, 3))
+    omega = np.array([9.0, 3.0, 12.0])
+    for i in np.flatnonzero((times >= 1.0) & (times < 1.8)):
+        rates[i] = omega
+        for _ in range(20):
+            torque = -np.cross(omega, moments * omega) - 0.33 * moments.mean() * omega
+            omega = omega + 0.005 / 20 * torque / moments
+    hand = (times < 1.0) | (times >= 1.8)
+    rates[hand] = 4 * np.sin(9 * times[hand, None] * np.array([1.0, 1.3, 0.7]))
+    rates += 0.005 * rng.normal(size=rates.shape)
+    [flight] = jr.records.flights(jr.records.Reading(times, rates))
+    assert 0.99 < flight.times[0] < 1.05
+    assert 1.75 < flight.times[-1] < 1.81

@@ -146,6 +146,9 @@ def _by_forces(
     spans = []
     for piece in itertools.pairwise((0, *reading.breaks, t.size)):
         rows = slice(*piece)
+        # Slopes need some rows to either side.
+        if piece[1] - piece[0] <= 4 * reach or not best[rows].any():
+            continue
         part = _Part.of(reading[rows], delay, best[rows])
         for first, last in part.parted(best[rows]):
             span = part.span(first, last)
@@ -225,23 +228,21 @@ class _Part(NamedTuple):
         core[first:last] = True
         for _ in range(_ROUNDS):
             fit = self.fit(core)
-            besides = self.beside(fit)
-            beside = besides.min(axis=0)
-            median = float(np.median(beside[core]))
+            residuals = self.residuals(fit)
+            least = residuals.min(axis=0)
+            median = float(np.median(least[core]))
             allowed = min(max(_QUIET, _NOISY[0] * median), _NOISY[1])
             shown = np.nan_to_num(np.linalg.norm(self.forces, axis=1))
             allowed = allowed + _FORCE[1] * shown
-            free = self.without_holes(beside < allowed, beside < 2 * allowed)
+            free = self.without_holes(least < allowed, least < 2 * allowed)
             spans = self.parted(free)
             if not spans:
                 return None
             first, last = max(spans, key=lambda span: core[slice(*span)].sum())
             if not core[first:last].any():
                 return None
-            # At its ends a flight is judged by slopes from inside it, and by less.
             allowed = max(_EDGE[0], _EDGE[1] * median) + _EDGE[2] * shown
-            first += int(np.argmax((besides[[0, 2]].min(axis=0) < allowed)[first:last]))
-            last -= int(np.argmax((besides[[0, 1]].min(axis=0) < allowed)[first:last][::-1]))
+            first, last = _trimmed(residuals < allowed, first, last)
             same = core.sum() == last - first and core[first:last].all()
             core[:] = False
             core[first:last] = True
@@ -275,11 +276,11 @@ class _Part(NamedTuple):
         fit[3:] *= min(1.0, _BIAS / size) if size > 0 else 1.0
         return fit
 
-    def beside(self, fit: Float[np.ndarray, "6"]) -> Float[np.ndarray, "slopes rows"]:
+    def residuals(self, fit: Float[np.ndarray, "6"]) -> Float[np.ndarray, "slopes rows"]:
         """What the lever and bias leave unexplained [m/s^2]; infinite where nothing is read."""
         shown = self.models @ fit[:3] + fit[3:]
-        beside = np.linalg.norm(self.clipped(shown) - self.forces, axis=2)
-        return np.where(np.isfinite(beside), beside, np.inf)
+        residuals = np.linalg.norm(self.clipped(shown) - self.forces, axis=2)
+        return np.where(np.isfinite(residuals), residuals, np.inf)
 
     def clipped(self, shown: np.ndarray) -> np.ndarray:
         """Specific forces within the range of the accelerometer, which shows its end beyond."""
@@ -296,6 +297,14 @@ class _Part(NamedTuple):
             if inside and last - first <= self.hole and nearly[first:last].all():
                 filled[first:last] = True
         return filled
+
+
+def _trimmed(fits: Bool[np.ndarray, "slopes rows"], first: int, last: int) -> tuple[int, int]:
+    """A flight without the rows at its ends that do not fit by slopes from inside it."""
+    central, before, after = fits[:, first:last]
+    starts = np.argmax(central | after)
+    ends = np.argmax((central | before)[::-1])
+    return first + int(starts), last - int(ends)
 
 
 def _jumps(
