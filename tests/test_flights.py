@@ -126,3 +126,15 @@ def test_drag_is_allowed_for_where_there_is_no_accelerometer(rng):
     [flight] = jr.records.flights(jr.records.Reading(times, rates))
     assert 0.99 < flight.times[0] < 1.05
     assert 1.75 < flight.times[-1] < 1.81
+
+
+def test_an_even_rest_is_not_the_end_of_a_range(rng):
+    """A synthetic record may read 9.8 m/s^2 throughout, and a slow clock leaves large steps."""
+    body = jr.datasets.gyro_example()
+    rest = 0.01 * rng.normal(size=(300, 3))
+    rates = np.concatenate([rest, body.omegas, rest])
+    forces = np.zeros(rates.shape)
+    forces[:300, 2] = forces[-300:, 2] = 9.8
+    times = 0.1 * np.arange(len(rates))
+    [flight] = jr.records.flights(jr.records.Reading(times, rates, forces))
+    assert len(flight.times) == len(body.omegas)

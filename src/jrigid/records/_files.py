@@ -187,27 +187,25 @@ def _with_units_of_blackbox(table: Table) -> Table:
         for j in _columns(table, "accSmooth"):
             table.headers[j] += " (g)"
             scales[j] = 1 / float(table.about["acc_1G"])
-    for stem in ("gyroADC", "gyroUnfilt"):
-        columns = _columns(table, stem)
-        if not columns:
-            continue
-        values = table.values[:, columns]
-        values = values[np.isfinite(values)]
-        most = float(np.abs(values).max(initial=0.0))
-        unit = "deg/s"
-        # A scale of 1 is written by firmware that scales itself, and by some that does not.
-        if scale == 1.0 and most > _OVER * _FULL_SCALE:
-            whole = bool(np.all(values == np.round(values)))
-            if whole and most <= _MOST_COUNTS:
-                unit = "counts"
-                said = f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a "
-                said += f"deg/s; if they are tenths of deg/s, pass unit={np.pi / 1800:.6g}"
-        for j in columns:
-            table.headers[j] += f" ({unit})"
-            scales[j] = scale
-            if said:
-                sources[j] = said
+    gyros = [*_columns(table, "gyroADC"), *_columns(table, "gyroUnfilt")]
+    values = table.values[:, gyros]
+    values = values[np.isfinite(values)]
+    most = float(np.abs(values).max(initial=0.0))
+    whole = bool(np.all(values == np.round(values)))
+    unit = "deg/s"
+    # A scale of 1 is written by firmware that scales itself, and by some that does not.
+    if scale == 1.0 and _OVER * _FULL_SCALE < most <= _MOST_COUNTS and whole:
+        unit = "counts"
+        said = f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a deg/s; "
+        said += f"if they are tenths of deg/s, pass unit={np.pi / 1800:.6g}"
+    for j in gyros:
+        table.headers[j] += f" ({unit})"
+        scales[j] = scale
+        if said:
+            sources[j] = said
     source = "so Betaflight logs it"
+    if not table.about.keys() & {"gyro_scale", "gyro.scale"}:
+        source += " since 2017 (there is no gyro_scale; older logs have counts, 16.4 to a deg/s)"
     return table._replace(source=source, scales=scales, sources=sources)
 
 
@@ -230,7 +228,7 @@ def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
     said = ""
     if 0 < scale < _PER_MICROSECOND:
         scale = float(np.degrees(1e6 * scale))
-        # Half a hundredth of a per mille is what single precision leaves of a scale of 1.
+        # Single precision leaves a little beside a scale of 1.
         scale = 1.0 if abs(scale - 1) < 1e-5 else scale
         said = f"gyro_scale says {scale:.4g} deg/s, in radians per microsecond"
     elif scale != 1.0:

@@ -27,7 +27,8 @@ _BIAS = 1.0  # [m/s^2] of an accelerometer; more is no bias but a hand
 _QUIET = 1.5  # [m/s^2] what a flight may differ from its own lever without any noise
 _NOISY = 3.5, 7.0  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
 _EDGE = 1.0, 2.0, 0.03  # [m/s^2], medians, and of the force: allowed at the ends of a flight
-_CLIPPED = 4  # readings equal to the largest: the accelerometer was at the end of its range
+_CLIPPED = 4  # readings equal to the largest: the accelerometer was at the end of its range,
+_LEAST_RANGE = 19.0  # [m/s^2] which is 2 g at least
 _JUMP = 8.0, 0.15  # medians of what slopes leave of a step, and parts of the rate: a blow
 _HOLE = 0.06  # [s] of a flight that may be unexplained, if by less than twice what is allowed
 _ROUNDS = 3  # of fitting a lever to a flight and finding where the flight ends
@@ -340,8 +341,8 @@ def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int
 def _at_the_end(forces: np.ndarray) -> np.ndarray:
     """Where an accelerometer shows the end of its range, which it does several times or never."""
     size = np.abs(np.nan_to_num(forces))
-    at_end = size >= (1 - 1e-6) * size.max(initial=0.0)
-    return at_end & (at_end.sum() >= _CLIPPED) & (size > 0)
+    at_end = size >= max((1 - 1e-6) * size.max(initial=0.0), _LEAST_RANGE)
+    return at_end & (at_end.sum() >= _CLIPPED)
 
 
 def _cross(vectors: np.ndarray) -> np.ndarray:
