@@ -198,15 +198,15 @@ def _with_units_of_blackbox(table: Table) -> Table:
         unit = "counts"
         said = f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a deg/s; "
         said += f"if they are tenths of deg/s, pass unit={np.pi / 1800:.6g}"
+    elif not said and not table.about.keys() & {"gyro_scale", "gyro.scale"}:
+        said = "so Betaflight logs it since 2017; there is no gyro_scale, and older logs have "
+        said += "counts (unit='counts')"
     for j in gyros:
         table.headers[j] += f" ({unit})"
         scales[j] = scale
         if said:
             sources[j] = said
-    source = "so Betaflight logs it"
-    if not table.about.keys() & {"gyro_scale", "gyro.scale"}:
-        source += " since 2017 (there is no gyro_scale; older logs have counts, 16.4 to a deg/s)"
-    return table._replace(source=source, scales=scales, sources=sources)
+    return table._replace(source="so Betaflight logs it", scales=scales, sources=sources)
 
 
 def _columns(table: Table, stem: str) -> list[int]:
