@@ -136,7 +136,8 @@ def _question(most: float, why: str) -> str:
         f"Argument `unit` must say the unit of the rates, but it does not, and {why}. The largest "
         f"number, {most:.6g}, is {most:.4g} rad/s by `unit='rad/s'`, {most * degree:.4g} rad/s by "
         f"`unit='deg/s'`, {most * count:.4g} rad/s by `unit='counts'` (of a gyro of 2000 deg/s, "
-        "16.4 to a deg/s); a number is a factor to rad/s."
+        f"16.4 to a deg/s). (`unit={{'rates': ...}}`, one of {', '.join(_UNITS['rates'])}, or a "
+        "factor to rad/s.)"
     )
 
 
