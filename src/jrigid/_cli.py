@@ -46,7 +46,8 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add = command.add_argument
     add("path", help="a file, or a folder, as `jrigid.records.read` takes it")
-    add("--unit", action="append", default=[], help="of the rates: deg/s; or times=ms, any number")
+    units = "of the rates: deg/s, counts or a factor; or times=ms, any number"
+    add("--unit", action="append", default=[], help=units)
     add("--columns", action="append", default=[], metavar="NAME=HEADERS",
         help="times=t, rates=gx,gy,gz, any number")  # fmt: skip
     add("--flights", action="store_true", help="find throws in the record; else it is one throw")
@@ -95,10 +96,17 @@ def _at_rest(reading: records.Reading) -> tuple[np.ndarray | None, np.ndarray]:
     return sigma if np.all(sigma > 0) else None, rest.bias
 
 
+def _unit(text: str) -> tuple[str, str | float]:
+    """What a unit is of, and its name or the factor that it stands for."""
+    kind, _, unit = text.rpartition("=")
+    try:
+        return kind or "rates", float(unit)
+    except ValueError:
+        return kind or "rates", unit
+
+
 def _fit(options: argparse.Namespace) -> int:
-    units: dict[str, str] = dict(
-        x.split("=", 1) if "=" in x else ("rates", x) for x in options.unit
-    )
+    units = dict(map(_unit, options.unit))
     named = [x.partition("=") for x in options.columns]
     columns = {name: tuple(x.split(",")) if "," in x else x for name, _, x in named}
     reading = records.read(options.path, unit=units, columns=columns)
