@@ -453,6 +453,16 @@ def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):
     assert asked["shape"] == identify.Tensor()
 
 
+@pytest.mark.parametrize(("text", "unit"), [
+    ("deg/s", ("rates", "deg/s")),
+    ("times=ms", ("times", "ms")),
+    ("0.00174533", ("rates", 0.00174533)),
+    ("rates=0.5", ("rates", 0.5)),
+])  # fmt: skip
+def test_a_unit_of_the_command_line_is_a_name_or_a_factor(text, unit):
+    assert _cli._unit(text) == unit
+
+
 def test_three_throws_in_a_process_of_its_own(tmp_path):
     """Rest, hand, flight, catch, three times; the noise and the bias are those of the rest."""
     rng, step, lever = np.random.default_rng(3), 0.01, np.array([0.03, -0.02, 0.05])
