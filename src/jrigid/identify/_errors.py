@@ -423,7 +423,7 @@ def _judged(
     noise = chi_square / max(freedom, 1.0)
     if options.noise_known:
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
-        overstated = noise < 1 - gate
+        overstated = 0 < noise < 1 - gate  # a plan has no residuals
         misfit = noise > 1 + gate or np.max(fit.scales) > 2
         inflation = max(noise, 1.0) if misfit else 1.0
     else:

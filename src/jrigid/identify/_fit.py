@@ -1,5 +1,6 @@
 """fit(): inertia, and what else is asked for, from what was observed."""
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -212,7 +213,7 @@ def fit_each(
         for x, y, z in zip(systems, observations, starts, strict=True)
     ]
     found = _fits(requests, Effort(max_steps, doublings), throw)
-    return FitResult(**jax.device_put(jtu.tree_map(lambda *x: np.stack(x), *found)))
+    return _side_by_side(found)
 
 
 def _reporter(progress: bool | None) -> Callable[[str], None] | None:
@@ -466,6 +467,15 @@ def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[
                 raise RuntimeError(Status[status])
         results.append(fields)
     return results
+
+
+def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:
+    """One result with an axis of fits in front, from the fields of each."""
+    names = [x.name for x in dataclasses.fields(FitResult)]
+    columns = zip(*(jtu.tree_leaves([x[name] for name in names]) for x in results), strict=True)
+    stacked = jax.device_put([np.stack(x) for x in columns])
+    single = FitResult(**jax.device_put(results[0]))
+    return jtu.tree_structure(single).unflatten(stacked)
 
 
 def _lengths(records: tuple[Record, ...]) -> list[int]:
