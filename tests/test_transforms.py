@@ -80,7 +80,8 @@ CODES = {
 # Regressions and fits of records of some length: tests/test_identify*.py.
 OF_RECORDS = {
     "identify.LinearStart", "identify.weak_form", "identify.momentum", "identify.gyrostat",
-    "identify.fit", "identify.fit_each", "identify.Status", "identify.Bound", "identify.Plan", "identify.Plan.bound",
+    "identify.fit", "identify.fit_each", "identify.Status", "identify.Bound", "identify.Plan",
+    "identify.Plan.bound",
     "identify.Plan.information", "identify.Plan.told", "identify.profile",
     "identify.optimal_throw", "identify.Optimum", "identify.compare", "identify.Comparison",
     "identify.cross_validate", "identify.train", "identify.residuals", "identify.block_bootstrap",

@@ -159,6 +159,9 @@ class Plan(Readable):
         ('overall scale', 'I3/I1 against gyro scale')
         """
         problem, minimum, layout = jtu.tree_map(np.asarray, _planned_once(self))
+        # Rounding alone is left of residuals; NaN stays, where there is no motion.
+        rows = minimum.rows._replace(residual=0 * minimum.rows.residual)
+        minimum = minimum._replace(rows=rows)
         dtype, samples = layout.ts.dtype, problem.samples
         kept, scales = samples.seen.astype(dtype), np.ones(len(samples.values), dtype)
         found = Fit(minimum, kept, scales, np.zeros(3, dtype), np.zeros(0, dtype))
