@@ -640,3 +640,15 @@ def test_a_rotor_beside_a_scale_that_is_kept_is_refused():
     body = jr.RigidBody(np.ones(3), jr.torques.Rotor(np.array([0.0, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`scale` must be 'rotor' for a system with a"):
         identify.fit(body, identify.Rates(TS, np.ones((200, 3)), 0.01))
+
+
+def test_a_tensor_that_is_known_has_no_numbers_and_its_state_is_found(rng):
+    tensor = body_of(rng)
+    moved, values = seen(rng, tensor)
+    record = identify.Rates(TS, values, 0.01)
+    found = identify.fit(jr.RigidBody(tensor), record, shape=identify.Fixed())
+    assert is_in(found, (Status.OK,)), words(found)
+    assert found.numbers.shape == (0,)
+    np.testing.assert_allclose(found.inertia, tensor)
+    errors = np.sqrt(np.diagonal(found.covariance))
+    assert np.all(np.abs(found.state.omega[0] - moved.omega[0]) < 5 * errors)

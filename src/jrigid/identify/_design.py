@@ -224,12 +224,12 @@ def _jacobian(rows: Rows) -> Array:
     """Of all residuals in the numbers and in each throw's state."""
     throws, samples, width = rows.residual.shape
     count = samples * width
-    jg = rows.of_border.reshape(throws, count, -1)
-    jl = rows.of_state.reshape(throws, count, -1)
-    locals_ = jl.shape[-1]
+    locals_ = rows.of_state.shape[-1]
+    jg = rows.of_border.reshape(throws, count, rows.of_border.shape[-1])
+    jl = rows.of_state.reshape(throws, count, locals_)
     eye = jnp.eye(throws, dtype=jl.dtype)
     apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
-    return jnp.concatenate([jg.reshape(throws * count, -1), apart], axis=1)
+    return jnp.concatenate([jg.reshape(throws * count, jg.shape[-1]), apart], axis=1)
 
 
 def profile(

@@ -102,8 +102,9 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     throws, count, width = rows.residual.shape
     residual = (root * rows.residual).reshape(throws, count * width)
     local = np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    local = (root[..., None] * local).reshape(throws, count * width, -1)
-    shared = (root[..., None] * rows.of_border[..., own:]).reshape(throws, count * width, -1)
+    local = (root[..., None] * local).reshape(throws, count * width, local.shape[-1])
+    shared = root[..., None] * rows.of_border[..., own:]
+    shared = shared.reshape(throws, count * width, units.size)
     shared = np.nan_to_num(shared * units)
     local = np.nan_to_num(local)
     eps, size = np.finfo(units.dtype).eps, units.size
@@ -117,7 +118,7 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     follow = np.where(shown[:, None], half, 0.0) @ along
     rest = shared - u @ along
     scores = (residual[:, None] @ rest)[:, 0] / units
-    r = np.linalg.qr(rest.reshape(-1, size), mode="r")
+    r = np.linalg.qr(rest.reshape(throws * count * width, size), mode="r")
     return _precision(np.asarray(r), half, follow, s, scores, units)
 
 
@@ -215,7 +216,7 @@ def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dic
     """Moments, axes and ratios, with errors, from the numbers and their covariance."""
     found = jtu.tree_map(np.asarray, spectrum(problem.unknowns, numbers))
     tensor, moments, axes, slopes = found
-    elements = slopes.reshape(9, -1)
+    elements = slopes.reshape(9, numbers.size)
     gaps = np.roll(moments, -1) - np.roll(moments, 1)
     floor = np.finfo(gaps.dtype).eps * moments[2]
     gaps = np.where(np.abs(gaps) > floor, gaps, floor)
