@@ -200,14 +200,14 @@ def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array
 
 
 def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
-    """The loop before its first evaluation: nothing is known of the point."""
-    lanes, dtype = settings.steps.shape[0], point.omega.dtype
+    """The loop of one lane before its first evaluation: nothing is known of the point."""
+    dtype = point.omega.dtype
     local = 6 if problem.options.on_attitude else 3
     still = jnp.zeros((*point.omega.shape[:-1], local), dtype)
     border = point.own.shape[-1] + point.numbers.shape[-1]
-    throws, samples, width = problem.samples.weight.shape[1:]
+    throws, samples, width = problem.samples.weight.shape
     # Shapes as `evaluation` returns them.
-    residual = jnp.zeros((lanes, throws, samples + problem.known, width), dtype)
+    residual = jnp.zeros((throws, samples + problem.known, width), dtype)
     rows = Rows(
         residual=residual,
         of_border=jnp.zeros((*residual.shape, border), dtype),
@@ -219,8 +219,7 @@ def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
         of_border=jnp.zeros((*still.shape, border), dtype),
         of_state=jnp.zeros((*still.shape, local), dtype),
     )
-    one = jnp.ones(lanes, dtype)
-    nothing = jnp.zeros(lanes, int)
+    one = jnp.ones((), dtype)
     best = _Place(
         point=point,
         rows=rows,
@@ -236,9 +235,9 @@ def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
         damping=settings.damping,
         growth=2 * one,
         going=settings.steps > 0,
-        settled=nothing > 0,
-        steps=nothing,
-        history=jnp.full((lanes, STEPS), jnp.nan, dtype),
+        settled=jnp.asarray(False),
+        steps=jnp.asarray(0),
+        history=jnp.full(STEPS, jnp.nan, dtype),
     )
 
 
@@ -309,7 +308,7 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
         settled = jnp.where(loop.going, settled, loop.settled)
         return _Loop(best, move, gain, damping, growth, going, settled, steps, history)
 
-    start = _start(problem, point, settings)
+    start = over_lanes(_start)(problem, point, settings)
     end = jax.lax.while_loop(lambda loop: jnp.any(loop.going), body, start)
     numbers = end.best.point.numbers
     return Minimum(
