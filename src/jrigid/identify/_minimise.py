@@ -30,7 +30,7 @@ from jrigid.identify._smoother import (
 )
 from jrigid.identify._unknowns import Unknowns
 
-STEPS = 16  # at most, of one call: lanes that are done do not wait long for the others
+STEPS = 400  # at most, of one call: a stage that is cut in two may end elsewhere in a bent valley
 FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-12
 _STUCK = 1e8
