@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jrigid._checks import demand
+from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import Fixed
 
 _LEAST = 1e-3  # of the largest level, where one of an axis is zero
-_TOLD = 1e-9  # of the largest singular value, as in the fit
 
 
 class Comparison(NamedTuple):
@@ -86,7 +86,7 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
         "unmodelled torque, but they are not.",
     )
     n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
-    states = [jnp.sum(x > _TOLD * x[:, :1]) for x in (y.state_singular_values for y in fits)]
+    states = [jnp.sum(x > SHOWN * x[:, :1]) for x in (y.state_singular_values for y in fits)]
     unknowns = jnp.stack([x.numbers.size + count for x, count in zip(fits, states, strict=True)])
     square, freedom = (jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3])
     left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import is_concrete
 from jrigid._numerics import safe_norm
 from jrigid._types import AnyArray
 from jrigid.identify._records import Record, Samples, first_and_last
@@ -178,11 +177,11 @@ def node_states(told: Told, opening: Array, start: Array) -> tuple[Array, Array 
 
 
 def segments_needed(angle: Array, n: int, length: float) -> int:
-    """How many nodes a throw needs; if the angle is not known yet, for the worst case."""
+    """How many nodes a throw needs; if the angle is not finite, for the worst case."""
     if not length:
         return min(n, MOST_NODES)
     most = n // 2 + 2
-    if not is_concrete(angle) or not 0 <= float(angle) < math.inf:
+    if not 0 <= float(angle) < math.inf:
         return most
     # 8, 32, 128, ...: few programs serve all records.
     needed = max(float(angle) / length + 2, 8.0)

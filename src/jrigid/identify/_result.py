@@ -63,11 +63,10 @@ def errors_of(covariance: Any) -> Any:
 
 
 class FitResult(eqx.Module):
-    """Inertia, state and nuisances with errors; what is a number in one fit is a lane's under vmap.
+    """Inertia, state and nuisances with errors; by `fit_each` with an axis of fits in front.
 
     `print` shows it in words. Errors are standard errors; if no noise was stated, or it does not
-    explain what is left, their level is that of the residuals. Of several bodies this is the first:
-    see `bodies`.
+    explain what is left, their level is that of the residuals.
 
     Attributes:
         status: A `jrigid.identify.Status`.

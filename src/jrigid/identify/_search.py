@@ -53,6 +53,7 @@ _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
+LANES = 8  # records of one compiled call, where there are several
 _LEVELS = 40  # stages in which the level of a torque is sought
 _LEVEL_STEPS = 6  # stages in which a level that is known is reached
 
@@ -232,7 +233,7 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
-    """One stage, in calls of a few steps each: the minimum and the sums of squares of all."""
+    """One stage, in calls of `STEPS` steps each: the minimum and the sums of squares of all."""
     settings, left, histories = request.settings, int(request.settings.steps), []
     while True:
         steps = np.asarray(min(left, STEPS))
@@ -303,12 +304,20 @@ def search(case: Case) -> Search:
 def no_search(case: Case) -> Search:
     """Evaluate nothing: for a record that cannot be used."""
     dtype, samples = case.point.omega.dtype, case.problem.samples
-    one, scales = np.ones((), dtype), np.ones(len(samples.values), dtype)
-    kept, level = np.zeros(samples.ts.shape, dtype), np.ones(3, dtype)
-    yes, none = np.asarray(False), np.asarray(0)
-    settings = Settings(kept, scales, level, one, one, yes, one, none, one)
+    one = np.ones((), dtype)
+    settings = Settings(
+        kept=np.zeros(samples.ts.shape, dtype),
+        scales=np.ones(len(samples.values), dtype),
+        level=np.ones(3, dtype),
+        weight=one,
+        horizon=one,
+        soft=np.asarray(False),
+        enough=one,
+        steps=np.asarray(0),
+        damping=one,
+    )
     minimum = yield Request(case.problem, case.final, case.point, settings)
-    return Fit(minimum, kept, scales, level, np.zeros(0, dtype))
+    return Fit(minimum, settings.kept, settings.scales, settings.level, np.zeros(0, dtype))
 
 
 def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool) -> int:
@@ -392,9 +401,6 @@ def run(searches: Iterable[Search]) -> list[Fit]:
                 found = minima([requests[i] for i in part], lanes)
                 answers |= dict(zip(part, found, strict=True))
     return fits
-
-
-LANES = 8  # records of one compiled call
 
 
 def _alike(requests: dict[int, Request]) -> Iterable[Sequence[int]]:
