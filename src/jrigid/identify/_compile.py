@@ -10,15 +10,32 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-# On a CPU a third of the time goes into code that runs no faster for it, or into many parts;
-# LLVM's second level of optimisation takes a fifth and makes a fit 3 % faster.
-_OPTIONS = {
+# On a CPU a third of the time goes into code that runs no faster for it, or into many parts.
+_ON_CPU = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 2,
-    "xla_backend_optimization_level": 1,
 }
-# Of what runs once in a fit: a third of the compile time for code half as fast.
-_ONCE = _OPTIONS | {"xla_backend_optimization_level": 0}
+# LLVM's second level of optimisation takes a fifth and makes a fit 3 % faster; of what runs once
+# in a fit, no optimisation takes a third of the time for code half as fast.
+_LEVEL, _LEVEL_ONCE = 1, 0
+
+
+@cache
+def _known(name: str) -> bool:
+    """Whether this jaxlib has an option: they come and go with its versions."""
+    try:
+        jax.jit(lambda: 0).lower().compile(compiler_options={name: _ON_CPU[name]})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+def _options(level: int) -> dict[str, Any] | None:
+    """Options of the compiler; None where it is not that of a CPU."""
+    if jax.default_backend() != "cpu":
+        return None
+    known = {name: value for name, value in _ON_CPU.items() if _known(name)}
+    return known | {"xla_backend_optimization_level": level}
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -27,34 +44,28 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     Within another jit, vmap or derivative it is the plain one: options are for whole programs.
     """
     plain = eqx.filter_jit(function)
-    options: dict[str, Any] = {"compiler_options": _OPTIONS}
-    quick = eqx.filter_jit(function, **options)
-    known = True
+
+    @cache
+    def quick() -> Any:
+        options: dict[str, Any] = {"compiler_options": _options(_LEVEL)}
+        return eqx.filter_jit(function, **options)
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        nonlocal known
         # Under jit even a constant becomes a tracer once something is done to it.
         values = [*jax.tree_util.tree_leaves(args), jnp.zeros(()) + 0]
         traced = any(isinstance(x, jax.core.Tracer) for x in values)
-        if known and not traced and jax.default_backend() == "cpu":
-            try:
-                return quick(*args)
-            except jax.errors.JaxRuntimeError as error:
-                if "xla_cpu_use_fusion_emitters" not in str(error):
-                    raise
-                known = False  # another jaxlib may not have the option
-        return plain(*args)
+        return plain(*args) if traced else quick()(*args)
 
     return call
 
 
-def program(function: Callable[..., Any], options: dict[str, Any] = _OPTIONS) -> Any:
+def program(function: Callable[..., Any], level: int = _LEVEL) -> Any:
     """`jax.jit` of a function of pytrees of arrays, numpy's or JAX's, and functions.
 
     Args:
         function: The function.
-        options: Of the compiler, on a CPU.
+        level: Of LLVM's optimisation, on a CPU.
     """
 
     def of_leaves(arrays: list[Any], static: Static) -> Any:
@@ -66,8 +77,7 @@ def program(function: Callable[..., Any], options: dict[str, Any] = _OPTIONS) ->
 
     @cache
     def compiled() -> Any:
-        on_cpu = jax.default_backend() == "cpu"
-        return jax.jit(of_leaves, compiler_options=options if on_cpu else None)
+        return jax.jit(of_leaves, compiler_options=_options(level))
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -82,7 +92,7 @@ def program(function: Callable[..., Any], options: dict[str, Any] = _OPTIONS) ->
 
 def small_program(function: Callable[..., Any]) -> Any:
     """A `program` that runs once or twice in a fit."""
-    return program(function, _ONCE)
+    return program(function, _LEVEL_ONCE)
 
 
 class Static:
