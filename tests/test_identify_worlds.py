@@ -70,7 +70,9 @@ def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, rng):
         own = np.asarray(found.sensor_covariance)[good]
         ratio = np.diagonal(np.asarray(found.numbers_covariance)[good] / own, axis1=1, axis2=2)
         assert np.median(ratio) < 1.05
-    assert bool(jnp.all(found.level == found.level[:, :1]))
+    alike = np.all(np.asarray(found.level) == np.asarray(found.level)[:, :1], axis=1)
+    assert np.mean(alike) > 0.5  # axes of their own are asked for by chance in some
+    assert np.median(np.asarray(found.correlation_time)) < STEP
 
 
 def test_a_level_that_is_known_is_that_which_is_estimated(smoothed, rng):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jrigid._checks import demand
+from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._result import FitResult
@@ -102,8 +103,9 @@ def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
     stated = all(x.states_noise for throw in records for x in throw)
     demand(stated, "Argument `throws` must state the noise, but one does not.")
     level = jnp.maximum(found.level, _LEAST * jnp.max(found.level))
+    torque = GaussMarkov(level, found.correlation_time)
     loss = "robust" if options.robust else "squares"
-    rest = {"unmodelled": level, "loss": loss, "motion": options.motion}
+    rest = {"unmodelled": torque, "loss": loss, "motion": options.motion}
     return fit(system, records, shape=Fixed(), throw=False, **rest)
 
 

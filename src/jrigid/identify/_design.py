@@ -20,6 +20,7 @@ from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify import _problem as problems
 from jrigid.identify._compile import Static, program, quick_jit
+from jrigid.identify._disturbance import no_disturbance
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
@@ -164,9 +165,10 @@ class Plan(Readable):
         minimum = minimum._replace(rows=rows)
         dtype, samples = layout.ts.dtype, problem.samples
         kept, scales = samples.seen.astype(dtype), np.ones(len(samples.values), dtype)
-        found = Fit(minimum, kept, scales, np.zeros(3, dtype), np.zeros(0, dtype))
+        none = no_disturbance(kept.shape[0], dtype)
+        found = Fit(minimum, layout, kept, scales, none, None, np.zeros(0, dtype))
         lengths = [x.shape[1] for x in samples.values]
-        return FitResult(**jax.device_put(conclude(problem, layout, found, lengths)))
+        return FitResult(**jax.device_put(conclude(problem, found, lengths)))
 
 
 def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
@@ -185,7 +187,7 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
     unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype)), 1e-9)
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
     omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
-    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega)
+    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega, omega[..., :0])
     on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
     options, layout = problems.Options(system.is_free, on_attitude), whole(samples, 1, plan.t0)
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
@@ -199,13 +201,13 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
     prior = problem.known - problem.held
     weight = jnp.pad(samples.seen.astype(dtype), ((0, 0), (0, prior)), constant_values=1)
-    none, local = jnp.zeros((), dtype), links.gap.shape[-1]
+    none = jnp.zeros((), dtype)
     minimum = Minimum(
         point=point,
         rows=rows,
         links=links,
         weight=jnp.pad(weight, ((0, 0), (0, problem.held))),
-        whitener=jnp.zeros((*links.gap.shape, local), dtype),
+        kicks=none,
         square=none,
         settled=jnp.asarray(True),
         steps=jnp.asarray(0),
@@ -289,7 +291,7 @@ class _Held(eqx.Module):
 
 def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
     """Fit anew at each value, all of them side by side."""
-    options = result.problem.options._replace(shooting=False, level="none", nodes=1)
+    options = result.problem.options._replace(shooting=False, unmodelled="none", nodes=1)
     result = jtu.tree_map(np.asarray, result)
     problem = dataclasses.replace(result.problem, options=options)
     unknowns, numbers, dtype = result.unknowns, result.numbers, result.numbers.dtype
@@ -301,7 +303,7 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     settings = Settings(
         kept=result.kept.astype(dtype),
         scales=result.scales,
-        level=np.ones(3, dtype),
+        disturbance=no_disturbance(result.kept.shape[0], dtype),
         weight=0 * one,
         horizon=2 * one,
         soft=np.asarray(False),
@@ -309,7 +311,7 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
         steps=np.asarray(STEPS),
         damping=FIRST_DAMPING * one,
     )
-    point = Point(numbers, result.own_numbers, *states)
+    point = Point(numbers, result.own_numbers, *states, states[1][..., :0])
 
     def request(value: Any) -> Request:
         hold = _Held(function, value.astype(dtype), unit.astype(dtype))

@@ -12,16 +12,14 @@ import numpy as np
 
 from jrigid._checks import RESULTS, is_good
 from jrigid.dynamics import State
+from jrigid.identify import _colour as colour
+from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
+from jrigid.identify import _trials as trials
+from jrigid.identify._disturbance import Disturbance
+from jrigid.identify._filter import innovations
 from jrigid.identify._layout import Layout
-from jrigid.identify._minimise import (
-    Evidence,
-    equations,
-    evidence,
-    link_whitener_of,
-    spectrum,
-    tensors_at,
-)
+from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples
@@ -30,11 +28,8 @@ from jrigid.identify._smoother import Links, Rows
 
 SHOWN = 1e-9  # of the largest singular value: a change of the state that the record shows
 _FAR = 1.0  # a change of a number beyond which the tensor is another one
-FAINT = 1e-4  # of the level that links of weight 1 stand for: no torque at all
 HISTORY = 512  # steps whose sums of squares are returned
 _TRIED = 0.03  # of the level that moves a rate by its noise: where one of zero is judged
-_WHITE = 6.0  # standard deviations of the correlation of neighbouring residuals
-_COLOURED = 0.25  # ... and its size, for residuals that are no noise
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
@@ -67,6 +62,7 @@ class Precision(NamedTuple):
         follow: How these follow the numbers, with the sign turned.
         of_state: Singular values of each throw's state, of unit columns, descending.
         scores: What each throw adds to the gradient of half the squares in the numbers.
+        information: What each throw tells of the numbers, in natural units.
     """
 
     values: np.ndarray
@@ -76,24 +72,7 @@ class Precision(NamedTuple):
     follow: np.ndarray
     of_state: np.ndarray
     scores: np.ndarray
-
-
-def _precision(
-    r: np.ndarray,
-    half: np.ndarray,
-    follow: np.ndarray,
-    of_state: np.ndarray,
-    scores: np.ndarray,
-    units: np.ndarray,
-) -> Precision:
-    """From the triangular factor of the numbers in natural units."""
-    sound = np.all(np.isfinite(r))
-    _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
-    largest = np.max(values, initial=0.0)
-    floor = np.maximum(values, 16 * np.finfo(r.dtype).eps * largest + 1e-150)
-    root = vt / floor[:, None] * units if sound else np.full_like(vt, np.nan)
-    local = half @ np.swapaxes(half, 1, 2)
-    return Precision(values, vt.T, root.T @ root, local, follow / units, of_state, scores)
+    information: np.ndarray
 
 
 def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarray) -> Precision:
@@ -118,30 +97,34 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     follow = np.where(shown[:, None], half, 0.0) @ along
     rest = shared - u @ along
     scores = (residual[:, None] @ rest)[:, 0] / units
+    information = np.swapaxes(rest, 1, 2) @ rest
     r = np.linalg.qr(rest.reshape(throws * count * width, size), mode="r")
-    return _precision(np.asarray(r), half, follow, s, scores, units)
+    sound = np.all(np.isfinite(r))
+    _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
+    floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
+    root = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
+    return Precision(
+        values=values,
+        directions=vt.T,
+        covariance=root.T @ root,
+        local=half @ np.swapaxes(half, 1, 2),
+        follow=follow / units,
+        of_state=s,
+        scores=scores,
+        information=information,
+    )
 
 
-def precision_of_fit(fit: Fit, units: np.ndarray) -> Precision:
-    """By the normal equations of the smoother, its links included."""
-    minimum = fit.minimum
-    parts = minimum.point, minimum.rows, minimum.links, minimum.weight, minimum.whitener
-    left = jtu.tree_map(np.asarray, equations(*parts))
-    scale = np.sqrt(np.maximum(np.diagonal(left.inner, axis1=1, axis2=2), 1e-300))
-    inner = left.inner / scale[:, :, None] / scale[:, None, :]
-    matrix = left.numbers * units[:, None] * units[None, :]
-    sound = np.all(np.isfinite(inner)) and np.all(np.isfinite(matrix))
-    if not sound:
-        inner, matrix = np.broadcast_to(np.eye(inner.shape[-1]), inner.shape), np.eye(units.size)
-    values, axes = np.linalg.eigh(inner)
-    values = np.maximum(values, np.finfo(units.dtype).eps)
-    half = axes / np.sqrt(values)[:, None, :] / scale[:, :, None]
-    s, axes = np.linalg.eigh(matrix)
-    r = np.sqrt(np.maximum(s, 0.0))[:, None] * axes.T
-    r = r if sound else np.full_like(r, np.nan)
-    follow = left.follow * units
-    of_state = np.sqrt(values)[:, ::-1]
-    return _precision(r, half, follow, of_state, left.scores, units)
+def innovations_of(fit: Fit, disturbance: Disturbance) -> Rows:
+    """Innovations of a record pushed by a torque: rows in first states, own numbers and numbers.
+
+    Rows of what is known beforehand come last, and have their weights too.
+    """
+    columns = np.asarray(innovations(quality.linearised(fit), disturbance).rows)
+    columns = np.concatenate([columns, quality.columns_of_prior(fit)], axis=1)
+    border = 1 + fit.minimum.links.gap.shape[-1]
+    of_border, of_state = columns[..., border:], columns[..., 1:border]
+    return Rows(columns[..., 0], of_border, of_state, np.zeros_like(fit.minimum.rows.node))
 
 
 class Weakest(NamedTuple):
@@ -154,20 +137,24 @@ class Weakest(NamedTuple):
     normal: np.ndarray  # whose product with that is one
 
 
-def precision(problem: Problem, fit: Fit) -> Precision:
-    """Of the smoother where there is an unmodelled torque, else of the rows alone."""
+def _rows_of_fit(problem: Problem, fit: Fit) -> tuple[Rows, np.ndarray]:
+    """Independent rows of a fit, and their weights: innovations where a torque may have acted."""
     minimum = fit.minimum
-    own, units = minimum.point.own.shape[-1], minimum.units
-    if problem.options.dense:
-        return precision_of_fit(fit, units)
-    rows = condensed(minimum.rows, minimum.links)
-    return precision_of_rows(rows, minimum.weight, own, units)
+    if not problem.options.dense:
+        return condensed(minimum.rows, minimum.links), minimum.weight
+    return innovations_of(fit, fit.disturbance), np.ones_like(minimum.weight)
+
+
+def precision(problem: Problem, fit: Fit) -> Precision:
+    """What a fit determines of the numbers."""
+    own, units = fit.minimum.point.own.shape[-1], fit.minimum.units
+    return precision_of_rows(*_rows_of_fit(problem, fit), own, units)
 
 
 def weakest(problem: Problem, fit: Fit) -> Weakest:
     """The direction in the numbers that the record determines least."""
     minimum, units = fit.minimum, fit.minimum.units
-    square, noise = float(minimum.square) + fit.kicks, 1.0
+    square, noise = float(minimum.square + minimum.kicks), 1.0
     if not problem.options.noise_known:
         throws, local = minimum.links.gap.shape[0], minimum.links.gap.shape[-1]
         counted = np.sum(quality.weights_of(problem, fit.kept))
@@ -180,36 +167,52 @@ def weakest(problem: Problem, fit: Fit) -> Weakest:
     return Weakest(square, noise, error, direction * units, direction / units)
 
 
-def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> np.ndarray:
-    """The torque's level that moves a rate by its noise from node to node, for each axis."""
+def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
+    """The level of a torque that moves a rate by its noise from node to node."""
     span = np.sum(np.where(layout.linked, layout.end - layout.start, 0.0))
     mean = span / max(np.sum(layout.linked), 1)
     size = np.trace(tensor) / 3
-    level = problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0)
-    return np.full(3, level, problem.noise.dtype)
+    return float(problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0))
 
 
-def evidence_of(problem: Problem, fit: Fit, whitener: Any) -> Evidence:
-    """What the record says of the torque's level; of one level for all axes, thrice the same."""
-    minimum = fit.minimum
-    parts = minimum.point, minimum.rows, minimum.links, minimum.weight, whitener
-    seen = jtu.tree_map(np.asarray, evidence(problem, *parts))
-    if problem.options.level == "estimate per axis":
-        return seen
-    return Evidence(*(np.full(3, np.sum(x)) for x in seen))
-
-
-def _levels(problem: Problem, layout: Layout, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """The level of the unmodelled torque and its errors; zero where the links are rigid."""
-    first = first_level(problem, layout, fit.minimum.tensor)
-    faint = fit.level <= 1.01 * FAINT * first
-    tried = np.where(faint, _TRIED * first, fit.level)
-    numbers = fit.minimum.point.numbers
-    whitener = link_whitener_of(problem, layout, numbers, tried)
-    information = evidence_of(problem, fit, whitener).information
-    # That of a level near zero is in proportion to its fourth power: the least to be seen.
-    errors = tried * np.where(faint, information**-0.25, 0.5 * information**-0.5)
-    return np.where(faint, 0.0, fit.level), errors
+def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
+    """Level and correlation time of the unmodelled torque, with errors."""
+    throws, none = fit.kept.shape[0], np.zeros(3)
+    fields = {
+        "level": none,
+        "level_errors": none,
+        "correlation_time": none,
+        "correlation_time_errors": none,
+        "level_by_trial": np.ones(throws),
+    }
+    if not problem.options.dense:
+        return fields
+    # A level was relative to a noise that was not known.
+    size = 1.0 if problem.options.noise_known else np.sqrt(inflation)
+    first = first_level(problem, fit.layout, fit.minimum.tensor)
+    search = levels.Search(problem, fit.layout, first)
+    torque = fit.torque
+    if torque is None:
+        given = fit.disturbance
+        torque = levels.known(np.asarray(given.level[0], float), np.asarray(given.time, float))
+    faint = search.is_faint(torque)
+    if faint:
+        tried = search.start(_TRIED * first, throws)
+        # Near none the likelihood is quadratic in the level squared: the least to be seen.
+        error = search.errors(tried, fit)[0]
+        found = tried.typical.level * np.sqrt(2 * error) * size
+        return fields | {"level_errors": found}
+    typical, errors = torque.typical, search.errors(torque, fit)
+    of_levels, of_times = np.split(errors, [torque.form.levels])
+    fields |= {
+        "level": size * typical.level,
+        "level_errors": size * typical.level * of_levels,
+        "correlation_time": typical.time,
+        "level_by_trial": np.exp(torque.trials),
+    }
+    if torque.form.times:
+        fields["correlation_time_errors"] = typical.time * of_times
+    return fields
 
 
 def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dict[str, Any]:
@@ -271,7 +274,6 @@ def _spread_of_moments(problem: Problem, numbers: np.ndarray, covariance: np.nda
 @np.errstate(all="ignore")  # what is not finite is judged below
 def conclude(
     problem: Problem,
-    layout: Layout,
     fit: Fit,
     lengths: Sequence[int],
     input_result: Any = RESULTS.successful,
@@ -280,7 +282,6 @@ def conclude(
 
     Args:
         problem: The record, filled up to a rounded number of samples.
-        layout: Of the last stage.
         fit: The minimum.
         lengths: How many samples of each record to return.
         input_result: What is wrong with the input.
@@ -289,24 +290,22 @@ def conclude(
     point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
     rows = condensed(minimum.rows, minimum.links)
     sensor = precision_of_rows(rows, minimum.weight, own, units)
-    known, kicks = sensor, 0.0
-    level = level_errors = np.zeros(3, units.dtype)
+    known, innovations, kicks = sensor, None, 0.0
     if options.dense:
-        known, kicks = precision_of_fit(fit, units), fit.kicks
-        level, level_errors = _levels(problem, layout, fit)
+        independent, weight = _rows_of_fit(problem, fit)
+        known = precision_of_rows(independent, weight, own, units)
+        innovations, kicks = independent.residual[:, : fit.kept.shape[1]], float(minimum.kicks)
     residuals, jacobian = _weighted(fit, rows, own)
     parts = problem.samples.parts
-    judged = _judged(problem, fit, known, kicks, residuals)
+    judged = _judged(problem, fit, known, kicks, residuals if innovations is None else innovations)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
-    if not options.noise_known:  # the level was relative to the noise
-        level, level_errors = (np.sqrt(inflation) * x for x in (level, level_errors))
     derived = derive(problem, point.numbers, covariance)
     loose = np.any(derived["ratios_errors"] > LARGEST_ERROR * derived["ratios"])
     if not is_good(input_result):
         judged["status"] = "BAD_INPUT"
     elif loose and judged["status"] == "OK":
         judged["status"] = "UNIDENTIFIABLE"
-    fields = judged | derived
+    fields = judged | derived | _of_torque(problem, fit, float(inflation))
     fields |= {
         "numbers": point.numbers,
         "own_numbers": point.own,
@@ -316,12 +315,10 @@ def conclude(
         "follow": known.follow,
         "scores": known.scores,
         "state": State(point.attitude[:, 0], point.omega[:, 0]),
-        "t0": layout.start[:, 0],
+        "t0": fit.layout.start[:, 0],
         "residuals": _resized(residuals, parts, lengths),
         "jacobian": _resized(jacobian, parts, lengths),
         "state_singular_values": sensor.of_state,
-        "level": level,
-        "level_errors": level_errors,
         "scales": fit.scales,
         "kept": _resized(fit.kept, parts, lengths) > 0,
         "history": np.pad(fit.history, (0, HISTORY), constant_values=np.nan)[:HISTORY],
@@ -389,12 +386,25 @@ def _widened(known: Precision, error: float, units: np.ndarray) -> Precision:
     """With an error of the weakest direction, in natural units, of at least this size."""
     if not error > 0:
         return known
-    last, direction = known.values[-1], known.directions[:, -1] * units
-    more = max(error**2 - 1 / max(last, 1e-150) ** 2, 0.0)
-    values = known.values.copy()
-    values[-1] = min(values[-1], 1 / error)
-    covariance = known.covariance + more * direction[:, None] * direction[None, :]
-    return known._replace(values=values, covariance=covariance)
+    factors = np.ones(units.size)
+    factors[-1] = max(error * known.values[-1], 1.0)
+    return _with_larger_errors(known, factors, units)
+
+
+def _with_larger_errors(known: Precision, factors: np.ndarray, units: np.ndarray) -> Precision:
+    """With errors so many times larger along each direction."""
+    directions = known.directions * units[:, None] / np.maximum(known.values, 1e-150)
+    more = directions * np.sqrt(factors**2 - 1)
+    covariance = known.covariance + more @ more.T
+    return known._replace(values=known.values / factors, covariance=covariance)
+
+
+def _scatter_of_trials(known: Precision, alive: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Errors by the scatter of trials over those stated, along each direction; 1 of few trials."""
+    if np.sum(alive) < trials.FEWEST or not np.all(np.isfinite(known.scores)):
+        return np.ones(units.size)
+    scores = known.scores[alive] * units
+    return trials.scatter(scores, known.values, known.directions)
 
 
 def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
@@ -415,24 +425,29 @@ def _judged(
     settled = bool(fit.minimum.settled)
     whiteness = _whiteness(residuals, problem.samples.parts)
     weight = quality.weights_of(problem, fit.kept)
-    alive = np.any(fit.kept > 0, axis=1)[:, None]
-    shown = np.sum((known.of_state > SHOWN * known.of_state[:, :1]) & alive)
+    alive = np.any(fit.kept > 0, axis=1)
+    shown = np.sum((known.of_state > SHOWN * known.of_state[:, :1]) & alive[:, None])
     rows = fit.minimum.rows.residual
     prior = rows[:, count : rows.shape[1] - problem.held]
     freedom = np.sum(weight) + np.sum(prior != 0) - units.size - shown
     chi_square = np.sum(weight * fit.residual**2) + np.sum(prior**2) + kicks
     noise = chi_square / max(freedom, 1.0)
+    band, sure = colour.loudest_band(residuals, problem.samples.parts)
+    coloured = band > colour.STRONG and sure > colour.SURE
     if options.noise_known:
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
         overstated = 0 < noise < 1 - gate  # a plan has no residuals
         misfit = noise > 1 + gate or np.max(fit.scales) > 2
-        inflation = max(noise, 1.0) if misfit else 1.0
     else:
-        like, sure = whiteness
-        misfit = like > _COLOURED and sure > _WHITE
-        overstated, inflation = False, noise
+        misfit, overstated = False, False
+    inflation = noise if misfit or not options.noise_known else 1.0
+    # A band that stands out may be the one that tells the numbers.
+    inflation = inflation * band if coloured else inflation
+    apart = _scatter_of_trials(known, alive, units) / np.sqrt(inflation)
+    misfit = misfit or coloured or np.any(apart > trials.DISAGREEING)
     if units.size:
         known = _widened(known, fit.probed_error / np.sqrt(inflation), units)
+        known = _with_larger_errors(known, np.maximum(apart, 1.0), units)
     pure = quality.is_pure(problem, fit, inflation)
     left = quality.unexplained(problem, fit, kicks)
     flat = quality.is_at_boundary(problem, fit)
@@ -460,6 +475,7 @@ def _judged(
         "degrees_of_freedom": np.asarray(int(freedom)),
         "reduced_chi_square": noise,
         "whiteness": whiteness,
+        "loudest_band": (band, sure),
         "chi_square_by_throw": np.sum(residuals**2, axis=(1, 2)) / seen,
         "inflation": np.asarray(inflation),
         "unexplained": np.asarray(left),

@@ -15,6 +15,7 @@ from jrigid._checks import check_option, check_type, demand, is_good, settle
 from jrigid._core.third_party import code_of
 from jrigid.dynamics import State
 from jrigid.identify._compile import Static, small_program
+from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
 from jrigid.identify._inputs import (
@@ -100,8 +101,11 @@ def fit(
             one throw or with an axis of throws in front; or (inertia or None, State or None).
             Needed where the attitude matters and was not observed: an attitude nearer than about
             half a turn will do.
-        unmodelled: A torque that no model has, white, of this level s [N m sqrt(s)] (its spectral
-            density is s^2), for all body axes or for each; or "estimate", or "estimate per axis".
+        unmodelled: A torque that no model has: the level [N m sqrt(s)] of a white one (its spectral
+            density is the level squared), for all body axes or for each; a `GaussMarkov`, which has
+            a memory; or "estimate": of white torques and those with a memory, with levels and
+            times for all axes or for each, and levels in proportion to the spin of a trial or of
+            its own, the one whose likelihood asks for it.
         loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard deviations
             are left out, throws with more than a quarter of such samples altogether, and the rest
             is fitted by squares.
@@ -239,7 +243,7 @@ class _Asked(NamedTuple):
     options: Options
     tensor: Any
     state: State | None
-    level: np.ndarray
+    torque: GaussMarkov
     free: Callable[..., Any] | None
     scale: str
     shape: AbstractShape
@@ -267,7 +271,7 @@ def _asked(
     refuse(systems[0], records, scale, shape)
     tensor, state = start_of(start, throws)
     stated = all(x.states_noise for x in records)
-    kind, level = _level(unmodelled, absolute_sigma and stated)
+    kind, torque = _torque(unmodelled, absolute_sigma and stated)
     demand(
         stated or len(records) == 1,
         "Argument `observations` must state the noise of each kind where there are several, but "
@@ -276,31 +280,35 @@ def _asked(
     options = Options(
         free_motion=systems[0].is_free and motion is None,
         on_attitude=any(x.sensor.on_attitude for x in records) or depends_on_attitude(systems[0]),
-        level=kind,
+        unmodelled=kind,
         robust=loss == "robust",
         noise_known=absolute_sigma and stated,
         motion=motion,
     )
     options = options._replace(shooting=_shoots(options, systems[0], records, state))
-    return _Asked(systems, records, options, tensor, state, level, free, scale, shape)
+    return _Asked(systems, records, options, tensor, state, torque, free, scale, shape)
 
 
-def _level(unmodelled: Any, stated: bool) -> tuple[str, Any]:
-    """What is to be done about the unmodelled torque, and its level for each axis."""
+def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
+    """What is to be done about the unmodelled torque, and the torque if it is known."""
     if isinstance(unmodelled, str):
-        check_option("unmodelled", unmodelled, ("estimate", "estimate per axis"))
-        return unmodelled, np.zeros(3)
-    level = np.asarray(unmodelled, float)
-    good = level.shape in ((), (3,)) and (np.all(level == 0) or np.all(level > 0))
-    demand(
-        bool(good and np.all(np.isfinite(level))),
-        "Argument `unmodelled` must be 0, a positive level, one for each body axis, 'estimate' or "
-        f"'estimate per axis', but it is {unmodelled!r}.",
+        check_option("unmodelled", unmodelled, ("estimate",))
+        return "estimate", GaussMarkov(0.0)
+    text = (
+        "Argument `unmodelled` must be 0, a positive level, one for each body axis, a "
+        f"`GaussMarkov` or 'estimate', but it is {unmodelled!r}."
     )
-    kind, text = "known" if np.any(level > 0) else "none", "where the noise is not known"
-    text = f"Argument `unmodelled` must be 0 or estimated {text}, but it is given."
-    demand(stated or kind == "none", text)
-    return kind, np.broadcast_to(level, 3)
+    torque = unmodelled
+    if not isinstance(torque, GaussMarkov):
+        demand(np.shape(unmodelled) in ((), (3,)), text)
+        torque = GaussMarkov(unmodelled)
+    level, time = np.asarray(torque.level), np.asarray(torque.time)
+    good = np.all(level == 0) or np.all(level > 0)
+    demand(bool(good and np.all(np.isfinite(level)) and np.all(time >= 0)), text)
+    known = bool(np.any(level > 0))
+    text = "Argument `unmodelled` must be 0 or estimated where the noise is not known, but it is "
+    demand(stated or not known, text + "given.")
+    return "known" if known else "none", torque
 
 
 def _shoots(
@@ -400,7 +408,9 @@ def _begun(
             jnp.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
             for x in (state.omega, state.attitude)
         )
-    point = Point(numbers[0], unknowns.own_start(throws, dtype), attitude, omega)
+    torque = omega if options.dense else omega[..., :0]
+    own = unknowns.own_start(throws, dtype)
+    point = Point(numbers[0], own, attitude, omega, jnp.zeros_like(torque))
     return _Begun(unknowns, numbers, single, cut, point, unknowns.inertia(numbers[0]))
 
 
@@ -446,7 +456,7 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
         point=begun.point,
         starts=begun.numbers,
         tensor=begun.tensor,
-        level=asked.level.astype(dtype),
+        torque=asked.torque,
         coarse=bool(observed.coarse),
         long=bool(observed.angle > _LONG),
         effort=effort,
@@ -461,7 +471,7 @@ def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[
     lengths = [max(x) for x in zip(*(_lengths(y.records) for y in requests), strict=True)]
     results = []
     for (case, input_result), found in zip(cases, run(searches), strict=True):
-        fields = conclude(case.problem, case.final, found, lengths, input_result)
+        fields = conclude(case.problem, found, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and code_of(fields["status"]) == code_of(status):
                 raise RuntimeError(Status[status])

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid.identify._compile import program, small_program
+from jrigid.identify._disturbance import Disturbance, Push, push_of, with_torque
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem, evaluation
 from jrigid.identify._smoother import (
@@ -23,9 +24,7 @@ from jrigid.identify._smoother import (
     Point,
     Rows,
     blocks_of,
-    eliminated,
     moved,
-    reduced,
     step_of,
 )
 from jrigid.identify._unknowns import Unknowns
@@ -43,7 +42,7 @@ class Settings(NamedTuple):
     Attributes:
         kept: 1 for each sample that takes part, 0 for one that does not (throws, samples).
         scales: Size of each record's residuals, in units of the noise.
-        level: Of the unmodelled torque about each axis, where there is one.
+        disturbance: The unmodelled torque, where there is one.
         weight: Of the links, in units of the noise, where there is none.
         horizon: Fraction of the record that takes part.
         soft: Whether the loss is Cauchy's.
@@ -54,7 +53,7 @@ class Settings(NamedTuple):
 
     kept: Any
     scales: Any
-    level: Any
+    disturbance: Disturbance
     weight: Any
     horizon: Any
     soft: Any
@@ -69,9 +68,9 @@ class Minimum(NamedTuple):
     Attributes:
         point: Numbers and states.
         rows: Residuals there and their derivatives.
-        links: Gaps between segments and their derivatives.
+        links: Gaps between segments and their derivatives, without the unmodelled torque.
         weight: Of each row (throws, rows).
-        whitener: Of each link.
+        kicks: Sum of squares of the whitened gaps.
         square: Sum of squares of the rows, or what stands for it under Cauchy's loss.
         settled: Whether no step was worth taking any more.
         steps: How many were taken.
@@ -85,7 +84,7 @@ class Minimum(NamedTuple):
     rows: Rows
     links: Links
     weight: Any
-    whitener: Any
+    kicks: Any
     square: Any
     settled: Any
     steps: Any
@@ -128,26 +127,18 @@ def weights(
     return jnp.where(soft, weight / (1 + square / bend), weight), total
 
 
-def link_whitener(
-    problem: Problem, layout: Layout, numbers: Array, level: Array, weight: Array
-) -> Array:
-    """What turns gaps of links (throws, nodes, local) into units of what they are allowed.
-
-    Between nodes dt apart a white torque of spectral density s^2 makes a random walk of the
-    momentum, s sqrt(dt), and of its integral.
-    """
+def push_over(problem: Problem, layout: Layout, numbers: Array, settings: Settings) -> Push:
+    """What may come between the end of a segment and the start of the next."""
+    if problem.options.dense:
+        tensor, span = problem.unknowns.inertia(numbers), layout.end - layout.start
+        on_attitude = problem.options.on_attitude
+        return push_of(settings.disturbance, span, layout.linked, tensor, on_attitude)
     local = 6 if problem.options.on_attitude else 3
-    linked = layout.linked.astype(level.dtype)
-    if not problem.options.dense:
-        return product("ts,ij->tsij", linked, jnp.diag(weight / problem.noise[:local]))
-    dt = jnp.where(layout.linked, layout.end - layout.start, 1.0)
-    tensor = problem.unknowns.inertia(numbers)
-    of_rate = product("ts,i,ij->tsij", linked / jnp.sqrt(dt), 1 / level, tensor)
-    if local == 3:
-        return of_rate
-    of_turn = of_rate * 12**0.5 / dt[..., None, None]
-    none = jnp.zeros_like(of_rate)
-    return jnp.block([[of_rate, none], [-(3**0.5) * of_rate, of_turn]])
+    linked = layout.linked.astype(numbers.dtype)
+    size = jnp.diag(settings.weight / problem.noise[:local])
+    whitener = product("ts,ij->tsij", linked, size)
+    nothing = jnp.zeros_like(whitener)
+    return Push(covariance=nothing, whitener=whitener, carried=nothing)
 
 
 class _Place(NamedTuple):
@@ -157,6 +148,7 @@ class _Place(NamedTuple):
     rows: Rows
     links: Links
     weight: Array
+    kicks: Array
     square: Array
     cost: Array
 
@@ -204,6 +196,7 @@ def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
     dtype = point.omega.dtype
     local = 6 if problem.options.on_attitude else 3
     still = jnp.zeros((*point.omega.shape[:-1], local), dtype)
+    move = jnp.concatenate([still, jnp.zeros_like(point.torque)], axis=-1)
     border = point.own.shape[-1] + point.numbers.shape[-1]
     throws, samples, width = problem.samples.weight.shape
     # Shapes as `evaluation` returns them.
@@ -218,6 +211,7 @@ def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
         gap=still,
         of_border=jnp.zeros((*still.shape, border), dtype),
         of_state=jnp.zeros((*still.shape, local), dtype),
+        torque=still[:, 0, :0],
     )
     one = jnp.ones((), dtype)
     best = _Place(
@@ -225,12 +219,13 @@ def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
         rows=rows,
         links=links,
         weight=jnp.zeros(residual.shape[:-1], dtype),
+        kicks=0 * one,
         square=jnp.inf * one,
         cost=jnp.inf * one,
     )
     return _Loop(
         best=best,
-        move=(jnp.zeros_like(point.numbers), jnp.zeros_like(point.own), still),
+        move=(jnp.zeros_like(point.numbers), jnp.zeros_like(point.own), move),
         gain=one,
         damping=settings.damping,
         growth=2 * one,
@@ -265,18 +260,21 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
     """
     over_lanes = jax.vmap if settings.steps.shape[0] > 1 else _of_one_lane
     evaluate = over_lanes(lambda problem, layout, point: evaluation(problem, layout)(point))
-    whitener = over_lanes(link_whitener)(
-        problem, layout, point.numbers, settings.level, settings.weight
-    )
+    push = over_lanes(push_over)(problem, layout, point.numbers, settings)
     own = point.own.shape[-1]
 
-    def costs(rows: Rows, links: Links) -> tuple[Array, Array, Array]:
-        weight, square = over_lanes(weights)(problem, layout, settings, rows)
-        gap = product("ltsij,ltsj->ltsi", whitener, links.gap)
-        return weight, square, square + jnp.sum(gap * gap, axis=(1, 2, 3))
+    def whole(rows: Rows, links: Links, push: Push, torque: Array) -> tuple[Rows, Links]:
+        """Rows and links of states that hold the torque, if there is one."""
+        return with_torque(rows, links, push, torque) if torque.shape[-1] else (rows, links)
 
-    def next_step(rows: Rows, links: Links, weight: Array, white: Array, damping: Array) -> Any:
-        return step_of(blocks_of(rows, links, weight, white), own, damping)
+    def kicks_of(rows: Rows, links: Links, push: Push, torque: Array) -> Array:
+        links = whole(rows, links, push, torque)[1]
+        gap = product("tsij,tsj->tsi", push.whitener, links.gap)
+        return jnp.sum(gap * gap) + jnp.sum(links.torque**2)
+
+    def next_step(place: _Place, push: Push, damping: Array) -> Any:
+        rows, links = whole(place.rows, place.links, push, place.point.torque)
+        return step_of(blocks_of(rows, links, place.weight, push.whitener), own, damping)
 
     def worth(cost: Array) -> Array:
         """The gain below which a step is not worth taking."""
@@ -289,14 +287,15 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
     def body(loop: _Loop) -> _Loop:
         point = over_lanes(moved)(loop.best.point, loop.move)
         rows, links = evaluate(problem, layout, point)
-        weight, square, cost = costs(rows, links)
+        weight, square = over_lanes(weights)(problem, layout, settings, rows)
+        kicks = over_lanes(kicks_of)(rows, links, push, point.torque)
+        cost = square + kicks
         finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(rows.of_border), axis=(1, 2, 3, 4))
         better = loop.going & finite & (cost <= loop.best.cost)
-        trial = _Place(point, rows, links, weight, square, cost)
+        trial = _Place(point, rows, links, weight, kicks, square, cost)
         best: _Place = _chosen(better, trial, loop.best)
         damping, growth = _next_damping(loop, better, cost)
-        equations = best.rows, best.links, best.weight, whitener, damping
-        move, gain = over_lanes(next_step)(*equations)
+        move, gain = over_lanes(next_step)(best, push, damping)
         gain_worth = worth(best.cost)
         settled = (gain <= gain_worth) & (damping <= 1e-2)
         settled = settled | (damping > _STUCK) | ~(gain > 1e-6 * gain_worth)
@@ -316,7 +315,7 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
         rows=end.best.rows,
         links=end.best.links,
         weight=end.best.weight,
-        whitener=whitener,
+        kicks=end.best.kicks,
         square=end.best.square,
         settled=end.settled & jnp.isfinite(end.best.cost),
         steps=end.steps,
@@ -325,84 +324,6 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
         tensor=over_lanes(lambda x, y: x.unknowns.inertia(y))(problem, numbers),
         units=over_lanes(lambda x, y: x.unknowns.natural_units(y))(problem, numbers),
     )
-
-
-class Equations(NamedTuple):
-    """A smoother's normal equations, without damping, after all later states are eliminated.
-
-    Attributes:
-        inner: Of first states and throws' own numbers (throws, count, count).
-        numbers: What is left for the numbers.
-        scores: Each throw's part of the gradient in the numbers.
-        follow: How first states and own numbers follow the numbers, with the sign turned.
-    """
-
-    inner: Any
-    numbers: Any
-    scores: Any
-    follow: Any
-
-
-@program
-def equations(point: Point, rows: Rows, links: Links, weight: Any, whitener: Any) -> Equations:
-    """Eliminate the states of one record."""
-    count = point.own.shape[-1] + links.gap.shape[-1]
-    blocks = blocks_of(rows, links, weight, whitener)
-    left = reduced(blocks, jnp.zeros((), point.omega.dtype))
-    rest = eliminated(left, count)
-    inner = left.matrix[:, :count, :count]
-    return Equations(inner, rest.numbers, rest.right, rest.follow)
-
-
-class Evidence(NamedTuple):
-    """What a record says of the level of an unmodelled torque about each axis.
-
-    Attributes:
-        squares: Of the whitened kicks.
-        effective: How many kicks the record determines.
-        information: About the logarithm of the level squared.
-    """
-
-    squares: Any
-    effective: Any
-    information: Any
-
-
-@program
-def evidence(
-    problem: Problem, point: Point, rows: Rows, links: Links, weight: Any, whitener: Any
-) -> Evidence:
-    """Derivatives of the smoother's marginal likelihood in the level of the torque.
-
-    -2 log p contains the log determinant of the normal equations, which is smooth in the
-    logarithm of the kicks' precision, so that differences serve. A noise that is not known is at
-    its most likely beside each level, which is then relative to it.
-    """
-    inner, h = point.own.shape[-1] + links.gap.shape[-1], 0.1
-    gap = product("tsij,tsj->tsi", whitener, links.gap)
-    kinds = whitener.shape[-1] // 3
-
-    def log_determinant(shift: Array) -> Array:
-        scale = jnp.tile(jnp.exp(shift / 2), kinds)
-        blocks = blocks_of(rows, links, weight, product("i,tsij->tsij", scale, whitener))
-        left = eliminated(reduced(blocks, jnp.zeros((), gap.dtype)), inner)
-        return left.log_determinant + jnp.linalg.slogdet(left.numbers)[1]
-
-    moves = h * jnp.concatenate([jnp.eye(3), -jnp.eye(3), jnp.zeros((1, 3))])
-    up, down, middle = jnp.split(jax.lax.map(log_determinant, moves.astype(gap.dtype)), [3, 6])
-    slope = (up - down) / (2 * h)
-    bend = (up - 2 * middle + down) / h**2
-    links_used = kinds * jnp.sum(jnp.any(whitener != 0, axis=(2, 3))).astype(gap.dtype)
-    squares = jnp.sum(gap * gap, axis=(0, 1)).reshape(kinds, 3).sum(axis=0)
-    effective = links_used - slope
-    information = 0.5 * jnp.maximum(effective - bend, 1e-12)
-    if not problem.options.noise_known:
-        whole = product("tn,tnd->tnd", jnp.sqrt(weight), rows.residual)
-        unknown = point.numbers.size + inner * weight.shape[0]
-        freedom = jnp.maximum(jnp.sum(whole != 0).astype(gap.dtype) - unknown, 1.0)
-        squares = squares * freedom / (jnp.sum(whole * whole) + jnp.sum(squares))
-        information = information - effective**2 / (2 * freedom)
-    return Evidence(squares, effective, jnp.maximum(information, 1e-12))
 
 
 @small_program
@@ -416,9 +337,3 @@ def spectrum(unknowns: Unknowns, numbers: Any) -> Any:
     """The tensor, its moments and axes, and its derivatives in the numbers (3, 3, numbers)."""
     tensor = unknowns.inertia(numbers)
     return tensor, *eigh(tensor), jax.jacfwd(unknowns.inertia)(numbers)
-
-
-@small_program
-def link_whitener_of(problem: Problem, layout: Layout, numbers: Any, level: Any) -> Any:
-    """`link_whitener` of one record, for a level of the unmodelled torque."""
-    return link_whitener(problem, layout, numbers, level, jnp.ones((), level.dtype))

@@ -34,7 +34,7 @@ class Options(NamedTuple):
     on_attitude: bool
     shooting: bool = False  # from a state of each segment, or from one of each throw
     nodes: int = 1
-    level: str = "none"  # of the unmodelled torque: or "known", "estimate", "estimate per axis"
+    unmodelled: str = "none"  # a torque that no model has: or "known", "estimate"
     robust: bool = False
     noise_known: bool = True
     motion: Any = None
@@ -42,7 +42,7 @@ class Options(NamedTuple):
     @property
     def dense(self) -> bool:
         """Whether each sample has a node."""
-        return self.level != "none"
+        return self.unmodelled != "none"
 
 
 class Problem(eqx.Module):
@@ -230,7 +230,7 @@ def _over_throws(function: Callable[..., Any], problem: Problem, layout: Layout)
     stacked = tuple(0 if own else None for own in problem.unknowns.stacked)
     first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
     data = _Throw(layout, problem.samples, first)
-    of_throws: Any = Point(None, 0, 0, 0)  # type: ignore[arg-type]
+    of_throws: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
 
     def over(point: Point, *moves: Array) -> Any:
         axes = of_throws, stacked, 0, *(0 for _ in moves)
@@ -268,6 +268,7 @@ def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows
         (rows, gap), (d_rows, d_gap) = jax.vmap(along, out_axes=(None, -1))(directions)
         node = jnp.pad(data.layout.node, (0, rows.shape[0] - data.layout.node.size))
         of_border, of_state = jnp.split(d_rows, border[1:], axis=-1)
-        return Rows(rows, of_border, of_state, node), Links(gap, *jnp.split(d_gap, border[1:], -1))
+        links = Links(gap, *jnp.split(d_gap, border[1:], -1), jnp.zeros(0, gap.dtype))
+        return Rows(rows, of_border, of_state, node), links
 
     return _over_throws(throw, problem, layout)

@@ -1,12 +1,16 @@
 """How well a fit describes its record: scales, outliers, misfits, boundaries. Plain numpy."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jrigid.identify._disturbance import Disturbance
+from jrigid.identify._filter import Linearised
+from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import Minimum
 from jrigid.identify._problem import Problem
 from jrigid.identify._shapes import BOUNDARY, Fixed, Flat
+from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
@@ -21,18 +25,22 @@ class Fit(NamedTuple):
 
     Attributes:
         minimum: Of one record.
+        layout: Its segments.
         kept: 1 for each sample that took part, 0 for the others (throws, samples).
         scales: Sizes of the residuals of each record, in units of the noise.
-        level: Of the unmodelled torque about each axis.
+        disturbance: The unmodelled torque.
+        torque: The same as it was sought, None where it was known.
         history: Sums of squares after each step of all stages.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
         probed_error: Error of the weakest direction, by probes, in natural units.
     """
 
     minimum: Minimum
+    layout: Layout
     kept: np.ndarray
     scales: np.ndarray
-    level: np.ndarray
+    disturbance: Disturbance
+    torque: Any
     history: np.ndarray
     ambiguous: bool = False
     probed_error: float = 0.0
@@ -42,11 +50,23 @@ class Fit(NamedTuple):
         """Whitened residuals of the samples (throws, samples, degrees)."""
         return self.minimum.rows.residual[:, : self.kept.shape[1]]
 
-    @property
-    def kicks(self) -> float:
-        """Sum of squares of the whitened gaps of the links."""
-        gap = self.minimum.whitener @ self.minimum.links.gap[..., None]
-        return float(np.sum(gap * gap))
+
+def linearised(fit: Fit) -> Linearised:
+    """A record where a fit ended."""
+    minimum, count = fit.minimum, fit.kept.shape[1]
+    rows = Rows(*(x[:, :count] for x in minimum.rows))
+    weight, own = minimum.weight[:, :count], minimum.point.own
+    return Linearised(fit.layout, minimum.tensor, rows, minimum.links, weight, own)
+
+
+def columns_of_prior(fit: Fit) -> np.ndarray:
+    """What is known beforehand, as columns of innovations, (throws, known, degrees, columns)."""
+    minimum, count = fit.minimum, fit.kept.shape[1]
+    root = np.sqrt(minimum.weight[:, count:, None, None])
+    residual = minimum.rows.residual[:, count:, :, None]
+    still = np.zeros((*residual.shape[:-1], minimum.links.gap.shape[-1]), residual.dtype)
+    columns = [residual, still, minimum.rows.of_border[:, count:]]
+    return root * np.concatenate(columns, axis=-1)
 
 
 def or_one(size: np.ndarray) -> np.ndarray:

@@ -104,13 +104,20 @@ class FitResult(eqx.Module):
         chi_square_by_throw: Mean square of the residuals of each throw.
         whiteness: Correlation of neighbouring residuals, and how many standard deviations that is
             from 0. Near 0 for noise; what a model leaves out changes slowly and brings it near 1.
+        loudest_band: Power of what is left in the band of frequencies that stands out most, over
+            the mean, and how many standard deviations that is from what noise has.
         unexplained: Of the square of what was observed, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed, descending.
         directions: In the numbers, columns for the singular values.
         state_singular_values: Of the derivatives in each throw's state, of unit columns; a zero is
             a change of the state that the record does not show.
-        level: Of the unmodelled torque about each body axis [N m sqrt(s)].
-        level_errors: Of the level; of one that was not sought, what the record could tell.
+        level: Of the unmodelled torque about each body axis [N m sqrt(s)]: the root of its spectral
+            density at low frequencies.
+        level_errors: Of the level; of one that was not sought, or not found, what the record could
+            tell.
+        correlation_time: Of the unmodelled torque about each body axis [s]; 0 where it is white.
+        correlation_time_errors: Of that.
+        level_by_trial: Of each trial, in units of `level`.
         scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
         kept: Which samples were, records side by side.
         history: Sum of squares of the record after each step, NaN beyond the last.
@@ -161,12 +168,16 @@ class FitResult(eqx.Module):
     reduced_chi_square: Scalar
     chi_square_by_throw: Float[Array, " throws"]
     whiteness: tuple[Scalar, Scalar]
+    loudest_band: tuple[Scalar, Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
     state_singular_values: Float[Array, "throws local"]
     level: Vector
     level_errors: Vector
+    correlation_time: Vector
+    correlation_time_errors: Vector
+    level_by_trial: Float[Array, " throws"]
     scales: Float[Array, " records"]
     kept: Bool[Array, "throws samples"]
     history: Float[Array, " steps"]

@@ -94,7 +94,8 @@ def log_density(result: FitResult) -> LogDensity:
 
     def function(position: Array) -> Array:
         numbers, rest = position[:size], position[size:].reshape(throws, local + own)
-        rows = rows_of(Point(numbers, rest[:, local:], *states), rest[:, None, :local])
+        point = Point(numbers, rest[:, local:], *states, states[1][..., :0])
+        rows = rows_of(point, rest[:, None, :local])
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
         return -0.5 * chi_square / result.inflation + log_jacobian(numbers, rest[:, local:])
 

@@ -14,13 +14,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from jrigid.identify._errors import (
-    FAINT,
-    Weakest,
-    evidence_of,
-    first_level,
-    weakest,
-)
+from jrigid.identify import _levels as levels
+from jrigid.identify import _trials as trials
+from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
+from jrigid.identify._errors import Weakest, first_level, precision, weakest
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
@@ -54,8 +51,9 @@ _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
 LANES = 8  # records of one compiled call, where there are several
-_LEVELS = 40  # stages in which the level of a torque is sought
-_LEVEL_STEPS = 6  # stages in which a level that is known is reached
+_LEVELS = 12  # stages in which an unmodelled torque is sought, white and then of any form
+_LEVEL_STEPS = 6  # stages in which one that is known is reached
+_AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
 _PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
@@ -84,14 +82,15 @@ class Stage(NamedTuple):
     """One minimisation of an attempt.
 
     Attributes:
-        weight: Of the links, in units of the noise; of a level that is known, how far it has come.
+        weight: Of the links, in units of the noise; of a torque that is known, how far its level
+            has come.
         steps: The largest number of steps.
         enough: A gain that is not worth a step.
         horizon: Fraction of the record that takes part.
         whole: From one state a throw.
         soft: With Cauchy's loss.
         reject: Samples too far off are left out from here on.
-        last: The level of the torque is no longer changed.
+        last: The torque is no longer changed.
     """
 
     weight: float
@@ -130,7 +129,7 @@ class Case:
         point: States at their starts, as observed.
         starts: Numbers for each attempt (attempts, numbers).
         tensor: The inertia of the first start.
-        level: Of the unmodelled torque, if it is known.
+        torque: Unmodelled, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
         long: Whether it turns many times, so that probes must go slowly too.
         effort: How hard to try.
@@ -142,7 +141,7 @@ class Case:
     point: Point
     starts: np.ndarray
     tensor: np.ndarray
-    level: np.ndarray
+    torque: GaussMarkov
     coarse: bool
     long: bool
     effort: Effort
@@ -173,8 +172,10 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
     largest = _LARGEST[case.point.omega.dtype.itemsize]
     end = Stage(largest, effort.max_steps, ACCURACY, whole=whole, last=True)
     if options.dense:
-        count = _LEVEL_STEPS if options.level == "known" else _LEVELS
-        stages = [Stage(float(x), 8, 0.01) for x in np.linspace(0, 1, count)]
+        if options.unmodelled == "known":
+            stages = [Stage(x, 8, 0.01) for x in np.linspace(0, 1, _LEVEL_STEPS).tolist()]
+        else:
+            stages = [Stage(1.0, 8, 0.01) for _ in range(2 * _LEVELS)]
         end = end._replace(weight=1.0)
     elif not options.shooting:
         horizons = [2.0**-k for k in range(effort.doublings, 0, -1)]
@@ -192,26 +193,23 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
 def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Search:
     """All stages from some numbers, each from where the one before ended."""
     options, dtype = problem.options, case.point.omega.dtype
-    first = first_level(problem, case.cut, case.tensor)
-    # Beside a noise that is not known a level far too large is nearly as likely as another.
-    level = (10 if options.noise_known else 1) * first
     kept = problem.samples.seen.astype(dtype)
     scales = np.ones(len(problem.samples.values), dtype)
-    point, histories, at_rest, minimum = case.point._replace(numbers=numbers), [], False, None
+    torque = _Torque(case, problem)
+    point, histories, minimum = case.point._replace(numbers=numbers), [], None
     for stage in stages_of(case, slow):
-        if at_rest and not stage.last:
+        if torque.at_rest and not stage.last:
             continue
         if options.robust and minimum is not None:
             residual = minimum.rows.residual[:, : kept.shape[1]]
             scales = scales_of(problem, residual, kept)
             if stage.reject:
                 kept = without_outliers(problem, residual, kept, scales)
-        if options.level == "known":
-            level = first * (case.level / first) ** stage.weight
+        torque.begin(stage)
         settings = Settings(
             kept=kept,
             scales=scales,
-            level=level.astype(dtype),
+            disturbance=torque.disturbance,
             weight=np.asarray(stage.weight, dtype),
             horizon=np.asarray(stage.horizon, dtype),
             soft=np.asarray(stage.soft),
@@ -223,13 +221,85 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
         minimum, history = yield from _stage(Request(problem, layout, point, settings))
         point = minimum.point
         histories.append(history)
-        fit = Fit(minimum, kept, scales, level, np.concatenate(histories))
+        fit = Fit(
+            minimum=minimum,
+            layout=layout,
+            kept=kept,
+            scales=scales,
+            disturbance=torque.disturbance,
+            torque=torque.found,
+            history=np.concatenate(histories),
+        )
         if case.effort.report is not None:
             case.effort.report(_progress(stage, fit))
-        if options.level.startswith("estimate") and not stage.last:
-            new, at_rest = _next_level(problem, fit, first)
-            level = new.astype(dtype)
+        if options.unmodelled == "estimate" and not stage.last:
+            kept = torque.sought_anew(fit)
     return fit
+
+
+def _without_foreign_trial(problem: Problem, fit: Fit) -> np.ndarray:
+    """Which samples are kept: not those of a trial that the others show to be of another body."""
+    known, units = precision(problem, fit), fit.minimum.units
+    alive = np.any(fit.kept > 0, axis=1)
+    left_out = trials.foreign(known.scores * units, known.information, alive)
+    kept = fit.kept.copy()
+    if left_out is not None:
+        kept[left_out] = 0
+    return kept
+
+
+class _Torque:
+    """The unmodelled torque on the way through the stages of an attempt.
+
+    It is white at first; once its level has come to rest and no trial is found to be of another
+    body, whose motion would pass for a torque, its other forms are tried.
+    """
+
+    def __init__(self, case: Case, problem: Problem):
+        """Begin with a torque far too large: the fit then follows the record."""
+        self._case, self._problem, self._dtype = case, problem, case.point.omega.dtype
+        self._kind, throws = problem.options.unmodelled, case.point.omega.shape[0]
+        self._first = first_level(problem, case.cut, case.tensor)
+        self._search = levels.Search(problem, case.cut, self._first)
+        # Beside a noise that is not known a level far too large is nearly as likely as another.
+        level = (10 if problem.options.noise_known else 1) * self._first
+        self._current = self._search.start(level, throws)
+        self.disturbance = no_disturbance(throws, self._dtype)
+        self._may_have_other_forms = True
+        self.at_rest = False
+
+    @property
+    def found(self) -> levels.Torque | None:
+        """The torque, where one is sought."""
+        return self._current if self._kind == "estimate" else None
+
+    def begin(self, stage: Stage) -> None:
+        """Set the torque of a stage."""
+        if self._kind == "none":
+            return
+        torque = self._current.disturbance
+        if self._kind == "known":
+            known, first = self._case.torque, self._first
+            level = first * (known.level / first) ** stage.weight
+            torque = Disturbance(np.broadcast_to(level, torque.level.shape), known.time)
+        self.disturbance = Disturbance(*(x.astype(self._dtype) for x in torque))
+
+    def sought_anew(self, fit: Fit) -> np.ndarray:
+        """Seek the torque where a stage ended; which samples are kept from here on."""
+        before = self._current
+        self._current = self._search.improved(before, fit)
+        if np.max(np.abs(self._current.numbers - before.numbers)) > _AT_REST:
+            return fit.kept
+        if not self._may_have_other_forms:
+            self.at_rest = True
+            return fit.kept
+        kept = _without_foreign_trial(self._problem, fit)
+        if np.all(kept == fit.kept):
+            self._may_have_other_forms = False
+            rates = np.sum(fit.minimum.point.omega**2, axis=-1)
+            spins = np.sqrt(np.mean(rates, axis=1))
+            self._current = self._search.preferred(self._current, fit, spins)
+        return kept
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
@@ -253,19 +323,6 @@ def _progress(stage: Stage, fit: Fit) -> str:
         f"fit: {fit.history.size} steps, links {stage.weight:g}, record {part:.3g}: "
         f"chi-square {float(fit.minimum.square):.6g}"
     )
-
-
-def _next_level(problem: Problem, fit: Fit, first: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Fisher's scoring for the logarithm of the level; and whether it has come to rest."""
-    seen = evidence_of(problem, fit, fit.minimum.whitener)
-    score = 0.5 * (seen.squares - seen.effective)
-    move = np.clip(score / np.maximum(seen.information, 1e-9), -3.0, 3.0)
-    move = np.where(np.isfinite(move), move, 0.0)
-    # Kicks of which less than one is determined, and of those too many: there is no torque.
-    none = (seen.effective < 1) & (score < 0)
-    new = np.where(none, 0.0, fit.level * np.exp(move / 2))
-    new = np.maximum(new, FAINT * first)
-    return new, bool(np.all(np.abs(np.log(new / fit.level)) < 0.01))
 
 
 def search(case: Case) -> Search:
@@ -308,7 +365,7 @@ def no_search(case: Case) -> Search:
     settings = Settings(
         kept=np.zeros(samples.ts.shape, dtype),
         scales=np.ones(len(samples.values), dtype),
-        level=np.ones(3, dtype),
+        disturbance=no_disturbance(samples.ts.shape[0], dtype),
         weight=one,
         horizon=one,
         soft=np.asarray(False),
@@ -317,7 +374,15 @@ def no_search(case: Case) -> Search:
         damping=one,
     )
     minimum = yield Request(case.problem, case.final, case.point, settings)
-    return Fit(minimum, settings.kept, settings.scales, settings.level, np.zeros(0, dtype))
+    return Fit(
+        minimum=minimum,
+        layout=case.final,
+        kept=settings.kept,
+        scales=settings.scales,
+        disturbance=settings.disturbance,
+        torque=None,
+        history=np.zeros(0, dtype),
+    )
 
 
 def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool) -> int:

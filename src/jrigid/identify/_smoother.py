@@ -29,6 +29,7 @@ class Point(NamedTuple):
     own: AnyArray  # (throws, n)
     attitude: AnyArray  # (throws, nodes, 4)
     omega: AnyArray
+    torque: AnyArray  # (throws, nodes, 3) in units of its rms, or (throws, nodes, 0) without one
 
 
 class Rows(NamedTuple):
@@ -41,11 +42,16 @@ class Rows(NamedTuple):
 
 
 class Links(NamedTuple):
-    """End of a segment less the next one's start, (throws, nodes, local), and derivatives."""
+    """End of a segment less the next one's start, (throws, nodes, local), and derivatives.
+
+    `torque` is the unmodelled torque at the first node, (throws, 3), whose size is known: it is 1
+    in units of its rms. Without such a torque it is (throws, 0).
+    """
 
     gap: AnyArray
     of_border: AnyArray
     of_state: AnyArray
+    torque: AnyArray
 
 
 class Blocks(NamedTuple):
@@ -106,6 +112,10 @@ def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Block
     bb = bb + product("tsai,tsaj->tij", g, g)
     b = b + product("tsai,tsa->tsi", f, c) - later(product("tsai,tsa->tsi", whitener, c))
     cb = cb + product("tsai,tsa->ti", g, c)
+    if links.torque.shape[-1]:
+        last = slice(-links.torque.shape[-1], None)
+        h = h.at[:, 0, last, last].add(jnp.eye(links.torque.shape[-1], dtype=h.dtype))
+        b = b.at[:, 0, last].add(links.torque)
     return Blocks(h, -product("tsai,tsaj->tsij", f, whitener), hb, bb, b, cb)
 
 
@@ -116,7 +126,7 @@ def _damped(matrix: Array, damping: Array) -> Array:
     return matrix + more[..., None] * eye
 
 
-def _solve(matrix: Array, columns: Array) -> tuple[Array, Array]:
+def solve_positive(matrix: Array, columns: Array) -> tuple[Array, Array]:
     """Of a matrix positive definite but for rounding, of any scale; and its log determinant."""
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     size = jnp.where(size > 0, size, 1.0)
@@ -136,7 +146,7 @@ def reduced(blocks: Blocks, damping: Array) -> Reduced:
         less, border, right = carry
         h, u, hb, b = node
         columns = jnp.concatenate([u.T, hb - border, (b - right)[:, None]], axis=1)
-        solved, log_determinant = _solve(h - less, columns)
+        solved, log_determinant = solve_positive(h - less, columns)
         down = product("ji,jk->ik", columns[:, :local], solved)
         schur = product("ij,ik->jk", columns[:, local:-1], solved[:, local:])
         carry = down[:, :local], down[:, local:-1], down[:, -1]
@@ -171,7 +181,7 @@ def eliminated(left: Reduced, count: int) -> Eliminated:
 
     def throw(matrix: Array, right: Array) -> tuple[Array, ...]:
         columns = jnp.concatenate([matrix[:count, count:], right[:count, None]], axis=1)
-        solved, log_determinant = _solve(matrix[:count, :count], columns)
+        solved, log_determinant = solve_positive(matrix[:count, :count], columns)
         schur = product("ij,ik->jk", matrix[:count, count:], solved)
         numbers = matrix[count:, count:] - schur[:, :-1]
         return numbers, right[count:] - schur[:, -1], solved[:, :-1], solved[:, -1], log_determinant
@@ -190,7 +200,7 @@ def step_of(blocks: Blocks, own: int, damping: Array) -> tuple[tuple[Array, Arra
     right = jnp.sum(rest.right, axis=0)
     numbers = -right
     if right.size:
-        numbers = -_solve(rest.numbers, right[:, None])[0][:, 0]
+        numbers = -solve_positive(rest.numbers, right[:, None])[0][:, 0]
     firsts = -rest.still - product("tij,j->ti", rest.follow, numbers)
 
     def moves(solved: Array, first: Array) -> Array:
@@ -214,7 +224,14 @@ def moved(point: Point, move: tuple[Array, Array, Array]) -> Point:
     """A point after a move; turns are about the body's axes."""
     numbers, own, states = move
     attitude = point.attitude
-    if states.shape[-1] == 6:
+    local = states.shape[-1] - point.torque.shape[-1]
+    if local == 6:
         turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
-        attitude = turn(attitude, states[..., 3:])
-    return Point(point.numbers + numbers, point.own + own, attitude, point.omega + states[..., :3])
+        attitude = turn(attitude, states[..., 3:6])
+    return Point(
+        numbers=point.numbers + numbers,
+        own=point.own + own,
+        attitude=attitude,
+        omega=point.omega + states[..., :3],
+        torque=point.torque + states[..., local:],
+    )

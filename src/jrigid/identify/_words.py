@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jrigid._core.third_party import code_of, names_of
+from jrigid.identify._colour import STRONG
+from jrigid.identify._colour import SURE as COLOURED
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._shapes import Fixed, Flat, Symmetric, Tensor, Top
 
@@ -130,13 +132,18 @@ def _reason(result: FitResult) -> str:
     if size < 1:
         degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
         return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
-    like, sure = result.whiteness
-    if like < _LIKE or sure < _SURE:
+    band, sure = result.loudest_band
+    if band > STRONG and sure > COLOURED:
         return (
-            f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
-            "`absolute_sigma=False`."
+            f"What is left has {band:.2g} times its mean power in one band of frequencies: "
+            "something that changes slowly, or swings, is missing. See `unmodelled` and `free`."
         )
-    return f"{found}, and neighbours correlate by {like:.2f}: see `unmodelled` and `free`."
+    if result.reduced_chi_square < 1.1:
+        return "Trials differ by more than their errors say: they may be of different bodies."
+    return (
+        f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
+        "`absolute_sigma=False`."
+    )
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
@@ -199,21 +206,32 @@ def _of_tensor(result: FitResult) -> list[str]:
     return lines
 
 
-def _of_level(result: FitResult) -> list[str]:
+def _of_torque(result: FitResult) -> list[str]:
     """The unmodelled torque, and what of the errors it makes."""
-    kind = result.problem.options.level
-    if kind == "none":
+    if result.problem.options.unmodelled == "none":
         return []
-    pairs = list(zip(np.asarray(result.level), np.asarray(result.level_errors), strict=True))
-    pairs = pairs if kind == "estimate per axis" else pairs[:1]
+    level, times = np.asarray(result.level), np.asarray(result.correlation_time)
+    alike = np.all(level == level[0]) and np.all(times == times[0])
+    axes = slice(0, 1 if alike else 3)
+    pairs = list(zip(level[axes], np.asarray(result.level_errors)[axes], strict=True))
     unseen = "0 (of {:.2g} nothing would be seen)"
-    level = ", ".join(_with_error(*x) if x[0] > 0 else unseen.format(x[1]) for x in pairs)
+    levels = ", ".join(_with_error(*x) if x[0] > 0 else unseen.format(x[1]) for x in pairs)
+    memory = "white"
+    if np.any(times > 0):
+        errors = np.asarray(result.correlation_time_errors)[axes]
+        memory = f"correlation time {_with_errors(times[axes], errors)} s"
     own = np.diagonal(np.asarray(result.sensor_covariance))
-    part = 100 * np.sqrt(np.median(own / _diagonal(result.numbers_covariance))) if own.size else 100
-    return [
-        f"  unmodelled torque {level} N m s^1/2; the sensors alone would make {part:.0f} % of the "
-        "errors"
+    shares = own / _diagonal(result.numbers_covariance)
+    part = 100 * np.sqrt(np.median(shares)) if own.size else 100
+    lines = [
+        f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would make "
+        f"{part:.0f} % of the errors"
     ]
+    by_trial = np.asarray(result.level_by_trial)
+    if np.any(by_trial != by_trial[0]):
+        least, most = by_trial.min(), by_trial.max()
+        lines.append(f"  its level in trials: {least:.2g} to {most:.2g} times that")
+    return lines
 
 
 def report(result: FitResult) -> str:
@@ -239,7 +257,7 @@ def report(result: FitResult) -> str:
     spoilt = ", ".join(map(str, np.flatnonzero(result.spoilt)))
     lines += [f"  throws left out: {spoilt}"] * bool(spoilt)
     lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(result)
-    lines += _of_level(result)
+    lines += _of_torque(result)
     own = [x for x in result.unknowns.sought if x.own and x.base.ndim]
     each = {x.name for x in own if throws > 1}  # too many to print
     pairs = {name: pair for name, pair in result.leaves.items() if name not in each}

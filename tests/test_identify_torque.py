@@ -1,0 +1,276 @@
+"""A torque that no model has, with a memory: its random walk, its likelihood, and what a fit finds.
+
+Judges: quadrature in 30 digits, a covariance written out as one matrix, and trials by an integrator
+in numpy whose torque is drawn step by step.
+"""
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import worlds
+from scipy.linalg import block_diag, expm
+
+import jrigid as jr
+from jrigid import identify
+from jrigid.identify import Status
+from jrigid.identify import _disturbance as disturbances
+from jrigid.identify import _filter as filters
+from jrigid.identify import _trials as trials
+from jrigid.identify._layout import Layout
+from jrigid.identify._smoother import Links, Rows
+
+MOMENTS = np.array([0.5, 0.8, 1.0])
+RATIOS = MOMENTS[1:] / MOMENTS[0]
+BLIND = jr.RigidBody(np.full(3, MOMENTS.mean()))
+LEVELS = np.array([0.02, 0.03, 0.05])
+NOISE = 5e-3
+
+
+@pytest.mark.parametrize("steps", [1e-3, 0.1, 0.999, 1.001, 7.0, 300.0])
+def test_what_a_torque_adds_in_a_step_is_its_integral(steps):
+    """White noise drives the torque, the torque the momentum, and the momentum the turn."""
+    found, along = disturbances._of_a_step(jnp.array(steps))
+    with mpmath.workdps(30):
+        a = mpmath.mpf(steps)
+        # Responses to a unit kick r ago, of level 1 and dt = 1.
+        torque = lambda r: mpmath.sqrt(2 * a) * mpmath.exp(-a * r)  # noqa: E731
+        momentum = lambda r: 1 - mpmath.exp(-a * r)  # noqa: E731
+        turn = lambda r: r - (1 - mpmath.exp(-a * r)) / a  # noqa: E731
+        of = [momentum, turn, torque]
+        points = [0, min(1, 5 / a), 1]
+        wanted = [[mpmath.quad(lambda r, f=f, g=g: f(r) * g(r), points) for g in of] for f in of]
+        x = 1 - mpmath.exp(-a)
+        # Of a torque at the start, in units of its rms 1 / sqrt(2 T), T = 1 / a.
+        rms = mpmath.sqrt(a / 2)
+        ahead = [rms * x / a, rms * (1 - x / a) / a, mpmath.exp(-a)]
+    np.testing.assert_allclose(found, np.array(wanted, float), rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(along, np.array(ahead, float), rtol=1e-11, atol=1e-99)
+
+
+def a_linear_record(rng, samples=7, columns=2):
+    """A record of two trials, one node a sample, as if linearised; and its tensor."""
+    throws, degrees = 2, 3
+    ts = np.sort(rng.uniform(0, 1, (throws, samples)), axis=1)
+    linked = np.ones((throws, samples), bool)
+    linked[:, -1] = False
+    layout = Layout(
+        ts, np.tile(np.arange(samples), (throws, 1)), ts, np.roll(ts, -1, axis=1), linked, ts
+    )
+    near_eye = np.eye(3) + 0.2 * rng.normal(size=(throws, samples, 3, 3))
+    there = linked[..., None]
+    links = Links(
+        there * rng.normal(size=(throws, samples, 3)),
+        there[..., None] * rng.normal(size=(throws, samples, 3, columns)),
+        there[..., None] * near_eye,
+        np.zeros((throws, 0)),
+    )
+    rows = Rows(
+        rng.normal(size=(throws, samples, degrees)),
+        rng.normal(size=(throws, samples, degrees, columns)),
+        rng.normal(size=(throws, samples, degrees, 3)),
+        layout.node,
+    )
+    mixed = rng.normal(size=(3, 3))
+    tensor = np.eye(3) + 0.1 * mixed @ mixed.T
+    weight = rng.uniform(0.2, 1, (throws, samples))
+    return filters.Linearised(layout, tensor, rows, links, weight, np.zeros((throws, 0)))
+
+
+def likelihood_by_one_matrix(record, level, time):
+    """-2 log of the restricted likelihood, the covariance of all readings written out.
+
+    The torque is followed on a grid so fine that it is constant in its steps.
+    """
+    layout, rows, links = record.layout, record.rows, record.links
+    logs, designs, offsets = 0.0, [], []
+    for t in range(level.shape[0]):
+        samples = layout.ts.shape[1]
+        # Covariance of torque and momentum over a step, by the matrix exponential (van Loan).
+        jump, parts = [], []
+        for k in range(samples - 1):
+            dt = layout.ts[t, k + 1] - layout.ts[t, k]
+            carried, spread = np.zeros((6, 6)), np.zeros((6, 6))
+            for i in range(3):
+                drift = np.array([[0.0, 1.0], [0.0, -1 / time[i]]])
+                drive = np.diag([0.0, (level[t, i] / time[i]) ** 2])
+                big = np.block([[-drift, drive], [np.zeros((2, 2)), drift.T]]) * dt
+                e = expm(big)
+                turn = e[2:, 2:].T
+                axes = np.ix_([i, 3 + i], [i, 3 + i])
+                carried[axes], spread[axes] = turn, turn @ e[:2, 2:]
+            jump.append(carried)
+            parts.append(spread)
+        inverse = block_diag(np.linalg.inv(record.tensor), np.eye(3))
+        size = np.diag(level[t] ** 2 / (2 * time))
+        mean = np.zeros((6, 1 + 3 + rows.of_border.shape[-1]))
+        mean[:3, 1:4] = np.eye(3)
+        covariance = {(0, 0): block_diag(np.zeros((3, 3)), size)}
+        means = [mean]
+        for k in range(samples - 1):
+            ahead = inverse @ jump[k] @ np.linalg.inv(inverse)
+            ahead[:3, :3] = links.of_state[t, k]
+            extra = np.concatenate([links.gap[t, k][:, None], np.zeros((3, 3)),
+                                    links.of_border[t, k]], axis=1)  # fmt: skip
+            means.append(ahead @ means[k] + np.concatenate([extra, np.zeros_like(extra)]))
+            for j in range(k + 1):
+                covariance[(k + 1, j)] = ahead @ covariance[(k, j)]
+                covariance[(j, k + 1)] = covariance[(k + 1, j)].T
+            noise = inverse @ parts[k] @ inverse.T
+            covariance[(k + 1, k + 1)] = ahead @ covariance[(k, k)] @ ahead.T + noise
+        root = np.sqrt(record.weight[t])[:, None, None]
+        shown = root * np.concatenate([rows.of_state[t], np.zeros_like(rows.of_state[t])], axis=-1)
+        whole = np.block([[shown[i] @ covariance[(i, j)] @ shown[j].T for j in range(samples)]
+                          for i in range(samples)])  # fmt: skip
+        whole = whole + np.eye(whole.shape[0])
+        still = np.zeros((samples, 3, 3))
+        offset = np.concatenate([rows.residual[t][..., None], still, rows.of_border[t]], axis=-1)
+        columns = root * offset + np.einsum("nij,njk->nik", shown, np.stack(means))
+        columns = columns.reshape(-1, columns.shape[-1])
+        lower = np.linalg.cholesky(whole)
+        logs += 2 * np.sum(np.log(np.diagonal(lower)))
+        white = np.linalg.solve(lower, columns)
+        offsets.append(white[:, 0])
+        design = np.zeros((white.shape[0], 3 * level.shape[0]))
+        design[:, 3 * t : 3 * t + 3] = white[:, 1:4]
+        designs.append(np.concatenate([design, white[:, 4:]], axis=1))
+    design, offset = np.concatenate(designs), np.concatenate(offsets)
+    left = offset - design @ np.linalg.lstsq(design, offset, rcond=None)[0]
+    return float(left @ left) + logs + np.linalg.slogdet(design.T @ design)[1]
+
+
+def test_the_likelihood_is_that_of_one_large_matrix(rng):
+    record = a_linear_record(rng)
+    columns = 1 + 3 + record.rows.of_border.shape[-1]
+    prior, freedom = np.zeros((2, columns, columns)), np.array(20.0)
+
+    def found(levels, times, sizes):
+        given = prior, freedom, np.array(True), levels, times, sizes
+        return filters.likelihood(record, *given)
+
+    levels, times, sizes = rng.normal(size=3), rng.normal(size=3) - 1, 0.3 * rng.normal(size=2)
+    value, slopes = found(levels, times, sizes)
+    level = np.exp(sizes)[:, None] * np.exp(levels)
+    wanted = likelihood_by_one_matrix(record, level, np.exp(times))
+    assert float(value) == pytest.approx(wanted, rel=1e-9)
+    h = 1e-5
+    for k, slope in enumerate(slopes):
+        for i in range(slope.size):
+            ends = []
+            for sign in (h, -h):
+                moved = [levels.copy(), times.copy(), sizes.copy()]
+                moved[k][i] += sign
+                ends.append(float(found(*moved)[0]))
+            assert float(slope[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5,
+                                                    abs=1e-5)  # fmt: skip
+
+
+def test_innovations_of_a_path_that_nothing_pushes_are_its_residuals(rng):
+    """A torque of no size adds nothing: the rows are those condensed on the first state."""
+    record = a_linear_record(rng)
+    none = disturbances.Disturbance(np.full((2, 3), 1e-12), np.full(3, 0.1))
+    found = np.asarray(filters.innovations(record, none).rows)
+    root = np.sqrt(record.weight)[..., None]
+    state = np.broadcast_to(np.eye(3), (2, 3, 3))
+    mean = np.zeros((2, 3))
+    for k in range(record.layout.ts.shape[1]):
+        residual = record.rows.residual[:, k]
+        shown = record.rows.of_state[:, k]
+        wanted = residual + np.einsum("tij,tj->ti", shown, mean)
+        np.testing.assert_allclose(found[:, k, :, 0], root[:, k] * wanted, atol=1e-9)
+        wanted = root[:, k, :, None] * (shown @ state)
+        np.testing.assert_allclose(found[:, k, :, 1:4], wanted, atol=1e-9)
+        ahead = record.links.of_state[:, k]
+        mean = np.einsum("tij,tj->ti", ahead, mean) + record.links.gap[:, k]
+        state = ahead @ state
+
+
+def a_torque(rng, level, time, duration):
+    """A function of time: exact draws of the process on a grid of a millisecond."""
+    grid = np.arange(0, duration + 0.01, 1e-3)
+    keep = np.exp(-1e-3 / time)
+    rms = level / np.sqrt(2 * time)
+    path = np.empty((grid.size, 3))
+    path[0] = rms * rng.normal(size=3)
+    for i in range(1, grid.size):
+        path[i] = keep * path[i - 1] + rms * np.sqrt(1 - keep**2) * rng.normal(size=3)
+    return lambda t, _: np.array([np.interp(t, grid, x) for x in path.T])
+
+
+def a_trial(rng, time=0.1, size=1.0, moments=MOMENTS, duration=1.0):
+    ts = np.arange(0, duration, 0.005)
+    spin = rng.normal(size=3)
+    spin = rng.uniform(5, 20) * spin / np.linalg.norm(spin)
+    torque = a_torque(rng, size * LEVELS, time, duration)
+    omega = worlds.tumble(np.diag(moments), spin, ts, torque=torque).omega
+    return identify.Rates(ts, omega + NOISE * rng.normal(size=omega.shape), NOISE)
+
+
+def off(found):
+    """Errors of the ratios over those stated."""
+    return (np.asarray(found.ratios) - RATIOS) / np.asarray(found.ratios_errors)
+
+
+def test_a_torque_with_a_memory_is_found_with_its_levels_and_its_time(rng):
+    sizes = np.array([0.5, 1.0, 2.0, 1.0, 0.5, 2.0, 1.0, 1.0])
+    found = identify.fit(
+        BLIND, [a_trial(rng, size=x) for x in sizes], unmodelled="estimate", throw=False
+    )
+    assert bool(found.status == Status.OK), str(found)
+    assert np.all(np.abs(off(found)) < 4)
+    level = np.asarray(found.level) * np.exp(np.mean(np.log(found.level_by_trial)))
+    level = level / np.exp(np.mean(np.log(sizes)))
+    assert np.all(np.abs(np.log(level / LEVELS)) < 0.6), str(found)
+    time, error = np.asarray(found.correlation_time), np.asarray(found.correlation_time_errors)
+    assert np.all(np.abs(time - 0.1) < 4 * error), str(found)
+    assert np.corrcoef(np.log(found.level_by_trial), np.log(sizes))[0, 1] > 0.8, str(found)
+    assert "correlation time" in str(found)
+
+
+def test_errors_stated_are_those_made_where_torques_have_a_memory(rng):
+    """Twelve fits of four trials each: the levels differ between axes."""
+    groups = [[a_trial(rng) for _ in range(4)] for _ in range(12)]
+    found = identify.fit_each(BLIND, groups, unmodelled="estimate")
+    pulls = off(found)
+    assert 0.5 < np.sqrt(np.mean(pulls**2)) < 1.6, pulls  # 24 numbers: 1 +- 0.15
+
+
+def test_a_torque_that_is_given_is_used(rng):
+    record = a_trial(rng)
+    torque = identify.GaussMarkov(LEVELS, 0.1)
+    found = identify.fit(BLIND, record, unmodelled=torque, throw=False)
+    np.testing.assert_allclose(found.level, LEVELS)
+    np.testing.assert_allclose(found.correlation_time, 0.1)
+    assert np.all(np.abs(off(found)) < 5)
+    with pytest.raises(ValueError, match="unmodelled"):
+        identify.fit(BLIND, record, unmodelled=identify.GaussMarkov(LEVELS, -0.1))
+
+
+def test_a_trial_of_another_body_is_named(rng):
+    records = [a_trial(rng) for _ in range(10)]
+    records[3] = a_trial(rng, moments=np.array([0.5, 0.9, 1.0]))
+    found = identify.fit(BLIND, records, unmodelled="estimate", throw=False)
+    np.testing.assert_array_equal(np.flatnonzero(found.spoilt), [3])
+    assert "throws left out: 3" in str(found)
+    assert np.all(np.abs(off(found)) < 4), str(found)
+
+
+def test_trials_of_one_body_disagree_by_their_errors(rng):
+    """The mean square of a trial's distance from all others is one; of a foreign one it is not."""
+    numbers, throws = 4, 400
+    design = rng.normal(size=(throws, 30, numbers))
+    truth = rng.normal(size=numbers)
+    seen = np.einsum("tni,i->tn", design, truth) + rng.normal(size=(throws, 30))
+    seen[7] += design[7] @ np.array([1.5, 0, 0, 0])
+    information = np.einsum("tni,tnj->tij", design, design)
+    alive = np.ones(throws, bool)
+    alive[5] = False
+    estimate = np.linalg.solve(
+        information[alive].sum(axis=0), np.einsum("tni,tn->i", design[alive], seen[alive])
+    )
+    scores = np.einsum("tni,tn->ti", design, np.einsum("tni,i->tn", design, estimate) - seen)
+    distance = trials.disagreement(scores, information, alive)
+    assert trials.foreign(scores, information, alive) == 7
+    assert distance[5] == 0
+    others = alive & (np.arange(throws) != 7)
+    assert 0.85 < np.mean(distance[others]) < 1.15  # 1600 numbers: 1 +- 0.035
