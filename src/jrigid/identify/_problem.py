@@ -268,7 +268,8 @@ def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows
         (rows, gap), (d_rows, d_gap) = jax.vmap(along, out_axes=(None, -1))(directions)
         node = jnp.pad(data.layout.node, (0, rows.shape[0] - data.layout.node.size))
         of_border, of_state = jnp.split(d_rows, border[1:], axis=-1)
-        links = Links(gap, *jnp.split(d_gap, border[1:], -1), jnp.zeros(0, gap.dtype))
+        gap_of_border, gap_of_state = jnp.split(d_gap, border[1:], -1)
+        links = Links(gap, gap_of_border, gap_of_state, jnp.zeros(0, gap.dtype))
         return Rows(rows, of_border, of_state, node), links
 
     return _over_throws(throw, problem, layout)
