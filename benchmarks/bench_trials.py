@@ -289,8 +289,9 @@ def main():
     ]
     explained = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:3]]
     sizes = (
-        f"The {options.body} body; {options.worlds} worlds of {options.trials} trials in each "
-        f"row, in groups of {options.group}; torque of {options.level:g} of the spin."
+        f"The {options.body} body; in each row {options.worlds} worlds of {options.trials} trials, "
+        f"in groups of {options.group}. The standard deviation of the torque is about "
+        f"{options.level:g} / s times the spin and the mean moment."
     )
     text = "\n\n".join([*explained, sizes, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
