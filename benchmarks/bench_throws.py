@@ -32,9 +32,19 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests"))
 import worlds  # pyright: ignore[reportMissingImports]
 
 MOMENTS = np.array([0.07, 0.93, 1.0])
-RATIOS, DRAG, LAG, MOST = MOMENTS[1:] / MOMENTS[0], 0.003, 0.003, 101
-SCENE = {"body": tuple(MOMENTS), "duration": (0.5, 1.0), "spin": (5.0, 20.0), "drag": DRAG,
-         "time_constant": LAG, "sigma": 5e-4, "wobble": 0.0}  # fmt: skip
+MEAN = MOMENTS.mean()
+RATIOS = MOMENTS[1:] / MOMENTS[0]
+DRAG = 0.003
+LAG = 0.003
+SCENE = {
+    "body": tuple(MOMENTS),
+    "duration": (0.5, 1.0),
+    "spin": (5.0, 20.0),
+    "drag": DRAG,
+    "time_constant": LAG,
+    "sigma": 5e-4,
+    "wobble": 0.0,
+}
 LASHES = {
     "none": {},
     "white, s = 0.01": {"kick": 0.01},
@@ -43,67 +53,92 @@ LASHES = {
     "ball 0.1, 15 Hz": {"wobble": 0.1},
     "ball 0.1, 5 Hz": {"wobble": 0.1, "wobble_frequency": 5.0},
 }
-FAILED = [int(x._value) for x in (Status.MISFIT, Status.WRONG_BASIN, Status.NOT_CONVERGED)]
+WHITE = "white, s = 0.01"
+SHAPES = {"flat": identify.Flat(), "any": identify.Tensor()}
+FAILED = (Status.MISFIT, Status.WRONG_BASIN, Status.NOT_CONVERGED)
+NAMES = [x for x in dir(Status) if isinstance(getattr(Status, x), Status)]
 
 
-def records(lash, count, seed):
-    """Times, readings and noise (throws, samples, ...), padded with NaN."""
-    throws = worlds.throws(np.random.default_rng(seed), count, **SCENE | LASHES[lash])
-    ts, values = np.full((count, MOST), np.nan), np.full((count, MOST, 3), np.nan)
-    for i, x in enumerate(throws):
-        ts[i, : x.ts.size], values[i, : x.ts.size] = x.ts, x.readings
-    return ts, values, np.array([x.sigma for x in throws])[:, None] * np.ones(MOST)
+def throws_of(lash, count, seed):
+    """Throws of the world with this lash, each a `worlds.Record`."""
+    return worlds.throws(np.random.default_rng(seed), count, **SCENE | LASHES[lash])
 
 
 def fitter(shape, lag, unmodelled):
-    """A fit of one throw, or of several at once; compiled once for each."""
-    body = jr.RigidBody(np.full(3, MOMENTS.mean()), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
+    """A function that fits each of several sets of throws, given as `fit` takes them."""
+    body = jr.RigidBody(np.full(3, MEAN), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
     gyro = identify.Gyro(time_constant=None if lag == "ignored" else jnp.asarray(LAG))
 
     def free(body, gyro):
         sought = identify.prior(gyro.time_constant, 0.002) if lag == "sought" else ()
         return body.torque.coefficient, sought
 
-    def one(ts, values, sigma):
-        record = identify.Record(gyro, ts, values, sigma)
-        return identify.fit(
-            body, record, free=free, shape=shape, unmodelled=unmodelled, throw=False
+    def fit_sets(sets):
+        records = [
+            [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in throws] for throws in sets
+        ]
+        return identify.fit_each(
+            body, records, free=free, shape=SHAPES[shape], unmodelled=unmodelled
         )
 
-    return jax.jit(jax.vmap(one))
+    return fit_sets
+
+
+def is_one_of(status, states):
+    """Whether each fit ended in one of these states."""
+    return np.any([np.asarray(status == x) for x in states], axis=0)
+
+
+def drags_of(found):
+    """The drag's coefficient in each fit, and its error."""
+    values, errors = jax.vmap(lambda x: x.leaves["torque.coefficient"])(found)
+    return np.asarray(values), np.asarray(errors)
 
 
 def of_singles(found):
-    """Explained %, told, scatters, errors over the sensor's."""
-    status, ratios, errors = (
-        np.asarray(x) for x in (found.status._value, found.ratios, found.ratios_errors)
-    )
-    explained = 100 * np.mean(~np.isin(status, FAILED))
-    told = (errors[:, 1] < 0.1 * RATIOS[1]) & ~np.isin(status, FAILED)
-    boundary = 100 * np.mean(status == int(Status.AT_BOUNDARY._value))
-    pulls = ((ratios - RATIOS) / errors)[told]
-    drag, error = map(np.asarray, jax.vmap(lambda x: x.leaves["torque.coefficient"])(found))
-    pulls = np.column_stack([pulls, ((drag - DRAG * MOMENTS.mean()) / error)[told]])
-    whole, own = (
-        np.diagonal(np.asarray(x), axis1=1, axis2=2)[told]
-        for x in (found.numbers_covariance, found.sensor_covariance)
-    )
-    scatter = [f"{x:.2f}" for x in np.sqrt(np.mean(pulls**2, axis=0))]
+    """Explained %, at boundary %, told, scatters, error of I3/I1, errors over the sensor's."""
+    ratios = np.asarray(found.ratios)
+    errors = np.asarray(found.ratios_errors)
+    failed = is_one_of(found.status, FAILED)
+    boundary = is_one_of(found.status, [Status.AT_BOUNDARY])
+    told = (errors[:, 1] < 0.1 * RATIOS[1]) & ~failed
+    drag, drag_error = drags_of(found)
+    pulls = np.column_stack([(ratios - RATIOS) / errors, (drag - DRAG * MEAN) / drag_error])
+    scatter = np.sqrt(np.mean(pulls[told] ** 2, axis=0))
     size = 100 * np.median(errors[told, 1] / RATIOS[1])
-    return [f"{explained:.0f}", f"{boundary:.0f}", int(told.sum()), *scatter, f"{size:.2f}",
-            f"{np.median(np.sqrt(whole / own)):.1f}"]  # fmt: skip
+    whole = np.diagonal(np.asarray(found.numbers_covariance), axis1=1, axis2=2)[told]
+    own = np.diagonal(np.asarray(found.sensor_covariance), axis1=1, axis2=2)[told]
+    return [
+        f"{100 * np.mean(~failed):.0f}",
+        f"{100 * np.mean(boundary):.0f}",
+        int(told.sum()),
+        *(f"{x:.2f}" for x in scatter),
+        f"{size:.2f}",
+        f"{np.median(np.sqrt(whole / own)):.1f}",
+    ]
 
 
 def of_halves(found):
     """Differences of the ratios and each half's error, in units of what was stated; its size."""
-    ratios, errors = np.asarray(found.ratios), np.asarray(found.ratios_errors)
+    ratios = np.asarray(found.ratios)
+    errors = np.asarray(found.ratios_errors)
     apart = (ratios[0] - ratios[1]) / np.linalg.norm(errors, axis=0)
     off = (ratios[:, 1] - RATIOS[1]) / errors[:, 1]
     size = 100 * errors[0, 1] / RATIOS[1]
-    names = [x for x in dir(Status) if isinstance(getattr(Status, x), Status)]
-    ends = {int(getattr(Status, x)._value): x for x in names}
-    return [", ".join(f"{x:+.1f}" for x in apart), ", ".join(f"{x:+.1f}" for x in off),
-            f"{size:.3f}", ", ".join(ends[int(x)] for x in found.status._value)]  # fmt: skip
+    ends = {int(getattr(Status, x)._value): x for x in NAMES}
+    return [
+        ", ".join(f"{x:+.1f}" for x in apart),
+        ", ".join(f"{x:+.1f}" for x in off),
+        f"{size:.3f}",
+        ", ".join(ends[int(x)] for x in found.status._value),
+    ]
+
+
+def name_of(unmodelled):
+    """What a fit is told of the unmodelled torque, in a word."""
+    if unmodelled == "estimate":
+        return "estimate"
+    return "known" if unmodelled else "none"
 
 
 def main():
@@ -112,29 +147,41 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--any", action="store_true", help="also as a body of any shape")
     given = parser.parse_args()
-    flat, any_ = identify.Flat(), identify.Tensor()
-    cases = [("flat", flat, "known", "estimate", lash) for lash in LASHES]
-    white = "white, s = 0.01"
-    cases += [("flat", flat, lag, "estimate", white) for lag in ("sought", "ignored")]
-    cases += [("flat", flat, "known", x, white) for x in (0.01 * MOMENTS.mean(), 0.0)]
+    cases = [("flat", "known", "estimate", lash) for lash in LASHES]
+    cases += [("flat", lag, "estimate", WHITE) for lag in ("sought", "ignored")]
+    cases += [("flat", "known", level, WHITE) for level in (0.01 * MEAN, 0.0)]
     if given.any:
-        cases += [("any", any_, "known", "estimate", lash) for lash in LASHES]
+        cases += [("any", "known", "estimate", lash) for lash in LASHES]
     fits, rows = {}, []
-    for name, shape, lag, unmodelled, lash in cases:
-        fit = fits.setdefault((name, lag, unmodelled), fitter(shape, lag, unmodelled))
-        data = records(lash, given.count, given.seed)
+    for shape, lag, unmodelled, lash in cases:
+        fit_sets = fits.setdefault((shape, lag, unmodelled), fitter(shape, lag, unmodelled))
+        throws = throws_of(lash, given.count, given.seed)
+        half = given.count // 2
         start = time.perf_counter()
-        singles = of_singles(fit(*data))
-        halves = fit(*(x.reshape(2, -1, *x.shape[1:]) for x in data))
-        told = unmodelled if unmodelled == "estimate" else "known" if unmodelled else "none"
-        rows.append([lash, name, lag, told, *singles, *of_halves(halves)])
+        singles = of_singles(fit_sets([[x] for x in throws]))
+        halves = of_halves(fit_sets([throws[:half], throws[half:]]))
+        rows.append([lash, shape, lag, name_of(unmodelled), *singles, *halves])
         print(*rows[-1], f"{time.perf_counter() - start:.0f} s", sep=" | ", flush=True)
-    header = ["lash", "shape", "lag", "unmodelled", "explained %", "at boundary %", "told",
-              "scatter I2/I1", "I3/I1", "drag", "error of I3/I1 %", "errors over the sensor's",
-              "halves apart", "off", "error %", "they end"]  # fmt: skip
-    text = "\n\n".join([" ".join((__doc__ or "").split("\n\n")[1].split()),
-                        " ".join((__doc__ or "").split("\n\n")[2].split()),
-                        common.table(header, rows)])  # fmt: skip
+    header = [
+        "lash",
+        "shape",
+        "lag",
+        "unmodelled",
+        "explained %",
+        "at boundary %",
+        "told",
+        "scatter I2/I1",
+        "I3/I1",
+        "drag",
+        "error of I3/I1 %",
+        "errors over the sensor's",
+        "halves apart",
+        "off",
+        "error %",
+        "they end",
+    ]
+    explained = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:3]]
+    text = "\n\n".join([*explained, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
     common.report("throws", "A hundred throws with what no model has", text, packages, given.write)
 

@@ -141,6 +141,42 @@ def test_small_kicks_move_a_free_motion_little(rng):
     assert np.max(np.abs(kicked.omega - free.omega)) < 1e-6
 
 
+@pytest.mark.parametrize("tau", [0.0, 0.05, 0.5])
+def test_a_held_torque_forgets_itself_within_its_time(rng, tau):
+    size, step = np.array([0.01, 0.02, 0.05]), 0.01
+    ts = step * np.arange(401)
+    torque = worlds.ou_torque(rng, ts, np.tile(size, (2000, 1)), tau)
+    assert torque.shape == (2000, 400, 3)
+    like = np.exp(-step / tau) if tau else 0.0
+    variance = size**2 * (1 - like) / (1 + like) / step
+    if tau:
+        assert variance == pytest.approx(size**2 / (2 * tau), rel=0.01)
+    # Of 2000 throws: of a variance one standard error is 3.2 %.
+    for row in (0, 200, 399):
+        assert np.var(torque[:, row], axis=0) == pytest.approx(variance, rel=0.15)
+    product = np.mean(torque[:, 1:] * torque[:, :-1], axis=(0, 1))
+    assert product / variance == pytest.approx(like, abs=0.05)
+    # A ball keeps what it was given.
+    still = worlds.tumble(2 * np.eye(3), np.zeros((2000, 3)), ts, held=torque)
+    given = step * np.cumsum(torque, axis=1)
+    assert 2 * still.omega[:, 1:] == pytest.approx(given, abs=1e-12)
+
+
+def test_a_held_torque_is_one_of_the_body(rng):
+    axis = np.array([0.0, 0.0, 1.0])
+    held = np.zeros((3, 100, 3))
+    free = worlds.tumble(TENSOR, OMEGA, TS)
+    assert worlds.tumble(TENSOR, OMEGA, TS, held=held).omega == pytest.approx(free.omega, abs=1e-5)
+    # Constant, it does work on the body at the rate of torque times omega.
+    ts = np.linspace(0.0, 5.0, 2001)
+    held = np.broadcast_to(0.3 * axis, (3, 2000, 3))
+    motion = worlds.tumble(TENSOR, OMEGA, ts, held=held)
+    energy = np.sum(motion.omega * times(TENSOR, motion.omega), axis=-1) / 2
+    rate = 0.3 * motion.omega[..., 2]
+    work = np.sum((rate[:, 1:] + rate[:, :-1]) / 2 * np.diff(ts), axis=1)
+    assert energy[:, -1] - energy[:, 0] == pytest.approx(work, abs=1e-4)
+
+
 @pytest.mark.parametrize("dense", [True, False])
 def test_a_lag_turns_and_shrinks_a_sinusoid(rng, dense):
     rate, constant, delay = 12.0, 0.02, 0.015
@@ -250,6 +286,27 @@ def test_throws_are_what_they_say(kick):
         momentum = np.linalg.norm(times(record.tensor, record.omega), axis=-1)
         steady = np.max(np.abs(momentum / momentum[0] - 1))
         assert steady < 1e-8 if kick == 0 else 1e-4 < steady < 0.1
+
+
+def test_throws_under_a_held_torque_gain_momentum_with_their_spin():
+    axes = worlds.random_axes(np.random.default_rng(3))
+    clean = {"drag": 0.0, "wobble": 0.0, "time_constant": 0.0, "sigma": 0.0, "axes": axes}
+    size = np.array([0.0, 0.0, 0.01])
+    records = worlds.throws(
+        np.random.default_rng(1), 200, "racquet", spin=(2.0, 40.0), duration=(0.5, 0.5),
+        rate=200.0, ou=size, tau=0.0, **clean,
+    )  # fmt: skip
+    gained = []
+    for record in records:
+        mean = np.trace(record.tensor) / 3
+        spin = np.linalg.norm(record.omega[0])
+        push = times(record.tensor, np.gradient(record.omega, record.ts, axis=0))
+        push -= cross(times(record.tensor, record.omega), record.omega)
+        gained.append(np.std(push @ axes, axis=0) / mean / spin)
+    across, _, along = np.median(gained, axis=0)
+    # Differences over two steps of 5 ms each average white torque over 10 ms.
+    assert along == pytest.approx(0.01 / np.sqrt(0.01), rel=0.2)
+    assert across < 0.1 * along
 
 
 def test_a_phone_in_the_air_is_measured_late():

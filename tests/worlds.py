@@ -28,7 +28,7 @@ class Motion:
     Attributes:
         ts: Times (samples,) [s].
         omega: Rates (..., samples, 3) [rad/s].
-        alpha: Their derivatives without the part of white torque [rad/s^2].
+        alpha: Their derivatives without the part of white or held torque [rad/s^2].
         attitude: Quaternions body to space, scalar first (..., samples, 4), or None.
         inner: Angles and rates of the loose part (..., samples, 6) [rad, rad/s], or None.
     """
@@ -111,10 +111,10 @@ class _Body:
             inside = inside + self.part.inertia * state[..., -3:]
         return times(self.inverse, state[..., :3] - inside)
 
-    def rates(self, t, state):
-        """Derivatives of the rates and of the state."""
+    def rates(self, t, state, held=0.0):
+        """Derivatives of the rates and of the state; a held torque adds to that of the motion."""
         omega, momentum = self.omega(t, state), state[..., :3]
-        torque = 0.0 if self.torque is None else self.torque(t, omega)
+        torque = held if self.torque is None else held + self.torque(t, omega)
         wheel = 0.0 if self.wheel is None else self.wheel(t)[1]
         out = [cross(momentum, omega) + torque]
         if self.followed:
@@ -129,12 +129,12 @@ class _Body:
         out += [nu, spring / inertia - alpha - cross(omega, nu)]
         return alpha, np.concatenate(out, axis=-1)
 
-    def step(self, t, dt, state):
+    def step(self, t, dt, state, held=0.0):
         """One step of the classical Runge-Kutta method of order 4."""
-        one = self.rates(t, state)[1]
-        two = self.rates(t + dt / 2, state + dt / 2 * one)[1]
-        three = self.rates(t + dt / 2, state + dt / 2 * two)[1]
-        four = self.rates(t + dt, state + dt * three)[1]
+        one = self.rates(t, state, held)[1]
+        two = self.rates(t + dt / 2, state + dt / 2 * one, held)[1]
+        three = self.rates(t + dt / 2, state + dt / 2 * two, held)[1]
+        four = self.rates(t + dt, state + dt * three, held)[1]
         return state + dt / 6 * (one + 2 * two + 2 * three + four)
 
 
@@ -155,21 +155,24 @@ def _smooth(body, state, ts):
     return np.moveaxis(done.y.reshape(*shape, len(ts)), -1, -2)
 
 
-def _kicked(body, state, ts, kick, rng, substeps):
+def _kicked(body, state, ts, kick, rng, substeps, held):
     """States at the times; each substep a half kick, a Runge-Kutta step, a half kick."""
     states = [state]
     turn = np.max(np.linalg.norm(body.omega(ts[0], state), axis=-1))
     if body.part is not None:
         turn = max(turn, 2 * np.pi * body.part.frequency)
-    for start, end in pairwise(ts):
+    for row, (start, end) in enumerate(pairwise(ts)):
+        torque = 0.0 if held is None else held[..., row, :]
         count = substeps or max(1, int(np.ceil(turn * (end - start) / _LARGEST_TURN)))
         dt = (end - start) / count
         sizes = kick * np.sqrt(dt / 2)
         for i in range(count):
-            noise = rng.normal(size=(2, *state.shape[:-1], 3)) * sizes
+            noise = np.zeros(2)
+            if np.any(kick):
+                noise = rng.normal(size=(2, *state.shape[:-1], 3)) * sizes
             state = state.copy()
             state[..., :3] += noise[0]
-            state = body.step(start + i * dt, dt, state)
+            state = body.step(start + i * dt, dt, state, torque)
             state[..., :3] += noise[1]
             if body.followed:
                 state[..., 3:7] /= np.linalg.norm(state[..., 3:7], axis=-1, keepdims=True)
@@ -179,7 +182,7 @@ def _kicked(body, state, ts, kick, rng, substeps):
 
 def tumble(
     tensor, omega0, ts, torque=None, wheel=None, kick=0.0, rng=None, substeps=None,
-    attitude0=None, part=None,
+    attitude0=None, part=None, held=None,
 ):  # fmt: skip
     """A rigid body turns about its centre of mass: I w' = (I w + h) x w - h' + torque + noise.
 
@@ -200,6 +203,8 @@ def tumble(
         substeps: Of each sample with a kick; None: at most 0.05 rad of the first rates each.
         attitude0: Quaternion at ts[0], (4,) or (throws, 4), if attitudes are wanted.
         part: A LoosePart, at rest in the body at ts[0].
+        held: A torque in body axes (..., samples - 1, 3) [N m], constant from each time to the
+            next; steps are as with a kick. See `ou_torque`.
 
     Returns:
         Motion.
@@ -211,8 +216,8 @@ def tumble(
     state[..., :3] = times(tensor, omega) + (0.0 if wheel is None else wheel(ts[0])[0])
     if attitude0 is not None:
         state[..., 3:7] = attitude0
-    if np.any(kick):
-        states = _kicked(body, state, ts, np.asarray(kick), rng, substeps)
+    if np.any(kick) or held is not None:
+        states = _kicked(body, state, ts, np.asarray(kick), rng, substeps, held)
     else:
         states = _smooth(body, state, ts)
     at = [(t, states[..., i, :]) for i, t in enumerate(ts)]
@@ -257,6 +262,32 @@ def wobble_torque(rng, tensor, omega0, size, frequencies=(0.3, 2.0)):
     # Nine sines, each of mean square 1/2.
     amplitude = size * np.mean(gyroscopic) / np.sqrt(4.5)
     return lambda t, _w: amplitude * np.sum(np.sin(rates * t + phases), axis=-1)
+
+
+def ou_torque(rng, ts, size, tau):
+    """An unmodelled torque: along each axis an Ornstein-Uhlenbeck process, held between times.
+
+    The process is stationary and sampled exactly: neighbours correlate by a = exp(-dt / tau). Its
+    variance is size^2 (1 - a) / (1 + a) / dt, so that the spectral density of the held torque at
+    frequency 0 is size^2 whatever tau; where dt is much smaller than tau, that is the variance
+    size^2 / (2 tau) of the process.
+
+    Args:
+        rng: A generator.
+        ts: Times, uniform (samples,) [s].
+        size: Root of the spectral density at frequency 0 (..., 3) [N m sqrt(s)].
+        tau: Correlation time [s]; 0: white.
+
+    Returns:
+        Torques (..., samples - 1, 3) [N m], as `tumble` takes them.
+    """
+    step = ts[1] - ts[0]
+    memory = np.exp(-step / tau) if tau else 0.0
+    size = np.asarray(size, float)[..., None, :]
+    noise = rng.normal(size=(*size.shape[:-2], len(ts) - 1, 3))
+    noise[..., 1:, :] *= np.sqrt(1 - memory**2)
+    path = lfilter([1.0], [1.0, -memory], noise, axis=-2)
+    return size * np.sqrt((1 - memory) / (1 + memory) / step) * path
 
 
 def wheel_profile(axis, size, start, duration, scale=1.0, delay=0.0):
@@ -480,7 +511,7 @@ THROWN = {"phone": (8.2e-5, 3.43e-4, 4.24e-4), "racquet": (1.5e-3, 1.50e-2, 1.64
 def throws(
     rng, count=100, body="phone", rate=100.0, duration=(0.3, 1.0), spin=(6.0, 14.0), drag=0.01,
     wobble=0.01, wobble_frequency=15.0, kick=0.0, time_constant=0.005, sigma=0.005, bias=0.0,
-    delay=0.0, limit=None, quantum=None,
+    delay=0.0, limit=None, quantum=None, ou=None, tau=0.1, ou_scatter=0.0, axes=None,
 ):  # fmt: skip
     """One body thrown many times: the scene of most home-made records.
 
@@ -504,12 +535,19 @@ def throws(
         delay: Of the gyro [s].
         limit: Of the gyro [rad/s].
         quantum: Of the gyro [rad/s].
+        ou: Ornstein-Uhlenbeck torque along each principal axis (3,), or None: the root of its
+            spectral density at frequency 0 over the mean moment and over the throw's spin
+            [1 / sqrt(s)].
+        tau: Its correlation time [s]; 0: white.
+        ou_scatter: Of the logarithm of its level from throw to throw.
+        axes: Principal axes in body axes (3, 3), columns; None: at random.
 
     Returns:
         A Record of each throw, with rates in true body axes at the times of its samples.
     """
     moments = np.asarray(THROWN[body] if isinstance(body, str) else body, float)
-    axes, mean = random_axes(rng), np.mean(moments)
+    axes = random_axes(rng) if axes is None else np.asarray(axes, float)
+    mean = np.mean(moments)
     tensor = axes @ np.diag(moments) @ axes.T
     directions = rng.normal(size=(count, 3))
     near = rng.uniform(size=count) < 0.5
@@ -524,9 +562,13 @@ def throws(
                if time_constant else 0)  # fmt: skip
     lead = int(np.ceil((delay + 5 * time_constant) * rate))
     grid = np.arange(-lead * fine, (np.max(lengths) - 1) * fine + 1) / (rate * fine)
+    held = None
+    if ou is not None:
+        levels = mean * spins * np.exp(ou_scatter * rng.normal(size=count))
+        held = ou_torque(rng, grid, levels[:, None] * np.asarray(ou, float), tau) @ axes.T
     motion = tumble(
         tensor, omega0, grid, quadratic_drag(drag * mean) if drag else None,
-        kick=kick * mean, rng=rng,
+        kick=kick * mean, rng=rng, held=held,
         part=LoosePart(wobble * moments[0], wobble_frequency) if wobble else None,
     )  # fmt: skip
     first = lead * fine
