@@ -164,10 +164,14 @@ def materialize(*arrays: Array) -> tuple[Array, ...]:
 _EXACT = jax.lax.Precision.HIGHEST
 
 
+_WORTH_A_PLAN = 1000  # numbers of an array, where numpy's plan for a product pays
+
+
 def product(subscripts: str, *operands: AnyArray) -> AnyArray:
     """`einsum` in the full precision of the dtype on every device; numpy's of arrays of numpy."""
     if all(isinstance(x, np.ndarray) for x in operands):
-        return np.einsum(subscripts, *operands, optimize=True)
+        large = max(x.size for x in operands) > _WORTH_A_PLAN
+        return np.einsum(subscripts, *operands, optimize=large)
     return jnp.einsum(subscripts, *operands, precision=_EXACT)
 
 

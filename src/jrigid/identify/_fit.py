@@ -362,7 +362,7 @@ def _observed(
     angle, coarse = 0.0, False
     if told is not None:
         angle = float(np.max(angle_turned(told)[:, -1]))
-        coarse = bool(longest_turn(told) > np.pi)
+        coarse = longest_turn(told) > np.pi
     return _Observed(samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate))
 
 
@@ -389,9 +389,8 @@ def _begun(
     told, samples = observed.told, observed.samples
     throws, dtype = samples.ts.shape[0], samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
-    starts = [unknowns.start(x, _ROUND if i else _FLAT) for i, x in enumerate(tensors)]
-    unknowns = on_host(starts[0][0])
-    numbers = np.stack([x for _, x in starts])
+    unknowns, numbers = unknowns.starts(tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1))
+    unknowns = on_host(unknowns)
     single = cut = whole(samples, options.nodes)
     attitude = np.zeros((throws, options.nodes, 4), dtype)
     attitude[..., 0] = 1

@@ -172,9 +172,9 @@ def angle_turned(told: Told) -> np.ndarray:
     return np.cumsum(_of_throws(_turned, told.ts, told.there, speed)[..., 0], axis=1)
 
 
-def longest_turn(told: Told) -> np.ndarray:
+def longest_turn(told: Told) -> float:
     """The most that a body turns from one sample to the next [rad]."""
-    return np.max(np.diff(angle_turned(told), axis=1), initial=0.0)
+    return float(np.max(np.diff(angle_turned(told), axis=1), initial=0.0))
 
 
 def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
@@ -235,13 +235,13 @@ def node_states(
     return omega, _carried(told.attitude[throw, opening], omega, late)
 
 
-def segments_needed(angle: AnyArray, n: int, length: float) -> int:
+def segments_needed(angle: float, n: int, length: float) -> int:
     """How many nodes a throw needs; if the angle is not finite, for the worst case."""
     if not length:
         return min(n, MOST_NODES)
     most = n // 2 + 2
-    if not 0 <= float(angle) < math.inf:
+    if not 0 <= angle < math.inf:
         return most
     # 8, 32, 128, ...: few programs serve all records.
-    needed = max(float(angle) / length + 2, 8.0)
+    needed = max(angle / length + 2, 8.0)
     return min(2 * 4 ** math.ceil(math.log(needed / 2, 4)), most)

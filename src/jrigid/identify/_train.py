@@ -249,7 +249,7 @@ def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     else:
         attitude = told.attitude[throw, first]
     data = _Data(samples, State(attitude, told.omega[throw, first]))
-    return _Observed(data, told.attitude is not None, float(longest_turn(told)))
+    return _Observed(data, told.attitude is not None, longest_turn(told))
 
 
 def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:

@@ -252,14 +252,25 @@ class Unknowns(eqx.Module):
         self, tensor: AnyArray, flattest: AnyArray | float = 1e-3
     ) -> tuple["Unknowns", AnyArray]:
         """Numbers for a tensor; the frame of the shape is chosen for it."""
-        xp = tensor.__array_namespace__()
-        known = self.known_tensor.astype(tensor.dtype)
-        shape, numbers = self.shape.start(tensor, known, flattest)
-        factor = xp.trace(tensor) / self.trace
-        scale = xp.log(xp.where(factor > 0, factor, 1.0))[None][: int(self.scaled)]
-        parts = [numbers, scale, *(x.start() for x in self.shared)]
-        numbers = xp.concatenate([xp.asarray(x, tensor.dtype) for x in parts])
-        return dataclasses.replace(self, shape=shape), numbers
+        unknowns, numbers = self.starts(tensor[None], [flattest])
+        return unknowns, numbers[0]
+
+    def starts(
+        self, tensors: AnyArray, flattest: Sequence[AnyArray | float]
+    ) -> tuple["Unknowns", AnyArray]:
+        """Numbers for each of several tensors; the frame of the shape is chosen for the first."""
+        xp = tensors.__array_namespace__()
+        known = self.known_tensor.astype(tensors.dtype)
+        pairs = zip(tensors, flattest, strict=True)
+        shapes = [self.shape.start(tensor, known, least) for tensor, least in pairs]
+        factors = xp.trace(tensors, axis1=1, axis2=2) / self.trace
+        scales = xp.log(xp.where(factors > 0, factors, 1.0))
+        others = [x.start() for x in self.shared]
+        rows = []
+        for (_, of_shape), scale in zip(shapes, scales, strict=True):
+            parts = [of_shape, scale[None][: int(self.scaled)], *others]
+            rows.append(xp.concatenate([xp.asarray(x, tensors.dtype) for x in parts]))
+        return dataclasses.replace(self, shape=shapes[0][0]), xp.stack(rows)
 
     def own_start(self, throws: int, dtype: Any) -> AnyArray:
         """Numbers of each throw."""
