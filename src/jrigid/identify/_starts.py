@@ -357,7 +357,7 @@ def linear_starts(
         there = told.there[..., None]
         zero = np.zeros_like(told.omega)
         omegas = np.where(there, told.omega, zero)
-        torques = zero if free else np.where(there, np.asarray(_torques(unknowns, told)), zero)
+        torques = zero if free else np.where(there, _torques_at(unknowns, told), zero)
         # Times that are not there repeat one.
         first = first_and_last(told.ts, told.there)[0]
         ts = np.maximum.accumulate(np.where(told.there, told.ts, first[:, None]), axis=1)
@@ -396,18 +396,25 @@ def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
     return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
 
 
+def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
+    """Torques at the samples; where attitudes are not known, at the unit quaternion."""
+    attitude = told.attitude
+    if attitude is None:
+        unit = np.eye(1, 4, dtype=told.ts.dtype)[0]
+        attitude = np.broadcast_to(unit, (*told.ts.shape, 4))
+    return np.asarray(_torques(unknowns, told.ts, attitude, told.omega))
+
+
 @small_program
-def _torques(unknowns: Any, told: Told) -> Any:
+def _torques(unknowns: Any, ts: Any, attitude: Any, omega: Any) -> Any:
     """As they are at the samples, by what is known of the system beforehand."""
-    unit = jnp.zeros((*told.ts.shape, 4), told.ts.dtype).at[..., 0].set(1)
-    attitude = unit if told.attitude is None else told.attitude
 
     def at(throw: Array, t: Array, q: Array, w: Array) -> Array:
         system = unknowns.original(throw)[0]
         return jnp.asarray(system.torque_on(t, State(q, w), None), w.dtype)
 
     of_throw = jax.vmap(at, (None, 0, 0, 0))
-    return jax.vmap(of_throw)(jnp.arange(len(told.ts)), told.ts, attitude, told.omega)
+    return jax.vmap(of_throw)(jnp.arange(len(ts)), ts, attitude, omega)
 
 
 def _least_squares(
@@ -423,20 +430,21 @@ def _least_squares(
     sphere, basis = np.asarray([1.0, 1, 1, 0, 0, 0], dtype) / 3, np.eye(6, dtype=dtype)
     if trace is None:  # the sphere that does best, or one like the system's own
         along = rows @ sphere
-        trace = np.sum(along * right) / or_one(np.sum(along * along))
-        trace = trace if trace > 0 else like
+        best_trace = np.sum(along * right) / or_one(np.sum(along * along))
+        size = best_trace if best_trace > 0 else like
     else:  # five directions
         basis = np.asarray(_TRACELESS, dtype)
-    wanted = right - rows @ (trace * sphere)
+        size = trace
+    wanted = right - rows @ (size * sphere)
     left, values, vt, told = _singular(rows @ basis.T)
     along = wanted @ left
     best = np.where(told, along, 0.0)
     # The misfit of the best answer is how far rows can be trusted.
     misfit = wanted - left @ best
-    floor = 2 * np.sqrt(np.sum(misfit * misfit)) / trace
+    floor = 2 * np.sqrt(np.sum(misfit * misfit)) / size
 
     def tensor(weights: np.ndarray) -> np.ndarray:
-        return _tensor(trace * sphere + weights @ vt @ basis)
+        return _tensor(size * sphere + weights @ vt @ basis)
 
     leaning = tensor(values * along / or_one(values * values + floor * floor))
     plain = tensor(best / np.where(told, values, 1.0))
