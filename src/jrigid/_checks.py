@@ -32,6 +32,7 @@ from jrigid._core.third_party import (
 
 Tree = TypeVar("Tree")
 
+AnyBool = Bool[Array, ""] | np.bool_  # the latter known on the host
 INERTIA = (3,), (3, 3)  # shapes of an inertia: principal moments or a tensor
 
 
@@ -359,7 +360,7 @@ def harmless(ok: Array, tree: Tree) -> Tree:
     return jtu.tree_map(replaced, tree)
 
 
-def nan_where(bad: Bool[Array, ""], tree: Tree) -> Tree:
+def nan_where(bad: AnyBool, tree: Tree) -> Tree:
     """Replace the inexact leaves of a pytree by NaN where `bad`."""
     return jtu.tree_map(
         lambda x: jnp.where(bad, jnp.nan, x) if eqx.is_inexact_array(x) else x, tree
@@ -384,14 +385,14 @@ class Findings:
 
     def __init__(self) -> None:
         """Start with nothing found."""
-        self.ok: Bool[Array, ""] = jnp.array(True)
+        self.ok: Any = np.True_
         self.result: Any = RESULTS.successful
-        self._failed: list[Bool[Array, ""]] = []
+        self._failed: list[AnyBool] = []
         self._messages: list[str] = []
         self._values: list[Any] = []
 
     def require(
-        self, ok: Bool[Array, ""], code: Any, message: str | None = None, value: Any = None
+        self, ok: AnyBool, code: Any, message: str | None = None, value: Any = None
     ) -> None:
         """Note what is wrong where `ok` is False.
 
@@ -401,8 +402,12 @@ class Findings:
             message: The sentence to report; by default that of the code.
             value: The value to show behind it.
         """
+        failed = self.ok & ~ok
         if code is not None:
-            self.result = RESULTS.where(self.ok & ~ok, code, self.result)
+            if not isinstance(failed, np.bool_):
+                self.result = RESULTS.where(failed, code, self.result)
+            elif failed:  # known on the host, without a compiled program
+                self.result = code
         self.ok = self.ok & ok
         self._failed.append(~ok)
         self._messages.append(str(RESULTS[code] if message is None else message))
@@ -430,7 +435,7 @@ class Findings:
 
 
 @jax.jit
-def _first_failed(failed: list[Bool[Array, ""]]) -> Array:
+def _first_failed(failed: list[AnyBool]) -> Array:
     """The index of the first True; 0 if there is none."""
     first = jnp.argmax(jax.lax.stop_gradient(jnp.stack(failed)))
     return first.astype(jnp.int32)  # the type of result codes
@@ -473,7 +478,7 @@ def _diagnosis(
     return _Diagnosis(first, found.messages, values)
 
 
-def _refuse(tree: Tree, bad: Array, diagnose: Callable[[], _Diagnosis]) -> Tree:
+def _refuse(tree: Tree, bad: AnyBool, diagnose: Callable[[], _Diagnosis]) -> Tree:
     """Return the tree; raise where `bad`, in Python if that is known, as under vmap and grad."""
     some = unvmap_any(bad)
     if isinstance(some, jax.core.Tracer):

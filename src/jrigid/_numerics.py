@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jrigid._types import AnyArray
+
 Components = tuple[Array, ...]
 
 _FEW = 4
@@ -43,16 +45,25 @@ def _over_components(combine: Any, vector: Float[Array, "*many n"]) -> Float[Arr
     return functools.reduce(combine, [vector[..., i] for i in range(vector.shape[-1])])
 
 
-def or_one(size: Float[Array, "..."]) -> Float[Array, "..."]:
+def or_one(size: AnyArray) -> AnyArray:
     """A size to divide by: 1 where it is not positive."""
-    return jnp.where(size > 0, size, 1.0)
+    return size.__array_namespace__().where(size > 0, size, 1.0)
 
 
-def rms(vectors: Float[Array, "*n k"], there: Array) -> Float[Array, ""]:
+def without_gradient(value: AnyArray) -> AnyArray:
+    """`jax.lax.stop_gradient`, which would make an array of JAX of one of numpy."""
+    return value if isinstance(value, np.ndarray | np.generic) else jax.lax.stop_gradient(value)
+
+
+def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
     """Root of the mean square length of the vectors that are there; 1 where it tells no size."""
-    count = jnp.maximum(jnp.sum(there), 1).astype(vectors.dtype)
-    size = safe_norm(jnp.where(there[..., None], vectors, 0.0).reshape(-1)) / jnp.sqrt(count)
-    return jnp.where((size > 0) & (size < jnp.inf), size, 1.0)
+    xp = vectors.__array_namespace__()
+    shown = xp.where(there[..., None], vectors, 0.0)
+    largest = without_gradient(or_one(xp.max(xp.abs(shown))))
+    count = xp.maximum(xp.sum(there), 1).astype(vectors.dtype)
+    square = xp.sum((shown / largest) ** 2) / count
+    good = (square > 0) & (square < xp.inf)
+    return xp.where(good, largest * xp.sqrt(xp.where(good, square, 1.0)), 1.0)
 
 
 def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -153,8 +164,14 @@ def materialize(*arrays: Array) -> tuple[Array, ...]:
 _EXACT = jax.lax.Precision.HIGHEST
 
 
-def product(subscripts: str, *operands: Array) -> Array:
-    """`jnp.einsum` in the full precision of the dtype on every device."""
+_WORTH_A_PLAN = 1000  # numbers of an array, where numpy's plan for a product pays
+
+
+def product(subscripts: str, *operands: AnyArray) -> AnyArray:
+    """`einsum` in the full precision of the dtype on every device; numpy's of arrays of numpy."""
+    if all(isinstance(x, np.ndarray) for x in operands):
+        large = max(x.size for x in operands) > _WORTH_A_PLAN
+        return np.einsum(subscripts, *operands, optimize=large)
     return jnp.einsum(subscripts, *operands, precision=_EXACT)
 
 

@@ -11,22 +11,22 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from jrigid._checks import check_option, check_type, demand, is_good, settle
+from jrigid._checks import check_option, check_type, demand, is_good
 from jrigid._core.third_party import code_of
+from jrigid._types import AnyArray
 from jrigid.dynamics import State
-from jrigid.identify._compile import Static, small_program
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import depends_on_attitude
+from jrigid.identify._host import on_host
 from jrigid.identify._inputs import (
     GUESS,
-    findings_of,
+    judge,
     noise_of,
     refuse,
     sizes_of,
     start_of,
     systems_of,
-    tells,
     typical_rate,
 )
 from jrigid.identify._layout import (
@@ -40,8 +40,16 @@ from jrigid.identify._layout import (
     told_by,
     whole,
 )
+from jrigid.identify._minimise import tensors_at
 from jrigid.identify._problem import Options, Problem
-from jrigid.identify._records import Record, Samples, lengthened, of_throws, samples_of
+from jrigid.identify._records import (
+    Record,
+    Samples,
+    lengthened,
+    of_throws,
+    samples_of,
+    tells,
+)
 from jrigid.identify._result import FitResult, Status
 from jrigid.identify._search import Case, Effort, Line, no_search, run, search
 from jrigid.identify._shapes import AbstractShape, Tensor
@@ -342,102 +350,97 @@ class _Observed(NamedTuple):
 
     samples: Samples
     told: Told | None
-    rate: Any
-    sizes: tuple[Any, ...]
-    angle: Any
-    coarse: Any
-    noise: Any
-    result: Any
+    rate: AnyArray
+    sizes: tuple[AnyArray, ...]
+    angle: float
+    coarse: bool
+    noise: np.ndarray
 
 
-@small_program
 def _observed(
-    systems: Any, records: tuple[Record, ...], tensor: Any, state: Any, attitude0: Any
+    records: tuple[Record, ...], state: State | None, attitude0: np.ndarray | None
 ) -> _Observed:
-    """Read the records of one fit."""
-    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
+    """Read the records of one fit, whose arrays are numpy's."""
+    samples = samples_of(records, np.ones((), records[0].values.dtype))
     sizes = sizes_of(samples)
     if not records[0].states_noise:
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     told = told_by(records, samples, attitude0)
     rate = typical_rate(told, state, samples.ts.dtype)
-    findings = findings_of(systems, records, tensor, state, told)
-    angle, coarse = jnp.zeros(()), jnp.asarray(False)
+    angle, coarse = 0.0, False
     if told is not None:
-        angle = jnp.max(angle_turned(told)[:, -1])
-        coarse = longest_turn(told) > jnp.pi
-    noise = noise_of(records, samples, rate)
-    return _Observed(samples, told, rate, sizes, angle, coarse, noise, findings.result)
+        angle = float(np.max(angle_turned(told)[:, -1]))
+        coarse = longest_turn(told) > np.pi
+    return _Observed(samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate))
 
 
 class _Begun(NamedTuple):
     """Numbers of each attempt, the segments, and the states at their starts."""
 
     unknowns: Unknowns
-    numbers: Any
+    numbers: np.ndarray
     single: Layout
     cut: Layout
     point: Point
-    tensor: Any
+    tensor: np.ndarray
 
 
-@small_program
 def _begun(
     unknowns: Unknowns,
     observed: _Observed,
-    tensor: Any,
-    state: Any,
-    static: Static,
+    tensor: np.ndarray | None,
+    state: State | None,
+    options: Options,
+    length: float,
 ) -> _Begun:
     """Where the search begins."""
-    options, length = static.value
     told, samples = observed.told, observed.samples
     throws, dtype = samples.ts.shape[0], samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
-    flattest = jnp.full(tensors.shape[0], _ROUND, dtype).at[0].set(_FLAT)
-    all_unknowns, numbers = jax.vmap(unknowns.start)(tensors, flattest)
-    unknowns = jtu.tree_map(lambda x: x[0], all_unknowns)
+    unknowns, numbers = unknowns.starts(tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1))
+    unknowns = on_host(unknowns)
     single = cut = whole(samples, options.nodes)
-    attitude = jnp.zeros((throws, options.nodes, 4), dtype).at[..., 0].set(1)
+    attitude = np.zeros((throws, options.nodes, 4), dtype)
+    attitude[..., 0] = 1
     if options.shooting and told is not None:
         cut, opening = segments(samples, told, options.nodes, length)
         omega, seen = node_states(told, opening, cut.start)
         attitude = attitude if seen is None else seen
     else:
+        assert state is not None
         omega, attitude = (
-            jnp.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
+            np.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
             for x in (state.omega, state.attitude)
         )
-    torque = omega if options.dense else omega[..., :0]
+    torque = np.zeros_like(omega if options.dense else omega[..., :0])
     own = unknowns.own_start(throws, dtype)
-    point = Point(numbers[0], own, attitude, omega, jnp.zeros_like(torque))
-    return _Begun(unknowns, numbers, single, cut, point, unknowns.inertia(numbers[0]))
+    point = Point(numbers[0], own, attitude, omega, torque)
+    return _Begun(unknowns, numbers, single, cut, point, tensors[0])
 
 
+@np.errstate(all="ignore")  # values that are bad or out of range
 def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     """Where the search of a record begins, and the result code of the input."""
-    options, state = asked.options, asked.state
-    records = asked.records
+    options = asked.options
+    records, state, tensor = on_host((asked.records, asked.state, asked.tensor))
     if options.motion is None:  # which may ask for times that increase
         records = tuple(lengthened(x) for x in records)
     dtype = records[0].values.dtype
     attitude0 = None
     if state is not None and options.on_attitude:
-        attitude0 = jnp.asarray(state.attitude, dtype)
-    given = asked.systems, records, asked.tensor, state
-    observed = _observed(*given, attitude0)
-    if not is_good(observed.result):
-        settle(observed, throw, findings_of, *given, observed.told)
+        attitude0 = state.attitude.astype(dtype)
+    observed = _observed(records, state, attitude0)
+    result = judge(asked.systems, records, tensor, state, observed.told, throw)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and observed.told is not None:
         count = observed.told.ts.shape[1]
         options = options._replace(nodes=segments_needed(observed.angle, count, length))
     unknowns = unknowns_of(
-        asked.systems,
+        on_host(asked.systems),
         tuple(x.sensor for x in records),
         observed.sizes,
         asked.free,
-        asked.shape,
+        on_host(asked.shape),
         asked.scale != "trace" and not asked.shape.absolute,
         observed.rate,
     )
@@ -446,22 +449,25 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
         "Argument `free` must not state what is known beforehand where the noise of the record is "
         "not stated or only relative, but it does: the two cannot be weighed.",
     )
-    begun = _begun(unknowns, observed, asked.tensor, state, Static((options, length)))
-    begun, observed = jtu.tree_map(np.asarray, (begun, observed))
+    begun = _begun(unknowns, observed, tensor, state, options, length)
     line = Line(np.zeros_like(begun.point.numbers), np.zeros((), dtype))
+    unknowns = begun.unknowns.holding(line)
+    tensor = begun.tensor
+    if options.dense:  # a level is sought, in proportion to it
+        tensor = np.asarray(tensors_at(unknowns, begun.numbers[:2]))[0]
     case = Case(
-        problem=Problem(options, begun.unknowns.holding(line), observed.samples, observed.noise),
+        problem=Problem(options, unknowns, observed.samples, observed.noise),
         single=begun.single,
         cut=begun.cut,
         point=begun.point,
         starts=begun.numbers,
-        tensor=begun.tensor,
+        tensor=tensor,
         torque=asked.torque,
-        coarse=bool(observed.coarse),
-        long=bool(observed.angle > _LONG),
+        coarse=observed.coarse,
+        long=observed.angle > _LONG,
         effort=effort,
     )
-    return case, observed.result
+    return case, result
 
 
 def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[str, Any]]:

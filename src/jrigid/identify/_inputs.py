@@ -1,20 +1,32 @@
 """What a fit does with its arguments: options at trace time, values at run time."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+import numpy as np
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand, is_inertia, is_unit
-from jrigid._numerics import or_one, rms
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_option,
+    demand,
+    is_good,
+    is_inertia,
+    is_unit,
+    settle,
+)
+from jrigid._numerics import or_one, rms, without_gradient
+from jrigid._types import AnyArray
 from jrigid.dynamics import State
+from jrigid.identify._compile import small_program
 from jrigid.identify._layout import Told
-from jrigid.identify._records import Record, Samples, check_records
-from jrigid.identify._sensors import AbstractSensor, MomentumSensor
+from jrigid.identify._records import Record, Samples, check_records, tells
+from jrigid.identify._sensors import MomentumSensor
 from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, Sampled, SpinningMass, Sum
@@ -104,42 +116,48 @@ def refuse(system: RigidBody, records: Sequence[Record], scale: str, shape: Abst
     )
 
 
-def typical_rate(told: Told | None, state: State | None, dtype: Any) -> Array:
+def typical_rate(told: Told | None, state: State | None, dtype: Any) -> AnyArray:
     """Rms of the rates, 1 where there are none."""
     if told is not None:
-        return jax.lax.stop_gradient(rms(told.omega, told.there))
+        return rms(told.omega, told.there)
     assert state is not None
-    omega = jax.lax.stop_gradient(state.omega.astype(dtype))
-    return rms(omega, jnp.ones(omega.shape[:-1], bool))
+    omega = without_gradient(state.omega.astype(dtype))
+    xp = omega.__array_namespace__()
+    return rms(omega, xp.ones(omega.shape[:-1], bool))
 
 
-def sizes_of(samples: Samples) -> tuple[Array, ...]:
+def sizes_of(samples: Samples) -> tuple[AnyArray, ...]:
     """Rms of the values of each record; 1 where they are zero."""
     pairs = zip(samples.values, samples.parts, strict=True)
     return tuple(rms(values, samples.seen[:, part]) for values, part in pairs)
 
 
-def noise_of(records: tuple[Record, ...], samples: Samples, rate: Array) -> Array:
+def noise_of(records: tuple[Record, ...], samples: Samples, rate: AnyArray) -> np.ndarray:
     """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
-    white = jnp.diagonal(samples.whitener, axis1=-2, axis2=-1)
-    sigma = jnp.where(samples.weight > 0, 1 / or_one(white), jnp.nan)
-    pairs = [(x, jnp.nanmedian(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)]
+    white = np.diagonal(samples.whitener, axis1=-2, axis2=-1)
+    sigma = np.where(samples.weight > 0, 1 / or_one(white), np.nan)
+    pairs = [(x, _median(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)]
     rates = [median for x, median in pairs if tells(x, "rates")]
     angles = [median for x, median in pairs if x.sensor.unit_length]
-    angle = [*angles, *(x / rate for x in rates), jnp.full_like(rate, GUESS)][0]
-    noise = jnp.repeat(jnp.stack([[*rates, angle * rate][0], angle]), 3)
-    return jnp.where(jnp.isfinite(noise), noise, GUESS * rate)
+    angle = [*angles, *(x / rate for x in rates), GUESS][0]
+    noise = np.repeat([[*rates, angle * rate][0], angle], 3).astype(sigma.dtype)
+    return np.where(np.isfinite(noise), noise, GUESS * rate)
 
 
-def tells(record: Record, what: str) -> bool:
-    return getattr(type(record.sensor), what) is not getattr(AbstractSensor, what)
+def _median(x: np.ndarray) -> np.floating:
+    """Median of the numbers that are not NaN; NaN where there are none."""
+    known = x[~np.isnan(x)]
+    return np.median(known) if known.size else x.dtype.type(np.nan)
 
 
-def findings_of(
-    systems: tuple[RigidBody, ...], records: tuple[Record, ...], tensor: Any, state: State | None,
-    told: Told | None,
-) -> Findings:  # fmt: skip
-    """What is wrong with the values of the arguments."""
+@small_program
+def result_of_start(systems: tuple[RigidBody, ...], tensor: Any, state: State | None) -> Any:
+    """The result code of `findings_of_start`."""
+    return findings_of_start(systems, tensor, state).result
+
+
+def findings_of_start(systems: tuple[RigidBody, ...], tensor: Any, state: State | None) -> Findings:
+    """What is wrong with the values of the systems and the start."""
     findings = Findings()
     for system in systems:
         system.check(findings)
@@ -148,16 +166,43 @@ def findings_of(
     if state is not None:
         findings.require(all_finite(state), RESULTS.invalid_state)
         findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
-    check_records(findings, records)
-    known = any(tells(x, "attitude") for x in records)
-    if told is not None and told.ts.shape[1] > 1 and not known:
-        findings.require(_between(told) < jnp.pi, RESULTS.invalid_state, _COARSE)
     return findings
 
 
-def _between(told: Told) -> Array:
+def findings_of_records(records: tuple[Record, ...], told: Told | None) -> Findings:
+    """What is wrong with records, whose arrays are numpy's."""
+    findings = Findings()
+    check_records(findings, records)
+    known = any(tells(x, "attitude") for x in records)
+    if told is not None and told.ts.shape[1] > 1 and not known:
+        findings.require(_between(told) < np.pi, RESULTS.invalid_state, _COARSE)
+    return findings
+
+
+def judge(
+    systems: tuple[RigidBody, ...], records: tuple[Record, ...], tensor: Any, state: State | None,
+    told: Told | None, throw: bool,
+) -> Any:  # fmt: skip
+    """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`."""
+    result = result_of_start(systems, tensor, state)
+    if not is_good(result):
+        settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
+        return result
+    findings = findings_of_records(records, told)
+    if throw and not findings.ok:
+        findings.guard(None, throw)
+    return findings.result
+
+
+class _Judged(NamedTuple):
+    """What `settle` looks at."""
+
+    result: Any
+
+
+def _between(told: Told) -> np.floating:
     """Angle turned between neighbouring samples, as a median."""
     ok = told.there[:, 1:] & told.there[:, :-1]
-    speed = jnp.sqrt(jnp.sum(told.omega[:, 1:] ** 2, axis=-1))
-    turned = jnp.where(ok, jnp.diff(told.ts, axis=1) * speed, jnp.nan)
-    return jnp.nan_to_num(jnp.nanmedian(turned))
+    speed = np.sqrt(np.sum(told.omega[:, 1:] ** 2, axis=-1))
+    turned = np.diff(told.ts, axis=1) * speed
+    return np.nan_to_num(_median(turned[ok]))

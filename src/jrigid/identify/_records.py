@@ -5,11 +5,10 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, check_type, demand, float_arrays, is_concrete
@@ -107,12 +106,13 @@ class Record(Readable):
         return self.sigma is not None or self.covariance is not None
 
     @property
-    def known(self) -> Bool[Array, "*throws n degrees"]:
+    def known(self) -> AnyArray:
         """Which numbers of the residual are there."""
-        there = jnp.isfinite(self.values) & jnp.isfinite(self.ts)[..., None]
+        xp = self.values.__array_namespace__()
+        there = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
         if self.sensor.degrees is None and self.covariance is None:
             return there
-        return jnp.repeat(jnp.all(there, axis=-1, keepdims=True), self.degrees, axis=-1)
+        return xp.repeat(xp.all(there, axis=-1, keepdims=True), self.degrees, axis=-1)
 
     def with_values(self, values: Array) -> "Record":
         """With other values, where there are times."""
@@ -193,11 +193,12 @@ def one_after_another(sizes: Iterable[int]) -> list[slice]:
     return list(map(slice, ends, ends[1:]))
 
 
-def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[Array, Array]:
+def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Times of the first and last samples of each throw; zero for one without samples."""
-    first = jnp.min(jnp.where(there, ts, jnp.inf), axis=1)
-    last = jnp.max(jnp.where(there, ts, -jnp.inf), axis=1)
-    return jnp.where(jnp.isfinite(first), first, 0.0), jnp.where(jnp.isfinite(last), last, 0.0)
+    xp = ts.__array_namespace__()
+    first = xp.min(xp.where(there, ts, xp.inf), axis=1)
+    last = xp.max(xp.where(there, ts, -xp.inf), axis=1)
+    return xp.where(xp.isfinite(first), first, 0.0), xp.where(xp.isfinite(last), last, 0.0)
 
 
 class Samples(NamedTuple):
@@ -224,37 +225,63 @@ class Samples(NamedTuple):
         return one_after_another(x.shape[-2] for x in self.values)
 
 
-def samples_of(records: Sequence[Record], guess: Array) -> Samples:
-    """Records as a fit reads them; a noise that is not known is `guess`."""
+def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
+    """Records as a fit reads them; a noise that is not known is `guess`.
+
+    Of records with numpy arrays (`lengthened`, `on_host`) the samples are numpy arrays too.
+    """
     width = max(x.degrees for x in records)
     values, *rest = zip(*(_normalised(x, guess, width) for x in records), strict=True)
-    ts, whitener, weight, sign = (jnp.concatenate(x, axis=1) for x in rest)
-    there = jnp.any(weight > 0, axis=-1)
-    ts = jnp.where(there, ts, first_and_last(ts, there)[0][:, None])
+    xp = records[0].values.__array_namespace__()
+    ts, whitener, weight, sign = (xp.concatenate(x, axis=1) for x in rest)
+    there = xp.any(weight > 0, axis=-1)
+    ts = xp.where(there, ts, first_and_last(ts, there)[0][:, None])
     return Samples(ts, values, whitener, weight, sign)
 
 
-def _normalised(record: Record, guess: Array, width: int) -> tuple[Array, ...]:
+def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, ...]:
     """Values, times, whitener, weight and sign of a record, the latter as wide as the widest's."""
-    known, values, sensor = record.known, record.values, record.sensor
+    known = record.known
+    values = record.values
+    sensor = record.sensor
+    xp = values.__array_namespace__()
     dtype, size = values.dtype, record.degrees
-    seen = jnp.any(known, axis=-1, keepdims=True)
-    harmless = jnp.zeros_like(values).at[..., 0].set(float(sensor.unit_length))
-    values = jnp.where(seen & jnp.isfinite(values), values, harmless)
-    eye = jnp.broadcast_to(jnp.eye(size, dtype=dtype), (*known.shape, size))
+    seen = xp.any(known, axis=-1, keepdims=True)
+    # A value that was not seen is zero, or the first unit vector.
+    first = xp.arange(values.shape[-1]) == 0
+    harmless = xp.where(first & sensor.unit_length, xp.ones((), dtype), 0.0)
+    values = xp.where(seen & xp.isfinite(values), values, harmless)
+    eye = xp.broadcast_to(xp.eye(size, dtype=dtype), (*known.shape, size))
     if record.covariance is not None:
-        lower = jnp.linalg.cholesky(jnp.where(seen[..., None], record.covariance, eye))
-        whitener = jax.scipy.linalg.solve_triangular(lower, eye, lower=True)
+        whitener = _inverse_factor(xp.where(seen[..., None], record.covariance, eye))
     else:
-        sigma = jnp.where(known, guess if record.sigma is None else record.sigma, 1.0)
+        sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
         whitener = eye / sigma[..., None].astype(dtype)
-    largest, sign = sensor.largest(), jnp.zeros(known.shape, dtype)
+    largest = sensor.largest()
+    sign = xp.zeros(known.shape, dtype)
     if largest is not None:
-        most = jnp.broadcast_to(largest.astype(dtype) * (1 - 1e-6), values.shape)
-        sign = jnp.where(known & (jnp.abs(values) >= most), jnp.sign(values), 0.0)
+        most = xp.broadcast_to(xp.asarray(largest, dtype) * (1 - 1e-6), values.shape)
+        sign = xp.where(known & (xp.abs(values) >= most), xp.sign(values), 0.0)
     pad = [(0, 0), (0, 0), (0, width - size)]
-    columns = (jnp.pad(x, pad) for x in (known.astype(dtype), sign))
-    return values, record.ts, jnp.pad(whitener, [*pad, pad[-1]]), *columns
+    columns = (xp.pad(x, pad) for x in (known.astype(dtype), sign))
+    return values, record.ts, xp.pad(whitener, [*pad, pad[-1]]), *columns
+
+
+def _inverse_factor(covariance: AnyArray) -> AnyArray:
+    """L^-1 of covariances L L^T (..., k, k), L lower triangular; NaN where there is no L.
+
+    By Gram and Schmidt: its rows are orthonormal in the product that the covariance makes.
+    """
+    xp = covariance.__array_namespace__()
+    eye = xp.eye(covariance.shape[-1], dtype=covariance.dtype)
+    rows = []
+    for i, unit in enumerate(eye):
+        row = xp.broadcast_to(unit, covariance.shape[:-1])
+        for other in rows:
+            row = row - xp.sum(covariance[..., i, :] * other, axis=-1, keepdims=True) * other
+        image = xp.sum(covariance * row[..., None, :], axis=-1)
+        rows.append(row / xp.sqrt(xp.sum(row * image, axis=-1, keepdims=True)))
+    return xp.stack(rows, axis=-2)
 
 
 def of_throws(observations: Any) -> tuple[Record, ...]:
@@ -293,8 +320,13 @@ def rounded(count: int) -> int:
     return 3 * power // 4 if count <= 3 * power // 4 else power
 
 
+def tells(record: Record, what: str) -> bool:
+    """Whether its sensor has a method of its own for "rates" or "attitude"."""
+    return getattr(type(record.sensor), what) is not getattr(sensors.AbstractSensor, what)
+
+
 def lengthened(record: Record) -> Record:
-    """With samples at its end in which nothing was seen."""
+    """With samples at its end in which nothing was seen; its arrays are numpy's."""
     more = rounded(record.ts.shape[-1]) - record.ts.shape[-1]
 
     def filled(x: Any, axis: int) -> Any:
@@ -357,36 +389,37 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
-    """Note what is wrong with values, times and noise."""
+    """Note what is wrong with values, times and noise of records with numpy arrays."""
     code = RESULTS.invalid_state
     for x in records:
         of, known = f"of `{type(x.sensor).__name__}` must", x.known
-        seen = jnp.any(known, axis=-1)
+        seen = np.any(known, axis=-1)
         text = f"Argument `values` {of} hold values, but all are NaN."
-        findings.require(jnp.any(known), code, text)
-        times = jax.lax.cummax(jnp.where(seen, x.ts, -jnp.inf), axis=1)
-        ordered = jnp.all(~seen[:, 1:] | (x.ts[:, 1:] > times[:, :-1]))
-        padded = jnp.isnan(x.ts) & jnp.all(jnp.isfinite(x.values), axis=-1)
+        findings.require(np.any(known), code, text)
+        times = np.maximum.accumulate(np.where(seen, x.ts, -np.inf), axis=1)
+        ordered = np.all(~seen[:, 1:] | (x.ts[:, 1:] > times[:, :-1]))
+        padded = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
         text = "be finite where there are values, and increasing, each time once, but it is not."
-        ordered = ordered & ~jnp.any(padded)
+        ordered = ordered & ~np.any(padded)
         findings.require(ordered, RESULTS.invalid_times, f"Argument `ts` {of} {text}")
         text = f"Arguments `sigma` and `covariance` {of} be positive, but one is not."
         findings.require(_is_noise(x, known), code, text)
         if x.sensor.unit_length:
-            square = jnp.sum(jnp.where(seen[..., None], x.values, 0.0) ** 2, axis=-1)
+            square = np.sum(np.where(seen[..., None], x.values, 0.0) ** 2, axis=-1)
             near = 1e-3 if x.values.shape[-1] == 4 else 0.5
             text = f"Argument `values` {of} be of unit length, but one is not."
-            findings.require(jnp.all(~seen | (jnp.abs(square - 1) < near)), code, text)
-    enough = jnp.asarray(sum(jnp.sum(x.known) for x in records) >= 12)
+            findings.require(np.all(~seen | (np.abs(square - 1) < near)), code, text)
+    enough = np.bool_(sum(np.sum(x.known) for x in records) >= 12)
     text = "hold more numbers than a body and its state have, but it holds too few."
     findings.require(enough, code, f"Argument `observations` must {text}")
 
 
-def _is_noise(x: Record, known: Array) -> Array:
-    if x.covariance is None:
-        sigma = jnp.ones(()) if x.sigma is None else x.sigma
-        return jnp.all(~known | ((sigma > 0) & jnp.isfinite(sigma)))
-    seen = jnp.any(known, axis=-1)[..., None, None]
-    noise = jnp.where(seen, x.covariance, jnp.eye(x.degrees, dtype=x.values.dtype)[None, None])
-    even = jnp.abs(noise - jnp.swapaxes(noise, -1, -2)) <= 1e-6 * jnp.abs(noise)
-    return jnp.all(even) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(noise)))
+def _is_noise(x: Record, known: AnyArray) -> np.bool_:
+    if x.covariance is not None:
+        seen = np.any(known, axis=-1)[..., None, None]
+        noise = np.where(seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
+        even = np.abs(noise - np.swapaxes(noise, -1, -2)) <= 1e-6 * np.abs(noise)
+        return np.all(even) & np.all(np.isfinite(_inverse_factor(noise)))
+    if x.sigma is None:
+        return np.True_
+    return np.all(~known | ((x.sigma > 0) & np.isfinite(x.sigma)))

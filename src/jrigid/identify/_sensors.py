@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jrigid import rotation
 from jrigid._checks import array_of_shape, check_option, demand
 from jrigid._numerics import product, safe_norm
-from jrigid._types import Readable
+from jrigid._types import AnyArray, Readable
 from jrigid.dynamics import State, angular_momentum
 from jrigid.systems import AbstractSystem
 
@@ -81,7 +81,7 @@ class AbstractSensor(Readable):
         """Values of this size stand for it and anything beyond: the sensor is saturated."""
         return None
 
-    def units(self, rate: Array, size: Array) -> "AbstractSensor":
+    def units(self, rate: AnyArray, size: AnyArray) -> "AbstractSensor":
         """Sizes of its errors [as they are], where they are zero: of a body that turns at `rate`.
 
         Args:

@@ -12,26 +12,28 @@ from jaxtyping import Array, Float
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand
 from jrigid._numerics import product
-from jrigid._spectral import eigh
-from jrigid._types import Readable, ScalarLike
+from jrigid._types import AnyArray, Readable, ScalarLike
 from jrigid.identify import _parameters
-from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
+from jrigid.identify._host import cholesky, principal_axes
+from jrigid.mass import MassProperties, inertia_of_second_moment
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 # Second moments of the mass, of their trace, below which a fit has run into a boundary.
 BOUNDARY = 1e-7
 
 
-def as_tensor(inertia: Array) -> Array:
+def as_tensor(inertia: AnyArray) -> AnyArray:
     """A tensor, of moments or itself."""
-    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+    return inertia.__array_namespace__().diag(inertia) if inertia.ndim == 1 else inertia
 
 
-def real_body(tensor: Array, flattest: ScalarLike) -> Array:
+def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:
     """The nearest shape of a body with extent in three directions: second moments of trace 1."""
-    values, axes = eigh(2 * second_moment(tensor) / jnp.trace(tensor))
-    values = jnp.maximum(values, flattest)
-    return product("ik,k,jk->ij", axes, values / jnp.sum(values), axes)
+    xp = tensor.__array_namespace__()
+    # Second moments are tr(I) / 2 - I, of half the trace of I.
+    values, axes = principal_axes(xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor))
+    values = xp.maximum(values, flattest)
+    return product("ik,k,jk->ij", axes, values / xp.sum(values), axes)
 
 
 class AbstractShape(Readable):
@@ -62,11 +64,14 @@ class AbstractShape(Readable):
     names: eqx.AbstractClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
-    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple[Any, Array]:
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple[Any, AnyArray]:
         """The shape, in a frame chosen for a tensor, and its numbers there.
 
         Args:
-            tensor: Where to start.
+            tensor: Where to start: of numpy in a fit, of JAX in a plan. `tensor.
+                __array_namespace__()` is the module whose functions serve both.
             known: The system's own tensor, which may be known in part.
             flattest: Least second moment of the mass, of the trace of the three.
         """
@@ -102,11 +107,14 @@ class Tensor(AbstractShape):
 
     names: ClassVar[tuple[str, ...]] = _names(5)
 
-    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Tensor", Array]:
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Tensor", AnyArray]:
         """The numbers of the nearest real body."""
+        xp = tensor.__array_namespace__()
         sigma = real_body(tensor, flattest)
-        lower = jnp.linalg.cholesky(sigma) / jnp.sqrt(sigma[0, 0])
-        return self, jnp.concatenate([jnp.log(jnp.diagonal(lower)[1:]), lower[_parameters.SIDES]])
+        lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
+        return self, xp.concatenate([xp.log(xp.diagonal(lower)[1:]), lower[_parameters.SIDES]])
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
@@ -118,7 +126,7 @@ class Tensor(AbstractShape):
 class _InFrame(AbstractShape):
     """A shape in axes of its own."""
 
-    frame: Float[Array, "3 3"] | None = None
+    frame: Float[AnyArray, "3 3"] | None = None
 
     def sigma(self, numbers: Array) -> Array:
         """Second moments in the frame, of whatever trace: by default of its axes, the last ones."""
@@ -136,13 +144,14 @@ class Moments(_InFrame):
     names: ClassVar[tuple[str, ...]] = _names(2)
 
     def start(
-        self, tensor: Array, known: Array, flattest: Array | float
-    ) -> tuple["Moments", Array]:
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Moments", AnyArray]:
         """Logarithms of ratios of second moments, in the system's axes."""
-        eye = jnp.eye(3, dtype=tensor.dtype)
-        frame = jnp.where(jnp.all(known * (1 - eye) == 0), eye, eigh(known)[1])
+        xp = tensor.__array_namespace__()
+        eye = xp.eye(3, dtype=tensor.dtype)
+        frame = xp.where(xp.all(known * (1 - eye) == 0), eye, principal_axes(known)[1])
         values = product("ki,kl,li->i", frame, real_body(tensor, flattest), frame)
-        return Moments(frame), jnp.log(values[1:] / values[0])
+        return Moments(frame), xp.log(values[1:] / values[0])
 
 
 class Symmetric(_InFrame):
@@ -159,15 +168,16 @@ class Symmetric(_InFrame):
     names: ClassVar[tuple[str, ...]] = _names(3)
 
     def start(
-        self, tensor: Array, known: Array, flattest: Array | float
-    ) -> tuple["Symmetric", Array]:
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Symmetric", AnyArray]:
         """The odd moment's axis as axis 3 of the frame."""
-        values, frame = eigh(real_body(tensor, flattest))
+        xp = tensor.__array_namespace__()
+        values, frame = principal_axes(real_body(tensor, flattest))
         last = values[2] - values[1] > values[1] - values[0]
-        frame = jnp.where(last, frame, frame[:, ::-1])
-        values = jnp.where(last, values, values[::-1])
-        size = jnp.log(2 * values[2:] / (values[0] + values[1]))
-        return Symmetric(frame), jnp.pad(size, (0, 2))
+        frame = xp.where(last, frame, frame[:, ::-1])
+        values = xp.where(last, values, values[::-1])
+        size = xp.log(2 * values[2:] / (values[0] + values[1]))
+        return Symmetric(frame), xp.pad(size, (0, 2))
 
     def sigma(self, numbers: Array) -> Array:
         """Of an axis near axis 3."""
@@ -186,10 +196,13 @@ class Top(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(1)
 
-    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Top", Array]:
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Top", AnyArray]:
         """Of the body's own axes."""
-        values = jnp.diagonal(real_body(tensor, flattest))
-        return self, jnp.log(2 * values[2:] / (values[0] + values[1]))
+        xp = tensor.__array_namespace__()
+        values = xp.diagonal(real_body(tensor, flattest))
+        return self, xp.log(2 * values[2:] / (values[0] + values[1]))
 
 
 class Flat(_InFrame):
@@ -204,10 +217,13 @@ class Flat(_InFrame):
 
     names: ClassVar[tuple[str, ...]] = _names(4)
 
-    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Flat", Array]:
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Flat", AnyArray]:
         """The largest second moment first, the thickness last."""
-        values, frame = eigh(real_body(tensor, flattest))
-        return Flat(frame[:, ::-1]), jnp.pad(0.5 * jnp.log(values[1:2] / values[2:]), (0, 3))
+        xp = tensor.__array_namespace__()
+        values, frame = principal_axes(real_body(tensor, flattest))
+        return Flat(frame[:, ::-1]), xp.pad(0.5 * xp.log(values[1:2] / values[2:]), (0, 3))
 
     def sigma(self, numbers: Array) -> Array:
         """L L^T, the third column of L zero."""
@@ -228,11 +244,13 @@ class Fixed(AbstractShape):
 
     absolute: ClassVar[bool] = True
     names: ClassVar[tuple[str, ...]] = ()
-    known: Float[Array, "3 3"] | None = None
+    known: Float[AnyArray, "3 3"] | None = None
 
-    def start(self, tensor: Array, known: Array, flattest: ScalarLike) -> tuple["Fixed", Array]:
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Fixed", AnyArray]:
         """No numbers."""
-        return Fixed(known), jnp.zeros(0, tensor.dtype)
+        return Fixed(known), tensor.__array_namespace__().zeros(0, tensor.dtype)
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor that is known."""
@@ -294,8 +312,8 @@ class LogCholesky(AbstractShape):
         return jnp.where(of_length, jnp.sqrt(square), 1.0)
 
     def start(
-        self, tensor: Array, known: Array, flattest: Array | float
-    ) -> tuple["LogCholesky", Array]:
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["LogCholesky", AnyArray]:
         """The numbers sought, as they were given."""
         return self, self.parameters[self._indices()].astype(tensor.dtype)
 

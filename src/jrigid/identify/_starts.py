@@ -13,19 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jrigid import rotation
 from jrigid._checks import RESULTS, Findings, demand, settle, shaped, whole_number
-from jrigid._numerics import or_one, product, rms, safe_norm
-from jrigid._types import Matrix, Readable, Real, Vector
+from jrigid._numerics import or_one, product, rms
+from jrigid._types import AnyArray, Matrix, Readable, Real, Vector
 from jrigid.dynamics import State
-from jrigid.identify._layout import Told, first_and_last
-from jrigid.identify._shapes import LogCholesky, as_tensor
-from jrigid.rotation import to_matrix
+from jrigid.identify import _host as host
+from jrigid.identify._compile import small_program
+from jrigid.identify._layout import Told
+from jrigid.identify._records import first_and_last
+from jrigid.identify._shapes import LogCholesky
 
 _Times = Real[ArrayLike, " n"]
 _Vectors = Real[ArrayLike, "n 3"]
 _LEAST_SAMPLES = 8  # to a window
 _FEW_ATTITUDES = 40  # fewer than these do without the weak form
 _WINDOWS, _RADIANS = 128, 3.0
+_LARGEST_BLOCK = 2**17  # weights of samples in windows that are computed together
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
 _FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
 # A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without a trace.
@@ -55,44 +59,81 @@ class LinearStart(Readable):
     covariance: Float[Array, "6 6"] | None = None
 
 
-def _tensor(six: Array) -> Matrix:
-    return product("ijk,k->ij", jnp.asarray(_OF_SIX, six.dtype), six)
+def _tensor(six: AnyArray) -> AnyArray:
+    xp = six.__array_namespace__()
+    return product("ijk,k->ij", xp.asarray(_OF_SIX, six.dtype), six)
 
 
-def _momenta(omegas: Array, attitudes: Array | None = None) -> Array:
-    """I omega in body axes, or in space, as matrices (..., 3, 6) times the six of the tensor."""
-    matrices = product("ijk,...j->...ik", jnp.asarray(_OF_SIX, omegas.dtype), omegas)
-    if attitudes is None:
-        return matrices
-    turn = jnp.vectorize(to_matrix, signature="(4)->(3,3)")(attitudes)
-    return product("...ij,...jk->...ik", turn, matrices)
+def _momenta(omegas: AnyArray, turns: AnyArray | None = None) -> AnyArray:
+    """I omega as matrices (..., 3, 6) times the six of the tensor.
+
+    Args:
+        omegas: Rates, body components.
+        turns: Rotation matrices from body to space, for momenta in space.
+    """
+    xp = omegas.__array_namespace__()
+    matrices = product("ijk,...j->...ik", xp.asarray(_OF_SIX, omegas.dtype), omegas)
+    return matrices if turns is None else product("...ij,...jk->...ik", turns, matrices)
 
 
 def _weak_rows(
-    windows: int, radians: float, ts: Array, known: Array, omega: Array, rotor: Array, torque: Array
-) -> Array:
+    windows: int,
+    radians: float,
+    ts: AnyArray,
+    known: AnyArray,
+    omega: AnyArray,
+    rotor: AnyArray,
+    torque: AnyArray,
+) -> AnyArray:
     """Equations (3 windows, 7) of a throw, the right side last: smooth bumps, by parts.
 
     Samples that are not known are zero, and repeat a time where theirs is not known.
     """
+    xp = ts.__array_namespace__()
     span = ts[-1] - ts[0]
     least = _LEAST_SAMPLES * span / (ts.shape[0] - 1)
-    half = or_one(0.5 * jnp.minimum(jnp.maximum(radians / rms(omega, known), least), span))
-    centers = jnp.linspace(ts[0] + half, ts[-1] - half, windows)
+    half = or_one(0.5 * xp.minimum(xp.maximum(radians / rms(omega, known), least), span))
+    centers = xp.linspace(ts[0] + half, ts[-1] - half, windows)
+    step = xp.pad(xp.diff(ts), 1)
+    samples = ts, 0.5 * (step[1:] + step[:-1]), known, omega, rotor, torque
+    if not isinstance(ts, np.ndarray):
+        return _rows_of_windows(centers, half, *samples)
+    # Neighbouring windows together see few of the samples of a long record.
+    parts = min(windows, -(-windows * ts.size // _LARGEST_BLOCK))
+    rows = []
+    for block in np.array_split(centers, parts):
+        seen = slice(*np.searchsorted(ts, [block[0] - half, block[-1] + half]))
+        rows.append(_rows_of_windows(block, half, *(x[seen] for x in samples)))
+    return np.concatenate(rows)
+
+
+def _rows_of_windows(
+    centers: AnyArray,
+    half: AnyArray,
+    ts: AnyArray,
+    step: AnyArray,
+    known: AnyArray,
+    omega: AnyArray,
+    rotor: AnyArray,
+    torque: AnyArray,
+) -> AnyArray:
+    """Equations of windows with these centers and half this width [s], (3 windows, 7)."""
+    xp = ts.__array_namespace__()
     s = (ts[None] - centers[:, None]) / half
-    inside = jnp.abs(s) < 1
-    s = jnp.where(inside, s, 1.0)
+    inside = xp.abs(s) < 1
+    s = xp.where(inside, s, 1.0)
     # A window with a gap says nothing.
-    whole = ~jnp.any(inside & ~known[None], axis=1)
-    whole = (whole & (jnp.sum(inside, axis=1) >= _LEAST_SAMPLES // 2))[:, None]
-    step = jnp.pad(jnp.diff(ts), 1)
-    weight = jnp.where(whole & inside, 0.5 * (step[1:] + step[:-1])[None], 0.0)
-    bump, fall = weight * (1 - s * s) ** 4, weight * 8 * s * (1 - s * s) ** 3 / half
-    parts = jnp.concatenate([_momenta(omega), rotor[..., None]], axis=-1)
-    turned = jnp.cross(omega[..., None], parts, axis=1)
+    whole = ~xp.any(inside & ~known[None], axis=1)
+    whole = (whole & (xp.sum(inside, axis=1) >= _LEAST_SAMPLES // 2))[:, None]
+    weight = xp.where(whole & inside, step[None], 0.0)
+    height = 1 - s * s
+    cube = weight * height * height * height
+    bump, fall = cube * height, cube * 8 * s / half
+    parts = xp.concatenate([_momenta(omega), rotor[..., None]], axis=-1)
+    turned = xp.cross(omega[..., None], parts, axis=1)
     rows = product("wn,nij->wij", fall, parts) + product("wn,nij->wij", bump, turned)
     right = product("wn,ni->wi", bump, torque) - rows[..., 6]
-    return jnp.concatenate([rows[..., :6], right[..., None]], axis=-1).reshape(-1, 7)
+    return xp.concatenate([rows[..., :6], right[..., None]], axis=-1).reshape(-1, 7)
 
 
 def _samples(padded: bool, ts: Array, *columns: Array) -> tuple[Findings, Array, list[Array]]:
@@ -223,7 +264,9 @@ def momentum(
 def _momentum(_: Any, known: Array, ts: Array, attitudes: Array, omegas: Array) -> tuple:
     known, size = known[..., None], rms(omegas, jnp.isfinite(ts))
     unit = jnp.zeros_like(attitudes).at[..., 0].set(1)
-    turned = _momenta(omegas, jnp.where(known, attitudes, unit)) / size
+    attitudes = jnp.where(known, attitudes, unit)
+    turns = jnp.vectorize(rotation.to_matrix, signature="(4)->(3,3)")(attitudes)
+    turned = _momenta(omegas, turns) / size
     total = jnp.broadcast_to(-jnp.eye(3, dtype=ts.dtype), (*ts.shape, 3, 3))
     rows = jnp.where(known[..., None], jnp.concatenate([turned, total], axis=-1), 0.0)
     vector, values = _null_vector(rows.reshape(-1, 9))
@@ -287,98 +330,123 @@ def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -
     return _tensor(six), values, None, covariance
 
 
-def _singular(rows: Array) -> tuple[Array, ...]:
+def _singular(rows: AnyArray) -> tuple[AnyArray, ...]:
     """The decomposition, and which values are more than rounding."""
-    left, values, vt = jnp.linalg.svd(rows, full_matrices=False)
-    return left, values, vt, values > 64 * jnp.finfo(values.dtype).eps * values[0]
+    xp = rows.__array_namespace__()
+    left, values, vt = xp.linalg.svd(rows, full_matrices=False)
+    return left, values, vt, values > 64 * xp.finfo(values.dtype).eps * values[0]
 
 
-def linear_starts(options: Any, unknowns: Any, told: Told | None, given: Array | None) -> Array:
+def linear_starts(
+    options: Any, unknowns: Any, told: Told | None, given: np.ndarray | None
+) -> np.ndarray:
     """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
     From attitudes, if there are few, since R I omega is constant in each throw of a free body;
     else from the weak form, with torques as they are at the samples.
     """
     dtype, free = unknowns.rate.dtype, options.free_motion
-    known = as_tensor(unknowns.original(0)[0].inertia.astype(dtype))
+    known = unknowns.known_tensor.astype(dtype)
     sought = unknowns.shape.names and not isinstance(unknowns.shape, LogCholesky)
     if given is not None or told is None or not sought or options.motion is not None:
         first = known if given is None else given.astype(dtype)
-        return jnp.stack([first, _rounder(first)])
-    there, first = told.there[..., None], first_and_last(told.ts, told.there)[0]
-    omegas, zero = jnp.where(there, told.omega, 0.0), jnp.zeros_like(told.omega)
+        return np.stack([first, _rounder(first)])
     if free and told.attitude is not None and told.ts.shape[1] < _FEW_ATTITUDES:
-        weight = there[..., None].astype(dtype)
-        turned = weight * _momenta(omegas, told.attitude)
-        middle = jnp.sum(turned, axis=1, keepdims=True)
-        middle = middle / jnp.maximum(jnp.sum(weight, axis=1, keepdims=True), 1.0)
-        rows = jnp.pad(turned - weight * middle, [(0, 0)] * 3 + [(0, 1)])
+        rows = _rows_of_attitudes(told)
     else:
-        torques = zero if free else jnp.where(there, _torques(unknowns, told), 0.0)
+        there = told.there[..., None]
+        zero = np.zeros_like(told.omega)
+        omegas = np.where(there, told.omega, zero)
+        torques = zero if free else np.where(there, _torques_at(unknowns, told), zero)
         # Times that are not there repeat one.
-        ts = jax.lax.cummax(jnp.where(told.there, told.ts, first[:, None]), axis=1)
-        of_throw = partial(_weak_rows, _WINDOWS, _RADIANS)
-        rows = jax.vmap(of_throw)(ts, told.there, omegas, zero, torques)
-    trace = None if unknowns.scaled and not free else jnp.trace(known)
-    plain, leaning = _least_squares(rows.reshape(-1, 7), trace, jnp.trace(known))
+        first = first_and_last(told.ts, told.there)[0]
+        ts = np.maximum.accumulate(np.where(told.there, told.ts, first[:, None]), axis=1)
+        throws = zip(ts, told.there, omegas, zero, torques, strict=True)
+        rows = np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in throws])
+    rows = np.where(np.isfinite(rows), rows, 0.0)  # a torque or a square may be out of range
+    trace = None if unknowns.scaled and not free else np.trace(known)
+    plain, leaning = _least_squares(rows, trace, np.trace(known))
     both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
-    return jnp.concatenate([jnp.stack(both), _plain_bodies(told, leaning)])
+    return np.concatenate([np.stack(both), _plain_bodies(told, leaning)])
 
 
-def _rounder(tensor: Array) -> Array:
+def _rows_of_attitudes(told: Told) -> np.ndarray:
+    """Equations (n, 7): the momentum in space at each sample is the mean one of its throw."""
+    assert told.attitude is not None
+    weight = told.there[..., None, None].astype(told.omega.dtype)
+    turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))
+    count = np.maximum(np.sum(weight, axis=1, keepdims=True), 1.0)
+    mean = np.sum(turned, axis=1, keepdims=True) / count
+    rows = np.pad(turned - weight * mean, [(0, 0)] * 3 + [(0, 1)])
+    return rows.reshape(-1, 7)
+
+
+def _rounder(tensor: np.ndarray) -> np.ndarray:
     """Of a body half way to a sphere."""
-    third = jnp.trace(tensor) / 3
-    return 0.5 * (tensor + third * jnp.eye(3, dtype=tensor.dtype))
+    third = np.trace(tensor) / 3
+    return 0.5 * (tensor + third * np.eye(3, dtype=tensor.dtype))
 
 
-def _plain_bodies(told: Told, like: Array) -> Array:
+def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
     """A sphere, and bodies of revolution along the axes of the rates, as large as the one given."""
-    shown = jnp.where(told.there[..., None], told.omega, 0.0)
-    axes = jnp.linalg.eigh(product("tni,tnj->ij", shown, shown))[1]
+    shown = np.where(told.there[..., None], told.omega, 0.0).reshape(-1, 3)
+    axes = np.linalg.eigh(shown.T @ shown)[1]
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
-    shapes = jnp.asarray(shapes / shapes.sum(axis=1, keepdims=True), axes.dtype)
-    return product("ik,sk,jk->sij", axes, jnp.trace(like) * shapes, axes)
+    shapes = (shapes / shapes.sum(axis=1, keepdims=True)).astype(axes.dtype)
+    return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
 
 
-def _torques(unknowns: Any, told: Told) -> Array:
+def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
+    """Torques at the samples; where attitudes are not known, at the unit quaternion."""
+    attitude = told.attitude
+    if attitude is None:
+        unit = np.eye(1, 4, dtype=told.ts.dtype)[0]
+        attitude = np.broadcast_to(unit, (*told.ts.shape, 4))
+    return np.asarray(_torques(unknowns, told.ts, attitude, told.omega))
+
+
+@small_program
+def _torques(unknowns: Any, ts: Any, attitude: Any, omega: Any) -> Any:
     """As they are at the samples, by what is known of the system beforehand."""
-    unit = jnp.zeros((*told.ts.shape, 4), told.ts.dtype).at[..., 0].set(1)
-    attitude = unit if told.attitude is None else told.attitude
 
     def at(throw: Array, t: Array, q: Array, w: Array) -> Array:
         system = unknowns.original(throw)[0]
         return jnp.asarray(system.torque_on(t, State(q, w), None), w.dtype)
 
     of_throw = jax.vmap(at, (None, 0, 0, 0))
-    return jax.vmap(of_throw)(jnp.arange(len(told.ts)), told.ts, attitude, told.omega)
+    return jax.vmap(of_throw)(jnp.arange(len(ts)), ts, attitude, omega)
 
 
-def _least_squares(rows: Array, trace: Array | None, like: Array) -> tuple[Array, Array]:
+def _least_squares(
+    rows: np.ndarray, trace: np.floating | None, like: np.floating
+) -> tuple[np.ndarray, np.ndarray]:
     """Tensors of a given trace, or, None, of any, from equations (n, 7).
 
     The first is the least-squares solution if that is a body; the second leans to a sphere where
     the record says little.
     """
-    rows = rows / or_one(jnp.max(jnp.abs(rows[:, :6])))
+    rows = rows / or_one(np.max(np.abs(rows[:, :6])))
     rows, right, dtype = rows[:, :6], rows[:, 6], rows.dtype
-    sphere, basis = jnp.asarray([1.0, 1, 1, 0, 0, 0], dtype) / 3, jnp.eye(6, dtype=dtype)
+    sphere, basis = np.asarray([1.0, 1, 1, 0, 0, 0], dtype) / 3, np.eye(6, dtype=dtype)
     if trace is None:  # the sphere that does best, or one like the system's own
-        along = product("ri,i->r", rows, sphere)
-        trace = jnp.sum(along * right) / or_one(jnp.sum(along * along))
-        trace = jnp.where(trace > 0, trace, like)
+        along = rows @ sphere
+        best_trace = np.sum(along * right) / or_one(np.sum(along * along))
+        size = best_trace if best_trace > 0 else like
     else:  # five directions
-        basis = jnp.asarray(_TRACELESS, dtype)
-    wanted = right - product("ri,i->r", rows, trace * sphere)
-    left, values, vt, told = _singular(product("ri,ki->rk", rows, basis))
-    along = product("rk,r->k", left, wanted)
-    best = jnp.where(told, along, 0.0)
+        basis = np.asarray(_TRACELESS, dtype)
+        size = trace
+    wanted = right - rows @ (size * sphere)
+    left, values, vt, told = _singular(rows @ basis.T)
+    along = wanted @ left
+    best = np.where(told, along, 0.0)
     # The misfit of the best answer is how far rows can be trusted.
-    floor = 2 * safe_norm(wanted - product("rk,k->r", left, best)) / trace
+    misfit = wanted - left @ best
+    floor = 2 * np.sqrt(np.sum(misfit * misfit)) / size
 
-    def tensor(weights: Array) -> Array:
-        return _tensor(trace * sphere + product("k,kj,ji->i", weights, vt, basis))
+    def tensor(weights: np.ndarray) -> np.ndarray:
+        return _tensor(size * sphere + weights @ vt @ basis)
 
     leaning = tensor(values * along / or_one(values * values + floor * floor))
-    plain = tensor(best / jnp.where(told, values, 1.0))
-    good = jnp.all(jnp.linalg.eigvalsh(plain) > 0)
-    return jnp.where(good, plain, leaning), leaning
+    plain = tensor(best / np.where(told, values, 1.0))
+    good = np.all(np.linalg.eigvalsh(plain) > 0)
+    return plain if good else leaning, leaning

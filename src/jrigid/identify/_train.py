@@ -13,15 +13,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_type, demand, settle, whole_number
+from jrigid._checks import check_type, demand, whole_number
 from jrigid._numerics import product
 from jrigid._stepping.method import method_of
 from jrigid._types import RandomKey
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import depends_on_attitude, forced_flow
-from jrigid.identify._inputs import findings_of
-from jrigid.identify._layout import Told, longest_turn, told_by
+from jrigid.identify._host import on_host
+from jrigid.identify._inputs import judge
+from jrigid.identify._layout import longest_turn, told_by
 from jrigid.identify._problem import Options, shown_by, whitened
 from jrigid.identify._records import Record, Samples, of_throws, samples_of
 from jrigid.rotation import exp, multiply
@@ -226,35 +227,34 @@ def _segments(records: tuple[Record, ...], length: int) -> tuple[tuple[Record, .
 
 
 class _Observed(NamedTuple):
-    """What segments tell of their states, the most that one turns between samples, and findings."""
+    """What segments tell of their states, and the most that one turns between samples [rad]."""
 
     data: _Data | None
-    has_attitude: Array
-    turn: Array
-    told: Told | None
-    result: Any
+    has_attitude: bool
+    turn: float
 
 
-@eqx.filter_jit
+@np.errstate(all="ignore")  # values that are bad or out of range
 def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
-    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
-    told, no = told_by(records, samples, None), jnp.asarray(False)
-    result = findings_of((system,), records, None, None, told).result
+    records = on_host(records)
+    samples = samples_of(records, np.ones((), records[0].values.dtype))
+    told = told_by(records, samples, None)
+    judge((system,), records, None, None, told, throw=True)
     if told is None:
-        return _Observed(None, no, jnp.zeros(()), None, result)
-    first = jnp.argmax(told.there, axis=1)
-    at = jax.vmap(lambda x, i: x[i])
-    unit = jnp.zeros((first.size, 4), samples.ts.dtype).at[:, 0].set(1)
-    attitude = unit if told.attitude is None else at(told.attitude, first)
-    turn = longest_turn(told)
-    data = _Data(samples, State(attitude, at(told.omega, first)))
-    return _Observed(data, no if told.attitude is None else ~no, turn, told, result)
+        return _Observed(None, False, 0.0)
+    throw = np.arange(len(told.ts))
+    first = np.argmax(told.there, axis=1)
+    if told.attitude is None:
+        attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(throw), 1))
+    else:
+        attitude = told.attitude[throw, first]
+    data = _Data(samples, State(attitude, told.omega[throw, first]))
+    return _Observed(data, told.attitude is not None, longest_turn(told))
 
 
 def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bool, int]:
     """Segments, whether the attitude matters, and steps between two samples."""
     seen = _observed(system, records)
-    settle(seen, True, findings_of, (system,), records, None, None, seen.told)
     on_attitude = any(x.sensor.on_attitude for x in records) or depends_on_attitude(system)
     inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     if seen.data is None or inside or (on_attitude and not seen.has_attitude):
@@ -268,7 +268,7 @@ def _prepared(system: RigidBody, records: tuple[Record, ...]) -> tuple[_Data, bo
         "Argument `observations` must hold more numbers in each throw, and `segment` in each "
         "segment, than a state has, but one does not.",
     )
-    return seen.data, on_attitude, max(1, int(np.ceil(float(seen.turn) / _TURN)))
+    return seen.data, on_attitude, max(1, int(np.ceil(seen.turn / _TURN)))
 
 
 @quick_jit

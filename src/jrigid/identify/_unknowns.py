@@ -18,7 +18,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import demand, is_concrete
+from jrigid._numerics import or_one, without_gradient
 from jrigid._types import AnyArray, Readable
+from jrigid.identify._host import cholesky
 from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
 from jrigid.identify._shapes import AbstractShape, as_tensor
@@ -83,7 +85,7 @@ class AbstractSought(Readable):
         return (self.name,) if whole else tuple(f"{self.name}[{j}]" for j in range(self.size))
 
     @abc.abstractmethod
-    def start(self) -> Array:
+    def start(self) -> AnyArray:
         """The numbers at the start."""
 
     @abc.abstractmethod
@@ -115,8 +117,8 @@ class AbstractSought(Readable):
 class _Any(AbstractSought):
     """Of either sign."""
 
-    def start(self) -> Array:
-        return jnp.zeros(self.size, self.unit.dtype)
+    def start(self) -> AnyArray:
+        return self.unit.__array_namespace__().zeros(self.size, self.unit.dtype)
 
     def value(self, x: Array) -> Array:
         return self.base + self.unit * x.reshape(self.base.shape)
@@ -128,8 +130,9 @@ class _Any(AbstractSought):
 class _Positive(AbstractSought):
     """Positive: linear in the number where it is large, exponential where it is small."""
 
-    def start(self) -> Array:
-        return jnp.log(jnp.expm1(jnp.maximum(self.base / self.unit, _LEAST))).reshape(-1)
+    def start(self) -> AnyArray:
+        xp = self.base.__array_namespace__()
+        return xp.log(xp.expm1(xp.maximum(self.base / self.unit, _LEAST))).reshape(-1)
 
     def value(self, x: Array) -> Array:
         return self.unit * jax.nn.softplus(x.reshape(self.base.shape))
@@ -142,10 +145,11 @@ class _Definite(AbstractSought):
     def size(self) -> int:
         return 6
 
-    def start(self) -> Array:
-        eye = _LEAST * jnp.eye(3, dtype=self.unit.dtype)
-        lower = jnp.linalg.cholesky(self.base / jnp.max(self.unit) + eye)
-        return jnp.concatenate([jnp.log(jnp.diagonal(lower)), lower[SIDES]])
+    def start(self) -> AnyArray:
+        xp = self.base.__array_namespace__()
+        eye = _LEAST * xp.eye(3, dtype=self.unit.dtype)
+        lower = cholesky(self.base / xp.max(self.unit) + eye)
+        return xp.concatenate([xp.log(xp.diagonal(lower)), lower[SIDES]])
 
     def value(self, x: Array) -> Array:
         return jnp.max(self.unit) * squared(jnp.exp(x[:3]), x[3:])
@@ -239,22 +243,40 @@ class Unknowns(eqx.Module):
             tensor = self.trace * tensor / jnp.trace(tensor)
         return tensor * jnp.exp(numbers[self.slices["scale"].start]) if self.scaled else tensor
 
+    @property
+    def known_tensor(self) -> AnyArray:
+        """The system's own tensor, of the first throw."""
+        return as_tensor(self.original(0)[0].inertia)
+
     def start(
         self, tensor: AnyArray, flattest: AnyArray | float = 1e-3
-    ) -> tuple["Unknowns", Array]:
+    ) -> tuple["Unknowns", AnyArray]:
         """Numbers for a tensor; the frame of the shape is chosen for it."""
-        known = as_tensor(self.original(0)[0].inertia.astype(tensor.dtype))
-        shape, numbers = self.shape.start(tensor, known, flattest)
-        factor = jnp.trace(tensor) / self.trace
-        scale = jnp.log(jnp.where(factor > 0, factor, 1.0))[None][: int(self.scaled)]
-        parts = [numbers, scale, *(x.start() for x in self.shared)]
-        numbers = jnp.concatenate([x.astype(tensor.dtype) for x in parts])
-        return dataclasses.replace(self, shape=shape), numbers
+        unknowns, numbers = self.starts(tensor[None], [flattest])
+        return unknowns, numbers[0]
 
-    def own_start(self, throws: int, dtype: Any) -> Array:
+    def starts(
+        self, tensors: AnyArray, flattest: Sequence[AnyArray | float]
+    ) -> tuple["Unknowns", AnyArray]:
+        """Numbers for each of several tensors; the frame of the shape is chosen for the first."""
+        xp = tensors.__array_namespace__()
+        known = self.known_tensor.astype(tensors.dtype)
+        pairs = zip(tensors, flattest, strict=True)
+        shapes = [self.shape.start(tensor, known, least) for tensor, least in pairs]
+        factors = xp.trace(tensors, axis1=1, axis2=2) / self.trace
+        scales = xp.log(xp.where(factors > 0, factors, 1.0))
+        others = [x.start() for x in self.shared]
+        rows = []
+        for (_, of_shape), scale in zip(shapes, scales, strict=True):
+            parts = [of_shape, scale[None][: int(self.scaled)], *others]
+            rows.append(xp.concatenate([xp.asarray(x, tensors.dtype) for x in parts]))
+        return dataclasses.replace(self, shape=shapes[0][0]), xp.stack(rows)
+
+    def own_start(self, throws: int, dtype: Any) -> AnyArray:
         """Numbers of each throw."""
-        parts = [jnp.zeros(0, dtype), *(x.start().astype(dtype) for x, _ in self.own_slices)]
-        return jnp.tile(jnp.concatenate(parts), (throws, 1))
+        xp = self.rate.__array_namespace__()
+        parts = [xp.zeros(0, dtype), *(x.start().astype(dtype) for x, _ in self.own_slices)]
+        return xp.tile(xp.concatenate(parts), (throws, 1))
 
     @property
     def leaves(self) -> tuple[AnyArray, ...]:
@@ -315,8 +337,8 @@ def _of_body(torque: Any, body: MassProperties | None) -> Any:
 
 
 def unknowns_of(
-    systems: Sequence[Any], sensors: tuple[Any, ...], sizes: Sequence[Array],
-    free: Callable[..., Any] | None, shape: AbstractShape, scaled: bool, rate: Array,
+    systems: Sequence[Any], sensors: tuple[Any, ...], sizes: Sequence[AnyArray],
+    free: Callable[..., Any] | None, shape: AbstractShape, scaled: bool, rate: AnyArray,
 ) -> Unknowns:  # fmt: skip
     """Set up the numbers.
 
@@ -337,17 +359,20 @@ def unknowns_of(
     demand(all(len(x) == len(paths) for x in throws), f"Argument `system` {text}")
     columns = list(zip(*throws, strict=True))  # of each array
     stacked = tuple(any(x is not column[0] for x in column) for column in columns)
-    leaves = [jnp.stack(x) if own else x[0] for x, own in zip(columns, stacked, strict=True)]
-    units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
-    units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
+    xp = rate.__array_namespace__()
+    leaves = [xp.stack(x) if own else x[0] for x, own in zip(columns, stacked, strict=True)]
+    picks = _picks(paths, tree, rest, free)
+    if picks:
+        units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
+        units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
     sought = []
-    for pick in _picks(paths, tree, rest, free):
+    for pick in picks:
         path, base = paths[pick.index]
-        base, largest = base.astype(dtype), jnp.max(jnp.abs(base)).astype(dtype)
+        base, largest = base.astype(dtype), xp.max(xp.abs(base)).astype(dtype)
         of_system = path[0].idx == 0  # type: ignore[union-attr]
-        unit = jnp.where(largest > 0, largest, 1.0) if of_system else units[pick.index]
-        unit = jax.lax.stop_gradient(jnp.broadcast_to(unit, base.shape).astype(dtype))
-        sigma = None if pick.sigma is None else jnp.asarray(pick.sigma, dtype)
+        unit = or_one(largest) if of_system else xp.asarray(units[pick.index], dtype)
+        unit = without_gradient(xp.broadcast_to(unit, base.shape).astype(dtype))
+        sigma = None if pick.sigma is None else xp.asarray(pick.sigma, dtype)
         positive = _Definite if base.shape == (3, 3) else _Positive
         kind = positive if _field(parts, path).get("positive") else _Any
         sought.append(kind(pick.index, _named(parts, path), pick.own, base, unit, sigma))
