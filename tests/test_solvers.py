@@ -231,7 +231,8 @@ def test_splitting_is_of_its_order_and_keeps_what_is_to_be_kept(order, inertia):
         state, energy, momentum, taken = found(8.0 / steps)
         assert int(taken) == steps
         assert abs(np.linalg.norm(state.attitude) - 1) < 1e-15
-        assert abs(momentum[1, 2] - momentum[0, 2]) < 1e-14  # about the vertical
+        # About the vertical; each of the hundreds of exact turns adds a rounding of its own.
+        assert abs(momentum[1, 2] - momentum[0, 2]) < 2e-14
         errors.append([np.linalg.norm(state.omega - exact.omega), abs(energy[1] - energy[0])])
     state_order, energy_order = np.log2(np.array(errors[0]) / errors[1])
     assert state_order == pytest.approx(order, abs=0.4)
