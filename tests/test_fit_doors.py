@@ -315,7 +315,7 @@ def test_what_is_not_in_a_fit_is_not_drawn(found, pictures, wrong):
 
 
 def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
-    options = found.problem.options._replace(level="known")
+    options = found.problem.options._replace(unmodelled="known")
     problem = dataclasses.replace(found.problem, options=options)
     kicked = dataclasses.replace(found, problem=problem, residuals=2 * found.residuals)
     ax = jr.plot.fit(kicked, {"record": pictures.figure().add_subplot()})["record"]
