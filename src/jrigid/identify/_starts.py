@@ -29,6 +29,7 @@ _Vectors = Real[ArrayLike, "n 3"]
 _LEAST_SAMPLES = 8  # to a window
 _FEW_ATTITUDES = 40  # fewer than these do without the weak form
 _WINDOWS, _RADIANS = 128, 3.0
+_EDGE = 1 - 1e-5  # of a window's half width
 _LARGEST_BLOCK = 2**17  # weights of samples in windows that are computed together
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
 _FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
@@ -120,7 +121,9 @@ def _rows_of_windows(
     """Equations of windows with these centers and half this width [s], (3 windows, 7)."""
     xp = ts.__array_namespace__()
     s = (ts[None] - centers[:, None]) / half
-    inside = xp.abs(s) < 1
+    # Samples at the very edge weigh nothing, but by rounding one that is not known, such as
+    # those that fill up a record, would count as a gap.
+    inside = xp.abs(s) < _EDGE
     s = xp.where(inside, s, 1.0)
     # A window with a gap says nothing.
     whole = ~xp.any(inside & ~known[None], axis=1)
