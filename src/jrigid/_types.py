@@ -26,9 +26,12 @@ if TYPE_CHECKING:
     from jaxtyping import Real as Real
 
     AnyArray = Any
+    AnyMatrix = Any
 else:
     #: An array of JAX, or of numpy on the host: to a type checker the two have nothing in common.
     AnyArray = Array | np.ndarray | np.generic
+    #: A matrix of either kind, shown in signatures by this name.
+    AnyMatrix = TypeAliasType("AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"])
 
     class Real:
         """`jaxtyping.Real[ArrayLike, "..."]`, shown as it is written."""

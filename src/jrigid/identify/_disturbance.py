@@ -19,7 +19,7 @@ from jrigid.identify._smoother import Links, Rows
 
 # Steps, in correlation times, beyond which the torque counts as white, or as constant.
 _LONGEST, _SHORTEST = 1e6, 1e-4
-_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_POINTS = 8  # of a quadrature that is exact to rounding for steps below a correlation time
 
 
 class GaussMarkov(eqx.Module):
@@ -95,11 +95,12 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
     x = -jnp.expm1(-a)
     root = jnp.sqrt(2 * a)
     # Responses to a kick that came a fraction r of the step ago.
-    r = jnp.asarray(0.5 + 0.5 * _POINTS, a.dtype)
+    points, weights = np.polynomial.legendre.leggauss(_POINTS)
+    r = jnp.asarray(0.5 + 0.5 * points, a.dtype)
     r = jnp.broadcast_to(r, (*a.shape, r.size))
     faded = -jnp.expm1(-a[..., None] * r)
     responses = jnp.stack([faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1)
-    weights = jnp.asarray(0.5 * _WEIGHTS, a.dtype)
+    weights = jnp.asarray(0.5 * weights, a.dtype)
     short = product("r,...ri,...rj->...ij", weights, responses, responses)
     # The same integrals in closed form lose their digits in short steps.
     momentum = (2 * a - 2 * x - x**2) / (2 * a)

@@ -290,14 +290,14 @@ def conclude(
     point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
     rows = condensed(minimum.rows, minimum.links)
     sensor = precision_of_rows(rows, minimum.weight, own, units)
-    known, innovations, kicks = sensor, None, 0.0
+    known, judged_by = sensor, None
     if options.dense:
         independent, weight = _rows_of_fit(problem, fit)
         known = precision_of_rows(independent, weight, own, units)
-        innovations, kicks = independent.residual[:, : fit.kept.shape[1]], float(minimum.kicks)
+        judged_by = independent.residual[:, : fit.kept.shape[1]]
     residuals, jacobian = _weighted(fit, rows, own)
     parts = problem.samples.parts
-    judged = _judged(problem, fit, known, kicks, residuals if innovations is None else innovations)
+    judged = _judged(problem, fit, known, residuals if judged_by is None else judged_by)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
     derived = derive(problem, point.numbers, covariance)
     loose = np.any(derived["ratios_errors"] > LARGEST_ERROR * derived["ratios"])
@@ -417,46 +417,77 @@ def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
     return like, np.abs(like) * np.sqrt(np.sum(both))
 
 
-def _judged(
-    problem: Problem, fit: Fit, known: Precision, kicks: float, residuals: np.ndarray
-) -> dict[str, Any]:
-    """How well a fit describes the record, by residuals and the squares of kicks, and its name."""
-    options, units, count = problem.options, fit.minimum.units, fit.kept.shape[1]
-    settled = bool(fit.minimum.settled)
-    whiteness = _whiteness(residuals, problem.samples.parts)
+def _kicks(problem: Problem, fit: Fit) -> float:
+    """Sum of squares of what an unmodelled torque did; 0 where there is none."""
+    return float(fit.minimum.kicks) if problem.options.dense else 0.0
+
+
+class _Left(NamedTuple):
+    """What a fit leaves of its record.
+
+    Attributes:
+        chi_square: Sum of squares, of what is known beforehand and of an unmodelled torque too.
+        freedom: Its degrees of freedom.
+        noise: The one over the other.
+        band: Power in the band that stands out most, and its standard deviations.
+        misfit: Whether it is more than noise, or in a band of frequencies.
+        overstated: Whether it is less than noise.
+        inflation: Of covariances.
+    """
+
+    chi_square: float
+    freedom: float
+    noise: float
+    band: tuple[float, float]
+    misfit: bool
+    overstated: bool
+    inflation: float
+
+
+def _what_is_left(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray) -> _Left:
+    count = fit.kept.shape[1]
     weight = quality.weights_of(problem, fit.kept)
-    alive = np.any(fit.kept > 0, axis=1)
-    shown = np.sum((known.of_state > SHOWN * known.of_state[:, :1]) & alive[:, None])
+    alive = np.any(fit.kept > 0, axis=1)[:, None]
+    shown = np.sum((known.of_state > SHOWN * known.of_state[:, :1]) & alive)
     rows = fit.minimum.rows.residual
     prior = rows[:, count : rows.shape[1] - problem.held]
-    freedom = np.sum(weight) + np.sum(prior != 0) - units.size - shown
-    chi_square = np.sum(weight * fit.residual**2) + np.sum(prior**2) + kicks
+    freedom = np.sum(weight) + np.sum(prior != 0) - fit.minimum.units.size - shown
+    chi_square = np.sum(weight * fit.residual**2) + np.sum(prior**2)
+    chi_square = chi_square + _kicks(problem, fit)
     noise = chi_square / max(freedom, 1.0)
     band, sure = colour.loudest_band(residuals, problem.samples.parts)
     coloured = band > colour.STRONG and sure > colour.SURE
-    if options.noise_known:
+    more = less = False
+    if problem.options.noise_known:
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
-        overstated = 0 < noise < 1 - gate  # a plan has no residuals
-        misfit = noise > 1 + gate or np.max(fit.scales) > 2
-    else:
-        misfit, overstated = False, False
-    inflation = noise if misfit or not options.noise_known else 1.0
+        more = noise > 1 + gate or np.max(fit.scales) > 2
+        less = 0 < noise < 1 - gate  # a plan has no residuals
+    inflation = noise if not problem.options.noise_known else max(noise, 1.0) if more else 1.0
     # A band that stands out may be the one that tells the numbers.
     inflation = inflation * band if coloured else inflation
-    apart = _scatter_of_trials(known, alive, units) / np.sqrt(inflation)
-    misfit = misfit or coloured or np.any(apart > trials.DISAGREEING)
+    misfit = bool(more or coloured)
+    return _Left(chi_square, freedom, noise, (band, sure), misfit, bool(less), inflation)
+
+
+def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray) -> dict[str, Any]:
+    """How well a fit describes the record, by residuals or innovations, and its name."""
+    units, settled = fit.minimum.units, bool(fit.minimum.settled)
+    left = _what_is_left(problem, fit, known, residuals)
+    apart = _scatter_of_trials(known, np.any(fit.kept > 0, axis=1), units)
+    apart = apart / np.sqrt(left.inflation)
+    misfit = left.misfit or np.any(apart > trials.DISAGREEING)
     if units.size:
-        known = _widened(known, fit.probed_error / np.sqrt(inflation), units)
+        known = _widened(known, fit.probed_error / np.sqrt(left.inflation), units)
         known = _with_larger_errors(known, np.maximum(apart, 1.0), units)
-    pure = quality.is_pure(problem, fit, inflation)
-    left = quality.unexplained(problem, fit, kicks)
+    pure = quality.is_pure(problem, fit, left.inflation)
+    unexplained = quality.unexplained(problem, fit, _kicks(problem, fit))
     flat = quality.is_at_boundary(problem, fit)
-    largest = np.sqrt(inflation) / np.min(known.values, initial=np.inf)
-    sound = np.all(np.isfinite(known.covariance)) and freedom > 0 and np.isfinite(chi_square)
-    if not sound:
+    largest = np.sqrt(left.inflation) / np.min(known.values, initial=np.inf)
+    sound = np.all(np.isfinite(known.covariance)) and left.freedom > 0
+    if not (sound and np.isfinite(left.chi_square)):
         status = "NOT_CONVERGED"
     elif misfit:
-        follows = left <= quality.FOLLOWED and not flat
+        follows = unexplained <= quality.FOLLOWED and not flat
         status = "MISFIT" if follows else ("WRONG_BASIN" if settled else "NOT_CONVERGED")
     elif pure or fit.ambiguous:
         status = "UNIDENTIFIABLE"
@@ -467,20 +498,20 @@ def _judged(
     elif not settled:
         status = "NOT_CONVERGED"
     else:
-        status = "MISFIT" if overstated else "OK"
+        status = "MISFIT" if left.overstated else "OK"
     seen = np.maximum(np.sum(residuals != 0, axis=(1, 2)), 1)
     return {
         "status": status,
-        "chi_square": chi_square,
-        "degrees_of_freedom": np.asarray(int(freedom)),
-        "reduced_chi_square": noise,
-        "whiteness": whiteness,
-        "loudest_band": (band, sure),
+        "chi_square": left.chi_square,
+        "degrees_of_freedom": np.asarray(int(left.freedom)),
+        "reduced_chi_square": left.noise,
+        "whiteness": _whiteness(residuals, problem.samples.parts),
+        "loudest_band": left.band,
         "chi_square_by_throw": np.sum(residuals**2, axis=(1, 2)) / seen,
-        "inflation": np.asarray(inflation),
-        "unexplained": np.asarray(left),
+        "inflation": np.asarray(left.inflation),
+        "unexplained": np.asarray(unexplained),
         "pure_spin": np.asarray(pure),
         "singular_values": known.values,
         "directions": known.directions,
-        "numbers_covariance": inflation * known.covariance,
+        "numbers_covariance": left.inflation * known.covariance,
     }

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand
 from jrigid._numerics import product
-from jrigid._types import AnyArray, Readable, ScalarLike
+from jrigid._types import AnyArray, AnyMatrix, Readable, ScalarLike
 from jrigid.identify import _parameters
 from jrigid.identify._host import cholesky, principal_axes
 from jrigid.mass import MassProperties, inertia_of_second_moment
@@ -126,7 +126,7 @@ class Tensor(AbstractShape):
 class _InFrame(AbstractShape):
     """A shape in axes of its own."""
 
-    frame: Float[AnyArray, "3 3"] | None = None
+    frame: AnyMatrix | None = None
 
     def sigma(self, numbers: Array) -> Array:
         """Second moments in the frame, of whatever trace: by default of its axes, the last ones."""
@@ -244,7 +244,7 @@ class Fixed(AbstractShape):
 
     absolute: ClassVar[bool] = True
     names: ClassVar[tuple[str, ...]] = ()
-    known: Float[AnyArray, "3 3"] | None = None
+    known: AnyMatrix | None = None
 
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
