@@ -15,7 +15,6 @@ from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
-from jrigid.identify import _trials as trials
 from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import innovations
 from jrigid.identify._layout import Layout
@@ -29,6 +28,8 @@ from jrigid.identify._smoother import Links, Rows
 SHOWN = 1e-9  # of the largest singular value: a change of the state that the record shows
 _FAR = 1.0  # a change of a number beyond which the tensor is another one
 HISTORY = 512  # steps whose sums of squares are returned
+_FEWEST = 8  # trials whose scatter says how large errors are
+_DISAGREEING = 3.0  # times the errors stated: the scatter of trials of which something is missing
 _TRIED = 0.03  # of the level that moves a rate by its noise: where one of zero is judged
 
 
@@ -62,7 +63,6 @@ class Precision(NamedTuple):
         follow: How these follow the numbers, with the sign turned.
         of_state: Singular values of each throw's state, of unit columns, descending.
         scores: What each throw adds to the gradient of half the squares in the numbers.
-        information: What each throw tells of the numbers, in natural units.
     """
 
     values: np.ndarray
@@ -72,7 +72,6 @@ class Precision(NamedTuple):
     follow: np.ndarray
     of_state: np.ndarray
     scores: np.ndarray
-    information: np.ndarray
 
 
 def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarray) -> Precision:
@@ -97,7 +96,6 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     follow = np.where(shown[:, None], half, 0.0) @ along
     rest = shared - u @ along
     scores = (residual[:, None] @ rest)[:, 0] / units
-    information = np.swapaxes(rest, 1, 2) @ rest
     r = np.linalg.qr(rest.reshape(throws * count * width, size), mode="r")
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
@@ -111,7 +109,6 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
         follow=follow / units,
         of_state=s,
         scores=scores,
-        information=information,
     )
 
 
@@ -401,10 +398,11 @@ def _with_larger_errors(known: Precision, factors: np.ndarray, units: np.ndarray
 
 def _scatter_of_trials(known: Precision, alive: np.ndarray, units: np.ndarray) -> np.ndarray:
     """Errors by the scatter of trials over those stated, along each direction; 1 of few trials."""
-    if np.sum(alive) < trials.FEWEST or not np.all(np.isfinite(known.scores)):
+    throws = np.sum(alive)
+    if throws < _FEWEST or not np.all(np.isfinite(known.scores)):
         return np.ones(units.size)
-    scores = known.scores[alive] * units
-    return trials.scatter(scores, known.values, known.directions)
+    along = (known.scores[alive] * units) @ known.directions / np.maximum(known.values, 1e-150)
+    return np.sqrt(np.sum(along**2, axis=0) * throws / (throws - 1))
 
 
 def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
@@ -475,7 +473,7 @@ def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray)
     left = _what_is_left(problem, fit, known, residuals)
     apart = _scatter_of_trials(known, np.any(fit.kept > 0, axis=1), units)
     apart = apart / np.sqrt(left.inflation)
-    misfit = left.misfit or np.any(apart > trials.DISAGREEING)
+    misfit = left.misfit or np.any(apart > _DISAGREEING)
     if units.size:
         known = _widened(known, fit.probed_error / np.sqrt(left.inflation), units)
         known = _with_larger_errors(known, np.maximum(apart, 1.0), units)

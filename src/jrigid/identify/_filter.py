@@ -54,6 +54,18 @@ class Innovations(NamedTuple):
     log_determinant: Any
 
 
+class OfTrials(NamedTuple):
+    """-2 log likelihood of each trial.
+
+    Attributes:
+        together: With the numbers at which the record was linearised.
+        alone: With the numbers that suit the trial best, as if it were of another body.
+    """
+
+    together: Any
+    alone: Any
+
+
 def _of_trial(rows: Rows, links: Links, weight: Array, push: Push) -> tuple[Array, Array]:
     """Innovations of one trial, whose states hold the torque."""
     local = links.gap.shape[-1]
@@ -123,8 +135,8 @@ def innovations(record: Linearised, torque: Disturbance) -> Innovations:
 def likelihood(
     record: Linearised, prior: Any, freedom: Any, noise_known: Any, levels: Any, times: Any,
     trials: Any,
-) -> tuple[Array, tuple[Array, Array, Array]]:  # fmt: skip
-    """-2 log likelihood of a torque, and its derivatives.
+) -> tuple[tuple[Array, OfTrials], tuple[Array, Array, Array]]:  # fmt: skip
+    """-2 log likelihood of a torque, of the record and of each trial, and the former's derivatives.
 
     Args:
         record: Where it was linearised.
@@ -138,7 +150,7 @@ def likelihood(
     """
     own = record.links.gap.shape[-1] + record.own.shape[-1]
 
-    def value(levels: Array, times: Array, trials: Array) -> Array:
+    def value(levels: Array, times: Array, trials: Array) -> tuple[Array, OfTrials]:
         torque = Disturbance(jnp.exp(trials[:, None] + levels[None]), jnp.exp(times))
         found = _filtered(record, torque)
         products = prior + product("tndi,tndj->tij", found.rows, found.rows)
@@ -151,15 +163,23 @@ def likelihood(
             solved, log_determinant = solve_positive(products[inside, inside], across)
             return products[rest][:, rest] - across.T @ solved, log_determinant
 
-        left, logs = jax.vmap(without_own)(products)
-        left = jnp.sum(left, axis=0)
-        chi_square = left[0, 0]
-        log_determinant = jnp.sum(found.log_determinant) + jnp.sum(logs)
-        if left.shape[0] > 1:
-            solved, of_numbers = solve_positive(left[1:, 1:], left[1:, :1])
-            chi_square = chi_square - jnp.sum(left[1:, :1] * solved)
-            log_determinant = log_determinant + of_numbers
-        of_noise = freedom * jnp.log(jnp.maximum(chi_square, 1e-30))
-        return jnp.where(noise_known, chi_square, of_noise) + log_determinant
+        def at_best_numbers(left: Array) -> tuple[Array, Array]:
+            """Chi-square where the numbers are the best, and their log determinant."""
+            if left.shape[0] == 1:
+                return left[0, 0], jnp.zeros_like(left[0, 0])
+            solved, log_determinant = solve_positive(left[1:, 1:], left[1:, :1])
+            return left[0, 0] - jnp.sum(left[1:, :1] * solved), log_determinant
 
-    return jax.value_and_grad(value, argnums=(0, 1, 2))(levels, times, trials)
+        left, of_own = jax.vmap(without_own)(products)
+        logs = found.log_determinant + of_own
+        chi_square, of_numbers = at_best_numbers(jnp.sum(left, axis=0))
+        # Of a noise that is not known each trial has the size that all make likely.
+        noise = jnp.where(noise_known, 1.0, chi_square / freedom)
+        alone = jax.vmap(at_best_numbers)(left)[0]
+        of_trials = OfTrials(left[:, 0, 0] / noise + logs, alone / noise + logs)
+        of_noise = freedom * jnp.log(jnp.maximum(chi_square, 1e-30))
+        whole = jnp.where(noise_known, chi_square, of_noise) + jnp.sum(logs) + of_numbers
+        return whole, of_trials
+
+    differentiated = jax.value_and_grad(value, argnums=(0, 1, 2), has_aux=True)
+    return differentiated(levels, times, trials)

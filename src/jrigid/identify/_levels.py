@@ -25,6 +25,9 @@ _ROUNDS = 40
 _HIGHEST = 30.0  # logarithm of a level, in units of the first, that no record asks for
 _TRIED = 2.0  # logarithm of a time to begin with, in units of the shortest
 _GAIN = 2.0  # of -2 log likelihood, for each number more (Akaike)
+_FOREIGN = 30.0  # fall of -2 log likelihood, beyond one for each number, for another body
+_FEWEST = 5  # trials that show which of them is of another body
+_MOST_FOREIGN = 0.25  # of all trials: beyond, nobody knows who is foreign
 _SPREAD = 0.7  # of the logarithms of trials' levels, as far as is known beforehand
 
 
@@ -108,15 +111,30 @@ class Likelihood:
         self, form: Form, numbers: np.ndarray, trials: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """The value, and its derivatives in numbers and in the logarithms of trials' sizes."""
-        levels, times = np.split(numbers, [form.levels])
-        times = times if form.times else np.array([self._none])
-        given = (np.broadcast_to(levels, 3), np.broadcast_to(times, 3), trials)
-        found = likelihood(*self._arguments, *(x.astype(self._dtype) for x in given))
-        value, (of_levels, of_times, of_trials) = jtu.tree_map(_wide, found)
+        (value, _), slopes = self._found(form, numbers, trials)
+        of_levels, of_times, of_trials = slopes
         slope = [np.sum(of_levels, keepdims=True) if form.levels == 1 else of_levels]
         if form.times:
             slope.append(np.sum(of_times, keepdims=True) if form.times == 1 else of_times)
         return float(value), np.concatenate(slope), of_trials
+
+    def as_of_another_body(self, torque: Torque) -> np.ndarray:
+        """By how much -2 log likelihood of each trial falls with numbers of its own.
+
+        The torque in it has the size that suits the trial best in either case, so that a trial
+        with a larger torque is not taken for one of another body.
+        """
+        sizes = np.linspace(-2.0, 2.0, 9)[:, None] + torque.trials
+        found = [self._found(torque.form, torque.numbers, x)[0][1] for x in sizes]
+        together = np.min([x.together for x in found], axis=0)
+        return together - np.min([x.alone for x in found], axis=0)
+
+    def _found(self, form: Form, numbers: np.ndarray, trials: np.ndarray) -> Any:
+        levels, times = np.split(numbers, [form.levels])
+        times = times if form.times else np.array([self._none])
+        given = (np.broadcast_to(levels, 3), np.broadcast_to(times, 3), trials)
+        found = likelihood(*self._arguments, *(x.astype(self._dtype) for x in given))
+        return jtu.tree_map(_wide, found)
 
 
 def _wide(x: Any) -> np.ndarray:
@@ -285,6 +303,19 @@ class Search:
         own = x[size:]
         at = likelihood(torque.form, x[:size], start + own)[0]
         return Torque(torque.form, x[:size], start + own, at)
+
+    def foreign(self, torque: Torque, fit: Fit) -> np.ndarray:
+        """Which trials are of another body, as far as their likelihood shows."""
+        alive = np.any(fit.kept > 0, axis=1)
+        none, numbers = np.zeros(alive.shape, bool), fit.minimum.point.numbers.size
+        if np.sum(alive) < _FEWEST or not numbers:
+            return none
+        fall = Likelihood(self._problem, fit).as_of_another_body(torque)
+        # A torque that is not quite of this kind lets all trials differ.
+        usual = max(float(np.median(fall[alive])) / numbers, 1.0)
+        found = alive & (fall > usual * (numbers + _FOREIGN))
+        most = alive.size * _MOST_FOREIGN
+        return found if np.sum(found | ~alive) <= most else none
 
     def errors(self, torque: Torque, fit: Fit) -> np.ndarray:
         """Standard errors of the logarithms of levels and times."""

@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid.identify import _levels as levels
-from jrigid.identify import _trials as trials
 from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
-from jrigid.identify._errors import Weakest, first_level, precision, weakest
+from jrigid.identify._errors import Weakest, first_level, weakest
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
@@ -237,22 +236,11 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
     return fit
 
 
-def _without_foreign_trial(problem: Problem, fit: Fit) -> np.ndarray:
-    """Which samples are kept: not those of a trial that the others show to be of another body."""
-    known, units = precision(problem, fit), fit.minimum.units
-    alive = np.any(fit.kept > 0, axis=1)
-    left_out = trials.foreign(known.scores * units, known.information, alive)
-    kept = fit.kept.copy()
-    if left_out is not None:
-        kept[left_out] = 0
-    return kept
-
-
 class _Torque:
     """The unmodelled torque on the way through the stages of an attempt.
 
-    It is white at first; once its level has come to rest and no trial is found to be of another
-    body, whose motion would pass for a torque, its other forms are tried.
+    It is white at first. Once its level has come to rest its other forms are tried; once these
+    have, trials of another body are looked for and left out.
     """
 
     def __init__(self, case: Case, problem: Problem):
@@ -290,16 +278,15 @@ class _Torque:
         self._current = self._search.improved(before, fit)
         if np.max(np.abs(self._current.numbers - before.numbers)) > _AT_REST:
             return fit.kept
-        if not self._may_have_other_forms:
-            self.at_rest = True
-            return fit.kept
-        kept = _without_foreign_trial(self._problem, fit)
-        if np.all(kept == fit.kept):
+        if self._may_have_other_forms:
             self._may_have_other_forms = False
             rates = np.sum(fit.minimum.point.omega**2, axis=-1)
             spins = np.sqrt(np.mean(rates, axis=1))
             self._current = self._search.preferred(self._current, fit, spins)
-        return kept
+            return fit.kept
+        foreign = self._search.foreign(self._current, fit)
+        self.at_rest = not np.any(foreign)
+        return np.where(foreign[:, None], 0, fit.kept).astype(fit.kept.dtype)
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
