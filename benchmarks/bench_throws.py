@@ -130,7 +130,7 @@ def of_halves(found):
         ", ".join(f"{x:+.1f}" for x in apart),
         ", ".join(f"{x:+.1f}" for x in off),
         f"{size:.3f}",
-        ", ".join(ends[int(x)] for x in found.status._value),
+        ", ".join(ends[int(x)] for x in np.asarray(found.status)),
     ]
 
 

@@ -14,7 +14,9 @@ a body whose smallest moment is 10 % larger; or, with `--cases both`, turned and
 
 Groups of 16 trials are interleaved (every seventh trial) or blocks of consecutive trials. Each
 group is one fit of a list of records, which is told the form of the drag and that there may be a
-torque (`unmodelled="estimate"`), and of the flat body that it is flat. Errors: rms over groups of
+torque (`unmodelled="estimate"`), of the flat body that it is flat, and of turned trials which of
+them are of one session: the axes are those of the first session of the group, the turns of others
+are sought (`each(gyro.misalignment, sessions)`). Errors: rms over groups of
 the estimate less the truth over the error stated, of I2/I1, I3/I1 and the drag. Between: root of
 chi-square over its degrees of freedom of the groups of a world about their weighted mean. Both are
 1 where errors are right, and are of the fits that do not end WRONG_BASIN, NOT_CONVERGED or
@@ -31,6 +33,7 @@ import pathlib
 import sys
 import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import common
 import jax
@@ -74,11 +77,13 @@ class World:
         moments: Principal moments of the body, ascending (3,).
         trials: A `worlds.Record` of each trial, readings along the axes of the gyro.
         foreign: Whether each trial is of the other body (trials,).
+        turned: Whether the axes of the gyro are turned for each session.
     """
 
     moments: np.ndarray
     trials: list
     foreign: np.ndarray
+    turned: bool
 
     @property
     def truth(self):
@@ -133,9 +138,10 @@ def world_of(options, case, tau, seed):
         strange = worlds.throws(rng, count, others, **scene)
         for i, trial in zip(np.flatnonzero(foreign), strange, strict=True):
             trials[i] = trial
-    if case in ("turned", "both"):
+    is_turned = case in ("turned", "both")
+    if is_turned:
         trials = turned(rng, trials, options.turn, options.session)
-    return World(moments, trials, foreign)
+    return World(moments, trials, foreign, is_turned)
 
 
 def groups_of(grouping, trials, size):
@@ -146,29 +152,79 @@ def groups_of(grouping, trials, size):
 
 
 def drag_of(body):
-    """What is sought beside the inertia."""
+    """What is sought beside the inertia of trials of one session."""
     return body.torque.coefficient
 
 
-def fit_groups(body, trials_of_groups):
-    """One fit for each group of trials, side by side."""
+def drag_and_turns(sessions):
+    """What is sought beside the inertia of trials of several sessions, -1 for the first."""
+
+    def free(body, gyro):
+        return body.torque.coefficient, identify.each(gyro.misalignment, sessions)
+
+    return free
+
+
+def sessions_of(groups, session):
+    """Which session of its group each trial is of, from -1 on (groups, size)."""
+    return np.array([np.unique(x // session, return_inverse=True)[1] for x in groups]) - 1
+
+
+def fit_groups(body, trials_of_groups, sessions):
+    """One fit for each group of trials: those with the same sessions side by side.
+
+    Args:
+        body: Which.
+        trials_of_groups: Records of each group.
+        sessions: Of each trial (groups, size).
+
+    Returns:
+        What each fit found, in the order of the groups.
+    """
     moments = np.array(BODIES[body])
     system = jr.RigidBody(np.full(3, moments.mean()), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
     records = [
         [identify.Rates(x.ts, x.readings, x.sigma) for x in trials] for trials in trials_of_groups
     ]
     shape = identify.Flat() if body == "flat" else identify.Tensor()
-    return identify.fit_each(
-        system, records, free=drag_of, shape=shape, unmodelled="estimate", throw=False
-    )
+    found: list[Found] = [None] * len(records)  # pyright: ignore[reportAssignmentType]
+    for pattern in np.unique(sessions, axis=0):
+        places = np.flatnonzero(np.all(sessions == pattern, axis=1))
+        fits = identify.fit_each(
+            system,
+            [records[i] for i in places],
+            free=drag_and_turns(pattern) if np.any(pattern >= 0) else drag_of,
+            shape=shape,
+            unmodelled="estimate",
+            throw=False,
+        )
+        for lane, place in enumerate(places):
+            found[place] = Found.of(jax.tree.map(lambda x, i=lane: x[i], fits))
+    return jax.tree.map(lambda *x: np.stack(x), *found)
 
 
-def estimates_of(found):
-    """I2/I1, I3/I1 and the drag's coefficient of each fit, and their errors (fits, 3)."""
-    drag, drag_error = jax.vmap(lambda x: x.leaves["torque.coefficient"])(found)
-    values = np.column_stack([found.ratios, drag])
-    errors = np.column_stack([found.ratios_errors, drag_error])
-    return values, errors
+class Found(NamedTuple):
+    """What is looked at of a fit, or of many."""
+
+    estimates: np.ndarray  # I2/I1, I3/I1 and the drag's coefficient
+    errors: np.ndarray
+    over_sensor: np.ndarray  # errors of ratios over the part of the sensors, in the median
+    status: np.ndarray
+    left_out: np.ndarray
+
+    @classmethod
+    def of(cls, fit):
+        """Of one fit."""
+        drag, drag_error = fit.leaves["torque.coefficient"]
+        whole = np.diagonal(np.asarray(fit.numbers_covariance))
+        own = np.diagonal(np.asarray(fit.sensor_covariance))
+        return cls(
+            np.append(fit.ratios, drag),
+            np.append(fit.ratios_errors, drag_error),
+            np.median(np.sqrt(whole / own)),
+            np.asarray(fit.status),
+            np.asarray(fit.spoilt),
+        )
 
 
 def chi_square_between(values, errors):
@@ -195,17 +251,10 @@ def rms_between(values, errors, usable):
     return np.sqrt(total / max(freedom, 1))
 
 
-def errors_over_sensor(found, usable):
-    """Median of the errors stated over the part of the sensors."""
-    whole = np.diagonal(np.asarray(found.numbers_covariance), axis1=1, axis2=2)[usable]
-    own = np.diagonal(np.asarray(found.sensor_covariance), axis1=1, axis2=2)[usable]
-    return np.median(np.sqrt(whole / own))
-
-
 def how_they_end(status):
     """How many fits ended in each state."""
-    names = {int(getattr(Status, x)._value): x for x in NAMES}
-    counts = collections.Counter(names[int(x)] for x in np.asarray(status._value))
+    names = {int(getattr(Status, x)): x for x in NAMES}
+    counts = collections.Counter(names[int(x)] for x in status)
     return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 
 
@@ -214,22 +263,25 @@ def row_of(options, drawn, grouping):
     start = time.perf_counter()
     groups = groups_of(grouping, options.trials, options.group)
     trials = [[world.trials[i] for i in group] for world in drawn for group in groups]
-    found = fit_groups(options.body, trials)
-    values, errors = estimates_of(found)
-    failed = np.any([np.asarray(found.status == x) for x in FAILED], axis=0)
-    usable = ~failed & np.all(np.isfinite(errors) & (errors > 0), axis=1)
+    of_groups = sessions_of(groups, options.session)
+    if not drawn[0].turned:
+        of_groups[:] = -1
+    found = fit_groups(options.body, trials, np.tile(of_groups, (len(drawn), 1)))
+    values, errors = found.estimates, found.errors
+    usable = ~np.isin(found.status, [int(x) for x in FAILED])
+    usable &= np.all(np.isfinite(errors) & (errors > 0), axis=1)
     pulls = ((values - drawn[0].truth) / errors)[usable]
     by_world = (len(drawn), len(groups))
     between = rms_between(
         values.reshape(*by_world, 3), errors.reshape(*by_world, 3), usable.reshape(by_world)
     )
     foreign = np.concatenate([world.foreign[groups] for world in drawn])
-    left_out = np.asarray(found.spoilt)
+    left_out = found.left_out
     return [
         *(f"{x:.2f}" for x in np.sqrt(np.mean(pulls**2, axis=0))),
         *(f"{x:.2f}" for x in between),
         f"{100 * np.median(errors[usable, 1] / drawn[0].truth[1]):.2f}",
-        f"{errors_over_sensor(found, usable):.1f}",
+        f"{np.median(found.over_sensor[usable]):.1f}",
         how_they_end(found.status),
         f"{np.sum(left_out & foreign)} of {np.sum(foreign)}",
         f"{np.sum(left_out & ~foreign)} of {np.sum(~foreign)}",

@@ -122,3 +122,64 @@ def test_without_a_stated_noise_the_residuals_take_its_place(rng):
     assert int(jnp.argmin(table.bic)) == 1
     left = 240 * np.log(np.asarray(table.chi_square) / 240)
     np.testing.assert_allclose(table.bic, left + np.log(240) * np.asarray(table.unknowns))
+
+
+@pytest.mark.parametrize("time", [0.0, 2.0])
+def test_the_likelihood_of_an_unmodelled_torque_is_that_of_a_dense_covariance(time, rng):
+    """Of a sphere, whose rates are the noise, a constant and the integral of the torque."""
+    ts, level = TS[:30], 0.05
+    later, earlier = np.maximum(*np.meshgrid(ts, ts)), np.minimum(*np.meshgrid(ts, ts))
+    spread = level**2 * earlier
+    if time:  # of a torque whose correlation falls exponentially, and is stationary from the start
+        memory = 1 + np.exp((earlier - later) / time)
+        memory = memory - np.exp(-earlier / time) - np.exp(-later / time)
+        spread = spread - level**2 * time / 2 * memory
+    covariance = spread / NOISE**2 + np.eye(ts.size)
+    values = np.ones(3) + rng.multivariate_normal(np.zeros(ts.size), NOISE**2 * covariance, 3).T
+    torque = identify.GaussMarkov(level, time)
+    found = identify.fit(
+        BLIND, identify.Rates(ts, values, NOISE), shape=identify.Fixed(), unmodelled=torque
+    )
+    inverse = np.linalg.inv(covariance)
+    ones = np.ones(ts.size)
+    left = (values - ones @ inverse @ values / (ones @ inverse @ ones)) / NOISE
+    np.testing.assert_allclose(found.chi_square, np.sum(left * (inverse @ left)), rtol=1e-6)
+    log_determinant = 3 * np.linalg.slogdet(covariance)[1]
+    np.testing.assert_allclose(found.log_determinant, log_determinant, rtol=1e-6)
+
+
+def test_an_unmodelled_torque_is_preferred_where_there_is_one(rng):
+    for level, best in ((0.0, "none"), (0.02, "torque")):
+        (record,) = throws(rng)
+        kicks = level * np.sqrt(TS[1]) * rng.normal(size=(TS.size, 3))
+        # Kicks of a body that turns slowly: what they do later is left out, as it is small.
+        record = identify.Rates(TS, record.values + np.cumsum(kicks, axis=0), NOISE)
+        plain = identify.fit(BLIND, record, throw=False)
+        torque = identify.fit(BLIND, record, unmodelled="estimate", throw=False)
+        found = identify.compare({"none": plain, "torque": torque})
+        assert found.names[int(jnp.argmin(found.bic))] == best, str(found)
+        assert found.unknowns[1] - found.unknowns[0] == torque.torque_numbers
+        assert torque.torque_numbers > 0
+
+
+@pytest.mark.slow  # a program of its own
+def test_throws_with_a_wheel_of_their_own_are_left_out_in_turn(rng):
+    """Each is a body with the record of its wheel, and what the gyro read."""
+    tensor, ts = np.diag(MOMENTS), np.arange(60) * 0.02
+    pairs = []
+    for i in range(4):
+        moved, told = worlds.wheel_profile(np.array([0.2, -0.3, 1.0]), 1.5, 0.1 + 0.1 * i, 0.6)
+        omega = 5.0 * rng.normal(size=3)
+        motion = worlds.tumble(tensor, omega, ts, wheel=moved)
+        clock = np.arange(61 + i) * 0.02
+        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
+        values = motion.omega + NOISE * rng.normal(size=motion.omega.shape)
+        pairs.append((jr.RigidBody(np.ones(3), wheel), identify.Rates(ts, values, NOISE)))
+
+    def fit(pairs):
+        bodies, records = zip(*pairs, strict=True)
+        return identify.fit(bodies, list(records), scale="rotor")
+
+    squares = np.asarray(identify.cross_validate(fit, pairs))
+    freedom = 3 * ts.size - 3
+    assert np.all(np.abs(squares - freedom) < 6 * np.sqrt(2 * freedom)), squares

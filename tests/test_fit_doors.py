@@ -418,6 +418,7 @@ def test_what_cannot_be_used_is_said_in_a_sentence(
 
 
 @pytest.mark.parametrize("arguments", [[], ["fit"], ["fit", "a", "--unmodelled", "some"],
+                                       ["fit", "a", "--unmodelled", "1,2,3"],
                                        ["fit", "a", "--shape", "cube"]])  # fmt: skip
 def test_wrong_arguments_are_argparses_to_tell(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
@@ -439,9 +440,10 @@ def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):
     np.savetxt(path, rows, delimiter=",", header="when,p,q,r,x,y,z", comments="")
     columns = ["--columns", "times=when", "--columns", "rates=p,q,r"]
     units = ["--unit", "times=s", "--unit", "rpm"]
-    rest = ["--unmodelled", "0.1", "--robust", "--bias", "--shape", "flat"]
+    rest = ["--unmodelled", "0.1,0.5", "--robust", "--bias", "--shape", "flat"]
     assert _cli.main(["fit", *columns, *units, *rest, str(path)]) == 1
-    assert asked["unmodelled"] == 0.1
+    np.testing.assert_array_equal(asked["unmodelled"].level, [0.1] * 3)
+    np.testing.assert_array_equal(asked["unmodelled"].time, [0.5] * 3)
     assert asked["loss"] == "robust"
     assert asked["shape"] == identify.Flat()
     assert asked["free"](None, identify.Gyro(jnp.ones(3))).shape == (3,)
@@ -449,7 +451,8 @@ def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):
     assert not record.states_noise
     np.testing.assert_allclose(record.values, readings * 2 * np.pi / 60, rtol=1e-6)
     assert _cli.main(["fit", *columns, "--unit", "times=s", "--unit", "dps", str(path)]) == 1
-    assert (asked["free"], asked["loss"], asked["unmodelled"]) == (None, "squares", 0.0)
+    assert (asked["free"], asked["loss"]) == (None, "squares")
+    np.testing.assert_array_equal(asked["unmodelled"].level, np.zeros(3))
     assert asked["shape"] == identify.Tensor()
 
 

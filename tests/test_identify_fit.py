@@ -2,6 +2,7 @@
 
 import functools
 import re
+import sys
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import jrigid as jr
 from jrigid import identify
-from jrigid.identify import Status
+from jrigid.identify import Status, _fit
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 TURN = Rotation.from_rotvec([0.6, -0.4, 0.9]).as_matrix()
@@ -973,3 +974,18 @@ def test_progress_is_printed(capfd, rng):
     short_fit(omegas + 1e-4 * rng.normal(size=omegas.shape))
     jax.effects_barrier()
     assert "chi-square" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("with_tqdm", [True, False])
+def test_progress_is_shown_on_a_terminal_by_default(with_tqdm, capsys, monkeypatch, rng):
+    """In a bar if there is tqdm, else line by line."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr(_fit, "_PATIENCE", 0.0)
+    if not with_tqdm:
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+    _, omegas, _ = rates(ASYMMETRIC, SHORT)
+    identify.fit(BLIND, identify.Rates(SHORT, omegas + 1e-4 * rng.normal(size=omegas.shape), 1e-4))
+    shown = capsys.readouterr()
+    assert "chi-square" in shown.err
+    assert ("stages" in shown.err) is with_tqdm
+    assert "chi-square" not in shown.out

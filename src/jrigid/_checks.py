@@ -117,6 +117,10 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in float32), but "
         "one is not."
     )
+    undersampled_rates = (
+        "Argument `values` of `Gyro` must be in rad/s and sampled twice a turn, but the body "
+        "turns more between samples: are rates in degrees a second (multiply them by pi / 180)?"
+    )
 
 
 def is_good(result: Any) -> bool:

@@ -29,8 +29,12 @@ _OPTIONS = {
 _SHAPES = "tensor", "moments", "symmetric", "top", "flat"  # of `jrigid.identify`
 
 
-def level(text: str) -> str | float:
-    return text if text.startswith("estimate") else float(text)
+def _torque(text: str) -> str | identify.GaussMarkov:
+    """An unmodelled torque: `estimate`, a level, or a level and a correlation time."""
+    if text == "estimate":
+        return text
+    numbers = [float(x) for x in text.split(",")]
+    return identify.GaussMarkov(*numbers)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -54,8 +58,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--sigma", type=float, help="noise of a reading [rad/s], whatever the file's unit")
     add("--bias", action="store_true", help="seek the gyro's bias")
     add("--shape", choices=_SHAPES, default="tensor", help="what is known of it (tensor: nothing)")
-    add("--unmodelled", type=level, default=0.0, metavar="LEVEL",
-        help="white torque, over the mean moment [rad/s^1.5], or estimate")  # fmt: skip
+    add("--unmodelled", type=_torque, default=identify.GaussMarkov(0.0), metavar="LEVEL[,TIME]",
+        help="of an unmodelled torque over the mean moment [rad/s^1.5], and its correlation time "
+        "[s] (white without one); or estimate")  # fmt: skip
     add("--robust", action="store_true", help="leave outliers out")
     add("--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)")
     add("--save", metavar="PKL", help="where to keep the fit, for `jrigid.identify.load`")

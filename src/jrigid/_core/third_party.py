@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import diffrax
 import equinox as eqx
 import jax
+import numpy as np
 from equinox.internal import unvmap_any as unvmap_any
 from jax.extend import core
 from jax.interpreters import ad as ad
@@ -40,6 +41,28 @@ def code_of(item: Any) -> Any:
     An array, or what stands for one in a tree of shapes.
     """
     return item._value
+
+
+class _Code(EnumerationItem):  # pyright: ignore[reportGeneralTypeIssues]
+    """An item that is an integer where one is asked for."""
+
+    def __int__(self) -> int:
+        return int(code_of(self))
+
+    def __index__(self) -> int:
+        return int(code_of(self))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        del copy
+        return np.array(code_of(self), dtype)
+
+
+def with_codes(enumeration: Any) -> Any:
+    """The same enumeration, whose items `int` and numpy take for their codes."""
+    items = vars(enumeration)["_name_to_item"]
+    for name, item in items.items():
+        items[name] = _Code(code_of(item), enumeration)  # pyright: ignore[reportCallIssue]
+    return enumeration
 
 
 def enumeration_of(item: Any) -> Any:

@@ -9,9 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-SURE = 6.0  # standard deviations: one white record in 10^9, for each band
+SURE = 5.5  # standard deviations: one white record in 5 x 10^7, for each band
 STRONG = 2.0  # times the mean power of what is left
 _FEWEST = 16  # samples with a spectrum
+
+
+def stands_out(power: float, deviations: float) -> bool:
+    """Whether a band of frequencies has more than noise has."""
+    return bool(power > STRONG and deviations > SURE)
 
 
 def loudest_band(residuals: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
@@ -36,7 +41,7 @@ def loudest_band(residuals: np.ndarray, parts: Sequence[slice]) -> tuple[float, 
                 i = int(np.argmax(power))
                 deviations = _deviations(float(power[i]), width * count)
                 if deviations > best[1]:
-                    best = float(power[i]), deviations
+                    best = float(power[i]), float(deviations)
                 width *= 2
     return best
 

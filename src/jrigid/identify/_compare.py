@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
 from jrigid._checks import demand
@@ -14,6 +15,7 @@ from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._result import FitResult
 from jrigid.identify._shapes import Fixed
+from jrigid.systems import RigidBody
 
 _LEAST = 1e-3  # of the largest level, where one of an axis is zero
 
@@ -25,7 +27,8 @@ class Comparison(NamedTuple):
         names: Of the models.
         chi_square: Of each.
         degrees_of_freedom: Residuals less what was sought.
-        unknowns: How many numbers were sought, those of the states with them.
+        unknowns: How many numbers were sought, those of the states and an unmodelled torque with
+            them.
         aic: Akaike's criterion: a model is the better the less it is.
         bic: The Bayesian one, which asks more of each unknown: 10 less is strong evidence.
     """
@@ -54,7 +57,9 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
 
     With the noise stated the criteria are chi-square + 2 k and chi-square + k log n, of k unknowns
     and n residuals; else n log(chi-square / n) stands for chi-square. What was known beforehand
-    counts as sought, and its squares are in chi-square.
+    counts as sought, and its squares are in chi-square. An unmodelled torque makes readings depend
+    on each other, so that the logarithm of their covariance's determinant is added to chi-square;
+    its numbers count as unknowns where they were sought.
 
     Args:
         results: Each fit by the name of its model.
@@ -63,7 +68,7 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
         The table.
 
     Raises:
-        ValueError: Fits of different samples, or with an unmodelled torque.
+        ValueError: Fits of different samples.
 
     Gradients: none.
     Source: G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6 (1978) 461.
@@ -81,24 +86,47 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     fits = tuple(results.values())
     asked = [((x.problem.samples, x.kept), x.problem.options.noise_known) for x in fits]
     demand(
-        all(bool(eqx.tree_equal(x, asked[0], rtol=1e-6)) for x in asked)
-        and not any(x.problem.options.dense for x in fits),
-        "Argument `results` must be fits of the same samples, their noise taken alike, without an "
-        "unmodelled torque, but they are not.",
+        all(bool(eqx.tree_equal(x, asked[0], rtol=1e-6)) for x in asked),
+        "Argument `results` must be fits of the same samples, their noise taken alike, but they "
+        "are not.",
     )
     n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
     states = [jnp.sum(x > SHOWN * x[:, :1]) for x in (y.state_singular_values for y in fits)]
-    unknowns = jnp.stack([x.numbers.size + count for x, count in zip(fits, states, strict=True)])
+    counts = [x.numbers.size + x.torque_numbers for x in fits]
+    unknowns = jnp.stack([x + y for x, y in zip(counts, states, strict=True)])
     square, freedom = (jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3])
     left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)
+    left = left + jnp.stack([x.log_determinant for x in fits])
     criteria = left + 2 * k, left + k * jnp.log(n)
     return Comparison(tuple(results), square, freedom, unknowns, *criteria)
 
 
+def _split(throw: Any) -> tuple[RigidBody | None, tuple[Any, ...]]:
+    """The body of a throw, if it has one of its own, and its records."""
+    body, records = throw if _is_pair(throw) else (None, throw)
+    return body, records if isinstance(records, tuple) else (records,)
+
+
+def _is_pair(throw: Any) -> bool:
+    """Whether a throw has a body of its own."""
+    return isinstance(throw, tuple) and isinstance(throw[0], RigidBody)
+
+
+def _with_what_was_found(found: FitResult, body: RigidBody | None) -> RigidBody:
+    """A body that a fit has not seen, with the inertia and the torque that the fit found."""
+    if body is None:
+        return found.system
+    sensors = found.unknowns.original(0)[1:]
+    leaves = jtu.tree_leaves(eqx.filter((body, *sensors), eqx.is_inexact_array))
+    leaves += [jnp.zeros_like(x[0]) for x in found.unknowns.groups.values()]  # it is in none
+    return found.unknowns.parts(found.numbers, found.own_numbers[0], tuple(leaves))[0]
+
+
 def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
     options = found.problem.options
-    system, *sensors = found.parts()
-    records = [x if isinstance(x, tuple) else (x,) for x in throws]
+    sensors = found.parts()[1:]
+    bodies, records = zip(*map(_split, throws), strict=True)
+    systems = [_with_what_was_found(found, x) for x in bodies]
     records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
     stated = all(x.states_noise for throw in records for x in throw)
     demand(stated, "Argument `throws` must state the noise, but one does not.")
@@ -106,7 +134,7 @@ def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
     torque = GaussMarkov(level, found.correlation_time)
     loss = "robust" if options.robust else "squares"
     rest = {"unmodelled": torque, "loss": loss, "motion": options.motion}
-    return fit(system, records, shape=Fixed(), throw=False, **rest)
+    return fit(systems, records, shape=Fixed(), throw=False, **rest)
 
 
 def cross_validate(
@@ -121,11 +149,13 @@ def cross_validate(
 
     Args:
         fit_function: Fits a list of throws: `lambda throws: jr.identify.fit(body, throws, ...)`.
-        throws: Of each a record or a tuple of records; a list of throws is left out as a group.
+        throws: Of each a record or a tuple of records; or, where throws have bodies of their own,
+            as with a record of a wheel for each, a pair of the body and these, which
+            `fit_function` then takes apart. A list of throws is left out as a group.
         refit: What finds the states of throws left out from the fit of the others, where the
-            default cannot: wheels that each throw has its own record of, numbers
-            sought by `each`, a motion that depends on an attitude that was not observed. The
-            default keeps the level of an unmodelled torque, the loss and the motion.
+            default cannot: numbers sought by `each`, a motion that depends on an attitude that was
+            not observed. The default keeps the level and the correlation time of an unmodelled
+            torque, the loss and the motion.
 
     Returns:
         Chi-square of each throw or group.

@@ -181,8 +181,8 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
     (throws, _), dtype = samples.ts.shape, samples.ts.dtype
     sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
     scaled = plan.scale != "trace" and not shape.absolute
-    unknowns = unknowns_of((system,), sensors, sizes, plan.free, shape, scaled, rate)
-    shared = not any(x.own for x in unknowns.sought)
+    unknowns = unknowns_of((system,), sensors, sizes, plan.free, shape, scaled, rate, throws)
+    shared = not any(x.own for x in unknowns.sought) and not unknowns.groups
     demand(shared, "Argument `free` must pick nothing of `each` throw, but it does.")
     unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype)), 1e-9)
     attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]

@@ -15,7 +15,6 @@ from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
-from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import innovations
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
@@ -112,40 +111,58 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     )
 
 
-def innovations_of(fit: Fit, disturbance: Disturbance) -> Rows:
-    """Innovations of a record pushed by a torque: rows in first states, own numbers and numbers.
+class Independent(NamedTuple):
+    """Independent rows of a fit, in first states, own numbers and numbers.
 
-    Rows of what is known beforehand come last, and have their weights too.
+    Attributes:
+        rows: Innovations where a torque may have acted, else residuals.
+        weight: Of each row.
+        log_determinant: Of the covariance of what was observed, in units of the noise: with the
+            sum of squares it makes -2 log likelihood.
     """
-    columns = np.asarray(innovations(quality.linearised(fit), disturbance).rows)
-    columns = np.concatenate([columns, quality.columns_of_prior(fit)], axis=1)
-    border = 1 + fit.minimum.links.gap.shape[-1]
+
+    rows: Rows
+    weight: np.ndarray
+    log_determinant: float
+
+
+def independent_rows(problem: Problem, fit: Fit) -> Independent:
+    """The rows of a fit by which it is judged, those of what is known beforehand last."""
+    minimum = fit.minimum
+    if not problem.options.dense:
+        return Independent(condensed(minimum.rows, minimum.links), minimum.weight, 0.0)
+    found = innovations(quality.linearised(fit), fit.disturbance)
+    columns = np.concatenate([np.asarray(found.rows), quality.columns_of_prior(fit)], axis=1)
+    border = 1 + minimum.links.gap.shape[-1]
     of_border, of_state = columns[..., border:], columns[..., 1:border]
-    return Rows(columns[..., 0], of_border, of_state, np.zeros_like(fit.minimum.rows.node))
+    rows = Rows(columns[..., 0], of_border, of_state, np.zeros_like(minimum.rows.node))
+    # They have their weights already.
+    return Independent(rows, np.ones_like(minimum.weight), float(np.sum(found.log_determinant)))
 
 
 class Weakest(NamedTuple):
-    """Chi-square of a fit, its unit, and the direction that the record determines least."""
+    """Chi-square of a fit, its unit, and what the record determines least of the inertia.
+
+    Attributes:
+        square: Chi-square.
+        noise: Its unit: the variance of a residual.
+        error: Of the combination of the inertia's numbers with the largest error, natural units.
+        normal: That combination: its product with a change of all numbers is the change of it.
+        direction: The change of all numbers, others following, that changes it by one.
+    """
 
     square: float
     noise: float
-    error: float  # in natural units
-    direction: np.ndarray  # a natural unit along it, in numbers
-    normal: np.ndarray  # whose product with that is one
-
-
-def _rows_of_fit(problem: Problem, fit: Fit) -> tuple[Rows, np.ndarray]:
-    """Independent rows of a fit, and their weights: innovations where a torque may have acted."""
-    minimum = fit.minimum
-    if not problem.options.dense:
-        return condensed(minimum.rows, minimum.links), minimum.weight
-    return innovations_of(fit, fit.disturbance), np.ones_like(minimum.weight)
+    error: float
+    normal: np.ndarray
+    direction: np.ndarray
 
 
 def precision(problem: Problem, fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
     own, units = fit.minimum.point.own.shape[-1], fit.minimum.units
-    return precision_of_rows(*_rows_of_fit(problem, fit), own, units)
+    rows, weight, _ = independent_rows(problem, fit)
+    return precision_of_rows(rows, weight, own, units)
 
 
 def weakest(problem: Problem, fit: Fit) -> Weakest:
@@ -156,12 +173,32 @@ def weakest(problem: Problem, fit: Fit) -> Weakest:
         throws, local = minimum.links.gap.shape[0], minimum.links.gap.shape[-1]
         counted = np.sum(quality.weights_of(problem, fit.kept))
         noise = square / max(float(counted) - units.size - local * throws, 1.0)
-    if not units.size:
-        return Weakest(square, noise, 0.0, units, units)
-    known = precision(problem, fit)
-    error = np.sqrt(noise) / max(float(known.values[-1]), 1e-15)
-    direction = known.directions[:, -1]
-    return Weakest(square, noise, error, direction * units, direction / units)
+    covariance = precision(problem, fit).covariance
+    error, normal, direction = weakest_of(problem.unknowns.judged, covariance, units)
+    return Weakest(square, noise, np.sqrt(noise) * error, normal, direction)
+
+
+def weakest_of(
+    part: slice, covariance: np.ndarray, units: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Error, normal and direction of `Weakest`, from a covariance of the numbers.
+
+    Args:
+        part: Where the numbers are by which a fit is judged.
+        covariance: Of all numbers.
+        units: Natural units of the numbers.
+    """
+    normal, direction = np.zeros_like(units), np.zeros_like(units)
+    inside = covariance[part, part] / (units[part, None] * units[part])
+    if not units.size or not np.all(np.isfinite(inside)):
+        return 0.0 if not units.size else np.inf, normal, direction
+    values, axes = np.linalg.eigh(inside)
+    normal[part] = axes[:, -1] / units[part]
+    # Others follow as far as they are known to, and no farther than a start need be.
+    follow = covariance @ normal / max(values[-1], 1e-300)
+    direction = np.clip(follow, -units, units)
+    direction[part] = axes[:, -1] * units[part]
+    return float(np.sqrt(max(values[-1], 0.0))), normal, direction
 
 
 def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
@@ -192,21 +229,19 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
     if torque is None:
         given = fit.disturbance
         torque = levels.known(np.asarray(given.level[0], float), np.asarray(given.time, float))
-    faint = search.is_faint(torque)
-    if faint:
-        tried = search.start(_TRIED * first, throws)
-        # Near none the likelihood is quadratic in the level squared: the least to be seen.
-        error = search.errors(tried, fit)[0]
-        found = tried.typical.level * np.sqrt(2 * error) * size
-        return fields | {"level_errors": found}
-    typical, errors = torque.typical, search.errors(torque, fit)
+    faint = search.are_faint(torque)
+    tried = torque.with_levels(np.where(faint, _TRIED * first, torque.levels))
+    typical, errors = tried.typical, search.errors(tried, fit)
     of_levels, of_times = np.split(errors, [torque.form.levels])
+    # Near none the likelihood is quadratic in the level squared: the least to be seen.
+    of_levels = np.where(faint, np.sqrt(2 * of_levels), of_levels)
     fields |= {
-        "level": size * typical.level,
+        "level": np.where(faint, 0.0, size * typical.level),
         "level_errors": size * typical.level * of_levels,
-        "correlation_time": typical.time,
-        "level_by_trial": np.exp(torque.trials),
     }
+    if np.all(faint):
+        return fields
+    fields |= {"correlation_time": typical.time, "level_by_trial": np.exp(torque.trials)}
     if torque.form.times:
         fields["correlation_time_errors"] = typical.time * of_times
     return fields
@@ -250,7 +285,7 @@ def _of_moments(moments: np.ndarray) -> np.ndarray:
 
 def _spread_of_moments(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Covariance of moments, ratios and shares: as `FitResult.spread`."""
-    size = problem.unknowns.slices["scale"].stop  # the others do not move the tensor
+    size = problem.unknowns.of_inertia.stop
     inside = covariance[:size, :size]
     if not size or not np.all(np.isfinite(inside)):
         return np.full((8, 8), 0.0 if not size else np.nan, numbers.dtype)
@@ -287,9 +322,9 @@ def conclude(
     point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
     rows = condensed(minimum.rows, minimum.links)
     sensor = precision_of_rows(rows, minimum.weight, own, units)
-    known, judged_by = sensor, None
+    known, judged_by, log_determinant = sensor, None, 0.0
     if options.dense:
-        independent, weight = _rows_of_fit(problem, fit)
+        independent, weight, log_determinant = independent_rows(problem, fit)
         known = precision_of_rows(independent, weight, own, units)
         judged_by = independent.residual[:, : fit.kept.shape[1]]
     residuals, jacobian = _weighted(fit, rows, own)
@@ -320,6 +355,8 @@ def conclude(
         "kept": _resized(fit.kept, parts, lengths) > 0,
         "history": np.pad(fit.history, (0, HISTORY), constant_values=np.nan)[:HISTORY],
         "ambiguous": np.asarray(fit.ambiguous),
+        "log_determinant": np.asarray(log_determinant),
+        "torque_numbers": np.asarray(0 if fit.torque is None else fit.torque.size),
         "problem": dataclasses.replace(
             problem,
             options=options._replace(nodes=1),
@@ -379,21 +416,17 @@ def _of_lengths(samples: Samples, lengths: Sequence[int]) -> Samples:
     )
 
 
-def _widened(known: Precision, error: float, units: np.ndarray) -> Precision:
-    """With an error of the weakest direction, in natural units, of at least this size."""
-    if not error > 0:
-        return known
-    factors = np.ones(units.size)
-    factors[-1] = max(error * known.values[-1], 1.0)
-    return _with_larger_errors(known, factors, units)
+def _with_error(part: slice, covariance: np.ndarray, units: np.ndarray, error: float) -> np.ndarray:
+    """With an error of the inertia's weakest direction, in natural units, of at least this size."""
+    before, _, direction = weakest_of(part, covariance, units)
+    return covariance + max(error**2 - before**2, 0.0) * np.outer(direction, direction)
 
 
-def _with_larger_errors(known: Precision, factors: np.ndarray, units: np.ndarray) -> Precision:
-    """With errors so many times larger along each direction."""
+def _with_larger_errors(known: Precision, factors: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """The covariance with errors so many times larger along each direction."""
     directions = known.directions * units[:, None] / np.maximum(known.values, 1e-150)
     more = directions * np.sqrt(factors**2 - 1)
-    covariance = known.covariance + more @ more.T
-    return known._replace(values=known.values / factors, covariance=covariance)
+    return known.covariance + more @ more.T
 
 
 def _scatter_of_trials(known: Precision, alive: np.ndarray, units: np.ndarray) -> np.ndarray:
@@ -454,7 +487,7 @@ def _what_is_left(problem: Problem, fit: Fit, known: Precision, residuals: np.nd
     chi_square = chi_square + _kicks(problem, fit)
     noise = chi_square / max(freedom, 1.0)
     band, sure = colour.loudest_band(residuals, problem.samples.parts)
-    coloured = band > colour.STRONG and sure > colour.SURE
+    coloured = colour.stands_out(band, sure)
     more = less = False
     if problem.options.noise_known:
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
@@ -469,19 +502,19 @@ def _what_is_left(problem: Problem, fit: Fit, known: Precision, residuals: np.nd
 
 def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray) -> dict[str, Any]:
     """How well a fit describes the record, by residuals or innovations, and its name."""
-    units, settled = fit.minimum.units, bool(fit.minimum.settled)
+    units, settled, unknowns = fit.minimum.units, bool(fit.minimum.settled), problem.unknowns
     left = _what_is_left(problem, fit, known, residuals)
     apart = _scatter_of_trials(known, np.any(fit.kept > 0, axis=1), units)
     apart = apart / np.sqrt(left.inflation)
     misfit = left.misfit or np.any(apart > _DISAGREEING)
-    if units.size:
-        known = _widened(known, fit.probed_error / np.sqrt(left.inflation), units)
-        known = _with_larger_errors(known, np.maximum(apart, 1.0), units)
+    covariance = left.inflation * _with_larger_errors(known, np.maximum(apart, 1.0), units)
+    if fit.probed_error > 0:
+        covariance = _with_error(unknowns.judged, covariance, units, fit.probed_error)
     pure = quality.is_pure(problem, fit, left.inflation)
     unexplained = quality.unexplained(problem, fit, _kicks(problem, fit))
     flat = quality.is_at_boundary(problem, fit)
-    largest = np.sqrt(left.inflation) / np.min(known.values, initial=np.inf)
-    sound = np.all(np.isfinite(known.covariance)) and left.freedom > 0
+    largest = weakest_of(unknowns.judged, covariance, units)[0]
+    sound = np.all(np.isfinite(covariance)) and left.freedom > 0
     if not (sound and np.isfinite(left.chi_square)):
         status = "NOT_CONVERGED"
     elif misfit:
@@ -511,5 +544,5 @@ def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray)
         "pure_spin": np.asarray(pure),
         "singular_values": known.values,
         "directions": known.directions,
-        "numbers_covariance": left.inflation * known.covariance,
+        "numbers_covariance": covariance,
     }

@@ -1,9 +1,10 @@
 """fit(): inertia, and what else is asked for, from what was observed."""
 
+import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +13,6 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid._checks import check_option, check_type, demand, is_good
-from jrigid._core.third_party import code_of
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._disturbance import GaussMarkov
@@ -123,8 +123,8 @@ def fit(
         doublings: Where no start can be made from the observations, the first 2^-doublings of the
             record is fitted first, then twice as much, and so on.
         max_steps: Steps of the last stage.
-        progress: Print each stage as it ends. None: from two seconds on, where the standard error
-            is a terminal.
+        progress: Print each stage as it ends. None: where the standard error is a terminal, show
+            it there from two seconds on, in a bar if tqdm is installed.
         throw: True: bad input, and fits that end WRONG_BASIN or NOT_CONVERGED, are errors. False:
             they are results with that status (bad input: of NaN).
 
@@ -152,8 +152,8 @@ def fit(
     request = _asked(
         system, observations, free, scale, shape, start, unmodelled, loss, absolute_sigma, motion
     )
-    effort = Effort(max_steps, doublings, _reporter(progress))
-    (fields,) = _fits([request], effort, throw)
+    with _reporter(progress) as report:
+        (fields,) = _fits([request], Effort(max_steps, doublings, report), throw)
     return FitResult(**jax.device_put(fields))
 
 
@@ -228,19 +228,34 @@ def fit_each(
     return _side_by_side(found)
 
 
-def _reporter(progress: bool | None) -> Callable[[str], None] | None:
-    """What is called with a line after each stage."""
-    if progress is not None:
-        return print if progress else None
-    if not sys.stderr.isatty():
-        return None
+@contextlib.contextmanager
+def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
+    """What is called with a line after each stage: a bar on a terminal where there is tqdm."""
+    if progress is not None or not sys.stderr.isatty():
+        yield print if progress else None
+        return
+    try:
+        from tqdm import tqdm
+    except ModuleNotFoundError:
+        yield _late_lines()
+        return
+    with tqdm(unit=" stages", delay=_PATIENCE, leave=False) as bar:
+
+        def show(line: str) -> None:
+            bar.set_postfix_str(line, refresh=False)
+            bar.update()
+
+        yield show
+
+
+def _late_lines() -> Callable[[str], None]:
     start = time.perf_counter()
 
-    def late(line: str) -> None:
+    def show(line: str) -> None:
         if time.perf_counter() - start > _PATIENCE:
             print(line, file=sys.stderr)
 
-    return late
+    return show
 
 
 class _Asked(NamedTuple):
@@ -443,6 +458,7 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
         on_host(asked.shape),
         asked.scale != "trace" and not asked.shape.absolute,
         observed.rate,
+        records[0].ts.shape[0],
     )
     demand(
         options.noise_known or all(x.sigma is None for x in unknowns.sought),
@@ -479,7 +495,7 @@ def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[
     for (case, input_result), found in zip(cases, run(searches), strict=True):
         fields = conclude(case.problem, found, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
-            if throw and code_of(fields["status"]) == code_of(status):
+            if throw and int(fields["status"]) == int(status):
                 raise RuntimeError(Status[status])
         results.append(fields)
     return results

@@ -32,10 +32,6 @@ from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, Sampled, SpinningMass, Sum
 
 GUESS = 0.02  # of the size of values, for a noise that is not known
-_COARSE = (
-    "Argument `values` of `Gyro` must be in radians a second and sampled more than twice a turn, "
-    "but the body turns more between samples: are rates in degrees a second, times not in seconds"
-)
 
 
 def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
@@ -175,7 +171,7 @@ def findings_of_records(records: tuple[Record, ...], told: Told | None) -> Findi
     check_records(findings, records)
     known = any(tells(x, "attitude") for x in records)
     if told is not None and told.ts.shape[1] > 1 and not known:
-        findings.require(_between(told) < np.pi, RESULTS.invalid_state, _COARSE)
+        findings.require(_between(told) < np.pi, RESULTS.undersampled_rates)
     return findings
 
 

@@ -55,13 +55,30 @@ class Torque(NamedTuple):
         form: Which numbers there are.
         numbers: Logarithms of levels and of times.
         trials: Of the size of the torque in each trial, beside that of others (throws,).
+        own_sizes: Whether these were sought, too.
         minus_two_log_likelihood: Of the record; infinite where it was not computed.
     """
 
     form: Form
     numbers: np.ndarray
     trials: np.ndarray
+    own_sizes: bool = False
     minus_two_log_likelihood: float = np.inf
+
+    @property
+    def size(self) -> int:
+        """How many numbers were sought: those of its form, and of trials that differ."""
+        return self.form.size + (self.trials.size if self.own_sizes else 0)
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Its levels in a trial of mean size: one, or one for each axis."""
+        return np.exp(self.numbers[: self.form.levels])
+
+    def with_levels(self, levels: np.ndarray) -> "Torque":
+        """The same torque with other levels."""
+        times = self.numbers[self.form.levels :]
+        return self._replace(numbers=np.concatenate([np.log(levels), times]))
 
     @property
     def disturbance(self) -> Disturbance:
@@ -231,9 +248,9 @@ class Search:
         numbers, at, _ = descend(function, start, low, high, inverse)
         return torque._replace(numbers=numbers, minus_two_log_likelihood=at)
 
-    def is_faint(self, torque: Torque) -> bool:
-        """Whether there is no torque that could be seen."""
-        return bool(np.all(torque.numbers[: torque.form.levels] < self._first + np.log(2 * FAINT)))
+    def are_faint(self, torque: Torque) -> np.ndarray:
+        """Which of the levels are too low to be seen."""
+        return torque.levels < 2 * FAINT * np.exp(self._first)
 
     def preferred(self, torque: Torque, fit: Fit, spins: np.ndarray) -> Torque:
         """The torque of the form that the likelihood prefers, from a white one.
@@ -245,7 +262,7 @@ class Search:
         """
         likelihood = Likelihood(self._problem, fit)
         best = self._descended(torque, likelihood)
-        if self.is_faint(best):
+        if np.all(self.are_faint(best)):
             return best
         if spins.size > 1:
             proportional = best._replace(trials=np.log(spins) - np.mean(np.log(spins)))
@@ -302,7 +319,9 @@ class Search:
             return torque
         own = x[size:]
         at = likelihood(torque.form, x[:size], start + own)[0]
-        return Torque(torque.form, x[:size], start + own, at)
+        return Torque(
+            torque.form, x[:size], start + own, own_sizes=True, minus_two_log_likelihood=at
+        )
 
     def foreign(self, torque: Torque, fit: Fit) -> np.ndarray:
         """Which trials are of another body, as far as their likelihood shows."""

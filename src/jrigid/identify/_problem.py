@@ -187,7 +187,7 @@ def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
 def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
     """Values of each record (throws, n, k) as its sensor would show them, one body for all."""
     unknowns = problem.unknowns
-    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves)
+    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves_of(0))
 
     def throw(attitude: Array, omega: Array, data: _Throw) -> list[Array]:
         return _seen(problem.options, system, sensors, State(attitude, omega), data)[0]

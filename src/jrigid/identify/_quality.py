@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jrigid.identify._colour import loudest_band, stands_out
 from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import Linearised
 from jrigid.identify._layout import Layout
@@ -121,6 +122,9 @@ def misfit(problem: Problem, fit: Fit) -> float:
     good = bool(fit.minimum.settled) and np.isfinite(ratio)
     if problem.options.noise_known and not problem.options.robust:
         good = good and ratio < 1 + GATE * np.sqrt(2 / freedom)
+        if good and not problem.options.dense:
+            white = np.sqrt(weight) * fit.residual
+            good = not stands_out(*loudest_band(white, problem.samples.parts))
     if good:
         return _AT_BOUNDARY if is_at_boundary(problem, fit) else 0.0
     return ratio if np.isfinite(ratio) else np.finfo(float).max

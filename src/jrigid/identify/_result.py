@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
+from jrigid._core.third_party import with_codes
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import Matrix, Real, Scalar, Vector
@@ -24,12 +25,13 @@ from jrigid.mass import MassProperties
 from jrigid.systems import RigidBody
 
 
+@with_codes
 class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
-    """What became of a fit."""
+    """What became of a fit; `int` gives the code of one, `numpy.asarray` the codes of many."""
 
-    OK = "The fit describes the record, and the record tells what was asked."
+    OK = "The fit describes the record, and the record determines the inertia."
     UNIDENTIFIABLE = (
-        "The fit describes the record, but the record does not tell all that was asked: see "
+        "The fit describes the record, but the record does not determine the inertia: see "
         "`null_directions`."
     )
     MISFIT = (
@@ -113,11 +115,14 @@ class FitResult(eqx.Module):
             a change of the state that the record does not show.
         level: Of the unmodelled torque about each body axis [N m sqrt(s)]: the root of its spectral
             density at low frequencies.
-        level_errors: Of the level; of one that was not sought, or not found, what the record could
-            tell.
+        level_errors: Of the level, by the relative error that its logarithm has; of one that was
+            not sought, or not found, what the record could tell.
         correlation_time: Of the unmodelled torque about each body axis [s]; 0 where it is white.
         correlation_time_errors: Of that.
         level_by_trial: Of each trial, in units of `level`.
+        torque_numbers: How many numbers of that torque were sought.
+        log_determinant: Of the covariance of the record that it makes, in units of the noise: with
+            `chi_square` it is -2 log likelihood, but for a constant; 0 without such a torque.
         scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
         kept: Which samples were, records side by side.
         history: Sum of squares of the record after each step, NaN beyond the last.
@@ -178,6 +183,8 @@ class FitResult(eqx.Module):
     correlation_time: Vector
     correlation_time_errors: Vector
     level_by_trial: Float[Array, " throws"]
+    torque_numbers: Int[Array, ""]
+    log_determinant: Scalar
     scales: Float[Array, " records"]
     kept: Bool[Array, "throws samples"]
     history: Float[Array, " steps"]
@@ -279,8 +286,7 @@ class FitResult(eqx.Module):
         Args:
             index: Which throw.
         """
-        given = self.unknowns.leaves, self.unknowns.stacked
-        leaves = jtu.tree_map(lambda x, own: x[index] if own else x, *given)
+        leaves = self.unknowns.leaves_of(index)
         return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves)
 
     def start(self, index: Int[_ArrayLike, ""] = 0) -> tuple[State, Float[Array, "*fits"]]:
@@ -398,18 +404,51 @@ class FitResult(eqx.Module):
 
         Of one that is sought anew in each throw, of each throw.
         """
-        numbers, first = self.numbers_covariance, self.follow.shape[1] - self.own_numbers.shape[1]
-        follow = self.follow[:, first:]
-        own = product("tlg,gh,tmh->tlm", follow, numbers, follow)
-        own = own + self.local_covariance[:, first:, first:]
-        slices = self.unknowns.slices | {x.name: s for x, s in self.unknowns.own_slices}
+        found = {}
+        for x in self.unknowns.sought:
+            numbers, covariance = self._of_sought(x)
+            function = jax.vmap(x.with_errors) if x.own else x.with_errors
+            found[x.name] = function(numbers, covariance)
+        return found
 
-        def value_and_errors(x: AbstractSought, s: slice) -> tuple[Array, Array]:
-            if x.own:
-                return jax.vmap(x.with_errors)(self.own_numbers[:, s], own[:, s, s])
-            return x.with_errors(self.numbers[s], numbers[s, s])
+    def _of_sought(self, x: AbstractSought) -> tuple[Array, Array]:
+        """Numbers of an array that is sought, and their covariance; of each throw if it is own."""
+        numbers = self.numbers_covariance
+        if not x.own:
+            part = self.unknowns.slices[x.name]
+            return self.numbers[part], numbers[part, part]
+        part = next(s for y, s in self.unknowns.own_slices if y is x)
+        first = self.follow.shape[1] - self.own_numbers.shape[1]
+        local = slice(first + part.start, first + part.stop)
+        follow = self.follow[:, local]
+        shared = product("tlg,gh,tmh->tlm", follow, numbers, follow)
+        return self.own_numbers[:, part], shared + self.local_covariance[:, local, local]
 
-        return {x.name: value_and_errors(x, slices[x.name]) for x in self.unknowns.sought}
+    @property
+    def determined(self) -> dict[str, bool]:
+        """Whether the record determines the inertia, and each array that `free` picked, by name.
+
+        An array is determined where its errors are below 0.3 of its size, or of its natural unit
+        if that is larger; one that is sought anew in each throw, where it is in every throw that
+        took part. The inertia, where `status` does not say otherwise. Of a single fit.
+
+        >>> import jax.numpy as jnp, jrigid as jr
+        >>> record = jr.datasets.gyro_example()
+        >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
+        >>> found = jr.identify.fit(
+        ...     jr.RigidBody(jnp.ones(3)), readings, free=lambda body, gyro: gyro.bias)
+        >>> print(found.determined)
+        {'inertia': True, 'gyro.bias': True}
+        """
+        found = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
+        for x in self.unknowns.sought:
+            numbers, covariance = self._of_sought(x)
+            units = jax.vmap(x.natural_units)(numbers) if x.own else x.natural_units(numbers)
+            errors = errors_of(covariance) / units
+            took_part = jnp.any(self.kept, axis=-1)
+            errors = errors[took_part] if x.own else errors
+            found[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
+        return found
 
     @property
     def mirror(self) -> Float[Array, "*fits 3"]:
@@ -460,7 +499,7 @@ def _of_moments(which: Any, tensor: Array) -> Array:
 def _spread(
     unknowns: Unknowns, numbers: Array, covariance: Array, function: Callable[..., Any]
 ) -> Array:
-    size = unknowns.slices["scale"].stop  # the others do not move the tensor
+    size = unknowns.of_inertia.stop
     values, axes = jnp.linalg.eigh(covariance[:size, :size])
     sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
     near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line

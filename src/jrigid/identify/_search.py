@@ -333,7 +333,8 @@ def search(case: Case) -> Search:
         off, seen = misfit(problem, end), weakest(problem, end)
         fall = (weak.square - seen.square) / seen.noise
         better = off < wrong or (off <= wrong and fall > 0)
-        rival = _are_apart(best, end, max(weak.error, seen.error)) and abs(fall) < _RIVAL
+        apart = _are_apart(best, end, problem.unknowns.judged, max(weak.error, seen.error))
+        rival = apart and abs(fall) < _RIVAL
         ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
         if better:
             best, wrong, weak = end, off, seen
@@ -373,7 +374,10 @@ def no_search(case: Case) -> Search:
 
 
 def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool) -> int:
-    """How many attempts to make: two of a misfit that follows the record, all of other failures."""
+    """How many attempts to make: two of a misfit that follows the record, all of other failures.
+
+    A coarse record has many bodies that follow it, so its misfits are such failures.
+    """
     problem, count = case.problem, len(case.starts)
     if is_pure(problem, best, noise) and wrong < 0.5:  # no misfit
         return 1
@@ -382,7 +386,7 @@ def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool
     if wrong > 0:
         lost = wrong > _FAR or is_at_boundary(problem, best)
         lost = lost or unexplained(problem, best) > FOLLOWED
-        return count if lost else min(2, count)
+        return count if lost or case.coarse else min(2, count)
     return min(4, count) if case.coarse else 1
 
 
@@ -410,10 +414,10 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
     return best._replace(probed_error=largest)
 
 
-def _are_apart(one: Fit, other: Fit, error: float) -> bool:
+def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
     """Whether two fits are different minima."""
-    apart = np.abs(one.minimum.point.numbers - other.minimum.point.numbers)
-    far = np.max(apart / other.minimum.units, initial=0.0)
+    apart = np.abs(one.minimum.point.numbers - other.minimum.point.numbers) / other.minimum.units
+    far = np.max(apart[judged], initial=0.0)
     return bool(far > max(_APART, 6 * error))
 
 

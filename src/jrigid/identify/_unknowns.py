@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import demand, is_concrete
-from jrigid._numerics import or_one, without_gradient
+from jrigid._numerics import or_one, product, without_gradient
 from jrigid._types import AnyArray, Readable
 from jrigid.identify._host import cholesky
 from jrigid.identify._parameters import SIDES, squared
@@ -37,6 +37,7 @@ class _Pick:
     index: int
     sigma: Any = None
     own: bool = False
+    groups: tuple[int, ...] | None = None
 
 
 def prior(array: Any, sigma: Any) -> Any:
@@ -54,13 +55,26 @@ def prior(array: Any, sigma: Any) -> Any:
     return jtu.tree_map(lambda x: dataclasses.replace(x, sigma=sigma), array)
 
 
-def each(array: Any) -> Any:
-    """Within `free`: an array that is sought anew in each throw; `each(prior(array, sigma))` too.
+def each(array: Any, groups: Sequence[int] | None = None) -> Any:
+    """Within `free`: an array that is sought anew in each throw, or in each group of throws.
+
+    A group is a session at a table: between two of them a gyro was taken off and put back, and sits
+    a few degrees off. Nothing tells the turn that all share from that of the body, so one group
+    keeps the misalignment that was given, and the axes are those of its gyro.
+
+    Args:
+        array: What is sought, or `prior(array, sigma)`.
+        groups: For each throw the number of its group, from 0 on; -1 for throws in which the array
+            is as it was given. None: each throw is a group.
 
     >>> import jrigid as jr
     >>> free = lambda body, gyro: jr.identify.each(gyro.bias)
+    >>> sessions = [-1, -1, -1, 0, 0, 0, 1, 1]  # of eight throws
+    >>> free = lambda body, gyro: jr.identify.each(gyro.misalignment, sessions)
     """
-    return jtu.tree_map(lambda x: dataclasses.replace(x, own=True), array)
+    groups = None if groups is None else tuple(int(x) for x in groups)
+    change = {"own": True} if groups is None else {"groups": groups}
+    return jtu.tree_map(lambda x: dataclasses.replace(x, **change), array)
 
 
 class AbstractSought(Readable):
@@ -69,7 +83,7 @@ class AbstractSought(Readable):
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
     own: bool = eqx.field(static=True)
-    base: AnyArray
+    base: AnyArray  # as it was given; sought by groups, with an axis of groups in front
     unit: AnyArray
     sigma: AnyArray | None
 
@@ -81,8 +95,8 @@ class AbstractSought(Readable):
     @property
     def names(self) -> tuple[str, ...]:
         """One for each number."""
-        whole = self.base.ndim == 0
-        return (self.name,) if whole else tuple(f"{self.name}[{j}]" for j in range(self.size))
+        indices = np.ndindex(*self.base.shape)
+        return tuple(self.name + "".join(f"[{j}]" for j in index) for index in indices)
 
     @abc.abstractmethod
     def start(self) -> AnyArray:
@@ -145,6 +159,10 @@ class _Definite(AbstractSought):
     def size(self) -> int:
         return 6
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"{self.name}[{j}]" for j in range(6))
+
     def start(self) -> AnyArray:
         xp = self.base.__array_namespace__()
         eye = _LEAST * xp.eye(3, dtype=self.unit.dtype)
@@ -200,8 +218,11 @@ class Unknowns(eqx.Module):
 
     given: tuple[Any, ...]  # arrays of system and sensors, some with an axis of throws in front
     rest: tuple[Any, ...] = eqx.field(static=True)  # what is no array
-    stacked: tuple[bool, ...] = eqx.field(static=True)  # which arrays have
+    stacked: tuple[bool, ...] = eqx.field(static=True)  # which of `leaves` have
     sought: tuple[AbstractSought, ...]
+    groups: dict[
+        str, AnyArray
+    ]  # of what is sought by groups: 1 for each throw in its group, else 0
     shape: AbstractShape
     scaled: bool = eqx.field(static=True)
     trace: AnyArray
@@ -219,6 +240,16 @@ class Unknowns(eqx.Module):
         sizes = {"shape": len(self.shape.names), "scale": int(self.scaled)}
         sizes |= {x.name: x.size for x in self.shared}
         return dict(zip(sizes, one_after_another(sizes.values()), strict=True))
+
+    @property
+    def of_inertia(self) -> slice:
+        """Where the numbers are that move the tensor."""
+        return slice(self.slices["scale"].stop)
+
+    @property
+    def judged(self) -> slice:
+        """Where the numbers are by which a fit is judged: of the inertia; all if that is known."""
+        return self.of_inertia if self.of_inertia.stop else slice(self.size)
 
     @property
     def size(self) -> int:
@@ -280,13 +311,22 @@ class Unknowns(eqx.Module):
 
     @property
     def leaves(self) -> tuple[AnyArray, ...]:
-        """The arrays of the system and the sensors."""
-        return tuple(jtu.tree_leaves(self.given))
+        """The arrays of the system and the sensors, then those of `groups`."""
+        return (*jtu.tree_leaves(self.given), *self.groups.values())
+
+    def leaves_of(self, throw: int | AnyArray) -> tuple[AnyArray, ...]:
+        """The same of one throw."""
+        pairs = zip(self.leaves, self.stacked, strict=True)
+        return tuple(x[throw] if own else x for x, own in pairs)
 
     def original(self, throw: int | AnyArray) -> tuple[Any, ...]:
         """System and sensors of a throw as they were given."""
-        pairs = zip(self.leaves, self.stacked, strict=True)
-        return self._built([x[throw] if own else x for x, own in pairs])
+        return self._built(self.leaves_of(throw)[: self._arrays])
+
+    @property
+    def _arrays(self) -> int:
+        """How many arrays the system and the sensors have."""
+        return len(self.stacked) - len(self.groups)
 
     def _built(self, leaves: Sequence[AnyArray]) -> tuple[Any, ...]:
         return eqx.combine(jtu.tree_structure(self.given).unflatten(leaves), self.rest)
@@ -295,10 +335,15 @@ class Unknowns(eqx.Module):
         self, numbers: AnyArray, own: AnyArray, leaves: tuple[AnyArray, ...]
     ) -> tuple[Any, ...]:
         """System and sensors of a throw: of its own numbers and the arrays given for it."""
-        arrays, slices = list(leaves), self.slices
+        arrays, slices = list(leaves[: self._arrays]), self.slices
+        member = dict(zip(self.groups, leaves[self._arrays :], strict=True))
         found = [(x, numbers[slices[x.name]]) for x in self.shared]
         for x, part in found + [(x, own[s]) for x, s in self.own_slices]:
-            arrays[x.index] = x.value(part).astype(numbers.dtype)
+            value = x.value(part).astype(numbers.dtype)
+            if x.name in member:  # as it was given in a throw that is in no group
+                given, weights = arrays[x.index].astype(numbers.dtype), member[x.name]
+                value = product("g,g...->...", weights, value) + (1 - jnp.sum(weights)) * given
+            arrays[x.index] = value
         system, *sensors = self._built(arrays)
         mass = self.shape.body(numbers[slices["shape"]])
         changed = self.inertia(numbers), _of_body(system.torque, mass)
@@ -339,6 +384,7 @@ def _of_body(torque: Any, body: MassProperties | None) -> Any:
 def unknowns_of(
     systems: Sequence[Any], sensors: tuple[Any, ...], sizes: Sequence[AnyArray],
     free: Callable[..., Any] | None, shape: AbstractShape, scaled: bool, rate: AnyArray,
+    throws: int,
 ) -> Unknowns:  # fmt: skip
     """Set up the numbers.
 
@@ -350,14 +396,15 @@ def unknowns_of(
         shape: What is known of the tensor.
         scaled: Whether the tensor's scale is sought.
         rate: Rms of the rates.
+        throws: How many there are.
     """
     dtype, parts = rate.dtype, (systems[0], *sensors)
     arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
     paths, tree = jtu.tree_flatten_with_path(arrays)
-    throws = [jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array)) for x in systems]
+    rows = [jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array)) for x in systems]
     text = "must hold bodies of the same kind for all throws, but it does not."
-    demand(all(len(x) == len(paths) for x in throws), f"Argument `system` {text}")
-    columns = list(zip(*throws, strict=True))  # of each array
+    demand(all(len(x) == len(paths) for x in rows), f"Argument `system` {text}")
+    columns = list(zip(*rows, strict=True))  # of each array
     stacked = tuple(any(x is not column[0] for x in column) for column in columns)
     xp = rate.__array_namespace__()
     leaves = [xp.stack(x) if own else x[0] for x, own in zip(columns, stacked, strict=True)]
@@ -365,7 +412,7 @@ def unknowns_of(
     if picks:
         units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
         units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
-    sought = []
+    sought, groups = [], {}
     for pick in picks:
         path, base = paths[pick.index]
         base, largest = base.astype(dtype), xp.max(xp.abs(base)).astype(dtype)
@@ -375,9 +422,31 @@ def unknowns_of(
         sigma = None if pick.sigma is None else xp.asarray(pick.sigma, dtype)
         positive = _Definite if base.shape == (3, 3) else _Positive
         kind = positive if _field(parts, path).get("positive") else _Any
-        sought.append(kind(pick.index, _named(parts, path), pick.own, base, unit, sigma))
+        name = _named(parts, path)
+        if pick.groups is not None:
+            groups[name] = member = _members(pick.groups, throws, dtype)
+            demand(
+                kind is not _Definite,
+                f"Argument `free` must not seek the tensor {name} by groups, but it does.",
+            )
+            base, unit = (np.tile(x, (member.shape[1],) + (1,) * x.ndim) for x in (base, unit))
+        sought.append(kind(pick.index, name, pick.own, base, unit, sigma))
     inertia = systems[0].inertia
     inertia = np.asarray(inertia, dtype) if is_concrete(inertia) else inertia.astype(dtype)
     trace = inertia.sum() if inertia.ndim == 1 else inertia.trace()
     given = tree.unflatten(leaves)
-    return Unknowns(given, rest, stacked, tuple(sought), shape, scaled, trace, rate)
+    stacked = (*stacked, *(True for _ in groups))
+    return Unknowns(given, rest, stacked, tuple(sought), groups, shape, scaled, trace, rate)
+
+
+def _members(groups: tuple[int, ...], throws: int, dtype: Any) -> np.ndarray:
+    """1 for each throw in its group, else 0 (throws, groups)."""
+    count = max(groups, default=-1) + 1
+    demand(
+        len(groups) == throws
+        and count > 0
+        and set(range(count)) <= set(groups) <= {-1, *range(count)},
+        f"Argument `groups` of `each` must number the groups of {throws} throws from 0 on, with -1 "
+        f"for throws in none, but it is {groups}.",
+    )
+    return (np.asarray(groups)[:, None] == np.arange(count)).astype(dtype)

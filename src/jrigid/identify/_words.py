@@ -8,13 +8,12 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from jrigid._core.third_party import code_of, names_of
-from jrigid.identify._colour import STRONG
-from jrigid.identify._colour import SURE as COLOURED
+from jrigid._core.third_party import names_of
+from jrigid.identify._errors import weakest_of
+from jrigid.identify._reasons import reason
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 from jrigid.identify._shapes import Fixed, Flat, Symmetric, Tensor, Top
 
-_NEARLY_A_SPHERE = 1.03  # degrees for radians shrink the gaps of the moments by 57
 _LIKE, _SURE = 0.1, 5.0  # correlation of neighbours, and its standard deviations, of no noise
 _FAINT = 0.02  # relative change of a tensor by a unit of one of its numbers: of a thickness
 
@@ -79,7 +78,10 @@ def null_directions(result: FitResult) -> tuple[str, ...]:
     loose = bool(np.any(result.ratios_errors > LARGEST_ERROR * result.ratios))
     found += ["I1's ratio to the others"] * (loose and not weak.any() and not result.pure_spin)
     if result.ambiguous and not result.pure_spin:
-        found.append(f"{_untold(result, directions[-1])}: others far from it are nearly as good")
+        covariance, numbers = np.asarray(result.numbers_covariance), result.numbers
+        units = np.asarray(unknowns.natural_units(numbers))
+        weakest = weakest_of(unknowns.judged, covariance, units)[1] * units
+        found.append(f"{_untold(result, weakest)}: others far from it are nearly as good")
     of_state = np.asarray(result.state_singular_values)
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
     if options.on_attitude and count:
@@ -123,29 +125,6 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     return notes
 
 
-def _reason(result: FitResult) -> str:
-    """Why residuals are not of the size stated, as far as they show it, and what to pass."""
-    if bool(result.status != Status.MISFIT) or not result.problem.options.noise_known:
-        return ""
-    size = math.sqrt(result.reduced_chi_square)
-    found = f"The residuals are {size:.2g} times the stated noise"
-    if size < 1:
-        degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
-        return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
-    band, sure = result.loudest_band
-    if band > STRONG and sure > COLOURED:
-        return (
-            f"What is left has {band:.2g} times its mean power in one band of frequencies: "
-            "something that changes slowly, or swings, is missing. See `unmodelled` and `free`."
-        )
-    if result.reduced_chi_square < 1.1:
-        return "Trials differ by more than their errors say: they may be of different bodies."
-    return (
-        f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
-        "`absolute_sigma=False`."
-    )
-
-
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
     notes, free_motion = _of_record(result), result.problem.options.free_motion
@@ -161,11 +140,9 @@ def remarks(result: FitResult) -> tuple[str, ...]:
             text = f"I{i + 1} and I{i + 2} are equal within their errors: which is the larger, and "
             text += "the axes of each, are not determined"
             notes.append((moments[i + 1] - moments[i] < 2 * error, text))
-        least, middle, most = np.sort(np.asarray(result.mirror))
+        least, middle, most = np.sort(np.asarray(result.mirror, float))
         real, unit = least > 0 and most < least + middle, max(least, 1e-300)
         notes += [
-            (by_rates and ratios[1] < _NEARLY_A_SPHERE, "nearly a sphere: so would any body look "
-             "whose rates are in degrees a second, or whose times are not in seconds"),
             (by_rates and free_motion and real,
              "with one axis of the gyro reversed the same record is that of a body with "
              f"I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}"),
@@ -239,7 +216,7 @@ def report(result: FitResult) -> str:
     if isinstance(result.chi_square, jax.core.Tracer):
         return "FitResult under a transformation"
     codes = dict(enumerate(names_of(Status)))
-    value = np.asarray(code_of(result.status))
+    value = np.asarray(result.status)
     if value.ndim:
         counts = {codes[code]: np.sum(value == code) for code in sorted(codes)}
         text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
@@ -250,7 +227,7 @@ def report(result: FitResult) -> str:
     left = None if known else jnp.sqrt(jnp.nanmean(result.left() ** 2))
     noise = "" if known else f" (noise taken from the residuals: {left:.3g} rms)"
     lines = [
-        " ".join(filter(None, [f"{codes[int(value)]}: {Status[result.status]}", _reason(result)])),
+        " ".join(filter(None, [f"{codes[int(value)]}: {Status[result.status]}", reason(result)])),
         f"  {seen}, {steps} steps; chi-square {result.chi_square:.1f} for "
         f"{result.degrees_of_freedom} degrees of freedom{noise}",
     ]

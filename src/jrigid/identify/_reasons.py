@@ -1,0 +1,150 @@
+"""Why a fit does not describe its record, as far as the record shows it, and what to pass.
+
+One sentence for the first line of a report: a unit, a noise, an error of the sensor that is not
+sought, or something that swings.
+"""
+
+import math
+
+import numpy as np
+
+from jrigid._checks import RESULTS
+from jrigid.identify._colour import stands_out
+from jrigid.identify._result import FitResult, Status
+from jrigid.identify._sensors import Gyro
+from jrigid.identify._shapes import AbstractShape, Flat, Moments, Tensor
+
+_NEARLY_A_SPHERE = 1.03  # I3/I1: degrees for radians shrink the gaps of the moments by 57
+_TOO_FAST = 3.0  # radians of a swing while the body turns by one: no free body does that
+_EXPLAINED = 0.5  # of what is left, for a bias to be named
+_WHITE, _WHITE_SURE = 0.1, 5.0  # correlation of neighbours, and its standard deviations
+_FEWEST = 16  # samples whose spectrum says something
+
+
+def reason(result: FitResult) -> str:
+    """The sentence, or an empty one where there is nothing to say; of a single fit."""
+    if result.status == Status.BAD_INPUT:
+        return RESULTS[result.input_result]
+    if _is_nearly_a_sphere(result):
+        return (
+            "Nearly a sphere: so looks any body whose rates are in degrees a second, or whose "
+            "times are not in seconds. Multiply rates in deg/s by pi / 180."
+        )
+    if result.status == Status.OK:
+        return _of_parameters(result)
+    swing = _swing(result)
+    if swing > _TOO_FAST:
+        return (
+            f"The rates swing {swing:.2g} times as fast as the body turns, which no body does: "
+            "they are too small. Pass them in rad/s (were they converted twice, or times not in "
+            "seconds?)."
+        )
+    bias = _bias(result)
+    if bias is not None:
+        numbers = ", ".join(f"{x:.2g}" for x in bias)
+        return (
+            f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what is left: seek "
+            "it (`free`), by `free=lambda body, gyro: gyro.bias`."
+        )
+    return _of_noise(result)
+
+
+def _by_gyro(result: FitResult) -> bool:
+    """Whether nothing but a gyro was read, and the inertia is not known beforehand."""
+    sensors = result.parts()[1:]
+    shape: AbstractShape = result.unknowns.shape
+    return all(isinstance(x, Gyro) for x in sensors) and isinstance(shape, Tensor | Moments | Flat)
+
+
+def _is_nearly_a_sphere(result: FitResult) -> bool:
+    free = result.problem.options.free_motion
+    return bool(free and _by_gyro(result) and result.ratios[1] < _NEARLY_A_SPHERE)
+
+
+def _of_parameters(result: FitResult) -> str:
+    """Which arrays beside the inertia are not determined."""
+    names = [name for name, known in result.determined.items() if not known]
+    return f"It does not determine {', '.join(names)}." if names else ""
+
+
+def _swing(result: FitResult) -> float:
+    """Rate of the largest swing of the readings over their rms: of a free body at most about 1."""
+    if not (result.problem.options.free_motion and _by_gyro(result)):
+        return 0.0
+    samples = result.problem.samples
+    part = samples.parts[0]
+    seen = np.asarray(samples.seen)[:, part]
+    trial = int(np.argmax(np.sum(seen, axis=1)))
+    ts = np.asarray(samples.ts)[trial, part][seen[trial]]
+    rates = np.asarray(samples.values[0])[trial][seen[trial]]
+    if ts.size < _FEWEST:
+        return 0.0
+    power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
+    peak = int(np.argmax(power))
+    # The samples may have gaps; a factor of 57 does not.
+    duration = float(ts[-1] - ts[0]) * ts.size / (ts.size - 1)
+    size = math.sqrt(np.mean(np.sum(rates**2, axis=1)))
+    return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
+
+
+def _bias(result: FitResult) -> np.ndarray | None:
+    """A bias that explains most of what the fit leaves, where none was sought."""
+    options = result.problem.options
+    gyros = [i for i, x in enumerate(result.parts()[1:]) if isinstance(x, Gyro)]
+    sought = any(x.name.endswith("bias") for x in result.unknowns.sought)
+    if not gyros or sought or options.dense or not options.noise_known:
+        return None
+    part = result.problem.samples.parts[gyros[0]]
+    residuals, jacobian = np.asarray(result.residuals), np.asarray(result.jacobian)
+    # Residuals are those of what is predicted, to which a bias is added.
+    of_bias = np.zeros((*residuals.shape, 3))
+    used = (residuals != 0)[:, part, :, None]
+    of_bias[:, part] = used * np.asarray(result.problem.samples.whitener)[:, part, :, :3]
+    before = np.sum(residuals**2)
+    excess = before - int(result.degrees_of_freedom)
+    if not excess > 0 or not np.all(np.isfinite(jacobian)):
+        return None
+    rows, size = _apart(residuals, jacobian, of_bias, result.numbers.size)
+    found = np.linalg.lstsq(rows, -size, rcond=1e-12)[0]
+    after = np.sum((size + rows @ found) ** 2)
+    return found[-3:] if before - after > _EXPLAINED * excess else None
+
+
+def _apart(
+    residuals: np.ndarray, jacobian: np.ndarray, of_bias: np.ndarray, numbers: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in all trials' states, the numbers and the bias, and residuals."""
+    trials, local = residuals.shape[0], jacobian.shape[-1] - numbers
+    blocks = []
+    for i in range(trials):
+        states = np.zeros((residuals[i].size, trials * local))
+        own = jacobian[i].reshape(-1, jacobian.shape[-1])
+        states[:, i * local : (i + 1) * local] = own[:, numbers:]
+        blocks.append(np.concatenate([states, own[:, :numbers], of_bias[i].reshape(-1, 3)], axis=1))
+    return np.concatenate(blocks), residuals.reshape(-1)
+
+
+def _of_noise(result: FitResult) -> str:
+    """What residuals of another size, or of a colour, say."""
+    if not (result.status == Status.MISFIT and result.problem.options.noise_known):
+        return ""
+    size = math.sqrt(result.reduced_chi_square)
+    found = f"The residuals are {size:.2g} times the stated noise"
+    if size < 1:
+        degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
+        return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
+    band, sure = (float(x) for x in result.loudest_band)
+    if stands_out(band, sure):
+        return (
+            f"What is left has {band:.2g} times its mean power in one band of frequencies: "
+            "something that changes slowly, or swings, is missing. See `unmodelled` and `free`."
+        )
+    like, deviations = result.whiteness
+    if like > _WHITE and deviations > _WHITE_SURE:
+        return f"{found}, and neighbours correlate by {like:.2f}: see `unmodelled` and `free`."
+    if size < 1.1:
+        return "Trials differ by more than their errors say: they may be of different bodies."
+    return (
+        f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
+        "`absolute_sigma=False`."
+    )

@@ -1,0 +1,96 @@
+"""What is wrong with a request is named in the first line of its report, with what to pass."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jrigid as jr
+from jrigid import identify
+from jrigid.identify import Status
+
+MOMENTS = np.array([0.5, 0.8, 1.0])
+BLIND = jr.RigidBody(np.ones(3))
+TS = np.arange(200) * 0.01
+NOISE = 0.02
+DEGREES = 180 / np.pi
+
+
+def motion(ts):
+    """Rates of a free body, by scipy."""
+
+    def euler(_, omega):
+        return np.cross(MOMENTS * omega, omega) / MOMENTS
+
+    spin = np.array([6.0, 5.0, -6.0])
+    return solve_ivp(euler, ts[[0, -1]], spin, "DOP853", ts, rtol=1e-10, atol=1e-10).y.T
+
+
+def first_line(values, sigma, **options):
+    found = identify.fit(BLIND, identify.Rates(TS, values, sigma), throw=False, **options)
+    return found, str(found).splitlines()[0]
+
+
+@pytest.fixture
+def readings(rng):
+    return motion(TS) + NOISE * rng.normal(size=(TS.size, 3))
+
+
+def test_nothing_is_said_of_a_record_that_obeys_its_model(readings):
+    found, line = first_line(readings, NOISE)
+    assert found.status == Status.OK
+    assert line == f"OK: {Status[found.status]}"
+
+
+def test_degrees_for_radians_are_named(readings):
+    """The body turns by five turns between samples: no fit is tried."""
+    found, line = first_line(DEGREES * readings, DEGREES * NOISE)
+    assert found.status == Status.BAD_INPUT
+    assert "degrees a second" in line
+    assert "pi / 180" in line
+
+
+def test_degrees_for_radians_are_named_where_samples_are_dense(rng):
+    """A body whose rates change 57 times as slowly as they should is nearly a sphere."""
+    ts = np.linspace(0, 2, 1000)
+    values = motion(ts) + NOISE * rng.normal(size=(ts.size, 3))
+    readings = identify.Rates(ts, DEGREES * values, DEGREES * NOISE)
+    found = identify.fit(BLIND, readings, throw=False)
+    assert "degrees a second" in str(found).splitlines()[0]
+    assert found.ratios[1] < 1.03
+
+
+def test_radians_converted_as_if_they_were_degrees_are_named(readings):
+    found, line = first_line(readings / DEGREES, NOISE / DEGREES)
+    assert found.status != Status.OK
+    assert re.search(r"swing \d+ times as fast as the body turns", line)
+    assert "rad/s" in line
+
+
+@pytest.mark.parametrize(("factor", "text"), [(50, "too large"), (0.02, "too small")])
+def test_a_sigma_of_another_size_is_named(readings, factor, text):
+    found, line = first_line(readings, factor * NOISE)
+    assert found.status == Status.MISFIT
+    assert f"`sigma` is {text}" in line
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 2.0])
+def test_a_bias_that_is_not_sought_is_named(readings, size):
+    bias = size * np.array([1.0, -0.7, 0.4])
+    found, line = first_line(readings + bias, NOISE)
+    assert found.status == Status.MISFIT
+    numbers = re.search(r"A bias of the gyro, some \((.*)\) rad/s", line)
+    assert numbers, line
+    assert "gyro.bias" in line
+    named = np.array([float(x) for x in numbers.group(1).split(",")])
+    assert np.linalg.norm(named - bias) < 0.6 * np.linalg.norm(bias)
+
+
+def test_a_torque_that_swings_is_named_and_is_no_bias(readings):
+    """Chi-square would not see it: it changes it by less than its gate."""
+    swing = NOISE * np.array([1.0, -0.7, 0.4]) * np.sin(23 * TS)[:, None]
+    found, line = first_line(readings + swing, NOISE)
+    assert found.reduced_chi_square < 1 + 5 * np.sqrt(2 / 600)
+    assert found.status == Status.MISFIT
+    assert "band of frequencies" in line
