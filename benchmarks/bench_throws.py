@@ -107,7 +107,7 @@ def of_singles(found):
     scatter = np.sqrt(np.mean(pulls[told] ** 2, axis=0))
     size = 100 * np.median(errors[told, 1] / RATIOS[1])
     whole = np.diagonal(np.asarray(found.numbers_covariance), axis1=1, axis2=2)[told]
-    own = np.diagonal(np.asarray(found.sensor_covariance), axis1=1, axis2=2)[told]
+    own = np.diagonal(np.asarray(found.diagnostics.sensor_covariance), axis1=1, axis2=2)[told]
     return [
         f"{100 * np.mean(~failed):.0f}",
         f"{100 * np.mean(boundary):.0f}",

@@ -217,7 +217,7 @@ class Found(NamedTuple):
         """Of one fit."""
         drag, drag_error = fit.leaves["torque.coefficient"]
         whole = np.diagonal(np.asarray(fit.numbers_covariance))
-        own = np.diagonal(np.asarray(fit.sensor_covariance))
+        own = np.diagonal(np.asarray(fit.diagnostics.sensor_covariance))
         return cls(
             np.append(fit.ratios, drag),
             np.append(fit.ratios_errors, drag_error),

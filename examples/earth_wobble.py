@@ -245,10 +245,11 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     # The number sought is log((1 - e) / (1 + e)); the spin and the attitude are not ours to know.
     of_ellipticity = -2 * unit / (1 - ellipticity**2)
     columns = found.numbers.size + 2
-    jacobian = found.jacobian[0].reshape(-1, 3, found.jacobian.shape[-1])[:, :2, :columns]
+    jacobian = found.diagnostics.jacobian[0]
+    jacobian = jacobian.reshape(-1, 3, jacobian.shape[-1])[:, :2, :columns]
     jacobian = jacobian.at[..., 0].multiply(of_ellipticity).reshape(-1, columns)
-    rows = found.residuals[0].reshape(-1, 3)[:, :2].reshape(-1)
-    steps = int(np.sum(np.isfinite(found.history)))
+    rows = found.diagnostics.residuals[0].reshape(-1, 3)[:, :2].reshape(-1)
+    steps = int(np.sum(np.isfinite(found.diagnostics.history)))
     # The Earth's own kicks are left over: what is no white noise is a misfit, and ours to judge.
     status = jr.identify.Status
     converged = bool((found.status == status.OK) | (found.status == status.MISFIT))

@@ -145,7 +145,7 @@ def test_the_likelihood_of_an_unmodelled_torque_is_that_of_a_dense_covariance(ti
     left = (values - ones @ inverse @ values / (ones @ inverse @ ones)) / NOISE
     np.testing.assert_allclose(found.chi_square, np.sum(left * (inverse @ left)), rtol=1e-6)
     log_determinant = 3 * np.linalg.slogdet(covariance)[1]
-    np.testing.assert_allclose(found.log_determinant, log_determinant, rtol=1e-6)
+    np.testing.assert_allclose(found.diagnostics.log_determinant, log_determinant, rtol=1e-6)
 
 
 def test_an_unmodelled_torque_is_preferred_where_there_is_one(rng):
@@ -158,8 +158,8 @@ def test_an_unmodelled_torque_is_preferred_where_there_is_one(rng):
         torque = identify.fit(BLIND, record, unmodelled="estimate", throw=False)
         found = identify.compare({"none": plain, "torque": torque})
         assert found.names[int(jnp.argmin(found.bic))] == best, str(found)
-        assert found.unknowns[1] - found.unknowns[0] == torque.torque_numbers
-        assert torque.torque_numbers > 0
+        assert found.unknowns[1] - found.unknowns[0] == torque.diagnostics.torque_numbers
+        assert torque.diagnostics.torque_numbers > 0
 
 
 @pytest.mark.slow  # a program of its own

@@ -246,7 +246,7 @@ def test_five_pictures_of_a_fit(found, readings, pictures, tmp_path):
     np.testing.assert_allclose(model.get_ydata(), found.predict(model.get_xdata())[:, 0])
     assert dropped.get_xdata().size == 0
     left = [line.get_ydata() for line in axes["residuals"].lines]
-    np.testing.assert_allclose(np.stack(left, axis=1), found.residuals[0])
+    np.testing.assert_allclose(np.stack(left, axis=1), found.diagnostics.residuals[0])
     assert axes["ratios"].get_xlabel() == "I2/I1"
 
 
@@ -265,7 +265,8 @@ def test_the_spectrum_of_white_noise_lies_in_its_range(found, pictures):
     # A slow wave that no model has, of a tenth of its noise's power, in one band, and beyond it.
     wave = 0.45 * np.sin(2 * np.pi * 0.3 * TS)[None, :, None]
     ax.clear()
-    jr.plot.fit(dataclasses.replace(found, residuals=found.residuals + wave), {"spectrum": ax})
+    waved = eqx.tree_at(lambda x: x.diagnostics.residuals, found, replace_fn=lambda x: x + wave)
+    jr.plot.fit(waved, {"spectrum": ax})
     power = ax.lines[0].get_ydata()
     assert abs(frequencies[np.argmax(power)] - 0.3) < 0.06
     assert np.max(power) > 5
@@ -280,9 +281,10 @@ def test_the_ellipse_is_that_of_the_covariance(found, pictures):
 
 
 def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, pictures):
-    wide = {"inflation": found.inflation * 9, "ratios_covariance": found.ratios_covariance * 9}
+    sizes = lambda x: (x.diagnostics.inflation, x.ratios_covariance)  # noqa: E731
+    wide = eqx.tree_at(sizes, found, replace_fn=lambda x: 9 * x)
     ax = pictures.figure().add_subplot()
-    jr.plot.fit(dataclasses.replace(found, **wide), {"ratios": ax})
+    jr.plot.fit(wide, {"ratios": ax})
     dashed, dotted = ax.lines[2:4]
     assert dotted.get_label() == "bound"
     apart = [line.get_xydata() - np.asarray(found.ratios) for line in (dashed, dotted)]
@@ -298,7 +300,7 @@ def test_what_a_record_does_not_tell_is_written(found, pictures):
 
 
 def test_ratios_that_are_not_told_have_no_ellipse(found, pictures):
-    spun = dataclasses.replace(found, pure_spin=jnp.array(True))
+    spun = eqx.tree_at(lambda x: x.diagnostics.pure_spin, found, jnp.array(True))
     ax = jr.plot.fit(spun, {"ratios": pictures.figure().add_subplot()})["ratios"]
     assert ax.get_title("left") == "Ratios: not determined"
     assert len(ax.lines) == 4  # a point, and the bounds of real bodies
@@ -317,7 +319,8 @@ def test_what_is_not_in_a_fit_is_not_drawn(found, pictures, wrong):
 def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
     options = found.problem.options._replace(unmodelled="known")
     problem = dataclasses.replace(found.problem, options=options)
-    kicked = dataclasses.replace(found, problem=problem, residuals=2 * found.residuals)
+    kicked = dataclasses.replace(found, problem=problem)
+    kicked = eqx.tree_at(lambda x: x.diagnostics.residuals, kicked, replace_fn=lambda x: 2 * x)
     ax = jr.plot.fit(kicked, {"record": pictures.figure().add_subplot()})["record"]
     np.testing.assert_allclose(ax.lines[0].get_ydata(), (readings + kicked.left()[0])[:, 0])
 

@@ -192,7 +192,7 @@ def test_what_is_printed(one_fit):
     assert found.names == tuple(f"shape[{i}]" for i in range(5))
     np.testing.assert_allclose(jnp.diagonal(found.correlation), 1, rtol=1e-12)
     assert float(jnp.trace(found.inertia)) == pytest.approx(3)
-    steps = np.asarray(found.history)[np.isfinite(found.history)]
+    steps = np.asarray(found.diagnostics.history)[np.isfinite(found.diagnostics.history)]
     assert steps[-1] == pytest.approx(float(found.chi_square))
     assert found.system.inertia.shape == (3, 3)
 
@@ -213,9 +213,9 @@ def rows_and_slope(inertia, state, t0, ts, values):
 def test_residuals_are_those_of_the_motion_and_have_its_derivatives(one_fit):
     _, readings, found = one_fit
     rows, slope = rows_and_slope(found.inertia, found.state, found.t0, TS, readings.values)
-    np.testing.assert_allclose(rows, found.residuals.reshape(1, -1), atol=1e-9)
+    np.testing.assert_allclose(rows, found.diagnostics.residuals.reshape(1, -1), atol=1e-9)
     # at the minimum the slope vanishes
-    scale = np.linalg.norm(np.asarray(found.jacobian)[0].reshape(600, 8), axis=0)[5:]
+    scale = np.linalg.norm(np.asarray(found.diagnostics.jacobian)[0].reshape(600, 8), axis=0)[5:]
     assert np.all(np.abs(slope[0]) < 0.01 * scale)
 
 
@@ -266,15 +266,15 @@ def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
 
     motion = jr.free_rotation(found.inertia, state0, ts, t0=t0)
     rows = (np.asarray(motion.omega) - readings.values) / 0.02
-    np.testing.assert_allclose(rows, found.residuals[0], atol=1e-9)
+    np.testing.assert_allclose(rows, found.diagnostics.residuals[0], atol=1e-9)
     rows, _ = rows_and_slope(found.inertia, found.state, found.t0, ts, readings.values)
-    np.testing.assert_allclose(rows, found.residuals.reshape(1, -1), atol=1e-9)
+    np.testing.assert_allclose(rows, found.diagnostics.residuals.reshape(1, -1), atol=1e-9)
     # Everywhere the state is that at t0 = 0.0 unless it is said.
     at_zero = jr.free_rotation(found.inertia, state0, np.zeros(200), t0=t0)
     at_zero = jr.State(at_zero.attitude[0], at_zero.omega[0])
     lane = jax.tree.map(lambda x: x[None], at_zero)
     rows, _ = rows_and_slope(found.inertia, lane, np.zeros(1), ts, readings.values)
-    np.testing.assert_allclose(rows, found.residuals.reshape(1, -1), atol=1e-9)
+    np.testing.assert_allclose(rows, found.diagnostics.residuals.reshape(1, -1), atol=1e-9)
     for state, at in ((state0, t0), (at_zero, np.zeros(()))):
         (_, covariance), _ = bound(found.inertia, state.omega, ts, at)
         np.testing.assert_allclose(covariance, found.ratios_covariance, rtol=1e-3)
@@ -716,7 +716,7 @@ def test_ten_numbers_of_a_body_about_its_pivot_of_which_two_are_known(rng):
     weighed = found.system.torque
     np.testing.assert_allclose(weighed.lever, found.body.center_of_mass, rtol=1e-12)
     density = identify.log_density(found)  # flat in the numbers: ten do not make a tensor of six
-    expected = -0.5 * float(found.chi_square) / float(found.inflation)
+    expected = -0.5 * float(found.chi_square) / float(found.diagnostics.inflation)
     np.testing.assert_allclose(quick_jit(density.function)(density.start), expected, rtol=1e-6)
     with pytest.raises(ValueError, match="scale"):
         identify.fit(body, readings, shape=ten, start=state)

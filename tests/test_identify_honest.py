@@ -55,7 +55,7 @@ def words(found):
     """What a fit that is not OK must have: numbers that are, steps, and a word."""
     text = str(found)
     assert np.isfinite(float(found.chi_square)), text
-    assert int(np.sum(np.isfinite(found.history))) > 0, text
+    assert int(np.sum(np.isfinite(found.diagnostics.history))) > 0, text
     return text
 
 
@@ -383,7 +383,7 @@ def test_a_drag_alone_does_not_tell_scale_and_itself(rng):
     text = words(found)
     assert is_in(found, (Status.UNIDENTIFIABLE,)), text
     assert any("overall scale" in x for x in found.null_directions), text
-    assert int(np.sum(np.isfinite(found.history))) < 200
+    assert int(np.sum(np.isfinite(found.diagnostics.history))) < 200
     assert abs(float(found.ratios[1]) - 2.3) < 5 * float(found.ratios_errors[1])
 
 

@@ -245,3 +245,21 @@ def test_a_trial_of_another_body_is_named(rng):
     np.testing.assert_array_equal(np.flatnonzero(found.spoilt), [3])
     assert "throws left out: 3" in str(found)
     assert np.all(np.abs(off(found)) < 4), str(found)
+
+
+def test_a_level_without_bound_is_a_failed_fit():
+    """Nothing but the torque moves the readings, and the noise is not known: it may be none."""
+    rng = np.random.default_rng(1)
+    failed = []
+    for _ in range(6):
+        values = np.ones(3) + 0.01 * np.cumsum(rng.normal(size=(60, 3)), axis=0)
+        readings = identify.Rates(np.arange(60) * 0.1, values)
+        options = {"shape": identify.Fixed(), "unmodelled": "estimate"}
+        found = identify.fit(BLIND, readings, throw=False, **options)
+        failed.append(bool(found.status == Status.NOT_CONVERGED))
+        assert failed[-1] == (not np.all(np.isfinite(found.level)))
+        assert failed[-1] == ("has no bound" in str(found).splitlines()[0])
+        if failed[-1]:
+            with pytest.raises(RuntimeError, match="not converged"):
+                identify.fit(BLIND, readings, **options)
+    assert any(failed)

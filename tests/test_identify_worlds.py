@@ -70,7 +70,7 @@ def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, rng):
     else:
         assert np.median(level) < 0.02 * LEVEL
         # as sure as a fit that takes the model's word for it
-        own = np.asarray(found.sensor_covariance)[good]
+        own = np.asarray(found.diagnostics.sensor_covariance)[good]
         ratio = np.diagonal(np.asarray(found.numbers_covariance)[good] / own, axis1=1, axis2=2)
         assert np.median(ratio) < 1.05
     alike = np.all(np.asarray(found.level) == np.asarray(found.level)[:, :1], axis=1)
@@ -88,7 +88,7 @@ def test_a_level_that_is_known_is_that_which_is_estimated(smoothed, rng):
     np.testing.assert_allclose(known.numbers_covariance, sought.numbers_covariance[0], rtol=0.02)
     assert "unmodelled torque" in str(known)
     assert "of the errors" in str(known)
-    own, whole = known.sensor_covariance, known.numbers_covariance
+    own, whole = known.diagnostics.sensor_covariance, known.numbers_covariance
     assert np.all(np.diagonal(own) < np.diagonal(whole))
 
 

@@ -7,6 +7,7 @@ from jrigid.identify._design import Bound as Bound
 from jrigid.identify._design import Plan as Plan
 from jrigid.identify._design import profile as profile
 from jrigid.identify._design import residuals as residuals
+from jrigid.identify._diagnostics import Diagnostics as Diagnostics
 from jrigid.identify._disturbance import GaussMarkov as GaussMarkov
 from jrigid.identify._fit import fit as fit
 from jrigid.identify._fit import fit_each as fit_each

@@ -91,12 +91,13 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
         "are not.",
     )
     n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
-    states = [jnp.sum(x > SHOWN * x[:, :1]) for x in (y.state_singular_values for y in fits)]
-    counts = [x.numbers.size + x.torque_numbers for x in fits]
+    values = [x.diagnostics.state_singular_values for x in fits]
+    states = [jnp.sum(x > SHOWN * x[:, :1]) for x in values]
+    counts = [x.numbers.size + x.diagnostics.torque_numbers for x in fits]
     unknowns = jnp.stack([x + y for x, y in zip(counts, states, strict=True)])
     square, freedom = (jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3])
     left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)
-    left = left + jnp.stack([x.log_determinant for x in fits])
+    left = left + jnp.stack([x.diagnostics.log_determinant for x in fits])
     criteria = left + 2 * k, left + k * jnp.log(n)
     return Comparison(tuple(results), square, freedom, unknowns, *criteria)
 

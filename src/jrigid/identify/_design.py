@@ -28,7 +28,7 @@ from jrigid.identify._layout import Layout, first_and_last, whole
 from jrigid.identify._minimise import FIRST_DAMPING, STEPS, Minimum, Settings
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples, of_throws, samples_of
-from jrigid.identify._result import FitResult
+from jrigid.identify._result import FitResult, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
 from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
 from jrigid.identify._smoother import Point, Rows
@@ -168,7 +168,7 @@ class Plan(Readable):
         none = no_disturbance(kept.shape[0], dtype)
         found = Fit(minimum, layout, kept, scales, none, None, np.zeros(0, dtype))
         lengths = [x.shape[1] for x in samples.values]
-        return FitResult(**jax.device_put(conclude(problem, found, lengths)))
+        return result_of(conclude(problem, found, lengths))
 
 
 def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
@@ -296,18 +296,18 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
     problem = dataclasses.replace(result.problem, options=options)
     unknowns, numbers, dtype = result.unknowns, result.numbers, result.numbers.dtype
     slope = np.asarray(_held_on(unknowns, numbers, Static(function)))
-    unit = 1e-3 * np.sqrt(slope @ result.numbers_covariance @ slope / result.inflation)
+    unit = 1e-3 * np.sqrt(slope @ result.numbers_covariance @ slope / result.diagnostics.inflation)
     single = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
     states = result.state.attitude[:, None], result.state.omega[:, None]
     one = np.ones((), dtype)
     settings = Settings(
         kept=result.kept.astype(dtype),
-        scales=result.scales,
+        scales=result.diagnostics.scales,
         disturbance=no_disturbance(result.kept.shape[0], dtype),
         weight=0 * one,
         horizon=2 * one,
         soft=np.asarray(False),
-        enough=(ACCURACY * result.inflation).astype(dtype),
+        enough=(ACCURACY * result.diagnostics.inflation).astype(dtype),
         steps=np.asarray(STEPS),
         damping=FIRST_DAMPING * one,
     )
@@ -320,7 +320,7 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
 
     growth = []
     for found in minima([request(x) for x in np.asarray(values)], len(values)):
-        more = (found.square - result.chi_square) / result.inflation
+        more = (found.square - result.chi_square) / result.diagnostics.inflation
         growth.append(more if found.settled else np.nan)
     return jnp.asarray(np.asarray(growth, dtype))
 

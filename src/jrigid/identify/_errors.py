@@ -235,10 +235,10 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
     of_levels, of_times = np.split(errors, [torque.form.levels])
     # Near none the likelihood is quadratic in the level squared: the least to be seen.
     of_levels = np.where(faint, np.sqrt(2 * of_levels), of_levels)
-    fields |= {
-        "level": np.where(faint, 0.0, size * typical.level),
-        "level_errors": size * typical.level * of_levels,
-    }
+    level = size * typical.level
+    if fit.torque is not None:
+        level = np.where(search.are_unbounded(tried, of_levels), np.inf, level)
+    fields |= {"level": np.where(faint, 0.0, level), "level_errors": level * of_levels}
     if np.all(faint):
         return fields
     fields |= {"correlation_time": typical.time, "level_by_trial": np.exp(torque.trials)}
@@ -258,7 +258,6 @@ def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dic
     sides = np.roll(axes, -1, axis=1), np.roll(axes, 1, axis=1)
     turns = np.einsum("ki,kln,li->in", sides[0], slopes, sides[1]) / gaps[:, None]
     spread = _spread_of_moments(problem, numbers, covariance)
-    errors = errors_of(spread)
     return {
         "inertia": tensor,
         "inertia_covariance": elements @ covariance @ elements.T,
@@ -269,9 +268,6 @@ def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dic
         "moments_covariance": spread[:3, :3],
         "ratios_covariance": spread[3:5, 3:5],
         "shares_covariance": spread[5:, 5:],
-        "moments_errors": errors[:3],
-        "ratios_errors": errors[3:5],
-        "shares_errors": errors[5:],
         "axes_errors": np.sqrt(np.maximum(np.sum((turns @ covariance) * turns, axis=1), 0.0)),
     }
 
@@ -332,16 +328,18 @@ def conclude(
     judged = _judged(problem, fit, known, residuals if judged_by is None else judged_by)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
     derived = derive(problem, point.numbers, covariance)
-    loose = np.any(derived["ratios_errors"] > LARGEST_ERROR * derived["ratios"])
+    loose = np.any(errors_of(derived["ratios_covariance"]) > LARGEST_ERROR * derived["ratios"])
     if not is_good(input_result):
         judged["status"] = "BAD_INPUT"
     elif loose and judged["status"] == "OK":
         judged["status"] = "UNIDENTIFIABLE"
-    fields = judged | derived | _of_torque(problem, fit, float(inflation))
+    of_torque = _of_torque(problem, fit, float(inflation))
+    if not np.all(np.isfinite([of_torque["level"], of_torque["level_errors"]])):
+        judged["status"] = "NOT_CONVERGED"
+    fields = judged | derived | of_torque
     fields |= {
         "numbers": point.numbers,
         "own_numbers": point.own,
-        "errors": errors_of(covariance),
         "sensor_covariance": inflation * sensor.covariance,
         "local_covariance": inflation * known.local,
         "follow": known.follow,
@@ -535,7 +533,6 @@ def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray)
         "status": status,
         "chi_square": left.chi_square,
         "degrees_of_freedom": np.asarray(int(left.freedom)),
-        "reduced_chi_square": left.noise,
         "whiteness": _whiteness(residuals, problem.samples.parts),
         "loudest_band": left.band,
         "chi_square_by_throw": np.sum(residuals**2, axis=(1, 2)) / seen,

@@ -1,7 +1,6 @@
 """fit(): inertia, and what else is asked for, from what was observed."""
 
 import contextlib
-import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +49,7 @@ from jrigid.identify._records import (
     samples_of,
     tells,
 )
-from jrigid.identify._result import FitResult, Status
+from jrigid.identify._result import FitResult, Status, leaves_of, result_of
 from jrigid.identify._search import Case, Effort, Line, no_search, run, search
 from jrigid.identify._shapes import AbstractShape, Tensor
 from jrigid.identify._smoother import Point
@@ -154,7 +153,7 @@ def fit(
     )
     with _reporter(progress) as report:
         (fields,) = _fits([request], Effort(max_steps, doublings, report), throw)
-    return FitResult(**jax.device_put(fields))
+    return result_of(fields)
 
 
 def fit_each(
@@ -503,11 +502,9 @@ def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[
 
 def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:
     """One result with an axis of fits in front, from the fields of each."""
-    names = [x.name for x in dataclasses.fields(FitResult)]
-    columns = zip(*(jtu.tree_leaves([x[name] for name in names]) for x in results), strict=True)
+    columns = zip(*map(leaves_of, results), strict=True)
     stacked = jax.device_put([np.stack(x) for x in columns])
-    single = FitResult(**jax.device_put(results[0]))
-    return jtu.tree_structure(single).unflatten(stacked)
+    return jtu.tree_structure(result_of(results[0])).unflatten(stacked)
 
 
 def _lengths(records: tuple[Record, ...]) -> list[int]:

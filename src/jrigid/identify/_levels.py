@@ -21,6 +21,7 @@ FAINT = 1e-4  # of the first level: no torque at all
 _DIFFERENCE = 0.1  # in logarithms, for derivatives
 _LONGEST_MOVE = 3.0  # in logarithms
 _FINE = 0.02  # a change of a logarithm that does not matter
+_UNKNOWN = 10.0  # error of the logarithm of a level that could be any
 _ROUNDS = 40
 _HIGHEST = 30.0  # logarithm of a level, in units of the first, that no record asks for
 _TRIED = 2.0  # logarithm of a time to begin with, in units of the shortest
@@ -251,6 +252,10 @@ class Search:
     def are_faint(self, torque: Torque) -> np.ndarray:
         """Which of the levels are too low to be seen."""
         return torque.levels < 2 * FAINT * np.exp(self._first)
+
+    def are_unbounded(self, torque: Torque, errors: np.ndarray) -> np.ndarray:
+        """Which of the levels are large and might be much larger, by the errors of logarithms."""
+        return (torque.levels > np.exp(self._first)) & ~(errors < _UNKNOWN)
 
     def preferred(self, torque: Torque, fit: Fit, spins: np.ndarray) -> Torque:
         """The torque of the form that the likelihood prefers, from a white one.

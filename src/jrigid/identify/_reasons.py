@@ -24,7 +24,7 @@ _FEWEST = 16  # samples whose spectrum says something
 def reason(result: FitResult) -> str:
     """The sentence, or an empty one where there is nothing to say; of a single fit."""
     if result.status == Status.BAD_INPUT:
-        return RESULTS[result.input_result]
+        return RESULTS[result.diagnostics.input_result]
     if _is_nearly_a_sphere(result):
         return (
             "Nearly a sphere: so looks any body whose rates are in degrees a second, or whose "
@@ -32,6 +32,11 @@ def reason(result: FitResult) -> str:
         )
     if result.status == Status.OK:
         return _of_parameters(result)
+    if not np.all(np.isfinite(np.asarray([result.level, result.level_errors]))):
+        return (
+            "The level of the unmodelled torque has no bound or no error: the record does not tell "
+            "it from noise. Pass `sigma`, or the torque (`unmodelled`)."
+        )
     swing = _swing(result)
     if swing > _TOO_FAST:
         return (
@@ -95,7 +100,8 @@ def _bias(result: FitResult) -> np.ndarray | None:
     if not gyros or sought or options.dense or not options.noise_known:
         return None
     part = result.problem.samples.parts[gyros[0]]
-    residuals, jacobian = np.asarray(result.residuals), np.asarray(result.jacobian)
+    residuals = np.asarray(result.diagnostics.residuals)
+    jacobian = np.asarray(result.diagnostics.jacobian)
     # Residuals are those of what is predicted, to which a bias is added.
     of_bias = np.zeros((*residuals.shape, 3))
     used = (residuals != 0)[:, part, :, None]
@@ -133,13 +139,13 @@ def _of_noise(result: FitResult) -> str:
     if size < 1:
         degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
         return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
-    band, sure = (float(x) for x in result.loudest_band)
+    band, sure = (float(x) for x in result.diagnostics.loudest_band)
     if stands_out(band, sure):
         return (
             f"What is left has {band:.2g} times its mean power in one band of frequencies: "
             "something that changes slowly, or swings, is missing. See `unmodelled` and `free`."
         )
-    like, deviations = result.whiteness
+    like, deviations = result.diagnostics.whiteness
     if like > _WHITE and deviations > _WHITE_SURE:
         return f"{found}, and neighbours correlate by {like:.2f}: see `unmodelled` and `free`."
     if size < 1.1:

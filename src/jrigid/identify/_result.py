@@ -1,5 +1,6 @@
 """FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,7 @@ from jrigid._spectral import eigh
 from jrigid._types import Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
+from jrigid.identify._diagnostics import Diagnostics
 from jrigid.identify._intervals import interval
 from jrigid.identify._problem import Problem, shown_by
 from jrigid.identify._records import Samples
@@ -64,6 +66,22 @@ def errors_of(covariance: Any) -> Any:
     return xp.sqrt(xp.maximum(xp.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
 
 
+def result_of(fields: dict[str, Any]) -> "FitResult":
+    """A result from its fields, those of its diagnostics among them."""
+    inner = {x.name for x in dataclasses.fields(Diagnostics)}
+    arrays = jax.device_put(fields)
+    diagnostics = Diagnostics(**{name: arrays[name] for name in inner})
+    rest = {name: x for name, x in arrays.items() if name not in inner}
+    return FitResult(**rest, diagnostics=diagnostics)
+
+
+def leaves_of(fields: dict[str, Any]) -> list[Any]:
+    """The arrays of a result, in the order of its leaves."""
+    inner = [fields[x.name] for x in dataclasses.fields(Diagnostics)]
+    of_result = [x.name for x in dataclasses.fields(FitResult)]
+    return jtu.tree_leaves([inner if x == "diagnostics" else fields[x] for x in of_result])
+
+
 class FitResult(eqx.Module):
     """Inertia, state and nuisances with errors; by `fit_each` with an axis of fits in front.
 
@@ -81,38 +99,15 @@ class FitResult(eqx.Module):
         moments_covariance: Of the moments.
         ratios_covariance: Of the ratios.
         shares_covariance: Of the shares; singular, as their sum is 1.
-        moments_errors: Standard errors of `moments`.
-        ratios_errors: Standard errors of `ratios`.
-        shares_errors: Standard errors of `shares`.
         axes_errors: Errors of the turn about each principal axis [rad].
         numbers: The numbers sought for all throws: see `names`.
         own_numbers: Those sought in each throw (throws, own).
         numbers_covariance: Of `numbers`.
-        errors: Standard errors of `numbers`.
-        sensor_covariance: The part of it that the sensors' noise makes.
-        local_covariance: Of each throw's state at `t0` (rate, then, if it matters, a small turn of
-            the attitude about the body axes) and own numbers, beside given numbers.
-        follow: How these follow the numbers, with the sign turned (throws, local, numbers).
-        scores: What each throw adds to the gradient of half the squares, zero in sum.
-        inflation: Of covariances, beyond what the noise stated makes.
         state: State at `t0`, not at time 0, with an axis of throws in front: see `start`.
         t0: Time of each throw's state [s]: that of its first sample, in a fit.
-        residuals: Whitened, records side by side; zero where nothing was seen.
-        jacobian: Their derivatives in the numbers and in the state of the throw.
-        chi_square: Sum of their squares; if no noise was stated, in units of 2 % of the rms of
-            what was observed.
+        chi_square: Sum of the squares of whitened residuals; if no noise was stated, in units of
+            2 % of the rms of what was observed.
         degrees_of_freedom: Residuals less what was sought.
-        reduced_chi_square: Chi-square for each degree of freedom.
-        chi_square_by_throw: Mean square of the residuals of each throw.
-        whiteness: Correlation of neighbouring residuals, and how many standard deviations that is
-            from 0. Near 0 for noise; what a model leaves out changes slowly and brings it near 1.
-        loudest_band: Power of what is left in the band of frequencies that stands out most, over
-            the mean, and how many standard deviations that is from what noise has.
-        unexplained: Of the square of what was observed, beyond the noise.
-        singular_values: Of the derivatives in the numbers, the states' part removed, descending.
-        directions: In the numbers, columns for the singular values.
-        state_singular_values: Of the derivatives in each throw's state, of unit columns; a zero is
-            a change of the state that the record does not show.
         level: Of the unmodelled torque about each body axis [N m sqrt(s)]: the root of its spectral
             density at low frequencies.
         level_errors: Of the level, by the relative error that its logarithm has; of one that was
@@ -120,15 +115,9 @@ class FitResult(eqx.Module):
         correlation_time: Of the unmodelled torque about each body axis [s]; 0 where it is white.
         correlation_time_errors: Of that.
         level_by_trial: Of each trial, in units of `level`.
-        torque_numbers: How many numbers of that torque were sought.
-        log_determinant: Of the covariance of the record that it makes, in units of the noise: with
-            `chi_square` it is -2 log likelihood, but for a constant; 0 without such a torque.
-        scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
         kept: Which samples were, records side by side.
-        history: Sum of squares of the record after each step, NaN beyond the last.
-        pure_spin: Whether constant rates describe a gyro's record as well.
-        ambiguous: Whether bodies far from this one describe the record nearly as well.
-        input_result: `jrigid.RESULTS` of the input.
+        diagnostics: What was left of the record, what determined the numbers, and how the fit got
+            there.
         problem: The record as it was fitted, and how.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -151,47 +140,48 @@ class FitResult(eqx.Module):
     moments_covariance: Matrix
     ratios_covariance: Float[Array, "2 2"]
     shares_covariance: Matrix
-    moments_errors: Vector
-    ratios_errors: Float[Array, "2"]
-    shares_errors: Vector
     axes_errors: Vector
     numbers: Float[Array, " numbers"]
     own_numbers: Float[Array, "throws own"]
     numbers_covariance: Float[Array, "numbers numbers"]
-    errors: Float[Array, " numbers"]
-    sensor_covariance: Float[Array, "numbers numbers"]
-    local_covariance: Float[Array, "throws local local"]
-    follow: Float[Array, "throws local numbers"]
-    scores: Float[Array, "throws numbers"]
-    inflation: Scalar
     state: State
     t0: Float[Array, " throws"]
-    residuals: Float[Array, "throws samples degrees"]
-    jacobian: Float[Array, "throws samples degrees unknowns"]
     chi_square: Scalar
     degrees_of_freedom: Int[Array, ""]
-    reduced_chi_square: Scalar
-    chi_square_by_throw: Float[Array, " throws"]
-    whiteness: tuple[Scalar, Scalar]
-    loudest_band: tuple[Scalar, Scalar]
-    unexplained: Scalar
-    singular_values: Float[Array, " numbers"]
-    directions: Float[Array, "numbers numbers"]
-    state_singular_values: Float[Array, "throws local"]
     level: Vector
     level_errors: Vector
     correlation_time: Vector
     correlation_time_errors: Vector
     level_by_trial: Float[Array, " throws"]
-    torque_numbers: Int[Array, ""]
-    log_determinant: Scalar
-    scales: Float[Array, " records"]
     kept: Bool[Array, "throws samples"]
-    history: Float[Array, " steps"]
-    pure_spin: Bool[Array, ""]
-    ambiguous: Bool[Array, ""]
-    input_result: Any
+    diagnostics: Diagnostics
     problem: Problem
+
+    @property
+    def moments_errors(self) -> Float[Array, "*fits 3"]:
+        """Standard errors of `moments`."""
+        return errors_of(self.moments_covariance)
+
+    @property
+    def ratios_errors(self) -> Float[Array, "*fits 2"]:
+        """Standard errors of `ratios`."""
+        return errors_of(self.ratios_covariance)
+
+    @property
+    def shares_errors(self) -> Float[Array, "*fits 3"]:
+        """Standard errors of `shares`."""
+        return errors_of(self.shares_covariance)
+
+    @property
+    def errors(self) -> Float[Array, "*fits numbers"]:
+        """Standard errors of `numbers`."""
+        return errors_of(self.numbers_covariance)
+
+    @property
+    def reduced_chi_square(self) -> Float[Array, "*fits"]:
+        """Chi-square for each degree of freedom."""
+        freedom = jnp.maximum(self.degrees_of_freedom, 1)
+        return self.chi_square / freedom.astype(self.chi_square.dtype)
 
     @property
     def unknowns(self) -> Unknowns:
@@ -258,11 +248,12 @@ class FitResult(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
         """Of `numbers`, then of each throw's state and own numbers."""
-        numbers, (*lanes, throws, local, size) = self.numbers_covariance, self.follow.shape
-        follow = self.follow.reshape(*lanes, throws * local, size)
+        numbers, known = self.numbers_covariance, self.diagnostics
+        *lanes, throws, local, size = known.follow.shape
+        follow = known.follow.reshape(*lanes, throws * local, size)
         across = -product("...ag,...gh->...ah", follow, numbers)
         eye = jnp.eye(throws, dtype=numbers.dtype)
-        blocks = product("ts,...tlm->...tlsm", eye, self.local_covariance)
+        blocks = product("ts,...tlm->...tlsm", eye, known.local_covariance)
         blocks = blocks.reshape(*lanes, throws * local, throws * local)
         blocks = blocks - product("...ah,...bh->...ab", across, follow)
         return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
@@ -270,9 +261,10 @@ class FitResult(eqx.Module):
     @property
     def clustered_covariance(self) -> Float[Array, "*fits numbers numbers"]:
         """Of `numbers`, by how much throws scatter, whatever the noise; of few throws too small."""
-        throws, inverse = self.scores.shape[-2], self.numbers_covariance
-        inverse = inverse / self.inflation[..., None, None]
-        spread = product("...tg,...th->...gh", self.scores, self.scores)
+        known = self.diagnostics
+        throws = known.scores.shape[-2]
+        inverse = self.numbers_covariance / known.inflation[..., None, None]
+        spread = product("...tg,...th->...gh", known.scores, known.scores)
         return inverse @ (spread * throws / max(throws - 1, 1)) @ inverse
 
     @property
@@ -379,7 +371,7 @@ class FitResult(eqx.Module):
             throw: Which throw.
         """
         part = self.problem.samples.parts[record]
-        return self.jacobian[throw, part], self.residuals[throw, part]
+        return self.diagnostics.jacobian[throw, part], self.diagnostics.residuals[throw, part]
 
     def left(self, record: int = 0) -> Float[Array, "throws n degrees"]:
         """What is left of a record: predicted less observed, in its own units; of a single fit.
@@ -394,7 +386,7 @@ class FitResult(eqx.Module):
         white = samples.whitener[:, samples.parts[record]]
         eye = jnp.eye(white.shape[-1], dtype=white.dtype)
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
-        rows = self.residuals[:, samples.parts[record], :, None]
+        rows = self.diagnostics.residuals[:, samples.parts[record], :, None]
         left = jnp.linalg.solve(white, rows)[..., 0]
         return jnp.where(used[:, samples.parts[record]], left, jnp.nan)
 
@@ -418,11 +410,12 @@ class FitResult(eqx.Module):
             part = self.unknowns.slices[x.name]
             return self.numbers[part], numbers[part, part]
         part = next(s for y, s in self.unknowns.own_slices if y is x)
-        first = self.follow.shape[1] - self.own_numbers.shape[1]
+        known = self.diagnostics
+        first = known.follow.shape[1] - self.own_numbers.shape[1]
         local = slice(first + part.start, first + part.stop)
-        follow = self.follow[:, local]
+        follow = known.follow[:, local]
         shared = product("tlg,gh,tmh->tlm", follow, numbers, follow)
-        return self.own_numbers[:, part], shared + self.local_covariance[:, local, local]
+        return self.own_numbers[:, part], shared + known.local_covariance[:, local, local]
 
     @property
     def determined(self) -> dict[str, bool]:

@@ -97,7 +97,8 @@ def log_density(result: FitResult) -> LogDensity:
         point = Point(numbers, rest[:, local:], *states, states[1][..., :0])
         rows = rows_of(point, rest[:, None, :local])
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
-        return -0.5 * chi_square / result.inflation + log_jacobian(numbers, rest[:, local:])
+        likelihood = -0.5 * chi_square / result.diagnostics.inflation
+        return likelihood + log_jacobian(numbers, rest[:, local:])
 
     def log_jacobian(numbers: Array, own: Array) -> Array:
         parts = [_log_volume(unknowns.shape, numbers[unknowns.slices["shape"]])]

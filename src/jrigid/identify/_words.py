@@ -46,7 +46,7 @@ def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
         return "overall scale"
     if name == "shape" and not unknowns.shape.absolute:
         only = np.where(np.arange(direction.size) < s.stop, direction, 0.0)
-        return "" if result.pure_spin else _of_shape(result, only)
+        return "" if result.diagnostics.pure_spin else _of_shape(result, only)
     if sizes.size == 3 and field == "bias":
         axis = np.abs(np.asarray(result.axes).T @ direction[s]).argmax()
         return f"{owner} bias along the axis of I{axis + 1}"
@@ -66,23 +66,23 @@ def _untold(result: FitResult, direction: np.ndarray) -> str:
 
 def null_directions(result: FitResult) -> tuple[str, ...]:
     """What the record does not tell."""
-    unknowns, options = result.unknowns, result.problem.options
+    unknowns, options, seen = result.unknowns, result.problem.options, result.diagnostics
     known = unknowns.scaled or unknowns.shape.absolute
     driven = any(x.name.startswith("torque") for x in unknowns.sought)
     follow = "" if options.free_motion else ", which what is sought of the torque follows"
     found = ["overall scale" + follow] * (not known and (driven or options.free_motion))
-    found += ["spin is pure: ratios not determined"] * bool(result.pure_spin)
-    directions = np.asarray(result.directions).T
-    weak = math.sqrt(result.inflation) > LARGEST_ERROR * np.asarray(result.singular_values)
+    found += ["spin is pure: ratios not determined"] * bool(seen.pure_spin)
+    directions = np.asarray(seen.directions).T
+    weak = math.sqrt(seen.inflation) > LARGEST_ERROR * np.asarray(seen.singular_values)
     found += [_untold(result, x) for x in directions[weak]]
     loose = bool(np.any(result.ratios_errors > LARGEST_ERROR * result.ratios))
-    found += ["I1's ratio to the others"] * (loose and not weak.any() and not result.pure_spin)
-    if result.ambiguous and not result.pure_spin:
+    found += ["I1's ratio to the others"] * (loose and not weak.any() and not seen.pure_spin)
+    if seen.ambiguous and not seen.pure_spin:
         covariance, numbers = np.asarray(result.numbers_covariance), result.numbers
         units = np.asarray(unknowns.natural_units(numbers))
         weakest = weakest_of(unknowns.judged, covariance, units)[1] * units
         found.append(f"{_untold(result, weakest)}: others far from it are nearly as good")
-    of_state = np.asarray(result.state_singular_values)
+    of_state = np.asarray(seen.state_singular_values)
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
     if options.on_attitude and count:
         found.append("heading about the vertical" if count == 1 else "attitude in space")
@@ -95,9 +95,10 @@ def _diagonal(matrix: Any) -> np.ndarray:
 
 def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     """What residuals, and values that repeat their largest one, would say, and if it is so."""
-    by_throw, known = np.asarray(result.chi_square_by_throw), result.problem.options.noise_known
-    size = max(math.sqrt(result.reduced_chi_square), float(np.max(result.scales)))
-    (like, sure), worst = result.whiteness, 0.0
+    seen, known = result.diagnostics, result.problem.options.noise_known
+    by_throw = np.asarray(seen.chi_square_by_throw)
+    size = max(math.sqrt(result.reduced_chi_square), float(np.max(seen.scales)))
+    (like, sure), worst = seen.whiteness, 0.0
     low, high = np.maximum(np.quantile(by_throw, [0.1, 0.9]), 1e-300)
     if by_throw.size >= 8:  # whose scatter says something
         ratios = _diagonal(result.clustered_covariance) / _diagonal(result.numbers_covariance)
@@ -197,7 +198,7 @@ def _of_torque(result: FitResult) -> list[str]:
     if np.any(times > 0):
         errors = np.asarray(result.correlation_time_errors)[axes]
         memory = f"correlation time {_with_errors(times[axes], errors)} s"
-    own = np.diagonal(np.asarray(result.sensor_covariance))
+    own = np.diagonal(np.asarray(result.diagnostics.sensor_covariance))
     shares = own / _diagonal(result.numbers_covariance)
     part = 100 * np.sqrt(np.median(shares)) if own.size else 100
     lines = [
@@ -221,7 +222,7 @@ def report(result: FitResult) -> str:
         counts = {codes[code]: np.sum(value == code) for code in sorted(codes)}
         text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         return f"{value.size} fits: {text}"
-    throws, steps = result.state.omega.shape[0], np.sum(np.isfinite(result.history))
+    throws, steps = result.state.omega.shape[0], np.sum(np.isfinite(result.diagnostics.history))
     seen = f"{np.sum(result.kept)} samples" + f" of {throws} throws" * (throws > 1)
     known = result.problem.options.noise_known
     left = None if known else jnp.sqrt(jnp.nanmean(result.left() ** 2))
@@ -233,7 +234,7 @@ def report(result: FitResult) -> str:
     ]
     spoilt = ", ".join(map(str, np.flatnonzero(result.spoilt)))
     lines += [f"  throws left out: {spoilt}"] * bool(spoilt)
-    lines += ["  ratios   not determined"] if result.pure_spin else _of_tensor(result)
+    lines += ["  ratios   not determined"] if result.diagnostics.pure_spin else _of_tensor(result)
     lines += _of_torque(result)
     own = [x for x in result.unknowns.sought if x.own and x.base.ndim]
     each = {x.name for x in own if throws > 1}  # too many to print

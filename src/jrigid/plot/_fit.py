@@ -108,7 +108,7 @@ def _left(result: FitResult, record: int) -> tuple[np.ndarray, np.ndarray]:
     part, width = samples.parts[record], sensor.degrees or samples.values[record].shape[-1]
     known = result.problem.options.noise_known
     size = 1.0 if known else np.sqrt(float(result.reduced_chi_square))
-    left = np.asarray(result.residuals[:, part, :width]) / size
+    left = np.asarray(result.diagnostics.residuals[:, part, :width]) / size
     return np.asarray(samples.ts[:, part] - result.t0[:, None]), np.where(left == 0, np.nan, left)
 
 
@@ -158,12 +158,12 @@ def _histogram(ax: Any, result: FitResult, record: int, _: int) -> None:
 
 
 def _ratios(ax: Any, result: FitResult, *_: int) -> None:
-    told = not result.pure_spin and bool(np.all(result.ratios_errors < result.ratios))
+    told = not result.diagnostics.pure_spin and bool(np.all(result.ratios_errors < result.ratios))
     colour, marker = LOOKS[0]
     # the chi-square of two numbers at 68 % and 95 %
     drawn = told * [("68 %", "-", colour, 2.2789), ("95 %", "--", colour, 5.9915)]
-    if told and result.inflation > 1:
-        drawn.append(("bound", ":", "k", 5.9915 / float(result.inflation)))
+    if told and result.diagnostics.inflation > 1:
+        drawn.append(("bound", ":", "k", 5.9915 / float(result.diagnostics.inflation)))
     values, vectors = np.linalg.eigh(result.ratios_covariance)
     ellipse = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]
     ax.plot(*result.ratios, marker, color=colour)
