@@ -80,7 +80,7 @@ def readings_of(rng, count, size, band):
 
 def how_they_end(status):
     """How many fits ended in each state."""
-    names = {int(getattr(Status, x)._value): x for x in NAMES}
+    names = {int(getattr(Status, x)): x for x in NAMES}
     counts = collections.Counter(names[int(x)] for x in np.asarray(status))
     return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 

@@ -205,7 +205,7 @@ def lanes(one):
         for parts in zip(*given, strict=True):
             found, sought = one(*parts)
             spread = found.inertia_covariance, found.ratios_errors
-            results.append((found.status._value, found.inertia, found.ratios, *spread, sought))
+            results.append((np.asarray(found.status), found.inertia, found.ratios, *spread, sought))
         return jax.tree.map(lambda *x: np.stack(x), *results)
 
     return every
@@ -214,7 +214,7 @@ def lanes(one):
 def covered(label, one, given, tensors, truths, absolute=False):
     """A row: fits that are OK, and how many of their intervals hold the truth."""
     status, inertia, ratios, spread, errors, sought = lanes(one)(*given)
-    good = np.asarray(status) == int(Status.OK._value)
+    good = np.asarray(status) == int(Status.OK)
     pick = np.array([3 * i + j for i, j in FIVE + ((2, 2),) * absolute])
     error = (np.asarray(inertia) - tensors).reshape(-1, 9)[:, pick][good]
     spread = np.asarray(spread)[:, pick][:, :, pick][good]

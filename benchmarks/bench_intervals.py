@@ -160,7 +160,7 @@ def fits(trials):
         for gap in GAPS:
             moments, values = records(name, gap, trials, rng)
             new, old, status = of_fits(values, BODIES[name][-1])
-            good = np.isin(np.asarray(status._value), [int(Status.OK._value)])
+            good = np.isin(np.asarray(status), [int(Status.OK)])
             truth = np.sort(moments)[1:] / moments.min()
             (new, width), (old, far) = (judged(np.asarray(x)[good], truth) for x in (new, old))
             row = [f"{x:.1f}" for x in (new[0], old[0], new[1], old[1])]

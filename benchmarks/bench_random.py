@@ -43,7 +43,7 @@ def rows_of(seeds):
     off = np.abs(np.asarray(found.ratios) - true[:, 1:] / true[:, :1]) / found.ratios_errors
     counts = [len(x.ts) for x in records]
     square = np.where(sound, square, np.inf)
-    return np.stack([found.status._value, square, np.max(off, axis=1), counts], axis=1)
+    return np.stack([np.asarray(found.status), square, np.max(off, axis=1), counts], axis=1)
 
 
 if __name__ == "__main__":
@@ -54,9 +54,9 @@ if __name__ == "__main__":
     seeds = np.arange(options.records)
     parts = np.array_split(seeds, -(-len(seeds) // TOGETHER))
     rows = np.concatenate([rows_of(x) for x in parts])
-    names = {int(getattr(Status, x)._value): x for x in dir(Status) if x.isupper()}
+    names = {int(getattr(Status, x)): x for x in dir(Status) if x.isupper()}
     counts = collections.Counter(names[int(code)] for code in rows[:, 0])
-    ok = rows[:, 0] == int(Status.OK._value)
+    ok = rows[:, 0] == int(Status.OK)
     off = (rows[:, 1] > MOST) | (rows[:, 2] > 6)
     bands = [(5, 20), (20, 100), (100, 500), (500, 3001)]
     inside = [(rows[:, 3] >= a) & (rows[:, 3] < b) for a, b in bands]

@@ -259,15 +259,6 @@ class FitResult(eqx.Module):
         return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
 
     @property
-    def clustered_covariance(self) -> Float[Array, "*fits numbers numbers"]:
-        """Of `numbers`, by how much throws scatter, whatever the noise; of few throws too small."""
-        known = self.diagnostics
-        throws = known.scores.shape[-2]
-        inverse = self.numbers_covariance / known.inflation[..., None, None]
-        spread = product("...tg,...th->...gh", known.scores, known.scores)
-        return inverse @ (spread * throws / max(throws - 1, 1)) @ inverse
-
-    @property
     def system(self) -> RigidBody:
         """The body that was found, that of the first throw."""
         return self.parts()[0]
@@ -354,12 +345,6 @@ class FitResult(eqx.Module):
                 "to follow, but it was not."
             )
         return body
-
-    @property
-    def correlation(self) -> Float[Array, "*fits all all"]:
-        """The covariance with ones on its diagonal."""
-        error = errors_of(self.covariance)
-        return self.covariance / error[..., :, None] / error[..., None, :]
 
     def rows(
         self, record: int = 0, throw: int = 0

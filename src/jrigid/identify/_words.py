@@ -98,19 +98,14 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     seen, known = result.diagnostics, result.problem.options.noise_known
     by_throw = np.asarray(seen.chi_square_by_throw)
     size = max(math.sqrt(result.reduced_chi_square), float(np.max(seen.scales)))
-    (like, sure), worst = seen.whiteness, 0.0
+    like, sure = seen.whiteness
     low, high = np.maximum(np.quantile(by_throw, [0.1, 0.9]), 1e-300)
-    if by_throw.size >= 8:  # whose scatter says something
-        ratios = _diagonal(result.clustered_covariance) / _diagonal(result.numbers_covariance)
-        worst = math.sqrt(np.max(ratios, initial=0.0))
     notes = [
         (known and size > 1.3, f"residuals are {size:.2g} times the stated noise"),
         (abs(like) > _LIKE and sure > _SURE, "residuals are not white: neighbours correlate by "
          f"{like:.2f}, {sure:.0f} standard deviations from none"),
         (by_throw.size > 2 and high > 4 * low,
          f"throws differ: chi-square of nine tenths spreads by {high / low:.2g}"),
-        (worst > 1.6, f"throws scatter more than the errors say: by up to {worst:.2g} times "
-         "(`clustered_covariance`)"),
     ]  # fmt: skip
     for x in result.unknowns.sought:
         if not x.own and x.sigma is not None:
