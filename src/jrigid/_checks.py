@@ -118,8 +118,8 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "one is not."
     )
     undersampled_rates = (
-        "Argument `values` of `Gyro` must be in rad/s and sampled twice a turn, but the body "
-        "turns more between samples: are rates in degrees a second (multiply them by pi / 180)?"
+        "Argument `values` of `Gyro` must be in rad/s and sampled twice a turn, but the body turns "
+        "more: are rates in degrees a second, times not in seconds? (1 deg/s is pi / 180 rad/s.)"
     )
 
 
