@@ -46,9 +46,6 @@ def code_of(item: Any) -> Any:
 class _Code(EnumerationItem):  # pyright: ignore[reportGeneralTypeIssues]
     """An item that is an integer where one is asked for."""
 
-    def __int__(self) -> int:
-        return int(code_of(self))
-
     def __index__(self) -> int:
         return int(code_of(self))
 

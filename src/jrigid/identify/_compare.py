@@ -104,13 +104,9 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
 
 def _split(throw: Any) -> tuple[RigidBody | None, tuple[Any, ...]]:
     """The body of a throw, if it has one of its own, and its records."""
-    body, records = throw if _is_pair(throw) else (None, throw)
+    is_pair = isinstance(throw, tuple) and isinstance(throw[0], RigidBody)
+    body, records = throw if is_pair else (None, throw)
     return body, records if isinstance(records, tuple) else (records,)
-
-
-def _is_pair(throw: Any) -> bool:
-    """Whether a throw has a body of its own."""
-    return isinstance(throw, tuple) and isinstance(throw[0], RigidBody)
 
 
 def _with_what_was_found(found: FitResult, body: RigidBody | None) -> RigidBody:

@@ -316,16 +316,17 @@ def conclude(
     """
     minimum, options = fit.minimum, problem.options
     point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
-    rows = condensed(minimum.rows, minimum.links)
-    sensor = precision_of_rows(rows, minimum.weight, own, units)
-    known, judged_by, log_determinant = sensor, None, 0.0
+    independent = independent_rows(problem, fit)
+    known = precision_of_rows(independent.rows, independent.weight, own, units)
+    rows, sensor = independent.rows, known
     if options.dense:
-        independent, weight, log_determinant = independent_rows(problem, fit)
-        known = precision_of_rows(independent, weight, own, units)
-        judged_by = independent.residual[:, : fit.kept.shape[1]]
+        rows = condensed(minimum.rows, minimum.links)
+        sensor = precision_of_rows(rows, minimum.weight, own, units)
     residuals, jacobian = _weighted(fit, rows, own)
-    parts = problem.samples.parts
-    judged = _judged(problem, fit, known, residuals if judged_by is None else judged_by)
+    parts, count = problem.samples.parts, fit.kept.shape[1]
+    # Weights of innovations are ones.
+    judged_by = (np.sqrt(independent.weight)[..., None] * independent.rows.residual)[:, :count]
+    judged = _judged(problem, fit, known, judged_by)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
     derived = derive(problem, point.numbers, covariance)
     loose = np.any(errors_of(derived["ratios_covariance"]) > LARGEST_ERROR * derived["ratios"])
@@ -353,7 +354,7 @@ def conclude(
         "kept": _resized(fit.kept, parts, lengths) > 0,
         "history": np.pad(fit.history, (0, HISTORY), constant_values=np.nan)[:HISTORY],
         "ambiguous": np.asarray(fit.ambiguous),
-        "log_determinant": np.asarray(log_determinant),
+        "log_determinant": np.asarray(independent.log_determinant),
         "torque_numbers": np.asarray(0 if fit.torque is None else fit.torque.size),
         "problem": dataclasses.replace(
             problem,

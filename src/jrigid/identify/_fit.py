@@ -49,7 +49,7 @@ from jrigid.identify._records import (
     samples_of,
     tells,
 )
-from jrigid.identify._result import FitResult, Status, leaves_of, result_of
+from jrigid.identify._result import FitResult, Status, arrays_of, result_of
 from jrigid.identify._search import Case, Effort, Line, no_search, run, search
 from jrigid.identify._shapes import AbstractShape, Tensor
 from jrigid.identify._smoother import Point
@@ -502,7 +502,7 @@ def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[
 
 def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:
     """One result with an axis of fits in front, from the fields of each."""
-    columns = zip(*map(leaves_of, results), strict=True)
+    columns = zip(*map(arrays_of, results), strict=True)
     stacked = jax.device_put([np.stack(x) for x in columns])
     return jtu.tree_structure(result_of(results[0])).unflatten(stacked)
 

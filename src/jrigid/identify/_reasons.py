@@ -110,24 +110,20 @@ def _bias(result: FitResult) -> np.ndarray | None:
     excess = before - int(result.degrees_of_freedom)
     if not excess > 0 or not np.all(np.isfinite(jacobian)):
         return None
-    rows, size = _apart(residuals, jacobian, of_bias, result.numbers.size)
-    found = np.linalg.lstsq(rows, -size, rcond=1e-12)[0]
-    after = np.sum((size + rows @ found) ** 2)
+    numbers = result.numbers.size
+    rows = []
+    for i, left in enumerate(residuals):
+        derivatives = jacobian[i].reshape(-1, jacobian.shape[-1])
+        state = derivatives[:, numbers:]
+        others = [derivatives[:, :numbers], of_bias[i].reshape(-1, 3), left.reshape(-1, 1)]
+        columns = np.concatenate(others, axis=1)
+        # What a state of the trial's own can do is taken out.
+        rows.append(columns - state @ np.linalg.lstsq(state, columns, rcond=1e-12)[0])
+    columns = np.concatenate(rows)
+    slopes, size = columns[:, :-1], columns[:, -1]
+    found = np.linalg.lstsq(slopes, -size, rcond=1e-12)[0]
+    after = np.sum((size + slopes @ found) ** 2)
     return found[-3:] if before - after > _EXPLAINED * excess else None
-
-
-def _apart(
-    residuals: np.ndarray, jacobian: np.ndarray, of_bias: np.ndarray, numbers: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows in all trials' states, the numbers and the bias, and residuals."""
-    trials, local = residuals.shape[0], jacobian.shape[-1] - numbers
-    blocks = []
-    for i in range(trials):
-        states = np.zeros((residuals[i].size, trials * local))
-        own = jacobian[i].reshape(-1, jacobian.shape[-1])
-        states[:, i * local : (i + 1) * local] = own[:, numbers:]
-        blocks.append(np.concatenate([states, own[:, :numbers], of_bias[i].reshape(-1, 3)], axis=1))
-    return np.concatenate(blocks), residuals.reshape(-1)
 
 
 def _of_noise(result: FitResult) -> str:

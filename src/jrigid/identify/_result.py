@@ -75,7 +75,7 @@ def result_of(fields: dict[str, Any]) -> "FitResult":
     return FitResult(**rest, diagnostics=diagnostics)
 
 
-def leaves_of(fields: dict[str, Any]) -> list[Any]:
+def arrays_of(fields: dict[str, Any]) -> list[Any]:
     """The arrays of a result, in the order of its leaves."""
     inner = [fields[x.name] for x in dataclasses.fields(Diagnostics)]
     of_result = [x.name for x in dataclasses.fields(FitResult)]

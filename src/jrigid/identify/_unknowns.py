@@ -220,9 +220,8 @@ class Unknowns(eqx.Module):
     rest: tuple[Any, ...] = eqx.field(static=True)  # what is no array
     stacked: tuple[bool, ...] = eqx.field(static=True)  # which of `leaves` have
     sought: tuple[AbstractSought, ...]
-    groups: dict[
-        str, AnyArray
-    ]  # of what is sought by groups: 1 for each throw in its group, else 0
+    # Of what is sought by groups, by name: 1 for each throw in its group, else 0.
+    groups: dict[str, AnyArray]
     shape: AbstractShape
     scaled: bool = eqx.field(static=True)
     trace: AnyArray
