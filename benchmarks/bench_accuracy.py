@@ -2,11 +2,11 @@
 
     taskset -c 1 python benchmarks/bench_accuracy.py [--write] [--lanes N]
 
-I = (1, 2, 3), attitudes at random, |omega| from 1 to 2 rad/s, T = 20: one body at a time (the mean
-of eight) and 10,000. Peers: hand-written diffrax, scipy's `solve_ivp`, heyoka (one body: its scalar
-integrator, many: its batch integrator) and, for the free body, MuJoCo's RK4 with its steps in place
-of tolerances. `--write` draws docs/images/accuracy_*.png too. Run it on one core: heyoka is timed
-on one thread.
+I = (1, 2, 3), attitudes at random, |omega| from 1 to 2 rad/s, T = 20: one body at a
+time (the mean of eight) and 10,000. Peers: hand-written diffrax, scipy's `solve_ivp`,
+heyoka (one body: its scalar integrator, many: its batch integrator) and, for the free
+body, MuJoCo's RK4 with its steps in place of tolerances. `--write` draws
+docs/images/accuracy_*.png too. Run it on one core: heyoka is timed on one thread.
 """
 
 import functools
@@ -45,7 +45,8 @@ LOOKS = {
 }
 
 
-# The bodies: in jrigid, and their torques for numbers, arrays and symbols ----------------------
+# The bodies: in jrigid, and their torques for numbers, arrays and symbols
+# ----------------------
 
 
 def cross(a, b):
@@ -99,7 +100,9 @@ class Case(NamedTuple):
         (p, q, r), (a, b, c, d) = z[:3], z[3:7]
         gyroscopic = cross([m * x for m, x in zip(MOMENTS, z[:3], strict=True)], z[:3])
         torque = self.torque(maths, t, z[:3], z[3:7])
-        spin_up = [(x + y) / m for x, y, m in zip(gyroscopic, torque, MOMENTS, strict=True)]
+        spin_up = [
+            (x + y) / m for x, y, m in zip(gyroscopic, torque, MOMENTS, strict=True)
+        ]
         turning = (
             -b * p - c * q - d * r,
             a * p + c * r - d * q,
@@ -119,20 +122,34 @@ def cases():
     all_of = (
         ("free", None, no_torque),
         ("heavy", torques.UniformGravity(WEIGHT, LEVER, (0.0, 0.0, -1.0)), weight),
-        ("dragged", torques.LinearDrag(linear) + torques.QuadraticDrag(quadratic), drag),
-        ("gravity gradient", torques.GravityGradient(ORBIT_RATE**2, orbit), gravity_gradient),
+        (
+            "dragged",
+            torques.LinearDrag(linear) + torques.QuadraticDrag(quadratic),
+            drag,
+        ),
+        (
+            "gravity gradient",
+            torques.GravityGradient(ORBIT_RATE**2, orbit),
+            gravity_gradient,
+        ),
         ("with a rotor", torques.Rotor(WHEEL), wheel),
     )
     moments = np.array(MOMENTS)
-    return [Case(name, jr.RigidBody(moments, torque), peer) for name, torque, peer in all_of]
+    return [
+        Case(name, jr.RigidBody(moments, torque), peer) for name, torque, peer in all_of
+    ]
 
 
 def starts_of(lanes):
     """Angular velocities and attitudes (lanes, 7)."""
     random = np.random.default_rng(0)
     omega, attitude = random.normal(size=(lanes, 3)), random.normal(size=(lanes, 4))
-    omega *= random.uniform(1.0, 2.0, (lanes, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
-    return np.concatenate([omega, attitude / np.linalg.norm(attitude, axis=1, keepdims=True)], 1)
+    omega *= random.uniform(1.0, 2.0, (lanes, 1)) / np.linalg.norm(
+        omega, axis=1, keepdims=True
+    )
+    return np.concatenate(
+        [omega, attitude / np.linalg.norm(attitude, axis=1, keepdims=True)], 1
+    )
 
 
 def check_rates(case, starts):
@@ -140,10 +157,13 @@ def check_rates(case, starts):
     for t, z in enumerate(starts[:20]):
         rate = case.body.vector_field(float(t), jr.State(z[3:], z[:3]), None)
         ours = np.concatenate([rate.omega, rate.attitude])
-        np.testing.assert_allclose(case.rates(math, float(t), *z.tolist()), ours, 0, 1e-14)
+        np.testing.assert_allclose(
+            case.rates(math, float(t), *z.tolist()), ours, 0, 1e-14
+        )
 
 
-# The reference, and errors --------------------------------------------------------------------
+# The reference, and errors
+# --------------------------------------------------------------------
 
 
 class Truth(NamedTuple):
@@ -170,7 +190,10 @@ def errors_of(ends, starts, truth):
 
 def tight(case, starts, tolerance=1e-19):
     """States at the end, and radians: by heyoka in long double, else by scipy."""
-    begin, hy = np.concatenate([starts, np.zeros((len(starts), 1))], 1), peers.package("heyoka")
+    begin, hy = (
+        np.concatenate([starts, np.zeros((len(starts), 1))], 1),
+        peers.package("heyoka"),
+    )
     if hy is not None:
         rates = functools.partial(case.rates_and_radians, hy, hy.time)
         run, _ = peers.by_heyoka_singly(rates, begin, END, tolerance, np.longdouble)
@@ -189,17 +212,25 @@ def truth_of(case, starts):
     if peers.package("heyoka") is not None:
         others, _ = tight(case, starts, 1e-17)
     else:
-        others = jax.jit(jax.vmap(by_diffrax(case, diffrax.Dopri8()), (0, None)))(starts, 1e-14)
+        others = jax.jit(jax.vmap(by_diffrax(case, diffrax.Dopri8()), (0, None)))(
+            starts, 1e-14
+        )
     growth = np.zeros(len(starts))
     for seed in range(3):
         aside = np.random.default_rng(seed).normal(size=starts.shape)
         aside *= 1e-8 / np.linalg.norm(aside, axis=1, keepdims=True)
-        growth = np.maximum(growth, 1e8 * errors_of(tight(case, starts + aside)[0], starts, ends))
-    radians, doubt = radians.astype(float), float(np.max(errors_of(others, starts, ends)))
+        growth = np.maximum(
+            growth, 1e8 * errors_of(tight(case, starts + aside)[0], starts, ends)
+        )
+    radians, doubt = (
+        radians.astype(float),
+        float(np.max(errors_of(others, starts, ends))),
+    )
     return Truth(ends.astype(float), radians, growth < 1 + radians, doubt)
 
 
-# The tools ------------------------------------------------------------------------------------
+# The tools
+# ------------------------------------------------------------------------------------
 
 
 def by_jrigid(case):
@@ -212,13 +243,17 @@ def by_jrigid(case):
 
 
 def by_closed_form(z, _tolerance):
-    last = jr.free_rotation(jnp.asarray(MOMENTS), jr.State(z[3:], z[:3]), END, throw=False)
+    last = jr.free_rotation(
+        jnp.asarray(MOMENTS), jr.State(z[3:], z[:3]), END, throw=False
+    )
     return jnp.concatenate([last.omega, last.attitude])
 
 
 def by_diffrax(case, solver):
     rates = functools.partial(case.rates, jnp)
-    return lambda z, tolerance: peers.by_diffrax(rates, z, END, tolerance, solver, timed=True)
+    return lambda z, tolerance: peers.by_diffrax(
+        rates, z, END, tolerance, solver, timed=True
+    )
 
 
 class Curve:
@@ -233,7 +268,9 @@ class Curve:
                 break
             first, ends = milliseconds(run)
             again = milliseconds(run)[0]
-            self.compile_ms = max(self.compile_ms, first - again if built is None else built)
+            self.compile_ms = max(
+                self.compile_ms, first - again if built is None else built
+            )
             self.errors.append(errors_of(ends, starts, truth.ends))
             self.times.append(again)
             self.runs.append(run)
@@ -300,12 +337,16 @@ def curves_of(case, starts, truth):
     eight, some = starts[:SINGLES], starts[: -(-len(starts) // 10)]
     found = {"jrigid.simulate": compiled(by_jrigid(case), starts, truth)}
     if case.name == "free":
-        found["jrigid.free_rotation"] = compiled(by_closed_form, starts, truth, TOLERANCES[-1:])
+        found["jrigid.free_rotation"] = compiled(
+            by_closed_form, starts, truth, TOLERANCES[-1:]
+        )
         mujoco = lambda n: peers.by_mujoco(MOMENTS, eight, END, n)  # noqa: E731
         found["MuJoCo RK4"] = repeated(mujoco, STEPS, eight, truth)
     for name, solver in (("Tsit5", diffrax.Tsit5()), ("Dopri8", diffrax.Dopri8())):
         knobs = TOLERANCES[:-1] if name == "Tsit5" else TOLERANCES
-        found[f"diffrax {name}"] = compiled(by_diffrax(case, solver), some, truth, knobs)
+        found[f"diffrax {name}"] = compiled(
+            by_diffrax(case, solver), some, truth, knobs
+        )
     rates = functools.partial(case.rates, math)
     for method in ("DOP853", "LSODA"):
         make = lambda x, m=method: peers.by_scipy(rates, eight, END, x, m)  # noqa: E731
@@ -329,14 +370,17 @@ def measured(case, starts, truth, rounds=3):
             curve.run_again()
     return {
         name: Measured(
-            one.points(1), many.points(len(starts)), max(one.compile_ms, many.compile_ms),
+            one.points(1),
+            many.points(len(starts)),
+            max(one.compile_ms, many.compile_ms),
             many.errors,
         )
         for name, (one, many) in found.items()
-    }  # fmt: skip
+    }
 
 
-# Tables and pictures --------------------------------------------------------------------------
+# Tables and pictures
+# --------------------------------------------------------------------------
 
 
 def rows_of(case, found):
@@ -345,7 +389,9 @@ def rows_of(case, found):
         one, many, compile_ms, _ = found[name]
         seconds = many * (1.0, 1e-3)
         times = [needed(x, target) for x in (one, seconds) for target in TARGETS]
-        rows.append([case.name, name, compile_ms or None, *times, float(one[:, 0].min())])
+        rows.append(
+            [case.name, name, compile_ms or None, *times, float(one[:, 0].min())]
+        )
     return rows
 
 
@@ -369,11 +415,17 @@ def picture(path, title, unit, panels, extrapolated=()):
         for tool in (x for x in reversed(LOOKS) if x in found):
             colour, marker = LOOKS[tool]
             (shown[tool],) = ax.plot(
-                *(found[tool] * (1.0, {"ms": 1.0, "s": 1e-3}[unit])).T, color=colour, marker=marker,
-                linestyle="" if marker == "*" else "--" if tool in extrapolated else "-",
+                *(found[tool] * (1.0, {"ms": 1.0, "s": 1e-3}[unit])).T,
+                color=colour,
+                marker=marker,
+                linestyle=""
+                if marker == "*"
+                else "--"
+                if tool in extrapolated
+                else "-",
                 markersize=12 if marker == "*" else 5.5,
                 linewidth=2.2 if colour == "black" else 1.4,
-            )  # fmt: skip
+            )
         ax.set_title(name, fontweight="bold")
         ax.set(xscale="log", yscale="log", xlim=(1e-1, 1e-16))
         ax.grid(color="0.9")
@@ -398,7 +450,10 @@ def pictures(results, lanes):
     IMAGES.mkdir(exist_ok=True)
     title = "{} to T = 20, 20 to 30 rad, on one core: better is lower and further right"
     one, many = (
-        {case: {tool: x[i] for tool, x in found.items()} for case, found in results.items()}
+        {
+            case: {tool: x[i] for tool, x in found.items()}
+            for case, found in results.items()
+        }
         for i in range(2)
     )
     picture(IMAGES / "accuracy_one.png", title.format("One body"), "ms", one)
@@ -435,9 +490,13 @@ more than 1 + radians). The reference is {reference}: the third column is how fa
 """
     header = ["body", "radians, median", "reference", "regular"]
     text += common.table([*header, *(f"{x:.0e}" for x in TOLERANCES)], promises)
-    optional = [x for x in ("scipy", "heyoka", "mujoco") if peers.package(x) is not None]
+    optional = [
+        x for x in ("scipy", "heyoka", "mujoco") if peers.package(x) is not None
+    ]
     title = "Error against time, for five kinds of body"
-    common.report("accuracy", title, text, ["jax", "diffrax", "numpy", *optional], write)
+    common.report(
+        "accuracy", title, text, ["jax", "diffrax", "numpy", *optional], write
+    )
     if write:
         pictures(results, lanes)
 

@@ -1,21 +1,24 @@
 """A narrow band of torque at the spin rate: do fits whose chi-square is good say so wrongly?
 
-Records of 60 samples of a gyro, 0.3 rad of rotation apart, with noise of 1 % of the spin; bodies of
-moments 1, 1.7 and 2.3, their axes and spins drawn anew for each record and moved by an independent
-integrator (tests/worlds.py). An unmodelled torque acts along each axis: three sines of random phase
-whose frequencies lie in a narrow band, so that its amplitude varies slowly. The band is the spin
-rate within 5 %, or within 5 % of the rate at which the free body precesses, 0.2 to 0.4 of the spin
-rate, where a torque acts most like a change of the inertia. The rms of the torque is a fraction of
-the gyroscopic torque. At the sizes of this table chi-square over its degrees of freedom n rises to
-about the gate of a good fit, 1 + 5 sqrt(2 / n), which is 1.54 for these records.
+Records of 60 samples of a gyro, 0.3 rad of rotation apart, with noise of 1 % of the
+spin; bodies of moments 1, 1.7 and 2.3, their axes and spins drawn anew for each record
+and moved by an independent integrator (tests/worlds.py). An unmodelled torque acts
+along each axis: three sines of random phase whose frequencies lie in a narrow band, so
+that its amplitude varies slowly. The band is the spin rate within 5 %, or within 5 % of
+the rate at which the free body precesses, 0.2 to 0.4 of the spin rate, where a torque
+acts most like a change of the inertia. The rms of the torque is a fraction of the
+gyroscopic torque. At the sizes of this table chi-square over its degrees of freedom n
+rises to about the gate of a good fit, 1 + 5 sqrt(2 / n), which is 1.54 for these
+records.
 
 Each record is fitted twice: the torque is ignored, or a torque is estimated
-(`unmodelled="estimate"`). Chi-square: that over its degrees of freedom, median and 90 % of the
-records. Wrong: fits that end OK with a ratio I2/I1 or I3/I1 more than six stated errors from the
-truth. Largest, and rms: the ratios less the truth over their errors, of fits that end OK.
+(`unmodelled="estimate"`). Chi-square: that over its degrees of freedom, median and 90 %
+of the records. Wrong: fits that end OK with a ratio I2/I1 or I3/I1 more than six stated
+errors from the truth. Largest, and rms: the ratios less the truth over their errors, of
+fits that end OK.
 
-`python benchmarks/bench_band.py` makes the table; `--records` sets how many records there are in
-each row, `--bands` and `--sizes` choose others.
+`python benchmarks/bench_band.py` makes the table; `--records` sets how many records
+there are in each row, `--bands` and `--sizes` choose others.
 """
 
 import collections
@@ -50,7 +53,8 @@ NAMES = [x for x in dir(Status) if isinstance(getattr(Status, x), Status)]
 def precession_rates(directions):
     """Rates at which free bodies with these spins in principal axes precess [rad/s].
 
-    Landau, Lifshitz, Mechanics, section 37: the rates repeat after 4 K(k) / (rate in front of t).
+    Landau, Lifshitz, Mechanics, section 37: the rates repeat after 4 K(k) / (rate in
+        front of t).
     """
     small, middle, large = MOMENTS
     momentum = directions**2 @ MOMENTS**2
@@ -58,8 +62,12 @@ def precession_rates(directions):
     about_large = momentum > energy * middle
     from_small = momentum - energy * small
     from_large = energy * large - momentum
-    square = np.where(about_large, (large - middle) * from_small, (middle - small) * from_large)
-    other = np.where(about_large, (middle - small) * from_large, (large - middle) * from_small)
+    square = np.where(
+        about_large, (large - middle) * from_small, (middle - small) * from_large
+    )
+    other = np.where(
+        about_large, (middle - small) * from_large, (large - middle) * from_small
+    )
     return np.pi / 2 * np.sqrt(square / np.prod(MOMENTS)) / ellipk(other / square)
 
 
@@ -114,7 +122,9 @@ def main():
     parser.add_argument("--records", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bands", choices=BANDS, nargs="+", default=BANDS)
-    parser.add_argument("--sizes", type=float, nargs="+", help="in place of those of each band")
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", help="in place of those of each band"
+    )
     given = parser.parse_args()
     rows = []
     for band in given.bands:

@@ -12,8 +12,8 @@ gradient of 1,000 lanes that differ in their initial rates.
 The peer is what a user of diffrax writes by hand: Dopri8, rtol = atol = 1e-9. Compile
 times are CPU seconds of the process. Every repetition traces new function objects after
 `jax.clear_caches()`, and the two take turns. Errors are relative, the median over the
-first 100 lanes, against the peer at 1e-13. "At equal error" interpolates the peer's run time
-between the two tolerances (powers of ten) whose errors enclose ours.
+first 100 lanes, against the peer at 1e-13. "At equal error" interpolates the peer's run
+time between the two tolerances (powers of ten) whose errors enclose ours.
 
 Functions run with `throw=False`; `--throw` leaves both at their defaults.
 """
@@ -52,8 +52,8 @@ PEER_TOLERANCE = 1e-9
 REFERENCE_TOLERANCE = 1e-13
 # Beyond so many CPU seconds a compilation is repeated three times, not five.
 COSTLY_COMPILE = 20.0
-# Runs of one program take about so many seconds in all, but there are five at least, and
-# two of those that last longer than the second figure.
+# Runs of one program take about so many seconds in all, but there are five at least,
+# and two of those that last longer than the second figure.
 RUN_BUDGET, LONG_RUN = 2.0, 8.0
 
 # (parameter, omega0) -> outputs
@@ -140,7 +140,9 @@ def by_hand(field, ts, parameter, omega, settings):
         jnp.concatenate([jnp.asarray(UPRIGHT), omega]),
         parameter,
         saveat=diffrax.SaveAt(ts=jnp.asarray(ts)),
-        stepsize_controller=diffrax.PIDController(rtol=settings.tolerance, atol=settings.tolerance),
+        stepsize_controller=diffrax.PIDController(
+            rtol=settings.tolerance, atol=settings.tolerance
+        ),
         adjoint=adjoint,
         max_steps=100_000,
         throw=settings.throw,
@@ -184,7 +186,9 @@ def top_peer(settings):
 
 def dipole_ours(settings):
     def torque(t, state, args):
-        return jnp.cross(args, jr.rotation.rotate_inverse(state.attitude, turning_field(t)))
+        return jnp.cross(
+            args, jr.rotation.rotate_inverse(state.attitude, turning_field(t))
+        )
 
     def run(dipole, omega):
         body = jr.RigidBody(MOMENTS, torque)
@@ -378,7 +382,9 @@ def measured(work, what, repeats, throw):
         row = [what, name, *least, least.total, middle, len(costs[name])]
         rows.append([*row, kernels[name], *times[name], errors[name]])
     ours, theirs = rows
-    equal_wall = at_equal_error(near, {x: times[x].wall for x in near}, errors["jrigid"])
+    equal_wall = at_equal_error(
+        near, {x: times[x].wall for x in near}, errors["jrigid"]
+    )
     equal_cpu = at_equal_error(near, {x: times[x].cpu for x in near}, errors["jrigid"])
     ratios = [
         what,
@@ -439,8 +445,12 @@ def section(work, repeats, throw):
 
 def main():
     parser = common.arguments(__doc__)
-    parser.add_argument("--quick", action="store_true", help="compile once, not five times")
-    parser.add_argument("--throw", action="store_true", help="raise errors, as by default")
+    parser.add_argument(
+        "--quick", action="store_true", help="compile once, not five times"
+    )
+    parser.add_argument(
+        "--throw", action="store_true", help="raise errors, as by default"
+    )
     parser.add_argument("--work", choices=list(WORKS), help="only this work")
     options = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)

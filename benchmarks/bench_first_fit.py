@@ -57,7 +57,11 @@ def cpu_of(command, **environment):
     """CPU seconds of a process and its output."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
-        command, env=os.environ | environment, check=True, capture_output=True, text=True
+        command,
+        env=os.environ | environment,
+        check=True,
+        capture_output=True,
+        text=True,
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime)

@@ -1,17 +1,18 @@
-"""How well `records.flights` finds throws: simulated ones, whose release and catch are known.
+"""How well `records.flights` finds trials: simulated ones, whose release and catch are known.
 
-A rigid body lies in a hand, is shaken, wound up and thrown. It flies for 0.3 to 1 s with a spin of
-2 to 30 rad/s and is caught, or bounces (40 %) and flies again. In flight there may be drag on the
-spin (60 %), drag of the air on the flight, and a wheel that is switched on and vibrates (25 %). The
-clock has 50 to 500 Hz. The accelerometer is at a lever of up to 12 cm; it has noise, a bias, a
-wrong scale, a wrong alignment, a range of 4, 8 or 16 g, a low-pass filter of up to 6 ms and a delay
-of up to 3 ms; the gyro has a low-pass filter of up to 3 ms.
-The integrator is an explicit Runge-Kutta method of this file, with steps of 1 ms.
+A rigid body lies in a hand, is shaken, wound up and thrown. It flies for 0.3 to 1 s
+with a spin of 2 to 30 rad/s and is caught, or bounces (40 %) and flies again. In flight
+there may be drag on the spin (60 %), drag of the air on the flight, and a wheel that is
+switched on and vibrates (25 %). The clock has 50 to 500 Hz. The accelerometer is at a
+lever of up to 12 cm; it has noise, a bias, a wrong scale, a wrong alignment, a range of
+4, 8 or 16 g, a low-pass filter of up to 6 ms and a delay of up to 3 ms; the gyro has a
+low-pass filter of up to 3 ms. The integrator is an explicit Runge-Kutta method of this
+file, with steps of 1 ms.
 
-Missed: of the flights of at least 0.25 s, those of which less than half is found. False: parts
-found, of which less than half is a flight. Errors are those of the first and the last row found;
-an early start and a late end have contact in them. "Both" is the part of all flights of which start
-and end are within 30 ms, those missed included.
+Missed: of the flights of at least 0.25 s, those of which less than half is found.
+False: parts found, of which less than half is a flight. Errors are those of the first
+and the last row found; an early start and a late end have contact in them. "Both" is
+the part of all flights of which start and end are within 30 ms, those missed included.
 """
 
 import dataclasses
@@ -56,7 +57,7 @@ def matrices(quaternions):
 
 
 def times_vector(matrix, vectors):
-    """Matrices times vectors, throw by throw."""
+    """Matrices times vectors, trial by trial."""
     return np.einsum("nij,nj->ni", matrix, vectors)
 
 
@@ -71,11 +72,11 @@ def half_sine(x):
     return np.where((x > 0) & (x < 1), np.sin(np.pi * np.clip(x, 0, 1)), 0.0)
 
 
-class Throws:
-    """Bodies, hands and flights, drawn at random; vectorised over the throws."""
+class Trials:
+    """Bodies, hands and flights, drawn at random; vectorised over the trials."""
 
     def __init__(self, rng, count):
-        """Draw `count` throws."""
+        """Draw `count` trials."""
         self.count = count
         self.draw_bodies(rng)
         self.draw_flights(rng)
@@ -100,7 +101,9 @@ class Throws:
         self.release = np.round(draw(1.5, 2.2, self.count), 3)
         self.contact = self.release + np.round(draw(0.3, 1.0, self.count), 3)
         self.bounces = draw(size=self.count) < 0.4
-        self.bounce_width = np.where(self.bounces, np.round(draw(0.008, 0.02, self.count), 3), 0)
+        self.bounce_width = np.where(
+            self.bounces, np.round(draw(0.008, 0.02, self.count), 3), 0
+        )
         again = np.round(draw(0.15, 0.4, self.count), 3)
         self.catch = self.contact + self.bounces * (self.bounce_width + again)
         spin = 2.0 * 15.0 ** draw(size=self.count)
@@ -117,7 +120,7 @@ class Throws:
         self.amplitude = draw(0.3, 2.0, shape)
         self.windup = draw(0.2, 0.5, self.count)
         self.letting_go = draw(0.02, 0.05, self.count)
-        self.throw_force = draw(8.0, 30.0, self.count)
+        self.trial_force = draw(8.0, 30.0, self.count)
         self.stiffness = 1 / draw(0.015, 0.04, self.count)
         self.catch_width = draw(0.03, 0.1, self.count)
         self.catch_force = draw(20.0, 120.0, self.count)
@@ -128,13 +131,15 @@ class Throws:
         self.push = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
 
     def draw_wheels(self, rng):
-        """A wheel that takes some of the momentum, in a quarter of the throws."""
+        """A wheel that takes some of the momentum, in a quarter of the trials."""
         draw = rng.uniform
         self.has_wheel = draw(size=self.count) < 0.25
         momentum = np.linalg.norm(times_vector(self.inertia, self.spin), axis=1)
         size = self.has_wheel * draw(0.2, 0.8, self.count) * momentum
         self.wheel = size[:, None] * directions(rng, self.count)
-        self.wheel_on = self.release + draw(0.1, 0.5, self.count) * (self.contact - self.release)
+        self.wheel_on = self.release + draw(0.1, 0.5, self.count) * (
+            self.contact - self.release
+        )
         self.wheel_time = draw(0.1, 0.4, self.count)
         self.vibration = self.has_wheel * draw(0.3, 4.0, self.count)
         self.vibration_frequency = draw(50.0, 120.0, self.count)
@@ -154,7 +159,9 @@ class Throws:
         """Angular acceleration: of a free body, or of one in a hand."""
         running = (t - self.wheel_on) / self.wheel_time
         stored = np.clip(running, 0, 1)[:, None] * self.wheel
-        taken = (((running > 0) & (running < 1)) / self.wheel_time)[:, None] * self.wheel
+        taken = (((running > 0) & (running < 1)) / self.wheel_time)[
+            :, None
+        ] * self.wheel
         momentum = times_vector(self.inertia, omega) + stored
         speed = np.linalg.norm(omega, axis=1)
         drag = (self.linear_drag + self.quadratic_drag * speed)[:, None] * omega
@@ -175,8 +182,8 @@ class Throws:
     def specific_force(self, t):
         """Acceleration of the mass centre less gravity, in space."""
         hand = np.array([0.0, 0.0, GRAVITY]) + self.shaking(t, 1)
-        throw = self.throw_force * half_sine((t - self.release) / self.windup + 1)
-        before = hand + throw[:, None] * self.push
+        trial = self.trial_force * half_sine((t - self.release) / self.windup + 1)
+        before = hand + trial[:, None] * self.push
         before = smooth_step((self.release - t) / self.letting_go)[:, None] * before
         caught = self.catch_force * half_sine((t - self.catch) / self.catch_width)
         after = smooth_step((t - self.catch) / self.catch_width)[:, None] * hand
@@ -192,19 +199,19 @@ class Throws:
         return np.where(self.in_flight(t)[:, None], air, force)
 
 
-def motions(rng, throws):
+def motions(rng, trials):
     """Rates, their changes and specific forces in the body, at steps of 1 ms."""
     times = STEP * np.arange(round(TOTAL / STEP))
-    omega = np.zeros((throws.count, 3))
-    attitude = rotations(rng, throws.count)
-    shape = (times.size, throws.count, 3)
+    omega = np.zeros((trials.count, 3))
+    attitude = rotations(rng, trials.count)
+    shape = (times.size, trials.count, 3)
     rates, changes, forces = np.zeros(shape), np.zeros(shape), np.zeros(shape)
 
     def slope(t, omega, attitude):
         w, vector = attitude[:, :1], attitude[:, 1:]
         real = -np.sum(vector * omega, axis=1, keepdims=True)
         turn = 0.5 * np.concatenate([real, w * omega + np.cross(vector, omega)], axis=1)
-        return throws.change_of_rate(t, omega), turn
+        return trials.change_of_rate(t, omega), turn
 
     for i, t in enumerate(times):
         middle, last = t + STEP / 2, t + STEP - 1e-9
@@ -214,7 +221,7 @@ def motions(rng, throws):
         k4 = slope(last, omega + STEP * k3[0], attitude + STEP * k3[1])
         rates[i], changes[i] = omega, k1[0]
         to_body = np.swapaxes(matrices(attitude), 1, 2)
-        forces[i] = times_vector(to_body, throws.specific_force(t))
+        forces[i] = times_vector(to_body, trials.specific_force(t))
         omega = omega + STEP / 6 * (k1[0] + 2 * k2[0] + 2 * k3[0] + k4[0])
         attitude = attitude + STEP / 6 * (k1[1] + 2 * k2[1] + 2 * k3[1] + k4[1])
         attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
@@ -258,30 +265,34 @@ def read_by_sensors(rng, fine, rates, changes, forces, vibration, frequency):
     reach = GRAVITY * rng.choice([4, 8, 16], p=[0.1, 0.2, 0.7])
     rates = low_passed(rates, rng.uniform(0, 0.003))
     omega = np.stack([np.interp(times, fine, x) for x in rates.T], axis=1)
-    omega += 0.01 * rng.normal(size=3) + rng.uniform(0.003, 0.03) * rng.normal(size=omega.shape)
+    omega += 0.01 * rng.normal(size=3) + rng.uniform(0.003, 0.03) * rng.normal(
+        size=omega.shape
+    )
     omega += 0.01 * wave[:, None] * directions(rng, 1)
     reading = jr.records.Reading(times, omega.clip(-35, 35), force.clip(-reach, reach))
     return reading, rate
 
 
 def cases(count, seed):
-    """Simulate `count` throws."""
+    """Simulate `count` trials."""
     rng = np.random.default_rng(seed)
-    throws = Throws(rng, count)
-    fine, rates, changes, forces = motions(rng, throws)
+    trials = Trials(rng, count)
+    fine, rates, changes, forces = motions(rng, trials)
     made = []
     for i in range(count):
-        spun_up = np.clip((fine - throws.wheel_on[i]) / throws.wheel_time[i], 0, 1)
-        vibration = throws.vibration[i] * spun_up
+        spun_up = np.clip((fine - trials.wheel_on[i]) / trials.wheel_time[i], 0, 1)
+        vibration = trials.vibration[i] * spun_up
         of_one = (rates[:, i], changes[:, i], forces[:, i])
-        frequency = throws.vibration_frequency[i]
+        frequency = trials.vibration_frequency[i]
         reading, rate = read_by_sensors(rng, fine, *of_one, vibration, frequency)
-        flights = [(float(throws.release[i]), float(throws.contact[i]))]
-        if throws.bounces[i]:
-            second = throws.contact[i] + throws.bounce_width[i]
-            flights.append((float(second), float(throws.catch[i])))
-        spin = float(np.linalg.norm(throws.spin[i]))
-        case = Case(reading, flights, rate, spin, bool(throws.has_wheel[i]), len(flights) > 1)
+        flights = [(float(trials.release[i]), float(trials.contact[i]))]
+        if trials.bounces[i]:
+            second = trials.contact[i] + trials.bounce_width[i]
+            flights.append((float(second), float(trials.catch[i])))
+        spin = float(np.linalg.norm(trials.spin[i]))
+        case = Case(
+            reading, flights, rate, spin, bool(trials.has_wheel[i]), len(flights) > 1
+        )
         made.append(case)
     return made
 
@@ -347,8 +358,10 @@ GROUPS = {
 
 def main():
     parser = common.arguments(__doc__)
-    parser.add_argument("--count", type=int, default=400, help="throws")
-    parser.add_argument("--seed", type=int, default=7, help="0 and 1 were used for tuning")
+    parser.add_argument("--count", type=int, default=400, help="trials")
+    parser.add_argument(
+        "--seed", type=int, default=7, help="0 and 1 were used for tuning"
+    )
     parser.add_argument("--by", nargs="+", default=["forces", "momentum"])
     given = parser.parse_args()
     made = cases(given.count, given.seed)
@@ -363,7 +376,7 @@ def main():
         print(f"{by}: {each:.0f} ms a record", flush=True)
     header = [
         "by",
-        "throws",
+        "trials",
         "flights",
         "missed %",
         "false",
@@ -375,9 +388,9 @@ def main():
         "with contact %",
     ]
     about = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:]]
-    about.append(f"{given.count} throws, seed {given.seed}.")
+    about.append(f"{given.count} trials, seed {given.seed}.")
     text = "\n\n".join([*about, common.table(header, rows)])
-    title = "Flights found in simulated throws"
+    title = "Flights found in simulated trials"
     common.report("flights", title, text, ("jax", "numpy"), given.write)
 
 

@@ -1,11 +1,11 @@
 """The exact free flow beside integrators, and the elliptic functions beside scipy's.
 
-10,000 random bodies to T = 100 (and to 10^6 turns), I = (1, 2, 3), omega standard normal: final
-attitude and omega, their Jacobian and a gradient; one body at 1000 times. Peers: heyoka's batch
-Taylor integrator (one thread, the widest vectors it recommends; `pip install heyoka`) and
-hand-written diffrax. Errors against the 30-digit closed form of tests/free_reference.py, on 50
-bodies. "Thread for thread": run as `taskset -c 0 python benchmarks/bench_free.py`, so that no
-contender has a second core.
+10,000 random bodies to T = 100 (and to 10^6 turns), I = (1, 2, 3), omega standard
+normal: final attitude and omega, their Jacobian and a gradient; one body at 1000 times.
+Peers: heyoka's batch Taylor integrator (one thread, the widest vectors it recommends;
+`pip install heyoka`) and hand-written diffrax. Errors against the 30-digit closed form
+of tests/free_reference.py, on 50 bodies. "Thread for thread": run as
+`taskset -c 0 python benchmarks/bench_free.py`, so that no contender has a second core.
 """
 
 import pathlib
@@ -65,7 +65,9 @@ def hessian_vector(x, t):
 def error(states):
     """Largest error of attitude and omega over the first bodies."""
     worst = 0.0
-    for omega, found in zip(OMEGAS[:CHECKED], np.asarray(states)[:CHECKED], strict=True):
+    for omega, found in zip(
+        OMEGAS[:CHECKED], np.asarray(states)[:CHECKED], strict=True
+    ):
         ((q, w),) = free_reference.free_motion(MOMENTS, ATTITUDE, omega, [END])
         exact = np.array([*q, *w], float)
         exact[:4] *= np.sign(exact[:4] @ found[:4])
@@ -111,12 +113,25 @@ def main(write: bool) -> None:
     found = common.timed(cases, repeats=9)
     value = found["value, T = 100"][0]
     for name, (least, median, answer) in found.items():
-        worst = error(answer) if name == "value, T = 100" or name.startswith("heyoka") else None
+        worst = (
+            error(answer)
+            if name == "value, T = 100" or name.startswith("heyoka")
+            else None
+        )
         rows.append(
-            [f"10,000 bodies: {name}", compile_ms[name], least, median, least / value, worst]
+            [
+                f"10,000 bodies: {name}",
+                compile_ms[name],
+                least,
+                median,
+                least / value,
+                worst,
+            ]
         )
 
-    program, ms = common.compiled(jax.vmap(lambda x: peers.by_diffrax(rates, x, END)), STARTS)
+    program, ms = common.compiled(
+        jax.vmap(lambda x: peers.by_diffrax(rates, x, END)), STARTS
+    )
     start = time.perf_counter()
     answer = jax.block_until_ready(program(STARTS))
     once = (time.perf_counter() - start) * 1e3
@@ -127,11 +142,22 @@ def main(write: bool) -> None:
     one = INPUTS[0]
     add("value", final, one, TIMES)
     add("Jacobian, six columns", jax.jacfwd(final), one, TIMES)
-    add("reverse gradient", jax.grad(lambda x, t: jnp.sum(final(x, t) ** 3)), one, TIMES)
+    add(
+        "reverse gradient", jax.grad(lambda x, t: jnp.sum(final(x, t) ** 3)), one, TIMES
+    )
     found = common.timed(cases, repeats=31)
     for name, (least, median, _) in found.items():
         ratio = least / found["value"][0]
-        rows.append([f"one body, 1000 times: {name}", compile_ms[name], least, median, ratio, None])
+        rows.append(
+            [
+                f"one body, 1000 times: {name}",
+                compile_ms[name],
+                least,
+                median,
+                ratio,
+                None,
+            ]
+        )
 
     cases = {}
     u, m = np.random.default_rng(1).uniform(size=(2, BODIES)) * [[10.0], [1.0]]
@@ -146,10 +172,19 @@ def main(write: bool) -> None:
     for name, (least, median, answer) in found.items():
         worst = None
         if name == "sn, cn, dn":
-            worst = float(np.max(np.abs(np.stack(answer) - np.stack(found["scipy"][2]))))
+            worst = float(
+                np.max(np.abs(np.stack(answer) - np.stack(found["scipy"][2])))
+            )
         ratio = least / found["scipy"][0]
         rows.append(
-            [f"ellipj, 10,000 lanes: {name}", compile_ms.get(name), least, median, ratio, worst]
+            [
+                f"ellipj, 10,000 lanes: {name}",
+                compile_ms.get(name),
+                least,
+                median,
+                ratio,
+                worst,
+            ]
         )
 
     header = ["what", "compile ms", "min ms", "median ms", "of the value", "error"]

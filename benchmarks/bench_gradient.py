@@ -57,7 +57,9 @@ def beside_diffrax(work, sizes):
         return first.relative_error(outputs, reference, fewest)
 
     error = error_of(ours(*inputs(fewest)))
-    near = first.enclosing(lambda exponent: error_of(peer(10.0**-exponent, *inputs(fewest))), error)
+    near = first.enclosing(
+        lambda exponent: error_of(peer(10.0**-exponent, *inputs(fewest))), error
+    )
     rows = []
     for lanes in sizes:
         given = inputs(lanes)
@@ -101,7 +103,9 @@ def main():
     rows = [row for x in first.WORKS.values() for row in beside_diffrax(x, sizes)]
     text += "\n\n" + common.table(header, rows)
     packages = ["jax", "diffrax", "equinox", "numpy"]
-    common.report_by_jax("gradient", "Run times of gradients", text, packages, options.write)
+    common.report_by_jax(
+        "gradient", "Run times of gradients", text, packages, options.write
+    )
 
 
 if __name__ == "__main__":

@@ -3,12 +3,13 @@
     taskset -c 0 python benchmarks/bench_lanes.py [--write] [--lanes N]
     python benchmarks/bench_lanes.py --memory 100000
 
-I = (1, 2, 3), weight 1, lever (0.3, 0.1, 0.5), rates normal with unit variance. `jax.vmap` of
-`jrigid.simulate`, of a hand-written `diffeqsolve` (Dopri8), heyoka's batch integrator in the same
-variables (quaternion and rates) and in Euler-Poisson's. Then lanes that are not alike: rates over a
-factor of 20, beside the sum of what each of four kinds takes alone; one lane that fails at once and
-one that needs a hundred times the steps; gradients and Jacobians in the three moments; two devices
-of one process. Run it on one core: heyoka is timed on one thread.
+I = (1, 2, 3), weight 1, lever (0.3, 0.1, 0.5), rates normal with unit variance.
+`jax.vmap` of `jrigid.simulate`, of a hand-written `diffeqsolve` (Dopri8), heyoka's
+batch integrator in the same variables (quaternion and rates) and in Euler-Poisson's.
+Then lanes that are not alike: rates over a factor of 20, beside the sum of what each of
+four kinds takes alone; one lane that fails at once and one that needs a hundred times
+the steps; gradients and Jacobians in the three moments; two devices of one process. Run
+it on one core: heyoka is timed on one thread.
 """
 
 import os
@@ -31,7 +32,8 @@ import jrigid as jr
 MOMENTS, LEVER, END = (1.0, 2.0, 3.0), (0.3, 0.1, 0.5), 100.0
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 BODY = jr.RigidBody(
-    np.array(MOMENTS), jr.torques.UniformGravity(1.0, np.array(LEVER), np.array([0.0, 0.0, -1.0]))
+    np.array(MOMENTS),
+    jr.torques.UniformGravity(1.0, np.array(LEVER), np.array([0.0, 0.0, -1.0])),
 )
 REPEATS = 3
 
@@ -43,7 +45,9 @@ def cross(a, b):
 def spin_up(w, up):
     """Euler's equations for symbols or numbers."""
     first = cross([m * x for m, x in zip(MOMENTS, w, strict=True)], w)
-    return [(a + b) / m for a, b, m in zip(first, cross(up, LEVER), MOMENTS, strict=True)]
+    return [
+        (a + b) / m for a, b, m in zip(first, cross(up, LEVER), MOMENTS, strict=True)
+    ]
 
 
 def by_poisson(*z):
@@ -86,10 +90,14 @@ def ours(rtol):
 def by_hand(omega, tolerance):
     solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _t, y, _args: jnp.stack(by_quaternion(*y))),
-        diffrax.Dopri8(), 0.0, END, 0.01, jnp.concatenate([omega, jnp.asarray(UPRIGHT)]),
+        diffrax.Dopri8(),
+        0.0,
+        END,
+        0.01,
+        jnp.concatenate([omega, jnp.asarray(UPRIGHT)]),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
         max_steps=100_000,
-    )  # fmt: skip
+    )
     return solution.ys[0]
 
 
@@ -117,18 +125,25 @@ def one_size(lanes):
         compile_ms, least, (state, steps) = seconds(ours(rtol), w0)
         error = energy_error(np.asarray(state.omega), up_in_body(state.attitude), w0)
         each = 1e6 * least / float(jnp.sum(steps))
-        rows.append([f"vmap(jrigid.simulate), rtol {rtol:g}", compile_ms, least, each, error])
+        rows.append(
+            [f"vmap(jrigid.simulate), rtol {rtol:g}", compile_ms, least, each, error]
+        )
     for tolerance in (1e-9, 1e-11):
         some = w0[: lanes // 10]
         program = jax.jit(jax.vmap(lambda w, x=tolerance: by_hand(w, x)))
         compile_ms, least, ends = seconds(program, some)
         ends = np.asarray(ends)
         error = energy_error(ends[:, :3], up_in_body(ends[:, 3:]), some)
-        name = f"vmap of hand-written diffrax, Dopri8, {tolerance:g} (ten times a tenth)"
+        name = (
+            f"vmap of hand-written diffrax, Dopri8, {tolerance:g} (ten times a tenth)"
+        )
         rows.append([name, compile_ms, 10 * least, None, error])
     up = np.tile([0.0, 0.0, 1.0], (lanes, 1))
     starts = {
-        "quaternion": (by_quaternion, np.concatenate([w0, np.tile(UPRIGHT, (lanes, 1))], 1)),
+        "quaternion": (
+            by_quaternion,
+            np.concatenate([w0, np.tile(UPRIGHT, (lanes, 1))], 1),
+        ),
         "Euler-Poisson": (by_poisson, np.concatenate([w0, up], 1)),
     }
     for name, (rates, begin) in starts.items():
@@ -139,7 +154,15 @@ def one_size(lanes):
             _, least, end = seconds(case)
             up = up_in_body(end[:, 3:]) if name == "quaternion" else end[:, 3:]
             error = energy_error(end[:, :3], up, w0)
-            rows.append([f"heyoka, batch, {name}, {tolerance:g}", compile_ms, least, None, error])
+            rows.append(
+                [
+                    f"heyoka, batch, {name}, {tolerance:g}",
+                    compile_ms,
+                    least,
+                    None,
+                    error,
+                ]
+            )
     return rows
 
 
@@ -148,16 +171,26 @@ def unlike(lanes):
     w0 = np.random.default_rng(1).normal(size=(lanes, 3))
     run = ours(1e-8)
     plain = seconds(run, w0)[1]
-    kinds = [seconds(run, factor * w0[k::4])[1] for k, factor in enumerate((1.0, 3.0, 9.0, 20.0))]
+    kinds = [
+        seconds(run, factor * w0[k::4])[1]
+        for k, factor in enumerate((1.0, 3.0, 9.0, 20.0))
+    ]
     mixed = w0 * np.tile([1.0, 3.0, 9.0, 20.0], lanes // 4)[:, None]
     rows = [
-        ["rates over a factor of 20", seconds(run, mixed)[1], sum(kinds), "sum of four kinds alone"]
+        [
+            "rates over a factor of 20",
+            seconds(run, mixed)[1],
+            sum(kinds),
+            "sum of four kinds alone",
+        ]
     ]
     bad, slow = w0.copy(), w0.copy()
     bad[7], slow[7] = np.nan, 300.0
     alone = seconds(run, np.tile(slow[7:8], (8, 1)))[1]
     rows.append(["one lane fails at once", seconds(run, bad)[1], plain, "without it"])
-    rows.append(["one lane needs 100 times the steps", seconds(run, slow)[1], alone, "it alone"])
+    rows.append(
+        ["one lane needs 100 times the steps", seconds(run, slow)[1], alone, "it alone"]
+    )
     return [[*x[:2], x[1] / x[2], x[3]] for x in rows]
 
 
@@ -168,7 +201,9 @@ def derivatives(lanes):
     def end(moments, omega, adjoint=None):
         body = jr.RigidBody(moments, BODY.torque)
         state = jr.State(UPRIGHT, omega)
-        return jr.simulate(body, state, END, adjoint=adjoint, throw=False).final_state.omega
+        return jr.simulate(
+            body, state, END, adjoint=adjoint, throw=False
+        ).final_state.omega
 
     def gradient(moments, omega):
         return jax.grad(lambda x: end(x, omega)[0])(moments)
@@ -179,7 +214,11 @@ def derivatives(lanes):
     rows = []
     for name, starts in (("one", w0[0]), (str(lanes), w0)):
         value = 1.0
-        for what, function in (("value", end), ("gradient", gradient), ("Jacobian", jacobian)):
+        for what, function in (
+            ("value", end),
+            ("gradient", gradient),
+            ("Jacobian", jacobian),
+        ):
             one = lambda omega, f=function: f(jnp.asarray(MOMENTS), omega)  # noqa: E731
             program = jax.jit(one if starts.ndim == 1 else jax.vmap(one))
             compile_ms, least, _ = seconds(program, starts)
@@ -201,11 +240,17 @@ def on_two_devices(lanes):
     """What a process with two devices says."""
     done = subprocess.run(
         [sys.executable, "-c", f"import bench_lanes; bench_lanes.sharded({lanes})"],
-        env=os.environ | {"JAX_NUM_CPU_DEVICES": "2"}, cwd=pathlib.Path(__file__).parent,
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        env=os.environ | {"JAX_NUM_CPU_DEVICES": "2"},
+        cwd=pathlib.Path(__file__).parent,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     one, two = map(float, done.stdout.split())
-    return [["one device", one, 1.0], ["two devices, by `jax.shard_map`", two, two / one]]
+    return [
+        ["one device", one, 1.0],
+        ["two devices, by `jax.shard_map`", two, two / one],
+    ]
 
 
 def memory(lanes):
@@ -226,7 +271,13 @@ def memory(lanes):
 
 def main(lanes, write):
     text = common.table(
-        [f"{lanes} heavy asymmetric tops", "compile ms", "min ms", "ns a step", "energy, median"],
+        [
+            f"{lanes} heavy asymmetric tops",
+            "compile ms",
+            "min ms",
+            "ns a step",
+            "energy, median",
+        ],
         one_size(lanes),
     )
     header = [f"{lanes // 5 // 4 * 4} of them", "min ms", "ratio", "to"]
@@ -242,7 +293,9 @@ def main(lanes, write):
 if __name__ == "__main__":
     parser = common.arguments(__doc__)
     parser.add_argument("--lanes", type=int, default=10_000)
-    parser.add_argument("--memory", type=int, help="peak memory of so many gradients, alone")
+    parser.add_argument(
+        "--memory", type=int, help="peak memory of so many gradients, alone"
+    )
     options = parser.parse_args()
     if options.memory:
         memory(options.memory)

@@ -2,9 +2,9 @@
 
     python benchmarks/bench_mass.py [--write] [--points N] [--around N]
 
-Compile time, value and gradient apart; minimum and median of repeats, the peers in the same run and
-interleaved with ours; beside each time the relative error, against sums in extended precision.
-`--write` stores the table in benchmarks/results/mass.md.
+Compile time, value and gradient apart; minimum and median of repeats, the peers in the
+same run and interleaved with ours; beside each time the relative error, against sums in
+extended precision. `--write` stores the table in benchmarks/results/mass.md.
 """
 
 from typing import Any
@@ -26,14 +26,22 @@ def inertia_of(second: np.ndarray) -> np.ndarray:
 
 def torus(around: int, across: int) -> tuple[np.ndarray, np.ndarray]:
     """A closed mesh of 2 x around x across faces: a lumpy, tilted torus, off the origin."""
-    i, j = (x.ravel() for x in np.meshgrid(np.arange(around), np.arange(across), indexing="ij"))
+    i, j = (
+        x.ravel()
+        for x in np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    )
     u, v = 2 * np.pi * i / around, 2 * np.pi * j / across
     ring = 1 + (0.4 + 0.1 * np.cos(3 * u)) * np.cos(v)
     vertices = np.stack([ring * np.cos(u), 0.8 * ring * np.sin(u), 0.5 * np.sin(v)], 1)
     vertices[:, 2] += 0.3 * vertices[:, 0]
     here, right = i * across + j, (i + 1) % around * across + j
-    up, both = i * across + (j + 1) % across, (i + 1) % around * across + (j + 1) % across
-    faces = np.concatenate([np.stack([here, right, both], 1), np.stack([here, both, up], 1)])
+    up, both = (
+        i * across + (j + 1) % across,
+        (i + 1) % around * across + (j + 1) % across,
+    )
+    faces = np.concatenate(
+        [np.stack([here, right, both], 1), np.stack([here, both, up], 1)]
+    )
     return vertices + np.array([0.3, -0.2, 0.1]), faces
 
 
@@ -41,7 +49,9 @@ def points_numpy(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
     return inertia_of((masses[:, None] * positions).T @ positions)
 
 
-def points_gradient_numpy(masses: np.ndarray, positions: np.ndarray, weight: np.ndarray) -> Any:
+def points_gradient_numpy(
+    masses: np.ndarray, positions: np.ndarray, weight: np.ndarray
+) -> Any:
     core = np.trace(weight) * np.eye(3, dtype=weight.dtype) - weight
     turned = positions @ core
     return np.sum(turned * positions, axis=1), 2 * masses[:, None] * turned
@@ -75,7 +85,11 @@ def bench_points(count: int, dtype: Any) -> list[tuple]:
     m, r = jnp.asarray(masses), jnp.asarray(positions)
     value, compile_value = common.compiled(jr.inertia_tensor, m, r)
     gradient, compile_gradient = common.compiled(
-        jax.grad(lambda m, r: jnp.sum(jnp.asarray(weight) * jr.inertia_tensor(m, r)), (0, 1)), m, r
+        jax.grad(
+            lambda m, r: jnp.sum(jnp.asarray(weight) * jr.inertia_tensor(m, r)), (0, 1)
+        ),
+        m,
+        r,
     )
     body, compile_body = common.compiled(jr.from_points, m, r)
     values = common.timed(
@@ -98,18 +112,35 @@ def bench_points(count: int, dtype: Any) -> list[tuple]:
     symmetric = (weight + weight.T) / 2
     exact_gradient = points_gradient_numpy(long_m, long_r, symmetric)[1]
     what = f"{count} points, {np.dtype(dtype).name}"
-    compile_times = {"jrigid.inertia_tensor": compile_value, "jrigid.from_points": compile_body}
+    compile_times = {
+        "jrigid.inertia_tensor": compile_value,
+        "jrigid.from_points": compile_body,
+    }
     rows = [
-        (what, "value", name, compile_times.get(name), low, mid,
-         error(answer, exact_body if "from" in name else exact))
+        (
+            what,
+            "value",
+            name,
+            compile_times.get(name),
+            low,
+            mid,
+            error(answer, exact_body if "from" in name else exact),
+        )
         for name, (low, mid, answer) in values.items()
-    ]  # fmt: skip
+    ]
     hand = points_gradient_numpy(masses, positions, symmetric.astype(dtype))[1]
     rows += [
-        (what, "gradient", name, compile_gradient if "jrigid" in name else None, low, mid,
-         error(answer[1] if "jrigid" in name else hand, exact_gradient))
+        (
+            what,
+            "gradient",
+            name,
+            compile_gradient if "jrigid" in name else None,
+            low,
+            mid,
+            error(answer[1] if "jrigid" in name else hand, exact_gradient),
+        )
         for name, (low, mid, answer) in gradients.items()
-    ]  # fmt: skip
+    ]
     return rows
 
 
@@ -124,15 +155,17 @@ def bench_mesh(around: int) -> list[tuple]:
         return jr.from_mesh(v, faces).inertia
 
     value, compile_value = common.compiled(body, v)
-    gradient, compile_gradient = common.compiled(jax.grad(lambda v: jnp.sum(weight * body(v))), v)
+    gradient, compile_gradient = common.compiled(
+        jax.grad(lambda v: jnp.sum(weight * body(v))), v
+    )
     values = common.timed(
         {
             "jrigid.from_mesh, jit": lambda: value(v),
             "jrigid.from_mesh, eager with its checks": lambda: body(v),
             "numpy": lambda: mesh_numpy(vertices, faces),
-            "trimesh.triangles.mass_properties": lambda: trimesh.triangles.mass_properties(
-                vertices[faces]
-            )["inertia"],
+            "trimesh.triangles.mass_properties": lambda: (
+                trimesh.triangles.mass_properties(vertices[faces])["inertia"]
+            ),
             "trimesh.Trimesh(...).moment_inertia": lambda: (
                 trimesh.Trimesh(vertices, faces, process=False).moment_inertia
             ),
@@ -142,22 +175,45 @@ def bench_mesh(around: int) -> list[tuple]:
     exact = mesh_exact(vertices, faces)
     what = f"mesh of {len(faces)} faces, float64"
     rows = [
-        (what, "value", name, compile_value if "jit" in name else None, low, mid,
-         error(answer, exact))
+        (
+            what,
+            "value",
+            name,
+            compile_value if "jit" in name else None,
+            low,
+            mid,
+            error(answer, exact),
+        )
         for name, (low, mid, answer) in values.items()
-    ]  # fmt: skip
+    ]
     low, mid, answer = gradients["jrigid.from_mesh, jit"]
-    # Along a dilation about the origin of a body about its centre, dI = 5 I: an exact check.
+    # Along a dilation about the origin of a body about its centre, dI = 5 I: an exact
+    # check.
     along = float(np.sum(np.asarray(answer) * vertices))
     wanted = float(5 * np.sum(np.asarray(weight) * exact))
     rows.append(
-        (what, "gradient", "jrigid.from_mesh, jit", compile_gradient, low, mid,
-         abs(along - wanted) / np.sum(np.abs(np.asarray(answer) * vertices)))
-    )  # fmt: skip
+        (
+            what,
+            "gradient",
+            "jrigid.from_mesh, jit",
+            compile_gradient,
+            low,
+            mid,
+            abs(along - wanted) / np.sum(np.abs(np.asarray(answer) * vertices)),
+        )
+    )
     return rows
 
 
-HEADER = ("problem", "what", "who", "compile ms", "min ms", "median ms", "relative error")
+HEADER = (
+    "problem",
+    "what",
+    "who",
+    "compile ms",
+    "min ms",
+    "median ms",
+    "relative error",
+)
 
 
 def main() -> None:
@@ -165,10 +221,14 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=10**6)
     parser.add_argument("--around", type=int, default=250)
     options = parser.parse_args()
-    rows = bench_points(options.points, np.float64) + bench_points(options.points, np.float32)
+    rows = bench_points(options.points, np.float64) + bench_points(
+        options.points, np.float32
+    )
     rows += bench_mesh(options.around)
     text = common.table(HEADER, rows)
-    common.report("mass", "Mass properties", text, ("jax", "numpy", "trimesh"), options.write)
+    common.report(
+        "mass", "Mass properties", text, ("jax", "numpy", "trimesh"), options.write
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """The posterior of a fit by blackjax beside its linear errors and its intervals: where they agree.
 
-Three bodies, one record each of 200 rates in ten turns: a plain one, one of nearly equal moments
-and one that is nearly flat. NUTS starts at the fit, its mass matrix is the inverse of the fit's
-covariance; two chains. The prior is flat in the tensor. Needs blackjax (`make bench` installs it).
+Three bodies, one record each of 200 rates in ten turns: a plain one, one of nearly
+equal moments and one that is nearly flat. NUTS starts at the fit, its mass matrix is
+the inverse of the fit's covariance; two chains. The prior is flat in the tensor. Needs
+blackjax (`make bench` installs it).
 """
 
 import importlib
@@ -48,7 +49,9 @@ def record(moments, noise, spin, rng):
 def sampled(found, key, size):
     """Numbers of the tensor (chains, draws, ...), and how many draws they are worth."""
     density = log_density(found)
-    kernel = blackjax.nuts(jax.jit(density.function), size, np.asarray(density.covariance))
+    kernel = blackjax.nuts(
+        jax.jit(density.function), size, np.asarray(density.covariance)
+    )
 
     @jax.jit
     def chain(key):
@@ -62,7 +65,11 @@ def sampled(found, key, size):
 
     positions, divergent = jax.lax.map(chain, jax.random.split(key, CHAINS))
     worth = blackjax.diagnostics.effective_sample_size(positions)
-    return positions[..., : found.numbers.size], float(worth.min()), float(divergent.max())
+    return (
+        positions[..., : found.numbers.size],
+        float(worth.min()),
+        float(divergent.max()),
+    )
 
 
 def main(write: bool) -> None:
@@ -70,14 +77,21 @@ def main(write: bool) -> None:
     if blackjax is None:
         print("blackjax is not installed: nothing to compare with")
         return
-    rows, (figure, axes) = [], plt.subplots(1, len(CASES), figsize=(12, 4), layout="constrained")
+    rows, (figure, axes) = (
+        [],
+        plt.subplots(1, len(CASES), figsize=(12, 4), layout="constrained"),
+    )
     for index, (name, (moments, noise, spin, size)) in enumerate(CASES.items()):
         rng = np.random.default_rng([7, index])
-        found = fit(jr.RigidBody(np.ones(3)), record(moments, noise, spin, rng), throw=False)
+        found = fit(
+            jr.RigidBody(np.ones(3)), record(moments, noise, spin, rng), throw=False
+        )
         start = time.perf_counter()
         numbers, worth, divergent = sampled(found, jax.random.key(index), size)
         seconds = time.perf_counter() - start
-        tensors = jax.vmap(found.unknowns.inertia)(numbers.reshape(-1, found.numbers.size))
+        tensors = jax.vmap(found.unknowns.inertia)(
+            numbers.reshape(-1, found.numbers.size)
+        )
         spread = jnp.linalg.eigvalsh(tensors)
         ratios = np.asarray(spread[:, 1:] / spread[:, :1])
         low, high = np.asarray(found.ratios_intervals)
@@ -85,22 +99,43 @@ def main(write: bool) -> None:
         true = np.array(moments)[1:] / moments[0]
         for i, label in enumerate(("I2/I1", "I3/I1")):
             quantiles = np.quantile(ratios[:, i], [0.025, 0.975])
-            rows.append([
-                f"{name}, {label}", float(true[i]), f"{best[i]:.5f} +- {error[i]:.5f}",
-                f"{low[i]:.5f} to {high[i]:.5f}", f"{quantiles[0]:.5f} to {quantiles[1]:.5f}",
-                float(ratios[:, i].std() / error[i]), worth, 100 * divergent, seconds,
-            ])  # fmt: skip
+            rows.append(
+                [
+                    f"{name}, {label}",
+                    float(true[i]),
+                    f"{best[i]:.5f} +- {error[i]:.5f}",
+                    f"{low[i]:.5f} to {high[i]:.5f}",
+                    f"{quantiles[0]:.5f} to {quantiles[1]:.5f}",
+                    float(ratios[:, i].std() / error[i]),
+                    worth,
+                    100 * divergent,
+                    seconds,
+                ]
+            )
             print(rows[-1], flush=True)
         draw(axes[index], name, ratios, found, true, (low, high))
-    header = ["body, ratio", "true", "fit, by derivatives", "`ratios_intervals`, 95 %",
-              "posterior, 95 %", "its spread to the error", "draws it is worth", "divergent %",
-              "s"]  # fmt: skip
+    header = [
+        "body, ratio",
+        "true",
+        "fit, by derivatives",
+        "`ratios_intervals`, 95 %",
+        "posterior, 95 %",
+        "its spread to the error",
+        "draws it is worth",
+        "divergent %",
+        "s",
+    ]
     if write:
         PICTURE.parent.mkdir(exist_ok=True)
         figure.savefig(PICTURE, dpi=120)
-    text = common.table(header, rows) + "\n\n![posteriors](../../docs/images/posterior.png)"
+    text = (
+        common.table(header, rows)
+        + "\n\n![posteriors](../../docs/images/posterior.png)"
+    )
     packages = ["jax", "blackjax", "numpy", "matplotlib"]
-    common.report("posterior", "Posteriors of the ratios by NUTS", text, packages, write)
+    common.report(
+        "posterior", "Posteriors of the ratios by NUTS", text, packages, write
+    )
 
 
 def draw(axis, name, ratios, found, true, limits):
@@ -114,8 +149,13 @@ def draw(axis, name, ratios, found, true, limits):
     for i, line in ((0, axis.axvline), (1, axis.axhline)):
         for limit in limits:
             style = {"color": "#D55E00", "lw": 1, "ls": "--"}
-            line(limit[i], label="`ratios_intervals`" if (i, limit[i]) == (0, limits[0][0])
-                 else None, **style)  # fmt: skip
+            line(
+                limit[i],
+                label="`ratios_intervals`"
+                if (i, limit[i]) == (0, limits[0][0])
+                else None,
+                **style,
+            )
     axis.plot(*true, "k+", ms=12, mew=2, label="true")
     axis.set(title=name, xlabel="$I_2/I_1$", ylabel="$I_3/I_1$")
     if name == "plain":

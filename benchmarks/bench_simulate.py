@@ -1,7 +1,8 @@
 """One simulate() call and its gradient, beside scipy's solve_ivp and hand-written diffrax.
 
-A tumbling body, I = (1, 2, 3), 100 turns. Beside each time stands the error, against a run at the
-tightest tolerance: contenders are to be compared at equal error, not at equal rtol.
+A tumbling body, I = (1, 2, 3), 100 turns. Beside each time stands the error, against a
+run at the tightest tolerance: contenders are to be compared at equal error, not at
+equal rtol.
 """
 
 import functools
@@ -24,7 +25,11 @@ END = float(200 * np.pi / np.linalg.norm(OMEGA))
 def ours(rtol, adjoint=None):
     def final(omega):
         trajectory = jr.simulate(
-            jr.RigidBody(MOMENTS), jr.State(ATTITUDE, omega), END, rtol=rtol, adjoint=adjoint
+            jr.RigidBody(MOMENTS),
+            jr.State(ATTITUDE, omega),
+            END,
+            rtol=rtol,
+            adjoint=adjoint,
         )
         return jnp.concatenate([trajectory.states.attitude, trajectory.states.omega])
 
@@ -55,10 +60,17 @@ def by_hand(rtol, adjoint=None):
     def final(omega):
         y0 = jnp.concatenate([jnp.asarray(ATTITUDE), omega])
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, END, 0.01, y0, jnp.asarray(MOMENTS),
+            diffrax.ODETerm(field),
+            diffrax.Dopri8(),
+            0.0,
+            END,
+            0.01,
+            y0,
+            jnp.asarray(MOMENTS),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-            adjoint=adjoint, max_steps=2**17,
-        )  # fmt: skip
+            adjoint=adjoint,
+            max_steps=2**17,
+        )
         return jnp.asarray(solution.ys)[0]
 
     return final
@@ -114,7 +126,9 @@ def main():
     options = common.arguments(__doc__).parse_args()
     omega = jnp.asarray(OMEGA)
     exact = np.asarray(jax.jit(ours(1e-14))(omega))
-    exact_jacobian = np.asarray(jax.jit(jax.jacfwd(ours(1e-13, diffrax.ForwardMode())))(omega))
+    exact_jacobian = np.asarray(
+        jax.jit(jax.jacfwd(ours(1e-13, diffrax.ForwardMode())))(omega)
+    )
     compile_times, cases = {}, {"value": {}, "gradient": {}, "Jacobian": {}}
     for name, make, rtol in CONTENDERS:
         programs = {
@@ -130,24 +144,40 @@ def main():
     for rtol in (1e-8, 1e-11):
         final, name = scipy_final(rtol), f"scipy solve_ivp, DOP853, rtol {rtol:.0e}"
         cases["value"][name] = lambda final=final: final(OMEGA)
-        cases["Jacobian"][f"{name}, six differences"] = lambda final=final: differences(final)
+        cases["Jacobian"][f"{name}, six differences"] = lambda final=final: differences(
+            final
+        )
     rows = []
     for what, contenders in cases.items():
         for name, (low, middle, answer) in common.timed(contenders, repeats=9).items():
             if what == "value":
                 off = error(answer, exact)
             elif what == "gradient":
-                off = np.linalg.norm(answer - exact_jacobian[4]) / np.linalg.norm(exact_jacobian[4])
+                off = np.linalg.norm(answer - exact_jacobian[4]) / np.linalg.norm(
+                    exact_jacobian[4]
+                )
             else:
-                columns = np.asarray(answer) if "scipy" not in name else np.stack(answer, axis=1)
-                off = np.linalg.norm(columns - exact_jacobian) / np.linalg.norm(exact_jacobian)
-            rows.append((what, name, compile_times.get((what, name)), low, middle, float(off)))
+                columns = (
+                    np.asarray(answer)
+                    if "scipy" not in name
+                    else np.stack(answer, axis=1)
+                )
+                off = np.linalg.norm(columns - exact_jacobian) / np.linalg.norm(
+                    exact_jacobian
+                )
+            rows.append(
+                (what, name, compile_times.get((what, name)), low, middle, float(off))
+            )
     header = ["what", "who", "compile ms", "min ms", "median ms", "error"]
     text = "100 turns of a tumbling body, I = (1, 2, 3), attitude and rates.\n\n"
     packages = ("jax", "diffrax", "numpy", "scipy")
     text += common.table(header, rows)
     common.report(
-        "simulate", "One call of simulate and its derivatives", text, packages, options.write
+        "simulate",
+        "One call of simulate and its derivatives",
+        text,
+        packages,
+        options.write,
     )
 
 

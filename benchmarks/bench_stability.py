@@ -1,15 +1,17 @@
 """Maps of stability: ten million linear points, and 128 x 128 motions told apart by MEGNO.
 
-Linear: the square of the growth rate about an axis over (I2/I1, I3/I1), against vectorised numpy;
-and DeBra and Delp's plane, growth rate and region. Peak memory of the same map in 20 blocks and in
-2, and of 20 blocks of a size against 2 blocks of that size, each in a process of its own.
+Linear: the square of the growth rate about an axis over (I2/I1, I3/I1), against
+vectorised numpy; and DeBra and Delp's plane, growth rate and region. Peak memory of the
+same map in 20 blocks and in 2, and of 20 blocks of a size against 2 blocks of that
+size, each in a process of its own.
 
-Nonlinear: a heavy top without symmetry (moments 1, 1.5, 0.7; lever 0.3, 0.1, 0.5; weight 1),
-released at a tilt about x with a spin about its third axis, 128 x 128 of them, followed to T = 200
-with one small motion beside each. Peers do the same in Euler-Poisson variables: heyoka's batch
-Taylor integrator with the small motion's equations written out, and with `var_ode_sys` (all six
-directions, which is what it offers); scipy's DOP853. From them only the growth at the end is taken.
-"Thread for thread": run as `taskset -c 0 python benchmarks/bench_stability.py`.
+Nonlinear: a heavy top without symmetry (moments 1, 1.5, 0.7; lever 0.3, 0.1, 0.5;
+weight 1), released at a tilt about x with a spin about its third axis, 128 x 128 of
+them, followed to T = 200 with one small motion beside each. Peers do the same in
+Euler-Poisson variables: heyoka's batch Taylor integrator with the small motion's
+equations written out, and with `var_ode_sys` (all six directions, which is what it
+offers); scipy's DOP853. From them only the growth at the end is taken. "Thread for
+thread": run as `taskset -c 0 python benchmarks/bench_stability.py`.
 """
 
 import subprocess
@@ -31,7 +33,8 @@ MOMENTS, LEVER = (1.0, 1.5, 0.7), (0.3, 0.1, 0.5)
 SIDE, END, STEPS = 128, 200.0, 800
 TILTS, SPINS = np.linspace(0.05, 3.1, SIDE), np.linspace(0.1, 4.0, SIDE)
 BODY = jr.RigidBody(
-    np.array(MOMENTS), jr.torques.UniformGravity(1.0, np.array(LEVER), np.array([0.0, 0.0, -1.0]))
+    np.array(MOMENTS),
+    jr.torques.UniformGravity(1.0, np.array(LEVER), np.array([0.0, 0.0, -1.0])),
 )
 BY_SCIPY = 6
 
@@ -56,10 +59,15 @@ def by_numpy(second, third):
 def linear():
     """Rows of ten million points."""
     axes = {"second": np.linspace(0.3, 3.0, 3200), "third": np.linspace(0.3, 3.0, 3200)}
-    plane = {"roll": np.linspace(-0.99, 0.99, 3200), "yaw": np.linspace(-0.99, 0.99, 3200)}
+    plane = {
+        "roll": np.linspace(-0.99, 0.99, 3200),
+        "yaw": np.linspace(-0.99, 0.99, 3200),
+    }
     size = 2**20
     maps = {
-        "growth rate squared": lambda: jr.stability.stability_map(square, axes, block_size=size),
+        "growth rate squared": lambda: jr.stability.stability_map(
+            square, axes, block_size=size
+        ),
         "satellite, rate and region": lambda: jr.stability.stability_map(
             satellite, plane, block_size=size
         ),
@@ -92,7 +100,9 @@ def peak_memory(side, block):
         f" block_size={block});"
         "print([x for x in open('/proc/self/status') if 'VmHWM' in x][0].split()[1])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     return float(done.stdout) / 1024
 
 
@@ -115,7 +125,9 @@ def rates(*z):
 
     pull, of_pull = cross(u, LEVER), cross(e, LEVER)  # lever x (-up)
     first = cross(momentum(w), w)
-    second = [x + y for x, y in zip(cross(momentum(d), w), cross(momentum(w), d), strict=True)]
+    second = [
+        x + y for x, y in zip(cross(momentum(d), w), cross(momentum(w), d), strict=True)
+    ]
     turn = [(a + b) / m for a, b, m in zip(first, pull, MOMENTS, strict=True)]
     of_turn = [(a + b) / m for a, b, m in zip(second, of_pull, MOMENTS, strict=True)]
     of_up = [x + y for x, y in zip(cross(e, w), cross(u, d), strict=True)]
@@ -127,7 +139,9 @@ def starts():
     tilt, spin = (x.reshape(-1) for x in np.meshgrid(TILTS, SPINS, indexing="ij"))
     zero, one = np.zeros_like(tilt), np.ones_like(tilt)
     up = [zero, np.sin(tilt), np.cos(tilt)]
-    return np.stack([zero, zero, spin, *up, 0.3 * one, 0.2 * one, 0.1 * one, one, zero, zero], 1)
+    return np.stack(
+        [zero, zero, spin, *up, 0.3 * one, 0.2 * one, 0.1 * one, one, zero, zero], 1
+    )
 
 
 def by_var_ode_sys(some):
@@ -136,7 +150,9 @@ def by_var_ode_sys(some):
 
     variables = hy.make_vars(*(f"x{i}" for i in range(6)))
     equations = rates(*variables, *([0.0] * 6))[:6]
-    system = hy.var_ode_sys(list(zip(variables, equations, strict=True)), hy.var_args.vars)
+    system = hy.var_ode_sys(
+        list(zip(variables, equations, strict=True)), hy.var_args.vars
+    )
     width = hy.recommended_simd_size()
     size = 6 + 36
     integrator = hy.taylor_adaptive_batch(
@@ -181,7 +197,9 @@ def nonlinear():
     if len(rows) > 1:
         some = begin[::64]
         taken = by_var_ode_sys(some) * len(begin) / len(some)
-        rows.append(["heyoka, var_ode_sys, 1e-9 (from a 64th)", None, taken, taken, None])
+        rows.append(
+            ["heyoka, var_ode_sys, 1e-9 (from a 64th)", None, taken, taken, None]
+        )
     rng = np.random.default_rng(0)
     start = time.perf_counter()
     for y in begin[rng.choice(lanes, BY_SCIPY, replace=False)]:
@@ -203,7 +221,9 @@ def main(write):
         ["2 blocks of 200,000 points", peak_memory(632, 200_000)],
         ["20 blocks of 200,000 points", peak_memory(side, 200_000)],
     ]
-    text += "\n\n" + common.table(["growth rate and region: peak memory", "MiB"], memory)
+    text += "\n\n" + common.table(
+        ["growth rate and region: peak memory", "MiB"], memory
+    )
     packages = ["jax", "diffrax", "numpy", "scipy"]
     if any("heyoka" in row[0] for row in rows):
         packages.append("heyoka")

@@ -1,14 +1,16 @@
 """Sweeps: 10^8 linear points streamed to a store, peers, memory, and what a block costs.
 
-The square of the growth rate about an axis, and DeBra and Delp's plane (growth rate and region),
-on a grid of 10,000 x 10,000: evaluated by vectorised numpy (in rows of blocks, nothing kept), by
-numba in parallel, by a loop over blocks of a jitted function, all dropping what they find; by
-`jrigid.sweep` to a store, and to one a twentieth as large. Each in a process of its own, whose peak
-memory is that of /proc. The store is written to the disk under TMPDIR; the page cache takes it.
+The square of the growth rate about an axis, and DeBra and Delp's plane (growth rate and
+region), on a grid of 10,000 x 10,000: evaluated by vectorised numpy (in rows of blocks,
+nothing kept), by numba in parallel, by a loop over blocks of a jitted function, all
+dropping what they find; by `jrigid.sweep` to a store, and to one a twentieth as large.
+Each in a process of its own, whose peak memory is that of /proc. The store is written
+to the disk under TMPDIR; the page cache takes it.
 
-Then what a block costs beside its work: blocks of about 50 ms in this process against a loop of the
-same calls, with and without a store, on one core; and empty blocks on a LocalCluster of two and in
-a pool of two processes. The most blocks ever run is `--many`.
+Then what a block costs beside its work: blocks of about 50 ms in this process against a
+loop of the same calls, with and without a store, on one core; and empty blocks on a
+LocalCluster of two and in a pool of two processes. The most blocks ever run is
+`--many`.
 """
 
 import json
@@ -45,8 +47,14 @@ def satellite(roll, yaw):
 
 def axes(function, side=SIDE):
     if function is square:
-        return {"second": np.linspace(0.3, 3.0, side), "third": np.linspace(0.3, 3.0, SIDE)}
-    return {"roll": np.linspace(-0.99, 0.99, side), "yaw": np.linspace(-0.99, 0.99, SIDE)}
+        return {
+            "second": np.linspace(0.3, 3.0, side),
+            "third": np.linspace(0.3, 3.0, SIDE),
+        }
+    return {
+        "roll": np.linspace(-0.99, 0.99, side),
+        "yaw": np.linspace(-0.99, 0.99, SIDE),
+    }
 
 
 def by_numpy(_):
@@ -97,9 +105,12 @@ def by_loop(function):
 def by_sweep(function, side=SIDE, store=True):
     with tempfile.TemporaryDirectory() as path:
         run = lambda place, side: jr.sweep(  # noqa: E731
-            function, axes(function, side), progress=False, block_size=ROWS * SIDE,
+            function,
+            axes(function, side),
+            progress=False,
+            block_size=ROWS * SIDE,
             store=place if store else None,
-        )  # fmt: skip
+        )
         run(Path(path) / "first", ROWS)
         yield
         done = run(Path(path) / "s", side)
@@ -127,7 +138,9 @@ def alone(name):
     start = time.perf_counter()
     next(case, None)
     seconds = time.perf_counter() - start
-    peak = next(x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
+    peak = next(
+        x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x
+    )
     print(json.dumps([seconds, int(peak.split()[1]) / 1024]))
 
 
@@ -142,7 +155,9 @@ def linear():
     rows = []
     for name, found in times.items():
         seconds, peaks = np.array(found).T
-        rows.append([name, seconds.min(), float(np.median(seconds)), f"{np.median(peaks):.0f}"])
+        rows.append(
+            [name, seconds.min(), float(np.median(seconds)), f"{np.median(peaks):.0f}"]
+        )
     return rows
 
 
@@ -170,12 +185,17 @@ def a_block(count=40, size=4096):
 
     cases = {
         "loop over jit": loop,
-        "jrigid.sweep": lambda: jr.sweep(work, {"x": x}, block_size=size, progress=False).valid,
+        "jrigid.sweep": lambda: (
+            jr.sweep(work, {"x": x}, block_size=size, progress=False).valid
+        ),
         "jrigid.sweep to a store": kept,
     }
     found = common.timed(cases, repeats=7)
     os.sched_setaffinity(0, cores)
-    return [[name, least / count, median / count] for name, (least, median, _) in found.items()]
+    return [
+        [name, least / count, median / count]
+        for name, (least, median, _) in found.items()
+    ]
 
 
 def empty(x):
@@ -191,8 +211,10 @@ def executors(count=400):
     client = Client(cluster)
     pool = ProcessPoolExecutor(2, mp_context=spawn)
     kinds = {
-        "in process": None, "pool of two": pool, "LocalCluster of two": client.get_executor(),
-    }  # fmt: skip
+        "in process": None,
+        "pool of two": pool,
+        "LocalCluster of two": client.get_executor(),
+    }
     rows = []
     for name, executor in kinds.items():
         for kept in (False, True):
@@ -202,9 +224,13 @@ def executors(count=400):
                 path = tempfile.mkdtemp()
                 start = time.perf_counter()
                 jr.sweep(
-                    empty, {"x": x}, executor=executor, block_size=16, progress=False,
+                    empty,
+                    {"x": x},
+                    executor=executor,
+                    block_size=16,
+                    progress=False,
                     store=f"{path}/s" if kept else None,
-                )  # fmt: skip
+                )
                 seconds.append((time.perf_counter() - start) / n * 1e3)
                 shutil.rmtree(path)
             where = f"{name}, {'to a store' if kept else 'results sent back'}"
@@ -237,9 +263,13 @@ if __name__ == "__main__":
         sys.exit()
     text = [
         common.table(["10^8 points", "min s", "median s", "peak MiB"], linear()),
-        common.table(["a block of 4,096 points, one core", "min ms", "median ms"], a_block()),
+        common.table(
+            ["a block of 4,096 points, one core", "min ms", "median ms"], a_block()
+        ),
         common.table(["an empty block", "min ms", "median ms"], executors()),
-        common.table(["to a store", "first s", "again s"], many(20_000) + many(options.many)),
+        common.table(
+            ["to a store", "first s", "again s"], many(20_000) + many(options.many)
+        ),
     ]
     packages = ("jax", "numpy", "numba", "zarr", "distributed")
     common.report("sweep", "Sweeps", "\n\n".join(text), packages, options.write)

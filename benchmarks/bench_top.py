@@ -1,13 +1,14 @@
 """The exact flow of Lagrange's top beside integrators.
 
-10,000 tops to T = 100: I = (1, 1, 0.5), mgl = 1, tilt 0.5, omega standard normal with 5 added to
-the third component; final attitude and omega, their Jacobian and a gradient. Peers: heyoka's batch
-Taylor integrator (one thread; `pip install heyoka`), hand-written diffrax, and scipy's DOP853 on
-the first tops. Errors against 30-digit Taylor series (tests/taylor_reference.py) on 20 tops.
-"Thread for thread": run as `taskset -c 0 python benchmarks/bench_top.py`.
+10,000 tops to T = 100: I = (1, 1, 0.5), mgl = 1, tilt 0.5, omega standard normal with 5
+added to the third component; final attitude and omega, their Jacobian and a gradient.
+Peers: heyoka's batch Taylor integrator (one thread; `pip install heyoka`), hand-written
+diffrax, and scipy's DOP853 on the first tops. Errors against 30-digit Taylor series
+(tests/taylor_reference.py) on 20 tops. "Thread for thread": run as
+`taskset -c 0 python benchmarks/bench_top.py`.
 
-MuJoCo is quoted, not run: 67 ms for one such trajectory (C, RK4, steps of 1e-2), with an error of
-1e-8 of the energy.
+MuJoCo is quoted, not run: 67 ms for one such trajectory (C, RK4, steps of 1e-2), with
+an error of 1e-8 of the energy.
 """
 
 import functools
@@ -40,7 +41,9 @@ BY_SCIPY = 5
 
 def final(x, t):
     """State (7,) at time t of the top x[:3] with angular velocity x[3:]."""
-    state = jr.top_motion(jr.SymmetricTop(*x[:3]), jr.State(ATTITUDE, x[3:]), t, throw=False)
+    state = jr.top_motion(
+        jr.SymmetricTop(*x[:3]), jr.State(ATTITUDE, x[3:]), t, throw=False
+    )
     return jnp.concatenate([state.attitude, state.omega], axis=-1)
 
 
@@ -108,10 +111,16 @@ def main(write: bool) -> None:
     found = common.timed(cases, repeats=9)
     value = found["value, T = 100"][0]
     for name, (least, median, answer) in found.items():
-        worst = error(answer) if name == "value, T = 100" or name.startswith("heyoka") else None
+        worst = (
+            error(answer)
+            if name == "value, T = 100" or name.startswith("heyoka")
+            else None
+        )
         rows.append([name, compile_ms[name], least, median, least / value, worst])
 
-    program, ms = common.compiled(jax.vmap(lambda y: peers.by_diffrax(rates, y, END)), STARTS)
+    program, ms = common.compiled(
+        jax.vmap(lambda y: peers.by_diffrax(rates, y, END)), STARTS
+    )
     start = time.perf_counter()
     answer = jax.block_until_ready(program(STARTS))
     once = (time.perf_counter() - start) * 1e3
@@ -124,12 +133,23 @@ def main(write: bool) -> None:
     name = "MuJoCo, C, RK4, step 1e-2 (quoted: 67 ms each; error of the energy 1e-8)"
     rows.append([name, None, quoted, quoted, quoted / value, None])
 
-    header = ["10,000 tops", "compile ms", "min ms", "median ms", "of the value", "error"]
+    header = [
+        "10,000 tops",
+        "compile ms",
+        "min ms",
+        "median ms",
+        "of the value",
+        "error",
+    ]
     packages = ["jax", "diffrax", "numpy", "scipy"]
     if any("heyoka" in row[0] for row in rows):
         packages.append("heyoka")
     common.report(
-        "top", "The exact flow of Lagrange's top", common.table(header, rows), packages, write
+        "top",
+        "The exact flow of Lagrange's top",
+        common.table(header, rows),
+        packages,
+        write,
     )
 
 

@@ -1,31 +1,36 @@
 """Trials like real ones, fitted in groups: do the errors stated account for the scatter?
 
-Each world is one body and a series of trials of it by an independent integrator (tests/worlds.py).
-The body is flat, of moments 0.07, 0.93 and 1, or a general one of 0.5, 0.8 and 1 (their unit plays
-no role), its axes at random. A trial lasts 0.5 to 1 s at 200 Hz, at 5 to 20 rad/s about any axis or
-nearly about a principal one; quadratic drag takes 0.3 % of the spin in a radian; the gyro's noise
-is 0.05 % of the spin. An unmodelled torque acts along the principal axes: Ornstein-Uhlenbeck
-processes of correlation time tau, whose standard deviation is in proportion to the spin. It differs
-between axes (40 % in the logarithm, drawn for each world) and between trials (40 % again). Its
-size is the same for every tau; tau = 0 is white torque with the spectral density that
-tau = 0.05 s has at frequency 0. Trials are "plain"; "turned": the axes of the gyro are turned by
-2.4 degrees, about a random axis for each session of 28 trials; "foreign": 6 % of the trials are of
-a body whose smallest moment is 10 % larger; or, with `--cases both`, turned and foreign.
+Each world is one body and a series of trials of it by an independent integrator
+(tests/worlds.py). The body is flat, of moments 0.07, 0.93 and 1, or a general one of
+0.5, 0.8 and 1 (their unit plays no role), its axes at random. A trial lasts 0.5 to 1 s
+at 200 Hz, at 5 to 20 rad/s about any axis or nearly about a principal one; quadratic
+drag takes 0.3 % of the spin in a radian; the gyro's noise is 0.05 % of the spin. An
+unmodelled torque acts along the principal axes: Ornstein-Uhlenbeck processes of
+correlation time tau, whose standard deviation is in proportion to the spin. It differs
+between axes (40 % in the logarithm, drawn for each world) and between trials (40 %
+again). Its size is the same for every tau; tau = 0 is white torque with the spectral
+density that tau = 0.05 s has at frequency 0. Trials are "plain"; "turned": the axes of
+the gyro are turned by 2.4 degrees, about a random axis for each session of 28 trials;
+"foreign": 6 % of the trials are of a body whose smallest moment is 10 % larger; or,
+with `--cases both`, turned and foreign.
 
-Groups of 16 trials are interleaved (every seventh trial) or blocks of consecutive trials. Each
-group is one fit of a list of records, which is told the form of the drag and that there may be a
-torque (`unmodelled="estimate"`), of the flat body that it is flat, and of turned trials which of
-them are of one session: the axes are those of the first session of the group, the turns of others
-are sought (`each(gyro.misalignment, sessions)`). Errors: rms over groups of
-the estimate less the truth over the error stated, of I2/I1, I3/I1 and the drag. Between: root of
-chi-square over its degrees of freedom of the groups of a world about their weighted mean. Both are
-1 where errors are right, and are of the fits that do not end WRONG_BASIN, NOT_CONVERGED or
-BAD_INPUT. Over the sensor's: errors stated over the part of the sensors, median of all fits and
-numbers. Named: trials of the other body that the fits left out (`spoilt`), of all such trials;
+Groups of 16 trials are interleaved (every seventh trial) or blocks of consecutive
+trials. Each group is one fit of a list of records, which is told the form of the drag
+and that there may be a torque (`unmodelled="estimate"`), of the flat body that it is
+flat, and of turned trials which of them are of one session: the axes are those of the
+first session of the group, the turns of others are sought
+(`each(gyro.misalignment, sessions)`). Errors: rms over groups of the estimate less the
+truth over the error stated, of I2/I1, I3/I1 and the drag. Between: root of chi-square
+over its degrees of freedom of the groups of a world about their weighted mean. Both are
+1 where errors are right, and are of the fits that do not end WRONG_BASIN, NOT_CONVERGED
+or BAD_INPUT. Over the sensor's: errors stated over the part of the sensors, median of
+all fits and numbers. Named: trials of the other body that the fits left out
+(`rejected_trials`), of all such trials;
 wrongly: the body's own trials that they left out. Seconds include compilation.
 
-`python benchmarks/bench_trials.py` makes the table of the flat body, with `--body general` that of
-the general one; `--worlds`, `--taus` and `--cases` choose a part of it.
+`python benchmarks/bench_trials.py` makes the table of the flat body, with
+`--body general` that of the general one; `--worlds`, `--taus` and `--cases` choose a
+part of it.
 """
 
 import collections
@@ -129,13 +134,13 @@ def world_of(options, case, tau, seed):
         "ou_scatter": BETWEEN_TRIALS,
         "axes": axes,
     }
-    trials = worlds.throws(rng, options.trials, tuple(moments), **scene)
+    trials = worlds.trials(rng, options.trials, tuple(moments), **scene)
     foreign = np.zeros(options.trials, bool)
     if case in ("foreign", "both"):
         count = round(options.foreign * options.trials)
         foreign[rng.choice(options.trials, count, replace=False)] = True
         others = other_body(moments, options.foreign_by)
-        strange = worlds.throws(rng, count, others, **scene)
+        strange = worlds.trials(rng, count, others, **scene)
         for i, trial in zip(np.flatnonzero(foreign), strange, strict=True):
             trials[i] = trial
     is_turned = case in ("turned", "both")
@@ -148,7 +153,11 @@ def groups_of(grouping, trials, size):
     """Indices of the trials of each group (groups, size)."""
     count = trials // size
     whole = np.arange(count * size)
-    return whole.reshape(size, count).T if grouping == "interleaved" else whole.reshape(count, size)
+    return (
+        whole.reshape(size, count).T
+        if grouping == "interleaved"
+        else whole.reshape(count, size)
+    )
 
 
 def drag_of(body):
@@ -167,7 +176,9 @@ def drag_and_turns(sessions):
 
 def sessions_of(groups, session):
     """Which session of its group each trial is of, from -1 on (groups, size)."""
-    return np.array([np.unique(x // session, return_inverse=True)[1] for x in groups]) - 1
+    return (
+        np.array([np.unique(x // session, return_inverse=True)[1] for x in groups]) - 1
+    )
 
 
 def fit_groups(body, trials_of_groups, sessions):
@@ -182,9 +193,12 @@ def fit_groups(body, trials_of_groups, sessions):
         What each fit found, in the order of the groups.
     """
     moments = np.array(BODIES[body])
-    system = jr.RigidBody(np.full(3, moments.mean()), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
+    system = jr.RigidBody(
+        np.full(3, moments.mean()), jr.torques.QuadraticDrag(jnp.asarray(1e-3))
+    )
     records = [
-        [identify.Rates(x.ts, x.readings, x.sigma) for x in trials] for trials in trials_of_groups
+        [identify.Rates(x.ts, x.readings, x.sigma) for x in trials]
+        for trials in trials_of_groups
     ]
     shape = identify.Flat() if body == "flat" else identify.Tensor()
     found: list[Found] = [None] * len(records)  # pyright: ignore[reportAssignmentType]
@@ -194,7 +208,7 @@ def fit_groups(body, trials_of_groups, sessions):
             system,
             [records[i] for i in places],
             free=drag_and_turns(pattern) if np.any(pattern >= 0) else drag_of,
-            shape=shape,
+            inertia_model=shape,
             unmodelled="estimate",
             throw=False,
         )
@@ -208,14 +222,16 @@ class Found(NamedTuple):
 
     estimates: np.ndarray  # I2/I1, I3/I1 and the drag's coefficient
     errors: np.ndarray
-    over_sensor: np.ndarray  # errors of ratios over the part of the sensors, in the median
+    over_sensor: (
+        np.ndarray
+    )  # errors of ratios over the part of the sensors, in the median
     status: np.ndarray
     left_out: np.ndarray
 
     @classmethod
     def of(cls, fit):
         """Of one fit."""
-        drag, drag_error = fit.leaves["torque.coefficient"]
+        drag, drag_error = fit.estimates["torque.coefficient"]
         whole = np.diagonal(np.asarray(fit.numbers_covariance))
         own = np.diagonal(np.asarray(fit.diagnostics.sensor_covariance))
         return cls(
@@ -223,7 +239,7 @@ class Found(NamedTuple):
             np.append(fit.ratios_errors, drag_error),
             np.median(np.sqrt(whole / own)),
             np.asarray(fit.status),
-            np.asarray(fit.spoilt),
+            np.asarray(fit.rejected_trials),
         )
 
 
@@ -273,7 +289,9 @@ def row_of(options, drawn, grouping):
     pulls = ((values - drawn[0].truth) / errors)[usable]
     by_world = (len(drawn), len(groups))
     between = rms_between(
-        values.reshape(*by_world, 3), errors.reshape(*by_world, 3), usable.reshape(by_world)
+        values.reshape(*by_world, 3),
+        errors.reshape(*by_world, 3),
+        usable.reshape(by_world),
     )
     foreign = np.concatenate([world.foreign[groups] for world in drawn])
     left_out = found.left_out
@@ -304,11 +322,18 @@ def arguments():
         default=0.01,
         help="standard deviation of the torque over the mean moment and the spin [1/s]",
     )
-    parser.add_argument("--turn", type=float, default=2.4, help="of a session's axes [degrees]")
-    parser.add_argument("--session", type=int, default=28, help="trials of a session")
-    parser.add_argument("--foreign", type=float, default=0.06, help="fraction of the trials")
     parser.add_argument(
-        "--foreign-by", type=float, default=0.1, help="relative change of the smallest moment"
+        "--turn", type=float, default=2.4, help="of a session's axes [degrees]"
+    )
+    parser.add_argument("--session", type=int, default=28, help="trials of a session")
+    parser.add_argument(
+        "--foreign", type=float, default=0.06, help="fraction of the trials"
+    )
+    parser.add_argument(
+        "--foreign-by",
+        type=float,
+        default=0.1,
+        help="relative change of the smallest moment",
     )
     return parser.parse_args()
 
@@ -318,9 +343,13 @@ def main():
     rows = []
     for case in options.cases:
         for tau in options.taus:
-            drawn = [world_of(options, case, tau, seed) for seed in range(options.worlds)]
+            drawn = [
+                world_of(options, case, tau, seed) for seed in range(options.worlds)
+            ]
             for grouping in GROUPINGS:
-                rows.append([case, f"{tau:g}", grouping, *row_of(options, drawn, grouping)])
+                rows.append(
+                    [case, f"{tau:g}", grouping, *row_of(options, drawn, grouping)]
+                )
                 print(*rows[-1], sep=" | ", flush=True)
     header = [
         "trials",

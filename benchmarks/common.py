@@ -43,7 +43,9 @@ def machine(packages: Sequence[str]) -> str:
     cpuinfo = pathlib.Path("/proc/cpuinfo")
     if cpuinfo.exists():
         lines = cpuinfo.read_text().splitlines()
-        model = next((x.split(":")[1].strip() for x in lines if "model name" in x), model)
+        model = next(
+            (x.split(":")[1].strip() for x in lines if "model name" in x), model
+        )
     versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in packages)
     where = f"{model}, {os.cpu_count()} cores, {jax.default_backend()}"
     return f"{where}; Python {platform.python_version()}, {versions}"
@@ -67,11 +69,15 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--write", action="store_true", help="store the table in results/")
+    parser.add_argument(
+        "--write", action="store_true", help="store the table in results/"
+    )
     return parser
 
 
-def report(name: str, title: str, text: str, packages: Sequence[str], write: bool) -> None:
+def report(
+    name: str, title: str, text: str, packages: Sequence[str], write: bool
+) -> None:
     """Print the machine and the table, and store them beside the code if asked to."""
     print(machine(packages), text, sep="\n\n")
     if write:
@@ -81,7 +87,9 @@ def report(name: str, title: str, text: str, packages: Sequence[str], write: boo
         path.write_text(f"# {title}\n\n{command} on {machine(packages)}.\n\n{text}\n")
 
 
-def report_by_jax(name: str, title: str, text: str, packages: Sequence[str], write: bool) -> None:
+def report_by_jax(
+    name: str, title: str, text: str, packages: Sequence[str], write: bool
+) -> None:
     """As `report`; the file has one section for each version of jax and keeps the others."""
     print(machine(packages), text, sep="\n\n")
     if not write:

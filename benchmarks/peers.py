@@ -40,8 +40,8 @@ def by_heyoka(
         tolerance: Of the integrator.
 
     Returns:
-        The compiled integrator as a function without arguments, and the milliseconds that took;
-        None where heyoka is missing.
+        The compiled integrator as a function without arguments, and the milliseconds
+        that took; None where heyoka is missing.
     """
     hy = _heyoka()
     if hy is None:
@@ -51,7 +51,9 @@ def by_heyoka(
     equations = list(zip(variables, rates(*variables), strict=True))
     width = hy.recommended_simd_size()
     start = time.perf_counter()
-    integrator = hy.taylor_adaptive_batch(equations, np.zeros((n, width)), tol=tolerance)
+    integrator = hy.taylor_adaptive_batch(
+        equations, np.zeros((n, width)), tol=tolerance
+    )
     compile_ms = (time.perf_counter() - start) * 1e3
 
     def run() -> np.ndarray:
@@ -98,7 +100,11 @@ def by_heyoka_singly(
 
 
 def by_scipy(
-    rates: Callable[..., list[Any]], starts: np.ndarray, end: float, tolerance: float, method: str
+    rates: Callable[..., list[Any]],
+    starts: np.ndarray,
+    end: float,
+    tolerance: float,
+    method: str,
 ) -> tuple[Callable[[], np.ndarray], float] | tuple[None, None]:
     """`solve_ivp`, one state after the other; `rates` of the time and of plain floats."""
     integrate = package("scipy.integrate")
@@ -108,7 +114,12 @@ def by_scipy(
 
     def last(state: np.ndarray) -> np.ndarray:
         solution = integrate.solve_ivp(
-            lambda t, y: rates(t, *y.tolist()), (0.0, end), state, method, rtol=rtol, atol=tolerance
+            lambda t, y: rates(t, *y.tolist()),
+            (0.0, end),
+            state,
+            method,
+            rtol=rtol,
+            atol=tolerance,
         )
         return solution.y[:, -1] if solution.success else np.full_like(state, np.nan)
 
@@ -150,8 +161,15 @@ def by_diffrax(
 ) -> Any:
     """What a user of diffrax writes by hand, on one array; `timed` if `rates` want the time too."""
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, _args: jnp.stack(rates(t, *y) if timed else rates(*y))),
-        solver or diffrax.Dopri8(), 0.0, end, 0.01, start, max_steps=100_000,
+        diffrax.ODETerm(
+            lambda t, y, _args: jnp.stack(rates(t, *y) if timed else rates(*y))
+        ),
+        solver or diffrax.Dopri8(),
+        0.0,
+        end,
+        0.01,
+        start,
+        max_steps=100_000,
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-    )  # fmt: skip
+    )
     return jnp.asarray(solution.ys)[0]

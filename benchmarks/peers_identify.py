@@ -1,13 +1,14 @@
 """Fits of the inertia to a gyro that jrigid's is measured beside: finite differences.
 
-Each is given what it cannot find: a start near the truth (tensor and first rates), the noise, and
-that the body is free. All have the same eight unknowns: five of the tensor by the logarithmic
-Cholesky factor of the second moments of mass (the trace is no news of a free body) and three rates
-at the first time.
+Each is given what it cannot find: a start near the truth (tensor and first rates), the
+noise, and that the body is free. All have the same eight unknowns: five of the tensor
+by the logarithmic Cholesky factor of the second moments of mass (the trace is no news
+of a free body) and three rates at the first time.
 
-`fit_scipy` is `scipy.optimize.least_squares` over `solve_ivp`; `fit_mujoco` is MuJoCo's own
-Gauss-Newton, `mujoco.minimize.least_squares`, over its rollouts; `fit_sysid` the same by its
-toolbox of system identification, `mujoco.sysid`, as its examples use it (pip's `mujoco[sysid]`).
+`fit_scipy` is `scipy.optimize.least_squares` over `solve_ivp`; `fit_mujoco` is MuJoCo's
+own Gauss-Newton, `mujoco.minimize.least_squares`, over its rollouts; `fit_sysid` the
+same by its toolbox of system identification, `mujoco.sysid`, as its examples use it
+(pip's `mujoco[sysid]`).
 
     python benchmarks/peers_identify.py
 
@@ -27,7 +28,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-_LARGEST_TURN = 0.1  # [rad] of a step of MuJoCo's Runge-Kutta: its error is far below 1e-4
+_LARGEST_TURN = (
+    0.1  # [rad] of a step of MuJoCo's Runge-Kutta: its error is far below 1e-4
+)
 _FREE_BODY = """<mujoco><option integrator="RK4" gravity="0 0 0">
 <flag constraint="disable" contact="disable"/></option>
 <worldbody><body name="body"><joint name="ball" type="ball"/>
@@ -59,7 +62,9 @@ def numbers_of(tensor: np.ndarray) -> np.ndarray:
     tensor = np.asarray(tensor, float)
     factor = np.linalg.cholesky(np.trace(tensor) / 2 * np.eye(3) - tensor)
     factor = factor / factor[2, 2]
-    return np.array([np.log(factor[0, 0]), np.log(factor[1, 1]), *factor[[1, 2, 2], [0, 0, 1]]])
+    return np.array(
+        [np.log(factor[0, 0]), np.log(factor[1, 1]), *factor[[1, 2, 2], [0, 0, 1]]]
+    )
 
 
 def tensor_of(numbers: np.ndarray) -> np.ndarray:
@@ -96,15 +101,23 @@ def _motions(ts: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
         return _cross(momentum, (inverse @ momentum[..., None])[..., 0]).ravel()
 
     done = solve_ivp(
-        rates, (ts[0], ts[-1]), momentum0.ravel(), "DOP853", ts,
-        rtol=1e-9, atol=1e-9 * np.max(np.abs(momentum0)),
-    )  # fmt: skip
+        rates,
+        (ts[0], ts[-1]),
+        momentum0.ravel(),
+        "DOP853",
+        ts,
+        rtol=1e-9,
+        atol=1e-9 * np.max(np.abs(momentum0)),
+    )
     momentum = np.moveaxis(done.y.reshape(*shape, len(ts)), -1, 1)
     return momentum @ np.swapaxes(inverse, -1, -2)
 
 
 def fit_scipy(
-    ts: np.ndarray, omegas: np.ndarray, sigma: float, start: tuple[np.ndarray, np.ndarray]
+    ts: np.ndarray,
+    omegas: np.ndarray,
+    sigma: float,
+    start: tuple[np.ndarray, np.ndarray],
 ) -> PeerFit:
     """`scipy.optimize.least_squares`, the nine motions of a Jacobian in one integration.
 
@@ -127,18 +140,24 @@ def fit_scipy(
         return ((_motions(ts, rows) - omegas) / sigma).reshape(*x.shape[:-1], -1)
 
     def slopes(x: np.ndarray) -> np.ndarray:
-        shifted = residuals(x + np.concatenate([np.zeros((1, 8)), 1e-6 * np.diag(scale)]))
+        shifted = residuals(
+            x + np.concatenate([np.zeros((1, 8)), 1e-6 * np.diag(scale)])
+        )
         return ((shifted[1:] - shifted[0]) / (1e-6 * scale)[:, None]).T
 
     jac: Any = slopes  # scipy's annotation knows its names alone
     done = least_squares(residuals, x0, jac, x_scale=scale, method="trf", max_nfev=200)
     seconds = time.perf_counter() - begin
-    return PeerFit(tensor_of(done.x[:5]), done.x[5:], float(2 * done.cost), seconds, evaluations)
+    return PeerFit(
+        tensor_of(done.x[:5]), done.x[5:], float(2 * done.cost), seconds, evaluations
+    )
 
 
 def _spec_with(spec: Any, numbers: np.ndarray) -> Any:
     """MuJoCo's specification with another inertia, of which its compiler takes the axes."""
-    spec.body("body").fullinertia[:] = tensor_of(numbers)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    spec.body("body").fullinertia[:] = tensor_of(numbers)[
+        [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    ]
     return spec
 
 
@@ -157,7 +176,10 @@ def _bounds(x0: np.ndarray, omegas: np.ndarray) -> list[np.ndarray]:
 
 
 def fit_mujoco(
-    ts: np.ndarray, omegas: np.ndarray, sigma: float, start: tuple[np.ndarray, np.ndarray]
+    ts: np.ndarray,
+    omegas: np.ndarray,
+    sigma: float,
+    start: tuple[np.ndarray, np.ndarray],
 ) -> PeerFit | None:
     """`mujoco.minimize.least_squares` over RK4 rollouts; None where MuJoCo is missing.
 
@@ -178,7 +200,9 @@ def fit_mujoco(
 
     def rates(x: np.ndarray) -> np.ndarray:
         compiled = _spec_with(spec, x[:5]).compile()
-        state = np.concatenate([[0.0, 1.0, 0.0, 0.0, 0.0], x[5:]])  # time, quaternion, rates
+        state = np.concatenate(
+            [[0.0, 1.0, 0.0, 0.0, 0.0], x[5:]]
+        )  # time, quaternion, rates
         states = rollout.rollout(compiled, data, state, nstep=steps)[0]
         return CubicSpline(grid, np.vstack([x[5:], states[0, :, 5:8]]))(ts)
 
@@ -191,7 +215,11 @@ def fit_mujoco(
 
     x0 = np.concatenate([numbers_of(start[0]), start[1]])
     x, log = minimize.least_squares(
-        x0, residuals, _bounds(x0, omegas), max_iter=200, verbose=minimize.Verbosity.SILENT
+        x0,
+        residuals,
+        _bounds(x0, omegas),
+        max_iter=200,
+        verbose=minimize.Verbosity.SILENT,
     )
     x, chi_square = np.ravel(x), float(2 * log[-1].objective)
     seconds = time.perf_counter() - begin
@@ -199,18 +227,25 @@ def fit_mujoco(
 
 
 def fit_sysid(
-    ts: np.ndarray, omegas: np.ndarray, sigma: float, start: tuple[np.ndarray, np.ndarray]
+    ts: np.ndarray,
+    omegas: np.ndarray,
+    sigma: float,
+    start: tuple[np.ndarray, np.ndarray],
 ) -> PeerFit | None:
     """MuJoCo's toolbox: parameters with modifiers, a sequence, its rollouts, its optimizer.
 
-    Arguments as `fit_scipy`. First rates are unknowns by way of `custom_rollout`, and the residual
-    is over the noise by way of `modify_residual`. None where `mujoco[sysid]` is missing.
+    Arguments as `fit_scipy`. First rates are unknowns by way of `custom_rollout`, and
+    the residual is over the noise by way of `modify_residual`. None where
+    `mujoco[sysid]` is missing.
     """
     try:
         mujoco = importlib.import_module("mujoco")
         sysid = importlib.import_module("mujoco.sysid")
         optimize = sysid.optimize
-    except (ImportError, AttributeError):  # without its extra the module is there, and empty
+    except (
+        ImportError,
+        AttributeError,
+    ):  # without its extra the module is there, and empty
         return None
     begin = time.perf_counter()
     spec = mujoco.MjSpec.from_string(_FREE_BODY)
@@ -221,10 +256,13 @@ def fit_sysid(
     unknowns = sysid.ParameterDict()
     unknowns.add(
         sysid.Parameter(
-            "inertia", x0[:5], lower[:5], upper[:5],
+            "inertia",
+            x0[:5],
+            lower[:5],
+            upper[:5],
             modifier=lambda s, p: _spec_with(s, p.value),
         )
-    )  # fmt: skip
+    )
     unknowns.add(sysid.Parameter("omega0", x0[5:], lower[5:], upper[5:]))
     grid = ts[0] + spec.option.timestep * np.arange(steps + 1)
     first = sysid.create_initial_state(model, np.array([1.0, 0.0, 0.0, 0.0]), start[1])
@@ -240,16 +278,24 @@ def fit_sysid(
         return sysid.sysid_rollout(**arguments | {"initial_states": states})
 
     def residuals(
-        one: Any, _predicted: Any, readings: Any, _model: Any, _all: bool, state: np.ndarray
+        one: Any,
+        _predicted: Any,
+        readings: Any,
+        _model: Any,
+        _all: bool,
+        state: np.ndarray,
     ) -> Any:
         rates = CubicSpline(grid, np.vstack([one["omega0"].value, state[:, 5:8]]))(ts)
         predicted = sysid.TimeSeries(ts, rates, names)
         return (rates - readings.data) / sigma, predicted, readings
 
     function = sysid.build_residual_fn(
-        models_sequences=[sequence], custom_rollout=rolled, modify_residual=residuals, n_threads=1,
+        models_sequences=[sequence],
+        custom_rollout=rolled,
+        modify_residual=residuals,
+        n_threads=1,
         resample_true=False,
-    )  # fmt: skip
+    )
     evaluations = 0
 
     def counted(x: np.ndarray, parameters: Any) -> Any:
@@ -272,7 +318,9 @@ def _record(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     moments = np.array([1.0, 1.7, 2.3]) / 5 * 3
     tensor, direction = axes @ np.diag(moments) @ axes.T, rng.normal(size=3)
     ts = np.arange(200) * np.pi / 10
-    unknowns = np.concatenate([numbers_of(tensor), direction / np.linalg.norm(direction)])
+    unknowns = np.concatenate(
+        [numbers_of(tensor), direction / np.linalg.norm(direction)]
+    )
     return tensor, ts, _motions(ts, unknowns[None])[0], rng.normal(size=(200, 3))
 
 
@@ -280,7 +328,11 @@ def _starts(tensor: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarra
     """Of the tensor: off by 1 and 20 % of its mean moment, and a sphere."""
     off = rng.normal(size=(3, 3))
     off = (off + off.T) / np.linalg.norm(off + off.T)
-    starts = {"1 % off": tensor + 0.01 * off, "20 % off": tensor + 0.2 * off, "sphere": np.eye(3)}
+    starts = {
+        "1 % off": tensor + 0.01 * off,
+        "20 % off": tensor + 0.2 * off,
+        "sphere": np.eye(3),
+    }
     for name, one in starts.items():  # none that no body has
         moments, axes = np.linalg.eigh(one)
         moments[2] = min(moments[2], 0.98 * (moments[0] + moments[1]))

@@ -26,7 +26,9 @@ MODULES = {
     for name, module in sorted(vars(jrigid).items())
     if inspect.ismodule(module) and hasattr(module, "__all__")
 }
-TOP = sorted(k for k, x in vars(jrigid).items() if k[0] != "_" and not inspect.ismodule(x))
+TOP = sorted(
+    k for k, x in vars(jrigid).items() if k[0] != "_" and not inspect.ismodule(x)
+)
 
 
 def home(name: str) -> str | None:
@@ -97,7 +99,9 @@ def mark_up(app, what, name, thing, options, lines) -> None:
         """A link where it is a name of this module, or of one that it names."""
         for target in (f"{module}.{match[1]}", f"jrigid.{match[1]}"):
             parent, _, last = target.rpartition(".")
-            if last in getattr(MODULES.get(parent), "__all__", TOP if parent == "jrigid" else []):
+            if last in getattr(
+                MODULES.get(parent), "__all__", TOP if parent == "jrigid" else []
+            ):
                 return f":py:obj:`{match[1]} <{target}>`"
         return f"``{match[1]}``"
 
@@ -144,7 +148,9 @@ class LinkNames(SphinxPostTransform):
             target = objects[f"jrigid.{named[1]}"]
             here, there = self.env.current_document.docname, target.docname
             if here != there:
-                link = make_refnode(self.app.builder, here, there, target.node_id, node.deepcopy())
+                link = make_refnode(
+                    self.app.builder, here, there, target.node_id, node.deepcopy()
+                )
                 node.replace_self(link)
 
 
@@ -195,12 +201,16 @@ def gallery() -> str:
     cards = []
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = nbformat.read(EXECUTED / path.name, as_version=4).cells
-        title = next(x for x in cells[0].source.splitlines() if x.startswith("# ")).lstrip("# ")
+        title = next(
+            x for x in cells[0].source.splitlines() if x.startswith("# ")
+        ).lstrip("# ")
         outputs = [x.get("data", {}) for cell in cells for x in cell.get("outputs", [])]
         pictures = [x["image/png"] for x in outputs if "image/png" in x]
         shown = ""
         if pictures:
-            image = Image.open(io.BytesIO(base64.b64decode(pictures[-1]))).convert("RGB")
+            image = Image.open(io.BytesIO(base64.b64decode(pictures[-1]))).convert(
+                "RGB"
+            )
             image.thumbnail((640, 640))
             image.save(THUMBNAILS / f"{path.stem}.png")
             shown = f":img-top: thumbnails/{path.stem}.png\n:img-alt: {title}\n"
@@ -219,7 +229,9 @@ def fill_gallery(app, config) -> None:
 def to_the_front(app, docname: str, source: list[str]) -> None:
     """README.md is in the front page and the start: links to it lead there."""
     text = re.sub(
-        r"\]\((?:\.\./)*README\.md#install", "](/docs/getting_started.md#install", source[0]
+        r"\]\((?:\.\./)*README\.md#install",
+        "](/docs/getting_started.md#install",
+        source[0],
     )
     source[0] = re.sub(r"\]\((?:\.\./)*README\.md", "](/docs/index.md", text)
 
@@ -232,7 +244,9 @@ def from_the_root(app, path, parent, content: list[str]) -> None:
 
 def setup(app) -> dict[str, bool]:
     """Called by Sphinx."""
-    quiet = logging.getLogger("sphinx.sphinx.directives.other")  # of pages that may come
+    quiet = logging.getLogger(
+        "sphinx.sphinx.directives.other"
+    )  # of pages that may come
     quiet.addFilter(lambda record: "toctree glob pattern" not in str(record.msg))
     app.connect("config-inited", fill_gallery)
     app.connect("builder-inited", write_api)

@@ -10,13 +10,23 @@ project = "jrigid"
 author = copyright = "The jrigid authors"
 version = release = metadata.version("jrigid")
 
-# The source of the site is the repository, so that a page's links are right there and here.
+# The source of the site is the repository, so that a page's links are right there and
+# here.
 root_doc = "docs/index"
 include_patterns = [
     *("docs/**", "notebooks/*.ipynb", "benchmarks/results/*.md"),
     *("CHANGELOG.md", "CONTRIBUTING.md"),
 ]
-exclude_patterns = [".*", "build", "dist", "outputs", "src", "tests", "examples", "**/.*"]
+exclude_patterns = [
+    ".*",
+    "build",
+    "dist",
+    "outputs",
+    "src",
+    "tests",
+    "examples",
+    "**/.*",
+]
 
 extensions = [
     *("sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"),
@@ -37,7 +47,13 @@ maximum_signature_line_length = 80
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 
-myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "substitution", "attrs_inline"]
+myst_enable_extensions = [
+    "dollarmath",
+    "amsmath",
+    "colon_fence",
+    "substitution",
+    "attrs_inline",
+]
 myst_heading_anchors = 3
 myst_update_mathjax = False
 nb_execution_mode = "off"  # notebooks/execute.py runs them

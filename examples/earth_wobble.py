@@ -1,9 +1,10 @@
 """What the Earth's wobble says about its inertia.
 
-The Earth does not spin about its axis of figure: the pole of rotation wanders on the ground in
-loops of about ten metres. A rigid Earth, left alone, would wobble once in 305 days. Here the Earth
-is a rotating body that obeys Euler's equations, pushed by the seasons; the record of its pole since
-1962 is fitted by gradients through the integration, and (I3 - I1)/I1 comes out.
+The Earth does not spin about its axis of figure: the pole of rotation wanders on the
+ground in loops of about ten metres. A rigid Earth, left alone, would wobble once in 305
+days. Here the Earth is a rotating body that obeys Euler's equations, pushed by the
+seasons; the record of its pole since 1962 is fitted by gradients through the
+integration, and (I3 - I1)/I1 comes out.
 
 Run it: `python earth_wobble.py [picture.png]`.
 """
@@ -25,10 +26,14 @@ from scipy.optimize import minimize_scalar
 import jrigid as jr
 
 MAS = math.pi / 648e6  # one milliarcsecond [rad]; 3.1 cm on the ground at the pole
-SPIN_PER_DAY = 7.292115e-5 * 86400.0  # sidereal radians in a day (IERS Conventions 2010, table 1.1)
+SPIN_PER_DAY = (
+    7.292115e-5 * 86400.0
+)  # sidereal radians in a day (IERS Conventions 2010, table 1.1)
 TURNS_PER_DAY = SPIN_PER_DAY / (2 * math.pi)
 ANNUAL = 2 * math.pi / 365.2422 / SPIN_PER_DAY  # annual frequency per sidereal radian
-SEASONS = np.array([1.0, -1.0, 2.0, -2.0]) * ANNUAL  # annual and semiannual, with and against spin
+SEASONS = (
+    np.array([1.0, -1.0, 2.0, -2.0]) * ANNUAL
+)  # annual and semiannual, with and against spin
 RIGID_PERIOD = 305.0  # days: Euler's period of a rigid body with the Earth's moments
 SCALE = 100 * MAS  # size of the wobble: makes residuals and parameters of order one
 DAYS_PER_SAMPLE = 10
@@ -38,13 +43,18 @@ PICTURE = Path(__file__).parents[1] / "outputs" / "earth_wobble.png"
 class Wobble(eqx.Module):
     """Parameters of the Earth's motion, all of order one.
 
-    Pairs of reals stand for complex numbers: x toward Greenwich plus i times y toward 90 deg east.
+    Pairs of reals stand for complex numbers: x toward Greenwich plus i times y toward
+        90 deg east.
 
     Attributes:
-        ellipticity: (I3 - I1)/I1, in units of that of a rigid Earth, 1/305 sidereal turns.
-        start: Direction of the spin at the start of the record, from the axis of figure [SCALE].
-        seasons: Torques at the four frequencies SEASONS [SCALE * ANNUAL * I1 * Omega^2].
-        drift: Wander of the axis of figure: Legendre coefficients, degree 0 to 3 [SCALE].
+        ellipticity: (I3 - I1)/I1, in units of that of a rigid Earth, 1/305 sidereal
+            turns.
+        start: Direction of the spin at the start of the record, from the axis of figure
+            [SCALE].
+        seasons: Torques at the four frequencies SEASONS [SCALE * ANNUAL * I1 *
+            Omega^2].
+        drift: Wander of the axis of figure: Legendre coefficients, degree 0 to 3
+            [SCALE].
     """
 
     ellipticity: Float[Array, ""]
@@ -83,9 +93,9 @@ class Pole(eqx.Module):
 def rotation_pole(record: jr.datasets.EarthPole, days: int = DAYS_PER_SAMPLE) -> Pole:
     """The pole of rotation out of the published pole.
 
-    The published pole p = x - i y is that of the celestial intermediate pole, y being positive
-    toward the west. The pole of rotation is m = p - (i / Omega) dp/dt (Gross, J. Geophys. Res. 97,
-    6979 (1992)); for the wobble the two differ by 0.2 %.
+    The published pole p = x - i y is that of the celestial intermediate pole, y being
+    positive toward the west. The pole of rotation is m = p - (i / Omega) dp/dt (Gross,
+    J. Geophys. Res. 97, 6979 (1992)); for the wobble the two differ by 0.2 %.
     """
     p = (record.x - 1j * record.y) / SCALE
     m = p - 1j / SPIN_PER_DAY * np.gradient(p, record.mjd)
@@ -137,8 +147,9 @@ def moments_of(ellipticity: Any) -> Float[Array, " 3"]:
 def motion(system: Any, state: jr.State, tau: Array, start: Any) -> jr.State:
     """Euler's equations, integrated from sample to sample.
 
-    In units of Omega and of I1 the moments are (1, 1, 1 + e), the spin is (m1, m2, 1) and tau is
-    the angle the Earth has turned. One wobble takes 1/e turns of the Earth, so a step can span many
+    In units of Omega and of I1 the moments are (1, 1, 1 + e), the spin is (m1, m2, 1)
+    and tau is the angle the Earth has turned. One wobble takes 1/e turns of the Earth,
+    so a step can span many
     turns: only omega is integrated, and fixed steps keep its derivatives right.
     """
     del start  # the first sample
@@ -167,7 +178,9 @@ def start_of(wobble: Wobble) -> jr.State:
     return jr.State(jnp.array([1.0, 0, 0, 0]), jnp.append(wobble.start * SCALE, 1.0))
 
 
-def pole_of_body(wobble: Wobble, tau: Float[Array, " times"]) -> Float[Array, "times 2"]:
+def pole_of_body(
+    wobble: Wobble, tau: Float[Array, " times"]
+) -> Float[Array, "times 2"]:
     """Direction of the spin from the axis of figure [SCALE]."""
     inertia = moments_of(wobble.ellipticity * ellipticity_of_period(RIGID_PERIOD))
     body = jr.RigidBody(inertia, Ground(wobble.seasons, wobble.drift, 1.0))
@@ -177,7 +190,9 @@ def pole_of_body(wobble: Wobble, tau: Float[Array, " times"]) -> Float[Array, "t
 def seen(tau: Any, state: jr.State, system: Any) -> Float[Array, " 3"]:
     """What is observed: the pole from where the ground is [SCALE], and the spin [Omega]."""
     x = 2 * tau / system.torque.span - 1
-    legendre = jnp.stack([jnp.ones_like(x), x, 1.5 * x * x - 0.5, (2.5 * x * x - 1.5) * x])
+    legendre = jnp.stack(
+        [jnp.ones_like(x), x, 1.5 * x * x - 0.5, (2.5 * x * x - 1.5) * x]
+    )
     pole = state.omega[:2] / SCALE + legendre @ system.torque.drift
     return jnp.concatenate([pole, state.omega[2:]])
 
@@ -188,7 +203,8 @@ class WobbleFit(eqx.Module):
     Attributes:
         params: Best parameters.
         residuals: Modelled minus observed, x and y of each time [SCALE].
-        jacobian: Their derivatives in the ellipticity and the other parameters, in any order.
+        jacobian: Their derivatives in the ellipticity and the other parameters, in any
+            order.
         steps: Evaluations of the integration and its derivatives.
         converged: Whether the fit met its tolerance.
     """
@@ -203,8 +219,8 @@ class WobbleFit(eqx.Module):
 def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     """Fit the Earth's motion by gradients, blind but for the sign of the wobble.
 
-    The noise of the pole is that of its residuals; that of the spin, which is known by clocks, is
-    next to nothing, and one value of it is enough.
+    The noise of the pole is that of its residuals; that of the spin, which is known by
+    clocks, is next to nothing, and one value of it is enough.
 
     Args:
         pole: The observed pole.
@@ -229,7 +245,7 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     found = jr.identify.fit(
         body,
         jr.identify.Observed(seen, pole.tau, values, np.array([1.0, 1.0, 1e-9])),
-        shape=jr.identify.Top(),
+        inertia_model=jr.identify.Top(),
         free=lambda body: (body.torque.seasons, body.torque.drift),
         start=start_of(guess),
         motion=motion,
@@ -240,9 +256,14 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     moments = jnp.diagonal(found.inertia)
     ellipticity = moments[2] / moments[0] - 1
     ground: Any = found.system.torque
-    params = Wobble(ellipticity / unit, found.state.omega[0, :2] / SCALE, ground.seasons,
-                    ground.drift)  # fmt: skip
-    # The number sought is log((1 - e) / (1 + e)); the spin and the attitude are not ours to know.
+    params = Wobble(
+        ellipticity / unit,
+        found.state.omega[0, :2] / SCALE,
+        ground.seasons,
+        ground.drift,
+    )
+    # The number sought is log((1 - e) / (1 + e)); the spin and the attitude are not
+    # ours to know.
     of_ellipticity = -2 * unit / (1 - ellipticity**2)
     columns = found.numbers.size + 2
     jacobian = found.diagnostics.jacobian[0]
@@ -250,7 +271,8 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     jacobian = jacobian.at[..., 0].multiply(of_ellipticity).reshape(-1, columns)
     rows = found.diagnostics.residuals[0].reshape(-1, 3)[:, :2].reshape(-1)
     steps = int(np.sum(np.isfinite(found.diagnostics.history)))
-    # The Earth's own kicks are left over: what is no white noise is a misfit, and ours to judge.
+    # The Earth's own kicks are left over: what is no white noise is a misfit, and ours
+    # to judge.
     status = jr.identify.Status
     converged = bool((found.status == status.OK) | (found.status == status.MISFIT))
     return WobbleFit(params, rows, jacobian, steps, converged)
@@ -264,15 +286,18 @@ def period_of_fit(fit: WobbleFit) -> float:
 def linear_misfit(pole: Pole) -> Callable[[Any], Any]:
     """The same model without an integration: misfit against rate, the rest by linear least squares.
 
-    A symmetric body's small wobble is an exponential, and its answer to seasonal torques another
-    four. At a given rate everything is linear; what does not depend on the rate is projected out.
+    A symmetric body's small wobble is an exponential, and its answer to seasonal
+    torques another four. At a given rate everything is linear; what does not depend on
+    the rate is projected out.
 
     Returns:
-        A function from (I3 - I1)/I1, of either sign, one or many, to the residuals' root mean
-        square [mas].
+        A function from (I3 - I1)/I1, of either sign, one or many, to the residuals'
+        root mean square [mas].
     """
     tau = pole.tau
-    others = np.concatenate([np.exp(1j * np.outer(tau, SEASONS)), drift_basis(tau)], axis=1)
+    others = np.concatenate(
+        [np.exp(1j * np.outer(tau, SEASONS)), drift_basis(tau)], axis=1
+    )
     others = np.linalg.qr(others)[0]
 
     rest = pole.m - others @ (others.conj().T @ pole.m)
@@ -298,18 +323,24 @@ def linear_fit(pole: Pole) -> float:
     scan = np.arange(-fastest, fastest, step)
     near = scan[np.argmin(misfit(scan))]
     best = minimize_scalar(
-        misfit, bounds=(near - step, near + step), method="bounded", options={"xatol": 1e-7 * step}
+        misfit,
+        bounds=(near - step, near + step),
+        method="bounded",
+        options={"xatol": 1e-7 * step},
     )
     return float(1.0 / (best.x * TURNS_PER_DAY))
 
 
-def kick_level(pole: Pole, residual: Complex[np.ndarray, " times"], period: float) -> float:
+def kick_level(
+    pole: Pole, residual: Complex[np.ndarray, " times"], period: float
+) -> float:
     """How hard the wobble is kicked: power density of the excitation near the wobble's frequency.
 
-    Air and water shake the Earth all the time, and it keeps wobbling after each kick: what the fit
-    leaves over is the sum of all kicks, each turning on with the wobble. Undoing the turning from
-    sample to sample leaves the kicks themselves; their spectrum is read from -0.3 to 0.1 cycles a
-    year off the wobble, where the kicks outweigh everything else and the annual line is left out.
+    Air and water shake the Earth all the time, and it keeps wobbling after each kick:
+    what the fit leaves over is the sum of all kicks, each turning on with the wobble.
+    Undoing the turning from sample to sample leaves the kicks themselves; their
+    spectrum is read from -0.3 to 0.1 cycles a year off the wobble, where the kicks
+    outweigh everything else and the annual line is left out.
 
     Returns:
         Variance of the (complex) kicks in a sidereal radian [SCALE^2].
@@ -349,15 +380,18 @@ class Result(eqx.Module):
         pole: The observed pole.
         modelled: The fitted pole [SCALE].
         period: Wobble period [days].
-        period_error: Its standard error, for a wobble that is kicked all the time [days].
+        period_error: Its standard error, for a wobble that is kicked all the time
+            [days].
         bootstrap_error: What a bootstrap over blocks of four years makes of it [days].
         ellipticity: Effective (I3 - I1)/I1.
         ellipticity_error: Its standard error.
         rms: Root mean square of the residuals [mas].
         rigid_rms: The same for the best motion with a period of 305 days [mas].
         linear_period: Period by linear least squares [days].
-        windows: Period by linear least squares in parts of the record: (from, to, days).
-        drift: Fitted wander of the axis of figure, Legendre coefficients of x and y [SCALE].
+        windows: Period by linear least squares in parts of the record: (from, to,
+            days).
+        drift: Fitted wander of the axis of figure, Legendre coefficients of x and y
+            [SCALE].
         steps: Evaluations of the integration and its derivatives.
     """
 
@@ -384,7 +418,9 @@ def analyse(pole: Pole) -> Result:
     period = period_of_fit(fit)
     residual = fit.residuals.reshape(-1, 2)
     x, y = np.asarray(residual).T
-    relative_error = math.sqrt(kicked_covariance(pole, fit)[0, 0]) * period / RIGID_PERIOD
+    relative_error = (
+        math.sqrt(kicked_covariance(pole, fit)[0, 0]) * period / RIGID_PERIOD
+    )
     shifts = jr.identify.block_bootstrap(
         fit.jacobian.reshape(*residual.shape, -1),
         residual,
@@ -422,7 +458,9 @@ def report(result: Result) -> str:
     effective, effective_error = result.ellipticity, result.ellipticity_error
     off = (result.period - RIGID_PERIOD) / error
     agreement = abs(result.period - result.linear_period) / error
-    windows = ", ".join(f"{days:.0f} d ({begin}-{end})" for begin, end, days in result.windows)
+    windows = ", ".join(
+        f"{days:.0f} d ({begin}-{end})" for begin, end, days in result.windows
+    )
     return f"""\
 The Earth's wobble, {years[0]:.0f} to {years[-1]:.1f}: IERS C04, {len(years)} poles, \
 {result.steps} integrations with derivatives
@@ -465,7 +503,9 @@ def picture(result: Result) -> Any:
     mas = SCALE / MAS
     observed, modelled = result.pole.m * mas, result.modelled * mas
     ink, faint, red = "#22303c", "#9aa7b1", "#d1495b"
-    colours = ListedColormap(0.35 + 0.65 * plt.get_cmap("viridis")(np.linspace(0, 1, 256)))
+    colours = ListedColormap(
+        0.35 + 0.65 * plt.get_cmap("viridis")(np.linspace(0, 1, 256))
+    )
     tone = Normalize(years[0], years[-1] + 6)
 
     def coloured(axes, x, y, when, **style):
@@ -487,7 +527,14 @@ def picture(result: Result) -> Any:
         top=0.885,
         bottom=0.065,
     )
-    figure.text(0.055, 0.962, "The path of the Earth's pole", fontsize=21, color=ink, weight="bold")
+    figure.text(
+        0.055,
+        0.962,
+        "The path of the Earth's pole",
+        fontsize=21,
+        color=ink,
+        weight="bold",
+    )
     figure.text(
         0.055,
         0.931,
@@ -503,7 +550,9 @@ def picture(result: Result) -> Any:
     for row, (begin, end) in enumerate(((years[0], middle), (middle, years[-1]))):
         axes = figure.add_subplot(grid[row, :])
         part = (years >= begin) & (years <= end)
-        drift = np.convolve(np.pad(observed, 117, mode="edge"), np.ones(235) / 235, mode="valid")
+        drift = np.convolve(
+            np.pad(observed, 117, mode="edge"), np.ones(235) / 235, mode="valid"
+        )
         for series, style in ((observed, "colour"), (modelled, "black")):
             coil = (series - drift)[part]
             x, y = years[part] + 0.0016 * coil.real, coil.imag
@@ -519,7 +568,9 @@ def picture(result: Result) -> Any:
     axes = figure.add_subplot(grid[2, 0])
     coloured(axes, observed.imag, observed.real, years, linewidths=1.0, alpha=0.9)
     wander = drift_basis(result.pole.tau) @ result.drift * mas
-    axes.plot(wander[:, 1], wander[:, 0], color=red, linewidth=3, solid_capstyle="round")
+    axes.plot(
+        wander[:, 1], wander[:, 0], color=red, linewidth=3, solid_capstyle="round"
+    )
     axes.annotate(
         "the figure's axis\nwanders",
         (wander[-1, 1], wander[-1, 0]),
@@ -530,7 +581,9 @@ def picture(result: Result) -> Any:
     )
     axes.set(xlim=(-700, 250), ylim=(480, -470), aspect="equal", box_aspect=1)
     axes.set_xticks([-600, -400, -200, 0, 200])
-    axes.set_title("All of it, seen from above the north pole", fontsize=11, color=ink, loc="left")
+    axes.set_title(
+        "All of it, seen from above the north pole", fontsize=11, color=ink, loc="left"
+    )
     axes.set_xlabel("toward 90\u00b0 E [mas]   (100 mas is 3.1 m)", color=ink)
     axes.set_ylabel("toward Greenwich [mas]  (downward)", color=ink)
 
@@ -547,7 +600,10 @@ def picture(result: Result) -> Any:
     axes.plot(modelled.imag[beat], modelled.real[beat], color=ink, linewidth=1.1)
     axes.set(xlim=(-550, 50), ylim=(300, -300), aspect="equal", box_aspect=1)
     axes.set_title(
-        "One beat of wobble and year: 1967.5 to 1974", fontsize=11, color=ink, loc="left"
+        "One beat of wobble and year: 1967.5 to 1974",
+        fontsize=11,
+        color=ink,
+        loc="left",
     )
     axes.set_xlabel("toward 90\u00b0 E [mas]", color=ink)
 

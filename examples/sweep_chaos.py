@@ -1,12 +1,13 @@
 """Where is a heavy top chaotic that is let go at a tilt, with a spin?
 
-The top has three different moments and a centre of mass off its axes, so that nothing but energy
-and one momentum is kept. MEGNO tells order from chaos after 200 s, and only tiles of the map that
-hold a coast between the two are computed. They go to a store: a run that was stopped, by whatever,
-goes on where it ended.
+The top has three different moments and a centre of mass off its axes, so that nothing
+but energy and one momentum is kept. MEGNO tells order from chaos after 200 s, and only
+tiles of the map that hold a coast between the two are computed. They go to a store: a
+run that was stopped, by whatever, goes on where it ended.
 
-Run it: `python sweep_chaos.py [--size 1000] [--store outputs/chaos.zarr]`. 1000 x 1000 points,
-16 % of them computed, took 95 s on two cores of an AMD EPYC, half of which other work had.
+Run it: `python sweep_chaos.py [--size 1000] [--store outputs/chaos.zarr]`. 1000 x 1000
+points, 16 % of them computed, took 95 s on two cores of an AMD EPYC, half of which
+other work had.
 """
 
 import argparse
@@ -55,11 +56,18 @@ def draw(found: jr.SweepResult) -> None:
     extent = (*np.degrees(found.extent[:2]), *found.extent[2:])
     style: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": extent}
     left.imshow(found.classes.T, cmap=ListedColormap(COLOURS), vmin=0, vmax=1, **style)
-    kinds = [Patch(color=x, label=y) for x, y in zip(COLOURS, ("order", "chaos"), strict=True)]
+    kinds = [
+        Patch(color=x, label=y)
+        for x, y in zip(COLOURS, ("order", "chaos"), strict=True)
+    ]
     left.legend(handles=kinds, loc="upper right")
     right.set_facecolor("#c8ccd0")
-    image = right.imshow(found.values["megno"][...].T, cmap="magma", norm=LogNorm(1.5, 60), **style)
-    bar = figure.colorbar(image, ax=right, label="MEGNO after 200 s (grey: not computed)")
+    image = right.imshow(
+        found.values["megno"][...].T, cmap="magma", norm=LogNorm(1.5, 60), **style
+    )
+    bar = figure.colorbar(
+        image, ax=right, label="MEGNO after 200 s (grey: not computed)"
+    )
     bar.set_ticks([2, 5, 10, 20, 50], labels=["2", "5", "10", "20", "50"])
     bar.ax.minorticks_off()
     left.set(ylabel="spin at release [rad/s]", title="Order and chaos of a heavy top")
@@ -77,11 +85,18 @@ def main() -> None:
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     OUTPUTS.mkdir(exist_ok=True)
-    axes = {"tilt": np.linspace(0.0, np.pi, given.size), "spin": np.linspace(0.0, 5.0, given.size)}
+    axes = {
+        "tilt": np.linspace(0.0, np.pi, given.size),
+        "spin": np.linspace(0.0, 5.0, given.size),
+    }
     start = time.perf_counter()
-    found = jr.sweep(chaos, axes, refine=is_chaotic, store=given.store, attributes=UNITS)
+    found = jr.sweep(
+        chaos, axes, refine=is_chaotic, store=given.store, attributes=UNITS
+    )
     seconds, computed = time.perf_counter() - start, np.mean(found.valid[...])
-    print(f"{found.classes.size} points in {seconds:.0f} s, {computed:.1%} of them computed")
+    print(
+        f"{found.classes.size} points in {seconds:.0f} s, {computed:.1%} of them computed"
+    )
     print(f"chaotic: {found.classes.mean():.1%}")
     draw(found)
     print(f"written to {given.store} and {OUTPUTS / 'sweep_chaos.png'}")

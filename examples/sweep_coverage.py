@@ -1,10 +1,10 @@
 """Do the error bars of a fit cover the truth as often as they say?
 
-A body with three different moments tumbles freely for three turns, and a gyro reads its rates 60
-times with a noise of a twelfth of them. Each trial draws the noise anew, fits the two ratios of
-moments and keeps the estimates, their stated errors and how the fit ended. Workers of a dask
-cluster share the trials, a hundred at a time; the seed alone decides the noise of a trial, so that
-it comes out the same anywhere.
+A body with three different moments tumbles freely for three turns, and a gyro reads its
+rates 60 times with a noise of a twelfth of them. Each trial draws the noise anew, fits
+the two ratios of moments and keeps the estimates, their stated errors and how the fit
+ended. Workers of a dask cluster share the trials, a hundred at a time; the seed alone
+decides the noise of a trial, so that it comes out the same anywhere.
 
 Run it: `python sweep_coverage.py [--size 4000]`.
 """
@@ -35,11 +35,13 @@ def trials(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     jax.config.update("jax_enable_x64", True)  # in each worker
     state0 = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array(OMEGA))
     rates = np.asarray(jr.free_rotation(np.array(MOMENTS), state0, TIMES).omega)
-    noise = [NOISE * np.random.default_rng(seed).normal(size=rates.shape) for seed in seeds]
+    noise = [
+        NOISE * np.random.default_rng(seed).normal(size=rates.shape) for seed in seeds
+    ]
     found = jr.identify.fit_each(
         jr.RigidBody(np.ones(3)),
         [jr.identify.Rates(TIMES, rates + x, NOISE) for x in noise],
-        shape=jr.identify.Moments(),
+        inertia_model=jr.identify.Moments(),
     )
     good = found.status == jr.identify.Status.OK
     return np.asarray(found.ratios), np.asarray(found.ratios_errors), np.asarray(good)
@@ -47,12 +49,19 @@ def trials(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def draw(normalised: np.ndarray) -> None:
     """Errors over stated errors, beside the unit normal."""
-    figure, panels = plt.subplots(1, 2, figsize=(9.0, 3.8), constrained_layout=True, sharey=True)
+    figure, panels = plt.subplots(
+        1, 2, figsize=(9.0, 3.8), constrained_layout=True, sharey=True
+    )
     x = np.linspace(-4.0, 4.0, 201)
     for panel, errors, name in zip(panels, normalised.T, NAMES, strict=True):
-        panel.hist(errors, bins=40, range=(-4, 4), density=True, color="#9ecae1", label="fits")
+        panel.hist(
+            errors, bins=40, range=(-4, 4), density=True, color="#9ecae1", label="fits"
+        )
         panel.plot(
-            x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color="#08306b", label="unit normal"
+            x,
+            np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi),
+            color="#08306b",
+            label="unit normal",
         )
         panel.set(title=name, xlabel="(estimate - truth) / stated error")
         panel.spines[["top", "right"]].set_visible(False)
@@ -68,7 +77,9 @@ def main() -> None:
     seeds = np.arange(parser.parse_args().size)
     start = time.perf_counter()
     no_dashboard: Any = None
-    cluster = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=no_dashboard)
+    cluster = LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=no_dashboard
+    )
     with cluster, Client(cluster) as client:
         parts = np.array_split(seeds, -(-seeds.size // TOGETHER))
         found: Any = client.gather(client.map(trials, parts))

@@ -1,13 +1,14 @@
 """How long does a thrown box stay as it was thrown, whatever its shape?
 
-A box thrown with a spin about its middle axis flips over, turns on, and flips back. The map shows
-how often it turns between two flips, for every ratio of its sides, if the spin misses the axis by
-one degree, half way between the other two axes. Towards two edges of the map two moments become
-equal, and no box there ever flips. Nor does one on the diagonal: if the middle side is the
-geometric mean of the others, this spin lies on the separatrix itself.
+A box thrown with a spin about its middle axis flips over, turns on, and flips back. The
+map shows how often it turns between two flips, for every ratio of its sides, if the
+spin misses the axis by one degree, half way between the other two axes. Towards two
+edges of the map two moments become equal, and no box there ever flips. Nor does one on
+the diagonal: if the middle side is the geometric mean of the others, this spin lies on
+the separatrix itself.
 
-Run it: `python sweep_flips.py [--size 2000]`. 4,000,000 boxes took 12 s, and the picture
-as much, on two cores of an AMD EPYC, half of which other work had.
+Run it: `python sweep_flips.py [--size 2000]`. 4,000,000 boxes took 12 s, and the
+picture as much, on two cores of an AMD EPYC, half of which other work had.
 """
 
 import argparse
@@ -40,7 +41,9 @@ def turns_between_flips(width: Array, thickness: Array) -> Array:
     sides = jnp.stack([jnp.ones_like(width), width, thickness * width])
     inertia = jr.solids.box(1.0, sides).inertia
     aside = math.sin(OFFSET) / math.sqrt(2.0)
-    omega = 2 * math.pi * jnp.array([aside, math.cos(OFFSET), aside])  # one turn a second
+    omega = (
+        2 * math.pi * jnp.array([aside, math.cos(OFFSET), aside])
+    )  # one turn a second
     return jr.stability.flip_time(inertia, omega)
 
 
@@ -49,7 +52,11 @@ def draw(found: jr.SweepResult) -> None:
     figure, axes = plt.subplots(figsize=(7.2, 6.0), constrained_layout=True)
     width, thickness = found.axes.values()
     image = axes.imshow(
-        found.values.T, origin="lower", extent=found.extent, cmap="viridis", norm=LogNorm(2, 30)
+        found.values.T,
+        origin="lower",
+        extent=found.extent,
+        cmap="viridis",
+        norm=LogNorm(2, 30),
     )
     ridge = np.abs(thickness[:, None] - width) < 0.012  # which all lines run along
     smooth = np.where(ridge, np.nan, found.values.T)
@@ -62,9 +69,15 @@ def draw(found: jr.SweepResult) -> None:
     for name, (length, wide, thick) in THINGS.items():
         place = wide / length, thick / wide
         axes.plot(*place, "o", color="white", markeredgecolor="black", markersize=5)
-        axes.annotate(name, place, (6, 4), textcoords="offset points", color="white", fontsize=9)
-    axes.text(0.54, 0.55, "separatrix", rotation=45, rotation_mode="anchor", color="white")
-    bar = figure.colorbar(image, ax=axes, label="turns between two flips", extend="both")
+        axes.annotate(
+            name, place, (6, 4), textcoords="offset points", color="white", fontsize=9
+        )
+    axes.text(
+        0.54, 0.55, "separatrix", rotation=45, rotation_mode="anchor", color="white"
+    )
+    bar = figure.colorbar(
+        image, ax=axes, label="turns between two flips", extend="both"
+    )
     bar.set_ticks([2, 3, 5, 10, 20, 30], labels=["2", "3", "5", "10", "20", "30"])
     bar.ax.minorticks_off()
     axes.set(
@@ -88,7 +101,9 @@ def main() -> None:
     low, middle = np.nanmin(found.values), np.nanmedian(found.values)
     print(f"turns between two flips: {low:.2f} at least, {middle:.1f} in the median")
     for name, (length, width, thickness) in THINGS.items():
-        turns = float(turns_between_flips(jnp.array(width / length), jnp.array(thickness / width)))
+        turns = float(
+            turns_between_flips(jnp.array(width / length), jnp.array(thickness / width))
+        )
         print(f"{name:10} {turns:5.2f} turns between two flips")
     PICTURE.parent.mkdir(exist_ok=True)
     draw(found)

@@ -1,13 +1,14 @@
 """Which rotations of Hyperion are chaotic?
 
-Planar rotation of a moon on a fixed ellipse: the angle of its longest axis from Saturn and its
-rate, both at a pericentre. Numbers are those of J. Wisdom, S. Peale, F. Mignard, Icarus 58 (1984)
-137: e = 0.1, omega_0 = sqrt(3 (B - A) / C) = 0.89 mean motions. MEGNO follows a neighbour in the
-plane too, so what is shown is planar chaos; out of the plane islands may still be unstable. Angles
-from 0 to 90 degrees are computed, the others are their mirror image with time run backwards.
+Planar rotation of a moon on a fixed ellipse: the angle of its longest axis from Saturn
+and its rate, both at a pericentre. Numbers are those of J. Wisdom, S. Peale, F.
+Mignard, Icarus 58 (1984) 137: e = 0.1, omega_0 = sqrt(3 (B - A) / C) = 0.89 mean
+motions. MEGNO follows a neighbour in the plane too, so what is shown is planar chaos;
+out of the plane islands may still be unstable. Angles from 0 to 90 degrees are
+computed, the others are their mirror image with time run backwards.
 
-Run it: `python sweep_hyperion.py [--size 300]`. 45,000 motions of 60 orbits took four and a
-half minutes on two cores of an AMD EPYC, half of which other work had.
+Run it: `python sweep_hyperion.py [--size 300]`. 45,000 motions of 60 orbits took four
+and a half minutes on two cores of an AMD EPYC, half of which other work had.
 """
 
 import argparse
@@ -47,9 +48,14 @@ def at_pericentre(angle: Array, rate: Array) -> jr.State:
 def chaos(angle: Array, rate: Array) -> Array:
     """MEGNO of a neighbour in the plane: a turn and a change of rate about the normal."""
     return jr.stability.megno(
-        hyperion(), at_pericentre(angle, rate), 2 * math.pi * ORBITS, STEPS * ORBITS,
-        vector=jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]), samples=1, throw=False,
-    ).megno  # fmt: skip
+        hyperion(),
+        at_pericentre(angle, rate),
+        2 * math.pi * ORBITS,
+        STEPS * ORBITS,
+        vector=jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]),
+        samples=1,
+        throw=False,
+    ).megno
 
 
 def mean_rate(angle: Array, rate: Array) -> Array:
@@ -79,15 +85,25 @@ def draw(found: jr.SweepResult, centres: list) -> None:
     half = np.maximum(found.values, 1)
     both = np.roll(np.concatenate([half, half[::-1]]), 2 * len(half) // 3, axis=0)
     image = axes.imshow(
-        both.T, origin="lower", aspect="auto", extent=(-60, 120, 0, 3), cmap="magma",
+        both.T,
+        origin="lower",
+        aspect="auto",
+        extent=(-60, 120, 0, 3),
+        cmap="magma",
         norm=LogNorm(1, 40),
-    )  # fmt: skip
+    )
     for resonance, angle, rate in centres:
-        colour, aside = ("black", 8) if resonance == RESONANCES[0] else ("white", 0)  # a small one
-        axes.text(angle + aside, rate, str(resonance), color=colour, ha="center", va="center")
+        colour, aside = (
+            ("black", 8) if resonance == RESONANCES[0] else ("white", 0)
+        )  # a small one
+        axes.text(
+            angle + aside, rate, str(resonance), color=colour, ha="center", va="center"
+        )
     axes.text(40, 1.5, "chaotic sea", ha="center")
     bar = figure.colorbar(image, ax=axes, label=f"MEGNO after {ORBITS} orbits")
-    bar.set_ticks([1, 2, 5, 10, 20, 40], labels=["1", "2 (order)", "5", "10", "20", "40 (chaos)"])
+    bar.set_ticks(
+        [1, 2, 5, 10, 20, 40], labels=["1", "2 (order)", "5", "10", "20", "40 (chaos)"]
+    )
     bar.ax.minorticks_off()
     axes.set(
         xlabel="angle at pericentre [deg]",
@@ -100,7 +116,9 @@ def draw(found: jr.SweepResult, centres: list) -> None:
 def main() -> None:
     """Sweep, say what came out, draw."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=300, help="points along a side, 6 n")
+    parser.add_argument(
+        "--size", type=int, default=300, help="points along a side, 6 n"
+    )
     size = parser.parse_args().size
     jax.config.update("jax_enable_x64", True)
     start = time.perf_counter()
@@ -108,7 +126,9 @@ def main() -> None:
     axes = {"angle": angles, "rate": (np.arange(size) + 0.5) * 3 / size}
     found = jr.sweep(chaos, axes, block_size=2048)
     print(f"{found.valid.sum()} of {found.valid.size} motions are valid")
-    print(f"chaotic {np.mean(found.values > 5):.0%}, regular {np.mean(found.values < 3):.0%}")
+    print(
+        f"chaotic {np.mean(found.values > 5):.0%}, regular {np.mean(found.values < 3):.0%}"
+    )
     centres = islands()
     for resonance, angle, rate in centres:
         print(f"island of {resonance!s:>3}: angle {angle:.0f} deg, rate {rate:.2f}")

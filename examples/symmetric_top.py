@@ -1,8 +1,9 @@
 """The inertia of a symmetric top from its body rates: a synthetic check with a known answer.
 
-A body with I1 = I2 tumbles freely and a gyro reads its rates with 2 % noise. From nothing but the
-readings, and starting from a sphere, I1/I3 comes back with an error bar that can be trusted: over
-many records, (estimate - truth) / error is a unit normal variable.
+A body with I1 = I2 tumbles freely and a gyro reads its rates with 2 % noise. From
+nothing but the readings, and starting from a sphere, I1/I3 comes back with an error bar
+that can be trusted: over many records, (estimate - truth) / error is a unit normal
+variable.
 
 Run it: `python symmetric_top.py`.
 """
@@ -26,7 +27,9 @@ def read_gyro(key: PRNGKeyArray) -> Float[Array, "times 3"]:
     """Noisy readings of the true top [rad/s]."""
     omega = jnp.asarray(TRUE_OMEGA)
     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
-    clean = jr.free_rotation(jnp.array([TRUE_RATIO, TRUE_RATIO, 1.0]), start, TIMES).omega
+    clean = jr.free_rotation(
+        jnp.array([TRUE_RATIO, TRUE_RATIO, 1.0]), start, TIMES
+    ).omega
     sigma = NOISE * jnp.linalg.norm(omega)
     return clean + sigma * jax.random.normal(key, clean.shape, clean.dtype)
 
@@ -40,7 +43,7 @@ def recover(readings: Float[Array, "times 3"]) -> tuple[Array, Array, Array]:
     found = jr.identify.fit(
         jr.RigidBody(jnp.ones(3)),
         jr.identify.Rates(TIMES, readings, 1.0),
-        shape=jr.identify.Top(),
+        inertia_model=jr.identify.Top(),
         absolute_sigma=False,
         throw=False,
     )

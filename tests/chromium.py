@@ -6,8 +6,18 @@ import subprocess
 import tempfile
 
 QUIET = [
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+    ),
+    *(
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ),
     *("--allow-file-access-from-files", "--hide-scrollbars", "--remote-debugging-pipe"),
 ]
 
@@ -76,7 +86,12 @@ class Chromium:
 
     def open(self, url, width=1280, height=900):
         """Load a page in a window of this size."""
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        size = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": 1,
+            "mobile": False,
+        }
         self("Emulation.setDeviceMetricsOverride", **size)
         self.events.clear()
         self("Page.navigate", url=url)
@@ -85,7 +100,9 @@ class Chromium:
 
     def evaluate(self, script):
         """The value of an expression of JavaScript, a promise awaited."""
-        told = self("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        told = self(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in told:
             raise RuntimeError(told["exceptionDetails"])
         return told["result"].get("value")
@@ -98,9 +115,15 @@ class Chromium:
             match event.get("method"):
                 case "Runtime.exceptionThrown":
                     details = params["exceptionDetails"]
-                    said.append(details.get("exception", details).get("description", str(details)))
+                    said.append(
+                        details.get("exception", details).get(
+                            "description", str(details)
+                        )
+                    )
                 case "Log.entryAdded" if params["entry"]["level"] == "error":
-                    said.append(f"{params['entry']['text']} {params['entry'].get('url', '')}")
+                    said.append(
+                        f"{params['entry']['text']} {params['entry'].get('url', '')}"
+                    )
                 case "Runtime.consoleAPICalled" if params["type"] == "error":
                     said.append(str(params["args"]))
                 case "Network.requestWillBeSent":

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jaxlib
 
-# XLA's other way to generate code on CPUs, in one piece, takes half the time. What is slower to
-# compile is what users have: run `XLA_FLAGS= make test` before a release.
+# XLA's other way to generate code on CPUs, in one piece, takes half the time. What is
+# slower to compile is what users have: run `XLA_FLAGS= make test` before a release.
 if jaxlib.version.__version_info__ < (0, 11):
     quick = (
         "--xla_cpu_use_fusion_emitters=false",
@@ -21,14 +21,15 @@ import jax
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
-# Tracing makes millions of small objects that live: looking through them for cycles takes a quarter
-# of its time at the usual thresholds.
+# Tracing makes millions of small objects that live: looking through them for cycles
+# takes a quarter of its time at the usual thresholds.
 gc.set_threshold(100_000, 50, 50)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-# What was compiled is found again by the next run with the same folder, small programs too.
+# What was compiled is found again by the next run with the same folder, small programs
+# too.
 if os.environ.get("JRIGID_TEST_CACHE"):
     jax.config.update("jax_compilation_cache_dir", os.environ["JRIGID_TEST_CACHE"])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
@@ -74,9 +75,9 @@ def rng(request):
     return np.random.default_rng(seed)
 
 
-# Each compiled function keeps memory maps of its own, and Linux allows a process 65530: beyond
-# them XLA's compiler dies. The suite compiles more than that, so now and then all are let go.
-# To count them takes 50 ms when there are many: one test in eight does.
+# Each compiled function keeps memory maps of its own, and Linux allows a process 65530:
+# beyond them XLA's compiler dies. The suite compiles more than that, so now and then
+# all are let go. To count them takes 50 ms when there are many: one test in eight does.
 _MAPS = Path("/proc/self/maps")
 _MOST_MAPS = 45_000
 _TESTS = itertools.count()

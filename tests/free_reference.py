@@ -1,50 +1,56 @@
 """The free body in closed form, any body, any state, any time, to more than 30 digits.
 
-An independent check of long motions: elliptic functions and one elliptic integral in mpmath.
+An independent check of long motions: elliptic functions and one elliptic integral in
+mpmath.
 
-The polhode circles the axis c of the largest or the smallest moment; b is the middle moment's axis
-and a the third. Landau & Lifshitz, Mechanics, section 37, give omega as Jacobi functions of
-u = rate t + u0,
+The polhode circles the axis c of the largest or the smallest moment; b is the middle
+moment's axis and a the third. Landau & Lifshitz, Mechanics, section 37, give omega as
+Jacobi functions of u = rate t + u0,
 
     omega_a = A cn u,   omega_b = B sn u,   omega_c = C dn u.
 
-In a frame whose z axis is the angular momentum L, the body's z-x-z Euler angles about the axes
-(a, b, c) obey cos theta = L_c / L, tan psi = L_a / L_b and
-phi' = L (omega_a L_a + omega_b L_b) / (L_a^2 + L_b^2), which the functions above turn into
+In a frame whose z axis is the angular momentum L, the body's z-x-z Euler angles about
+the axes (a, b, c) obey cos theta = L_c / L, tan psi = L_a / L_b and
+phi' = L (omega_a L_a + omega_b L_b) / (L_a^2 + L_b^2), which the functions above turn
+into
 
     phi' = L / I_c + L (1 / I_a - 1 / I_c) / (1 - n sn^2 u),
     n = -(I_c / I_a) (I_a - I_b) / (I_b - I_c),
 
-an elliptic integral of the third kind with n <= 0, so that it is Carlson's R_J of positive
-arguments. (Their derivation is checked by Taylor series in test_free_reference.py.) A body that
-turns steadily, (I omega) x omega = 0, is one rotation. Else the sign of
+an elliptic integral of the third kind with n <= 0, so that it is Carlson's R_J of
+positive arguments. (Their derivation is checked by Taylor series in
+test_free_reference.py.) A body that turns steadily, (I omega) x omega = 0, is one
+rotation. Else the sign of
 
     D = L^2 - 2 E I_b = I_a (I_a - I_b) omega_a^2 + I_c (I_c - I_b) omega_c^2,
 
-without rounding from the doubles given, says which formula applies: with a the axis of the smallest
-moment and c that of the largest, D > 0 circles c, D < 0 circles a (their names then change places),
-and D = 0 is the exact separatrix: sech and tanh, and phi' = L / I_b about the middle axis.
+without rounding from the doubles given, says which formula applies: with a the axis of
+the smallest moment and c that of the largest, D > 0 circles c, D < 0 circles a (their
+names then change places), and D = 0 is the exact separatrix: sech and tanh, and phi' =
+L / I_b about the middle axis.
 
-Every other quantity is a sum of terms of one sign or is bounded away from cancellation by D, and
-carries 60 digits and two more for each decade by which D, or 1 - m, is small.
+Every other quantity is a sum of terms of one sign or is bounded away from cancellation
+by D, and carries 60 digits and two more for each decade by which D, or 1 - m, is small.
 """
 
 import mpmath as mp
 import numpy as np
 
 DIGITS = 60
-_EXACT = 700  # digits in which products of five doubles, and their sums, are exact in these tests
+# Digits in which products of five doubles, and their sums, are exact in these tests
+_EXACT = 700
 
 
 def free_motion(inertia, attitude, omega, times):
     """Attitude (4,) and omega (3,) at each time, as lists of mpf good to more than 30 digits.
 
-    The attitude's sign is continuous in time from that of the attitude given, which is normalised
-    first.
+    The attitude's sign is continuous in time from that of the attitude given, which is
+    normalised first.
 
     Args:
-        inertia: Three positive moments, or a symmetric tensor (3, 3), which is diagonalised to
-            `DIGITS` + 60 digits: a tensor's exact degeneracies are met to that precision only.
+        inertia: Three positive moments, or a symmetric tensor (3, 3), which is
+            diagonalised to `DIGITS` + 60 digits: a tensor's exact degeneracies are met
+            to that precision only.
         attitude: (4,), scalar first.
         omega: (3,), body components.
         times: A sequence of numbers of either sign, exact as doubles.
@@ -62,7 +68,9 @@ def free_motion(inertia, attitude, omega, times):
             moments, axes = _principal_axes(inertia)
             turns = [
                 ([r[0], *_rotate(axes, r[1:])], _rotate(axes, w))
-                for r, w in _turns(moments, _rotate(list(zip(*axes, strict=True)), w0), times)
+                for r, w in _turns(
+                    moments, _rotate(list(zip(*axes, strict=True)), w0), times
+                )
             ]
         return [(_multiply(q0, r), w) for r, w in turns]
 
@@ -89,7 +97,8 @@ def _turns(moments, w0, times):
         parts = ia * (ib - ia) * w0[a] ** 2, ic * (ic - ib) * w0[c] ** 2
         excess = parts[1] - parts[0]  # L^2 - 2 E Ib
         steady = all(
-            (moments[i] - moments[j]) * w0[i] * w0[j] == 0 for i, j in ((0, 1), (1, 2), (2, 0))
+            (moments[i] - moments[j]) * w0[i] * w0[j] == 0
+            for i, j in ((0, 1), (1, 2), (2, 0))
         )
     if steady:
         return [(_rotation(w0, t), list(w0)) for t in times]
@@ -138,7 +147,8 @@ def _euler(momentum, phi, psi):
 def _generic(moments, w, times):
     """Euler angles about L, as a quaternion, and omega; the polhode circles the third axis."""
     ia, ib, ic = moments
-    # Coefficients with (A, B, C) the largest values of the components; all summands are positive.
+    # Coefficients with (A, B, C) the largest values of the components; all summands are
+    # positive.
     peak_a = mp.sqrt(w[0] ** 2 + ib * (ib - ic) / (ia * (ia - ic)) * w[1] ** 2)
     peak_b = peak_a * mp.sqrt(ia * (ia - ic) / (ib * (ib - ic)))
     peak_c = mp.sqrt(w[2] ** 2 + ib * (ib - ia) / (ic * (ic - ia)) * w[1] ** 2)
@@ -175,7 +185,10 @@ def _generic(moments, w, times):
         integral = 2 * half_turns * whole + third_kind(u, sn, cn, dn)
         phi += length * (1 / ia - 1 / ic) * integral / rate
         # psi without jumps: it turns by pi with every half turn of u
-        psi = mp.atan2(ia * peak_a * cn, ib * peak_b * sn) - mp.sign(peak_b) * half_turns * mp.pi
+        psi = (
+            mp.atan2(ia * peak_a * cn, ib * peak_b * sn)
+            - mp.sign(peak_b) * half_turns * mp.pi
+        )
         sign = -1 if half_turns % 2 else 1
         omega = [sign * peak_a * cn, sign * peak_b * sn, peak_c * dn]
         momentum = [i * x for i, x in zip(moments, omega, strict=True)]
@@ -186,8 +199,8 @@ def _generic(moments, w, times):
 def _separatrix(moments, w, times):
     """As `_generic`, exactly on the separatrix; the third axis is that of the middle moment.
 
-    The components across the middle axis go as sech u with a constant ratio, so psi is constant;
-    2 E = L^2 / I_b makes phi' = L / I_b.
+    The components across the middle axis go as sech u with a constant ratio, so psi is
+    constant; 2 E = L^2 / I_b makes phi' = L / I_b.
     """
     momentum = [i * x for i, x in zip(moments, w, strict=True)]
     across = mp.hypot(momentum[0], momentum[1])

@@ -13,7 +13,8 @@ import numpy as np
 
 import jrigid as jr
 
-# A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot show.
+# A tumbling asymmetric body whose axes are not principal: what an isotropic one cannot
+# show.
 TENSOR = np.array([[2.0, -0.3, 0.2], [-0.3, 2.5, 0.4], [0.2, 0.4, 1.7]])
 MOMENTS = np.array([1.0, 2.0, 3.0])
 ATTITUDE = np.array([0.5, -0.1, 0.7, 0.5])
@@ -48,7 +49,10 @@ def quick_jit(function):
     """jax.jit that spends less on compiling: for large derivatives that are run once."""
     if jax.default_backend() != "cpu":
         return jax.jit(function)
-    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    options = {
+        "xla_backend_optimization_level": 0,
+        "xla_cpu_use_fusion_emitters": False,
+    }
     quick, plain = jax.jit(function, compiler_options=options), jax.jit(function)
     known = True
 

@@ -28,8 +28,8 @@ KNOTS, SWITCHES = 2048, 12
 # Runs up to this long [s] get strong torques. In longer ones the spin would run away.
 SHORT = 20.0
 _OF_MOTION = ("moments", "attitude", "omega", "breaks")
-# DOP853 at the smallest tolerance that scipy takes. Its estimate can be a thousand times
-# too small, so its steps [s] are short as well.
+# DOP853 at the smallest tolerance that scipy takes. Its estimate can be a thousand
+# times too small, so its steps [s] are short as well.
 ACCURATE = {"rtol": 3e-14, "atol": 1e-15, "max_step": 0.03}
 # Tolerance and size of the disturbance for the test of whether a motion is regular.
 LOOSE, DISTURBANCE = 1e-9, 1e-5

@@ -1,9 +1,9 @@
 """Reference motions in extended precision, by a method unlike the package's: Taylor series.
 
-Free and heavy bodies are quadratic differential equations, x_i' = sum of c x_j x_k over a short
-list of terms. Their Taylor coefficients and those of the variational equations follow from a
-recurrence, here in 80-bit floating point, for many bodies side by side, with steps short enough
-that truncation is below rounding (1e-19 a step).
+Free and heavy bodies are quadratic differential equations, x_i' = sum of c x_j x_k over
+a short list of terms. Their Taylor coefficients and those of the variational equations
+follow from a recurrence, here in 80-bit floating point, for many bodies side by side,
+with steps short enough that truncation is below rounding (1e-19 a step).
 """
 
 import numpy as np
@@ -14,11 +14,19 @@ LARGEST_STEP = 0.25
 
 # q' = q (0, omega) / 2
 _QUATERNION = (
-    (0, 1, 0, -1), (0, 2, 1, -1), (0, 3, 2, -1),
-    (1, 0, 0, 1), (1, 2, 2, 1), (1, 3, 1, -1),
-    (2, 0, 1, 1), (2, 3, 0, 1), (2, 1, 2, -1),
-    (3, 0, 2, 1), (3, 1, 1, 1), (3, 2, 0, -1),
-)  # fmt: skip
+    (0, 1, 0, -1),
+    (0, 2, 1, -1),
+    (0, 3, 2, -1),
+    (1, 0, 0, 1),
+    (1, 2, 2, 1),
+    (1, 3, 1, -1),
+    (2, 0, 1, 1),
+    (2, 3, 0, 1),
+    (2, 1, 2, -1),
+    (3, 0, 2, 1),
+    (3, 1, 1, 1),
+    (3, 2, 0, -1),
+)
 _CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
@@ -50,7 +58,9 @@ def _flow(terms, derivative_terms, x, dx, duration):
             forward, backward = series[: n + 1], series[n::-1]
             slope = slopes[n::-1]
             series[n + 1] = _bilinear(forward, backward, terms) / (n + 1)
-            total = _bilinear(forward, slope, terms) + _bilinear(forward, slope, swapped)
+            total = _bilinear(forward, slope, terms) + _bilinear(
+                forward, slope, swapped
+            )
             explicit = dc * np.sum(forward[:, dj] * backward[:, dk], axis=0)
             np.add.at(total, (di, parameter), explicit)
             slopes[n + 1] = total / (n + 1)
@@ -63,9 +73,9 @@ def _flow(terms, derivative_terms, x, dx, duration):
 def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
     """Motion of heavy (or free) bodies and its derivatives, at the end of `duration`.
 
-    Gravity pulls along -z in space; `moment_of_weight` w is m g lever in body components, so that
-    I omega' = (I omega) x omega + gamma x w, gamma' = gamma x omega, gamma the vertical in the
-    body. For a free body leave it out.
+    Gravity pulls along -z in space; `moment_of_weight` w is m g lever in body
+    components, so that I omega' = (I omega) x omega + gamma x w, gamma' = gamma x
+    omega, gamma the vertical in the body. For a free body leave it out.
 
     Args:
         moments: (B, 3).
@@ -75,10 +85,12 @@ def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
         moment_of_weight: (B, 3) or None.
 
     Returns:
-        State (B, 7): attitude and omega; Jacobian (B, 7, 10 or 13) with respect to attitude (4),
-        omega (3), moments (3) and w (3), as long doubles.
+        State (B, 7): attitude and omega; Jacobian (B, 7, 10 or 13) with respect to
+        attitude (4), omega (3), moments (3) and w (3), as long doubles.
     """
-    moments, attitude, omega = (np.asarray(v, LONG).T for v in (moments, attitude, omega))
+    moments, attitude, omega = (
+        np.asarray(v, LONG).T for v in (moments, attitude, omega)
+    )
     bodies = moments.shape[1]
     heavy = moment_of_weight is not None
     one = np.ones(bodies, LONG)
@@ -101,14 +113,20 @@ def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
             for a, c, sign in ((j, k, 1), (k, j, -1)):
                 terms.append((4 + i, 7 + a, 10, sign * weight[c] / moments[i]))
                 derivatives.append((4 + i, 7 + a, 10, 10 + c, sign / moments[i]))
-                derivatives.append((4 + i, 7 + a, 10, 7 + i, -sign * weight[c] / moments[i] ** 2))
+                derivatives.append(
+                    (4 + i, 7 + a, 10, 7 + i, -sign * weight[c] / moments[i] ** 2)
+                )
     x = np.zeros((rows, bodies), LONG)
     dx = np.zeros((rows, columns, bodies), LONG)
     x[:4], x[4:7] = attitude, omega
     dx[np.arange(7), np.arange(7)] = 1
     if heavy:
         w, p, q, r = attitude
-        x[7:10] = 2 * (p * r - w * q), 2 * (q * r + w * p), w * w - p * p - q * q + r * r
+        x[7:10] = (
+            2 * (p * r - w * q),
+            2 * (q * r + w * p),
+            w * w - p * p - q * q + r * r,
+        )
         x[10] = 1
         dx[7:10, :4] = 2 * np.array([[-q, r, -w, p], [p, w, r, q], [w, -p, -q, r]])
     columns_of = [np.array(v) for v in zip(*terms, strict=True)]
@@ -133,8 +151,9 @@ def _turned(products):
 def free_hessian_vector(moments, attitude, omega, duration, direction):
     """The derivative of `heavy_body`'s Jacobian along a direction, for free bodies.
 
-    By the second variational equations. As there, the attitude's norm is a free input: the motion
-    is q' = q (0, omega) / 2 for any q, so that its last state is linear in the first attitude.
+    By the second variational equations. As there, the attitude's norm is a free input:
+    the motion is q' = q (0, omega) / 2 for any q, so that its last state is linear in
+    the first attitude.
 
     Args:
         moments: (B, 3).
@@ -146,11 +165,13 @@ def free_hessian_vector(moments, attitude, omega, duration, direction):
     Returns:
         (B, 7, 10), long doubles: d/ds of the Jacobian at inputs + s direction.
     """
-    moments, attitude, omega = (np.asarray(v, LONG).T for v in (moments, attitude, omega))
+    moments, attitude, omega = (
+        np.asarray(v, LONG).T for v in (moments, attitude, omega)
+    )
     bodies = moments.shape[1]
     along = np.broadcast_to(np.asarray(direction, LONG), (bodies, 10)).T
-    # omega_i' = ratio_i omega_j omega_k, ratio_i = (I_j - I_k) / I_i, and its derivatives with
-    # respect to the moments, along the direction, and both
+    # omega_i' = ratio_i omega_j omega_k, ratio_i = (I_j - I_k) / I_i, and its
+    # derivatives with respect to the moments, along the direction, and both
     ratio = np.zeros((3, bodies), LONG)
     slope = np.zeros((3, 3, bodies), LONG)
     turned_slope = np.zeros((3, 3, bodies), LONG)
@@ -165,14 +186,17 @@ def free_hessian_vector(moments, attitude, omega, duration, direction):
         turned_slope[i, k] = change[i] / moments[i] ** 2
         turned_slope[i, i] = -(turned_ratio[i] + slope[i, i] * change[i]) / moments[i]
 
-    # The turn r since the start, q = q0 r, depends on omega and the moments alone (6 columns).
-    # Columns of dx: 0-5 the derivatives, 6 that along the direction, 7-12 both.
+    # The turn r since the start, q = q0 r, depends on omega and the moments alone (6
+    # columns). Columns of dx: 0-5 the derivatives, 6 that along the direction, 7-12
+    # both.
     x = np.zeros((7, bodies), LONG)
     dx = np.zeros((7, 13, bodies), LONG)
     x[0], x[4:] = 1, omega
     dx[[4, 5, 6], [0, 1, 2]] = 1
     dx[4:, 6] = along[4:7]
-    speed = np.sqrt(np.sum(omega**2, axis=0)) * np.maximum(0.5, np.max(np.abs(ratio), axis=0))
+    speed = np.sqrt(np.sum(omega**2, axis=0)) * np.maximum(
+        0.5, np.max(np.abs(ratio), axis=0)
+    )
     steps = max(1, int(np.ceil(np.max(np.abs(duration) * speed) / LARGEST_STEP)))
     h = np.broadcast_to(np.asarray(duration, LONG), (bodies,)) / steps
     first, second = [1, 2, 0], [2, 0, 1]
@@ -194,12 +218,18 @@ def free_hessian_vector(moments, attitude, omega, duration, direction):
             new[:4] = _turned(_products(r, w[:, None]))[:, 0]
             new[4:] = ratio * product
             slopes_new[:4] = _turned(_products(r, dw) + _products(w, dr).swapaxes(0, 1))
-            slopes_new[:4, 7:] += _turned(_products(yr, jw) + _products(yw, jr).swapaxes(0, 1))
+            slopes_new[:4, 7:] += _turned(
+                _products(yr, jw) + _products(yw, jr).swapaxes(0, 1)
+            )
             slopes_new[4:] = ratio[:, None] * both
             slopes_new[4:, 3:6] += slope * product[:, None]
             slopes_new[4:, 6] += turned_ratio * product
-            slopes_new[4:, 7:] += turned_ratio[:, None] * both[:, :6] + ratio[:, None] * across
-            slopes_new[4:, 10:] += slope * both[:, 6:7] + turned_slope * product[:, None]
+            slopes_new[4:, 7:] += (
+                turned_ratio[:, None] * both[:, :6] + ratio[:, None] * across
+            )
+            slopes_new[4:, 10:] += (
+                slope * both[:, 6:7] + turned_slope * product[:, None]
+            )
             series[..., n + 1], slopes[..., n + 1] = new / (n + 1), slopes_new / (n + 1)
         x, dx = series[..., ORDER], slopes[..., ORDER]
         for n in range(ORDER - 1, -1, -1):

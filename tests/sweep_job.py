@@ -56,7 +56,9 @@ def executor(mode):
     if mode == "dask":
         from dask.distributed import Client, LocalCluster
 
-        cluster = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+        cluster = LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        )
         return Client(cluster).get_executor()
     return None
 
@@ -64,7 +66,12 @@ def executor(mode):
 if __name__ == "__main__":
     mode, store, blocks = sys.argv[1], sys.argv[2], int(sys.argv[3])
     done = jr.sweep(
-        slow, axes(blocks), store=store, executor=executor(mode), block_size=BLOCK, progress=False
+        slow,
+        axes(blocks),
+        store=store,
+        executor=executor(mode),
+        block_size=BLOCK,
+        progress=False,
     )
     assert done.valid[...].all()
     assert not done.failures

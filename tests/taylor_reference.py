@@ -1,6 +1,7 @@
 """Free bodies and symmetric tops by Taylor series in fixed-point integers: no formulas.
 
-Good to any number of digits; what the closed form of free_reference.py is checked against.
+Good to any number of digits; what the closed form of free_reference.py is checked
+against.
 """
 
 import operator
@@ -9,8 +10,9 @@ from math import isqrt
 
 import mpmath as mp
 
-# The state is the attitude (0 to 3), omega (4 to 6) and, for a top, the vertical gamma in body
-# components (7 to 9). A rate is the sum of sign * state[j] * state[k] over its (j, k, sign).
+# The state is the attitude (0 to 3), omega (4 to 6) and, for a top, the vertical gamma
+# in body components (7 to 9). A rate is the sum of sign * state[j] * state[k] over its
+# (j, k, sign).
 
 # q' = q (0, omega) / 2, without the half
 _QUATERNION = (
@@ -30,15 +32,16 @@ _VERTICAL = (
 def taylor_motion(moments, attitude, omega, time, bits=256):
     """Attitude (4,) and omega (3,) of a free body at one time, as lists of mpf.
 
-    Steps are cut so that the series' last terms fall below the last bit: the error is some
-    (steps) x 2^-bits times what the motion itself amplifies.
+    Steps are cut so that the series' last terms fall below the last bit: the error is
+    some (steps) x 2^-bits times what the motion itself amplifies.
 
     Args:
         moments: Three positive doubles.
         attitude: (4,), normalised first.
         omega: (3,), not zero.
         time: A double of either sign.
-        bits: After the binary point, with the unit of time such that |omega| is about 1.
+        bits: After the binary point, with the unit of time such that |omega| is about
+            1.
     """
     moments = _exact(moments)
     ratios = []
@@ -51,8 +54,8 @@ def taylor_motion(moments, attitude, omega, time, bits=256):
 def taylor_top(i1, i3, mgl, attitude, omega, time, bits=128):
     """Attitude (4,) and omega (3,) of a heavy symmetric top at one time, as lists of mpf.
 
-    I1 omega1' = (I1 - I3) omega2 omega3 + mgl gamma2, and so on, with gamma the vertical in body
-    components. The error is as in `taylor_motion`.
+    I1 omega1' = (I1 - I3) omega2 omega3 + mgl gamma2, and so on, with gamma the
+    vertical in body components. The error is as in `taylor_motion`.
 
     Args:
         i1: The moment about body axes 1 and 2.
@@ -61,14 +64,17 @@ def taylor_top(i1, i3, mgl, attitude, omega, time, bits=128):
         attitude: (4,), body to space, normalised first.
         omega: (3,), in body components.
         time: A double of either sign.
-        bits: After the binary point, with the unit of time such that the largest of |omega|,
+        bits: After the binary point, with the unit of time such that the largest of
+            |omega|,
             |I3 / I1 omega3| and sqrt(|mgl| / I1) is about 1.
     """
     i1, i3, mgl = _exact((i1, i3, mgl))
     rates = [*_exact(omega), i3 / i1 * _exact(omega)[2]]
     fastest = max(*(abs(float(x)) for x in rates), float(abs(mgl / i1)) ** 0.5)
     ratio = (i1 - i3) / i1
-    return _motion((ratio, -ratio, Fraction(0)), mgl / i1, attitude, omega, time, fastest, bits)
+    return _motion(
+        (ratio, -ratio, Fraction(0)), mgl / i1, attitude, omega, time, fastest, bits
+    )
 
 
 def _motion(ratios, torque, attitude, omega, time, fastest, bits):
@@ -85,7 +91,11 @@ def _motion(ratios, torque, attitude, omega, time, fastest, bits):
     x = [fixed(v / norm) for v in attitude] + [fixed(v / unit) for v in omega]
     if torque is not None:
         q0, q1, q2, q3 = attitude
-        vertical = 2 * (q1 * q3 - q0 * q2), 2 * (q2 * q3 + q0 * q1), q0**2 - q1**2 - q2**2 + q3**2
+        vertical = (
+            2 * (q1 * q3 - q0 * q2),
+            2 * (q2 * q3 + q0 * q1),
+            q0**2 - q1**2 - q2**2 + q3**2,
+        )
         x += [fixed(v / square) for v in vertical]
         torque = fixed(torque / unit**2)
     ratios = [fixed(r) for r in ratios]

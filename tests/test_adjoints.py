@@ -23,7 +23,9 @@ TORQUES = {
     "quadratic drag": jr.torques.QuadraticDrag(0.2),
     "friction": jr.torques.CoulombFriction(0.1, 0.05),
     "weight": jr.torques.UniformGravity(1.0, jnp.array([0.1, 0.0, 0.3]), -ALONG_Z),
-    "gravity gradient": jr.torques.GravityGradient(0.3, jr.torques.KeplerOrbit(1.0, 1.0, 0.2)),
+    "gravity gradient": jr.torques.GravityGradient(
+        0.3, jr.torques.KeplerOrbit(1.0, 1.0, 0.2)
+    ),
     "magnet": jr.torques.MagneticDipole(jnp.array([0.2, 0.0, 0.1]), ALONG_Z),
     "rotor": jr.torques.Rotor(lambda t: jnp.array([0.0, 0.2, 0.3]) * jnp.cos(t)),
     "wheel": jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0])),
@@ -36,7 +38,9 @@ def last_rate(parameters, torque, adjoint):
     body = jr.RigidBody(parameters[:3], torque)
     state0 = jr.State(ATTITUDE, parameters[3:])
     steps = 256 if isinstance(adjoint, diffrax.DirectAdjoint) else None
-    return jr.simulate(body, state0, TS, adjoint=adjoint, max_steps=steps).states.omega[-1]
+    return jr.simulate(body, state0, TS, adjoint=adjoint, max_steps=steps).states.omega[
+        -1
+    ]
 
 
 PARAMETERS = jnp.concatenate([MOMENTS, OMEGA])
@@ -46,7 +50,9 @@ FORWARD, DIRECT = diffrax.ForwardMode(), diffrax.DirectAdjoint()
 def test_what_direct_computes_twice_is_the_same_motion():
     torque = TORQUES["damper and function of time"]
     slopes = jax.jacrev(lambda p: last_rate(p, torque, DIRECT))(PARAMETERS)
-    expected = quick_jit(jax.jacfwd(lambda p: last_rate(p, torque, FORWARD)))(PARAMETERS)
+    expected = quick_jit(jax.jacfwd(lambda p: last_rate(p, torque, FORWARD)))(
+        PARAMETERS
+    )
     np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-11)
 
 
@@ -60,8 +66,12 @@ def test_every_adjoint_in_every_mode_under_every_torque(name):
         "direct, forward": (jax.jacfwd, DIRECT),
     }
     found = {
-        way: mode(lambda p, adjoint=adjoint: last_rate(p, TORQUES[name], adjoint))(PARAMETERS)
+        way: mode(lambda p, adjoint=adjoint: last_rate(p, TORQUES[name], adjoint))(
+            PARAMETERS
+        )
         for way, (mode, adjoint) in ways.items()
     }
     for way, slopes in found.items():
-        np.testing.assert_allclose(slopes, found["forward"], rtol=0, atol=1e-9, err_msg=way)
+        np.testing.assert_allclose(
+            slopes, found["forward"], rtol=0, atol=1e-9, err_msg=way
+        )

@@ -18,7 +18,9 @@ def test_jitted_vmapped_product_with_a_shared_matrix_is_right():
     matrix = rng.normal(size=(3, 3))
     omegas = rng.normal(size=(20000, 3))
     ours = jax.jit(jax.vmap(lambda w: jnp.sum((jnp.asarray(matrix) @ w) ** 2)))(omegas)
-    np.testing.assert_allclose(ours, np.sum((omegas @ matrix.T) ** 2, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(
+        ours, np.sum((omegas @ matrix.T) ** 2, axis=1), rtol=1e-12
+    )
 
 
 def test_kinetic_energy_of_many_lanes_is_right():

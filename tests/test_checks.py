@@ -20,7 +20,9 @@ class Answer(eqx.Module):
 
 def look(inertia, x):
     findings = Findings()
-    findings.require(_checks.is_inertia(inertia), RESULTS.invalid_inertia, value=inertia)
+    findings.require(
+        _checks.is_inertia(inertia), RESULTS.invalid_inertia, value=inertia
+    )
     message = "Argument `x` must be positive, but it is not."
     findings.require(x > 0, RESULTS.invalid_state, message, x)
     return findings
@@ -29,7 +31,9 @@ def look(inertia, x):
 @eqx.filter_jit
 def compute(inertia, x):
     findings = look(inertia, x)
-    result = RESULTS.where(findings.ok & (x > 10), RESULTS.max_steps_reached, findings.result)
+    result = RESULTS.where(
+        findings.ok & (x > 10), RESULTS.max_steps_reached, findings.result
+    )
     return Answer(_checks.nan_where(~findings.ok, jnp.sum(inertia) * x * 2), result)
 
 
@@ -47,18 +51,31 @@ XS = jnp.array([1.0, -2.0, -3.0])
         (lambda: work(MOMENTS, -1.0), r"`x` must be positive, but it is not: -1\.0\."),
         (lambda: work(-MOMENTS, 1.0), r"not: \[-1\. -2\. -3\.\]\. \(Three bodies"),
         (lambda: work(MOMENTS, 11.0), "maximum number of solver steps"),
-        (lambda: jax.vmap(lambda x: work(MOMENTS, x))(XS), r"not: -2\.0 in lane 1 and 1 more\."),
-        (lambda: jax.vmap(lambda x: work(-MOMENTS, x))(XS), r"-3\.\] in lane 0 and 2 more"),
+        (
+            lambda: jax.vmap(lambda x: work(MOMENTS, x))(XS),
+            r"not: -2\.0 in lane 1 and 1 more\.",
+        ),
+        (
+            lambda: jax.vmap(lambda x: work(-MOMENTS, x))(XS),
+            r"-3\.\] in lane 0 and 2 more",
+        ),
         (
             lambda: jax.vmap(
-                lambda a: jax.vmap(lambda x: work(a * MOMENTS, x))(jnp.array([1.0, 2.0, 3.0]))
+                lambda a: jax.vmap(lambda x: work(a * MOMENTS, x))(
+                    jnp.array([1.0, 2.0, 3.0])
+                )
             )(jnp.array([1.0, -1.0])),
             r"\[-1\. -2\. -3\.\] in lane \(1, 0\) and 2 more",
         ),
         (lambda: jax.grad(lambda x: work(MOMENTS, x).value)(-1.0), r"not: -1\.0\."),
-        (lambda: jax.vmap(jax.grad(lambda x: work(MOMENTS, x).value))(XS), r"-2\.0 in lane 1"),
         (
-            lambda: jax.grad(lambda a: jnp.sum(jax.vmap(lambda x: work(MOMENTS, x).value)(a)))(XS),
+            lambda: jax.vmap(jax.grad(lambda x: work(MOMENTS, x).value))(XS),
+            r"-2\.0 in lane 1",
+        ),
+        (
+            lambda: jax.grad(
+                lambda a: jnp.sum(jax.vmap(lambda x: work(MOMENTS, x).value)(a))
+            )(XS),
             r"-2\.0 in lane 1",
         ),
         (
@@ -88,13 +105,17 @@ def test_inside_jit_the_error_is_raised_at_run_time(xs, message):
 def test_good_values_pass_everywhere_and_without_callbacks():
     assert work(MOMENTS, 1.0).value == 12
     assert jax.grad(lambda x: work(MOMENTS, x).value)(1.0) == 12
-    assert "callback" not in str(jax.make_jaxpr(lambda x: work(MOMENTS, x, throw=False).value)(1.0))
+    assert "callback" not in str(
+        jax.make_jaxpr(lambda x: work(MOMENTS, x, throw=False).value)(1.0)
+    )
 
 
-def test_without_throw_a_bad_lane_is_marked_and_no_other_touched():
+def test_without_trial_a_bad_lane_is_marked_and_no_other_touched():
     found = jax.vmap(lambda x: work(MOMENTS, x, throw=False))(XS)
     np.testing.assert_array_equal(found.value, [12, np.nan, np.nan])
-    np.testing.assert_array_equal(found.result == RESULTS.invalid_state, [False, True, True])
+    np.testing.assert_array_equal(
+        found.result == RESULTS.invalid_state, [False, True, True]
+    )
 
 
 def test_a_builder_raises_or_is_nan():
@@ -103,7 +124,9 @@ def test_a_builder_raises_or_is_nan():
 
     with pytest.raises(RuntimeError, match=r"not: -2\.0 in lane 1 and 1 more"):
         jax.vmap(lambda x: build(x, True))(XS)
-    np.testing.assert_array_equal(jax.vmap(lambda x: build(x, False))(XS), [1, np.nan, np.nan])
+    np.testing.assert_array_equal(
+        jax.vmap(lambda x: build(x, False))(XS), [1, np.nan, np.nan]
+    )
 
 
 def test_a_formula_is_nan_outside_its_domain_and_its_derivatives_are_clean():

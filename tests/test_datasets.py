@@ -42,7 +42,9 @@ def test_earth_pole_reads_the_published_digits(earth):
 
 def test_earth_pole_without_its_extra_says_which(monkeypatch):
     monkeypatch.setitem(sys.modules, "astropy_iers_data", None)
-    with pytest.raises(ImportError, match=r'astropy-iers-data: pip install "jrigid\[data\]"'):
+    with pytest.raises(
+        ImportError, match=r'astropy-iers-data: pip install "jrigid\[data\]"'
+    ):
         jr.datasets.earth_pole()
 
 
@@ -65,9 +67,15 @@ def test_toutatis_attitudes_are_z_x_z(toutatis):
         }
         return np.array(matrices[axis])
 
-    expected = about("z", 122.2) @ about("x", 86.5) @ about("z", 107.0)  # first line of the file
-    np.testing.assert_allclose(hat_rotation(toutatis.attitudes[0]), expected, atol=1e-14)
-    np.testing.assert_allclose(np.linalg.norm(toutatis.attitudes, axis=1), 1.0, atol=1e-15)
+    expected = (
+        about("z", 122.2) @ about("x", 86.5) @ about("z", 107.0)
+    )  # first line of the file
+    np.testing.assert_allclose(
+        hat_rotation(toutatis.attitudes[0]), expected, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(toutatis.attitudes, axis=1), 1.0, atol=1e-15
+    )
 
 
 @eqx.filter_jit
@@ -103,7 +111,9 @@ def misfit_degrees(toutatis, omega):
     overlap = np.abs(np.sum(state[:, :4] * toutatis.attitudes[:17], axis=1))
     overlap /= np.linalg.norm(state[:, :4], axis=1)
     degrees = np.degrees(2 * np.arccos(np.minimum(overlap, 1.0)))
-    per_day = np.degrees(np.linalg.norm(state[:, 4:] - toutatis.omegas[:17], axis=1)) * 86400
+    per_day = (
+        np.degrees(np.linalg.norm(state[:, 4:] - toutatis.omegas[:17], axis=1)) * 86400
+    )
     return degrees, per_day
 
 
@@ -117,7 +127,9 @@ def test_toutatis_axes_are_right_handed_as_labelled(toutatis):
     assert np.median(per_day) < 7.0
 
 
-@pytest.mark.parametrize("signs", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (1, -1, -1)])
+@pytest.mark.parametrize(
+    "signs", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (1, -1, -1)]
+)
 def test_toutatis_axes_labelled_otherwise_miss_the_radar(toutatis, signs):
     degrees, _ = misfit_degrees(toutatis, toutatis.epoch_omega * np.array(signs))
     assert np.median(degrees) > 30.0
@@ -130,7 +142,9 @@ def test_gyro_example_is_free_rotation_plus_its_noise():
     momentum = np.sum((record.true_moments * record.true_omegas) ** 2, axis=1)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
     np.testing.assert_allclose(momentum, momentum[0], rtol=1e-7)
-    np.testing.assert_allclose(np.std(record.omegas - record.true_omegas), record.sigma, rtol=0.1)
+    np.testing.assert_allclose(
+        np.std(record.omegas - record.true_omegas), record.sigma, rtol=0.1
+    )
     assert np.ptp(np.sign(record.true_omegas[:, 1])) == 2.0  # it flips over
 
 

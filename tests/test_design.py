@@ -34,16 +34,16 @@ def error(omega):
 
 @pytest.fixture(scope="module")
 def best():
-    return identify.optimal_throw(plan_of(np.array([0.0, 0.1, 1.0])), spin, MOST)
+    return identify.optimal_trial(plan_of(np.array([0.0, 0.1, 1.0])), spin, MOST)
 
 
-def test_the_best_throw_beats_random_ones(best, rng):
+def test_the_best_trial_beats_random_ones(best, rng):
     omega = np.asarray(best.plan.state.omega)
     assert np.linalg.norm(omega) <= MOST * (1 + 1e-12)
-    throws = rng.normal(size=(400, 3))
-    throws *= MOST / np.linalg.norm(throws, axis=1, keepdims=True)
-    throws[200:] *= rng.uniform(size=(200, 1)) ** (1 / 3)  # and within the limit
-    errors = np.asarray(error(np.concatenate([throws, omega[None], [[0.0, 0.1, 1.0]]])))
+    trials = rng.normal(size=(400, 3))
+    trials *= MOST / np.linalg.norm(trials, axis=1, keepdims=True)
+    trials[200:] *= rng.uniform(size=(200, 1)) ** (1 / 3)  # and within the limit
+    errors = np.asarray(error(np.concatenate([trials, omega[None], [[0.0, 0.1, 1.0]]])))
     *random, found, first = errors
     assert found <= np.nanmin(random)
     np.testing.assert_allclose(np.exp(best.score), found, rtol=1e-9)
@@ -51,7 +51,7 @@ def test_the_best_throw_beats_random_ones(best, rng):
     assert found < 0.1 * first
 
 
-def test_the_best_throw_is_one_that_no_small_change_betters(best, rng):
+def test_the_best_trial_is_one_that_no_small_change_betters(best, rng):
     """By gradient and by the neighbours; each start has only gone down."""
     assert float(best.slope) < 0.03
     omega = np.asarray(best.plan.state.omega)
@@ -97,17 +97,19 @@ def test_a_plan_s_bound_has_its_slopes_in_both_modes():
 def test_a_plan_that_says_too_little_is_refused():
     plan = plan_of(np.ones(3))
     with pytest.raises(ValueError, match="an entry for each of 2 arrays"):
-        identify.optimal_throw(plan, lambda x: (x.state.omega, x.observations.ts), [1.0])
+        identify.optimal_trial(
+            plan, lambda x: (x.state.omega, x.observations.ts), [1.0]
+        )
     with pytest.raises(ValueError, match="noise"):
         identify.Plan(NEARLY_SYMMETRIC, plan.state, identify.Rates(TS, None))
     with pytest.raises(ValueError, match="scale"):
         plan_of(np.ones(3), scale="known")
-    with pytest.raises(ValueError, match="nothing of `each` throw"):
+    with pytest.raises(ValueError, match="nothing of `each` trial"):
         _ = plan_of(np.ones(3), free=lambda _, gyro: identify.each(gyro.bias)).bound
 
 
 @pytest.mark.slow  # 300 fits
-def test_fits_of_the_best_throw_scatter_as_it_promises(best, rng):
+def test_fits_of_the_best_trial_scatter_as_it_promises(best, rng):
     """Ratios over those of the truth, in units of the bound: a covariance of 1."""
     first = plan_of(np.array([0.0, 0.4, 1.0]))
     spread = []
@@ -119,7 +121,9 @@ def test_fits_of_the_best_throw_scatter_as_it_promises(best, rng):
         off = np.asarray(found.ratios) - np.array([1.05, 1.6])
         spread.append(np.sqrt(np.trace(np.cov(off.T))))
         if plan is best.plan:
-            half = np.linalg.inv(np.linalg.cholesky(np.asarray(plan.bound.ratios_covariance)))
+            half = np.linalg.inv(
+                np.linalg.cholesky(np.asarray(plan.bound.ratios_covariance))
+            )
             np.testing.assert_allclose(np.cov(half @ off.T), np.eye(2), atol=0.35)
             assert np.all(np.abs(np.mean(half @ off.T, axis=1)) < 4 / np.sqrt(300))
     assert spread[0] < 0.7 * spread[1]
@@ -129,13 +133,13 @@ def test_fits_of_the_best_throw_scatter_as_it_promises(best, rng):
 def test_the_spin_and_the_times_together():
     """Few samples, at the times that tell most: fewer errors than any even spacing in the box."""
     plan = plan_of(np.array([0.3, 0.5, 0.8]), np.linspace(0, 18, 12))
-    best = identify.optimal_throw(
+    best = identify.optimal_trial(
         plan, lambda x: (x.state.omega, x.observations.ts), (1.0, (0.0, 18.0)), starts=4
     )
     times = np.asarray(best.plan.observations.ts)
     assert times.min() >= 0
     assert times.max() <= 18
-    of_spin = identify.optimal_throw(plan, spin, 1.0, starts=4)
+    of_spin = identify.optimal_trial(plan, spin, 1.0, starts=4)
     assert float(best.score) < float(of_spin.score) - 0.1
     assert float(of_spin.score) < float(of_spin.start_score)
 
@@ -148,11 +152,15 @@ def test_a_wheel_s_profile_is_chosen_within_its_limits():
     record = identify.Rates(np.linspace(0, 6, 15), None, NOISE)
     state = jr.State(UNTURNED, np.array([0.3, 0.5, 0.8]))
     plan = identify.Plan(body, state, record, scale="rotor")
-    best = identify.optimal_throw(
-        plan, lambda x: x.system.torque.momentum.values, (-0.3, 0.3), starts=2, steps=30,
+    best = identify.optimal_trial(
+        plan,
+        lambda x: x.system.torque.momentum.values,
+        (-0.3, 0.3),
+        starts=2,
+        steps=30,
         score=lambda bound: jnp.linalg.slogdet(bound.covariance[:6, :6])[1],
-    )  # fmt: skip
+    )
     profile = np.asarray(best.plan.system.torque.momentum.values)
     assert np.abs(profile).max() <= 0.3 + 1e-12
     assert float(best.score) < float(best.start_score) - 1
-    assert bool(best.plan.told.status == identify.Status.OK)
+    assert bool(best.plan.predicted.status == identify.Status.OK)

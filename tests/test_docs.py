@@ -24,11 +24,12 @@ PAGES = [
 
 
 # What takes long in CI; recipes are all run.
-LONG = re.compile(r"jr\.identify\.(fit|optimal_throw)\(|optax.*jr\.simulate", re.DOTALL)
+LONG = re.compile(r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate", re.DOTALL)
 LONG_PAGES = [
     x
     for x in PAGES
-    # The block of identify.md is the example in the docstring of `fit`, but for what it seeks.
+    # The block of identify.md is the example in the docstring of `fit`, but for what it
+    # seeks.
     if x.parent.name != "recipes" and x.stem != "identify"
     if any(map(LONG.search, BLOCK.findall(x.read_text())))
 ]
@@ -56,9 +57,13 @@ def run(page, wanted):
     for block in BLOCK.finditer(text):
         if not wanted(block[1]):
             continue
-        above = text[: block.start(1)].count("\n")  # so that an error names the page's line
+        above = text[: block.start(1)].count(
+            "\n"
+        )  # so that an error names the page's line
         code = compile("\n" * above + block[1], str(page), "exec")
-        with jax.numpy_dtype_promotion("standard"):  # as users have it, and as optax needs it
+        with jax.numpy_dtype_promotion(
+            "standard"
+        ):  # as users have it, and as optax needs it
             exec(code, namespace)
         count += 1
     if pyplot := sys.modules.get("matplotlib.pyplot"):
@@ -72,8 +77,13 @@ NUMBER = re.compile(r"(?<![\w.^])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 def compare(page, *printed):
     """`print` in a block: numbers are those of the comment beside it, or on the next line."""
     line = sys._getframe(1).f_lineno
-    comment = "#".join(page[line - 1].split("#")[1:]) or page[line].strip().partition("# ")[2]
-    found, written = NUMBER.findall(" ".join(map(str, printed))), NUMBER.findall(comment)
+    comment = (
+        "#".join(page[line - 1].split("#")[1:]) or page[line].strip().partition("# ")[2]
+    )
+    found, written = (
+        NUMBER.findall(" ".join(map(str, printed))),
+        NUMBER.findall(comment),
+    )
     for x in found[: len(written)]:  # a loop's comment has the numbers of all its turns
         assert any(is_rounded(x, y) for y in written), (page[line - 1], printed)
 
@@ -84,7 +94,9 @@ def is_rounded(x, y):
     return abs(float(x) - float(y)) <= last
 
 
-DRAWS = re.compile(r"\b(plt|jr\.plot)\.\w|\.(plot|legend|annotate|scatter|hist|axvline)\(")
+DRAWS = re.compile(
+    r"\b(plt|jr\.plot)\.\w|\.(plot|legend|annotate|scatter|hist|axvline)\("
+)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +105,9 @@ DRAWS = re.compile(r"\b(plt|jr\.plot)\.\w|\.(plot|legend|annotate|scatter|hist|a
 def test_notebooks_draw_in_ten_lines(path):
     """A cell draws last: from where it begins to its end there are ten lines of code at most."""
     for cell in json.loads(path.read_text())["cells"]:
-        code = [line for line in map(str.strip, cell["source"]) if line and line[0] != "#"]
+        code = [
+            line for line in map(str.strip, cell["source"]) if line and line[0] != "#"
+        ]
         drawing = [i for i, line in enumerate(code) if DRAWS.search(line)]
         if cell["cell_type"] == "code" and drawing:
             assert len(code) - drawing[0] <= 10, (cell["id"], code[drawing[0]])

@@ -50,7 +50,9 @@ def test_against_numpy(name, dtype):
     }
     for key, value in found.items():
         assert value.dtype == dtype
-        np.testing.assert_allclose(value, expected[key], atol=ulps(dtype, 16), err_msg=key)
+        np.testing.assert_allclose(
+            value, expected[key], atol=ulps(dtype, 16), err_msg=key
+        )
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -83,7 +85,9 @@ def test_energy_changes_at_the_power_of_the_torque_and_poinsots_invariants_do_no
             jr.kinetic_energy(inertia, w),
             jnp.sum(jr.angular_momentum(inertia, w) ** 2),
         )
-        driven = jax.jvp(invariants, (omega,), (jr.euler_equations(inertia, omega, torque),))
+        driven = jax.jvp(
+            invariants, (omega,), (jr.euler_equations(inertia, omega, torque),)
+        )
         free = jax.jvp(invariants, (omega,), (jr.euler_equations(inertia, omega),))
         return driven[1], free[1]
 
@@ -98,7 +102,9 @@ def test_moments_and_their_diagonal_tensor_agree():
     for moments in (MOMENTS, BREAKS_THE_TRIANGLE):
         for key, value in everything(np.diag(moments), OMEGA, TORQUE).items():
             expected = everything(moments, OMEGA, TORQUE)[key]
-            np.testing.assert_allclose(value, expected, atol=ulps(float, 8), err_msg=key)
+            np.testing.assert_allclose(
+                value, expected, atol=ulps(float, 8), err_msg=key
+            )
 
 
 def test_a_body_in_turned_axes_moves_the_same_way():
@@ -109,7 +115,9 @@ def test_a_body_in_turned_axes_moves_the_same_way():
     other = everything((turned + turned.T) / 2, r @ OMEGA, r @ TORQUE)
     for key, value in own.items():
         expected = r @ value if value.shape else value
-        np.testing.assert_allclose(other[key], expected, atol=ulps(float, 32), err_msg=key)
+        np.testing.assert_allclose(
+            other[key], expected, atol=ulps(float, 32), err_msg=key
+        )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -125,7 +133,8 @@ def test_a_sphere_keeps_its_rate_exactly(dtype):
 def test_bearings_bear_nothing_about_a_principal_axis_and_more_the_faster_the_wobble():
     for axis in np.eye(3):
         assert np.all(np.asarray(jr.bearing_torque(MOMENTS, 7 * axis)) == 0)
-    # a disk on a shaft tilted by b: (I3 - I1) w^2 sin b cos b (Goldstein, 3rd ed., section 5.5)
+    # a disk on a shaft tilted by b: (I3 - I1) w^2 sin b cos b (Goldstein, 3rd ed.,
+    # section 5.5)
     b, spin, disk = 0.2, 30.0, np.array([1.0, 1.0, 2.0])
     torque = jr.bearing_torque(disk, spin * np.array([np.sin(b), 0.0, np.cos(b)]))
     size = (2.0 - 1.0) * spin**2 * np.sin(b) * np.cos(b)
@@ -140,7 +149,9 @@ def test_bearings_bear_nothing_about_a_principal_axis_and_more_the_faster_the_wo
 def test_a_tensor_of_any_size_neither_overflows_nor_underflows(size, dtype):
     """An asteroid's tensor in float32: products of three moments are out of range."""
     found = everything(
-        (size * TENSOR).astype(dtype), OMEGA.astype(dtype), (size * TORQUE).astype(dtype)
+        (size * TENSOR).astype(dtype),
+        OMEGA.astype(dtype),
+        (size * TORQUE).astype(dtype),
     )
     expected = np.linalg.solve(TENSOR, TORQUE - np.cross(OMEGA, TENSOR @ OMEGA))
     np.testing.assert_allclose(found["rate"], expected, atol=ulps(dtype, 16))
@@ -159,29 +170,42 @@ def test_derivatives_at_the_sphere_and_at_equal_moments():
         i = moments.astype(complex)
         i[k] += 1j * h
         w = OMEGA
-        rate = (TORQUE + np.array(
-            [(i[1] - i[2]) * w[1] * w[2], (i[2] - i[0]) * w[2] * w[0], (i[0] - i[1]) * w[0] * w[1]]
-        )) / i  # fmt: skip
+        rate = (
+            TORQUE
+            + np.array(
+                [
+                    (i[1] - i[2]) * w[1] * w[2],
+                    (i[2] - i[0]) * w[2] * w[0],
+                    (i[0] - i[1]) * w[0] * w[1],
+                ]
+            )
+        ) / i
         return rate.imag / h
 
     for moments in (np.ones(3), np.array([1.0, 1.0, 1.5]), np.array([2.0, 1.5, 1.5])):
         expected = np.stack([exact(moments, k) for k in range(3)], axis=1)
         for found in jacobians(moments):
             np.testing.assert_allclose(found, expected, atol=ulps(float, 8))
-        along_the_diagonal = [np.einsum("aii->ai", x) for x in jacobians(np.diag(moments))]
+        along_the_diagonal = [
+            np.einsum("aii->ai", x) for x in jacobians(np.diag(moments))
+        ]
         for found in along_the_diagonal:
             np.testing.assert_allclose(found, expected, atol=ulps(float, 8))
 
 
 def test_state_is_a_pytree_of_arrays():
-    state = jr.State(np.array([1, 0, 0, 0]), np.array([1, 2, 3]), (jnp.ones(3), jnp.zeros(())))
+    state = jr.State(
+        np.array([1, 0, 0, 0]), np.array([1, 2, 3]), (jnp.ones(3), jnp.zeros(()))
+    )
     assert state.omega.dtype == np.float64
     leaves, structure = jax.tree.flatten(state)
     assert [x.shape for x in leaves] == [(4,), (3,), (3,), ()]
     again = jax.tree.unflatten(structure, leaves)
     assert jax.tree.structure(again) == structure
     assert jr.State(ATTITUDE, OMEGA).internal is None
-    assert jr.State(np.float32(ATTITUDE), np.float32(OMEGA)).attitude.dtype == np.float32
+    assert (
+        jr.State(np.float32(ATTITUDE), np.float32(OMEGA)).attitude.dtype == np.float32
+    )
     lanes = jax.vmap(lambda w: jr.State(jnp.asarray(ATTITUDE), w))(jnp.ones((5, 3)))
     assert lanes.attitude.shape == (5, 4)
 
@@ -201,7 +225,10 @@ WRONG_SHAPES = {
         lambda: jr.euler_equations(MOMENTS, OMEGA, FOUR),
         r"`torque` must have shape \(3,\), but it has shape \(4,\)",
     ),
-    "bearing": (lambda: jr.bearing_torque(MOMENTS, FOUR), r"`omega` must have shape \(3,\), but"),
+    "bearing": (
+        lambda: jr.bearing_torque(MOMENTS, FOUR),
+        r"`omega` must have shape \(3,\), but",
+    ),
 }
 
 

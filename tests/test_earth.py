@@ -32,15 +32,16 @@ def test_from_305_days_to_the_least_squares_answer(result):
 
 
 def test_period_agrees_with_an_independent_analysis(result):
-    # 432.6 +- 0.4 days: cubic trend, annual and semiannual terms, one prograde exponential.
+    # 432.6 +- 0.4 days: cubic trend, annual and semiannual terms, one prograde
+    # exponential.
     assert abs(result.period - 432.6) < 0.4
     assert abs(result.ellipticity - 0.002305) < 3e-6
     assert result.rms < 0.55 * result.rigid_rms
 
 
 def test_error_allows_for_the_kicks(result):
-    # The wobble depends on the window by ten days, see below; a bootstrap that cannot see the
-    # memory of the wobble claims 0.4 days.
+    # The wobble depends on the window by ten days, see below; a bootstrap that cannot
+    # see the memory of the wobble claims 0.4 days.
     assert 1.0 < result.period_error < 4.0
 
 
@@ -55,7 +56,10 @@ def test_period_depends_on_the_window(pole):
 def test_another_start_ends_at_the_same_period(pole, result):
     fit = earth_wobble.fit_wobble(pole, 2000.0)
     assert bool(fit.converged)
-    assert abs(earth_wobble.period_of_fit(fit) - result.period) < 0.01 * result.period_error
+    assert (
+        abs(earth_wobble.period_of_fit(fit) - result.period)
+        < 0.01 * result.period_error
+    )
 
 
 def test_the_wobble_turns_with_the_spin_and_naively_read_against_it(pole):
@@ -95,7 +99,9 @@ def test_integrated_body_is_the_exponential_of_linear_theory(pole):
         earth_wobble.SEASONS, np.asarray(wobble.seasons), strict=True
     ):
         torque = (real + 1j * imaginary) * earth_wobble.ANNUAL
-        answer = (np.exp(1j * season * tau) - np.exp(1j * rate * tau)) / (1j * (season - rate))
+        answer = (np.exp(1j * season * tau) - np.exp(1j * rate * tau)) / (
+            1j * (season - rate)
+        )
         expected = expected + torque * answer
     np.testing.assert_allclose(moved[:, 0] + 1j * moved[:, 1], expected, atol=2e-4)
 
@@ -111,7 +117,9 @@ def linearised_fit(pole, observed, ellipticity):
     seasons = np.exp(1j * np.outer(tau, earth_wobble.SEASONS))
     others = np.concatenate([seasons, earth_wobble.drift_basis(tau)], axis=1)
     for _ in range(4):
-        basis = np.concatenate([np.exp(1j * ellipticity * tau)[:, None], others], axis=1)
+        basis = np.concatenate(
+            [np.exp(1j * ellipticity * tau)[:, None], others], axis=1
+        )
         amplitudes = solve_normal_equations(basis, observed)
         residual = basis @ amplitudes - observed
         slope = 1j * unit * tau * amplitudes[0] * basis[:, 0]
@@ -121,9 +129,14 @@ def linearised_fit(pole, observed, ellipticity):
         rows = np.stack([residual.real, residual.imag], axis=1).reshape(-1)
         ellipticity -= unit * solve_normal_equations(jacobian, rows)[0]
     wobble = earth_wobble.Wobble(
-        jnp.asarray(ellipticity / unit), jnp.zeros(2), jnp.zeros((4, 2)), jnp.zeros((4, 2))
+        jnp.asarray(ellipticity / unit),
+        jnp.zeros(2),
+        jnp.zeros((4, 2)),
+        jnp.zeros((4, 2)),
     )
-    return earth_wobble.WobbleFit(wobble, jnp.asarray(rows), jnp.asarray(jacobian), 0, True)
+    return earth_wobble.WobbleFit(
+        wobble, jnp.asarray(rows), jnp.asarray(jacobian), 0, True
+    )
 
 
 def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
@@ -133,7 +146,9 @@ def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
     rate = earth_wobble.ellipticity_of_period(432.6)
     wobble = np.exp(1j * rate * pole.tau)
     step = pole.tau[1] - pole.tau[0]
-    level = 2.2 / 100**2 / earth_wobble.SPIN_PER_DAY  # 2.2 mas^2 a day, as in the record
+    level = (
+        2.2 / 100**2 / earth_wobble.SPIN_PER_DAY
+    )  # 2.2 mas^2 a day, as in the record
 
     @jax.jit
     def bootstrap(jacobian, residuals):
@@ -147,7 +162,9 @@ def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
     for _ in range(40):
         kicks = rng.normal(size=(len(wobble), 2)) @ [1, 1j] * np.sqrt(level * step / 2)
         fit = linearised_fit(pole, wobble * (1.5 + np.cumsum(kicks / wobble)), rate)
-        off = float(fit.params.ellipticity) - rate / earth_wobble.ellipticity_of_period(305.0)
+        off = float(fit.params.ellipticity) - rate / earth_wobble.ellipticity_of_period(
+            305.0
+        )
         honest.append(off / np.sqrt(earth_wobble.kicked_covariance(pole, fit)[0, 0]))
         naive.append(off / bootstrap(fit.jacobian, fit.residuals))
     print("pulls", np.mean(honest), np.std(honest), np.std(naive))

@@ -16,7 +16,8 @@ STEP = 18  # digits below which the steps of differences are
 TINY = {np.float32: -37.0, np.float64: -300.0}  # exponents of the smallest mc tried
 
 
-# --- references: textbook definitions in many digits, as functions of mc = 1 - m ------------------
+# --- references: textbook definitions in many digits, as functions of mc = 1 - m
+# ------------------
 
 
 def in_digits(function):
@@ -115,7 +116,9 @@ def by_mc(function):
     return lambda *args: function(*args[:-1], None, mc=args[-1])
 
 
-ELLIPK, ELLIPE, ELLIPPI = map(by_mc, (elliptic.ellipk, elliptic.ellipe, elliptic.ellippi))
+ELLIPK, ELLIPE, ELLIPPI = map(
+    by_mc, (elliptic.ellipk, elliptic.ellipe, elliptic.ellippi)
+)
 ELLIPKINC, ELLIPEINC = map(by_mc, (elliptic.ellipkinc, elliptic.ellipeinc))
 ELLIPPIINC, ELLIPJ = map(by_mc, (elliptic.ellippiinc, elliptic.ellipj))
 
@@ -127,7 +130,9 @@ def columns(rows, dtype=np.float64):
 def check(found, exact, allowed, inputs, dtype=np.float64, scale=None):
     """Errors in units of eps times the scale, by default the exact value itself."""
     eps = float(np.finfo(dtype).eps)
-    for i, (value, truth) in enumerate(zip(np.asarray(found).tolist(), exact, strict=True)):
+    for i, (value, truth) in enumerate(
+        zip(np.asarray(found).tolist(), exact, strict=True)
+    ):
         size = (abs(truth) if abs(truth) > 1e-40 else 1) if scale is None else scale[i]
         error = float(abs(mpf(value) - truth) / size / eps)
         assert error <= allowed, (error, value, float(truth), [x[i] for x in inputs])
@@ -141,11 +146,16 @@ def complementary(rng, dtype, n=12):
     """mc over the whole domain of m <= 1, m = 0 included."""
     low = TINY[dtype]
     parts = [rng.uniform(0, 1, n), powers(rng, low, 0, n), powers(rng, -9, -1, n)]
-    parts += [1 + powers(rng, -8, 3, n), powers(rng, 3, -low - 1, n // 3), [1.0, 0.5, 10.0**low]]
+    parts += [
+        1 + powers(rng, -8, 3, n),
+        powers(rng, 3, -low - 1, n // 3),
+        [1.0, 0.5, 10.0**low],
+    ]
     return np.concatenate(parts).astype(dtype)
 
 
-# --- Carlson --------------------------------------------------------------------------------------
+# --- Carlson
+# --------------------------------------------------------------------------------------
 
 PUBLISHED = [  # Carlson, Numerical Algorithms 10 (1995) 13, section 3
     ("rf", (1, 2, 0), 1.3110287771461),
@@ -179,7 +189,10 @@ def test_carlson_of_any_arguments(name, dtype, rng):
     if name == "rj":
         wide[3] = wide[1] * powers(rng, -far / 3, far / 3, n)
     alike = [3 * (1 + powers(rng, -16, -1, n)) for _ in range(count)]
-    with_zero = [np.zeros(n), *(powers(rng, -far / 3, far / 3, n) for _ in range(count - 1))]
+    with_zero = [
+        np.zeros(n),
+        *(powers(rng, -far / 3, far / 3, n) for _ in range(count - 1)),
+    ]
     equal = [np.full(2, x) for x in ([0.7, 30.0],) for _ in range(count)]
     cases = zip(of_order_one, wide, alike, with_zero, equal, strict=True)
     inputs = [np.concatenate(column).astype(dtype) for column in cases]
@@ -205,7 +218,9 @@ def test_principal_values_of_rj_and_rc(rng):
         exact = [mp.re(mp.elliprj(*map(mpf, r))) for r in zip(x, y, z, -p, strict=True)]
         middle = np.sort([x, y, z], 0)[1]
         first = [mp.elliprf(*map(mpf, r)) for r in zip(x, y, z, strict=True)]
-    scale = [abs(e) + f / (m + q) for e, f, m, q in zip(exact, first, middle, p, strict=True)]
+    scale = [
+        abs(e) + f / (m + q) for e, f, m, q in zip(exact, first, middle, p, strict=True)
+    ]
     check(found, exact, 30, (x, y, z, p), scale=scale)
     with mp.workdps(DIGITS):
         exact = [mp.re(mp.elliprc(mpf(a), -mpf(b))) for a, b in zip(x, y, strict=True)]
@@ -230,8 +245,21 @@ def test_carlson_at_the_edges_of_its_domain():
 
 POINTS = {
     "rf": [(0.3, 1.2, 5.0), (1.0, 1.0, 1.0), (2.0, 2.0, 0.5), (1e-40, 1.0, 3.0)],
-    "rc": [(0.3, 1.2), (1.0, 1.0), (5.0, 0.2), (1.0, 1 + 1e-9), (2.0, 1e-30), (0.7, -0.4)],
-    "rd": [(0.3, 1.2, 5.0), (1.0, 1.0, 1.0), (2.0, 0.5, 2.0), (1, 1 + 1e-9, 1), (3.0, 2.0, 1e-20)],
+    "rc": [
+        (0.3, 1.2),
+        (1.0, 1.0),
+        (5.0, 0.2),
+        (1.0, 1 + 1e-9),
+        (2.0, 1e-30),
+        (0.7, -0.4),
+    ],
+    "rd": [
+        (0.3, 1.2, 5.0),
+        (1.0, 1.0, 1.0),
+        (2.0, 0.5, 2.0),
+        (1, 1 + 1e-9, 1),
+        (3.0, 2.0, 1e-20),
+    ],
     "rj": [
         (0.3, 1.2, 5.0, 0.8),
         (1.0, 1.0, 1.0, 1.0),
@@ -241,7 +269,7 @@ POINTS = {
         (0.4, 0.7, 1.0, 300.0),
         (0.3, 1.2, 5.0, -0.8),
     ],
-}  # fmt: skip
+}
 
 
 def partial(function, index):
@@ -266,7 +294,9 @@ def forward(function, pairs):
 
         def along(indices):
             ones = np.ones(args[0].shape, args[0].dtype)
-            return tuple(np.concatenate([ones * (i == k) for i in indices]) for k in range(count))
+            return tuple(
+                np.concatenate([ones * (i == k) for i in indices]) for k in range(count)
+            )
 
         def first(*args):
             return jax.jvp(function, args, along([i for i, _ in every]))[1]
@@ -280,7 +310,9 @@ def forward(function, pairs):
         else:
             firsts, seconds = first(*tiled), None
         starts = [[i for i, _ in every].index(k) for k in range(count)]
-        return [part(firsts, k) for k in starts], [part(seconds, k) for k in range(len(pairs))]
+        return [part(firsts, k) for k in starts], [
+            part(seconds, k) for k in range(len(pairs))
+        ]
 
     return derivatives
 
@@ -295,7 +327,9 @@ def derivatives(name):
     def every(*args):
         reverse = jax.grad(lambda *args: jnp.sum(function(*args)), tuple(range(count)))
         firsts, seconds = forward(function, pairs)(*args)
-        if name == "rc":  # whose two modes agree to the last bits where one argument moves
+        if (
+            name == "rc"
+        ):  # whose two modes agree to the last bits where one argument moves
             firsts = [partial(function, i)(*args) for i in range(count)]
         return firsts, seconds, reverse(*args)
 
@@ -326,7 +360,8 @@ def check_second(name, rows, pairs, allowed):
 def compare_second(derivatives, reference, rows, pairs, allowed, scale=None):
     for (i, j), found in zip(pairs, derivatives, strict=True):
         exact = [
-            slope(reference, i, row, 2) if i == j else mixed(reference, i, j, row) for row in rows
+            slope(reference, i, row, 2) if i == j else mixed(reference, i, j, row)
+            for row in rows
         ]
         check(found, exact, allowed, columns(rows), scale=scale and scale(exact))
 
@@ -340,7 +375,11 @@ def slope(reference, index, arguments, order=1):
 
         def at(k):
             return mp.re(
-                reference(*arguments[:index], arguments[index] + k * step, *arguments[index + 1 :])
+                reference(
+                    *arguments[:index],
+                    arguments[index] + k * step,
+                    *arguments[index + 1 :],
+                )
             )
 
         if order == 1:
@@ -388,7 +427,10 @@ def test_derivatives_of_carlson_at_zero_are_infinite_there_and_nowhere_else():
             along = tuple(np.eye(count))
             lanes = tuple(jnp.full(count, x) for x in others)
             rest = jax.jvp(of_others, lanes, along)[1]
-            found[name] = [partial(function, 0)(zero, *others), *(rest[i] for i in range(count))]
+            found[name] = [
+                partial(function, 0)(zero, *others),
+                *(rest[i] for i in range(count)),
+            ]
         return found
 
     for name, found in slopes(jax.tree.map(jnp.asarray, points)).items():
@@ -398,7 +440,8 @@ def test_derivatives_of_carlson_at_zero_are_infinite_there_and_nowhere_else():
             check([found[index]], [exact], 64, columns([points[name]]))
 
 
-# --- Legendre -------------------------------------------------------------------------------------
+# --- Legendre
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -417,7 +460,12 @@ def test_complete_integral_of_the_third_kind(dtype, rng):
     size = mc.size
     pi = ELLIPPI
     spread = powers(rng, -5, 5, size)
-    for n in (rng.uniform(0, 0.99, size), -spread, 1 - powers(rng, -5, -1, size), np.zeros(size)):
+    for n in (
+        rng.uniform(0, 0.99, size),
+        -spread,
+        1 - powers(rng, -5, -1, size),
+        np.zeros(size),
+    ):
         n = n.astype(dtype)
         exact = [pi_of(*row) for row in zip(n.tolist(), mc.tolist(), strict=True)]
         check(pi(n, mc), exact, 10, (n, mc), dtype)
@@ -442,10 +490,14 @@ def test_characteristic_above_one_is_the_real_part_of_mpmath():
         assert mp.im(exact) != 0
         exact = mp.re(exact)
     np.testing.assert_allclose(elliptic.ellippi(1.5, 0.25), float(exact), rtol=1e-13)
-    np.testing.assert_allclose(elliptic.ellippiinc(1.5, np.pi / 2, 0.25), float(exact), rtol=1e-13)
+    np.testing.assert_allclose(
+        elliptic.ellippiinc(1.5, np.pi / 2, 0.25), float(exact), rtol=1e-13
+    )
     with mp.workdps(15):
         exact = mp.re(mp.ellippi(mpf(1.5), mpf(1.2), mpf(0.25)))
-    np.testing.assert_allclose(elliptic.ellippiinc(1.5, 1.2, 0.25), float(exact), rtol=1e-13)
+    np.testing.assert_allclose(
+        elliptic.ellippiinc(1.5, 1.2, 0.25), float(exact), rtol=1e-13
+    )
 
 
 def amplitudes(rng, n):
@@ -460,15 +512,21 @@ def test_incomplete_integrals_over_the_whole_domain(dtype, rng):
     phi = amplitudes(rng, n).astype(dtype)
     if dtype == np.float32:
         phi = np.where(np.abs(phi) > 1e3, dtype(100), phi)
-    mc = rng.permutation(np.concatenate([complementary(rng, dtype, n), [0.3] * n]))[: phi.size]
+    mc = rng.permutation(np.concatenate([complementary(rng, dtype, n), [0.3] * n]))[
+        : phi.size
+    ]
     mc = mc.astype(dtype)
     rows = list(zip(phi.tolist(), mc.tolist(), strict=True))
     # The second term: the last bit of the amplitude.
     f_exact, e_exact = [f_inc(*row) for row in rows], [e_inc(*row) for row in rows]
     delta = [mp.sqrt(mp.cos(p) ** 2 + mpf(x) * mp.sin(p) ** 2) for p, x in rows]
-    scale = [abs(f) + abs(p) / d for f, d, (p, _) in zip(f_exact, delta, rows, strict=True)]
+    scale = [
+        abs(f) + abs(p) / d for f, d, (p, _) in zip(f_exact, delta, rows, strict=True)
+    ]
     check(ELLIPKINC(phi, mc), f_exact, 8, (phi, mc), dtype, scale)
-    scale = [abs(e) + abs(p) * d for e, d, (p, _) in zip(e_exact, delta, rows, strict=True)]
+    scale = [
+        abs(e) + abs(p) * d for e, d, (p, _) in zip(e_exact, delta, rows, strict=True)
+    ]
     check(ELLIPEINC(phi, mc), e_exact, 8, (phi, mc), dtype, scale)
     small = np.abs(phi) < 5
     phi, mc = phi[small], mc[small]
@@ -477,11 +535,16 @@ def test_incomplete_integrals_over_the_whole_domain(dtype, rng):
         rows = list(zip(q.tolist(), phi.tolist(), mc.tolist(), strict=True))
         exact = [pi_inc(*row) for row in rows]
         integrand = [
-            1 / ((1 - a * mp.sin(p) ** 2) * mp.sqrt(mp.cos(p) ** 2 + mpf(x) * mp.sin(p) ** 2))
+            1
+            / (
+                (1 - a * mp.sin(p) ** 2)
+                * mp.sqrt(mp.cos(p) ** 2 + mpf(x) * mp.sin(p) ** 2)
+            )
             for a, p, x in rows
         ]
         scale = [
-            abs(e) + abs(p * d) for e, d, (_, p, _) in zip(exact, integrand, rows, strict=True)
+            abs(e) + abs(p * d)
+            for e, d, (_, p, _) in zip(exact, integrand, rows, strict=True)
         ]
         check(ELLIPPIINC(q, phi, mc), exact, 10, (q, phi, mc), dtype, scale)
 
@@ -496,7 +559,9 @@ def test_incomplete_integrals_of_a_parameter_above_one(rng):
         (ELLIPEINC, e_inc, (phi, mc)),
         (ELLIPPIINC, pi_inc, (q, phi, mc)),
     ):
-        exact = [reference(*row) for row in zip(*map(np.ndarray.tolist, inputs), strict=True)]
+        exact = [
+            reference(*row) for row in zip(*map(np.ndarray.tolist, inputs), strict=True)
+        ]
         check(function(*inputs), exact, 60, inputs)
 
 
@@ -504,16 +569,22 @@ def test_legendre_integrals_agree_with_scipy(rng):
     m = np.concatenate([rng.uniform(-20, 1, 200), [0.0]])
     phi = rng.uniform(-10, 10, m.size)
     complete, incomplete = ("ellipk", "ellipe"), ("ellipkinc", "ellipeinc")
-    for name, args in [(n, (m,)) for n in complete] + [(n, (phi, m)) for n in incomplete]:
+    for name, args in [(n, (m,)) for n in complete] + [
+        (n, (phi, m)) for n in incomplete
+    ]:
         found = getattr(elliptic, name)(*args)
-        np.testing.assert_allclose(found, getattr(scipy.special, name)(*args), rtol=2e-13)
+        np.testing.assert_allclose(
+            found, getattr(scipy.special, name)(*args), rtol=2e-13
+        )
 
 
 def test_legendre_relation(rng):
     m = np.concatenate([rng.uniform(0, 1, 50), powers(rng, -14, -1, 50)])
     k, e = elliptic.ellipk(m), elliptic.ellipe(m)
     other_k, other_e = elliptic.ellipk(None, mc=m), elliptic.ellipe(None, mc=m)
-    np.testing.assert_allclose(e * other_k + other_e * k - k * other_k, np.pi / 2, rtol=1e-13)
+    np.testing.assert_allclose(
+        e * other_k + other_e * k - k * other_k, np.pi / 2, rtol=1e-13
+    )
 
 
 def test_legendre_integrals_at_the_edges_of_their_domain():
@@ -525,11 +596,19 @@ def test_legendre_integrals_at_the_edges_of_their_domain():
     assert elliptic.ellippi(1.5, 1.0) == -np.inf
     assert elliptic.ellippi(1.0, 0.5) == np.inf
     np.testing.assert_allclose(elliptic.ellipk(0.0), half, rtol=ulps(float, 4))
-    for complete in (elliptic.ellipk, elliptic.ellipe, functools.partial(elliptic.ellippi, 0.3)):
+    for complete in (
+        elliptic.ellipk,
+        elliptic.ellipe,
+        functools.partial(elliptic.ellippi, 0.3),
+    ):
         assert np.isnan(complete(1.1))
         assert np.isnan(complete(np.nan))
-    np.testing.assert_allclose(elliptic.ellipkinc(1.2, 1.0), np.arctanh(np.sin(1.2)), rtol=1e-15)
-    np.testing.assert_allclose(elliptic.ellipeinc(4.0, 1.0), 2 - np.sin(4.0), rtol=1e-15)
+    np.testing.assert_allclose(
+        elliptic.ellipkinc(1.2, 1.0), np.arctanh(np.sin(1.2)), rtol=1e-15
+    )
+    np.testing.assert_allclose(
+        elliptic.ellipeinc(4.0, 1.0), 2 - np.sin(4.0), rtol=1e-15
+    )
     assert elliptic.ellipkinc(2.0, 1.0) == np.inf
     assert elliptic.ellipkinc(-2.0, 1.0) == -np.inf
     assert elliptic.ellippiinc(0.3, 2.0, 1.0) == np.inf
@@ -563,7 +642,11 @@ LEGENDRE = {
     "ellippi": (
         ELLIPPI,
         pi_of,
-        [(n, mc) for n in (0.0, 0.4, 0.99, -0.7, -25.0) for mc in (1.0, 0.6, 1e-12, 3.5)],
+        [
+            (n, mc)
+            for n in (0.0, 0.4, 0.99, -0.7, -25.0)
+            for mc in (1.0, 0.6, 1e-12, 3.5)
+        ],
     ),
     "ellipkinc": (ELLIPKINC, f_inc, INCOMPLETE_POINTS),
     "ellipeinc": (ELLIPEINC, e_inc, INCOMPLETE_POINTS),
@@ -573,7 +656,10 @@ LEGENDRE = {
 
 OF_POINTS = {name: (*CARLSON[name][:2], POINTS[name]) for name in CARLSON} | LEGENDRE
 PAIRS_OF = {
-    **{name: [(0, 0), (n - 1, n - 1), (0, n - 1)] for name, (_, _, n) in CARLSON.items()},
+    **{
+        name: [(0, 0), (n - 1, n - 1), (0, n - 1)]
+        for name, (_, _, n) in CARLSON.items()
+    },
     "ellipk": [(0, 0)],
     "ellipe": [(0, 0)],
     "ellippi": [(1, 1)],
@@ -586,7 +672,9 @@ PAIRS_OF = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(x, marks=pytest.mark.slow) if x == "ellippiinc" else x  # from Carlson's
+        pytest.param(x, marks=pytest.mark.slow)
+        if x == "ellippiinc"
+        else x  # from Carlson's
         for x in LEGENDRE
     ],
 )
@@ -609,10 +697,16 @@ def test_a_derivative_by_m_is_minus_that_by_mc():
         function = getattr(elliptic, name)
         by_m = partial(function, 0)(m)
         assert np.all(np.asarray(by_m * (1 if name == "ellipk" else -1)) > 0)
-        complement = partial(lambda mc, function=function: function(None, mc=mc), 0)(1 - m)
+        complement = partial(lambda mc, function=function: function(None, mc=mc), 0)(
+            1 - m
+        )
         np.testing.assert_allclose(by_m, -complement, rtol=ulps(float, 2))
-    np.testing.assert_allclose(partial(elliptic.ellipk, 0)(m)[0], np.pi / 8, rtol=ulps(float, 4))
-    np.testing.assert_allclose(partial(elliptic.ellipe, 0)(m)[0], -np.pi / 8, rtol=ulps(float, 4))
+    np.testing.assert_allclose(
+        partial(elliptic.ellipk, 0)(m)[0], np.pi / 8, rtol=ulps(float, 4)
+    )
+    np.testing.assert_allclose(
+        partial(elliptic.ellipe, 0)(m)[0], -np.pi / 8, rtol=ulps(float, 4)
+    )
 
 
 def test_derivatives_at_m_1_are_infinite_where_the_truth_is():
@@ -636,8 +730,13 @@ def test_derivatives_at_m_1_are_infinite_where_the_truth_is():
         found = []
         for function, _ in cases:
             _, along = jax.linearize(function, m)
-            found.append((along(jnp.ones(4)), *jax.linear_transpose(along, m)(jnp.ones(4))))
-        twice = [jax.hessian(function)(m[0]) for function in (elliptic.ellipk, elliptic.ellipe)]
+            found.append(
+                (along(jnp.ones(4)), *jax.linear_transpose(along, m)(jnp.ones(4)))
+            )
+        twice = [
+            jax.hessian(function)(m[0])
+            for function in (elliptic.ellipk, elliptic.ellipe)
+        ]
         return found, twice, partial(steep, 0)(phi)
 
     found, twice, slope_of_steep = both_modes(one, np.arcsin(0.5) * (1 - 1e-15))
@@ -647,7 +746,8 @@ def test_derivatives_at_m_1_are_infinite_where_the_truth_is():
     assert slope_of_steep > 1e6
 
 
-# --- Jacobi ---------------------------------------------------------------------------------------
+# --- Jacobi
+# ---------------------------------------------------------------------------------------
 
 NAMES = ("sn", "cn", "dn", "am")
 
@@ -661,7 +761,13 @@ def check_jacobi(u, mc, dtype):
         for name, value, truth in zip(NAMES, found, jacobi(a, x), strict=True):
             assert value.dtype == dtype
             bar = promised * (1 + abs(a) * speed) * (speed if name == "dn" else 1)
-            assert abs(float(value[i]) - float(truth)) <= bar, (name, a, x, value[i], truth)
+            assert abs(float(value[i]) - float(truth)) <= bar, (
+                name,
+                a,
+                x,
+                value[i],
+                truth,
+            )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -684,12 +790,16 @@ def test_jacobi_functions_satisfy_their_identities(rng):
     np.testing.assert_allclose(np.cos(am), cn, atol=ulps(float, 200))
     np.testing.assert_array_equal(elliptic.am(u, m), am)
     below = m < 1
-    np.testing.assert_allclose(elliptic.ellipkinc(am, m)[below], u[below], rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        elliptic.ellipkinc(am, m)[below], u[below], rtol=1e-13, atol=1e-13
+    )
 
 
 def test_jacobi_functions_agree_with_scipy(rng):
     u, m = rng.uniform(-10, 10, 500), rng.uniform(0, 1, 500)
-    for found, theirs in zip(elliptic.ellipj(u, m), scipy.special.ellipj(u, m), strict=True):
+    for found, theirs in zip(
+        elliptic.ellipj(u, m), scipy.special.ellipj(u, m), strict=True
+    ):
         np.testing.assert_allclose(found, theirs, atol=2e-13)
 
 
@@ -725,7 +835,10 @@ def test_jacobi_functions_at_the_edges():
 
 JACOBI_POINTS = [
     *((0.7, mc) for mc in [*MC_POINTS, 0.0, -1e-12, -1e-3, -0.8, -30.0]),
-    *((9.1, mc) for mc in (1.0, 0.6, 1e-3, 1e-8, 1e-12, 1e-300, 3.5, 0.0, -1e-12, -1.0)),
+    *(
+        (9.1, mc)
+        for mc in (1.0, 0.6, 1e-3, 1e-8, 1e-12, 1e-300, 3.5, 0.0, -1e-12, -1.0)
+    ),
     (-2.3, 0.2),
     (-2.3, 0.0),
     (1e-5, 0.4),
@@ -777,7 +890,10 @@ def test_second_derivatives_of_jacobi_functions(name, of_jacobi):
     index = NAMES.index(name)
     *_, twice = of_jacobi
     compare_second(
-        [np.asarray(by[index])[[JACOBI_POINTS.index(x) for x in SECOND_POINTS]] for by in twice],
+        [
+            np.asarray(by[index])[[JACOBI_POINTS.index(x) for x in SECOND_POINTS]]
+            for by in twice
+        ],
         lambda u, mc: jacobi(u, mc)[index],
         SECOND_POINTS,
         PAIRS,
@@ -804,7 +920,8 @@ def test_derivatives_in_single_precision():
             check(found, exact, 400, inputs, np.float32, scale)
 
 
-# --- transformations, shapes and dtypes -----------------------------------------------------------
+# --- transformations, shapes and dtypes
+# -----------------------------------------------------------
 
 EVERY = {
     "rf": (elliptic.rf, (0.3, 1.2, 5.0)),
@@ -831,7 +948,9 @@ def test_jit_vmap_and_broadcasting_change_nothing(name):
     ]
     plain = jax.tree.leaves(function(*grid))
     axes = [0] + [None] * (len(grid) - 1)
-    mapped = jax.tree.leaves(quick_jit(jax.vmap(function, in_axes=axes))(*map(jnp.asarray, grid)))
+    mapped = jax.tree.leaves(
+        quick_jit(jax.vmap(function, in_axes=axes))(*map(jnp.asarray, grid))
+    )
     for found, lanes in zip(plain, mapped, strict=True):
         assert found.shape == (3, 2)
         np.testing.assert_allclose(lanes, found, rtol=ulps(float, 8))
@@ -843,26 +962,37 @@ def test_the_dtype_is_that_of_the_arguments(name):
     for dtype in DTYPES:
         out = jax.eval_shape(function, *(np.asarray(x, dtype) for x in arguments))
         assert all(x.dtype == dtype for x in jax.tree.leaves(out))
-    whole = [np.asarray(round(x) if i + 1 < len(arguments) else 0) for i, x in enumerate(arguments)]
+    whole = [
+        np.asarray(round(x) if i + 1 < len(arguments) else 0)
+        for i, x in enumerate(arguments)
+    ]
     if name not in ("rf", "rc", "rd", "rj"):
-        assert all(x.dtype == np.float64 for x in jax.tree.leaves(jax.eval_shape(function, *whole)))
+        assert all(
+            x.dtype == np.float64
+            for x in jax.tree.leaves(jax.eval_shape(function, *whole))
+        )
 
 
 def test_mc_wins_over_m():
     for function, arguments in list(EVERY.values())[4:]:
         found = jax.tree.leaves(function(*arguments[:-1], 0.9, mc=0.7))
-        np.testing.assert_allclose(found, jax.tree.leaves(function(*arguments)), rtol=1e-14)
+        np.testing.assert_allclose(
+            found, jax.tree.leaves(function(*arguments)), rtol=1e-14
+        )
 
 
 def test_neither_m_nor_mc_is_an_error():
-    with pytest.raises(ValueError, match="`m` must be given, or else `mc`, but neither"):
+    with pytest.raises(
+        ValueError, match="`m` must be given, or else `mc`, but neither"
+    ):
         elliptic.ellipk(None)
 
 
 @pytest.mark.parametrize("p", [1e200, 1e250, 1e300, 1e307, -1e300])
 def test_rj_of_very_large_and_relatively_large_p(p):
     with mp.workdps(40):
-        # (3 / p)(R_F - pi/(2 sqrt p)) for large p, DLMF 19.27.11; the next term is below 1e-100
+        # (3 / p)(R_F - pi/(2 sqrt p)) for large p, DLMF 19.27.11; the next term is
+        # below 1e-100
         rf = mp.elliprf(1, 2, 3)
         exact = 3 / mp.mpf(p) * (rf - (mp.pi / (2 * mp.sqrt(p)) if p > 0 else 0))
     np.testing.assert_allclose(elliptic.rj(1.0, 2.0, 3.0, p), float(exact), rtol=4e-15)

@@ -45,7 +45,11 @@ def test_steps_back_lead_to_the_start():
     solver = SOLVERS["Dopri8"]
     there = moved(solver, STIFFNESS, START, count=1)
     back = equal_steps(
-        method_of(solver), lambda t, y: pendulum(STIFFNESS, t, y), T0 + STEP, -STEP, there
+        method_of(solver),
+        lambda t, y: pendulum(STIFFNESS, t, y),
+        T0 + STEP,
+        -STEP,
+        there,
     )
     # Twice the local error of a method of order 8.
     np.testing.assert_allclose(back, START, atol=2 * float(STEP) ** 9)
@@ -58,11 +62,15 @@ def test_derivatives_of_every_mode_and_order_agree(count):
 
     x = jnp.concatenate([STIFFNESS[None], START])
     slopes = jax.jit(jax.jacfwd(end))(x)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(end))(x), slopes, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        jax.jit(jax.jacrev(end))(x), slopes, rtol=1e-12, atol=1e-14
+    )
     nudge = jnp.finfo(x.dtype).eps ** (1 / 3)
     rows = [(end(x + nudge * e) - end(x - nudge * e)) / (2 * nudge) for e in jnp.eye(3)]
     np.testing.assert_allclose(jnp.stack(rows, axis=1), slopes, atol=1e-9)
     second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(x)
     for outer, inner in ((jax.jacfwd, jax.jacrev), (jax.jacrev, jax.jacfwd)):
         # The reverse of a forward derivative is what a loss with a Jacobian needs.
-        np.testing.assert_allclose(jax.jit(outer(inner(end)))(x), second, rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(
+            jax.jit(outer(inner(end)))(x), second, rtol=1e-11, atol=1e-13
+        )

@@ -52,12 +52,14 @@ def found(readings):
 
 def test_a_prediction_is_the_record_less_its_noise(found, readings):
     shown = found.predict(TS)
-    np.testing.assert_allclose(shown, readings + found.left()[0], atol=1e-12)
+    np.testing.assert_allclose(shown, readings + found.residuals()[0], atol=1e-12)
     times = np.concatenate([TS[:1], LATER])
     true = worlds.tumble(TENSOR, OMEGA, times).omega
     np.testing.assert_allclose(found.predict(times), true, atol=0.8 * SIGMA)
     backward = found.predict(-LATER)  # free motion goes both ways
-    again = jr.free_rotation(found.inertia, found.start()[0], -LATER).states.omega
+    again = jr.free_rotation(
+        found.inertia, found.initial_state()[0], -LATER
+    ).states.omega
     np.testing.assert_allclose(backward, again, atol=1e-12)
 
 
@@ -73,10 +75,13 @@ def test_times_of_a_prediction_may_have_any_shape(found):
     np.testing.assert_allclose(inside, flat, atol=1e-12)
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    ({"record": 1}, "`record` must be at least 0 and below 1, but it is 1"),
-    ({"throw": -1}, "`throw` must be at least 0 and below 1, but it is -1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"record": 1}, "`record` must be at least 0 and below 1, but it is 1"),
+        ({"trial": -1}, "`trial` must be at least 0 and below 1, but it is -1"),
+    ],
+)
 def test_a_prediction_of_what_is_not_there_is_refused(found, options, words):
     with pytest.raises(ValueError, match=words):
         found.predict(TS, **options)
@@ -84,49 +89,60 @@ def test_a_prediction_of_what_is_not_there_is_refused(found, options, words):
 
 def with_parts(found, body, *sensors, omegas=None, t0=(0.0,)):
     """A result as if these had been fitted, which would take long to compile."""
-    throws = len(t0)
+    trials = len(t0)
     found = jax.tree.map(
-        lambda x: jnp.repeat(x, throws, axis=0) if x.ndim and x.shape[0] == 1 else x, found
+        lambda x: jnp.repeat(x, trials, axis=0) if x.ndim and x.shape[0] == 1 else x,
+        found,
     )
     given, rest = eqx.partition((body, *sensors), eqx.is_inexact_array)
     old, stacked = found.problem, (False,) * len(jax.tree.leaves(given))
-    unknowns = dataclasses.replace(old.unknowns, given=given, rest=rest, stacked=stacked)
-    options = old.options._replace(free_motion=body.is_free, on_attitude=True)
+    unknowns = dataclasses.replace(
+        old.unknowns, given=given, rest=rest, stacked=stacked
+    )
+    options = old.options._replace(free_motion=body.is_free, depends_on_attitude=True)
     samples = old.samples._replace(values=old.samples.values * len(sensors))
     problem = Problem(options, unknowns, samples, old.noise)
     omegas = found.state.omega if omegas is None else jnp.asarray(omegas)
-    state = jr.State(jnp.tile(jnp.array([1.0, 0, 0, 0]), (throws, 1)), omegas)
+    state = jr.State(jnp.tile(jnp.array([1.0, 0, 0, 0]), (trials, 1)), omegas)
     return dataclasses.replace(found, state=state, t0=jnp.asarray(t0), problem=problem)
 
 
 def test_a_prediction_has_the_sensors_memory_and_the_torque(found, rng):
-    """A late, slow, biased gyro that saturates, of two throws in air; the second starts at 3 s."""
+    """A late, slow, biased gyro that saturates, of two trials in air; the second starts at 3 s."""
     late, slow, bias, limit, drag = 0.02, 0.015, 0.1, 1.7, 0.05
     omegas, start = np.array([[0.6, 2.0, 0.8], [1.5, -0.4, 1.9]]), 3.0
-    gyro = identify.Gyro(bias * jnp.ones(3), delay=late, time_constant=slow, limit=limit)
+    gyro = identify.Gyro(
+        bias * jnp.ones(3), delay=late, time_constant=slow, limit=limit
+    )
     body = jr.RigidBody(found.inertia, jr.torques.QuadraticDrag(drag * jnp.ones(3)))
     star = identify.AttitudeSensor()
     told = with_parts(found, body, star, gyro, omegas=omegas, t0=(0.0, start))
     ts = start + np.array([2.4, 0.3, 4.1, 1.2])  # in any order
-    shown = told.predict(ts, record=1, throw=1)
+    shown = told.predict(ts, record=1, trial=1)
     grid = np.arange(0, 5, 0.001)
     air, tensor = worlds.quadratic_drag(drag), np.asarray(found.inertia)
     motion = worlds.tumble(tensor, omegas[1], grid, air)
     order = np.argsort(ts)
     true = worlds.gyro(
-        (start + grid, motion.omega), ts[order], rng, 0.0, bias, delay=late,
-        time_constant=slow, limit=limit,
-    )  # fmt: skip
+        (start + grid, motion.omega),
+        ts[order],
+        rng,
+        0.0,
+        bias,
+        delay=late,
+        time_constant=slow,
+        limit=limit,
+    )
     assert np.max(np.abs(true)) == limit
     np.testing.assert_allclose(shown[order], true, atol=1e-4)
-    assert np.abs(told.predict(ts, record=1, throw=0) - shown).max() > 0.1
-    turned = told.predict(ts[order], throw=1)
+    assert np.abs(told.predict(ts, record=1, trial=0) - shown).max() > 0.1
+    turned = told.predict(ts[order], trial=1)
     times, upright = np.append(0, ts[order] - start), np.array([1.0, 0, 0, 0])
     true = worlds.tumble(tensor, omegas[1], times, air, attitude0=upright).attitude[1:]
     side = np.sign(np.sum(turned * true, axis=1, keepdims=True))
     np.testing.assert_allclose(side * turned, true, atol=1e-6)
-    with pytest.raises(ValueError, match="`ts` must not be before the throw's `t0`"):
-        told.predict(2.9, record=1, throw=1)
+    with pytest.raises(ValueError, match="`ts` must not be before the trial's `t0`"):
+        told.predict(2.9, record=1, trial=1)
 
 
 # Shares
@@ -144,7 +160,9 @@ def test_shares_are_moments_over_their_sum(found):
     slopes = jax.jacfwd(shares)(found.numbers)
     straight = slopes @ found.numbers_covariance @ slopes.T
     np.testing.assert_allclose(found.shares_covariance, straight, rtol=0.02, atol=1e-9)
-    np.testing.assert_allclose(found.shares_errors, np.sqrt(np.diagonal(straight)), rtol=0.02)
+    np.testing.assert_allclose(
+        found.shares_errors, np.sqrt(np.diagonal(straight)), rtol=0.02
+    )
     np.testing.assert_allclose(jnp.sum(found.shares_covariance, axis=0), 0, atol=1e-15)
 
 
@@ -200,9 +218,11 @@ def test_functions_are_kept_by_their_names(found, tmp_path):
     named = told(spin)
     identify.save(path, named)
     again = identify.load(path)
-    assert again.parts()[1].function is spin
+    assert again.fitted()[1].function is spin
     np.testing.assert_array_equal(again.predict(1.0), named.predict(1.0))
-    with pytest.raises(ValueError, match=r"Argument `result` must hold functions .*lambda"):
+    with pytest.raises(
+        ValueError, match=r"Argument `result` must hold functions .*lambda"
+    ):
         identify.save(path, told(lambda _, state, __: state.omega[2:]))
     path.write_bytes(path.read_bytes().replace(b"spin", b"spun"))
     with pytest.raises(ValueError, match=r"Argument `path` must be a file .*spun"):
@@ -212,12 +232,18 @@ def test_functions_are_kept_by_their_names(found, tmp_path):
 def test_what_is_no_fit_is_not_read(tmp_path, untyped):
     path = tmp_path / "fit.pkl"
     path.write_text("not a fit\n")
-    with pytest.raises(ValueError, match="Argument `path` must be a file that `save` wrote"):
+    with pytest.raises(
+        ValueError, match="Argument `path` must be a file that `save` wrote"
+    ):
         identify.load(path)
     path.write_bytes(b"N.")  # None, as a pickle
-    with pytest.raises(ValueError, match="`path` must be a FitResult, but it is a NoneType"):
+    with pytest.raises(
+        ValueError, match="`path` must be a FitResult, but it is a NoneType"
+    ):
         identify.load(path)
-    with pytest.raises(ValueError, match="`result` must be a FitResult, but it is a str"):
+    with pytest.raises(
+        ValueError, match="`result` must be a FitResult, but it is a str"
+    ):
         identify.save(path, "fit")
     with pytest.raises(FileNotFoundError):
         identify.load(tmp_path / "none.pkl")
@@ -242,8 +268,12 @@ def test_five_pictures_of_a_fit(found, readings, pictures, tmp_path):
     assert axes["record"].get_ylabel() == "rate [rad/s]"
     assert axes["record"].get_xlabel() == "time [s]"
     model, points, dropped = axes["record"].lines[:3]
-    np.testing.assert_array_equal(points.get_xydata(), np.stack([TS, readings[:, 0]], axis=1))
-    np.testing.assert_allclose(model.get_ydata(), found.predict(model.get_xdata())[:, 0])
+    np.testing.assert_array_equal(
+        points.get_xydata(), np.stack([TS, readings[:, 0]], axis=1)
+    )
+    np.testing.assert_allclose(
+        model.get_ydata(), found.predict(model.get_xdata())[:, 0]
+    )
     assert dropped.get_xdata().size == 0
     left = [line.get_ydata() for line in axes["residuals"].lines]
     np.testing.assert_allclose(np.stack(left, axis=1), found.diagnostics.residuals[0])
@@ -262,10 +292,13 @@ def test_the_spectrum_of_white_noise_lies_in_its_range(found, pictures):
         for f, p in zip(frequencies, power, strict=True)
     ]
     assert np.mean(inside) > 0.8
-    # A slow wave that no model has, of a tenth of its noise's power, in one band, and beyond it.
+    # A slow wave that no model has, of a tenth of its noise's power, in one band, and
+    # beyond it.
     wave = 0.45 * np.sin(2 * np.pi * 0.3 * TS)[None, :, None]
     ax.clear()
-    waved = eqx.tree_at(lambda x: x.diagnostics.residuals, found, replace_fn=lambda x: x + wave)
+    waved = eqx.tree_at(
+        lambda x: x.diagnostics.residuals, found, replace_fn=lambda x: x + wave
+    )
     jr.plot.fit(waved, {"spectrum": ax})
     power = ax.lines[0].get_ydata()
     assert abs(frequencies[np.argmax(power)] - 0.3) < 0.06
@@ -275,9 +308,14 @@ def test_the_spectrum_of_white_noise_lies_in_its_range(found, pictures):
 def test_the_ellipse_is_that_of_the_covariance(found, pictures):
     ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
     inverse = np.linalg.inv(found.ratios_covariance)
-    for line, square in ((ax.lines[1], 2.279), (ax.lines[2], 5.991)):  # chi-square of two
+    for line, square in (
+        (ax.lines[1], 2.279),
+        (ax.lines[2], 5.991),
+    ):  # chi-square of two
         apart = line.get_xydata() - np.asarray(found.ratios)
-        np.testing.assert_allclose(np.einsum("ni,ij,nj->n", apart, inverse, apart), square, 1e-3)
+        np.testing.assert_allclose(
+            np.einsum("ni,ij,nj->n", apart, inverse, apart), square, 1e-3
+        )
 
 
 def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, pictures):
@@ -289,9 +327,13 @@ def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, picture
     assert dotted.get_label() == "bound"
     apart = [line.get_xydata() - np.asarray(found.ratios) for line in (dashed, dotted)]
     np.testing.assert_allclose(apart[0], 3 * apart[1], atol=1e-12)
-    plan = identify.Plan(found.system, found.start()[0], [identify.Rates(TS, None, SIGMA)])
+    plan = identify.Plan(
+        found.system, found.initial_state()[0], [identify.Rates(TS, None, SIGMA)]
+    )
     least = np.linalg.inv(plan.bound.ratios_covariance)
-    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", apart[1], least, apart[1]), 5.991, 0.01)
+    np.testing.assert_allclose(
+        np.einsum("ni,ij,nj->n", apart[1], least, apart[1]), 5.991, 0.01
+    )
 
 
 def test_what_a_record_does_not_tell_is_written(found, pictures):
@@ -309,20 +351,28 @@ def test_ratios_that_are_not_told_have_no_ellipse(found, pictures):
     assert "spin is pure" in ax.texts[0].get_text()
 
 
-@pytest.mark.parametrize("wrong", [{"record": 1}, {"throw": -1}, {"axes": {"wrong": None}}])
+@pytest.mark.parametrize(
+    "wrong", [{"record": 1}, {"trial": -1}, {"axes": {"wrong": None}}]
+)
 def test_what_is_not_in_a_fit_is_not_drawn(found, pictures, wrong):
     with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must be one of"):
         jr.plot.fit(found, **({"axes": {}} | wrong))
     assert not pictures.get_fignums()
 
 
-def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(found, readings, pictures):
+def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(
+    found, readings, pictures
+):
     options = found.problem.options._replace(unmodelled="known")
     problem = dataclasses.replace(found.problem, options=options)
     kicked = dataclasses.replace(found, problem=problem)
-    kicked = eqx.tree_at(lambda x: x.diagnostics.residuals, kicked, replace_fn=lambda x: 2 * x)
+    kicked = eqx.tree_at(
+        lambda x: x.diagnostics.residuals, kicked, replace_fn=lambda x: 2 * x
+    )
     ax = jr.plot.fit(kicked, {"record": pictures.figure().add_subplot()})["record"]
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), (readings + kicked.left()[0])[:, 0])
+    np.testing.assert_allclose(
+        ax.lines[0].get_ydata(), (readings + kicked.residuals()[0])[:, 0]
+    )
 
 
 def test_attitudes_are_drawn_on_the_models_side(found, pictures):
@@ -360,7 +410,13 @@ def write(path, times, rates, **forces):
     for name, force in forces.items():
         columns += [*force.T / 9.80665]
         names += [f"{name}{axis} (g)" for axis in "xyz"]
-    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=",".join(names), comments="")
+    np.savetxt(
+        path,
+        np.stack(columns, axis=1),
+        delimiter=",",
+        header=",".join(names),
+        comments="",
+    )
     return str(path)
 
 
@@ -396,21 +452,35 @@ def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
     assert set(_cli._EXIT) == ends - {"BAD_INPUT"}
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["none.csv"], "No such file"),
-    (["words.csv"], "Argument `path` must have names of its columns above numbers"),
-    (["good.csv", "--unit", "furlong"], "Argument `unit` must be one of"),
-    (["good.csv", "--columns", "rates=p,q,r"], "Argument `columns` must name columns"),
-    (["held.csv", "--flights"], "Argument `path` must hold flights, but it has none"),
-    (["still.csv"], "Argument `path` must hold rates of a gyro, but it has none"),
-    (["good.csv", "--sigma", "-1"], "Arguments `sigma` and `covariance` of `Gyro` must be"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.csv"], "No such file"),
+        (["words.csv"], "Argument `path` must have names of its columns above numbers"),
+        (["good.csv", "--unit", "furlong"], "Argument `unit` must be one of"),
+        (
+            ["good.csv", "--columns", "rates=p,q,r"],
+            "Argument `columns` must name columns",
+        ),
+        (
+            ["held.csv", "--flights"],
+            "Argument `path` must hold flights, but it has none",
+        ),
+        (["still.csv"], "Argument `path` must hold rates of a gyro, but it has none"),
+        (
+            ["good.csv", "--sigma", "-1"],
+            "Arguments `sigma` and `covariance` of `Gyro` must be",
+        ),
+    ],
+)
 def test_what_cannot_be_used_is_said_in_a_sentence(
     readings, tmp_path, capsys, arguments, words, monkeypatch, rng
 ):
     monkeypatch.chdir(tmp_path)
     Path("words.csv").write_text("no numbers\nhere\n")
-    Path("still.csv").write_text("t,ax,ay,az\n" + "".join(f"{i},0,0,9.8\n" for i in range(9)))
+    Path("still.csv").write_text(
+        "t,ax,ay,az\n" + "".join(f"{i},0,0,9.8\n" for i in range(9))
+    )
     write("good.csv", TS, readings)
     write("held.csv", TS, readings, a=9.8 * np.abs(rng.normal(size=readings.shape)))
     assert _cli.main(["fit", *arguments]) == 1
@@ -420,9 +490,16 @@ def test_what_cannot_be_used_is_said_in_a_sentence(
     assert words in said
 
 
-@pytest.mark.parametrize("arguments", [[], ["fit"], ["fit", "a", "--unmodelled", "some"],
-                                       ["fit", "a", "--unmodelled", "1,2,3"],
-                                       ["fit", "a", "--shape", "cube"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fit"],
+        ["fit", "a", "--unmodelled", "some"],
+        ["fit", "a", "--unmodelled", "1,2,3"],
+        ["fit", "a", "--inertia-model", "cube"],
+    ],
+)
 def test_wrong_arguments_are_argparses_to_tell(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         _cli.main(arguments)
@@ -443,33 +520,39 @@ def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):
     np.savetxt(path, rows, delimiter=",", header="when,p,q,r,x,y,z", comments="")
     columns = ["--columns", "times=when", "--columns", "rates=p,q,r"]
     units = ["--unit", "times=s", "--unit", "rpm"]
-    rest = ["--unmodelled", "0.1,0.5", "--robust", "--bias", "--shape", "flat"]
+    rest = ["--unmodelled", "0.1,0.5", "--robust", "--bias", "--inertia-model", "flat"]
     assert _cli.main(["fit", *columns, *units, *rest, str(path)]) == 1
     np.testing.assert_array_equal(asked["unmodelled"].level, [0.1] * 3)
     np.testing.assert_array_equal(asked["unmodelled"].time, [0.5] * 3)
     assert asked["loss"] == "robust"
-    assert asked["shape"] == identify.Flat()
+    assert asked["inertia_model"] == identify.Flat()
     assert asked["free"](None, identify.Gyro(jnp.ones(3))).shape == (3,)
     (record,) = asked["observations"]
     assert not record.states_noise
     np.testing.assert_allclose(record.values, readings * 2 * np.pi / 60, rtol=1e-6)
-    assert _cli.main(["fit", *columns, "--unit", "times=s", "--unit", "dps", str(path)]) == 1
+    assert (
+        _cli.main(["fit", *columns, "--unit", "times=s", "--unit", "dps", str(path)])
+        == 1
+    )
     assert (asked["free"], asked["loss"]) == (None, "squares")
     np.testing.assert_array_equal(asked["unmodelled"].level, np.zeros(3))
-    assert asked["shape"] == identify.Tensor()
+    assert asked["inertia_model"] == identify.Tensor()
 
 
-@pytest.mark.parametrize(("text", "unit"), [
-    ("deg/s", ("rates", "deg/s")),
-    ("times=ms", ("times", "ms")),
-    ("0.00174533", ("rates", 0.00174533)),
-    ("rates=0.5", ("rates", 0.5)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("deg/s", ("rates", "deg/s")),
+        ("times=ms", ("times", "ms")),
+        ("0.00174533", ("rates", 0.00174533)),
+        ("rates=0.5", ("rates", 0.5)),
+    ],
+)
 def test_a_unit_of_the_command_line_is_a_name_or_a_factor(text, unit):
     assert _cli._unit(text) == unit
 
 
-def test_three_throws_in_a_process_of_its_own(tmp_path):
+def test_three_trials_in_a_process_of_its_own(tmp_path):
     """Rest, hand, flight, catch, three times; the noise and the bias are those of the rest."""
     rng, step, lever = np.random.default_rng(3), 0.01, np.array([0.03, -0.02, 0.05])
     rates, forces = [np.zeros((300, 3))], [np.tile([0, 0, 9.81], (300, 1))]
@@ -484,24 +567,31 @@ def test_three_throws_in_a_process_of_its_own(tmp_path):
         forces += [9 * rng.normal(size=(40, 3)) + [0, 0, 30]]
         rates += [np.zeros((250, 3))]
         forces += [np.tile([0, 0, 9.81], (250, 1))]
-    rates, forces, bias = np.concatenate(rates), np.concatenate(forces), [0.02, -0.03, 0.01]
+    rates, forces, bias = (
+        np.concatenate(rates),
+        np.concatenate(forces),
+        [0.02, -0.03, 0.01],
+    )
     rates = rates + bias + 0.01 * rng.normal(size=rates.shape)
     forces = forces + 0.1 * rng.normal(size=forces.shape)
     write(tmp_path / "a.csv", step * np.arange(len(rates)), rates, a=forces)
     flags = ["--flights", "--plot", "fit.png", "--save", "fit.pkl"]
     done = subprocess.run(
-        [sys.executable, "-m", "jrigid", "fit", "a.csv", *flags], cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(Path(jr.__file__).parents[1]), "XLA_FLAGS": QUICK},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-m", "jrigid", "fit", "a.csv", *flags],
+        cwd=tmp_path,
+        env=os.environ
+        | {"PYTHONPATH": str(Path(jr.__file__).parents[1]), "XLA_FLAGS": QUICK},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "flight 3 of 3" in done.stdout
-    assert "samples of 3 throws" in done.stdout
+    assert "samples of 3 trials" in done.stdout
     result = identify.load(tmp_path / "fit.pkl")
     assert_true(result)
     assert str(result) in done.stdout
-    np.testing.assert_allclose(result.parts()[1].bias, bias, atol=0.002)
+    np.testing.assert_allclose(result.fitted()[1].bias, bias, atol=0.002)
     sigma = 1 / np.asarray(result.problem.samples.whitener)[0, 0].diagonal()
     np.testing.assert_allclose(sigma, 0.01, rtol=0.15)
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""Flights in simulated throws: how well they are found, and what could hide them."""
+"""Flights in simulated trials: how well they are found, and what could hide them."""
 
 import pathlib
 import sys
@@ -14,7 +14,7 @@ import bench_flights  # pyright: ignore[reportMissingImports]
 
 @pytest.fixture(scope="module")
 def thrown():
-    """Throws that the detector was not tuned on."""
+    """Trials that the detector was not tuned on."""
     return bench_flights.cases(100, seed=3)
 
 
@@ -31,7 +31,7 @@ def test_flights_keep_what_the_documentation_states(thrown):
     assert sum(false for _, false in results) == 0
 
 
-def test_nothing_flies_before_the_throw(thrown):
+def test_nothing_flies_before_the_trial(thrown):
     """Shaking and winding up are no flights."""
     for case in thrown:
         released = case.flights[0][0] - 0.06
@@ -83,7 +83,10 @@ def test_an_accelerometer_that_lags(thrown):
     for x in [x for x in thrown if not x.wheel and not x.bounces][:8]:
         reading = x.reading
         late = np.stack(
-            [np.interp(reading.times - 0.005, reading.times, c) for c in reading.specific_forces.T],
+            [
+                np.interp(reading.times - 0.005, reading.times, c)
+                for c in reading.specific_forces.T
+            ],
             axis=1,
         )
         delayed = jr.records.Reading(reading.times, reading.rates, late)

@@ -1,8 +1,8 @@
 """The exact flow of the free body: values, invariants, derivatives, edges, bad input.
 
-The reference values of tests/data/free_rotation.npz come from a closed form at 60 digits, which
-tests/test_free_reference.py checks against Taylor series; the derivatives are compared with
-variational equations in 80-bit arithmetic (tests/reference.py).
+The reference values of tests/data/free_rotation.npz come from a closed form at 60
+digits, which tests/test_free_reference.py checks against Taylor series; the derivatives
+are compared with variational equations in 80-bit arithmetic (tests/reference.py).
 """
 
 from pathlib import Path
@@ -49,7 +49,9 @@ def same_sign(found, exact):
 
 def exact_states(regime):
     chosen = RECORD["regime"] == regime
-    return np.concatenate([RECORD["attitude_out"][chosen], RECORD["omega_out"][chosen]], axis=1)
+    return np.concatenate(
+        [RECORD["attitude_out"][chosen], RECORD["omega_out"][chosen]], axis=1
+    )
 
 
 def of_lanes(function):
@@ -58,7 +60,9 @@ def of_lanes(function):
 
     def call(*inputs):
         count = len(inputs[0])
-        padded = (np.concatenate([x, np.repeat(x[-1:], lanes - count, 0)]) for x in inputs)
+        padded = (
+            np.concatenate([x, np.repeat(x[-1:], lanes - count, 0)]) for x in inputs
+        )
         return jax.tree.map(lambda x: x[:count], function(*padded))
 
     return call
@@ -82,7 +86,9 @@ def test_the_record_holds_at_least_fifty_cases_a_regime():
 def test_values_to_the_bar_against_30_digits(regime, compiled):
     inertia, attitude, omega, time = rows(regime)
     exact = exact_states(regime)
-    found = same_sign(np.asarray(compiled["value"](inertia, attitude, omega, time)), exact)
+    found = same_sign(
+        np.asarray(compiled["value"](inertia, attitude, omega, time)), exact
+    )
     size = np.linalg.norm(omega, axis=1)
     size = np.where(size == 0, 1.0, size)[:, None]
     radians = size * np.abs(time)[:, None]
@@ -94,17 +100,23 @@ def test_values_to_the_bar_against_30_digits(regime, compiled):
     if regime in UNSTABLE or regime.startswith("unphysical"):
         columns = compiled["jacobian"](inertia, attitude, omega, time)
         for column, x in zip(columns, (inertia, attitude, omega), strict=True):
-            scaled = np.asarray(column) / np.where(np.arange(7) < 4, 1.0, size)[:, :, None]
+            scaled = (
+                np.asarray(column) / np.where(np.arange(7) < 4, 1.0, size)[:, :, None]
+            )
             norm = np.linalg.norm(scaled, axis=(1, 2)) * np.linalg.norm(x, axis=1)
             assert np.all(np.isfinite(norm))
             amplified[:, 0] += norm
     bar = 1e-13 * (1 + radians) + 8 * EPS * amplified
     assert np.all(error <= bar), np.max(error / bar)
-    if regime != "unphysical 1e6":  # where the motion amplifies, enough that still says something
+    if (
+        regime != "unphysical 1e6"
+    ):  # where the motion amplifies, enough that still says something
         assert np.sum(bar < 1e-6) >= 20
 
 
-@pytest.mark.parametrize(("dtype", "offset"), [(np.float64, 1e-34), (np.float32, 1e-15)])
+@pytest.mark.parametrize(
+    ("dtype", "offset"), [(np.float64, 1e-34), (np.float32, 1e-15)]
+)
 def test_a_flip_that_begins_very_near_the_unstable_axis_goes_through(dtype, offset):
     """At any time the motion obeys Euler's equations, and it ends at the other side."""
     omega = np.array([offset, 1.0, offset], dtype)
@@ -115,7 +127,9 @@ def test_a_flip_that_begins_very_near_the_unstable_axis_goes_through(dtype, offs
 
     @jax.jit
     def moving(t):
-        return jax.jvp(lambda t: state_at(moments, attitude, omega, t), (t,), (jnp.ones_like(t),))
+        return jax.jvp(
+            lambda t: state_at(moments, attitude, omega, t), (t,), (jnp.ones_like(t),)
+        )
 
     for t in times.astype(dtype):
         state, rate = moving(t)
@@ -134,7 +148,9 @@ def test_energy_and_momentum_in_space_to_1e_14_at_all_times(regime, compiled):
     scale = np.where(scale == 0, 1.0, scale)[:, None]  # squares of 1e-160 underflow
     before, after = omega / scale, found[:, 4:] / scale
     momentum = [np.einsum("nij,nj->ni", tensor, w) for w in (before, after)]
-    energy = [np.sum(w * m, axis=1) for w, m in zip((before, after), momentum, strict=True)]
+    energy = [
+        np.sum(w * m, axis=1) for w, m in zip((before, after), momentum, strict=True)
+    ]
     np.testing.assert_allclose(energy[1], energy[0], rtol=1e-14)
     in_space = [
         Rotation.from_quat(q, scalar_first=True).apply(m)
@@ -146,14 +162,20 @@ def test_energy_and_momentum_in_space_to_1e_14_at_all_times(regime, compiled):
     np.testing.assert_allclose(np.linalg.norm(found[:, :4], axis=1), 1.0, rtol=1e-14)
 
 
-# --- Derivatives --------------------------------------------------------------------------------
+# --- Derivatives
+# --------------------------------------------------------------------------------
 
 OF_THE_SCALE = {"rest", "tensor", "omega x 1e-160", "omega x 1e-7", "omega x 1e4"}
-DERIVATIVE_REGIMES = [r for r in REGIMES if r not in OF_THE_SCALE and not r.startswith("unphys")]
+DERIVATIVE_REGIMES = [
+    r for r in REGIMES if r not in OF_THE_SCALE and not r.startswith("unphys")
+]
 
 
-# Moments that no real body has, in units of the middle one, as in classic test problems.
-UNPHYSICAL = np.array([[0.25, 1.0, 1.5], [0.6, 1.0, 1.8], [0.5, 1.0, 2.4], [1.0, 0.2, 1.9]])
+# Moments that no real body has, in units of the middle one, as in classic test
+# problems.
+UNPHYSICAL = np.array(
+    [[0.25, 1.0, 1.5], [0.6, 1.0, 1.8], [0.5, 1.0, 2.4], [1.0, 0.2, 1.9]]
+)
 
 
 def of_unit_rate(per_regime):
@@ -161,18 +183,24 @@ def of_unit_rate(per_regime):
     chosen = np.concatenate(
         [
             np.flatnonzero(RECORD["regime"] == regime)[
-                np.linspace(0, np.sum(RECORD["regime"] == regime) - 1, per_regime).astype(int)
+                np.linspace(
+                    0, np.sum(RECORD["regime"] == regime) - 1, per_regime
+                ).astype(int)
             ]
             for regime in DERIVATIVE_REGIMES
         ]
     )
-    inertia, attitude, omega = (RECORD[name][chosen] for name in ("inertia", "attitude", "omega"))
+    inertia, attitude, omega = (
+        RECORD[name][chosen] for name in ("inertia", "attitude", "omega")
+    )
     inertia = inertia / np.median(inertia, axis=1)[:, None]
     attitude = attitude / np.linalg.norm(attitude, axis=1)[:, None]
     omega = omega / np.linalg.norm(omega, axis=1)[:, None]
     regimes = RECORD["regime"][chosen]
     inertia = np.concatenate([inertia, UNPHYSICAL])
-    attitude, omega = (np.concatenate([x, x[: len(UNPHYSICAL)]]) for x in (attitude, omega))
+    attitude, omega = (
+        np.concatenate([x, x[: len(UNPHYSICAL)]]) for x in (attitude, omega)
+    )
     regimes = np.concatenate([regimes, ["unphysical"] * len(UNPHYSICAL)])
     return np.concatenate([attitude, omega, inertia], axis=1), regimes
 
@@ -210,15 +238,21 @@ def test_derivatives_equal_the_variational_equations(duration, per_regime, deriv
     direction = np.random.default_rng(3).normal(size=inputs.shape)
     direction[:, :4] = 0  # the package normalises the attitude, the reference does not
     state, exact = reference.heavy_body(inertia, attitude, omega, duration)
-    curvature = reference.free_hessian_vector(inertia, attitude, omega, duration, direction)
+    curvature = reference.free_hessian_vector(
+        inertia, attitude, omega, duration, direction
+    )
     tangent = np.tile(np.eye(10), (len(inputs), 1, 1))
     tangent[:, :4, :4] -= attitude[:, :, None] * attitude[:, None, :]
     exact = np.einsum("nij,njk->nik", exact.astype(float), tangent)
     curvature = np.einsum("nij,njk->nik", curvature.astype(float), tangent)
 
-    found, *firsts_and_seconds = (np.asarray(x) for x in derivatives(inputs, direction, duration))
+    found, *firsts_and_seconds = (
+        np.asarray(x) for x in derivatives(inputs, direction, duration)
+    )
     signs = np.ones((len(inputs), 7, 1))
-    signs[:, :4] = np.sign(np.sum(found[:, :4] * state[:, :4].astype(float), 1))[:, None, None]
+    signs[:, :4] = np.sign(np.sum(found[:, :4] * state[:, :4].astype(float), 1))[
+        :, None, None
+    ]
     forward, reverse, by_columns, by_rows = (signs * x for x in firsts_and_seconds)
 
     def norm(x):
@@ -228,10 +262,14 @@ def test_derivatives_equal_the_variational_equations(duration, per_regime, deriv
     rounding = 8 * EPS * norm(curvature) / norm(exact)
     for first in (forward, reverse):
         relative = norm(first - exact) / norm(exact)
-        assert np.all(relative <= 1e-9 + rounding), dict(zip(regimes, relative, strict=True))
+        assert np.all(relative <= 1e-9 + rounding), dict(
+            zip(regimes, relative, strict=True)
+        )
     for second in (by_columns, by_rows):
         relative = norm(second - curvature) / np.maximum(norm(curvature), norm(exact))
-        assert np.all(relative <= 1e-9 + 10 * rounding), dict(zip(regimes, relative, strict=True))
+        assert np.all(relative <= 1e-9 + 10 * rounding), dict(
+            zip(regimes, relative, strict=True)
+        )
 
 
 def test_derivatives_at_rest_are_finite_and_right(compiled):
@@ -254,7 +292,9 @@ def test_derivative_in_time_is_euler_s_equation(times):
     np.testing.assert_allclose(
         rates[:4], jr.rotation.attitude_rate(state[:4], state[4:]), atol=1e-13
     )
-    np.testing.assert_allclose(rates[4:], jr.euler_equations(MOMENTS, state[4:]), atol=1e-13)
+    np.testing.assert_allclose(
+        rates[4:], jr.euler_equations(MOMENTS, state[4:]), atol=1e-13
+    )
 
 
 # Exact doubles: every change of the size of the differences below is exact too.
@@ -265,7 +305,9 @@ TENSORS = {
     "nearly a sphere": np.diag([2.0, 2.0 + 2.0**-13, 2.0 + 2.0**-12]),
     "nearly symmetric": np.diag([1.0, 1.0 + 2.0**-30, 1.5]),
     "generic": np.array([[2.0, 0.25, -0.5], [0.25, 1.5, 0.125], [-0.5, 0.125, 3.0]]),
-    "generic, unphysical": np.array([[2.0, 1.25, -0.5], [1.25, 1.5, 0.125], [-0.5, 0.125, 7.0]]),
+    "generic, unphysical": np.array(
+        [[2.0, 1.25, -0.5], [1.25, 1.5, 0.125], [-0.5, 0.125, 7.0]]
+    ),
 }
 
 
@@ -303,7 +345,9 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
     h = 2.0**-14
     with mp.workdps(40):
         exact = np.array((64 * slope(h / 4) - 20 * slope(h / 2) + slope(h)) / 45, float)
-    value, forward, reverse, _ = map(np.asarray, of_tensor(tensor, omega, change, turn, t))
+    value, forward, reverse, _ = map(
+        np.asarray, of_tensor(tensor, omega, change, turn, t)
+    )
     sign = np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
     exact[:4] *= sign
     bound = 1e-9 * np.linalg.norm(exact)
@@ -337,7 +381,9 @@ def test_derivatives_in_a_tensor_after_a_long_time_near_the_separatrix(gap, of_t
 
     with mp.workdps(40):
         h = 2.0**-34
-        exact = np.array((8 * (motion(h) - motion(-h)) - motion(2 * h) + motion(-2 * h)), float)
+        exact = np.array(
+            (8 * (motion(h) - motion(-h)) - motion(2 * h) + motion(-2 * h)), float
+        )
     exact /= 12 * h
     value, forward, reverse, _ = map(np.asarray, of_tensor(tensor, omega, n, turn, t))
     exact[:4] *= np.sign(np.sum(value[:4] * np.array(motion(0.0)[:4], float)))
@@ -369,15 +415,19 @@ def test_second_derivatives_in_a_tensor_of_distinct_moments(of_tensor):
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.linalg.norm(exact))
 
 
-# --- float32, shapes, modes ---------------------------------------------------------------------
+# --- float32, shapes, modes
+# ---------------------------------------------------------------------
 
-# Errors of the attitude and of omega / |omega|, in float32 eps (1 + radians of the motion). The
-# moments of a tensor come from its six elements with an error of a few eps of the largest.
+# Errors of the attitude and of omega / |omega|, in float32 eps (1 + radians of the
+# motion). The moments of a tensor come from its six elements with an error of a few eps
+# of the largest.
 FLOAT32_MULTIPLE = 16
 FLOAT32_MULTIPLE_OF_A_TENSOR = 64
 
 
-@pytest.mark.parametrize("regime", [r for r in REGIMES if r not in UNSTABLE | {"omega x 1e-160"}])
+@pytest.mark.parametrize(
+    "regime", [r for r in REGIMES if r not in UNSTABLE | {"omega x 1e-160"}]
+)
 def test_float32_within_a_multiple_of_its_eps(regime, compiled):
     inertia, attitude, omega, time = (x.astype(np.float32) for x in rows(regime))
     if regime == "tensor":
@@ -407,14 +457,19 @@ def test_float32_within_a_multiple_of_its_eps(regime, compiled):
 
 
 def test_dtype_follows_the_arguments():
-    single = [np.float32(x) for x in (MOMENTS, ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 3.0)]
+    single = [
+        np.float32(x)
+        for x in (MOMENTS, ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 3.0)
+    ]
     state = jr.free_rotation(single[0], jr.State(single[1], single[2]), single[3])
     assert state.attitude.dtype == state.omega.dtype == np.float32
 
 
 @pytest.fixture(scope="module")
 def single():
-    return quick_jit(lambda state0, t: jr.free_rotation(TENSOR, state0, t, t0=-1.5, throw=False))
+    return quick_jit(
+        lambda state0, t: jr.free_rotation(TENSOR, state0, t, t0=-1.5, throw=False)
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3), (0,)])
@@ -448,8 +503,12 @@ def test_equals_simulate():
 
     @quick_jit
     def both(state0, ts):
-        integrated = jr.simulate(jr.RigidBody(TENSOR), state0, ts, rtol=1e-11, throw=False)
-        return jr.free_rotation(TENSOR, state0, ts, throw=False).states, integrated.states
+        integrated = jr.simulate(
+            jr.RigidBody(TENSOR), state0, ts, rtol=1e-11, throw=False
+        )
+        return jr.free_rotation(
+            TENSOR, state0, ts, throw=False
+        ).states, integrated.states
 
     exact, integrated = both(state0, ts)
     np.testing.assert_allclose(exact.attitude, integrated.attitude, atol=1e-11)
@@ -475,7 +534,8 @@ def test_an_eager_call_compiles_once():
     assert not compiled
 
 
-# --- Bad input ----------------------------------------------------------------------------------
+# --- Bad input
+# ----------------------------------------------------------------------------------
 
 GOOD = {
     "inertia": MOMENTS,
@@ -510,13 +570,21 @@ BAD = {
         "invalid_attitude",
         r"unit quaternion, .*: \[0\. 0\. 0\. 0\.\] in lane 1\.",
     ),
-    "not unit": ({"attitude": 2.0 * GOOD["attitude"]}, "invalid_attitude", "unit quaternion"),
+    "not unit": (
+        {"attitude": 2.0 * GOOD["attitude"]},
+        "invalid_attitude",
+        "unit quaternion",
+    ),
     "infinite time": (
         {"ts": np.array([1.0, np.inf])},
         "invalid_times",
         r"`ts` must be finite, but it is not: inf in lane 1\.",
     ),
-    "NaN t0": ({"t0": np.nan}, "invalid_times", r"`t0` must be finite.*: nan in lane 1\."),
+    "NaN t0": (
+        {"t0": np.nan},
+        "invalid_times",
+        r"`t0` must be finite.*: nan in lane 1\.",
+    ),
 }
 
 
@@ -552,7 +620,10 @@ def run_under_jit(lane):
 @pytest.mark.parametrize("name", BAD)
 def test_bad_value_is_an_error_eagerly_and_under_jit_and_marks_its_lane(name):
     change, code, message = BAD[name]
-    lanes = {k: jnp.stack([x, jnp.asarray(change.get(k, x), float), x]) for k, x in GOOD.items()}
+    lanes = {
+        k: jnp.stack([x, jnp.asarray(change.get(k, x), float), x])
+        for k, x in GOOD.items()
+    }
     with pytest.raises(RuntimeError, match=message):
         jax.vmap(lambda lane: run(**lane))(lanes)
     with pytest.raises(RuntimeError, match=message.split(":")[0].split(" in lane")[0]):
@@ -563,12 +634,18 @@ def test_bad_value_is_an_error_eagerly_and_under_jit_and_marks_its_lane(name):
     assert np.all(np.isnan(motion.omega[1]))
     assert np.all(np.isnan(motion.attitude[1]))
     assert np.all(np.isfinite(motion.omega[::2]))
-    assert all(np.all(np.isfinite(slope)) for slope in jax.tree.leaves((slopes, of_shared)))
+    assert all(
+        np.all(np.isfinite(slope)) for slope in jax.tree.leaves((slopes, of_shared))
+    )
     assert np.isfinite(forward)
-    np.testing.assert_allclose(sum(np.sum(x) for x in of_shared.values()), forward, rtol=1e-12)
+    np.testing.assert_allclose(
+        sum(np.sum(x) for x in of_shared.values()), forward, rtol=1e-12
+    )
     expected = getattr(jr.RESULTS, code)
     np.testing.assert_array_equal(motion.result == expected, [False, True, False])
-    np.testing.assert_array_equal(motion.result == jr.RESULTS.successful, [True, False, True])
+    np.testing.assert_array_equal(
+        motion.result == jr.RESULTS.successful, [True, False, True]
+    )
 
 
 def test_angles_that_overflow_are_an_error_or_have_a_code():
@@ -595,10 +672,19 @@ def test_nothing_that_is_compiled_calls_back(inertia):
 
     def everything(inertia, omega):
         names = [
-            "cone_angles", "geometric_phase", "mean_precession_rate", "modulus", "parameter",
-            "poinsot", "polhode", "polhode_period", "precession_per_period", "precession_rate",
-            "regime", "wobble_rate",
-        ]  # fmt: skip
+            "cone_angles",
+            "geometric_phase",
+            "mean_precession_rate",
+            "modulus",
+            "parameter",
+            "poinsot",
+            "polhode",
+            "polhode_period",
+            "precession_per_period",
+            "precession_rate",
+            "regime",
+            "wobble_rate",
+        ]
         state = jr.State(state0.attitude, omega)
         return (
             [getattr(free, name)(inertia, omega) for name in names],
@@ -609,10 +695,14 @@ def test_nothing_that_is_compiled_calls_back(inertia):
         )
 
     assert "callback" not in str(jax.make_jaxpr(everything)(inertia, OMEGA))
-    assert "callback" in str(jax.make_jaxpr(lambda w: run(**{**GOOD, "omega": w}))(OMEGA))
+    assert "callback" in str(
+        jax.make_jaxpr(lambda w: run(**{**GOOD, "omega": w}))(OMEGA)
+    )
 
 
-@pytest.mark.parametrize("make", [jr.RigidBody, lambda x: jr.MassProperties(1.0, np.zeros(3), x)])
+@pytest.mark.parametrize(
+    "make", [jr.RigidBody, lambda x: jr.MassProperties(1.0, np.zeros(3), x)]
+)
 def test_a_body_in_place_of_its_inertia_is_a_sentence(make, untyped):
     body, state0 = make(np.array([1.0, 1.5, 2.0])), jr.State(GOOD["attitude"], OMEGA)
     message = rf"`inertia` must be .* but it is a {type(body).__name__}: pass its `\.inertia`\."
@@ -629,7 +719,9 @@ def test_a_body_in_place_of_its_inertia_is_a_sentence(make, untyped):
 
 def test_wrong_shapes_and_types(untyped):
     state0 = jr.State(GOOD["attitude"], OMEGA)
-    with pytest.raises(ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"
+    ):
         jr.free_rotation(np.ones(4), state0, 1.0)
     with pytest.raises(ValueError, match="must be a State"):
         jr.free_rotation(MOMENTS, OMEGA, 1.0)

@@ -19,7 +19,8 @@ def _distance(motion, other, omega):
     with mp.workdps(50):
         attitude = max(abs(a - b) for a, b in zip(motion[0], other[0], strict=True))
         return max(
-            attitude, *(abs(a - b) / scale for a, b in zip(motion[1], other[1], strict=True))
+            attitude,
+            *(abs(a - b) / scale for a, b in zip(motion[1], other[1], strict=True)),
         )
 
 
@@ -41,10 +42,16 @@ def _difference(moments, attitude, omega, time, bits=160):
         ((1.0, 2.0, 3.0), (1e-8, 1.0, 2e-9), 25.0),
     ],
     ids=[
-        "largest", "smallest", "other handedness", "separatrix", "near separatrix", "symmetric",
-        "nearly sphere", "near the middle axis",
+        "largest",
+        "smallest",
+        "other handedness",
+        "separatrix",
+        "near separatrix",
+        "symmetric",
+        "nearly sphere",
+        "near the middle axis",
     ],
-)  # fmt: skip
+)
 def test_closed_form_against_taylor_series(moments, omega, time):
     assert _difference(moments, (0.5, -0.1, 0.7, 0.3), omega, time) < 1e-30
 
@@ -75,14 +82,18 @@ def test_every_regime_against_taylor_series(regime, rng):
     rows = np.flatnonzero(DATA["regime"] == regime)
     largest = 0.0
     for k in rng.choice(rows, 4, replace=False):
-        moments, attitude, omega = (DATA[name][k] for name in ("inertia", "attitude", "omega"))
+        moments, attitude, omega = (
+            DATA[name][k] for name in ("inertia", "attitude", "omega")
+        )
         unstable = "separatrix" in regime or "middle" in regime
         radians = rng.uniform(60, 100 if unstable else 200) * rng.choice([-1, 1])
         i1, i2, i3 = np.sort(moments)
         radians /= max(1, (i3 - i1) / i1 / 5)
         bits = 160
         if unstable:
-            bits += int(abs(radians) * np.sqrt((i2 - i1) * (i3 - i2) / (i1 * i3)) / np.log(2))
+            bits += int(
+                abs(radians) * np.sqrt((i2 - i1) * (i3 - i2) / (i1 * i3)) / np.log(2)
+            )
         speed = np.max(np.abs(omega))
         speed *= np.linalg.norm(omega / speed)
         difference = _difference(moments, attitude, omega, radians / speed, bits)
@@ -98,7 +109,9 @@ def test_tensor_is_its_principal_moments_in_other_axes(rng):
     moments = np.array([9.0, 27, 36])
     for _ in range(4):
         local, attitude = rng.normal(size=3).astype(np.float16), rng.normal(size=4)
-        omega = axes @ local.astype(float)  # exact: three times the components in principal axes
+        omega = axes @ local.astype(
+            float
+        )  # exact: three times the components in principal axes
         tensor = axes @ np.diag(moments / 9) @ axes.T
         (q, w), (p, v) = (
             free_motion(tensor, attitude, omega, [20.0])[0],
@@ -147,7 +160,9 @@ def test_second_derivatives_are_differences_of_the_first(rng, duration):
     omega = rng.normal(size=(6, 3))
     omega /= np.linalg.norm(omega, axis=1, keepdims=True)
     omega[1], omega[4, 1:], omega[5] = [0.6, 0.2, -0.8], 0, [0, 1, 0]
-    inputs = np.concatenate([rng.normal(size=(6, 4)), omega, moments], axis=1).astype(LONG)
+    inputs = np.concatenate([rng.normal(size=(6, 4)), omega, moments], axis=1).astype(
+        LONG
+    )
     direction = rng.normal(size=(6, 10))
 
     def jacobian(shift):
@@ -160,4 +175,6 @@ def test_second_derivatives_are_differences_of_the_first(rng, duration):
     durations = np.full(6, duration)
     found = free_hessian_vector(moments, inputs[:, :4], omega, durations, direction)
     for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * np.max(np.abs(other)))
+        np.testing.assert_allclose(
+            one, other, rtol=0, atol=1e-11 * np.max(np.abs(other))
+        )

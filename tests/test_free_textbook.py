@@ -21,7 +21,8 @@ def motion_of(moments, omega, ts):
     return jr.free_rotation(moments, jr.State(IDENTITY, omega), ts)
 
 
-# --- The symmetric body -------------------------------------------------------------------------
+# --- The symmetric body
+# -------------------------------------------------------------------------
 
 
 def test_the_earth_as_a_rigid_body():
@@ -41,36 +42,56 @@ def test_the_earth_as_a_rigid_body():
     assert free.polhode_period(moments, omega) == pytest.approx(
         2 * np.pi / float(wobble), rel=1e-12
     )
-    assert free.mean_precession_rate(moments, omega) == pytest.approx(float(precession), rel=1e-14)
+    assert free.mean_precession_rate(moments, omega) == pytest.approx(
+        float(precession), rel=1e-14
+    )
     # The pole of rotation goes with the spin, once round the figure in 305 days.
     quarter = motion_of(moments, omega, np.pi / 2 / wobble).omega
-    np.testing.assert_allclose(quarter, rate * np.array([0, np.sin(alpha), np.cos(alpha)]),
-                               rtol=0, atol=1e-9 * alpha * rate)  # fmt: skip
+    np.testing.assert_allclose(
+        quarter,
+        rate * np.array([0, np.sin(alpha), np.cos(alpha)]),
+        rtol=0,
+        atol=1e-9 * alpha * rate,
+    )
 
 
 @pytest.mark.parametrize(("i3", "kind"), [(1.6, "oblate"), (0.5, "prolate")])
 def test_momentum_rate_and_axis_lie_in_a_plane_in_the_order_of_the_shape(i3, kind):
     moments, omega = np.array([1.0, 1.0, i3]), np.array([0.3, -0.4, 1.2])
     angles = free.cone_angles(moments, omega)
-    assert np.tan(angles.momentum) == pytest.approx(np.tan(angles.omega) / i3, rel=1e-14)
+    assert np.tan(angles.momentum) == pytest.approx(
+        np.tan(angles.omega) / i3, rel=1e-14
+    )
     states = motion_of(moments, omega, np.linspace(0.0, 20.0, 9))
     for q, w in zip(np.array(states.attitude), np.array(states.omega), strict=True):
         turn = Rotation.from_quat(np.array(q), scalar_first=True)
-        momentum, rate, axis = turn.apply(moments * w), turn.apply(w), turn.apply([0.0, 0.0, 1.0])
-        assert abs(np.dot(momentum, np.cross(rate, axis))) < 1e-14 * np.linalg.norm(momentum)
+        momentum, rate, axis = (
+            turn.apply(moments * w),
+            turn.apply(w),
+            turn.apply([0.0, 0.0, 1.0]),
+        )
+        assert abs(np.dot(momentum, np.cross(rate, axis))) < 1e-14 * np.linalg.norm(
+            momentum
+        )
 
         def between(a, b):
             return np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b))
 
         assert between(rate, axis) == pytest.approx(float(angles.omega), rel=1e-13)
-        assert between(momentum, axis) == pytest.approx(float(angles.momentum), rel=1e-13)
+        assert between(momentum, axis) == pytest.approx(
+            float(angles.momentum), rel=1e-13
+        )
         assert between(momentum, rate) == pytest.approx(float(angles.space), rel=1e-13)
     if kind == "oblate":  # the momentum between axis and rate
         assert angles.momentum < angles.omega
-        assert angles.momentum + angles.space == pytest.approx(float(angles.omega), rel=1e-14)
+        assert angles.momentum + angles.space == pytest.approx(
+            float(angles.omega), rel=1e-14
+        )
     else:
         assert angles.omega < angles.momentum
-        assert angles.omega + angles.space == pytest.approx(float(angles.momentum), rel=1e-14)
+        assert angles.omega + angles.space == pytest.approx(
+            float(angles.momentum), rel=1e-14
+        )
 
 
 def test_the_axis_of_a_symmetric_body_precesses_at_the_precession_rate():
@@ -79,11 +100,14 @@ def test_the_axis_of_a_symmetric_body_precesses_at_the_precession_rate():
     state = motion_of(moments, omega, 0.8 / rate)
     momentum = moments * omega
     turn = Rotation.from_rotvec(0.8 * momentum / np.linalg.norm(momentum))
-    axis = Rotation.from_quat(np.array(state.attitude), scalar_first=True).apply([0.0, 0.0, 1.0])
+    axis = Rotation.from_quat(np.array(state.attitude), scalar_first=True).apply(
+        [0.0, 0.0, 1.0]
+    )
     np.testing.assert_allclose(axis, turn.apply([0.0, 0.0, 1.0]), atol=1e-14)
 
 
-# --- The asymmetric body ------------------------------------------------------------------------
+# --- The asymmetric body
+# ------------------------------------------------------------------------
 
 
 def test_the_separatrix_is_where_landau_says():
@@ -132,14 +156,27 @@ CODES = {
     "at rest": (MOMENTS, np.zeros(3)),
     "sphere": (np.full(3, 2.0), np.array([1.0, 2.0, 3.0])),
     "steady rotation": (MOMENTS, np.array([0.0, 2.0, 0.0])),
-    "about the axis of the smallest moment": (np.array([2.0, 2.0, 1.0]), np.array([0.3, 0.4, 1.0])),
-    "about the axis of the largest moment": (np.array([2.0, 3.0, 2.0]), np.array([0.3, 0.4, 1.0])),
+    "about the axis of the smallest moment": (
+        np.array([2.0, 2.0, 1.0]),
+        np.array([0.3, 0.4, 1.0]),
+    ),
+    "about the axis of the largest moment": (
+        np.array([2.0, 3.0, 2.0]),
+        np.array([0.3, 0.4, 1.0]),
+    ),
     "separatrix": (np.array([1.0, 2.0, 2.25]), np.array([3.0, 1.0, 4.0])),
 }
 
 
 REGIME = jax.jit(free.regime)
-NAMES = ("at_rest", "sphere", "steady_rotation", "about_smallest", "about_largest", "separatrix")
+NAMES = (
+    "at_rest",
+    "sphere",
+    "steady_rotation",
+    "about_smallest",
+    "about_largest",
+    "separatrix",
+)
 
 
 def test_regimes_are_listed_each_with_a_text():
@@ -187,11 +224,17 @@ def test_periods_and_phases_against_an_integration(name):
     def rhs(_, y):
         q, w = y[:4], y[4:7]
         dq = 0.5 * np.array([-q[1:] @ w, *(q[0] * w + np.cross(q[1:], w))])
-        return [*dq, *(np.cross(moments * w, w) / moments), 1 / size * (w @ (moments * w))]
+        return [
+            *dq,
+            *(np.cross(moments * w, w) / moments),
+            1 / size * (w @ (moments * w)),
+        ]
 
     start = [*IDENTITY, *omega, 0.0]
     ts = np.linspace(0.0, period, 4001)
-    path = solve_ivp(rhs, (0, period), start, method="DOP853", t_eval=ts, rtol=1e-12, atol=1e-13).y
+    path = solve_ivp(
+        rhs, (0, period), start, method="DOP853", t_eval=ts, rtol=1e-12, atol=1e-13
+    ).y
     back = np.linalg.norm(path[4:7] - omega[:, None], axis=0)
     np.testing.assert_allclose(back[-1], 0, atol=1e-8)
     assert np.min(back[40:-40]) > 1e-3 * np.linalg.norm(omega)  # and not before
@@ -214,9 +257,12 @@ def test_periods_and_phases_against_an_integration(name):
     dynamic = path[7, -1]
     phase = free.geometric_phase(moments, omega)
     assert phase == pytest.approx(angle[-1] - angle[0] - dynamic, rel=1e-7)
-    # ... minus the solid angle that the momentum circles in the body, up to whole turns.
+    # ... minus the solid angle that the momentum circles in the body, up to whole
+    # turns.
     unit = (moments * path[4:7].T) / size
-    longitude = np.unwrap(np.arctan2(unit[:, (circled + 2) % 3], unit[:, (circled + 1) % 3]))
+    longitude = np.unwrap(
+        np.arctan2(unit[:, (circled + 2) % 3], unit[:, (circled + 1) % 3])
+    )
     height = unit @ axis
     area = np.sum(0.5 * ((1 - height[1:]) + (1 - height[:-1])) * np.diff(longitude))
     area *= np.sign(momentum[circled])
@@ -226,8 +272,14 @@ def test_periods_and_phases_against_an_integration(name):
 
 def test_a_period_can_be_fitted_and_designed():
     """Derivatives of period, phases and modulus against central differences, moments and tensor."""
-    names = ("polhode_period", "mean_precession_rate", "precession_per_period", "geometric_phase",
-             "parameter", "modulus")  # fmt: skip
+    names = (
+        "polhode_period",
+        "mean_precession_rate",
+        "precession_per_period",
+        "geometric_phase",
+        "parameter",
+        "modulus",
+    )
 
     @jax.jit
     def all_of(x):
@@ -242,10 +294,14 @@ def test_a_period_can_be_fitted_and_designed():
         h = 1e-5
         for n in range(6):
             step = h * np.eye(6)[n]
-            difference = (8 * (all_of(x + step) - all_of(x - step))
-                          - (all_of(x + 2 * step) - all_of(x - 2 * step))) / (12 * h)  # fmt: skip
+            difference = (
+                8 * (all_of(x + step) - all_of(x - step))
+                - (all_of(x + 2 * step) - all_of(x - 2 * step))
+            ) / (12 * h)
             scale = np.max(np.abs(found), axis=1)
-            np.testing.assert_array_less(np.abs(found[:, n] - difference), 1e-8 * (1 + scale))
+            np.testing.assert_array_less(
+                np.abs(found[:, n] - difference), 1e-8 * (1 + scale)
+            )
 
 
 def test_the_period_has_its_derivative_at_a_pure_spin():
@@ -269,7 +325,9 @@ def test_the_period_has_its_derivative_at_a_pure_spin():
         assert value == pytest.approx(float(exact_value), rel=1e-14)
         np.testing.assert_allclose(slopes, exact_slopes, rtol=1e-12, atol=1e-13)
         assert np.all(np.isfinite(curvature))
-        np.testing.assert_allclose(curvature[:3, :3], exact[:3, :3], rtol=1e-11, atol=1e-10)
+        np.testing.assert_allclose(
+            curvature[:3, :3], exact[:3, :3], rtol=1e-11, atol=1e-10
+        )
 
 
 def test_jacobi_s_modulus_of_landau():
@@ -288,7 +346,9 @@ def test_polhode_lies_on_poinsot_s_sphere_and_ellipsoid():
     curve = np.asarray(free.polhode(MOMENTS, omega, 101))
     surfaces = free.poinsot(MOMENTS, omega)
     momentum = MOMENTS * curve
-    np.testing.assert_allclose(np.linalg.norm(momentum, axis=1), surfaces.sphere_radius, rtol=1e-14)
+    np.testing.assert_allclose(
+        np.linalg.norm(momentum, axis=1), surfaces.sphere_radius, rtol=1e-14
+    )
     on = np.sum((momentum / np.asarray(surfaces.momentum_ellipsoid)) ** 2, axis=1)
     np.testing.assert_allclose(on, 1.0, rtol=1e-14)
     on = np.sum((curve / np.asarray(surfaces.omega_ellipsoid)) ** 2, axis=1)
@@ -315,10 +375,13 @@ def test_herpolhode_lies_in_the_invariable_plane():
     assert curve.shape == (3, 4, 3)
     momentum = np.asarray(jr.rotation.rotate(attitude, MOMENTS * omega))
     along = np.asarray(curve) @ (momentum / np.linalg.norm(momentum))
-    np.testing.assert_allclose(along, free.poinsot(MOMENTS, omega).plane_distance, rtol=1e-13)
+    np.testing.assert_allclose(
+        along, free.poinsot(MOMENTS, omega).plane_distance, rtol=1e-13
+    )
 
 
-# --- Small wobbles ------------------------------------------------------------------------------
+# --- Small wobbles
+# ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -340,7 +403,9 @@ def test_linearised_motion_agrees_to_the_square_of_the_wobble(axis):
 
 
 def test_linearised_motion_stays_finite_and_the_modulus_at_most_one():
-    far = jr.stability.linearized(MOMENTS, 1, np.array([1e-3, 1.0, 0.0]), np.array([2000.0, -1e6]))
+    far = jr.stability.linearized(
+        MOMENTS, 1, np.array([1e-3, 1.0, 0.0]), np.array([2000.0, -1e6])
+    )
     assert np.all(np.isfinite(far))
     assert free.parameter(np.array([1.0, 2.0, 2.25]), np.array([0.75, 0.5, 1.0])) <= 1
 
@@ -349,40 +414,54 @@ def test_slopes_of_the_separatrix_s_angle():
     slopes = jax.grad(lambda i: free.separatrix(i).momentum_angle)
     i1, i2, i3 = 1.0, 1.7, 2.9
     ratio = np.sqrt((i2 / i1 - 1) / (1 - i2 / i3))
-    by_i2 = (1 / i1 / (i2 / i1 - 1) + 1 / i3 / (1 - i2 / i3)) * ratio / 2 / (1 + ratio**2)
+    by_i2 = (
+        (1 / i1 / (i2 / i1 - 1) + 1 / i3 / (1 - i2 / i3)) * ratio / 2 / (1 + ratio**2)
+    )
     assert slopes(np.array([i1, i2, i3]))[1] == pytest.approx(by_i2, rel=1e-13)
-    np.testing.assert_array_equal(slopes(np.array([1.0, 1.0, 2.0])), [-np.inf, np.inf, 0.0])
-    np.testing.assert_array_equal(slopes(np.array([1.0, 2.0, 2.0])), [0.0, np.inf, -np.inf])
+    np.testing.assert_array_equal(
+        slopes(np.array([1.0, 1.0, 2.0])), [-np.inf, np.inf, 0.0]
+    )
+    np.testing.assert_array_equal(
+        slopes(np.array([1.0, 2.0, 2.0])), [0.0, np.inf, -np.inf]
+    )
 
 
 def test_a_body_less_symmetric_than_it_is_flat_has_no_wobble_rate():
     for third, symmetric in ((1.0 + 1.5e-8, False), (2.0, True)):
-        rate = free.wobble_rate(np.array([1.0, 1.0 + 1e-8, third]), np.array([0.0, 0.0, 1.0]))
+        rate = free.wobble_rate(
+            np.array([1.0, 1.0 + 1e-8, third]), np.array([0.0, 0.0, 1.0])
+        )
         assert np.isfinite(rate) == symmetric
 
 
 def test_linearised_sphere_and_symmetric_body_are_exact_limits():
-    np.testing.assert_array_equal(jr.stability.growth_rate_squared(np.ones(3), 0, 2.0), 0.0)
-    slope = jax.jacfwd(lambda i: jr.stability.linearized(i, 2, np.array([0.1, 0.2, 1.0]), 3.0))(
-        np.ones(3)
+    np.testing.assert_array_equal(
+        jr.stability.growth_rate_squared(np.ones(3), 0, 2.0), 0.0
     )
+    slope = jax.jacfwd(
+        lambda i: jr.stability.linearized(i, 2, np.array([0.1, 0.2, 1.0]), 3.0)
+    )(np.ones(3))
     # w1' = (I2 - I3) w2 w3 / I1: a first step of the motion, 3 seconds long
     np.testing.assert_allclose(slope[0], [0.0, 0.6, -0.6], atol=1e-14)
     np.testing.assert_allclose(slope[1], [-0.3, 0.0, 0.3], atol=1e-14)
 
 
-# --- Asteroids ----------------------------------------------------------------------------------
+# --- Asteroids
+# ----------------------------------------------------------------------------------
 
 
 def test_periods_of_4179_toutatis():
     """Published: 5.38 and 7.41 days (B. E. A. Mueller, N. H. Samarasinha, M. J. S. Belton, Icarus
     158 (2002) 305), 5.41 and 7.35 (R. S. Hudson, S. J. Ostro, Science 270 (1995) 84).
 
-    Moments and state: Y. Takahashi, M. W. Busch, D. J. Scheeres, Astron. J. 146:95 (2013).
+    Moments and state: Y. Takahashi, M. W. Busch, D. J. Scheeres, Astron. J. 146:95
+        (2013).
     """
     record = jr.datasets.toutatis_1992()
     rotation = free.polhode_period(record.moments, record.epoch_omega) / DAY
-    precession = 2 * np.pi / free.mean_precession_rate(record.moments, record.epoch_omega) / DAY
+    precession = (
+        2 * np.pi / free.mean_precession_rate(record.moments, record.epoch_omega) / DAY
+    )
     assert f"{float(rotation):.5f}" == "5.36853"
     assert f"{float(precession):.5f}" == "7.41165"
     assert rotation == pytest.approx(5.38, abs=0.02)
@@ -391,8 +470,9 @@ def test_periods_of_4179_toutatis():
     assert free.REGIMES[code] == "about the axis of the smallest moment"
 
 
-# Angles [deg] between the observed and the computed directions of the body's long, intermediate
-# and short axes, as Principia's physics/euler_solver_test.cpp prints them, each to its last digit.
+# Angles [deg] between the observed and the computed directions of the body's long,
+# intermediate and short axes, as Principia's physics/euler_solver_test.cpp prints them,
+# each to its last digit.
 PRINCIPIA = """
 7.9 5.4 5.9, 6.6 7.7 4.7, 13 15 9.4, 9.4 4.3 8.4, 2.0 0.6 2.1, 5.7 15 15, 3.0 2.6 2.6, 3.4 3.4 1.1,
 3.1 1.4 3.4, 2.8 1.6 2.7, 2.0 3.2 2.6, 2.5 5.3 5.3, 4.1 3.8 4.5, 3.2 8.2 8.0, 7.3 5.8 8.0,
@@ -403,10 +483,16 @@ PRINCIPIA = """
 def test_radar_attitudes_of_toutatis_as_closely_as_principia():
     record = jr.datasets.toutatis_1992()
     states = jr.free_rotation(
-        record.moments, jr.State(record.epoch_attitude, record.epoch_omega), record.times
+        record.moments,
+        jr.State(record.epoch_attitude, record.epoch_omega),
+        record.times,
     )
-    computed = Rotation.from_quat(np.array(states.attitude), scalar_first=True).as_matrix()
-    observed = Rotation.from_quat(np.array(record.attitudes), scalar_first=True).as_matrix()
+    computed = Rotation.from_quat(
+        np.array(states.attitude), scalar_first=True
+    ).as_matrix()
+    observed = Rotation.from_quat(
+        np.array(record.attitudes), scalar_first=True
+    ).as_matrix()
     cosines = np.einsum("nik,nik->nk", computed, observed)
     angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))[:, [2, 0, 1]]
     for row, printed in zip(angles, PRINCIPIA.strip().split(","), strict=True):
@@ -417,26 +503,37 @@ def test_radar_attitudes_of_toutatis_as_closely_as_principia():
 
 def test_periods_of_99942_apophis():
     """P. Pravec et al., Icarus 233 (2014) 48: precession 27.38 +- 0.07 h, rotation 263 +- 6 h, from
-    I1/I3 = 0.61, I2/I3 = 0.965, E/E0 = 1.024, E0 the energy of the slowest spin with that momentum.
+    I1/I3 = 0.61, I2/I3 = 0.965, E/E0 = 1.024, E0 the energy of the slowest spin with
+    that momentum.
     """
     i1, _, i3 = moments = np.array([0.61, 0.965, 1.0])
     energy = 1.024 / i3  # 2 E for |L| = 1
     along1 = (energy - 1 / i3) / (1 / i1 - 1 / i3)
     momentum = np.array([np.sqrt(along1), 0.0, np.sqrt(1 - along1)])
     omega = momentum / moments
-    assert free.REGIMES[free.regime(moments, omega)] == "about the axis of the largest moment"
-    # The momentum itself is published as the precession period alone: it sets the unit of time.
+    assert (
+        free.REGIMES[free.regime(moments, omega)]
+        == "about the axis of the largest moment"
+    )
+    # The momentum itself is published as the precession period alone: it sets the unit
+    # of time.
     precession = 2 * np.pi / float(free.mean_precession_rate(moments, omega))
     omega = omega * precession / (27.38 * 3600)
     assert free.polhode_period(moments, omega) / 3600 == pytest.approx(263, abs=6)
 
 
-# --- Outside the domain -------------------------------------------------------------------------
+# --- Outside the domain
+# -------------------------------------------------------------------------
 
 OF_ANY_BODY = (
-    "polhode_period", "mean_precession_rate", "precession_per_period", "geometric_phase",
-    "parameter", "modulus", "poinsot",
-)  # fmt: skip
+    "polhode_period",
+    "mean_precession_rate",
+    "precession_per_period",
+    "geometric_phase",
+    "parameter",
+    "modulus",
+    "poinsot",
+)
 SYMMETRIC = ("wobble_rate", "precession_rate", "cone_angles")
 SKEWED = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 3.0]])
 LANES = {  # the inertia and the rates of each
@@ -456,13 +553,16 @@ def along_the_motion(inertia, omega):
     return {
         "relative_rotation": free.relative_rotation(inertia, omega, 2.0),
         "polhode": free.polhode(inertia, omega, 5),
-        "herpolhode": free.herpolhode(inertia, jr.State(IDENTITY, omega), np.arange(2.0)),
+        "herpolhode": free.herpolhode(
+            inertia, jr.State(IDENTITY, omega), np.arange(2.0)
+        ),
     }
 
 
 def every_formula(inertia, omega):
     values = {n: getattr(free, n)(inertia, omega) for n in (*OF_ANY_BODY, *SYMMETRIC)}
-    # of a tensor the motion's derivatives take a minute to compile; the values are tested below
+    # of a tensor the motion's derivatives take a minute to compile; the values are
+    # tested below
     return values | (along_the_motion(inertia, omega) if inertia.ndim == 1 else {})
 
 
@@ -472,7 +572,9 @@ def all_lanes(inertia, omega):
 
     def total(inertia, omega, shift):
         more = shift * (1.0 if inertia.ndim == 2 else jnp.eye(3))
-        values = jax.vmap(lambda i, w: every_formula(i + more, w + shift))(inertia, omega)
+        values = jax.vmap(lambda i, w: every_formula(i + more, w + shift))(
+            inertia, omega
+        )
         leaves = jax.tree.leaves(values)
         return sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in leaves), values
 
@@ -483,7 +585,9 @@ def all_lanes(inertia, omega):
     return values, slopes, forward
 
 
-@pytest.mark.parametrize("kind", ["moments", pytest.param("tensor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["moments", pytest.param("tensor", marks=pytest.mark.slow)]
+)
 def test_outside_its_domain_a_formula_is_nan_in_that_lane_alone(kind):
     inertia, omega = (np.stack(x) for x in zip(*LANES.values(), strict=True))
     if kind == "tensor":
@@ -510,8 +614,12 @@ def test_outside_its_domain_a_formula_is_nan_in_that_lane_alone(kind):
 
 
 def test_a_body_that_is_not_symmetric_about_the_third_axis_has_no_wobble_rate():
-    bodies = [np.diag([1.0, 1.0, 3.0]), np.diag(MOMENTS), np.diag([2.0, 1.0, 1.0]),
-              np.diag([1.0, 1.0, 2.0]) + 0.1]  # fmt: skip
+    bodies = [
+        np.diag([1.0, 1.0, 3.0]),
+        np.diag(MOMENTS),
+        np.diag([2.0, 1.0, 1.0]),
+        np.diag([1.0, 1.0, 2.0]) + 0.1,
+    ]
     omega = np.tile([0.3, -0.4, 1.2], (4, 1))
     values = all_lanes(np.stack(bodies * 2), np.concatenate([omega] * 2))[0]
     for name in SYMMETRIC:
@@ -524,10 +632,16 @@ def test_a_sphere_has_no_separatrix():
     @quick_jit
     def both(shift):
         value, push, edges = jax.linearize(total, shift, has_aux=True)
-        return push(shift + 1), jax.linear_transpose(push, shift)(jnp.ones_like(value)), edges
+        return (
+            push(shift + 1),
+            jax.linear_transpose(push, shift)(jnp.ones_like(value)),
+            edges,
+        )
 
     def total(shift):
-        bodies = np.array([[2.0] * 3, [1.0, 2.0, 3.0], [1.0, -2.0, 3.0], [1.0, np.nan, 3.0]])
+        bodies = np.array(
+            [[2.0] * 3, [1.0, 2.0, 3.0], [1.0, -2.0, 3.0], [1.0, np.nan, 3.0]]
+        )
         edges = jax.vmap(lambda i: free.separatrix(i + shift))(bodies)
         return jnp.nansum(edges.omega_angle), edges
 
@@ -540,7 +654,9 @@ def test_a_sphere_has_no_separatrix():
 
 def test_wrong_shapes_and_options(untyped):
     for points in (1, 2.0):
-        with pytest.raises(ValueError, match="`points` must be an integer and at least 2"):
+        with pytest.raises(
+            ValueError, match="`points` must be an integer and at least 2"
+        ):
             free.polhode(MOMENTS, np.ones(3), points)
     with pytest.raises(ValueError, match="`axis` must be one of 0, 1, 2"):
         jr.stability.growth_rate_squared(MOMENTS, 3, 1.0)
@@ -548,13 +664,18 @@ def test_wrong_shapes_and_options(untyped):
         free.polhode_period(MOMENTS, np.ones(4))
     with pytest.raises(ValueError, match=r"`duration` must have shape \(\)"):
         free.relative_rotation(MOMENTS, np.ones(3), np.ones(2))
-    with pytest.raises(ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"`inertia` must have shape \(3,\) or \(3, 3\)"
+    ):
         free.separatrix(np.ones(2))
 
 
 def test_times_that_their_dtype_cannot_tell_apart_are_an_error():
     """Unix time in float32: its numbers are 128 seconds apart."""
-    single = [jnp.asarray(x, jnp.float32) for x in ([1.0, 2.0, 3.0], [1.0, 0, 0, 0], [0.1, 1, 0.2])]
+    single = [
+        jnp.asarray(x, jnp.float32)
+        for x in ([1.0, 2.0, 3.0], [1.0, 0, 0, 0], [0.1, 1, 0.2])
+    ]
     state0 = jr.State(*single[1:])
     ts = jnp.asarray(1.7e9 + np.arange(11.0), jnp.float32)
     with pytest.raises(RuntimeError, match=r"tells apart times .*Subtract the epoch"):

@@ -17,7 +17,9 @@ def second_moments(tensor):
 
 def a_body(rng):
     """Of twelve points: physical without any formula."""
-    return jr.from_points(rng.uniform(0.1, 1, 12), rng.normal((0.3, -0.2, 0.1), 1.0, (12, 3)))
+    return jr.from_points(
+        rng.uniform(0.1, 1, 12), rng.normal((0.3, -0.2, 0.1), 1.0, (12, 3))
+    )
 
 
 def test_any_six_numbers_are_a_real_body_s(rng):
@@ -36,7 +38,9 @@ def test_any_six_numbers_are_a_real_body_s(rng):
             np.longdouble,  # a needle's moment is a small difference
         )
         sigma = lower @ lower.T
-        np.testing.assert_allclose(tensor, np.trace(sigma) * np.eye(3) - sigma, rtol=1e-13)
+        np.testing.assert_allclose(
+            tensor, np.trace(sigma) * np.eye(3) - sigma, rtol=1e-13
+        )
         moments = np.linalg.eigvalsh(tensor)
         assert moments[0] > 0
         assert moments[2] <= moments[0] + moments[1] + 1e-14 * moments[2]
@@ -46,7 +50,9 @@ def test_both_ways_of_the_six_numbers(rng):
     for _ in range(20):
         tensor = np.asarray(a_body(rng).inertia)
         numbers = identify.parameters_from_inertia(tensor)
-        np.testing.assert_allclose(identify.inertia_from_parameters(numbers), tensor, rtol=1e-12)
+        np.testing.assert_allclose(
+            identify.inertia_from_parameters(numbers), tensor, rtol=1e-12
+        )
         # the first is the scale, the others the shape
         scaled = identify.parameters_from_inertia(9.0 * tensor)
         np.testing.assert_allclose(scaled[0] - numbers[0], np.log(3.0), rtol=1e-12)
@@ -60,7 +66,9 @@ def test_the_sphere_and_the_symmetric_body_are_nothing_special():
         six = jacobian[np.triu_indices(3)]
         assert np.linalg.cond(six) < 30
         back = jax.jacfwd(
-            lambda p: identify.parameters_from_inertia(identify.inertia_from_parameters(p))
+            lambda p: identify.parameters_from_inertia(
+                identify.inertia_from_parameters(p)
+            )
         )
         np.testing.assert_allclose(back(numbers), np.eye(6), atol=1e-13)
 
@@ -71,7 +79,9 @@ def test_the_ten_numbers_both_ways(rng):
         numbers = identify.log_cholesky_from_body(body)
         again = identify.body_from_log_cholesky(numbers)
         np.testing.assert_allclose(again.mass, body.mass, rtol=1e-13)
-        np.testing.assert_allclose(again.center_of_mass, body.center_of_mass, rtol=1e-13)
+        np.testing.assert_allclose(
+            again.center_of_mass, body.center_of_mass, rtol=1e-13
+        )
         np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-11, atol=1e-12)
 
 
@@ -81,9 +91,14 @@ def test_the_ten_numbers_are_the_factor_of_the_pseudo_inertia(rng):
     m, c = float(body.mass), np.asarray(body.center_of_mass)
     about_origin = np.asarray(body.about(np.zeros(3)))
     pseudo = np.block(
-        [[second_moments(about_origin), m * c[:, None]], [m * c[None], np.full((1, 1), m)]]
+        [
+            [second_moments(about_origin), m * c[:, None]],
+            [m * c[None], np.full((1, 1), m)],
+        ]
     )
-    alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = np.asarray(identify.log_cholesky_from_body(body))
+    alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = np.asarray(
+        identify.log_cholesky_from_body(body)
+    )
     upper = np.exp(alpha) * np.array(
         [
             [np.exp(d1), s12, s13, t1],
@@ -98,7 +113,9 @@ def test_the_ten_numbers_are_the_factor_of_the_pseudo_inertia(rng):
 def test_any_ten_numbers_are_a_real_body_s(rng):
     for _ in range(20):
         body = identify.body_from_log_cholesky(rng.normal(size=10))
-        jr.MassProperties(body.mass, body.center_of_mass, body.inertia)  # checks and does not raise
+        jr.MassProperties(
+            body.mass, body.center_of_mass, body.inertia
+        )  # checks and does not raise
 
 
 def test_turned_axes_are_the_same_body(rng):
@@ -119,8 +136,16 @@ FLAT = np.array([1.0, 2.0, 3.0])
     ("function", "good", "bad"),
     [
         (identify.parameters_from_inertia, np.array([1.0, 2.0, 2.5]), FLAT),
-        (identify.parameters_from_inertia, np.array([1.0, 2.0, 2.5]), np.array([1.0, 1, 3])),
-        (identify.parameters_from_inertia, np.array([1.0, 2.0, 2.5]), np.full(3, np.nan)),
+        (
+            identify.parameters_from_inertia,
+            np.array([1.0, 2.0, 2.5]),
+            np.array([1.0, 1, 3]),
+        ),
+        (
+            identify.parameters_from_inertia,
+            np.array([1.0, 2.0, 2.5]),
+            np.full(3, np.nan),
+        ),
         (identify.parameters_from_inertia, np.eye(3), np.eye(3) + 0.1 * np.eye(3, k=1)),
         (identify.inertia_from_parameters, np.arange(6.0) / 9, np.full(6, np.inf)),
         (identify.body_from_log_cholesky, np.arange(10.0) / 9, np.full(10, np.nan)),
@@ -131,9 +156,13 @@ FLAT = np.array([1.0, 2.0, 3.0])
         ),
     ],
 )
-def test_outside_the_domain_a_lane_is_nan_and_derivatives_are_clean(function, good, bad):
+def test_outside_the_domain_a_lane_is_nan_and_derivatives_are_clean(
+    function, good, bad
+):
     """That of the lane, that of the other lane, and that of what they share."""
-    lanes = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y, float) for y in x]), good, bad)
+    lanes = jax.tree.map(
+        lambda *x: jnp.stack([jnp.asarray(y, float) for y in x]), good, bad
+    )
     values = jax.vmap(function)(lanes)
     alone = function(good)
     for both, one in zip(jax.tree.leaves(values), jax.tree.leaves(alone), strict=True):
@@ -146,9 +175,13 @@ def test_outside_the_domain_a_lane_is_nan_and_derivatives_are_clean(function, go
 
     slope = jax.jit(jax.grad(total, argnums=(0, 1)))
     of_shift, of_lanes = slope(0.0, lanes)
-    expected, of_good = slope(0.0, jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), lanes))
+    expected, of_good = slope(
+        0.0, jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), lanes)
+    )
     np.testing.assert_allclose(of_shift, expected / 2, rtol=1e-12)
-    for both, one in zip(jax.tree.leaves(of_lanes), jax.tree.leaves(of_good), strict=True):
+    for both, one in zip(
+        jax.tree.leaves(of_lanes), jax.tree.leaves(of_good), strict=True
+    ):
         np.testing.assert_allclose(both[0], one[0], rtol=1e-12)
         assert np.all(both[1] == 0)
 
@@ -158,11 +191,14 @@ def test_bad_shapes_and_flat_bodies(untyped):
         identify.inertia_from_parameters(np.zeros(5))
     with pytest.raises(ValueError, match="must be a MassProperties"):
         identify.log_cholesky_from_body(np.eye(3))
-    with pytest.raises(RuntimeError, match="`body` must have extent in three directions"):
+    with pytest.raises(
+        RuntimeError, match="`body` must have extent in three directions"
+    ):
         identify.LogCholesky(jr.solids.disk(1.0, 0.5))
 
 
-# --- Linear starts ------------------------------------------------------------------------------
+# --- Linear starts
+# ------------------------------------------------------------------------------
 
 TENSOR = np.array([[2.0, -0.3, 0.2], [-0.3, 2.5, 0.4], [0.2, 0.4, 1.7]])
 RATIOS = TENSOR / np.trace(TENSOR)
@@ -199,7 +235,9 @@ def test_exact_samples_give_the_body(free_samples, wheel_samples):
     assert weak.singular_values[-1] < 1e-6 * weak.singular_values[-2]
     by_momentum = identify.momentum(TS, attitudes, omegas)
     np.testing.assert_allclose(by_momentum.inertia, RATIOS, atol=1e-13)
-    exact = Rotation.from_quat(attitudes[0], scalar_first=True).apply(RATIOS @ omegas[0])
+    exact = Rotation.from_quat(attitudes[0], scalar_first=True).apply(
+        RATIOS @ omegas[0]
+    )
     np.testing.assert_allclose(by_momentum.momentum, exact, atol=1e-12)
     wheel = identify.gyrostat(TS, *wheel_samples)
     np.testing.assert_allclose(wheel.inertia, TENSOR, rtol=1e-5)
@@ -215,7 +253,9 @@ def test_errors_fall_with_the_noise(free_samples, wheel_samples, rng):
             found = (
                 identify.weak_form(TS, dirty).inertia / RATIOS,
                 identify.momentum(TS, attitudes, dirty).inertia / RATIOS,
-                identify.gyrostat(TS, turned + noise * rng.normal(size=turned.shape), wheel).inertia
+                identify.gyrostat(
+                    TS, turned + noise * rng.normal(size=turned.shape), wheel
+                ).inertia
                 / TENSOR,
             )
             errors.append([np.sqrt(np.mean((np.diagonal(x) - 1) ** 2)) for x in found])
@@ -228,7 +268,9 @@ def test_samples_that_are_missing_are_left_out(free_samples, wheel_samples, rng)
     lost = rng.choice(len(TS), 10, replace=False)
     for x in (attitudes, omegas, turned):
         x[lost] = np.nan
-    np.testing.assert_allclose(identify.weak_form(TS, omegas).inertia, RATIOS, atol=1e-5)
+    np.testing.assert_allclose(
+        identify.weak_form(TS, omegas).inertia, RATIOS, atol=1e-5
+    )
     found = identify.momentum(TS, attitudes, omegas)
     np.testing.assert_allclose(found.inertia, RATIOS, atol=1e-12)
     found = identify.gyrostat(TS, turned, wheel).inertia
@@ -266,10 +308,16 @@ def test_starts_under_jit_vmap_and_derivatives(free_samples, wheel_samples, rng)
     up, down, here = all_three(0.02 + h), all_three(0.02 - h), all_three(0.02)
     for value, slope, a, b, c in zip(values, slopes, up, down, here, strict=True):
         np.testing.assert_allclose(value[0], c, atol=1e-12)
-        np.testing.assert_allclose(slope[0], (a - b) / (2 * h), atol=1e-7 * np.max(np.abs(slope)))
-    single = identify.weak_form(ts.astype(np.float32), omegas.astype(np.float32)).inertia
+        np.testing.assert_allclose(
+            slope[0], (a - b) / (2 * h), atol=1e-7 * np.max(np.abs(slope))
+        )
+    single = identify.weak_form(
+        ts.astype(np.float32), omegas.astype(np.float32)
+    ).inertia
     assert single.dtype == np.float32
-    np.testing.assert_allclose(single, identify.weak_form(ts, omegas).inertia, atol=1e-3)
+    np.testing.assert_allclose(
+        single, identify.weak_form(ts, omegas).inertia, atol=1e-3
+    )
 
 
 def test_bad_samples_are_errors(free_samples, wheel_samples, untyped):
@@ -293,7 +341,9 @@ def test_a_bad_lane_of_samples_is_named_or_marked(free_samples):
     attitudes, omegas = (x[::20] for x in free_samples)
     ts = TS[::20]
     lanes = np.stack([omegas, np.full_like(omegas, np.nan)])
-    with pytest.raises(RuntimeError, match=r"four samples that are finite .*: 0 in lane 1"):
+    with pytest.raises(
+        RuntimeError, match=r"four samples that are finite .*: 0 in lane 1"
+    ):
         jax.vmap(lambda w: identify.momentum(ts, attitudes, w))(lanes)
     found = jax.vmap(lambda w: identify.momentum(ts, attitudes, w, throw=False))(lanes)
     assert list(found.result == jr.RESULTS.invalid_state) == [False, True]

@@ -78,8 +78,10 @@ def covers(found, tensor, absolute=False, far=30.0, ratio=5.0):
 
 def near(found, name, true, far=5.0, least=0.0):
     """An array that was sought is within its errors."""
-    value, error = (np.asarray(x) for x in found.leaves[name])
-    assert np.all(np.abs(value - true) < far * error + least), f"{value} {error} {true}\n{found}"
+    value, error = (np.asarray(x) for x in found.estimates[name])
+    assert np.all(np.abs(value - true) < far * error + least), (
+        f"{value} {error} {true}\n{found}"
+    )
 
 
 # Records that tell little, or not what they seem to
@@ -123,14 +125,28 @@ def test_prolate_bodies_about_equatorial_axes_are_never_ok_and_wrong(rng):
 
 
 # Of `worlds.random_record`, each of which tells both ratios to better than a tenth.
-TELLING = (2311, 21639, 21700, 3261, 21489, 2633, 2941, 1079, 3297, 21189, 1653, 21929, 21976, 3485)
+TELLING = (
+    2311,
+    21639,
+    21700,
+    3261,
+    21489,
+    2633,
+    2941,
+    1079,
+    3297,
+    21189,
+    1653,
+    21929,
+    21976,
+    3485,
+)
 TELLING += (21453, 41, 1520, 1687, 3174, 20312, 2892)
 
 
 LOST = {21700: Status.WRONG_BASIN}  # no attempt finds it, which is said
-COARSE = (
-    21453  # six samples in nine turns, of which an alias is followed: it is said to be no answer
-)
+# Six samples in nine turns, of which an alias is followed: it is said to be no answer
+COARSE = 21453
 
 
 @pytest.mark.slow  # many fits
@@ -141,7 +157,9 @@ def test_records_that_tell_all_are_fitted(seed):
     if seed in (*LOST, COARSE):
         assert is_in(found, (LOST.get(seed, Status.UNIDENTIFIABLE),))
     else:
-        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), str(found).split(":")[0]
+        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), str(found).split(":")[
+            0
+        ]
         covers(found, 3 * record.tensor / np.trace(record.tensor), far=53.0)
 
 
@@ -152,7 +170,10 @@ def off_by(found, tensor):
     error = (np.asarray(found.inertia) - tensor).reshape(-1, 9)[:, places]
     square = np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
     true = np.linalg.eigvalsh(tensor)
-    ratios = np.abs(np.asarray(found.ratios) - true[:, 1:] / true[:, :1]) / found.ratios_errors
+    ratios = (
+        np.abs(np.asarray(found.ratios) - true[:, 1:] / true[:, :1])
+        / found.ratios_errors
+    )
     return square, np.max(ratios, axis=1)
 
 
@@ -167,7 +188,10 @@ def test_500_random_records_are_never_ok_and_wrong():
     square, ratio = off_by(jax.tree.map(lambda x: x[ok], found), tensors[ok])
     good = (square < 53) & (ratio < 6)
     seeds = np.flatnonzero(ok)[~good]
-    wrong = [f"{x}: {y} {z}" for x, y, z in zip(seeds, square[~good], ratio[~good], strict=True)]
+    wrong = [
+        f"{x}: {y} {z}"
+        for x, y, z in zip(seeds, square[~good], ratio[~good], strict=True)
+    ]
     right = np.sum(good)
     assert not wrong, "\n".join(wrong)
     assert right > 90, right
@@ -196,9 +220,14 @@ def test_a_reversed_axis_of_the_gyro_is_that_of_the_mirror_body_which_is_named(r
     found = fitted(values * np.array([1.0, 1.0, -1.0]))
     assert is_in(found, (Status.OK,)), words(found)
     text = str(found)
-    assert "with one axis of the gyro reversed the same record is that of a body" in text
+    assert (
+        "with one axis of the gyro reversed the same record is that of a body" in text
+    )
     _, _, named = text.partition("of a body with ")
-    ratios = [float(part.split(" = ")[1].split()[0]) for part in named.split("\n")[0].split(", ")]
+    ratios = [
+        float(part.split(" = ")[1].split()[0])
+        for part in named.split("\n")[0].split(", ")
+    ]
     np.testing.assert_allclose(ratios, [1.7, 2.3], rtol=0.02)
 
 
@@ -208,7 +237,9 @@ def test_flat_bodies_are_not_told_to_be_unknown_beside_sharp_ratios(rng):
         _, values = seen(rng, tensor)
         found = fitted(values, throw=False)
         text = words(found)
-        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE, Status.AT_BOUNDARY)), text
+        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE, Status.AT_BOUNDARY)), (
+            text
+        )
         if found.ratios_errors[1] < 0.05 * found.ratios[1]:
             assert not any("I3/I1" in x for x in found.null_directions), text
 
@@ -243,7 +274,9 @@ def test_clipped_rates_and_rates_in_space_without_a_noise_stated_are_not_ok(rng)
         assert "saturated" in text
         assert "not white" in text
 
-        values = in_space(tensor, moved.omega[0], TS) + 0.01 * rng.normal(size=moved.omega.shape)
+        values = in_space(tensor, moved.omega[0], TS) + 0.01 * rng.normal(
+            size=moved.omega.shape
+        )
         found = fitted(values, None, throw=False)
         text = words(found)
         assert not is_in(found, (Status.OK,)), text
@@ -268,7 +301,7 @@ def test_a_clipped_gyro_whose_limit_is_given_is_ok(rng):
 
 
 @pytest.mark.slow  # a program of its own
-def test_robust_does_not_throw_all_away_where_the_model_is_wrong(rng):
+def test_robust_does_not_trial_all_away_where_the_model_is_wrong(rng):
     """A torque moves the rates by 65 times the noise."""
     tensor = body_of(rng)
     omega0 = spin_of(rng, tensor)
@@ -290,7 +323,7 @@ def test_robust_does_not_throw_all_away_where_the_model_is_wrong(rng):
 def test_blocks_of_residuals_dealt_out_anew_give_errors(rng):
     tensor = body_of(rng)
     found = fitted(seen(rng, tensor)[1])
-    rows = found.rows()
+    rows = found.linearization()
     shifts = identify.block_bootstrap(*rows, 10, jax.random.key(0), samples=300)
     spread = np.std(np.asarray(shifts), axis=0)
     stated = np.sqrt(np.diagonal(np.asarray(found.covariance)))
@@ -314,7 +347,9 @@ def pushed(tensor, drag=0.02):
 @pytest.mark.slow  # a program of its own
 def test_a_known_thruster_and_a_known_drag_tell_the_tensor_blind(rng):
     """Or it is said why they do not."""
-    system = jr.RigidBody(np.ones(3), jr.torques.Constant(CONSTANT) + jr.torques.LinearDrag(0.02))
+    system = jr.RigidBody(
+        np.ones(3), jr.torques.Constant(CONSTANT) + jr.torques.LinearDrag(0.02)
+    )
     ended = []
     for _ in range(5):
         tensor = rng.uniform(0.5, 2.0) * body_of(rng, np.exp(rng.uniform(0, 0.6, 3)))
@@ -336,10 +371,12 @@ def test_a_drag_that_is_not_there_ends_at_none(rng):
         tensor = body_of(rng)
         _, values = seen(rng, tensor, torque=lambda _t, w, c=drag: -c * w)
         found = identify.fit(
-            system, identify.Rates(TS, values, 0.01), free=lambda body: body.torque.coefficient,
-        )  # fmt: skip
+            system,
+            identify.Rates(TS, values, 0.01),
+            free=lambda body: body.torque.coefficient,
+        )
         text = words(found)
-        value, error = (float(x) for x in found.leaves["torque.coefficient"])
+        value, error = (float(x) for x in found.estimates["torque.coefficient"])
         assert value >= 0
         assert abs(value - drag) < 5 * error + 1e-4, text
         covers(found, tensor)
@@ -360,15 +397,19 @@ def test_a_drag_sought_as_a_tensor_stays_one(rng):
         torque = lambda _t, w, c=drag: -worlds.times(c, w)  # noqa: E731
         _, values = seen(rng, tensor, torque=torque, sigma=0.003)
         found = identify.fit(
-            system, identify.Rates(TS, values, 0.003), free=lambda body: body.torque.coefficient,
+            system,
+            identify.Rates(TS, values, 0.003),
+            free=lambda body: body.torque.coefficient,
             throw=False,
-        )  # fmt: skip
+        )
         text = words(found)
         assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), text
-        value, error = (np.asarray(x) for x in found.leaves["torque.coefficient"])
+        value, error = (np.asarray(x) for x in found.estimates["torque.coefficient"])
         np.testing.assert_allclose(value, value.T, rtol=1e-12)
         assert np.linalg.eigvalsh(value)[0] > -1e-12
-        assert np.all(np.abs(value - drag) < 5 * error + 1e-4), f"{value} {error} {drag} {text}"
+        assert np.all(np.abs(value - drag) < 5 * error + 1e-4), (
+            f"{value} {error} {drag} {text}"
+        )
 
 
 @pytest.mark.slow  # a program of its own
@@ -377,9 +418,11 @@ def test_a_drag_alone_does_not_tell_scale_and_itself(rng):
     tensor = body_of(rng)
     _, values = seen(rng, tensor, torque=lambda _t, w: -0.02 * w)
     found = identify.fit(
-        system, identify.Rates(TS, values, 0.01), free=lambda body: body.torque.coefficient,
+        system,
+        identify.Rates(TS, values, 0.01),
+        free=lambda body: body.torque.coefficient,
         scale="known",
-    )  # fmt: skip
+    )
     text = words(found)
     assert is_in(found, (Status.UNIDENTIFIABLE,)), text
     assert any("overall scale" in x for x in found.null_directions), text
@@ -397,7 +440,11 @@ def test_a_torque_that_no_model_has_is_estimated(sigma, rng):
     for kind in ("white", "smooth", "none"):
         tensor = body_of(rng)
         omega0 = spin_of(rng, tensor)
-        torque = worlds.wobble_torque(rng, tensor, omega0, 0.03) if kind == "smooth" else None
+        torque = (
+            worlds.wobble_torque(rng, tensor, omega0, 0.03)
+            if kind == "smooth"
+            else None
+        )
         kick = 0.02 if kind == "white" else 0.0
         _, values = seen(rng, tensor, omega0=omega0, torque=torque, kick=kick)
         found = fitted(values, sigma, unmodelled="estimate")
@@ -418,7 +465,9 @@ def test_what_no_fit_answers_is_refused(untyped):
     with pytest.raises(ValueError, match="`unmodelled` must be 0 or estimated"):
         identify.fit(BLIND, rates(), unmodelled=0.1)
     with pytest.raises(ValueError, match=r"`covariance` .* beside a sensor's `limit`"):
-        identify.Record(identify.Gyro(limit=2.0), TS, np.ones((200, 3)), covariance=np.eye(3))
+        identify.Record(
+            identify.Gyro(limit=2.0), TS, np.ones((200, 3)), covariance=np.eye(3)
+        )
 
 
 # Sensors
@@ -432,7 +481,9 @@ def test_the_drift_of_a_gyro_begins_with_its_record():
         record = identify.Record(sensor, 1e9 + np.arange(3.0), np.zeros((3, 3)), 0.1)
         rows = identify.residuals(BLIND, state, record, t0=1e9)
         np.testing.assert_allclose(rows[0, -3:], late / 0.1)
-    np.testing.assert_array_equal(drifting.predict(jnp.asarray(3.0), state, BLIND), 3 * np.ones(3))
+    np.testing.assert_array_equal(
+        drifting.predict(jnp.asarray(3.0), state, BLIND), 3 * np.ones(3)
+    )
 
 
 def gyro_of(rng, moved, ts, sigma, **errors):
@@ -456,7 +507,10 @@ def test_errors_of_a_gyro_are_found(name, rng):
         picked = getattr(gyro, name)
         return identify.prior(picked, 0.05) if name == "bias" else picked
 
-    grid, epoch = grid_for(TS), 1.7e9 if name == "drift" else 0.0  # of a telephone's clock
+    grid, epoch = (
+        grid_for(TS),
+        1.7e9 if name == "drift" else 0.0,
+    )  # of a telephone's clock
     for _ in range(2):
         tensor = body_of(rng)
         moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
@@ -471,7 +525,9 @@ def test_errors_of_a_gyro_are_found(name, rng):
 
 
 @pytest.mark.slow  # a program of its own
-def test_a_delay_of_a_gyro_alone_is_the_state_s_and_the_ratios_are_told_all_the_same(rng):
+def test_a_delay_of_a_gyro_alone_is_the_state_s_and_the_ratios_are_told_all_the_same(
+    rng,
+):
     """Free motion a little later is free motion."""
     grid = grid_for(TS)
     for _ in range(6):
@@ -538,7 +594,9 @@ def test_a_magnetometer_of_an_unknown_field_beside_a_gyro(rng):
     shown += np.array([3.0, 0.0, -2.0])
     records = (
         identify.Rates(TS, values, 0.01),
-        identify.Record(identify.Magnetometer(np.array([1.0, 1.0, -1.0])), TS, shown, sigma),
+        identify.Record(
+            identify.Magnetometer(np.array([1.0, 1.0, -1.0])), TS, shown, sigma
+        ),
     )
     free = lambda _, __, compass: (compass.field, compass.bias)  # noqa: E731
     with pytest.raises(ValueError, match="start"):
@@ -546,7 +604,7 @@ def test_a_magnetometer_of_an_unknown_field_beside_a_gyro(rng):
     found = identify.fit(BLIND, records, free=free, start=jr.State(start, np.zeros(3)))
     text = words(found)
     near(found, "magnetometer.bias", np.array([3.0, 0.0, -2.0]))
-    size, _ = found.leaves["magnetometer.field"]
+    size, _ = found.estimates["magnetometer.field"]
     assert abs(np.linalg.norm(size) - np.linalg.norm(field)) < 1.0, text
     # Attitude and field turn together.
     assert is_in(found, (Status.OK,)), text
@@ -560,21 +618,23 @@ SHORT = np.arange(60) * 0.3
 SEVERAL = 4
 
 
-def throws_of(rng, tensors, **errors):
-    """A record of each body, three turns, and the gyro's errors, each throw's own if a list."""
+def trials_of(rng, tensors, **errors):
+    """A record of each body, three turns, and the gyro's errors, each trial's own if a list."""
     records = []
     grid = grid_for(SHORT)
     for i, tensor in enumerate(tensors):
         moved = worlds.tumble(tensor, spin_of(rng, tensor), grid)
         own = {k: v[i] if isinstance(v, list) else v for k, v in errors.items()}
-        records.append(identify.Rates(SHORT, gyro_of(rng, moved, SHORT, 0.01, **own), 0.01))
+        records.append(
+            identify.Rates(SHORT, gyro_of(rng, moved, SHORT, 0.01, **own), 0.01)
+        )
     return records
 
 
 @pytest.mark.slow  # a program of its own
-def test_a_bias_of_each_throw(rng):
+def test_a_bias_of_each_trial(rng):
     tensor, biases = body_of(rng), list(0.05 * rng.normal(size=(SEVERAL, 3)))
-    records = throws_of(rng, [tensor] * SEVERAL, bias=biases)
+    records = trials_of(rng, [tensor] * SEVERAL, bias=biases)
     found = identify.fit(BLIND, records, free=lambda _, gyro: identify.each(gyro.bias))
     assert is_in(found, (Status.OK,)), words(found)
     covers(found, tensor)
@@ -583,25 +643,28 @@ def test_a_bias_of_each_throw(rng):
 
 @pytest.mark.slow  # two programs of their own
 @pytest.mark.parametrize("sought", [False, True])
-def test_a_wheel_as_each_throw_recorded_it(sought, rng):
+def test_a_wheel_as_each_trial_recorded_it(sought, rng):
     """With 1 % of scale and 5 ms of delay in the record, sought or none."""
     spin, sigma, ts = 5.0, 0.02, np.arange(60) * 0.02
     tensor = body_of(rng)
     scale, delay = (1.01, 0.005) if sought else (1.0, 0.0)
     systems, records = [], []
     for i in range(3):
-        true, told = worlds.wheel_profile(rng.normal(size=3), 1.5, 0.1 + 0.1 * i, 0.6, scale, delay)
+        true, told = worlds.wheel_profile(
+            rng.normal(size=3), 1.5, 0.1 + 0.1 * i, 0.6, scale, delay
+        )
         moved = worlds.tumble(tensor, spin_of(rng, tensor, spin), ts, wheel=true)
         values = moved.omega + sigma * rng.normal(size=moved.omega.shape)
-        clock = np.arange(61 + i) * 0.02  # of another length in each throw
+        clock = np.arange(61 + i) * 0.02  # of another length in each trial
         wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
         systems.append(jr.RigidBody(np.ones(3), wheel))
         records.append(identify.Rates(ts, values, sigma))
     free = None
     if sought:
         free = lambda body: (  # noqa: E731
-            identify.prior(body.torque.momentum.scale, 0.02), body.torque.momentum.delay
-        )  # fmt: skip
+            identify.prior(body.torque.momentum.scale, 0.02),
+            body.torque.momentum.delay,
+        )
     found = identify.fit(systems, records, scale="rotor", free=free)
     text = words(found)
     assert is_in(found, (Status.OK,)), text
@@ -625,11 +688,15 @@ def test_lanes_are_what_they_are_alone(rng):
     for i, x in enumerate(readings):
         alone = identify.fit(BLIND, x, free=free, throw=False)
         assert bool(alone.status == jax.tree.map(lambda y, i=i: y[i], together.status))
-        np.testing.assert_allclose(together.inertia[i], alone.inertia, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(
+            together.inertia[i], alone.inertia, rtol=1e-6, atol=1e-9
+        )
         np.testing.assert_allclose(together.chi_square[i], alone.chi_square, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("factor", "text"), [(50.0, "is too large"), (0.02, "is too small")])
+@pytest.mark.parametrize(
+    ("factor", "text"), [(50.0, "is too large"), (0.02, "is too small")]
+)
 def test_a_noise_that_is_stated_wrongly_is_named_in_the_first_line(factor, text, rng):
     tensor = body_of(rng)
     _, values = seen(rng, tensor)
@@ -650,7 +717,7 @@ def test_a_tensor_that_is_known_has_no_numbers_and_its_state_is_found(rng):
     tensor = body_of(rng)
     moved, values = seen(rng, tensor)
     record = identify.Rates(TS, values, 0.01)
-    found = identify.fit(jr.RigidBody(tensor), record, shape=identify.Fixed())
+    found = identify.fit(jr.RigidBody(tensor), record, inertia_model=identify.Fixed())
     assert is_in(found, (Status.OK,)), words(found)
     assert found.numbers.shape == (0,)
     np.testing.assert_allclose(found.inertia, tensor)

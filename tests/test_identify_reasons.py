@@ -28,7 +28,9 @@ def motion(ts):
 
 
 def first_line(values, sigma, **options):
-    found = identify.fit(BLIND, identify.Rates(TS, values, sigma), throw=False, **options)
+    found = identify.fit(
+        BLIND, identify.Rates(TS, values, sigma), throw=False, **options
+    )
     return found, str(found).splitlines()[0]
 
 

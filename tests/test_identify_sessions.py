@@ -47,22 +47,26 @@ def test_a_turn_for_each_session_is_found_with_its_error(worlds_found):
     assert np.all(np.asarray(found.status == Status.OK))
     for i, true in enumerate(turns):
         one = jax.tree.map(lambda x, i=i: x[i], found)
-        value, error = one.leaves["gyro.misalignment"]
+        value, error = one.estimates["gyro.misalignment"]
         assert value.shape == (2, 3)
         assert np.all(np.abs(np.asarray(value) - true) < 4.5 * np.asarray(error))
         assert one.determined == {"inertia": True, "gyro.misalignment": True}
         # Of each trial the sensor of its session.
         for trial in (0, 4, 8):
-            gyro = one.parts(trial)[1]
+            gyro = one.fitted(trial)[1]
             of_trial = np.zeros((1, 3)) if trial == 0 else value[SESSIONS[trial]]
-            np.testing.assert_allclose(gyro.misalignment, np.ravel(of_trial), atol=1e-12)
+            np.testing.assert_allclose(
+                gyro.misalignment, np.ravel(of_trial), atol=1e-12
+            )
 
 
 def test_errors_of_the_tensor_are_those_made(worlds_found):
     found, _ = worlds_found
     trace = np.trace(np.asarray(found.inertia), axis1=1, axis2=2)[:, None, None]
     off = np.asarray(found.inertia) * np.trace(TENSOR) / trace - TENSOR
-    errors = np.sqrt(np.diagonal(np.asarray(found.inertia_covariance), axis1=1, axis2=2))
+    errors = np.sqrt(
+        np.diagonal(np.asarray(found.inertia_covariance), axis1=1, axis2=2)
+    )
     pulls = off.reshape(-1, 9) / (errors * np.trace(TENSOR) / trace[:, 0])
     assert 0.6 < np.sqrt(np.mean(pulls**2)) < 1.5
     assert np.all(np.abs(pulls) < 4.5)

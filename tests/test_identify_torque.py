@@ -1,7 +1,7 @@
 """A torque that no model has, with a memory: its random walk, its likelihood, and what a fit finds.
 
-Judges: quadrature in 30 digits, a covariance written out as one matrix, and trials by an integrator
-in numpy whose torque is drawn step by step.
+Judges: quadrature in 30 digits, a covariance written out as one matrix, and trials by
+an integrator in numpy whose torque is drawn step by step.
 """
 
 import jax.numpy as jnp
@@ -38,7 +38,10 @@ def test_what_a_torque_adds_in_a_step_is_its_integral(steps):
         turn = lambda r: r - (1 - mpmath.exp(-a * r)) / a  # noqa: E731
         of = [momentum, turn, torque]
         points = [0, min(1, 5 / a), 1]
-        wanted = [[mpmath.quad(lambda r, f=f, g=g: f(r) * g(r), points) for g in of] for f in of]
+        wanted = [
+            [mpmath.quad(lambda r, f=f, g=g: f(r) * g(r), points) for g in of]
+            for f in of
+        ]
         x = 1 - mpmath.exp(-a)
         # Of a torque at the start, in units of its rms 1 / sqrt(2 T), T = 1 / a.
         rms = mpmath.sqrt(a / 2)
@@ -49,31 +52,38 @@ def test_what_a_torque_adds_in_a_step_is_its_integral(steps):
 
 def a_linear_record(rng, samples=7, columns=2):
     """A record of two trials, one node a sample, as if linearised; and its tensor."""
-    throws, degrees = 2, 3
-    ts = np.sort(rng.uniform(0, 1, (throws, samples)), axis=1)
-    linked = np.ones((throws, samples), bool)
+    trials, degrees = 2, 3
+    ts = np.sort(rng.uniform(0, 1, (trials, samples)), axis=1)
+    linked = np.ones((trials, samples), bool)
     linked[:, -1] = False
     layout = Layout(
-        ts, np.tile(np.arange(samples), (throws, 1)), ts, np.roll(ts, -1, axis=1), linked, ts
+        ts,
+        np.tile(np.arange(samples), (trials, 1)),
+        ts,
+        np.roll(ts, -1, axis=1),
+        linked,
+        ts,
     )
-    near_eye = np.eye(3) + 0.2 * rng.normal(size=(throws, samples, 3, 3))
+    near_eye = np.eye(3) + 0.2 * rng.normal(size=(trials, samples, 3, 3))
     there = linked[..., None]
     links = Links(
-        there * rng.normal(size=(throws, samples, 3)),
-        there[..., None] * rng.normal(size=(throws, samples, 3, columns)),
+        there * rng.normal(size=(trials, samples, 3)),
+        there[..., None] * rng.normal(size=(trials, samples, 3, columns)),
         there[..., None] * near_eye,
-        np.zeros((throws, 0)),
+        np.zeros((trials, 0)),
     )
     rows = Rows(
-        rng.normal(size=(throws, samples, degrees)),
-        rng.normal(size=(throws, samples, degrees, columns)),
-        rng.normal(size=(throws, samples, degrees, 3)),
+        rng.normal(size=(trials, samples, degrees)),
+        rng.normal(size=(trials, samples, degrees, columns)),
+        rng.normal(size=(trials, samples, degrees, 3)),
         layout.node,
     )
     mixed = rng.normal(size=(3, 3))
     tensor = np.eye(3) + 0.1 * mixed @ mixed.T
-    weight = rng.uniform(0.2, 1, (throws, samples))
-    return filters.Linearised(layout, tensor, rows, links, weight, np.zeros((throws, 0)))
+    weight = rng.uniform(0.2, 1, (trials, samples))
+    return filters.Linearised(
+        layout, tensor, rows, links, weight, np.zeros((trials, 0))
+    )
 
 
 def likelihood_by_one_matrix(record, level, time):
@@ -85,7 +95,8 @@ def likelihood_by_one_matrix(record, level, time):
     logs, designs, offsets = 0.0, [], []
     for t in range(level.shape[0]):
         samples = layout.ts.shape[1]
-        # Covariance of torque and momentum over a step, by the matrix exponential (van Loan).
+        # Covariance of torque and momentum over a step, by the matrix exponential (van
+        # Loan).
         jump, parts = [], []
         for k in range(samples - 1):
             dt = layout.ts[t, k + 1] - layout.ts[t, k]
@@ -109,21 +120,33 @@ def likelihood_by_one_matrix(record, level, time):
         for k in range(samples - 1):
             ahead = inverse @ jump[k] @ np.linalg.inv(inverse)
             ahead[:3, :3] = links.of_state[t, k]
-            extra = np.concatenate([links.gap[t, k][:, None], np.zeros((3, 3)),
-                                    links.of_border[t, k]], axis=1)  # fmt: skip
-            means.append(ahead @ means[k] + np.concatenate([extra, np.zeros_like(extra)]))
+            extra = np.concatenate(
+                [links.gap[t, k][:, None], np.zeros((3, 3)), links.of_border[t, k]],
+                axis=1,
+            )
+            means.append(
+                ahead @ means[k] + np.concatenate([extra, np.zeros_like(extra)])
+            )
             for j in range(k + 1):
                 covariance[(k + 1, j)] = ahead @ covariance[(k, j)]
                 covariance[(j, k + 1)] = covariance[(k + 1, j)].T
             noise = inverse @ parts[k] @ inverse.T
             covariance[(k + 1, k + 1)] = ahead @ covariance[(k, k)] @ ahead.T + noise
         root = np.sqrt(record.weight[t])[:, None, None]
-        shown = root * np.concatenate([rows.of_state[t], np.zeros_like(rows.of_state[t])], axis=-1)
-        whole = np.block([[shown[i] @ covariance[(i, j)] @ shown[j].T for j in range(samples)]
-                          for i in range(samples)])  # fmt: skip
+        shown = root * np.concatenate(
+            [rows.of_state[t], np.zeros_like(rows.of_state[t])], axis=-1
+        )
+        whole = np.block(
+            [
+                [shown[i] @ covariance[(i, j)] @ shown[j].T for j in range(samples)]
+                for i in range(samples)
+            ]
+        )
         whole = whole + np.eye(whole.shape[0])
         still = np.zeros((samples, 3, 3))
-        offset = np.concatenate([rows.residual[t][..., None], still, rows.of_border[t]], axis=-1)
+        offset = np.concatenate(
+            [rows.residual[t][..., None], still, rows.of_border[t]], axis=-1
+        )
         columns = root * offset + np.einsum("nij,njk->nik", shown, np.stack(means))
         columns = columns.reshape(-1, columns.shape[-1])
         lower = np.linalg.cholesky(whole)
@@ -148,7 +171,11 @@ def test_the_likelihood_is_that_of_one_large_matrix(rng):
         (value, _), slopes = filters.likelihood(record, *given)
         return value, slopes
 
-    levels, times, sizes = rng.normal(size=3), rng.normal(size=3) - 1, 0.3 * rng.normal(size=2)
+    levels, times, sizes = (
+        rng.normal(size=3),
+        rng.normal(size=3) - 1,
+        0.3 * rng.normal(size=2),
+    )
     value, slopes = found(levels, times, sizes)
     level = np.exp(sizes)[:, None] * np.exp(levels)
     wanted = likelihood_by_one_matrix(record, level, np.exp(times))
@@ -161,8 +188,9 @@ def test_the_likelihood_is_that_of_one_large_matrix(rng):
                 moved = [levels.copy(), times.copy(), sizes.copy()]
                 moved[k][i] += sign
                 ends.append(float(found(*moved)[0]))
-            assert float(slope[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5,
-                                                    abs=1e-5)  # fmt: skip
+            assert float(slope[i]) == pytest.approx(
+                (ends[0] - ends[1]) / (2 * h), rel=1e-5, abs=1e-5
+            )
 
 
 def test_innovations_of_a_path_that_nothing_pushes_are_its_residuals(rng):
@@ -205,16 +233,24 @@ def off(found):
 def test_a_torque_with_a_memory_is_found_with_its_levels_and_its_time(rng):
     sizes = np.array([0.5, 1.0, 2.0, 1.0, 0.5, 2.0, 1.0, 1.0])
     found = identify.fit(
-        BLIND, some_trials(rng, sizes.size, size=sizes), unmodelled="estimate", throw=False
+        BLIND,
+        some_trials(rng, sizes.size, size=sizes),
+        unmodelled="estimate",
+        throw=False,
     )
     assert bool(found.status == Status.OK), str(found)
     assert np.all(np.abs(off(found)) < 4)
     level = np.asarray(found.level) * np.exp(np.mean(np.log(found.level_by_trial)))
     level = level / np.exp(np.mean(np.log(sizes)))
     assert np.all(np.abs(np.log(level / LEVELS)) < 0.6), str(found)
-    time, error = np.asarray(found.correlation_time), np.asarray(found.correlation_time_errors)
+    time, error = (
+        np.asarray(found.correlation_time),
+        np.asarray(found.correlation_time_errors),
+    )
     assert np.all(np.abs(time - 0.1) < 4 * error), str(found)
-    assert np.corrcoef(np.log(found.level_by_trial), np.log(sizes))[0, 1] > 0.8, str(found)
+    assert np.corrcoef(np.log(found.level_by_trial), np.log(sizes))[0, 1] > 0.8, str(
+        found
+    )
     assert "correlation time" in str(found)
 
 
@@ -242,8 +278,8 @@ def test_a_trial_of_another_body_is_named(rng):
     records = some_trials(rng, 10)
     records[3:4] = some_trials(rng, 1, moments=np.array([0.5, 0.9, 1.0]))
     found = identify.fit(BLIND, records, unmodelled="estimate", throw=False)
-    np.testing.assert_array_equal(np.flatnonzero(found.spoilt), [3])
-    assert "throws left out: 3" in str(found)
+    np.testing.assert_array_equal(np.flatnonzero(found.rejected_trials), [3])
+    assert "trials left out: 3" in str(found)
     assert np.all(np.abs(off(found)) < 4), str(found)
 
 

@@ -1,4 +1,4 @@
-"""fit() on records that do not obey its model: unmodelled torque, a wheel, several throws."""
+"""fit() on records that do not obey its model: unmodelled torque, a wheel, several trials."""
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +45,15 @@ def smoothed():
     )
 
 
-@pytest.mark.parametrize("kick", [0.0, 1.0, pytest.param(0.1, marks=pytest.mark.slow),
-                                  pytest.param(10.0, marks=pytest.mark.slow)])  # fmt: skip
+@pytest.mark.parametrize(
+    "kick",
+    [
+        0.0,
+        1.0,
+        pytest.param(0.1, marks=pytest.mark.slow),
+        pytest.param(10.0, marks=pytest.mark.slow),
+    ],
+)
 def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, rng):
     """Coverage and level; where there is none the level is zero within its error."""
     lanes = 40
@@ -56,11 +63,17 @@ def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, rng):
     good = np.asarray(found.status == Status.OK)
     assert good.mean() > 0.9, str(found)
     errors, covariances = errors_of(found)
-    square = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)[good] / 5
+    square = (
+        np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)[good] / 5
+    )
     assert 0.6 < square.mean() < 1.5  # 200 degrees of freedom: 1 +- 0.1
-    level, error = np.asarray(found.level)[good, 0], np.asarray(found.level_errors)[good, 0]
+    level, error = (
+        np.asarray(found.level)[good, 0],
+        np.asarray(found.level_errors)[good, 0],
+    )
     if kick:
-        # The likelihood of a level that is hardly seen is a parabola in its logarithm, not in it.
+        # The likelihood of a level that is hardly seen is a parabola in its logarithm,
+        # not in it.
         seen, true = level > 0, kick * LEVEL
         pulls = (level - true) / error
         pulls[seen] = np.log(level[seen] / true) / (error[seen] / level[seen])
@@ -71,7 +84,9 @@ def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, rng):
         assert np.median(level) < 0.02 * LEVEL
         # as sure as a fit that takes the model's word for it
         own = np.asarray(found.diagnostics.sensor_covariance)[good]
-        ratio = np.diagonal(np.asarray(found.numbers_covariance)[good] / own, axis1=1, axis2=2)
+        ratio = np.diagonal(
+            np.asarray(found.numbers_covariance)[good] / own, axis1=1, axis2=2
+        )
         assert np.median(ratio) < 1.05
     alike = np.all(np.asarray(found.level) == np.asarray(found.level)[:, :1], axis=1)
     assert np.mean(alike) > 0.5  # axes of their own are asked for by chance in some
@@ -85,7 +100,9 @@ def test_a_level_that_is_known_is_that_which_is_estimated(smoothed, rng):
     level = float(sought.level[0, 0])
     known = identify.fit(BLIND, identify.Rates(TS, values[0], NOISE), unmodelled=level)
     np.testing.assert_allclose(known.inertia, sought.inertia[0], atol=1e-4)
-    np.testing.assert_allclose(known.numbers_covariance, sought.numbers_covariance[0], rtol=0.02)
+    np.testing.assert_allclose(
+        known.numbers_covariance, sought.numbers_covariance[0], rtol=0.02
+    )
     assert "unmodelled torque" in str(known)
     assert "of the errors" in str(known)
     own, whole = known.diagnostics.sensor_covariance, known.numbers_covariance
@@ -108,8 +125,12 @@ def test_a_sampled_function_is_a_cubic_between_its_samples(rng):
     np.testing.assert_allclose(rate, peer(times[1:-1], 1), atol=1e-10)
     for t, value in ((-1.0, values[0]), (9.0, values[-1])):  # held beyond the ends
         np.testing.assert_allclose(curve(t), 1.2 * value)
-    padded = jr.torques.Sampled(np.append(ts, [ts[-1]] * 3), np.append(values, values[[-1] * 3], 0))
-    np.testing.assert_allclose(padded(1.5), jr.torques.Sampled(ts, values)(1.5), rtol=1e-12)
+    padded = jr.torques.Sampled(
+        np.append(ts, [ts[-1]] * 3), np.append(values, values[[-1] * 3], 0)
+    )
+    np.testing.assert_allclose(
+        padded(1.5), jr.torques.Sampled(ts, values)(1.5), rtol=1e-12
+    )
     np.testing.assert_allclose(padded(9.0), values[-1])
     two = jr.torques.Sampled(np.array([0.0, 2.0]), np.array([1.0, 2.0]))
     assert float(two(0.5)) == pytest.approx(1.25)
@@ -122,25 +143,29 @@ WHEEL_TENSOR = WHEEL_TENSOR @ np.diag([2600e-6, 890e-6, 2860e-6]) @ WHEEL_TENSOR
 WHEEL_TENSOR = (WHEEL_TENSOR + WHEEL_TENSOR.T) / 2
 
 
-def throws_with_a_wheel(rng, count, scale=1.0, delay=0.0):
+def trials_with_a_wheel(rng, count, scale=1.0, delay=0.0):
     """Half a second each at 400 Hz, a wheel that spins up to 2.1e-3 in each at another pace."""
     ts, sigma = np.arange(0, 0.5, 0.0025), 0.06
     spins = np.array([[6.0, 12.0, -8.0], [-9.0, 7.0, 8.0], [3.0, -14.0, 5.0]])[:count]
     records, bodies = [], []
     for i, spin in enumerate(spins):
         axis = np.array([0.0, 0.6, 0.8])
-        true, told = worlds.wheel_profile(axis, 2.1e-3, 0.05, 0.3 + 0.05 * i, scale, delay)
+        true, told = worlds.wheel_profile(
+            axis, 2.1e-3, 0.05, 0.3 + 0.05 * i, scale, delay
+        )
         motion = worlds.tumble(WHEEL_TENSOR, spin, ts, wheel=true)
         values = motion.omega + sigma * rng.normal(size=motion.omega.shape)
         momenta = np.array([told(t)[0] for t in ts])
         records.append(identify.Rates(ts, values, sigma))
-        bodies.append(jr.RigidBody(np.ones(3), jr.torques.Rotor(jr.torques.Sampled(ts, momenta))))
+        bodies.append(
+            jr.RigidBody(np.ones(3), jr.torques.Rotor(jr.torques.Sampled(ts, momenta)))
+        )
     return ts, bodies, records
 
 
-def test_the_whole_tensor_from_throws_each_with_its_wheel_s_record(rng):
+def test_the_whole_tensor_from_trials_each_with_its_wheel_s_record(rng):
     """Blind, from a unit tensor, 400 times too large."""
-    _, bodies, records = throws_with_a_wheel(rng, 2)
+    _, bodies, records = trials_with_a_wheel(rng, 2)
     found = identify.fit(bodies, records, scale="rotor")
     assert bool(found.status == Status.OK)
     assert found.null_directions == ()
@@ -151,23 +176,25 @@ def test_the_whole_tensor_from_throws_each_with_its_wheel_s_record(rng):
 
 def test_a_wheel_known_to_two_per_cent_tells_the_scale_to_two_per_cent(rng):
     """Its report is 1 % too large and 5 ms late; both are sought, the delay without a prior."""
-    _, bodies, records = throws_with_a_wheel(rng, 1, scale=1.01, delay=0.005)
+    _, bodies, records = trials_with_a_wheel(rng, 1, scale=1.01, delay=0.005)
 
     def free(body):
-        return identify.prior(body.torque.momentum.scale, 0.02), body.torque.momentum.delay
+        return identify.prior(
+            body.torque.momentum.scale, 0.02
+        ), body.torque.momentum.delay
 
     found = identify.fit(bodies[0], records, scale="rotor", free=free)
     trace = float(jnp.trace(found.inertia))
     spread = found.spread(lambda tensor: jnp.trace(tensor)[None])[0, 0]
     assert 0.02 < float(spread) ** 0.5 / trace < 0.06
     assert abs(trace / np.trace(WHEEL_TENSOR) - 1.01) < 4 * float(spread) ** 0.5 / trace
-    delay, error = found.leaves["torque.momentum.delay"]
+    delay, error = found.estimates["torque.momentum.delay"]
     # the samples are to be read 5 ms earlier than they say
     assert abs(float(delay) + 0.005) < 4 * float(error) < 0.008
 
 
-def test_gyrostat_takes_many_throws_and_states_its_errors(rng):
-    ts, bodies, records = throws_with_a_wheel(rng, 3)
+def test_gyrostat_takes_many_trials_and_states_its_errors(rng):
+    ts, bodies, records = trials_with_a_wheel(rng, 3)
     momenta = np.stack([x.torque.momentum.values for x in bodies])
     values = np.stack([x.values for x in records])
     ts = np.tile(ts, (3, 1))
@@ -190,15 +217,19 @@ def test_the_log_density_has_the_fit_s_minimum_and_curvature(rng):
     free = lambda _, gyro: identify.prior(gyro.bias, 0.02)  # noqa: E731
     found = identify.fit(BLIND, identify.Rates(TS, values, 1e-4), free=free)
     density = identify.log_density(found)
-    both = quick_jit(lambda x: (jax.grad(density.function)(x), jax.hessian(density.function)(x)))
+    both = quick_jit(
+        lambda x: (jax.grad(density.function)(x), jax.hessian(density.function)(x))
+    )
     slope, curvature = both(density.start)
     errors = np.sqrt(np.diagonal(density.covariance))
     assert np.all(np.abs(slope) * errors < 1e-2)
     inverse = np.linalg.inv(-np.asarray(curvature))
-    np.testing.assert_allclose(inverse, density.covariance, atol=0.02 * errors.max() ** 2)
+    np.testing.assert_allclose(
+        inverse, density.covariance, atol=0.02 * errors.max() ** 2
+    )
     np.testing.assert_allclose(np.diagonal(inverse), errors**2, rtol=0.02)
     record = identify.Rates(TS, values, 1e-4)
     start = jr.State(np.array([1.0, 0, 0, 0]), OMEGA)
-    smoothed = identify.Plan(jr.RigidBody(TENSOR), start, record).told
+    smoothed = identify.Plan(jr.RigidBody(TENSOR), start, record).predicted
     told = identify.log_density(smoothed)  # a plan has a density too
     assert told.start.shape == (8,)

@@ -61,12 +61,15 @@ def coverage(gaps, which, errors, rng, trials=200):
     gaps = np.array(gaps) * GAP
     moments = 1 + np.cumsum([0, *gaps])
     turn = np.einsum("ni,iab->nab", rng.normal(size=(trials, 5)) * errors, basis())
-    found = intervals(jnp.asarray(which), jnp.asarray(np.diag(moments) + turn), covariance(errors))
+    found = intervals(
+        jnp.asarray(which), jnp.asarray(np.diag(moments) + turn), covariance(errors)
+    )
     return tuple(covered(x, moments[which] / moments[0]) for x in found)
 
 
 ALIKE = ERROR * np.ones(5)
-# 200 trials: a standard error of 1.5 points, so that 90 % is more than three below 95 %.
+# 200 trials: a standard error of 1.5 points, so that 90 % is more than three below 95
+# %.
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.3, 1.0])
@@ -88,14 +91,22 @@ def test_errors_that_differ_by_directions_do_no_harm(factor, rng):
 
 
 def test_where_the_function_is_linear_the_errors_are_the_usual_ones():
-    found = interval(lambda x: x[0, 1], jnp.diag(jnp.array([1.0, 1.5, 2.0])),
-                     covariance(ALIKE), jnp.asarray(0.9))  # fmt: skip
-    np.testing.assert_allclose(found, ERROR * 0.5**0.5 * 1.6448536 * np.array([-1, 1]), rtol=1e-6)
+    found = interval(
+        lambda x: x[0, 1],
+        jnp.diag(jnp.array([1.0, 1.5, 2.0])),
+        covariance(ALIKE),
+        jnp.asarray(0.9),
+    )
+    np.testing.assert_allclose(
+        found, ERROR * 0.5**0.5 * 1.6448536 * np.array([-1, 1]), rtol=1e-6
+    )
 
 
 def test_equal_moments_and_flat_bodies_are_closed_ends():
     near = jnp.diag(jnp.array([1.0, 1 + GAP, 1.7]))
-    lower, upper = interval(Partial(ratio, jnp.asarray(1)), near, covariance(ALIKE), LEVEL)
+    lower, upper = interval(
+        Partial(ratio, jnp.asarray(1)), near, covariance(ALIKE), LEVEL
+    )
     assert 1 - 1e-8 < lower <= 1
     assert 1 + GAP < upper < 1 + 5 * GAP
     flat = jnp.diag(jnp.array([1.0, 1.5, 2.5 - ERROR]))

@@ -27,7 +27,9 @@ def matrices(q):
 
 def bodies(rng, count=4, names="abcd"):
     """Real ones, of four points each, with all products of inertia."""
-    clouds = [jr.from_points(rng.uniform(0.5, 2, 4), rng.normal(size=(4, 3))) for _ in names]
+    clouds = [
+        jr.from_points(rng.uniform(0.5, 2, 4), rng.normal(size=(4, 3))) for _ in names
+    ]
     return dict(zip(names, clouds, strict=True))
 
 
@@ -42,7 +44,9 @@ def assert_same(body, other, rtol=1e-12):
 def test_scipy_turns_vectors_as_attitudes_do(rng):
     q, v = attitudes(rng), rng.normal(size=3)
     turn = jr.io.to_scipy(q)
-    assert_allclose(turn.apply(v), np.asarray(jax.vmap(jr.rotation.rotate, (0, None))(q, v)))
+    assert_allclose(
+        turn.apply(v), np.asarray(jax.vmap(jr.rotation.rotate, (0, None))(q, v))
+    )
     assert_allclose(matrices(jr.io.from_scipy(turn)), turn.as_matrix(), atol=1e-15)
     assert jr.io.from_scipy(jr.io.to_scipy(q[0])).shape == (4,)
 
@@ -57,9 +61,13 @@ def test_scipys_rigid_transforms(rng):
 
 
 def test_what_is_no_rotation_is_told_so():
-    with pytest.raises(ValueError, match=r"must be a scipy.*RigidTransform, but it is a int"):
+    with pytest.raises(
+        ValueError, match=r"must be a scipy.*RigidTransform, but it is a int"
+    ):
         jr.io.from_scipy(3)
-    with pytest.raises(ValueError, match=r"must be a jaxlie.SO3 or jaxlie.SE3, but it is a int"):
+    with pytest.raises(
+        ValueError, match=r"must be a jaxlie.SO3 or jaxlie.SE3, but it is a int"
+    ):
         jr.io.from_jaxlie(3)
 
 
@@ -85,23 +93,33 @@ def test_jaxlie_turns_vectors_as_attitudes_do(rng):
 
 @pytest.mark.parametrize("door", ["to_scipy", "to_jaxlie"])
 def test_what_is_no_attitude_is_told_so(door, untyped):
-    with pytest.raises(ValueError, match=r"`attitude` must have shape \(4,\), but .* \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"`attitude` must have shape \(4,\), but .* \(3,\)"
+    ):
         getattr(jr.io, door)(np.ones(3))
-    with pytest.raises(ValueError, match=r"`position` must have shape \(3,\), but .* \(5, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"`position` must have shape \(3,\), but .* \(5, 3\)"
+    ):
         getattr(jr.io, door)(HALF, np.ones((5, 3)))
 
 
 def m2q(matrix):
     """NAIF's SPICE quaternion of a matrix: Q2M's formula of its header, solved for q0 > 0."""
     q0 = 0.5 * np.sqrt(1 + np.trace(matrix))
-    off = [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    off = [
+        matrix[2, 1] - matrix[1, 2],
+        matrix[0, 2] - matrix[2, 0],
+        matrix[1, 0] - matrix[0, 1],
+    ]
     return np.array([q0, *(np.array(off) / (4 * q0))])
 
 
 def test_spice_quaternions_are_those_of_matrices_from_space_to_body(rng):
-    # The header of M2Q: ROTATE by a quarter about z makes this matrix and this quaternion.
+    # The header of M2Q: ROTATE by a quarter about z makes this matrix and this
+    # quaternion.
     assert_allclose(
-        m2q(np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])), [0.5**0.5, 0, 0, -(0.5**0.5)]
+        m2q(np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])),
+        [0.5**0.5, 0, 0, -(0.5**0.5)],
     )
     for q in attitudes(rng):
         q = q * np.sign(q[0])
@@ -133,7 +151,9 @@ def test_mrps_are_those_of_scipy(rng):
         assert_allclose(np.linalg.norm(back, axis=1), 1, rtol=1e-14)
 
 
-@pytest.mark.parametrize("q", [HALF, -HALF, np.array([1e-9, 0.6, 0.0, -0.8]), np.eye(4)[0]])
+@pytest.mark.parametrize(
+    "q", [HALF, -HALF, np.array([1e-9, 0.6, 0.0, -0.8]), np.eye(4)[0]]
+)
 def test_mrps_have_the_derivative_of_their_set_at_half_turns_and_at_none(q):
     """Along p -> p exp(d): that of the inverse map, from_mrp, which is analytic."""
     along = lambda d: jr.io.to_mrp(jr.rotation.multiply(q, jr.rotation.exp(d)))  # noqa: E731
@@ -169,7 +189,9 @@ def assert_same_as_trimesh(body, mesh, density, scale=1.0, rtol=1e-6):
     expected = own.mass_properties
     assert_allclose(body.mass, expected["mass"], rtol=rtol)
     assert_allclose(body.center_of_mass, expected["center_mass"], rtol=rtol)
-    assert_allclose(body.inertia, expected["inertia"], rtol=rtol, atol=rtol * body.inertia.max())
+    assert_allclose(
+        body.inertia, expected["inertia"], rtol=rtol, atol=rtol * body.inertia.max()
+    )
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
@@ -182,7 +204,9 @@ def test_files_of_meshes_are_read_as_trimesh_does(rng, tmp_path, suffix):
 
 def test_corners_at_one_place_are_merged(rng):
     mesh = lump(rng)
-    soup = trimesh.Trimesh(*trimesh.triangles.to_kwargs(mesh.triangles).values(), process=False)
+    soup = trimesh.Trimesh(
+        *trimesh.triangles.to_kwargs(mesh.triangles).values(), process=False
+    )
     assert len(soup.vertices) == 3 * len(mesh.faces)
     with pytest.raises(RuntimeError, match="closed surface"):
         jr.from_mesh(soup.vertices, soup.faces)
@@ -192,7 +216,9 @@ def test_corners_at_one_place_are_merged(rng):
 
 def test_a_scene_is_its_parts_in_their_places_also_mirrored(rng, tmp_path):
     hull, weight = lump(rng), lump(rng, 12)
-    place = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag([1.0, -1, 1, 1])
+    place = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag(
+        [1.0, -1, 1, 1]
+    )
     place[:3, 3] = 3.0, 1.0, 2.0
     scene = trimesh.Scene()
     scene.add_geometry(hull, geom_name="hull")
@@ -209,11 +235,15 @@ def test_a_scene_is_its_parts_in_their_places_also_mirrored(rng, tmp_path):
     )
     assert_same(two, expected)
     scene.export(tmp_path / "scene.glb")
-    again = jr.io.read_mesh(tmp_path / "scene.glb", {"hull": 3.0, "left": 5.0, "right": 7.0})
+    again = jr.io.read_mesh(
+        tmp_path / "scene.glb", {"hull": 3.0, "left": 5.0, "right": 7.0}
+    )
     assert_same(again, two, 1e-6)
     with pytest.raises(ValueError, match=r"must have one of 'left'"):
         jr.io.from_trimesh(scene, {"hull": 3.0})
-    with pytest.raises(ValueError, match=r"must name parts, .'hull'.* but it names .*'keel'"):
+    with pytest.raises(
+        ValueError, match=r"must name parts, .'hull'.* but it names .*'keel'"
+    ):
         jr.io.from_trimesh(scene, {"hull": 3.0, "left": 1.0, "right": 1.0, "keel": 1.0})
     with pytest.raises(ValueError, match="its scene holds none"):
         jr.io.from_trimesh(trimesh.Scene())
@@ -222,13 +252,17 @@ def test_a_scene_is_its_parts_in_their_places_also_mirrored(rng, tmp_path):
 def test_a_part_that_is_no_body_is_named_with_what_to_do(rng):
     mesh = lump(rng)
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
-    with pytest.raises(ValueError, match=r"Part 'hull'.* .*closed surface.* `mesh.fill_holes\(\)`"):
+    with pytest.raises(
+        ValueError, match=r"Part 'hull'.* .*closed surface.* `mesh.fill_holes\(\)`"
+    ):
         jr.io.from_trimesh(trimesh.Scene({"hull": mesh}))
     mesh = lump(rng)
     mesh.invert()
     with pytest.raises(ValueError, match=r"inside out.*fix_normals"):
         jr.io.from_trimesh(mesh)
-    with pytest.raises(ValueError, match=r"`density` must be positive and finite, .*: -1.0\.$"):
+    with pytest.raises(
+        ValueError, match=r"`density` must be positive and finite, .*: -1.0\.$"
+    ):
         jr.io.from_trimesh(lump(rng), -1.0)
     with pytest.raises(ValueError, match=r"`scale` must be positive, but it is -1.0"):
         jr.io.from_trimesh(lump(rng), scale=-1.0)
@@ -243,7 +277,8 @@ def test_a_part_that_is_no_body_is_named_with_what_to_do(rng):
 
 mujoco = pytest.importorskip("mujoco")
 
-FUSE = "<mujoco><compiler fusestatic='false'/></mujoco>"  # else MuJoCo drops what cannot move
+# Else MuJoCo drops what cannot move
+FUSE = "<mujoco><compiler fusestatic='false'/></mujoco>"
 
 
 def urdf(inertial):
@@ -280,10 +315,16 @@ FILES = {
         "<inertial><origin xyz='0.1 -0.2 0.3' rpy='0.4 -1.1 2'/><mass value='3'/>"
         f"<inertia {SIX}/></inertial>"
     ),
-    "urdf at the origin": urdf(f"<inertial><mass value='3'/><inertia {SIX}/></inertial>"),
-    "full": mjcf("<inertial pos='0.1 -0.2 0.3' mass='3' fullinertia='1 2 2.5 0.1 -0.2 0.3'/>"),
+    "urdf at the origin": urdf(
+        f"<inertial><mass value='3'/><inertia {SIX}/></inertial>"
+    ),
+    "full": mjcf(
+        "<inertial pos='0.1 -0.2 0.3' mass='3' fullinertia='1 2 2.5 0.1 -0.2 0.3'/>"
+    ),
     **{
-        name: mjcf(f"<inertial pos='0.1 -0.2 0.3' mass='3' diaginertia='1 2 2.5' {turn}/>")
+        name: mjcf(
+            f"<inertial pos='0.1 -0.2 0.3' mass='3' diaginertia='1 2 2.5' {turn}/>"
+        )
         for name, turn in TURNED.items()
     },
     **{
@@ -293,7 +334,7 @@ FILES = {
         )
         for seq in ("xyz", "zxz", "ZYX", "xYz")
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -315,30 +356,38 @@ def test_mujoco_reads_what_is_written(rng, tmp_path, suffix):
 
 def test_what_is_written_in_single_precision_is_read_again(tmp_path):
     with jax.enable_x64(False):
-        for numbers in ("ixx='0.1' iyy='0.2' izz='0.3' ixy='0' ixz='0' iyz='0'",
-                        "ixx='.1' iyy='.2' izz='.7' ixy='.05' ixz='.02' iyz='-.03'"):  # fmt: skip
+        for numbers in (
+            "ixx='0.1' iyy='0.2' izz='0.3' ixy='0' ixz='0' iyz='0'",
+            "ixx='.1' iyy='.2' izz='.7' ixy='.05' ixz='.02' iyz='-.03'",
+        ):
             text = urdf(f"<inertial><mass value='0.1'/><inertia {numbers}/></inertial>")
             body = jr.io.read_inertials(text, unphysical="nearest")["b"]
             jr.io.write_inertials(tmp_path / "b.urdf", {"b": body}, template=text)
             assert_same(jr.io.read_inertials(tmp_path / "b.urdf")["b"], body, 0)
             assert 'mass value="0.1"' in (tmp_path / "b.urdf").read_text()
         with pytest.raises(ValueError, match=r"0\.1, 0\.2, 0\.3001 kg m"):
-            jr.io.read_inertials(urdf(
-                "<inertial><mass value='1'/><inertia ixx='.1' iyy='.2' izz='.3001' ixy='0' ixz='0' "
-                "iyz='0'/></inertial>"
-            ))  # fmt: skip
+            jr.io.read_inertials(
+                urdf(
+                    "<inertial><mass value='1'/><inertia ixx='.1' iyy='.2' izz='.3001' "
+                    "ixy='0' ixz='0' "
+                    "iyz='0'/></inertial>"
+                )
+            )
 
 
-@pytest.mark.parametrize("pose", [
-    "<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
-    "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
-    "<pose degrees='true'>0.1 -0.2 0.3 10 -50 120</pose>",
-    "<pose degrees='True'>0.1 -0.2 0.3 10 -50 120</pose>",
-    "<pose rotation_format='quat_xyzw'>0.1 -0.2 0.3 0.1 0.7 -0.5 0.5</pose>",
-    "<pose rotation_format='quat_xyzw'/>",
-    "<pose/>",
-    "",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "pose",
+    [
+        "<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
+        "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
+        "<pose degrees='true'>0.1 -0.2 0.3 10 -50 120</pose>",
+        "<pose degrees='True'>0.1 -0.2 0.3 10 -50 120</pose>",
+        "<pose rotation_format='quat_xyzw'>0.1 -0.2 0.3 0.1 0.7 -0.5 0.5</pose>",
+        "<pose rotation_format='quat_xyzw'/>",
+        "<pose/>",
+        "",
+    ],
+)
 def test_sdf_is_read_as_drake_does(pose):
     parsing = pytest.importorskip("pydrake.multibody.parsing")
     plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(0.0)
@@ -351,26 +400,34 @@ def test_sdf_is_read_as_drake_does(pose):
 
 def sdf(pose, more=""):
     six = "".join(
-        f"<{k}>{x}</{k}>" for k, x in (y.split("=") for y in SIX.replace("'", "").split())
+        f"<{k}>{x}</{k}>"
+        for k, x in (y.split("=") for y in SIX.replace("'", "").split())
     )
     inertial = f"<inertial>{pose}<mass>3</mass><inertia>{six}</inertia></inertial>"
-    return (
-        f"<sdf version='1.9'><model name='m'><link name='b'>{inertial}</link></model>{more}</sdf>"
-    )
+    model = f"<model name='m'><link name='b'>{inertial}</link></model>"
+    return f"<sdf version='1.9'>{model}{more}</sdf>"
 
 
 def test_sdf_turns_by_roll_pitch_yaw_about_fixed_axes_as_urdf():
-    for pose in ("<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
-                 "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
-                 "<pose degrees='True'>0.1 -0.2 0.3 22.918311805232932 -63.02535746439056 "
-                 "114.59155902616465</pose>"):  # fmt: skip
+    for pose in (
+        "<pose>0.1 -0.2 0.3 0.4 -1.1 2</pose>",
+        "<pose><!-- to the tip -->0.1 -0.2 0.3 0.4 -1.1 2<!-- or so --></pose>",
+        "<pose degrees='True'>0.1 -0.2 0.3 22.918311805232932 -63.02535746439056 "
+        "114.59155902616465</pose>",
+    ):
         assert_same(jr.io.read_inertials(sdf(pose))["b"], in_mujoco(FILES["urdf"]))
     x, y, z, w = scipy_transform.Rotation.from_euler("xyz", [0.4, -1.1, 2]).as_quat()
     pose = f"<pose rotation_format='quat_xyzw'>0.1 -0.2 0.3 {x} {y} {z} {w}</pose>"
     assert_same(jr.io.read_inertials(sdf(pose))["b"], in_mujoco(FILES["urdf"]))
-    for empty in ("", "<pose/><mass/><inertia/>", "<pose rotation_format='quat_xyzw'/>"):
+    for empty in (
+        "",
+        "<pose/><mass/><inertia/>",
+        "<pose rotation_format='quat_xyzw'/>",
+    ):
         link = f"<link name='b'><inertial>{empty}</inertial></link><link name='c'/>"
-        read = jr.io.read_inertials(f"<sdf><model name='m'>{link}</model></sdf>")  # SDF's defaults
+        read = jr.io.read_inertials(
+            f"<sdf><model name='m'>{link}</model></sdf>"
+        )  # SDF's defaults
         assert list(read) == ["b"]
         assert_same(read["b"], jr.MassProperties(1.0, np.zeros(3), np.ones(3)))
 
@@ -382,7 +439,9 @@ def test_links_of_several_models_have_their_models_in_the_name():
     assert set(jr.io.read_inertials(sdf("", more))) == {"m::b", "n::x::b", "k::x::b"}
 
 
-@pytest.mark.parametrize("text", [FILES["urdf"], FILES["euler"], sdf("<pose>1 2 3 1 2 3</pose>")])
+@pytest.mark.parametrize(
+    "text", [FILES["urdf"], FILES["euler"], sdf("<pose>1 2 3 1 2 3</pose>")]
+)
 def test_a_template_keeps_all_but_its_inertials(rng, tmp_path, text):
     body, path = bodies(rng)["a"], tmp_path / "robot"
     kept = "<!-- by hand --><visual><geometry><box size='1 1 1'/></geometry></visual>"
@@ -395,16 +454,25 @@ def test_a_template_keeps_all_but_its_inertials(rng, tmp_path, text):
     assert_same(jr.io.read_inertials(path)["b"], body, 0)
     jr.io.write_inertials(path, {"b": body.translated(np.ones(3))}, template=path)
     assert_same(jr.io.read_inertials(path)["b"], body.translated(np.ones(3)), 0)
-    with pytest.raises(ValueError, match=r"`bodies` must name links of the template, but \['c'\]"):
+    with pytest.raises(
+        ValueError, match=r"`bodies` must name links of the template, but \['c'\]"
+    ):
         jr.io.write_inertials(path, {"c": body}, template=path)
 
 
 @pytest.mark.parametrize("space", ["xmlns:drake='drake.mit.edu'", "xmlns:ns0='other'"])
-def test_a_template_keeps_what_is_around_its_root_and_its_prefixes(rng, tmp_path, space):
+def test_a_template_keeps_what_is_around_its_root_and_its_prefixes(
+    rng, tmp_path, space
+):
     prefix = space[6:].partition("=")[0]
-    before, after = "<!-- Licence: yes --><?note by hand?>", "<!-- old: <robot/></robot> -->"
+    before, after = (
+        "<!-- Licence: yes --><?note by hand?>",
+        "<!-- old: <robot/></robot> -->",
+    )
     text = f"{before}<robot {space}><?keep me?><{prefix}:plate/><link name='b'/></robot>{after}"
-    jr.io.write_inertials(tmp_path / "b.urdf", {"b": bodies(rng)["a"]}, template=f"\n {text}\n")
+    jr.io.write_inertials(
+        tmp_path / "b.urdf", {"b": bodies(rng)["a"]}, template=f"\n {text}\n"
+    )
     lines = (tmp_path / "b.urdf").read_text().splitlines()
     assert lines[1:3] == ["<!-- Licence: yes -->", "<?note by hand?>"]
     assert lines[3].startswith(f"<robot xmlns:{prefix}=")
@@ -418,13 +486,17 @@ def test_sdf_written_is_read(rng, tmp_path):
     jr.io.write_inertials(tmp_path / "bodies.sdf", known)
     for name, body in jr.io.read_inertials(tmp_path / "bodies.sdf").items():
         assert_same(body, known[name], 0)
-    with pytest.raises(ValueError, match=r"`path` must be one of '.urdf', '.xml', '.sdf', but"):
+    with pytest.raises(
+        ValueError, match=r"`path` must be one of '.urdf', '.xml', '.sdf', but"
+    ):
         jr.io.write_inertials(tmp_path / "bodies.txt", known)
 
 
 def test_mjcf_in_several_files(tmp_path):
     """As MuJoCo: what is included stands in its place, and the last compiler wins."""
-    (tmp_path / "settings.xml").write_text("<mujoco><compiler angle='radian'/></mujoco>")
+    (tmp_path / "settings.xml").write_text(
+        "<mujoco><compiler angle='radian'/></mujoco>"
+    )
     (tmp_path / "arm.xml").write_text(
         "<mujocoinclude><body name='b'><inertial pos='0 0 1' mass='2' diaginertia='1 2 2.5' "
         "euler='0.4 -1.1 2'/><body><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/></body>"
@@ -442,7 +514,9 @@ def test_mjcf_in_several_files(tmp_path):
     assert_same(read["b"], in_mujoco((tmp_path / "whole.xml").read_text()), 1e-5)
 
 
-@pytest.mark.parametrize(("name", "mass"), [("sub/b.xml", 3.0), ("b.xml", 3.0), ("c.xml", 2.0)])
+@pytest.mark.parametrize(
+    ("name", "mass"), [("sub/b.xml", 3.0), ("b.xml", 3.0), ("c.xml", 2.0)]
+)
 def test_included_files_are_looked_for_where_mujoco_does(tmp_path, name, mass):
     def include(file):
         return f"<mujocoinclude><include file='{file}'/></mujocoinclude>"
@@ -465,48 +539,114 @@ DIAGONAL = "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1' {}/>"
 FULL = "<inertial mass='1' pos='0 0 0' fullinertia='1 1 1 0 0 0' {}/>"
 
 
-@pytest.mark.parametrize(("text", "match"), [
-    (mjcf(DIAGONAL.format("quat='1 0 0 0' euler='1 2 3'")), "takes only one of quat, euler"),
-    (mjcf(FULL.format("zaxis='0 0 1'")), "takes only one of zaxis, fullinertia"),
-    (mjcf(FULL.format("diaginertia='1 1 1'")), "takes only one of fullinertia, diaginertia"),
-    (mjcf("<inertial pos='0 0 0' diaginertia='1 1 1'/>"), "'b' cannot be read: it has no mass"),
-    (mjcf("<inertial mass='1' diaginertia='1 1 1'/>"), "it has no pos"),
-    (mjcf("<inertial mass='1' pos='0 0 0'/>"), "it has no diaginertia"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (
+            mjcf(DIAGONAL.format("quat='1 0 0 0' euler='1 2 3'")),
+            "takes only one of quat, euler",
+        ),
+        (mjcf(FULL.format("zaxis='0 0 1'")), "takes only one of zaxis, fullinertia"),
+        (
+            mjcf(FULL.format("diaginertia='1 1 1'")),
+            "takes only one of fullinertia, diaginertia",
+        ),
+        (
+            mjcf("<inertial pos='0 0 0' diaginertia='1 1 1'/>"),
+            "'b' cannot be read: it has no mass",
+        ),
+        (mjcf("<inertial mass='1' diaginertia='1 1 1'/>"), "it has no pos"),
+        (mjcf("<inertial mass='1' pos='0 0 0'/>"), "it has no diaginertia"),
+    ],
+)
 def test_what_mujoco_refuses_is_refused(text, match):
     with pytest.raises(ValueError):
-        mujoco.MjModel.from_xml_string(text.replace("<inertial", "<freejoint/><inertial"))
+        mujoco.MjModel.from_xml_string(
+            text.replace("<inertial", "<freejoint/><inertial")
+        )
     with pytest.raises(ValueError, match=match):
         jr.io.read_inertials(text)
 
 
-@pytest.mark.parametrize(("text", "match"), [
-    (urdf(f"<inertial><mass value='${{m}}'/><inertia {SIX}/></inertial>"),
-     r"of 'b' cannot be read: '\$\{m\}' is a formula"),
-    (urdf("<inertial><mass value='1'/><inertia ixx='1' ixz='0' iyy='1' izz='1' iyz='0'/>"
-          "</inertial>"), r"of 'b' cannot be read: it has no inertia ixy\.$"),
-    (urdf("<inertial/>"), r"it has no mass value, no inertia ixx, no inertia iyy"),
-    *((f"<robot xmlns:xacro='{uri}'><link name='a'><xacro:box_inertia m='1'/></link></robot>",
-       "it has macros: `xacro a.xacro > a.urdf` first")
-      for uri in ("http://www.ros.org/wiki/xacro", "http://wiki.ros.org/xacro")),
-    ("<mujoco><include file='a.xml'/></mujoco>", "must be a path, but it is the text of a file"),
-    (sdf("", "<world name='w'><include><uri>model://x</uri></include></world>"), "gz sdf -p"),
-    ("<mujoco><worldbody><replicate count='2'><frame><body name='b'/></frame></replicate>"
-     "</worldbody></mujoco>", "`<replicate>` makes bodies: save the compiled model"),
-    ("<mujoco><worldbody><attach model='b'/></worldbody></mujoco>", "`<attach>` adds bodies"),
-    *((mjcf("<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>", f"{option}='3'"),
-       f"`{option}` makes MuJoCo change it: save .*, delete `{option}` there and read that")
-      for option in ("settotalmass", "boundmass", "boundinertia")),
-    (sdf("<pose degrees='yes'>0 0 0 0 0 0</pose>"), "`degrees` must be one of 'true', '1'"),
-    (sdf("<pose rotation_format='rpy'>0 0 0 0 0 0</pose>"), "one of 'euler_rpy', 'quat_xyzw'"),
-    (sdf("<pose>1 2 3</pose>"), "'1 2 3' must be 6 numbers"),
-    (mjcf("<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>", "inertiafromgeom='true'"),
-     "overlook"),
-    (sdf("<pose relative_to='m'>0 0 0 0 0 0</pose>"), "relative to the link"),
-    ("<sdf><model name='m'><link name='b'><inertial auto='true'/></link></model></sdf>", "`auto`"),
-    ("<robot><link name='a'/><link name='a'/></robot>", "must be unique, but 'a' is not"),
-    ("<html/>", "must be one of 'robot', 'mujoco', 'sdf', but it is 'html'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (
+            urdf(f"<inertial><mass value='${{m}}'/><inertia {SIX}/></inertial>"),
+            r"of 'b' cannot be read: '\$\{m\}' is a formula",
+        ),
+        (
+            urdf(
+                "<inertial><mass value='1'/><inertia ixx='1' ixz='0' iyy='1' izz='1' iyz='0'/>"
+                "</inertial>"
+            ),
+            r"of 'b' cannot be read: it has no inertia ixy\.$",
+        ),
+        (urdf("<inertial/>"), r"it has no mass value, no inertia ixx, no inertia iyy"),
+        *(
+            (
+                f"<robot xmlns:xacro='{uri}'>"
+                "<link name='a'><xacro:box_inertia m='1'/></link></robot>",
+                "it has macros: `xacro a.xacro > a.urdf` first",
+            )
+            for uri in ("http://www.ros.org/wiki/xacro", "http://wiki.ros.org/xacro")
+        ),
+        (
+            "<mujoco><include file='a.xml'/></mujoco>",
+            "must be a path, but it is the text of a file",
+        ),
+        (
+            sdf("", "<world name='w'><include><uri>model://x</uri></include></world>"),
+            "gz sdf -p",
+        ),
+        (
+            "<mujoco><worldbody><replicate count='2'><frame><body name='b'/></frame></replicate>"
+            "</worldbody></mujoco>",
+            "`<replicate>` makes bodies: save the compiled model",
+        ),
+        (
+            "<mujoco><worldbody><attach model='b'/></worldbody></mujoco>",
+            "`<attach>` adds bodies",
+        ),
+        *(
+            (
+                mjcf(
+                    "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>",
+                    f"{option}='3'",
+                ),
+                f"`{option}` makes MuJoCo change it: save .*, "
+                f"delete `{option}` there and read that",
+            )
+            for option in ("settotalmass", "boundmass", "boundinertia")
+        ),
+        (
+            sdf("<pose degrees='yes'>0 0 0 0 0 0</pose>"),
+            "`degrees` must be one of 'true', '1'",
+        ),
+        (
+            sdf("<pose rotation_format='rpy'>0 0 0 0 0 0</pose>"),
+            "one of 'euler_rpy', 'quat_xyzw'",
+        ),
+        (sdf("<pose>1 2 3</pose>"), "'1 2 3' must be 6 numbers"),
+        (
+            mjcf(
+                "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>",
+                "inertiafromgeom='true'",
+            ),
+            "overlook",
+        ),
+        (sdf("<pose relative_to='m'>0 0 0 0 0 0</pose>"), "relative to the link"),
+        (
+            "<sdf><model name='m'><link name='b'><inertial auto='true'/></link></model></sdf>",
+            "`auto`",
+        ),
+        (
+            "<robot><link name='a'/><link name='a'/></robot>",
+            "must be unique, but 'a' is not",
+        ),
+        ("<html/>", "must be one of 'robot', 'mujoco', 'sdf', but it is 'html'"),
+    ],
+)
 def test_files_that_cannot_be_read_say_why(text, match):
     with pytest.raises(ValueError, match=match):
         jr.io.read_inertials(text)
@@ -555,12 +695,19 @@ def test_drake_19551_rounding():
 def test_drake_11109_all_links_are_named_in_one_error():
     one = "<inertial><mass value='{}'/><inertia ixx='{}' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
     one += "</inertial>"
-    links = [one.format(1, 2.5), one.format(0, 1), one.format(1, 1), one.format(1, "nan")]
+    links = [
+        one.format(1, 2.5),
+        one.format(0, 1),
+        one.format(1, 1),
+        one.format(1, "nan"),
+    ]
     text = "".join(f"<link name='l{i}'>{x}</link>" for i, x in enumerate(links))
     with pytest.raises(ValueError) as error:
         jr.io.read_inertials(f"<robot name='r'>{text}</robot>")
     lines = str(error.value).splitlines()
-    assert lines[1].startswith("'l0': The principal moments are 1, 1, 2.5 kg m^2, of which the lar")
+    assert lines[1].startswith(
+        "'l0': The principal moments are 1, 1, 2.5 kg m^2, of which the lar"
+    )
     assert lines[2].startswith("'l1': The mass is 0 kg, which is not positive")
     assert lines[3].startswith("'l3': A number is not finite")
     assert len(lines) == 4
@@ -580,7 +727,9 @@ def test_wrong_signs_and_orders_are_recognised():
     negated = complaint(4.0, [0, 0, 0], [a, d, f, -b, -c, -e])
     assert "if its products of inertia are negated" in negated
     # What MJCF wants is xx yy zz xy xz yz, what URDF says is xx xy xz yy yz zz.
-    assert "where MJCF's `fullinertia` is" in complaint(4.0, [0, 0, 0], [a, b, c, d, e, f])
+    assert "where MJCF's `fullinertia` is" in complaint(
+        4.0, [0, 0, 0], [a, b, c, d, e, f]
+    )
     read = {"ixx": a, "ixy": d, "ixz": f, "iyy": b, "iyz": c, "izz": e}
     six = [read[k] for k in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
     assert "iyy iyz izz are asked for" in complaint(4.0, [0, 0, 0], six)
@@ -593,8 +742,13 @@ def test_what_looks_odd_is_told():
     assert "may be about the origin of the link" in text
     assert jr.io.diagnose(rod) == ()
     box = jr.solids.box(2.0, np.array([0.1, 0.2, 0.3]))
-    for factor, unit in ((1e6, "0.11 m if the tensor is in kg mm^2"), (1e9, "0.11 m if in g mm^2")):
-        [text] = jr.io.diagnose(jr.MassProperties(2.0, np.zeros(3), factor * box.inertia))
+    for factor, unit in (
+        (1e6, "0.11 m if the tensor is in kg mm^2"),
+        (1e9, "0.11 m if in g mm^2"),
+    ):
+        [text] = jr.io.diagnose(
+            jr.MassProperties(2.0, np.zeros(3), factor * box.inertia)
+        )
         assert unit in text
     [text] = jr.io.diagnose(jr.MassProperties(2e6, np.zeros(3), box.inertia))
     assert "if the mass is in g." in text
@@ -608,7 +762,9 @@ def test_what_looks_odd_is_told():
 def test_other_real_bodies_are_not_complained_of(rng):
     for body in bodies(rng).values():
         assert jr.io.diagnose(body.translated(-body.center_of_mass)) == ()
-    far = jr.solids.sphere(1.0, 0.5).translated(np.array([0.5, 0, 0]))  # touches the origin
+    far = jr.solids.sphere(1.0, 0.5).translated(
+        np.array([0.5, 0, 0])
+    )  # touches the origin
     assert jr.io.diagnose(far) == ()
 
 
@@ -640,17 +796,22 @@ def test_the_nearest_tensor_is_a_projection(rng, thickness):
 def test_the_nearest_of_a_real_one_is_itself(rng):
     for body in [*bodies(rng).values(), jr.solids.box(1.0, np.array([1.0, 2.0, 3.0]))]:
         assert np.array_equal(jr.io.nearest_physical(body.inertia), body.inertia)
-    assert_allclose(jr.io.nearest_physical(np.array([1.0, 1, 2.5])).diagonal(), [1.25, 1.25, 2.5])
+    assert_allclose(
+        jr.io.nearest_physical(np.array([1.0, 1, 2.5])).diagonal(), [1.25, 1.25, 2.5]
+    )
 
 
 def test_mujoco_loads_the_nearest(rng):
     """Of a thickness: MuJoCo allows no rounding in A + B >= C."""
-    bad = mjcf("<freejoint/><inertial mass='2' pos='0 0 0' fullinertia='1 2 4 0.3 0.1 0'/>")
+    bad = mjcf(
+        "<freejoint/><inertial mass='2' pos='0 0 0' fullinertia='1 2 4 0.3 0.1 0'/>"
+    )
     with pytest.raises(ValueError, match="A \\+ B >= C"):
         mujoco.MjModel.from_xml_string(bad)
     [body] = jr.io.read_inertials(bad, unphysical="nearest", thickness=1e-3).values()
     text = " ".join(
-        repr(float(body.inertia[i])) for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        repr(float(body.inertia[i]))
+        for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     )
     assert_same(in_mujoco(bad.replace("1 2 4 0.3 0.1 0", text)), body, 1e-9)
 
@@ -676,8 +837,9 @@ def test_a_trajectory_as_tables():
     assert_allclose(table[[f"attitude_{x}" for x in "wxyz"]], moved.states.attitude)
     assert_allclose(data.omega.sel(axis="z", time=2.0), moved.states.omega[-1, 2])
     assert table.attrs["units"] == {
-        **{f"attitude_{x}": "1" for x in "wxyz"}, **{f"omega_{x}": "rad/s" for x in "xyz"}
-    }  # fmt: skip
+        **{f"attitude_{x}": "1" for x in "wxyz"},
+        **{f"omega_{x}": "rad/s" for x in "xyz"},
+    }
     assert data.time.units == "s"
     assert data.attrs["result"] == "All went well."
     # Lanes, with their times in common and each with its own.
@@ -685,10 +847,17 @@ def test_a_trajectory_as_tables():
     assert dict(lanes.sizes) == {"lane": 2, "time": 5, "component": 4, "axis": 3}
     assert_allclose(lanes.omega.isel(lane=1), many.states.omega[1])
     assert list(lanes.result.values) == ["All went well."] * 2
-    own = jr.Trajectory(many.ts + jnp.array([[0.0], [1.0]]), *list(vars(many).values())[1:])
+    own = jr.Trajectory(
+        many.ts + jnp.array([[0.0], [1.0]]), *list(vars(many).values())[1:]
+    )
     assert jr.io.to_xarray(own).time.dims == ("lane", "sample")
-    for several in (many, jax.tree.map(lambda x: x[0, 0] if x.ndim > 1 else x[0], many)):
-        with pytest.raises(ValueError, match=r"shape \(n,\), but they have .*: use `to_xarray`"):
+    for several in (
+        many,
+        jax.tree.map(lambda x: x[0, 0] if x.ndim > 1 else x[0], many),
+    ):
+        with pytest.raises(
+            ValueError, match=r"shape \(n,\), but they have .*: use `to_xarray`"
+        ):
             jr.io.to_pandas(several)
 
 
@@ -696,7 +865,9 @@ def test_a_flight_with_a_wheel_as_tables():
     pytest.importorskip("xarray")
     wheel = jr.torques.SpinningMass(0.1, np.array([0.0, 0, 1]))
     body = jr.FloatingBody(jr.solids.box(2.0, np.array([0.1, 0.2, 0.3])), None, wheel)
-    start = jr.FloatingState(np.zeros(3), np.ones(3), jr.rotation.identity(), np.ones(3), (0.5,))
+    start = jr.FloatingState(
+        np.zeros(3), np.ones(3), jr.rotation.identity(), np.ones(3), (0.5,)
+    )
     flown = jr.simulate(body, start, jnp.linspace(0.0, 1.0, 3))
     table = jr.io.to_pandas(flown)
     assert_allclose(table[["position_x", "velocity_y"]].iloc[-1], 1.0)
@@ -714,7 +885,9 @@ def test_a_fit_as_tables(fit):
     pytest.importorskip("xarray")
     table, data = jr.io.to_pandas(fit), jr.io.to_xarray(fit)
     assert_allclose(table.loc[["ratios_I2/I1", "ratios_I3/I1"], "value"], fit.ratios)
-    assert_allclose(table.loc[["ratios_I2/I1", "ratios_I3/I1"], "error"], fit.ratios_errors)
+    assert_allclose(
+        table.loc[["ratios_I2/I1", "ratios_I3/I1"], "error"], fit.ratios_errors
+    )
     assert_allclose(data.shares, fit.shares)
     assert_allclose(data.moments_error**2, np.diagonal(fit.moments_covariance))
     assert list(data.number.values) == list(fit.names)
@@ -729,9 +902,13 @@ def test_a_fit_as_tables(fit):
 def test_a_sweep_as_tables():
     pytest.importorskip("xarray")
     swept = jr.sweep(
-        lambda x, y: {"sum": x + y}, {"x": np.arange(3.0), "y": np.arange(2.0)}, progress=False
+        lambda x, y: {"sum": x + y},
+        {"x": np.arange(3.0), "y": np.arange(2.0)},
+        progress=False,
     )
-    assert_allclose(jr.io.to_xarray(swept)["sum"], np.add.outer(np.arange(3.0), np.arange(2.0)))
+    assert_allclose(
+        jr.io.to_xarray(swept)["sum"], np.add.outer(np.arange(3.0), np.arange(2.0))
+    )
     assert_allclose(jr.io.to_pandas(swept)["sum"].loc[2.0, 1.0], 3.0)
 
 

@@ -29,8 +29,8 @@ DIPOLE = np.array([0.3, 0.1, 0.5])
 OMEGA = np.array([0.3, 0.5, 0.8])
 LANES = np.random.default_rng(0).normal(size=(1000, 3))
 
-# The flags that conftest.py sets for older versions of XLA change the counts. Users have the
-# defaults, which these options restore.
+# The flags that conftest.py sets for older versions of XLA change the counts. Users
+# have the defaults, which these options restore.
 _DEFAULTS = None
 if not NEWER:
     _DEFAULTS = {"xla_cpu_use_fusion_emitters": True, "xla_disable_hlo_passes": ""}

@@ -52,7 +52,9 @@ def double_pendulum_acceleration(q, q_dot, m1, m2, l1, l2, g):
     common = 2 * m1 + m2 - m2 * np.cos(2 * a - 2 * b)
     first = -g * (2 * m1 + m2) * np.sin(a) - m2 * g * np.sin(a - 2 * b)
     first -= 2 * sin * m2 * (b_dot**2 * l2 + a_dot**2 * l1 * cos)
-    second = a_dot**2 * l1 * (m1 + m2) + g * (m1 + m2) * np.cos(a) + b_dot**2 * l2 * m2 * cos
+    second = (
+        a_dot**2 * l1 * (m1 + m2) + g * (m1 + m2) * np.cos(a) + b_dot**2 * l2 * m2 * cos
+    )
     return np.array([first / (l1 * common), 2 * sin * second / (l2 * common)])
 
 
@@ -96,13 +98,24 @@ CASES = {
         (1.2, 0.5, 0.8, 1.1, 9.81),
     ),
     "symmetric top": (symmetric_top, top_acceleration, (TOP_Q, TOP_Q_DOT), TOP),
-    "charge in fields": (charge, charge_acceleration, (THREE, THREE[::-1].copy()), (1.4, -0.7)),
-    "indefinite": (bateman, bateman_acceleration, (TWO, np.array([1.3, -0.4])), (1.2, 0.3, 2.0)),
+    "charge in fields": (
+        charge,
+        charge_acceleration,
+        (THREE, THREE[::-1].copy()),
+        (1.4, -0.7),
+    ),
+    "indefinite": (
+        bateman,
+        bateman_acceleration,
+        (TWO, np.array([1.3, -0.4])),
+        (1.2, 0.3, 2.0),
+    ),
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [(name, np.float64) for name in CASES] + [("symmetric top", np.float32)]
+    ("name", "dtype"),
+    [(name, np.float64) for name in CASES] + [("symmetric top", np.float32)],
 )
 def test_accelerations_are_those_of_the_textbook(name, dtype):
     function, by_hand, (q, q_dot), params = CASES[name]
@@ -145,7 +158,9 @@ def test_a_body_in_euler_angles_obeys_eulers_equations():
 def test_energy_and_momenta(name):
     function, by_hand, (q, q_dot), params = CASES[name]
     expected = {
-        "symmetric top": lambda q, v: symmetric_top(q, v, *TOP) + 2 * TOP[2] * np.cos(q[1]),
+        "symmetric top": lambda q, v: (
+            symmetric_top(q, v, *TOP) + 2 * TOP[2] * np.cos(q[1])
+        ),
         # of the magnetic field nothing is left
         "charge in fields": lambda q, v: 0.7 * np.sum(v**2) - 0.7 * q[0] ** 2 * q[2],
         "indefinite": lambda q, v: 1.2 * v[0] * v[1] + 2.0 * q[0] * q[1],
@@ -190,7 +205,12 @@ def solve(field, y0, args, ts, rtol=1e-10):
 def test_a_top_keeps_its_energy_and_the_momenta_of_phi_and_psi():
     @quick_jit
     def motion(q, q_dot):
-        ys = solve(lagrangian.vector_field(symmetric_top), (q, q_dot), TOP, jnp.linspace(0, 10, 40))
+        ys = solve(
+            lagrangian.vector_field(symmetric_top),
+            (q, q_dot),
+            TOP,
+            jnp.linspace(0, 10, 40),
+        )
         of = lambda f: jax.vmap(lambda q, q_dot: f(symmetric_top, q, q_dot, *TOP))(*ys)  # noqa: E731
         return ys, of(lagrangian.energy), of(lagrangian.momenta)
 
@@ -210,7 +230,10 @@ def test_a_time_among_the_parameters_drives_an_oscillator_at_resonance():
 
     ts = np.linspace(0, 12, 7)
     q, q_dot = ts * np.sin(ts) / 2, (np.sin(ts) + ts * np.cos(ts)) / 2
-    at = lambda q, q_dot, t: lagrangian.acceleration(driven, q[None], q_dot[None], t, 1.0)[0]  # noqa: E731
+
+    def at(q, q_dot, t):
+        return lagrangian.acceleration(driven, q[None], q_dot[None], t, 1.0)[0]
+
     found = quick_jit(jax.vmap(at))(q, q_dot, ts)
     np.testing.assert_allclose(found, np.cos(ts) - q, atol=ulps(float, 32))
 
@@ -247,22 +270,37 @@ def test_derivatives_against_differences_of_the_textbook():
 
     @quick_jit
     def derivatives(x):
-        return jax.jacfwd(found)(x), jax.jacrev(found)(x), jax.jacfwd(jax.jacrev(total))(x)
+        return (
+            jax.jacfwd(found)(x),
+            jax.jacrev(found)(x),
+            jax.jacfwd(jax.jacrev(total))(x),
+        )
 
     forward, reverse, hessian = derivatives(inputs)
     basis = np.eye(inputs.size)
-    jacobian = np.stack([central_difference(expected, inputs, e) for e in basis], axis=1)
+    jacobian = np.stack(
+        [central_difference(expected, inputs, e) for e in basis], axis=1
+    )
     size = np.max(np.abs(jacobian))
     np.testing.assert_allclose(forward, jacobian, atol=1e-8 * size)
     np.testing.assert_allclose(reverse, forward, atol=ulps(float, 256) * size)
     h = 1e-4
     value = lambda x: weights @ expected(x)  # noqa: E731
-    for i, j in [(0, 1), (1, 1), (q.size, q.size + 1), (1, 2 * q.size), (-1, 1), (-2, -2)]:
+    for i, j in [
+        (0, 1),
+        (1, 1),
+        (q.size, q.size + 1),
+        (1, 2 * q.size),
+        (-1, 1),
+        (-2, -2),
+    ]:
         a, b = h * basis[i], h * basis[j]
         mixed = value(inputs + a + b) - value(inputs + a - b)
         mixed = (mixed - value(inputs - a + b) + value(inputs - a - b)) / (4 * h * h)
         size = np.max(np.abs(hessian))
-        np.testing.assert_allclose(hessian[i, j], mixed, atol=1e-6 * size, err_msg=f"{i}, {j}")
+        np.testing.assert_allclose(
+            hessian[i, j], mixed, atol=1e-6 * size, err_msg=f"{i}, {j}"
+        )
 
 
 def test_derivative_through_an_integration():
@@ -283,12 +321,17 @@ def test_derivative_through_an_integration():
 @pytest.mark.parametrize("dtype", [np.float64])
 def test_cyclic_coordinates_of_a_top_are_phi_and_psi(dtype):
     q, q_dot = TOP_Q.astype(dtype), TOP_Q_DOT.astype(dtype)
-    top = lambda q, q_dot, *p: lagrangian.cyclic_coordinates(symmetric_top, q, q_dot, *p)  # noqa: E731
+
+    def top(q, q_dot, *p):
+        return lagrangian.cyclic_coordinates(symmetric_top, q, q_dot, *p)
+
     top = quick_jit(top)
     np.testing.assert_array_equal(top(q, q_dot, *TOP), [True, False, True])
     # on its vertical axis, and at rest, dL/dq is zero for theta too
     np.testing.assert_array_equal(top(0 * q, 0 * q_dot, *TOP), [True, False, True])
-    without_gravity = top(q, q_dot, 1.0, 1.0, 0.0)  # a sphere's L still depends on theta
+    without_gravity = top(
+        q, q_dot, 1.0, 1.0, 0.0
+    )  # a sphere's L still depends on theta
     np.testing.assert_array_equal(without_gravity, [True, False, True])
 
 
@@ -301,10 +344,13 @@ def test_a_coordinate_that_cancels_is_cyclic_and_a_slow_one_is_not(dtype):
         return 0.5 * jnp.sum(velocity**2) + mu / jnp.sqrt(jnp.sum(at**2))
 
     q, q_dot = np.array([1.5, 2.3], dtype), np.array([0.2, 0.7], dtype)
-    found = quick_jit(lambda *a: lagrangian.cyclic_coordinates(planet, *a))(q, q_dot, 0.9)
+    found = quick_jit(lambda *a: lagrangian.cyclic_coordinates(planet, *a))(
+        q, q_dot, 0.9
+    )
     np.testing.assert_array_equal(found, [False, True])
     straight = quick_jit(lambda *a: lagrangian.cyclic_coordinates(oscillator, *a))
-    # seconds or centuries: a potential of 1e-14 is seen in a motion of 1e-7 and from rest
+    # seconds or centuries: a potential of 1e-14 is seen in a motion of 1e-7 and from
+    # rest
     for speed in (1e-7, 0.0):
         slow = straight(q, q_dot * dtype(speed), 1.0, 1e-14)
         np.testing.assert_array_equal(slow, [False, False])
@@ -339,7 +385,9 @@ UPRIGHT = TOP_Q * np.array([1, 0, 1])
 
 
 def one_top(q, mgl):
-    return lagrangian.acceleration(symmetric_top, q, TOP_Q_DOT.astype(q.dtype), *TOP[:2], mgl)
+    return lagrangian.acceleration(
+        symmetric_top, q, TOP_Q_DOT.astype(q.dtype), *TOP[:2], mgl
+    )
 
 
 tops = quick_jit(jax.vmap(one_top, (0, None)))
@@ -378,7 +426,10 @@ def test_derivatives_of_a_singular_lane_are_zero_and_touch_no_other():
 
     @quick_jit
     def derivatives(lanes, mgl):
-        each = [jax.vmap(mode(step), (0, None))(lanes, mgl) for mode in (jax.jacfwd, jax.jacrev)]
+        each = [
+            jax.vmap(mode(step), (0, None))(lanes, mgl)
+            for mode in (jax.jacfwd, jax.jacrev)
+        ]
         return jax.jacfwd(one_top)(lanes[0], mgl), each, jax.grad(shared)(mgl)
 
     alone, jacobians, slope = derivatives(lanes, TOP[2])
@@ -392,7 +443,9 @@ def test_an_infinite_derivative_in_one_lane_stops_no_other():
     """V = x^1.5 has a finite force and an infinite rate of it at 0."""
     steep = lambda q, q_dot: 0.5 * q_dot[0] ** 2 - q[0] ** 1.5  # noqa: E731
     one = lambda x: lagrangian.acceleration(steep, x[None], jnp.zeros(1))[0]  # noqa: E731
-    found = quick_jit(jax.vmap(lambda x: jax.jvp(one, (x,), (1.0,))))(jnp.array([0.0, 4.0]))
+    found = quick_jit(jax.vmap(lambda x: jax.jvp(one, (x,), (1.0,))))(
+        jnp.array([0.0, 4.0])
+    )
     np.testing.assert_allclose(found, [[0, -3], [-np.inf, -0.375]])
 
 
@@ -429,7 +482,9 @@ def test_units_do_not_make_a_mass_matrix_singular(dtype):
     for matrix in (plain, hollow):
         found = call((matrix * np.outer(units, units)).astype(dtype))
         expected = -np.linalg.solve(matrix, np.ones(3))
-        np.testing.assert_allclose(np.asarray(found) * units, expected, rtol=ulps(dtype, 64))
+        np.testing.assert_allclose(
+            np.asarray(found) * units, expected, rtol=ulps(dtype, 64)
+        )
 
 
 def test_an_integration_that_starts_at_a_singular_point_fails():
@@ -455,8 +510,12 @@ def test_an_integration_that_starts_at_a_singular_point_fails():
 
 
 def test_values_that_are_not_finite_are_nan():
-    assert np.all(np.isnan(lagrangian.acceleration(oscillator, TWO * np.nan, TWO, 1.0, 1.0)))
-    assert np.all(np.isnan(lagrangian.acceleration(oscillator, TWO, TWO * np.inf, 1.0, 1.0)))
+    assert np.all(
+        np.isnan(lagrangian.acceleration(oscillator, TWO * np.nan, TWO, 1.0, 1.0))
+    )
+    assert np.all(
+        np.isnan(lagrangian.acceleration(oscillator, TWO, TWO * np.inf, 1.0, 1.0))
+    )
     assert np.all(np.isnan(lagrangian.acceleration(oscillator, TWO, TWO, 1.0, np.inf)))
     zero = jnp.zeros(1, np.float32)
     tiny = lambda q, q_dot: 1e-30 * q_dot[0] ** 2 - 1e20 * q[0]  # noqa: E731
@@ -471,18 +530,30 @@ FUNCTIONS = ["acceleration", "momenta", "energy", "cyclic_coordinates"]
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_wrong_arguments_are_errors(name, untyped):
     call = getattr(lagrangian, name)
-    with pytest.raises(ValueError, match=r"Argument `q` must have shape \(n,\), but .* \(\)\."):
+    with pytest.raises(
+        ValueError, match=r"Argument `q` must have shape \(n,\), but .* \(\)\."
+    ):
         call(oscillator, 1.0, TWO, 1.0, 1.0)
-    with pytest.raises(ValueError, match=r"Argument `q_dot` must have shape \(2,\), but .* \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"Argument `q_dot` must have shape \(2,\), but .* \(3,\)"
+    ):
         call(oscillator, TWO, THREE, 1.0, 1.0)
-    for wrong in (lambda q, _: q, lambda *_: 1, lambda q, _: jnp.sum(q).astype(complex)):
-        with pytest.raises(ValueError, match="Argument `lagrangian` must return a real scalar"):
+    for wrong in (
+        lambda q, _: q,
+        lambda *_: 1,
+        lambda q, _: jnp.sum(q).astype(complex),
+    ):
+        with pytest.raises(
+            ValueError, match="Argument `lagrangian` must return a real scalar"
+        ):
             call(wrong, TWO, TWO)
 
 
 def test_wrong_arguments_of_the_field_and_of_reach_are_errors(untyped):
     field = lagrangian.vector_field(oscillator)
-    with pytest.raises(ValueError, match=r"Argument `args` must be a tuple .* is a float"):
+    with pytest.raises(
+        ValueError, match=r"Argument `args` must be a tuple .* is a float"
+    ):
         field(0.0, (TWO, TWO), 1.0)
     with pytest.raises(ValueError, match=r"Argument `q_dot` must have shape \(2,\)"):
         field(0.0, (TWO, THREE), (1.0, 1.0))

@@ -15,7 +15,9 @@ from jrigid._stepping.method import method_of
 from jrigid._stepping.step import error_of, pull_back, stages
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-GRAVITY = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
+GRAVITY = jr.torques.UniformGravity(
+    1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0])
+)
 TOP = jr.RigidBody(np.array([1.0, 2.0, 3.0]), GRAVITY)
 TIMES = np.array([0.0, 1.0, 1.0, 3.0])
 
@@ -32,7 +34,8 @@ def _states(body, omega, ts=TIMES):
 _TOPS = quick_jit(jax.vmap(lambda omega: _states(TOP, omega)))
 
 
-# Arrays whose last axis are the lanes -------------------------------------------------------
+# Arrays whose last axis are the lanes
+# -------------------------------------------------------
 
 
 @jax.custom_jvp
@@ -48,9 +51,13 @@ def _of_all_kinds(x, i, table):
     a, b, c = x
     rows = jnp.stack([x, 2 * x, jnp.flip(x)], axis=1)
     halves = jax.lax.bitcast_convert_type(x, jnp.int32).astype(x.dtype)
-    mixed = jnp.concatenate([rows.T.reshape(-1)[:4], jnp.where(a > 0, x, -x), jnp.arange(2.0)])
+    mixed = jnp.concatenate(
+        [rows.T.reshape(-1)[:4], jnp.where(a > 0, x, -x), jnp.arange(2.0)]
+    )
     by_cond = jax.lax.cond(a > b, lambda x: x**2, lambda x: -x, x)
-    by_loop = jax.lax.while_loop(lambda x: jnp.sum(x) < 10, lambda x: 2 * jnp.abs(x) + 1, x)
+    by_loop = jax.lax.while_loop(
+        lambda x: jnp.sum(x) < 10, lambda x: 2 * jnp.abs(x) + 1, x
+    )
     looked_up = jnp.interp(c, jnp.linspace(-3, 3, 9), table)
     turned = jnp.linalg.solve(rows @ rows.T + 5 * jnp.eye(3), x)
     tail = jax.jit(lambda x: _ruled(jnp.sort(x))[i])(x)
@@ -67,10 +74,13 @@ def test_a_function_in_lanes_equals_its_vmap(rng):
     table = jnp.asarray(rng.normal(size=9))
     found = lanes_last(lambda x, i: _of_all_kinds(x, i, table), x, i)
     wanted = jax.vmap(lambda x, i: _of_all_kinds(x, i, table), -1, -1)(x, i)
-    jax.tree_util.tree_map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, wanted)
+    jax.tree_util.tree_map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, wanted
+    )
 
 
-# Steps of a method --------------------------------------------------------------------------
+# Steps of a method
+# --------------------------------------------------------------------------
 
 METHODS = {
     "Verner9": (jr.solvers.Verner9(), 9, 4),
@@ -144,7 +154,8 @@ def test_the_reverse_of_a_step_is_its_transpose(in_lanes):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15)
 
 
-# Motions -------------------------------------------------------------------------------------
+# Motions
+# -------------------------------------------------------------------------------------
 
 
 def test_a_lane_is_the_same_to_the_bit_whatever_is_around_it(rng):
@@ -152,7 +163,9 @@ def test_a_lane_is_the_same_to_the_bit_whatever_is_around_it(rng):
     omegas = rng.normal(size=(200, 3))
     order = rng.permutation(200)
     all_, again, few = _TOPS(omegas), _TOPS(omegas[order]), _TOPS(omegas[:130])
-    for x, y, z in zip(*map(jax.tree_util.tree_leaves, (all_, again, few)), strict=True):
+    for x, y, z in zip(
+        *map(jax.tree_util.tree_leaves, (all_, again, few)), strict=True
+    ):
         np.testing.assert_array_equal(x[order], y)
         np.testing.assert_array_equal(x[:130], z)
 
@@ -163,7 +176,9 @@ def test_lanes_equal_single_calls(rng):
     for i, omega in enumerate(omegas):
         alone = _motion(TOP, omega)
         np.testing.assert_allclose(together.omega[i], alone.states.omega, atol=1e-10)
-        np.testing.assert_allclose(together.attitude[i], alone.states.attitude, atol=1e-10)
+        np.testing.assert_allclose(
+            together.attitude[i], alone.states.attitude, atol=1e-10
+        )
         assert abs(int(stats["num_steps"][i]) - int(alone.stats["num_steps"])) <= 3
         assert int(results._value[i]) == 0
 
@@ -194,7 +209,13 @@ def test_lanes_may_differ_in_everything_also_twice_over(rng):
         weight = jr.torques.UniformGravity(mass, lever, gravity)
         body = jr.RigidBody(moments, jr.torques.as_torque(push) + weight)
         trajectory = jr.simulate(
-            body, jr.State(UPRIGHT, omega), ts, strength, t0=ts[0] - 0.5, rtol=rtol, throw=False
+            body,
+            jr.State(UPRIGHT, omega),
+            ts,
+            strength,
+            t0=ts[0] - 0.5,
+            rtol=rtol,
+            throw=False,
         )
         return trajectory.states.omega
 
@@ -220,9 +241,13 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
         hidden = jnp.tanh(weights[0] @ state.omega)
         wave = jnp.interp(jnp.mod(t, 1.0), jnp.linspace(0, 1, 5), args)
         series = jax.lax.while_loop(
-            lambda s: s[1] < 6, lambda s: (s[0] + t ** s[1] / 100, s[1] + 1), (0.0 * t, 1)
+            lambda s: s[1] < 6,
+            lambda s: (s[0] + t ** s[1] / 100, s[1] + 1),
+            (0.0 * t, 1),
         )[0]
-        sign = jax.lax.cond(state.omega[0] > 0, lambda w: -0.1 * w, lambda w: 0.1 * w, state.omega)
+        sign = jax.lax.cond(
+            state.omega[0] > 0, lambda w: -0.1 * w, lambda w: 0.1 * w, state.omega
+        )
         return weights[1] @ hidden + sign + 0.05 * wave * jnp.ones(3) + 0.01 * series
 
     body, table = (
@@ -232,7 +257,9 @@ def test_a_torque_of_any_make_is_the_same_in_lanes(rng):
 
     def final(omega):
         state = jr.State(UPRIGHT, omega)
-        return jr.simulate(body, state, 1.5, table, rtol=1e-8, throw=False).final_state.omega
+        return jr.simulate(
+            body, state, 1.5, table, rtol=1e-8, throw=False
+        ).final_state.omega
 
     omegas = rng.normal(size=(3, 3))
     together = quick_jit(jax.vmap(final))(omegas)
@@ -244,14 +271,19 @@ def _library():
     """Every torque of the library, on an orbit where it takes one."""
     t, up = jr.torques, np.array([0.0, 0.6, 0.8])
     orbit = t.KeplerOrbit(0.5, 1.3, 0.2)
-    plates, centers = np.array([[1.0, 0, 0], [0, 0.6, 0.8]]), np.array([[0, 0.1, 0.2], [0.3, 0, 0]])
+    plates, centers = (
+        np.array([[1.0, 0, 0], [0, 0.6, 0.8]]),
+        np.array([[0, 0.1, 0.2], [0.3, 0, 0]]),
+    )
     towards = lambda t: jnp.stack([jnp.cos(t), jnp.sin(t), 0 * t])  # noqa: E731
     return {
         "constant": t.Constant(0.1 * up),
         "gravity": GRAVITY,
         "gravity gradient": t.GravityGradient(0.5, orbit),
         "dipole": t.MagneticDipole(0.2 * up, lambda t, _: orbit(t)),
-        "sunlight": t.SolarPressure(np.ones(2), plates, centers, towards, 0.3, 0.2, 0.1),
+        "sunlight": t.SolarPressure(
+            np.ones(2), plates, centers, towards, 0.3, 0.2, 0.1
+        ),
         "linear drag": t.LinearDrag(np.array([0.1, 0.2, 0.3])),
         "quadratic drag": t.QuadraticDrag(0.1),
         "friction": t.CoulombFriction(0.1, 0.5, up),
@@ -269,7 +301,11 @@ def test_every_torque_of_the_library_is_the_same_in_lanes(name, rng):
         state = body.with_parts(jr.State(jr.rotation.normalize(q), w))
         return jax.flatten_util.ravel_pytree(body.vector_field(t, state, None))[0]
 
-    lanes = jnp.asarray(rng.normal(size=8)), rng.normal(size=(4, 8)), rng.normal(size=(3, 8))
+    lanes = (
+        jnp.asarray(rng.normal(size=8)),
+        rng.normal(size=(4, 8)),
+        rng.normal(size=(3, 8)),
+    )
     found = quick_jit(lambda *x: lanes_last(rates, *x))(*lanes)
     wanted = quick_jit(jax.vmap(rates, -1, -1))(*lanes)
     np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-14)
@@ -284,9 +320,15 @@ def test_all_torques_at_once_move_a_body_as_a_solver_of_diffrax_does(rng):
         state = body.with_parts(jr.State(UPRIGHT, omega))
         controller = diffrax.PIDController(rtol=1e-9, atol=1e-9)
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(body.vector_field), diffrax.Tsit5(), 0.0, 2.0, 0.01, state,
-            stepsize_controller=controller, throw=False,
-        ).ys  # fmt: skip
+            diffrax.ODETerm(body.vector_field),
+            diffrax.Tsit5(),
+            0.0,
+            2.0,
+            0.01,
+            state,
+            stepsize_controller=controller,
+            throw=False,
+        ).ys
 
     def ours(omega):
         state = jr.State(UPRIGHT, omega)
@@ -322,18 +364,26 @@ print(len(jax.devices()), all(np.array_equal(a, b) for a, b in pairs))
 
 
 def test_lanes_over_the_devices_of_a_process():
-    said, complained = in_a_process(SHARDED, JAX_NUM_CPU_DEVICES="2", JAX_PLATFORMS="cpu")
+    said, complained = in_a_process(
+        SHARDED, JAX_NUM_CPU_DEVICES="2", JAX_PLATFORMS="cpu"
+    )
     assert said.split() == ["2", "True"], complained
 
 
-# Derivatives ---------------------------------------------------------------------------------
+# Derivatives
+# ---------------------------------------------------------------------------------
 
 
 def _end(moments, omega, adjoint=None):
-    body, options = jr.RigidBody(moments, GRAVITY), {"solver": diffrax.Tsit5(), "rtol": 1e-6}
+    body, options = (
+        jr.RigidBody(moments, GRAVITY),
+        {"solver": diffrax.Tsit5(), "rtol": 1e-6},
+    )
     trajectory = _motion(body, omega, adjoint=adjoint, **options)
     states = trajectory.states
-    return jnp.concatenate([states.omega.ravel(), states.attitude.ravel()]), trajectory.result
+    return jnp.concatenate(
+        [states.omega.ravel(), states.attitude.ravel()]
+    ), trajectory.result
 
 
 def test_derivatives_in_lanes_are_those_of_single_motions(rng):
@@ -360,7 +410,9 @@ def test_derivatives_in_lanes_are_those_of_single_motions(rng):
     np.testing.assert_allclose(found[1][good], of_omegas, rtol=1e-8, atol=1e-9)
     assert np.all(found[1][2] == 0)
     alone = quick_jit(jacobian)(moments, omegas[3])
-    np.testing.assert_allclose(jacobians[0][2], alone[0], atol=1e-8 * np.abs(alone[0]).max())
+    np.testing.assert_allclose(
+        jacobians[0][2], alone[0], atol=1e-8 * np.abs(alone[0]).max()
+    )
 
 
 def test_what_is_not_kept_is_run_again(monkeypatch):

@@ -1,4 +1,3 @@
-# ruff: noqa: E501
 import functools
 import re
 
@@ -23,9 +22,11 @@ CUBE_FACES = np.array(
         *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
     ]
 )
-OUTWARD = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # of a right-handed tetrahedron
-# F. Tonon, Explicit exact formulas for the 3-D tetrahedron inertia tensor in terms of its vertex
-# coordinates, J. Math. Stat. 1 (2005) 8-11, the numerical example.
+OUTWARD = np.array(
+    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+)  # of a right-handed tetrahedron
+# F. Tonon, Explicit exact formulas for the 3-D tetrahedron inertia tensor in terms of
+# its vertex coordinates, J. Math. Stat. 1 (2005) 8-11, the numerical example.
 TONON = np.array(
     [
         [8.33220, -11.86875, 0.93355],
@@ -34,7 +35,8 @@ TONON = np.array(
         [2.00000, 5.00000, 3.00000],
     ]
 )
-# About the centroid, density 1: a, b, c and the integrals of y z, x z, x y (his a', b', c').
+# About the centroid, density 1: a, b, c and the integrals of y z, x z, x y (his a', b',
+# c').
 TONON_MOMENTS = np.array([43520.33257, 194711.28938, 191168.76173])
 TONON_PRODUCTS = np.array([4417.66150, -46343.16662, 11996.20119])
 
@@ -63,7 +65,8 @@ def assert_ulps(actual, expected, ulps):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * scale)
 
 
-# --- worked examples -------------------------------------------------------------------------
+# --- worked examples
+# -------------------------------------------------------------------------
 
 
 def test_cube_about_its_corner_and_its_centre():
@@ -74,7 +77,9 @@ def test_cube_about_its_corner_and_its_centre():
     bodies = {
         "solid": jr.solids.box(mass, jnp.full(3, a)).translated(jnp.full(3, a / 2)),
         "mesh": jr.from_mesh(a * CUBE, CUBE_FACES, density),
-        "density": jr.from_density(lambda r: density + 0 * r[0], jnp.zeros(3), jnp.full(3, a)),
+        "density": jr.from_density(
+            lambda r: density + 0 * r[0], jnp.zeros(3), jnp.full(3, a)
+        ),
     }
     for name, body in bodies.items():
         assert_ulps(body.about(jnp.zeros(3)), corner, 8), name
@@ -96,7 +101,9 @@ def test_rod_about_its_centre_and_its_end():
 
 def test_rectangular_lamina_about_a_corner():
     mass, a, b = 2.0, 3.0, 1.5
-    tensor = jr.solids.lamina(mass, jnp.array([a, b])).about(jnp.array([-a / 2, -b / 2, 0.0]))
+    tensor = jr.solids.lamina(mass, jnp.array([a, b])).about(
+        jnp.array([-a / 2, -b / 2, 0.0])
+    )
     xy = -mass * a * b / 4
     expected = [
         [mass * b**2 / 3, xy, 0],
@@ -111,13 +118,16 @@ def test_rectangular_lamina_about_a_corner():
 
 
 def test_square_lamina_about_a_corner_has_its_diagonals_as_principal_axes():
-    lamina = jr.solids.lamina(1.0, jnp.array([1.0, 1.0])).about(jnp.array([-0.5, -0.5, 0.0]))
+    lamina = jr.solids.lamina(1.0, jnp.array([1.0, 1.0])).about(
+        jnp.array([-0.5, -0.5, 0.0])
+    )
     principal = jr.principal_axes(lamina)
     assert_ulps(principal.moments, np.array([1 / 12, 7 / 12, 2 / 3]), 8)
     root = 0.5**0.5
     expected = np.array([[root, -root, 0], [root, root, 0], [0, 0, 1]])
     assert_ulps(principal.axes, expected, 8)
-    # At the next corner the axis is (1, -1, 0): the tie of its components must not decide the sign.
+    # At the next corner the axis is (1, -1, 0): the tie of its components must not
+    # decide the sign.
     flip = np.diag([1.0, -1.0, 1.0])
     other = flip @ lamina @ flip
     expected = np.array([[root, root, 0], [-root, root, 0], [0, 0, 1]])
@@ -138,7 +148,8 @@ def test_tonon_tetrahedron_with_products_of_inertia():
         np.testing.assert_allclose(body.center_of_mass, TONON.mean(0), rtol=8 * EPS)
 
 
-# --- composition and change of axes ----------------------------------------------------------
+# --- composition and change of axes
+# ----------------------------------------------------------
 
 
 def test_parallel_axis_round_trip_and_both_moments_and_tensors():
@@ -158,9 +169,12 @@ def test_composition_equals_the_cloud_taken_at_once():
     rng = np.random.default_rng(0)
     masses, positions = rng.uniform(0.5, 2, 30), rng.normal(size=(30, 3)) + 5.0
     whole = jr.from_points(masses, positions)
-    parts = sum(jr.from_points(masses[i : i + 10], positions[i : i + 10]) for i in (0, 10, 20))
+    parts = sum(
+        jr.from_points(masses[i : i + 10], positions[i : i + 10]) for i in (0, 10, 20)
+    )
     singles = sum(
-        jr.MassProperties(m, r, np.zeros(3)) for m, r in zip(masses[:3], positions[:3], strict=True)
+        jr.MassProperties(m, r, np.zeros(3))
+        for m, r in zip(masses[:3], positions[:3], strict=True)
     )
     three = jr.from_points(masses[:3], positions[:3])
     for a, b in ((parts, whole), (singles, three)):
@@ -185,11 +199,14 @@ def test_rotation_and_translation_are_those_of_the_points():
     origin = jr.inertia_tensor(masses, positions @ turn.T + np.asarray(d))
     assert_ulps(moved.about(jnp.zeros(3)), origin, 16)
     np.testing.assert_allclose(
-        moved.principal_axes().moments, jr.principal_axes(direct.inertia).moments, rtol=1e-14
+        moved.principal_axes().moments,
+        jr.principal_axes(direct.inertia).moments,
+        rtol=1e-14,
     )
 
 
-# --- points, densities, meshes ---------------------------------------------------------------
+# --- points, densities, meshes
+# ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("points", [1, 5, 1023, 1024, 5003])
@@ -200,7 +217,8 @@ def test_inertia_of_points_equals_numpy(points, dtype):
     positions = (rng.normal(size=(points, 3)) @ symmetric(0)).astype(dtype)
     exact = inertia_of(
         np.einsum(
-            "n,na,nb->ab", *(np.asarray(x, np.float64) for x in (masses, positions, positions))
+            "n,na,nb->ab",
+            *(np.asarray(x, np.float64) for x in (masses, positions, positions)),
         )
     )
     tensor = jr.inertia_tensor(masses, positions)
@@ -211,8 +229,15 @@ def test_inertia_of_points_equals_numpy(points, dtype):
 
 def test_derivatives_of_the_inertia_of_many_points_in_every_mode():
     rng = np.random.default_rng(3)
-    m, r = jnp.asarray(rng.uniform(0.5, 1.5, 1500)), jnp.asarray(rng.normal(size=(1500, 3)))
-    weight, dm, dr = jnp.asarray(symmetric(4)), jnp.asarray(rng.normal(size=1500)), r[::-1]
+    m, r = (
+        jnp.asarray(rng.uniform(0.5, 1.5, 1500)),
+        jnp.asarray(rng.normal(size=(1500, 3))),
+    )
+    weight, dm, dr = (
+        jnp.asarray(symmetric(4)),
+        jnp.asarray(rng.normal(size=1500)),
+        r[::-1],
+    )
 
     def f(m, r):
         return jnp.sum(weight * jr.inertia_tensor(m, r))
@@ -243,7 +268,9 @@ def test_derivatives_of_the_inertia_of_many_points_in_every_mode():
 
 def test_a_body_far_from_the_origin_keeps_its_digits():
     far = np.full(3, 1e6)
-    near_mesh, far_mesh = (jr.from_mesh(CUBE + d, CUBE_FACES) for d in (np.zeros(3), far))
+    near_mesh, far_mesh = (
+        jr.from_mesh(CUBE + d, CUBE_FACES) for d in (np.zeros(3), far)
+    )
     # The corners themselves round to 1e6 eps = 2e-10, exactly: they are integers.
     assert_ulps(far_mesh.inertia, near_mesh.inertia, 8)
     assert_ulps(far_mesh.center_of_mass, far + 0.5, 2)
@@ -260,21 +287,35 @@ def test_a_point_far_away_costs_no_digits_whatever_its_mass(light, towards):
     with mpmath.workdps(60):
         m, r = mpmath.matrix(masses.tolist()), mpmath.matrix(positions.tolist())
         center = (r.T * m) / sum(m)
-        arms = mpmath.matrix([[r[i, j] - center[j] for j in range(3)] for i in range(21)])
+        arms = mpmath.matrix(
+            [[r[i, j] - center[j] for j in range(3)] for i in range(21)]
+        )
         second = arms.T * mpmath.diag(list(m)) * arms
         trace = sum(second[i, i] for i in range(3))
         exact = np.array((trace * mpmath.eye(3) - second).tolist(), float)
         body = jr.from_points(masses, positions)
         assert_ulps(body.inertia, exact, 4)
         if towards[1] == 0:  # moment by moment, and so that none comes out negative
-            np.testing.assert_allclose(np.diag(body.inertia), np.diag(exact), rtol=4 * EPS)
-            assert min(mpmath.eigsy(mpmath.matrix(body.inertia.tolist()), eigvals_only=True)) > 0
+            np.testing.assert_allclose(
+                np.diag(body.inertia), np.diag(exact), rtol=4 * EPS
+            )
+            assert (
+                min(
+                    mpmath.eigsy(
+                        mpmath.matrix(body.inertia.tolist()), eigvals_only=True
+                    )
+                )
+                > 0
+            )
 
 
 def test_density_by_quadrature_is_exact_for_polynomials():
     # rho = x y^2 over [0, 1] x [0, 2] x [1, 2]: moments by hand.
     body = jr.from_density(
-        lambda r: r[0] * r[1] ** 2, jnp.array([0.0, 0, 1]), jnp.array([1.0, 2, 2]), order=3
+        lambda r: r[0] * r[1] ** 2,
+        jnp.array([0.0, 0, 1]),
+        jnp.array([1.0, 2, 2]),
+        order=3,
     )
     x = [1 / 2, 1 / 3, 1 / 4]
     y = [8 / 3, 4.0, 32 / 5]
@@ -291,9 +332,15 @@ def test_density_by_quadrature_is_exact_for_polynomials():
     assert_ulps(body.mass, mass, 8)
     assert_ulps(body.center_of_mass, centre, 8)
     assert_ulps(body.about(jnp.zeros(3)), inertia_of(second), 8)
-    slope = jax.jit(jax.grad(
-        lambda p: jr.from_density(lambda r: 1 + p * r[0] ** 2, jnp.zeros(3), jnp.ones(3), order=4).mass
-    ))(1.0)  # fmt: skip
+    slope = jax.jit(
+        jax.grad(
+            lambda p: (
+                jr.from_density(
+                    lambda r: 1 + p * r[0] ** 2, jnp.zeros(3), jnp.ones(3), order=4
+                ).mass
+            )
+        )
+    )(1.0)
     np.testing.assert_allclose(slope, 1 / 3, rtol=8 * EPS)
 
 
@@ -306,21 +353,30 @@ def test_a_cavity_is_a_surface_turned_inward():
 
 
 def test_derivatives_of_a_mesh_in_its_vertices():
-    weight, change = jnp.asarray(symmetric(5)), np.random.default_rng(6).normal(size=(8, 3))
+    weight, change = (
+        jnp.asarray(symmetric(5)),
+        np.random.default_rng(6).normal(size=(8, 3)),
+    )
 
     def f(vertices):
         body = jr.from_mesh(vertices, CUBE_FACES, 2.0)
-        return body.mass + jnp.sum(body.center_of_mass**2) + jnp.sum(weight * body.inertia)
+        return (
+            body.mass + jnp.sum(body.center_of_mass**2) + jnp.sum(weight * body.inertia)
+        )
 
     value = jax.jit(f)
     reverse, forward = jax.jit(
-        lambda v: (jnp.sum(jax.grad(f)(v) * change), jax.jvp(f, (v,), (jnp.asarray(change),))[1])
+        lambda v: (
+            jnp.sum(jax.grad(f)(v) * change),
+            jax.jvp(f, (v,), (jnp.asarray(change),))[1],
+        )
     )(CUBE)
     h = EPS ** (1 / 3)
     central = (value(CUBE + h * change) - value(CUBE - h * change)) / (2 * h)
     np.testing.assert_allclose(reverse, central, rtol=1e-9)
     np.testing.assert_allclose(forward, reverse, rtol=1e-13)
-    # Gauss: the volume grows by the flux of the displacement, three volumes for a dilation.
+    # Gauss: the volume grows by the flux of the displacement, three volumes for a
+    # dilation.
     dilation = jax.jit(
         lambda v: jax.jvp(lambda v: jr.from_mesh(v, CUBE_FACES).mass, (v,), (v,))[1]
     )(CUBE)
@@ -339,8 +395,12 @@ def _bad_meshes():
     four = np.concatenate([OUTWARD, [[0, 4, 1], [0, 1, 5], [0, 5, 4], [1, 4, 5]]])
     soup = np.arange(36).reshape(12, 3)
     closed, inside_out = "closed surface", "inside out"
-    apex = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]])
-    big = np.concatenate([CUBE, CUBE * 0.9 + 5])  # a second cube, inside out and not inside
+    apex = np.array(
+        [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]]
+    )
+    big = np.concatenate(
+        [CUBE, CUBE * 0.9 + 5]
+    )  # a second cube, inside out and not inside
     return {
         "open": (CUBE, CUBE_FACES[:-1], closed),
         "open by two faces": (CUBE, CUBE_FACES[:-2], closed),
@@ -380,9 +440,20 @@ def test_bad_mesh_is_an_error_for_known_faces(name):
 mesh_of_traced_faces = jax.jit(functools.partial(jr.from_mesh, throw=False))
 
 
-@pytest.mark.parametrize("name", ["open by two faces", "one face flipped", "index out of range",
-                                  "negative index", "degenerate faces", "repeated faces",
-                                  "four faces at an edge", "inside out", "corners not merged"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "open by two faces",
+        "one face flipped",
+        "index out of range",
+        "negative index",
+        "degenerate faces",
+        "repeated faces",
+        "four faces at an edge",
+        "inside out",
+        "corners not merged",
+    ],
+)
 def test_bad_mesh_is_found_among_traced_faces(name):
     vertices, faces, _ = BAD_MESHES[name]
     assert_nan(mesh_of_traced_faces(vertices, faces))
@@ -407,7 +478,9 @@ def test_open_meshes_are_found_however_their_vertices_are_numbered(fault):
             }[fault]
         )
     assert not any(is_closed(faces, 8) for faces in meshes)
-    traced = jax.jit(jax.vmap(lambda faces: is_closed_traced(faces, 8)))(np.stack(meshes))
+    traced = jax.jit(jax.vmap(lambda faces: is_closed_traced(faces, 8)))(
+        np.stack(meshes)
+    )
     assert not np.any(traced)
 
 
@@ -466,7 +539,9 @@ def test_surfaces_are_taken_at_their_word(name):
         np.testing.assert_allclose(body.mass, volumes.sum(), rtol=eps)
         np.testing.assert_allclose(body.center_of_mass, center, rtol=eps, atol=eps)
         exact = own + inertia_of(np.einsum("n,na,nb->ab", volumes, arms, arms))
-        np.testing.assert_allclose(body.inertia, exact, rtol=eps, atol=eps * np.max(exact))
+        np.testing.assert_allclose(
+            body.inertia, exact, rtol=eps, atol=eps * np.max(exact)
+        )
 
 
 def test_derivatives_of_a_hollow_mesh_in_its_vertices():
@@ -474,12 +549,14 @@ def test_derivatives_of_a_hollow_mesh_in_its_vertices():
     volume = lambda v, faces: jr.from_mesh(v, faces).mass  # noqa: E731
     found = jax.jit(jax.grad(lambda v: volume(v, faces)))(vertices)
     of_a_cube = jax.jit(jax.grad(lambda v: volume(v, CUBE_FACES)))
-    # The cavity's own volume grows by as much as the body loses: a cube mirrored at its centre.
+    # The cavity's own volume grows by as much as the body loses: a cube mirrored at its
+    # centre.
     outer, inner = of_a_cube(vertices[:8]), -of_a_cube(-vertices[8:])
     np.testing.assert_allclose(found, np.concatenate([outer, -inner]), atol=8 * EPS)
 
 
-# --- principal axes and functions of a tensor ------------------------------------------------
+# --- principal axes and functions of a tensor
+# ------------------------------------------------
 
 
 def test_principal_axes_rebuild_the_tensor_in_order_right_handed_with_fixed_signs():
@@ -488,12 +565,16 @@ def test_principal_axes_rebuild_the_tensor_in_order_right_handed_with_fixed_sign
         axes = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
         moments = 10 ** rng.uniform(-6, 0, size=(500, 3))
         moments[:100, 1] = moments[:100, 0]
-        moments[100:200, 2] = moments[100:200, 1] * (1 + 10 ** rng.uniform(-16, -2, 100))
+        moments[100:200, 2] = moments[100:200, 1] * (
+            1 + 10 ** rng.uniform(-16, -2, 100)
+        )
         tensors = np.einsum("nij,nj,nkj->nik", axes, moments, axes).astype(dtype)
         tensors = (tensors + np.swapaxes(tensors, 1, 2)) / 2
         found = jax.jit(jax.vmap(jr.principal_axes))(tensors)
         turned = np.float64(found.axes)
-        rebuilt = np.einsum("nij,nj,nkj->nik", turned, np.float64(found.moments), turned)
+        rebuilt = np.einsum(
+            "nij,nj,nkj->nik", turned, np.float64(found.moments), turned
+        )
         eps = np.finfo(dtype).eps
         scale = np.max(np.abs(tensors), axis=(1, 2), keepdims=True)
         assert np.max(np.abs(rebuilt - tensors) / scale) < 16 * eps
@@ -501,7 +582,9 @@ def test_principal_axes_rebuild_the_tensor_in_order_right_handed_with_fixed_sign
         assert np.all(np.linalg.det(turned) > 0)
         assert np.all(np.diff(found.moments, axis=1) >= 0)
         leading = np.abs(turned) >= 0.9 * np.max(np.abs(turned), axis=1, keepdims=True)
-        first = np.take_along_axis(turned, np.argmax(leading, axis=1)[:, None], axis=1)[:, 0]
+        first = np.take_along_axis(turned, np.argmax(leading, axis=1)[:, None], axis=1)[
+            :, 0
+        ]
         assert np.all(first[:, [0, 2]] > 0)
 
 
@@ -535,7 +618,10 @@ def near_repeated():
 def test_first_derivatives_of_symmetric_functions_of_moments_at_repeated_moments():
     # Exact by algebra: sum 1/m = tr I^-1, sum m^3 = tr I^3, prod m = det I.
     functions = {
-        "sum of reciprocals": (lambda m: jnp.sum(1 / m), lambda a: -np.linalg.inv(a @ a)),
+        "sum of reciprocals": (
+            lambda m: jnp.sum(1 / m),
+            lambda a: -np.linalg.inv(a @ a),
+        ),
         "sum of cubes": (lambda m: jnp.sum(m**3), lambda a: 3 * a @ a),
         "product": (jnp.prod, lambda a: np.linalg.det(a) * np.linalg.inv(a)),
         "middle of pairs": (
@@ -564,7 +650,9 @@ def test_first_derivatives_of_symmetric_functions_of_moments_at_repeated_moments
     for name, (_, exact) in functions.items():
         reverse, forward = found[name]
         expected = np.stack([exact(tensor) for tensor in tensors])
-        np.testing.assert_allclose(reverse, expected, atol=2e-14 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(
+            reverse, expected, atol=2e-14 * np.max(np.abs(expected))
+        )
         along = np.einsum("nij,nij->n", expected, directions)
         np.testing.assert_allclose(forward, along, atol=1e-13 * np.max(np.abs(along)))
 
@@ -573,7 +661,9 @@ def test_derivatives_of_axes_where_moments_are_apart_and_their_finiteness_where_
     direction = jnp.asarray(symmetric(9))
     tensor = jnp.asarray(rotation(2) @ np.diag([1.0, 1.7, 2.3]) @ rotation(2).T)
     slope = jax.jit(
-        lambda tensor: jax.jvp(lambda x: jr.principal_axes(x).axes, (tensor,), (direction,))[1]
+        lambda tensor: jax.jvp(
+            lambda x: jr.principal_axes(x).axes, (tensor,), (direction,)
+        )[1]
     )
     axes = jax.jit(lambda tensor: jr.principal_axes(tensor).axes)
     h = EPS ** (1 / 3)
@@ -592,8 +682,8 @@ ORDERS = {
 
 
 def test_tensor_function_to_second_order_at_repeated_moments():
-    # Exact by algebra, f = 1/x: D f[H] = -J H J, D2 f[H, G] = J H J G J + J G J H J, J = I^-1;
-    # f = x^3: D f[H] = H I I + I H I + I I H and so on.
+    # Exact by algebra, f = 1/x: D f[H] = -J H J, D2 f[H, G] = J H J G J + J G J H J, J
+    # = I^-1; f = x^3: D f[H] = H I I + I H I + I I H and so on.
     tensors = near_repeated()
     h_all = np.stack([symmetric(200 + i) for i in range(len(tensors))])
     g_all = np.stack([symmetric(300 + i) for i in range(len(tensors))])
@@ -603,9 +693,18 @@ def test_tensor_function_to_second_order_at_repeated_moments():
         inverse = -j @ h @ j, j @ h @ j @ g @ j + j @ g @ j @ h @ j
         cube = (
             h @ tensor @ tensor + tensor @ h @ tensor + tensor @ tensor @ h,
-            sum(a @ b @ c for a, b, c in ((h, g, tensor), (g, h, tensor), (h, tensor, g),
-                                          (g, tensor, h), (tensor, h, g), (tensor, g, h))),
-        )  # fmt: skip
+            sum(
+                a @ b @ c
+                for a, b, c in (
+                    (h, g, tensor),
+                    (g, h, tensor),
+                    (h, tensor, g),
+                    (g, tensor, h),
+                    (tensor, h, g),
+                    (tensor, g, h),
+                )
+            ),
+        )
         return inverse, cube
 
     @jax.jit
@@ -635,13 +734,20 @@ def test_tensor_function_second_derivatives_agree_in_every_mode_and_in_parameter
         return jnp.sum(weight * jnp.sin(jr.tensor_function(lambda m: m**p, tensor)))
 
     cases = jnp.stack(
-        [jnp.eye(3), jnp.diag(jnp.array([1.0, 1.0, 1.5])), jnp.asarray(near_repeated()[-3])]
+        [
+            jnp.eye(3),
+            jnp.diag(jnp.array([1.0, 1.0, 1.5])),
+            jnp.asarray(near_repeated()[-3]),
+        ]
     )
     p = jnp.asarray(0.7)
 
     @functools.partial(jax.jit, compiler_options=QUICK)
     def every(cases):
-        second = {name: jax.vmap(lambda x, o=o: o[0](o[1](f))(x, p))(cases) for name, o in ORDERS.items()}  # fmt: skip
+        second = {
+            name: jax.vmap(lambda x, o=o: o[0](o[1](f))(x, p))(cases)
+            for name, o in ORDERS.items()
+        }
         mixed = jax.vmap(lambda x: jax.jacrev(jax.grad(f), argnums=1)(x, p))(cases)
         return second, mixed
 
@@ -655,7 +761,9 @@ def test_tensor_function_second_derivatives_agree_in_every_mode_and_in_parameter
         step = np.zeros((3, 3))
         step[i, j] += h / 2
         step[j, i] += h / 2
-        central = (gradient(cases + step[None], p) - gradient(cases - step[None], p)) / (2 * h)
+        central = (
+            gradient(cases + step[None], p) - gradient(cases - step[None], p)
+        ) / (2 * h)
         expected = 0.5 * (reference[..., i, j] + reference[..., j, i])
         np.testing.assert_allclose(central, expected, atol=1e-9)
     central = (gradient(cases, p + h) - gradient(cases, p - h)) / (2 * h)
@@ -670,7 +778,9 @@ def square_root_and_slopes(tensor, h, g):
     return jax.jvp(first, (tensor,), (g,))
 
 
-@pytest.mark.parametrize("moments", [[1.0, 1.0, 1.0], [1.0, 1 + 1e-9, 1.5], [1e-4, 1.0, 1 + 1e-5]])
+@pytest.mark.parametrize(
+    "moments", [[1.0, 1.0, 1.0], [1.0, 1 + 1e-9, 1.5], [1e-4, 1.0, 1 + 1e-5]]
+)
 def test_tensor_function_square_root_against_mpmath(moments):
     mpmath.mp.dps = 60
     tensor = rotation(3) @ np.diag(moments) @ rotation(3).T
@@ -689,7 +799,9 @@ def test_tensor_function_square_root_against_mpmath(moments):
     found = square_root_and_slopes(tensor, h, g)
     tolerance = 30 * EPS * max(moments) / min(moments)
     np.testing.assert_allclose(found[0], first, atol=tolerance * np.max(np.abs(first)))
-    np.testing.assert_allclose(found[1], second, atol=30 * tolerance * np.max(np.abs(second)))
+    np.testing.assert_allclose(
+        found[1], second, atol=30 * tolerance * np.max(np.abs(second))
+    )
 
 
 def test_third_derivatives_of_tensor_function_raise_instead_of_being_wrong():
@@ -703,12 +815,15 @@ def test_third_derivatives_of_tensor_function_raise_instead_of_being_wrong():
             jax.jit(third)(jnp.eye(3))
 
 
-# --- transformations and precision -----------------------------------------------------------
+# --- transformations and precision
+# -----------------------------------------------------------
 
 
 def every_function(x):
     """All of the module's functions of one array (3,) near one; x[0] < x[1] + x[2] and so on."""
-    tensor = jnp.diag(x) + 0.1 * x[0] * (jnp.ones((3, 3), x.dtype) - jnp.eye(3, dtype=x.dtype))
+    tensor = jnp.diag(x) + 0.1 * x[0] * (
+        jnp.ones((3, 3), x.dtype) - jnp.eye(3, dtype=x.dtype)
+    )
     quaternion = jnp.concatenate([x, x[:1]])
     body = jr.MassProperties(x[0], x, tensor)
     moved = body.translated(x)
@@ -717,8 +832,12 @@ def every_function(x):
     return {
         "from_points": jr.from_points(x, points),
         "inertia_tensor": jr.inertia_tensor(x, points),
-        "from_density": jr.from_density(lambda r: 1 + jnp.sum((r * x) ** 2), -x, x, order=3),
-        "from_mesh": jr.from_mesh(jnp.asarray(CUBE, x.dtype) * x[None, :], CUBE_FACES, x[1]),
+        "from_density": jr.from_density(
+            lambda r: 1 + jnp.sum((r * x) ** 2), -x, x, order=3
+        ),
+        "from_mesh": jr.from_mesh(
+            jnp.asarray(CUBE, x.dtype) * x[None, :], CUBE_FACES, x[1]
+        ),
         "parallel_axis": jr.parallel_axis(x, x[0], x),
         "to_center_of_mass": jr.to_center_of_mass(tensor, 0.01 * x[0], x),
         "principal_axes": principal.moments,
@@ -739,7 +858,8 @@ def test_every_public_name_is_among_the_functions():
     names = {
         name
         for name, value in vars(jr.mass).items()
-        if not name.startswith("_") and "jrigid.mass" in getattr(value, "__module__", "")
+        if not name.startswith("_")
+        and "jrigid.mass" in getattr(value, "__module__", "")
     }
     for name in ("MassProperties", "PrincipalAxes"):
         kind = getattr(jr.mass, name)
@@ -753,7 +873,9 @@ def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
 
     def everything(x):
         def total(x):
-            return sum(jnp.sum(jnp.cos(leaf)) for leaf in jax.tree.leaves(every_function(x)))
+            return sum(
+                jnp.sum(jnp.cos(leaf)) for leaf in jax.tree.leaves(every_function(x))
+            )
 
         slopes, values = jax.jacfwd(lambda x: (every_function(x),) * 2, has_aux=True)(x)
         return values, slopes, jax.grad(total)(x)
@@ -766,8 +888,12 @@ def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
     results = {}
     for dtype in (jnp.float64, jnp.float32):
         values, slopes, gradient = batched(jnp.stack([x64, x64[::-1]]).astype(dtype))
-        assert all(leaf.dtype == dtype for leaf in jax.tree.leaves((values, slopes, gradient)))
-        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((values, slopes)))
+        assert all(
+            leaf.dtype == dtype for leaf in jax.tree.leaves((values, slopes, gradient))
+        )
+        assert all(
+            np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((values, slopes))
+        )
         one = jax.tree.map(lambda leaf: np.asarray(leaf[0]), (values, slopes))
         scale = np.max(np.abs(gradient))
         np.testing.assert_allclose(
@@ -776,7 +902,9 @@ def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
         results[dtype] = (values, slopes)
     eager = every_function(x64)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b[0], atol=1e-14), eager, results[jnp.float64][0]
+        lambda a, b: np.testing.assert_allclose(a, b[0], atol=1e-14),
+        eager,
+        results[jnp.float64][0],
     )
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4),
@@ -788,7 +916,11 @@ def test_every_function_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
 def weighted_sum(body):
     """A number that mass, centre and every moment enter with curvature."""
     weights = np.cos(1.0 + np.arange(9.0)).reshape(3, 3)
-    return body.mass**2 + jnp.sum(jnp.sin(body.center_of_mass)) + jnp.sum(weights * body.inertia**2)
+    return (
+        body.mass**2
+        + jnp.sum(jnp.sin(body.center_of_mass))
+        + jnp.sum(weights * body.inertia**2)
+    )
 
 
 HOLLOW, HOLLOW_FACES = cubes(([0.0, 0, 0], 1.0), ([0.1, 0.05, 0], -0.5))
@@ -797,15 +929,32 @@ CURVED = {
     "mesh": (lambda v: jr.from_mesh(v, CUBE_FACES, 2.0), CUBE),
     "mesh with a cavity": (lambda v: jr.from_mesh(v, HOLLOW_FACES, 2.0), HOLLOW),
     "positions": (lambda r: jr.from_points(jnp.arange(1.0, 41.0) / 40, r), CLOUD),
-    "positions of many": (lambda r: jr.from_points(jnp.ones(1200) / 1200, jnp.concatenate([r] * 30)), CLOUD),
+    "positions of many": (
+        lambda r: jr.from_points(jnp.ones(1200) / 1200, jnp.concatenate([r] * 30)),
+        CLOUD,
+    ),
     "masses": (lambda m: jr.from_points(m, CLOUD), np.arange(1.0, 41.0) / 40),
-    "density": (lambda c: jr.from_density(lambda r: 1 + jnp.sum((r * c) ** 2), -ONES, ONES, order=4), np.array([1.0, 0.5, 2.0])),
-    "box of a density": (lambda a: jr.from_density(lambda r: jnp.exp(r[0] - r[1]), -a, ONES, order=4), np.array([1.0, 0.5, 2.0])),
+    "density": (
+        lambda c: jr.from_density(
+            lambda r: 1 + jnp.sum((r * c) ** 2), -ONES, ONES, order=4
+        ),
+        np.array([1.0, 0.5, 2.0]),
+    ),
+    "box of a density": (
+        lambda a: jr.from_density(lambda r: jnp.exp(r[0] - r[1]), -a, ONES, order=4),
+        np.array([1.0, 0.5, 2.0]),
+    ),
     "capsule": (lambda x: jr.solids.capsule(*x), np.array([1.0, 0.5, 2.0])),
     "shell": (lambda x: jr.solids.shell(*x), np.array([1.0, 0.5, 1.2])),
-    "tetrahedron": (lambda v: jr.solids.tetrahedron(1.5, v), np.array([[0.1, 0, 0.3], [1, 0.2, -0.1], [0.3, 1.5, 0.2], [0.2, 0.4, 2]])),
-    "turned": (lambda q: jr.solids.box(1.0, np.arange(1.0, 4)).translated(ONES).rotated(q), np.array([1.0, 0.2, 0.3, 0.4])),
-}  # fmt: skip
+    "tetrahedron": (
+        lambda v: jr.solids.tetrahedron(1.5, v),
+        np.array([[0.1, 0, 0.3], [1, 0.2, -0.1], [0.3, 1.5, 0.2], [0.2, 0.4, 2]]),
+    ),
+    "turned": (
+        lambda q: jr.solids.box(1.0, np.arange(1.0, 4)).translated(ONES).rotated(q),
+        np.array([1.0, 0.2, 0.3, 0.4]),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", CURVED)
@@ -818,17 +967,23 @@ def test_second_derivatives_equal_differences_of_the_gradient(name):
     @functools.partial(jax.jit, compiler_options=QUICK)
     def derivatives(x):
         gradient, curvature = jax.jvp(jax.grad(total), (x,), (along,))
-        forward = jax.jvp(lambda x: jax.jvp(total, (x,), (across,))[1], (x,), (along,))[1]
+        forward = jax.jvp(lambda x: jax.jvp(total, (x,), (across,))[1], (x,), (along,))[
+            1
+        ]
         return gradient, curvature, forward
 
     _, curvature, forward = derivatives(x)
     h = 1e-5
-    difference = (derivatives(x + h * along)[0] - derivatives(x - h * along)[0]) / (2 * h)
+    difference = (derivatives(x + h * along)[0] - derivatives(x - h * along)[0]) / (
+        2 * h
+    )
     scale = np.max(np.abs(difference))
     # truncation is about h^2 of the fourth derivative, rounding eps / h
     np.testing.assert_allclose(curvature, difference, rtol=0, atol=1e-8 * scale)
     size = scale * np.sum(np.abs(across))
-    np.testing.assert_allclose(np.sum(curvature * across), forward, rtol=0, atol=64 * EPS * size)
+    np.testing.assert_allclose(
+        np.sum(curvature * across), forward, rtol=0, atol=64 * EPS * size
+    )
 
 
 def test_a_gradient_in_mass_properties_has_their_shape():
@@ -839,7 +994,8 @@ def test_a_gradient_in_mass_properties_has_their_shape():
     np.testing.assert_allclose(gradient.inertia, np.eye(3))
 
 
-# --- bad input -------------------------------------------------------------------------------
+# --- bad input
+# -------------------------------------------------------------------------------
 
 ONES, ZEROS = np.ones(3), np.zeros(3)
 SKEW = np.arange(9.0).reshape(3, 3)
@@ -847,25 +1003,89 @@ THREE_LANES = np.array([[1.0, 2.0, 2.5], [1.0, 1.0, 1.5], [2.0, 2.0, 2.0]])
 POINTS = np.eye(3)
 
 BAD_VALUES = {
-    "negative mass": (jr.MassProperties, (-1.0, ZEROS, ONES), r"`mass` must be positive and finite, but it is not: -1\.0\."),
+    "negative mass": (
+        jr.MassProperties,
+        (-1.0, ZEROS, ONES),
+        r"`mass` must be positive and finite, but it is not: -1\.0\.",
+    ),
     "zero mass": (jr.MassProperties, (0.0, ZEROS, ONES), "`mass` must be positive"),
     "NaN mass": (jr.MassProperties, (np.nan, ZEROS, ONES), "`mass` must be positive"),
-    "NaN centre": (jr.MassProperties, (1.0, ZEROS * np.nan, ONES), "`center_of_mass` must be finite"),
-    "NaN moment": (jr.MassProperties, (1.0, ZEROS, ONES * np.nan), "`inertia` must hold three"),
-    "infinite moment": (jr.MassProperties, (1.0, ZEROS, ONES * np.inf), "`inertia` must hold three"),
-    "negative moment": (jr.MassProperties, (1.0, ZEROS, np.array([-0.1, 1, 1])), r"`inertia` must hold three.*: \[-0\.1"),
-    "three lanes of moments": (jr.MassProperties, (1.0, ZEROS, THREE_LANES), "three lanes of `jax.vmap`"),
-    "triangle inequality": (jr.MassProperties, (1.0, ZEROS, np.array([1.0, 1.0, 2.1])), "real body"),
-    "negative point mass": (jr.from_points, (-ONES, POINTS), r"`masses` must be finite and non-negative, but it is not: -1\.0"),
-    "massless points": (jr.from_points, (ZEROS, POINTS), "`masses` must not be all zero"),
-    "NaN point mass": (jr.from_points, (ONES * np.nan, POINTS), "`masses` must be finite"),
-    "NaN position": (jr.from_points, (ONES, POINTS * np.nan), r"`positions` must be finite, but it is not: \[nan"),
-    "negative density": (lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k), (-1.0,), "`density` must be finite and non-negative"),
-    "NaN density": (lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k), (np.nan,), "`density` must be finite"),
-    "no density": (lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k), (0.0,), "`density` must not be zero"),
-    "box turned round": (lambda a, b, **k: jr.from_density(lambda r: 1 + r[0], a, b, **k), (ONES, ZEROS), "`lower` < `upper`"),
-    "negative density of a mesh": (lambda d, **k: jr.from_mesh(CUBE, CUBE_FACES, d, **k), (-1.0,), "`density` must be positive"),
-}  # fmt: skip
+    "NaN centre": (
+        jr.MassProperties,
+        (1.0, ZEROS * np.nan, ONES),
+        "`center_of_mass` must be finite",
+    ),
+    "NaN moment": (
+        jr.MassProperties,
+        (1.0, ZEROS, ONES * np.nan),
+        "`inertia` must hold three",
+    ),
+    "infinite moment": (
+        jr.MassProperties,
+        (1.0, ZEROS, ONES * np.inf),
+        "`inertia` must hold three",
+    ),
+    "negative moment": (
+        jr.MassProperties,
+        (1.0, ZEROS, np.array([-0.1, 1, 1])),
+        r"`inertia` must hold three.*: \[-0\.1",
+    ),
+    "three lanes of moments": (
+        jr.MassProperties,
+        (1.0, ZEROS, THREE_LANES),
+        "three lanes of `jax.vmap`",
+    ),
+    "triangle inequality": (
+        jr.MassProperties,
+        (1.0, ZEROS, np.array([1.0, 1.0, 2.1])),
+        "real body",
+    ),
+    "negative point mass": (
+        jr.from_points,
+        (-ONES, POINTS),
+        r"`masses` must be finite and non-negative, but it is not: -1\.0",
+    ),
+    "massless points": (
+        jr.from_points,
+        (ZEROS, POINTS),
+        "`masses` must not be all zero",
+    ),
+    "NaN point mass": (
+        jr.from_points,
+        (ONES * np.nan, POINTS),
+        "`masses` must be finite",
+    ),
+    "NaN position": (
+        jr.from_points,
+        (ONES, POINTS * np.nan),
+        r"`positions` must be finite, but it is not: \[nan",
+    ),
+    "negative density": (
+        lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k),
+        (-1.0,),
+        "`density` must be finite and non-negative",
+    ),
+    "NaN density": (
+        lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k),
+        (np.nan,),
+        "`density` must be finite",
+    ),
+    "no density": (
+        lambda c, **k: jr.from_density(lambda r: c * r[0], ZEROS, ONES, **k),
+        (0.0,),
+        "`density` must not be zero",
+    ),
+    "box turned round": (
+        lambda a, b, **k: jr.from_density(lambda r: 1 + r[0], a, b, **k),
+        (ONES, ZEROS),
+        "`lower` < `upper`",
+    ),
+    "negative density of a mesh": (
+        lambda d, **k: jr.from_mesh(CUBE, CUBE_FACES, d, **k),
+        (-1.0,),
+        "`density` must be positive",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BAD_VALUES)
@@ -876,8 +1096,16 @@ def test_bad_value_is_an_error_or_nan(name):
     assert_nan(function(*arguments, throw=False))
 
 
-@pytest.mark.parametrize("name", ["negative mass", "three lanes of moments", "triangle inequality",
-                                  "NaN position", "negative density"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "negative mass",
+        "three lanes of moments",
+        "triangle inequality",
+        "NaN position",
+        "negative density",
+    ],
+)
 def test_bad_value_is_an_error_under_jit(name):
     function, arguments, message = BAD_VALUES[name]
     with pytest.raises(RuntimeError, match=message.partition(", but it is not: ")[0]):
@@ -886,17 +1114,47 @@ def test_bad_value_is_an_error_under_jit(name):
 
 BAD_LANES = {
     "negative mass": (jr.MassProperties, ([1.0, -1, 2], [ONES] * 3, [ONES] * 3)),
-    "NaN centre": (jr.MassProperties, ([1.0, 1, 2], [ONES, ONES * np.nan, ONES], [ONES] * 3)),
-    "three lanes of moments": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [np.eye(3), THREE_LANES, np.eye(3)])),
-    "NaN inertia": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, ONES * np.nan, ONES])),
-    "triangle inequality": (jr.MassProperties, ([1.0, 1, 2], [ONES] * 3, [ONES, [1, 1, 3.0], ONES])),
+    "NaN centre": (
+        jr.MassProperties,
+        ([1.0, 1, 2], [ONES, ONES * np.nan, ONES], [ONES] * 3),
+    ),
+    "three lanes of moments": (
+        jr.MassProperties,
+        ([1.0, 1, 2], [ONES] * 3, [np.eye(3), THREE_LANES, np.eye(3)]),
+    ),
+    "NaN inertia": (
+        jr.MassProperties,
+        ([1.0, 1, 2], [ONES] * 3, [ONES, ONES * np.nan, ONES]),
+    ),
+    "triangle inequality": (
+        jr.MassProperties,
+        ([1.0, 1, 2], [ONES] * 3, [ONES, [1, 1, 3.0], ONES]),
+    ),
     "points: negative mass": (jr.from_points, ([ONES, -ONES, ONES], [POINTS] * 3)),
     "points: NaN": (jr.from_points, ([ONES] * 3, [POINTS, POINTS * np.nan, POINTS])),
-    "mesh inside out": (lambda v, throw=True: jr.from_mesh(v, CUBE_FACES, throw=throw), ([CUBE, -CUBE, 2 * CUBE],)),
-    "mesh open": (lambda f, throw=True: jr.from_mesh(CUBE, f, throw=throw), (np.stack([CUBE_FACES, np.roll(CUBE_FACES, 1, 0) * 0 + CUBE_FACES[:1], CUBE_FACES]),)),
-    "mesh of a negative density": (lambda d, throw=True: jr.from_mesh(CUBE, CUBE_FACES, d, throw=throw), ([1.0, -1, 2],)),
-    "negative density": (lambda c, throw=True: jr.from_density(lambda r: c * r[0], ZEROS, ONES, order=2, throw=throw), ([1.0, -1, 2],)),
-}  # fmt: skip
+    "mesh inside out": (
+        lambda v, throw=True: jr.from_mesh(v, CUBE_FACES, throw=throw),
+        ([CUBE, -CUBE, 2 * CUBE],),
+    ),
+    "mesh open": (
+        lambda f, throw=True: jr.from_mesh(CUBE, f, throw=throw),
+        (
+            np.stack(
+                [CUBE_FACES, np.roll(CUBE_FACES, 1, 0) * 0 + CUBE_FACES[:1], CUBE_FACES]
+            ),
+        ),
+    ),
+    "mesh of a negative density": (
+        lambda d, throw=True: jr.from_mesh(CUBE, CUBE_FACES, d, throw=throw),
+        ([1.0, -1, 2],),
+    ),
+    "negative density": (
+        lambda c, throw=True: jr.from_density(
+            lambda r: c * r[0], ZEROS, ONES, order=2, throw=throw
+        ),
+        ([1.0, -1, 2],),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BAD_LANES)
@@ -907,43 +1165,94 @@ def test_a_bad_lane_is_named_or_nan_and_leaves_the_others_alone(name):
         jax.vmap(function)(*lanes)
     batch = jax.jit(jax.vmap(functools.partial(function, throw=False)))(*lanes)
     for i in (0, 2):
-        lane, alone = jax.tree.map(lambda x, i=i: x[i], batch), function(*(x[i] for x in lanes))
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * EPS), lane, alone)
+        lane, alone = (
+            jax.tree.map(lambda x, i=i: x[i], batch),
+            function(*(x[i] for x in lanes)),
+        )
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * EPS), lane, alone
+        )
     assert_nan(jax.tree.map(lambda x: x[1], batch))
 
 
 GOOD_CENTER = np.array([0.5, -1.0, 2.0])
 BAD_FORMULAS = {
-    "skew tensor displaced": (jr.parallel_axis, ([np.eye(3), SKEW], [1.0, 1], [ONES] * 2)),
-    "NaN tensor displaced": (jr.parallel_axis, ([ONES, ONES * np.nan], [1.0, 1], [ONES] * 2)),
+    "skew tensor displaced": (
+        jr.parallel_axis,
+        ([np.eye(3), SKEW], [1.0, 1], [ONES] * 2),
+    ),
+    "NaN tensor displaced": (
+        jr.parallel_axis,
+        ([ONES, ONES * np.nan], [1.0, 1], [ONES] * 2),
+    ),
     "negative mass displaced": (jr.parallel_axis, ([ONES] * 2, [1.0, -1], [ONES] * 2)),
-    "displaced to infinity": (jr.parallel_axis, ([ONES] * 2, [1.0, 1], [ONES, ONES * np.inf])),
-    "three lanes displaced back": (jr.to_center_of_mass, ([4 * np.eye(3), THREE_LANES], [1.0, 1], [ONES] * 2)),
-    "NaN displaced back": (jr.to_center_of_mass, ([3 * ONES, ONES * np.nan], [0.1, 0.1], [ONES] * 2)),
-    "NaN mass displaced back": (jr.to_center_of_mass, ([3 * ONES] * 2, [0.1, np.nan], [ONES] * 2)),
-    "displaced back from NaN": (jr.to_center_of_mass, ([3 * ONES] * 2, [0.1, 0.1], [ONES, ONES * np.nan])),
-    "displaced back too far": (jr.to_center_of_mass, ([3 * ONES] * 2, [0.1, 3.0], [ONES] * 2)),
+    "displaced to infinity": (
+        jr.parallel_axis,
+        ([ONES] * 2, [1.0, 1], [ONES, ONES * np.inf]),
+    ),
+    "three lanes displaced back": (
+        jr.to_center_of_mass,
+        ([4 * np.eye(3), THREE_LANES], [1.0, 1], [ONES] * 2),
+    ),
+    "NaN displaced back": (
+        jr.to_center_of_mass,
+        ([3 * ONES, ONES * np.nan], [0.1, 0.1], [ONES] * 2),
+    ),
+    "NaN mass displaced back": (
+        jr.to_center_of_mass,
+        ([3 * ONES] * 2, [0.1, np.nan], [ONES] * 2),
+    ),
+    "displaced back from NaN": (
+        jr.to_center_of_mass,
+        ([3 * ONES] * 2, [0.1, 0.1], [ONES, ONES * np.nan]),
+    ),
+    "displaced back too far": (
+        jr.to_center_of_mass,
+        ([3 * ONES] * 2, [0.1, 3.0], [ONES] * 2),
+    ),
     "negative mass of a point": (jr.inertia_tensor, ([ONES, -ONES], [POINTS] * 2)),
-    "NaN position of a point": (jr.inertia_tensor, ([ONES] * 2, [POINTS, POINTS * [[1, 1, np.nan]]])),
+    "NaN position of a point": (
+        jr.inertia_tensor,
+        ([ONES] * 2, [POINTS, POINTS * [[1, 1, np.nan]]]),
+    ),
     "axes of a skew tensor": (jr.principal_axes, ([np.diag([1.0, 2.0, 3.0]), SKEW],)),
-    "axes of three lanes": (jr.principal_axes, ([np.diag([1.0, 2.0, 3.0]), THREE_LANES],)),
+    "axes of three lanes": (
+        jr.principal_axes,
+        ([np.diag([1.0, 2.0, 3.0]), THREE_LANES],),
+    ),
     "axes of NaN": (jr.principal_axes, ([ONES * [1, 2, 3], ONES * np.nan],)),
-    "function of a skew tensor": (functools.partial(jr.tensor_function, jnp.log), ([np.eye(3) * 2, SKEW],)),
-    "function of NaN": (functools.partial(jr.tensor_function, jnp.log), ([ONES * 2, ONES * np.nan],)),
-    "about a place of a bad body": (lambda i, x: jr.MassProperties(2.0, GOOD_CENTER, i, throw=False).about(x), ([ONES, -ONES], [ONES] * 2)),
+    "function of a skew tensor": (
+        functools.partial(jr.tensor_function, jnp.log),
+        ([np.eye(3) * 2, SKEW],),
+    ),
+    "function of NaN": (
+        functools.partial(jr.tensor_function, jnp.log),
+        ([ONES * 2, ONES * np.nan],),
+    ),
+    "about a place of a bad body": (
+        lambda i, x: jr.MassProperties(2.0, GOOD_CENTER, i, throw=False).about(x),
+        ([ONES, -ONES], [ONES] * 2),
+    ),
     "about no place": (jr.solids.sphere(2.0, 1.0).about, ([ONES, ONES * np.nan],)),
-    "zero turn": (jr.solids.box(2.0, ONES).translated(GOOD_CENTER).rotated, ([np.arange(4.0), np.zeros(4)],)),
-}  # fmt: skip
+    "zero turn": (
+        jr.solids.box(2.0, ONES).translated(GOOD_CENTER).rotated,
+        ([np.arange(4.0), np.zeros(4)],),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BAD_FORMULAS)
-def test_a_bad_lane_of_a_formula_is_nan_and_leaves_the_other_and_its_gradient_alone(name):
+def test_a_bad_lane_of_a_formula_is_nan_and_leaves_the_other_and_its_gradient_alone(
+    name,
+):
     function, lanes = BAD_FORMULAS[name]
     lanes = [np.asarray(x, float) for x in lanes]
 
     def total(*lanes):
         answers = jax.vmap(function)(*lanes)
-        finite = [jnp.where(jnp.isnan(x), 0.0, jnp.sin(x)) for x in jax.tree.leaves(answers)]
+        finite = [
+            jnp.where(jnp.isnan(x), 0.0, jnp.sin(x)) for x in jax.tree.leaves(answers)
+        ]
         return sum(jnp.sum(x) for x in finite), answers
 
     both = jax.jit(jax.value_and_grad(total, tuple(range(len(lanes))), has_aux=True))
@@ -951,7 +1260,9 @@ def test_a_bad_lane_of_a_formula_is_nan_and_leaves_the_other_and_its_gradient_al
     (_, alone), expected = both(*(x[[0, 0]] for x in lanes))
     assert_nan(jax.tree.map(lambda x: x[1], answers))
     for found, good in ((answers, alone), (slopes, expected)):
-        jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), found, good)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_array_equal(a[0], b[0]), found, good
+        )
     assert all(np.all(np.isfinite(x[0])) for x in jax.tree.leaves(answers))
     assert any(np.any(x[0] != 0) for x in slopes)
     for slope in slopes:
@@ -965,8 +1276,12 @@ def test_a_bad_tensor_leaves_the_gradient_in_the_parameters_of_its_function_alon
 
     slope = jax.jit(jax.grad(total))
     good = 3 * 2**0.7 * np.log(2)
-    np.testing.assert_allclose(slope(0.7, np.stack([2 * np.eye(3), SKEW])), good, rtol=8 * EPS)
-    np.testing.assert_allclose(slope(0.7, np.stack([2 * np.eye(3)] * 2)), 2 * good, rtol=8 * EPS)
+    np.testing.assert_allclose(
+        slope(0.7, np.stack([2 * np.eye(3), SKEW])), good, rtol=8 * EPS
+    )
+    np.testing.assert_allclose(
+        slope(0.7, np.stack([2 * np.eye(3)] * 2)), 2 * good, rtol=8 * EPS
+    )
 
 
 def test_what_is_done_with_a_bad_body_is_nan():
@@ -977,7 +1292,9 @@ def test_what_is_done_with_a_bad_body_is_nan():
         good.rotated(jnp.zeros(4)),
     ]
     for body in bodies:
-        assert_nan([body, good + body, body + good, body.translated(ONES), body.rotated(q)])
+        assert_nan(
+            [body, good + body, body + good, body.translated(ONES), body.rotated(q)]
+        )
         assert_nan([body.about(ZEROS), body.principal_axes(), sum([good, body])])
     lost = good.translated(jnp.full(3, jnp.inf))
     assert_nan([lost + good, lost.rotated(q), lost.about(ZEROS)])
@@ -985,18 +1302,60 @@ def test_what_is_done_with_a_bad_body_is_nan():
 
 NAN_LANE = np.array([1.0, np.nan])
 SHARED = {
-    "points, a bad mass": (lambda x, bad: jr.from_points(jnp.stack([bad, 1.0]), x, throw=False), POINTS[:2] + 1),
-    "points, a bad position": (lambda m, bad: jr.from_points(m, POINTS * bad, throw=False), ONES),
-    "mesh, a bad vertex": (lambda d, bad: jr.from_mesh(CUBE * bad, CUBE_FACES, d, throw=False), 2.0),
-    "mesh, a bad density": (lambda v, bad: jr.from_mesh(v, CUBE_FACES, bad, throw=False), CUBE),
-    "density, a bad box": (lambda c, bad: jr.from_density(lambda r: c * r[0], ZEROS, ONES * bad, order=2, throw=False), 2.0),
-    "sum, a bad centre": (lambda m, bad: jr.solids.sphere(m, 1.0) + jr.MassProperties(m, bad * ONES, ONES, throw=False), 2.0),
-    "sum, a bad mass": (lambda x, bad: jr.solids.sphere(1.0, 1.0).translated(x) + jr.MassProperties(bad, ZEROS, ONES, throw=False), ONES),
-    "turn of a bad body": (lambda q, bad: jr.MassProperties(1.0, ONES, bad * ONES, throw=False).rotated(q), np.arange(1.0, 5)),
-    "bad turn": (lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(np.arange(4.0) * bad), 2.0),
-    "zero turn": (lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(jnp.nan_to_num(np.arange(4.0) * bad)), 2.0),
+    "points, a bad mass": (
+        lambda x, bad: jr.from_points(jnp.stack([bad, 1.0]), x, throw=False),
+        POINTS[:2] + 1,
+    ),
+    "points, a bad position": (
+        lambda m, bad: jr.from_points(m, POINTS * bad, throw=False),
+        ONES,
+    ),
+    "mesh, a bad vertex": (
+        lambda d, bad: jr.from_mesh(CUBE * bad, CUBE_FACES, d, throw=False),
+        2.0,
+    ),
+    "mesh, a bad density": (
+        lambda v, bad: jr.from_mesh(v, CUBE_FACES, bad, throw=False),
+        CUBE,
+    ),
+    "density, a bad box": (
+        lambda c, bad: jr.from_density(
+            lambda r: c * r[0], ZEROS, ONES * bad, order=2, throw=False
+        ),
+        2.0,
+    ),
+    "sum, a bad centre": (
+        lambda m, bad: (
+            jr.solids.sphere(m, 1.0)
+            + jr.MassProperties(m, bad * ONES, ONES, throw=False)
+        ),
+        2.0,
+    ),
+    "sum, a bad mass": (
+        lambda x, bad: (
+            jr.solids.sphere(1.0, 1.0).translated(x)
+            + jr.MassProperties(bad, ZEROS, ONES, throw=False)
+        ),
+        ONES,
+    ),
+    "turn of a bad body": (
+        lambda q, bad: jr.MassProperties(1.0, ONES, bad * ONES, throw=False).rotated(q),
+        np.arange(1.0, 5),
+    ),
+    "bad turn": (
+        lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(
+            np.arange(4.0) * bad
+        ),
+        2.0,
+    ),
+    "zero turn": (
+        lambda m, bad: jr.solids.box(m, np.arange(1.0, 4)).rotated(
+            jnp.nan_to_num(np.arange(4.0) * bad)
+        ),
+        2.0,
+    ),
     "bad shift": (lambda m, bad: jr.solids.sphere(m, 1.0).translated(bad * ONES), 2.0),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SHARED)
@@ -1006,22 +1365,32 @@ def test_a_bad_lane_leaves_the_gradient_in_shared_arguments_alone(name):
     def total(x, bad):
         body = function(x, bad)
         origin = body.about(jnp.zeros(3))
-        value = body.mass + jnp.sum(jnp.sin(body.center_of_mass)) + jnp.sum(jnp.cos(origin))
+        value = (
+            body.mass + jnp.sum(jnp.sin(body.center_of_mass)) + jnp.sum(jnp.cos(origin))
+        )
         return jnp.where(jnp.isfinite(value), value, 0.0)
 
     shared = jnp.asarray(shared)
     both = jax.jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
     twice = both(shared, np.ones(2))
     assert np.any(twice != 0)
-    np.testing.assert_allclose(both(shared, NAN_LANE), twice / 2, rtol=64 * EPS, atol=64 * EPS)
+    np.testing.assert_allclose(
+        both(shared, NAN_LANE), twice / 2, rtol=64 * EPS, atol=64 * EPS
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 4e37])
 def test_checks_of_a_tensor_do_not_depend_on_its_scale(scale):
     good = np.array([[3.0, 0.3, -0.2], [0.3, 3.5, 0.4], [-0.2, 0.4, 4.0]])
     turn = rotation(0)
-    negative, odd = (turn @ np.diag(x) @ turn.T for x in ([-0.2, 2.0, 2.1], [1.0, 2.0, 3.5]))
-    for tensor, message in ((good, None), (negative, "must hold three"), (odd, "real body")):
+    negative, odd = (
+        turn @ np.diag(x) @ turn.T for x in ([-0.2, 2.0, 2.1], [1.0, 2.0, 3.5])
+    )
+    for tensor, message in (
+        (good, None),
+        (negative, "must hold three"),
+        (odd, "real body"),
+    ):
         tensor = jnp.asarray(tensor * scale, jnp.float32)
         assert is_symmetric(tensor)
         assert is_positive_definite(tensor) == (message != "must hold three")
@@ -1048,8 +1417,12 @@ def test_thin_bodies_are_bodies():
     for moments in ([1.0, 1.0, 2.0], [0.3, 0.4, 0.7], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]):
         body = jr.MassProperties(1.0, ZEROS, np.array(moments))
         for seed in range(4):
-            turned = body.rotated(jnp.asarray(np.random.default_rng(seed).normal(size=4)))
-            again = jr.MassProperties(turned.mass, turned.center_of_mass, turned.inertia)
+            turned = body.rotated(
+                jnp.asarray(np.random.default_rng(seed).normal(size=4))
+            )
+            again = jr.MassProperties(
+                turned.mass, turned.center_of_mass, turned.inertia
+            )
             np.testing.assert_array_equal(again.inertia, turned.inertia)
 
 
@@ -1061,31 +1434,111 @@ def test_bodies_print_their_numbers():
 
 WRONG_SHAPES = {
     "mass": (jr.MassProperties, (ONES, ZEROS, ONES), r"`mass` must have shape \(\)"),
-    "centre": (jr.MassProperties, (1.0, np.zeros(2), ONES), r"`center_of_mass` must have shape \(3,\)"),
-    "inertia": (jr.MassProperties, (1.0, ZEROS, np.ones(6)), r"`inertia` must have shape \(3,\) or"),
-    "masses": (jr.from_points, (np.ones((3, 1)), POINTS), r"`masses` must have shape \(n,\)"),
-    "positions": (jr.from_points, (ONES, POINTS[:2]), r"`positions` must have shape \(3, 3\)"),
+    "centre": (
+        jr.MassProperties,
+        (1.0, np.zeros(2), ONES),
+        r"`center_of_mass` must have shape \(3,\)",
+    ),
+    "inertia": (
+        jr.MassProperties,
+        (1.0, ZEROS, np.ones(6)),
+        r"`inertia` must have shape \(3,\) or",
+    ),
+    "masses": (
+        jr.from_points,
+        (np.ones((3, 1)), POINTS),
+        r"`masses` must have shape \(n,\)",
+    ),
+    "positions": (
+        jr.from_points,
+        (ONES, POINTS[:2]),
+        r"`positions` must have shape \(3, 3\)",
+    ),
     "no points": (jr.from_points, (np.ones(0), np.ones((0, 3))), "at least one point"),
-    "tensor of nothing": (jr.inertia_tensor, (np.ones(0), np.ones((0, 3))), "at least one point"),
-    "lower": (lambda: jr.from_density(jnp.sum, np.zeros(2), ONES), (), r"`lower` must have shape"),
-    "upper": (lambda: jr.from_density(jnp.sum, ZEROS, np.ones(2)), (), r"`upper` must have shape"),
-    "order": (lambda: jr.from_density(jnp.sum, ZEROS, ONES, order=1), (), "`order` must be an integer"),
-    "density": (lambda: jr.from_density(lambda r: r, ZEROS, ONES), (), "`density` must map"),
-    "vertices": (jr.from_mesh, (CUBE[:, :2], CUBE_FACES), r"`vertices` must have shape \(n, 3\)"),
-    "faces": (jr.from_mesh, (CUBE, CUBE_FACES.ravel()), r"`faces` must have shape \(n, 3\)"),
-    "fractional faces": (jr.from_mesh, (CUBE, CUBE_FACES * 1.0), "`faces` must hold integers"),
+    "tensor of nothing": (
+        jr.inertia_tensor,
+        (np.ones(0), np.ones((0, 3))),
+        "at least one point",
+    ),
+    "lower": (
+        lambda: jr.from_density(jnp.sum, np.zeros(2), ONES),
+        (),
+        r"`lower` must have shape",
+    ),
+    "upper": (
+        lambda: jr.from_density(jnp.sum, ZEROS, np.ones(2)),
+        (),
+        r"`upper` must have shape",
+    ),
+    "order": (
+        lambda: jr.from_density(jnp.sum, ZEROS, ONES, order=1),
+        (),
+        "`order` must be an integer",
+    ),
+    "density": (
+        lambda: jr.from_density(lambda r: r, ZEROS, ONES),
+        (),
+        "`density` must map",
+    ),
+    "vertices": (
+        jr.from_mesh,
+        (CUBE[:, :2], CUBE_FACES),
+        r"`vertices` must have shape \(n, 3\)",
+    ),
+    "faces": (
+        jr.from_mesh,
+        (CUBE, CUBE_FACES.ravel()),
+        r"`faces` must have shape \(n, 3\)",
+    ),
+    "fractional faces": (
+        jr.from_mesh,
+        (CUBE, CUBE_FACES * 1.0),
+        "`faces` must hold integers",
+    ),
     "no faces": (jr.from_mesh, (CUBE, CUBE_FACES[:0]), "at least one face"),
-    "mesh density": (jr.from_mesh, (CUBE, CUBE_FACES, ONES), r"`density` must have shape \(\)"),
-    "displaced tensor": (jr.parallel_axis, (np.ones(2), 1.0, ONES), "`inertia` must have shape"),
+    "mesh density": (
+        jr.from_mesh,
+        (CUBE, CUBE_FACES, ONES),
+        r"`density` must have shape \(\)",
+    ),
+    "displaced tensor": (
+        jr.parallel_axis,
+        (np.ones(2), 1.0, ONES),
+        "`inertia` must have shape",
+    ),
     "displaced mass": (jr.parallel_axis, (ONES, ONES, ONES), "`mass` must have shape"),
-    "displacement": (jr.to_center_of_mass, (ONES, 1.0, 1.0), "`displacement` must have shape"),
-    "mass displaced back": (jr.to_center_of_mass, (ONES, ONES, ONES), "`mass` must have shape"),
+    "displacement": (
+        jr.to_center_of_mass,
+        (ONES, 1.0, 1.0),
+        "`displacement` must have shape",
+    ),
+    "mass displaced back": (
+        jr.to_center_of_mass,
+        (ONES, ONES, ONES),
+        "`mass` must have shape",
+    ),
     "axes": (jr.principal_axes, (np.ones((3, 2)),), "`inertia` must have shape"),
-    "function": (lambda: jr.tensor_function(lambda x: jnp.stack([x, x]), ONES), (), "`f` must map"),
-    "point": (lambda: jr.solids.rod(1.0, 1.0).about(1.0), (), "`point` must have shape"),
-    "shift": (lambda: jr.solids.rod(1.0, 1.0).translated(1.0), (), "`displacement` must have shape"),
-    "turn": (lambda: jr.solids.rod(1.0, 1.0).rotated(ONES), (), "`attitude` must have shape"),
-}  # fmt: skip
+    "function": (
+        lambda: jr.tensor_function(lambda x: jnp.stack([x, x]), ONES),
+        (),
+        "`f` must map",
+    ),
+    "point": (
+        lambda: jr.solids.rod(1.0, 1.0).about(1.0),
+        (),
+        "`point` must have shape",
+    ),
+    "shift": (
+        lambda: jr.solids.rod(1.0, 1.0).translated(1.0),
+        (),
+        "`displacement` must have shape",
+    ),
+    "turn": (
+        lambda: jr.solids.rod(1.0, 1.0).rotated(ONES),
+        (),
+        "`attitude` must have shape",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", WRONG_SHAPES)

@@ -1,7 +1,7 @@
 """Mistakes of new users, each with the message that must come; for the rest: docs/gotchas.md."""
+# ruff: noqa: ARG005
 
 # Users write out the arguments of a lambda, used or not.
-# ruff: noqa: ARG005
 
 import io
 import math
@@ -21,10 +21,22 @@ UPRIGHT, OMEGA = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 1.0, 0.2])
 STATE, BODY = jr.State(UPRIGHT, OMEGA), jr.RigidBody(MOMENTS)
 TS = np.array([0.0, 0.5, 1.0])
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-FACES = np.array([
-    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-])  # fmt: skip
+FACES = np.array(
+    [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+)
 RECORD = jr.datasets.gyro_example()
 BLIND = jr.RigidBody(np.ones(3))
 
@@ -83,7 +95,9 @@ MISTAKES = {
         r"`system` must be a jrigid system \(a RigidBody.*array of shape \(3,\)",
     ),
     "many states at once": (
-        lambda: free(MOMENTS, jr.State(np.tile(UPRIGHT, (9, 1)), np.tile(OMEGA, (9, 1))), TS),
+        lambda: free(
+            MOMENTS, jr.State(np.tile(UPRIGHT, (9, 1)), np.tile(OMEGA, (9, 1))), TS
+        ),
         r"`state0.attitude` must have shape \(4,\), .*\(9, 4\)\. \(For many, `jax.vmap`\.\)",
     ),
     "many inertias at once": (
@@ -112,7 +126,9 @@ MISTAKES = {
         r"`inertia` must have shape .*\(6,\)\. \(Six numbers make \[\[Ixx, Ixy, Ixz\].*sign",
     ),
     "half of a tensor": (
-        lambda: jr.MassProperties(1.0, np.zeros(3), [[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
+        lambda: jr.MassProperties(
+            1.0, np.zeros(3), [[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]
+        ),
         r"`inertia` must .* symmetric",
     ),
     "moments of no body": (
@@ -135,7 +151,10 @@ MISTAKES = {
         lambda: mesh(CUBE, FACES + 1),
         r"Indices count from 0 to 7 here, but they go from 1 to 8",
     ),
-    "one face flipped": (lambda: mesh(CUBE, flip), "flipped: `trimesh.repair.fix_winding`"),
+    "one face flipped": (
+        lambda: mesh(CUBE, flip),
+        "flipped: `trimesh.repair.fix_winding`",
+    ),
     "a hole": (lambda: mesh(CUBE, FACES[1:]), "A face is missing"),
     "all faces flipped": (
         lambda: mesh(CUBE, FACES[:, ::-1]),
@@ -172,7 +191,9 @@ MISTAKES = {
         r"`torque` must be a callable \(t, state, args\)",
     ),
     "an `if` in a torque": (
-        lambda: forced(lambda t, state, args: state.omega if t > 0.5 else 0 * state.omega),
+        lambda: forced(
+            lambda t, state, args: state.omega if t > 0.5 else 0 * state.omega
+        ),
         r"Use `jnp.where` or `jax.lax.cond` in a torque, not `if`, `and` or `max` of Python",
     ),
     "numpy in a torque": (
@@ -197,7 +218,9 @@ MISTAKES = {
     ),
     "numpy in a force": (
         lambda: simulate(
-            jr.FloatingBody(jr.solids.sphere(1.0, 0.1), lambda t, state, args: np.sin(t)),
+            jr.FloatingBody(
+                jr.solids.sphere(1.0, 0.1), lambda t, state, args: np.sin(t)
+            ),
             jr.FloatingState(np.zeros(3), np.zeros(3), UPRIGHT, OMEGA),
             TS,
         ),
@@ -205,7 +228,10 @@ MISTAKES = {
     ),
     "numpy in an event": (
         lambda: simulate(
-            BODY, STATE, TS, event=diffrax.Event(lambda t, state, args, **_: np.sin(t) - 0.5)
+            BODY,
+            STATE,
+            TS,
+            event=diffrax.Event(lambda t, state, args, **_: np.sin(t) - 0.5),
         ),
         "Use `jax.numpy` in the condition of an event, not numpy",
     ),
@@ -219,9 +245,14 @@ MISTAKES = {
         lambda: jax.jacfwd(turned)(OMEGA),
         r"`adjoint=diffrax.ForwardMode\(\)` serves jax.jvp, jax.jacfwd",
     ),
-    "a tolerance of zero": (lambda: turned(OMEGA, rtol=0.0), "`rtol` must be at least 1e-14"),
+    "a tolerance of zero": (
+        lambda: turned(OMEGA, rtol=0.0),
+        "`rtol` must be at least 1e-14",
+    ),
     "a count through vmap": (
-        lambda: jax.vmap(lambda n: jr.stability.megno(BODY, STATE, 1.0, steps=n))(np.arange(9)),
+        lambda: jax.vmap(lambda n: jr.stability.megno(BODY, STATE, 1.0, steps=n))(
+            np.arange(9)
+        ),
         "`steps` must be known when it is compiled, but it is traced: hand it past",
     ),
     "an option through jit": (
@@ -229,7 +260,9 @@ MISTAKES = {
         "`axis` must be known when it is compiled, but it is traced: hand it past",
     ),
     "`throw` through jit": (
-        lambda: jax.jit(lambda throw: free(MOMENTS, STATE, TS, throw=throw).omega)(False),
+        lambda: jax.jit(lambda throw: free(MOMENTS, STATE, TS, throw=throw).omega)(
+            False
+        ),
         "`throw` must be known when it is compiled, but it is traced: hand it past",
     ),
     # records and fits
@@ -249,9 +282,9 @@ MISTAKES = {
         lambda: fit(BLIND, rates(1000 * RECORD.times)),
         "rates in degrees a second, times not in seconds?",
     ),
-    "bodies that are not as many as throws": (
+    "bodies that are not as many as trials": (
         lambda: fit([BLIND] * 3, [rates(), rates()]),
-        "`system` must hold one body for each of 2 throws, but it holds 3",
+        "`system` must hold one body for each of 2 trials, but it holds 3",
     ),
     "`free` that picks the inertia": (
         lambda: fit(BLIND, rates(), free=lambda body, gyro: body.inertia),
@@ -266,7 +299,9 @@ MISTAKES = {
         "free motion tells ratios of the moments, never their scale",
     ),
     "a string through jit": (
-        lambda: jax.jit(lambda scale: fit(BLIND, rates(), scale=scale).inertia)("trace"),
+        lambda: jax.jit(lambda scale: fit(BLIND, rates(), scale=scale).inertia)(
+            "trace"
+        ),
         "static_argnums",
     ),
     "a file without units": (
@@ -294,7 +329,9 @@ MISTAKES = {
         "`result` must be a FitResult, but it is a GyroRecord",
     ),
     "many motions in one picture": (
-        lambda: jr.plot.polhode(MOMENTS, jr.State(np.ones((2, 9, 4)), np.ones((2, 9, 3)))),
+        lambda: jr.plot.polhode(
+            MOMENTS, jr.State(np.ones((2, 9, 4)), np.ones((2, 9, 3)))
+        ),
         r"one motion, but it is several: take one by `jax.tree.map\(lambda x: x\[i\], motion\)`",
     ),
     "a motion before the body": (
@@ -302,10 +339,12 @@ MISTAKES = {
         "`body` must have or be an inertia, but it is a State",
     ),
     "no zarr": (
-        lambda: without("zarr", lambda: jr.sweep(lambda a: a, {"a": TS}, store="none.zarr")),
+        lambda: without(
+            "zarr", lambda: jr.sweep(lambda a: a, {"a": TS}, store="none.zarr")
+        ),
         r'pip install "jrigid\[sweep\]"',
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -323,5 +362,7 @@ def test_an_error_in_a_torque_is_chained_to_that_of_jax(untyped):
 
 def test_single_precision_is_told():
     body, state0 = jax.tree.map(lambda x: x.astype(jnp.float32), (BODY, STATE))
-    with pytest.warns(UserWarning, match="float32: errors of 1e-6 .* Switch on `jax_enable_x64`"):
+    with pytest.warns(
+        UserWarning, match="float32: errors of 1e-6 .* Switch on `jax_enable_x64`"
+    ):
         jr.simulate(body, state0, np.float32(1.0))

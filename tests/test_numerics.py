@@ -22,7 +22,8 @@ def derivatives(function):
     return jax.jit(lambda points: jnp.stack([jax.vmap(f)(points) for f in orders]))
 
 
-# --- edges ------------------------------------------------------------------------------------
+# --- edges
+# ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -43,12 +44,18 @@ def test_norm_neither_overflows_nor_underflows_and_nor_does_its_gradient(dtype):
         vector = np.array([2.0, -3.0, 6.0]).astype(dtype) * dtype(size)
         value, gradient = both(jnp.asarray(vector))
         np.testing.assert_allclose(value, 7 * dtype(size), rtol=ulps(dtype, 4))
-        np.testing.assert_allclose(gradient, np.array([2, -3, 6]) / 7, rtol=ulps(dtype, 4))
+        np.testing.assert_allclose(
+            gradient, np.array([2, -3, 6]) / 7, rtol=ulps(dtype, 4)
+        )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_arctan2_at_the_origin_has_value_and_gradient_zero(dtype):
-    orders = [safe_arctan2, jax.grad(safe_arctan2, (0, 1)), jax.hessian(safe_arctan2, (0, 1))]
+    orders = [
+        safe_arctan2,
+        jax.grad(safe_arctan2, (0, 1)),
+        jax.hessian(safe_arctan2, (0, 1)),
+    ]
     together = jax.jit(lambda y, x: [order(y, x) for order in orders])
     for y in (0.0, -0.0):
         for x in (0.0, -0.0):
@@ -62,7 +69,9 @@ def test_arctan2_and_its_gradient_at_any_distance_from_the_origin(dtype):
     tiny, large = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
     for size in (8 * tiny, tiny**0.5 / 8, 1.0, large**0.5 * 8):
         for y, x in ((3, 4), (3, -4), (-3, -4), (0, 5), (5, 0), (0, -5), (-5, 0)):
-            value, gradient = both(jnp.asarray(y * size, dtype), jnp.asarray(x * size, dtype))
+            value, gradient = both(
+                jnp.asarray(y * size, dtype), jnp.asarray(x * size, dtype)
+            )
             np.testing.assert_allclose(value, np.arctan2(y, x), rtol=ulps(dtype, 2))
             expected = np.array([x, -y]) / (25 * size)
             np.testing.assert_allclose(
@@ -70,15 +79,20 @@ def test_arctan2_and_its_gradient_at_any_distance_from_the_origin(dtype):
             )
 
 
-# --- functions of a square --------------------------------------------------------------------
+# --- functions of a square
+# --------------------------------------------------------------------
 
 EVEN = {
     "cos_sqrt": (cos_sqrt, lambda r: mpmath.cos(r)),
     "sinc_sqrt": (sinc_sqrt, lambda r: mpmath.sin(r) / r if r else mpmath.mpf(1)),
-    "arctanc_sqrt": (arctanc_sqrt, lambda r: mpmath.atan(r) / r if r else mpmath.mpf(1)),
+    "arctanc_sqrt": (
+        arctanc_sqrt,
+        lambda r: mpmath.atan(r) / r if r else mpmath.mpf(1),
+    ),
 }
 SEAMS = {"cos_sqrt": 0.5, "sinc_sqrt": 0.5, "arctanc_sqrt": 0.2}
-# A derivative divides differences of the closed form by the seam: so many ulps at each order.
+# A derivative divides differences of the closed form by the seam: so many ulps at each
+# order.
 ULPS_BY_ORDER = (3, 16, 256, 4096)
 
 
@@ -101,9 +115,15 @@ def test_even_function_and_three_derivatives_are_seamless(name, dtype):
             series = _taylor_at_zero(name, order)
             for z, value in zip(points, found[order], strict=True):
                 even = lambda u: reference(mpmath.sqrt(u))  # noqa: E731
-                exact = series if z < 1e-30 else mpmath.diff(even, mpmath.mpf(float(z)), order)
+                exact = (
+                    series
+                    if z < 1e-30
+                    else mpmath.diff(even, mpmath.mpf(float(z)), order)
+                )
                 scale = abs(float(series))
-                error = abs(float(value) - float(exact)) / (scale * float(np.finfo(dtype).eps))
+                error = abs(float(value) - float(exact)) / (
+                    scale * float(np.finfo(dtype).eps)
+                )
                 assert error <= allowed, (order, z, error)
 
 

@@ -66,8 +66,11 @@ def test_polhodes_keep_momentum_and_energy():
         momentum = np.asarray(TENSOR @ omega)
         level = omega @ momentum / (momentum @ momentum)
         np.testing.assert_allclose(np.sum(curve**2, axis=1), 1, atol=1e-12)
-        np.testing.assert_allclose(np.einsum("ni,ij,nj->n", curve, inverse, curve), level, 1e-12)
-        # the library's, whose points are even in time, lies on it and it goes all the way round
+        np.testing.assert_allclose(
+            np.einsum("ni,ij,nj->n", curve, inverse, curve), level, 1e-12
+        )
+        # the library's, whose points are even in time, lies on it and it goes all the
+        # way round
         points = np.asarray(jr.free.polhode(TENSOR, omega, 50)) @ np.asarray(TENSOR)
         points /= np.linalg.norm(points, axis=1, keepdims=True)
         apart = np.linalg.norm(points[:, None] - curve, axis=2)
@@ -80,7 +83,9 @@ def test_the_separatrix_passes_through_the_middle_axis_in_its_planes():
     np.testing.assert_allclose(np.max(curve[:, 1]), 1, atol=1e-12)
     np.testing.assert_allclose(np.min(curve[:, 1]), -1, atol=1e-12)
     ratio = jr.free.separatrix(MOMENTS).momentum_ratio
-    np.testing.assert_allclose(np.abs(curve[:, 2]), ratio * np.abs(curve[:, 0]), atol=1e-7)
+    np.testing.assert_allclose(
+        np.abs(curve[:, 2]), ratio * np.abs(curve[:, 0]), atol=1e-7
+    )
 
 
 def test_on_the_ellipsoid_energy_is_one():
@@ -109,11 +114,15 @@ def test_a_motion_is_drawn_as_it_went_and_what_is_behind_faintly():
     np.testing.assert_array_equal(np.isfinite(near.get_data_3d()[0]), path @ eye <= 0)
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 1.8), (0.2, 1.0, 1.0), (1e-9, 1e-9, 1e-9)])
+@pytest.mark.parametrize(
+    "moments", [(1.0, 1.0, 1.8), (0.2, 1.0, 1.0), (1e-9, 1e-9, 1e-9)]
+)
 def test_bodies_of_revolution_and_spheres_have_polhodes(moments):
     ax = jr.plot.polhode(jnp.array(moments), OMEGA)
     momentum = np.asarray(moments) * OMEGA
-    np.testing.assert_allclose(named(ax, "motion 1")[0], momentum / np.linalg.norm(momentum))
+    np.testing.assert_allclose(
+        named(ax, "motion 1")[0], momentum / np.linalg.norm(momentum)
+    )
     drawn = [x for x in curves(ax) if len(x) > 2]
     alone = {1.0: 2, 0.2: 0}.get(moments[0])  # the axis of revolution
     assert len(drawn) == (0 if alone is None else 9)
@@ -154,16 +163,22 @@ def test_a_herpolhode_is_as_seen_along_the_momentum():
     np.testing.assert_allclose(np.hypot(x, y), np.linalg.norm(flat, axis=1), atol=1e-12)
     # turned by as much, and in the same sense
     turned = np.arctan2(np.cross(flat[0], flat) @ up, flat @ flat[0])
-    np.testing.assert_allclose(np.exp(1j * np.arctan2(y, x)), np.exp(1j * turned), atol=1e-9)
+    np.testing.assert_allclose(
+        np.exp(1j * np.arctan2(y, x)), np.exp(1j * turned), atol=1e-9
+    )
 
 
 def test_a_pure_spin_and_a_separatrix_have_herpolhodes():
-    ax = jr.plot.herpolhode(MOMENTS, jr.State(START.attitude, jnp.array([0.0, 0.0, 2.0])))
+    ax = jr.plot.herpolhode(
+        MOMENTS, jr.State(START.attitude, jnp.array([0.0, 0.0, 2.0]))
+    )
     assert np.max(np.hypot(*ax.lines[2].get_data())) < 1e-12
     assert ax.get_xlim()[1] > 0.1
     # These numbers are on the separatrix to the last bit.
     moments = jnp.array([1.0, 2.5, 4.0])
-    ax = jr.plot.herpolhode(moments, jr.State(START.attitude, jnp.array([1.0, 0.25, 0.5])))
+    ax = jr.plot.herpolhode(
+        moments, jr.State(START.attitude, jnp.array([1.0, 0.25, 0.5]))
+    )
     assert np.hypot(*ax.lines[0].get_data())[0] == 0
 
 
@@ -217,7 +232,10 @@ def test_the_tip_stays_between_its_turning_points_and_touches_them():
     tilts = np.arccos(path[:, 2])
     np.testing.assert_allclose([np.min(tilts), np.max(tilts)], bounds, atol=1e-4)
     euler = np.asarray(jr.rotation.to_euler(SPUN.attitude[7]))
-    azimuth = [np.sin(euler[1]) * np.sin(euler[0]), -np.sin(euler[1]) * np.cos(euler[0])]
+    azimuth = [
+        np.sin(euler[1]) * np.sin(euler[0]),
+        -np.sin(euler[1]) * np.cos(euler[0]),
+    ]
     np.testing.assert_allclose(path[7, :2], azimuth, atol=1e-12)
     np.testing.assert_array_equal(start, path[:1])
     words = "{:.1f}° to {:.1f}°".format(*np.degrees(bounds))
@@ -229,7 +247,9 @@ def test_the_tip_stays_between_its_turning_points_and_touches_them():
 def test_the_level_ends_on_the_well():
     steady = jr.top.initial_state(TOP, 0.5, omega3=6.0, phi_dot="slow")
     ax = jr.plot.effective_potential(TOP, SPUN, steady)
-    for state, (well, level) in zip((TILTED, steady), (ax.lines[:2], ax.lines[2:]), strict=True):
+    for state, (well, level) in zip(
+        (TILTED, steady), (ax.lines[:2], ax.lines[2:]), strict=True
+    ):
         tilts, heights = level.get_data()
         p_phi, p_psi, _ = jr.top.conserved(TOP, state)
         ends = jr.top.effective_potential(TOP, np.radians(tilts), p_phi, p_psi)
@@ -242,7 +262,10 @@ def test_the_level_ends_on_the_well():
     low, high = ax.get_ylim()
     assert low < np.min(ax.lines[0].get_ydata())
     assert high > ax.lines[3].get_ydata()[0]
-    for state in (jr.top.initial_state(TOP, 0.0, omega3=5.0), jr.top.initial_state(TOP, 2.0)):
+    for state in (
+        jr.top.initial_state(TOP, 0.0, omega3=5.0),
+        jr.top.initial_state(TOP, 2.0),
+    ):
         jr.plot.effective_potential(TOP, state).figure.canvas.draw()
 
 
@@ -250,7 +273,9 @@ def test_the_level_ends_on_the_well():
 
 
 def test_the_border_runs_where_the_level_is():
-    ax = jr.plot.chart(MAP, AREA, level=0.0, regions=("below", "above"), title="gap [m]")
+    ax = jr.plot.chart(
+        MAP, AREA, level=0.0, regions=("below", "above"), title="gap [m]"
+    )
     mesh, border = ax.collections[:2]
     np.testing.assert_allclose(mesh.get_array().reshape(31, 41), MAP.T)
     a, b = np.concatenate([x.vertices for x in border.get_paths()]).T
@@ -318,7 +343,9 @@ def test_a_code_has_its_own_name_and_its_own_tint(values, regions, expected):
 
 
 def test_what_is_not_known_is_white():
-    ax = jr.plot.chart(np.where(MAP > 0, np.nan, MAP), AREA, level=-0.5, regions=("low", "high"))
+    ax = jr.plot.chart(
+        np.where(MAP > 0, np.nan, MAP), AREA, level=-0.5, regions=("low", "high")
+    )
     assert colour_at(ax, 0.9, 0.1) == "#ffffff" != colour_at(ax, -0.9, 0.1)
 
 
@@ -331,11 +358,15 @@ def test_the_drift_is_that_of_energy_and_momentum():
     axes = jr.plot.motion(trajectory)
     energy, momentum = (line.get_ydata() for line in axes["drift"].lines[:2])
     known = np.asarray(trajectory.energy)
-    np.testing.assert_allclose(energy[1:], np.abs(known - known[0])[1:] / known[0], 1e-12)
+    np.testing.assert_allclose(
+        energy[1:], np.abs(known - known[0])[1:] / known[0], 1e-12
+    )
     known = np.asarray(trajectory.angular_momentum)
     lost = np.linalg.norm(known - known[0], axis=1) / np.linalg.norm(known[0])
     np.testing.assert_allclose(momentum[1:], lost[1:], 1e-12)
-    np.testing.assert_array_equal(axes["omega"].lines[2].get_ydata(), trajectory.states.omega[:, 2])
+    np.testing.assert_array_equal(
+        axes["omega"].lines[2].get_ydata(), trajectory.states.omega[:, 2]
+    )
     assert all(has_units(axes[x]) or x == "drift" for x in axes)
     assert axes["drift"].get_ylabel() == "relative change"
 
@@ -360,7 +391,9 @@ def faces_of(ax):
 
 
 def test_the_box_drawn_has_the_inertia():
-    film = jr.plot.animate(TENSOR + jnp.eye(3), jr.free_rotation(MOMENTS, START, TIMES), ts=TIMES)
+    film = jr.plot.animate(
+        TENSOR + jnp.eye(3), jr.free_rotation(MOMENTS, START, TIMES), ts=TIMES
+    )
     surface = film.surface
     triangles = np.concatenate([surface.faces[:, :3], surface.faces[:, [0, 2, 3]]])
     box = jr.from_mesh(surface.vertices, triangles)  # closed, and not inside out
@@ -375,7 +408,9 @@ def test_a_body_is_drawn_as_it_is_turned():
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     ax = jr.plot.body((corners, faces), START.attitude)
     np.testing.assert_allclose(faces_of(ax), corners[faces.ravel()] / 3)
-    turned = jr.plot.body((corners, faces), jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2])))
+    turned = jr.plot.body(
+        (corners, faces), jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+    )
     np.testing.assert_allclose(
         faces_of(turned), faces_of(ax)[:, [1, 0, 2]] * [-1, 1, 1], atol=1e-15
     )
@@ -393,7 +428,9 @@ def test_a_body_is_drawn_as_it_is_turned():
 
 
 ALL = jax.tree.map(lambda x: jnp.stack([x, x, x]), SPUN)
-DRAGGED = jr.simulate(jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1)), START, TIMES[::40])
+DRAGGED = jr.simulate(
+    jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1)), START, TIMES[::40]
+)
 REST = jr.State(START.attitude, jnp.zeros(3))
 PLOT = jr.plot
 ONE = "must be one motion, but it is several: take one"
@@ -416,33 +453,52 @@ WRONG = {
         lambda: PLOT.animate(TOP, SPUN, ts=TIMES[::-1]),
         "`ts` must not decrease",
     ),
-    "no frames": (lambda: PLOT.animate(TOP, SPUN, ts=TIMES, fps=0.0), "`fps` must be positive"),
+    "no frames": (
+        lambda: PLOT.animate(TOP, SPUN, ts=TIMES, fps=0.0),
+        "`fps` must be positive",
+    ),
     "a state": (
         lambda: PLOT.motion(START, system=TOP, ts=0.0),
         "`motion` must hold many states, but it is a single one",
     ),
     "one frame": (
-        lambda: PLOT.animate(TOP, jr.State(SPUN.attitude[:1], SPUN.omega[:1]), ts=TIMES[:1]),
+        lambda: PLOT.animate(
+            TOP, jr.State(SPUN.attitude[:1], SPUN.omega[:1]), ts=TIMES[:1]
+        ),
         "two states at least",
     ),
-    "polhode at rest": (lambda: PLOT.polhode(MOMENTS, REST), "must turn, but one is at rest"),
+    "polhode at rest": (
+        lambda: PLOT.polhode(MOMENTS, REST),
+        "must turn, but one is at rest",
+    ),
     "herpolhode at rest": (lambda: PLOT.herpolhode(MOMENTS, REST), "must turn"),
     "herpolhode of rates": (
         lambda: PLOT.herpolhode(MOMENTS, OMEGA),
         r"`motion` must be a motion or a State, but it is an array of shape \(3,\)",
     ),
-    "herpolhode with drag": (lambda: PLOT.herpolhode(MOMENTS, DRAGGED), "must be free and keep"),
+    "herpolhode with drag": (
+        lambda: PLOT.herpolhode(MOMENTS, DRAGGED),
+        "must be free and keep",
+    ),
     "swapped": (
         lambda: PLOT.polhode(START, MOMENTS),
         "`body` must have or be an inertia, but it is a State",
     ),
     "no finite state": (
-        lambda: PLOT.effective_potential(TOP, jr.State(START.attitude, OMEGA * jnp.nan)),
+        lambda: PLOT.effective_potential(
+            TOP, jr.State(START.attitude, OMEGA * jnp.nan)
+        ),
         "must have a finite state",
     ),
     "no top": (lambda: PLOT.tip(TOP, MOMENTS), "`motion` must be a motion or a State"),
-    "body along a path": (lambda: PLOT.body(MOMENTS, SPUN), "`attitude` must be one quaternion"),
-    "map without grid": (lambda: PLOT.chart(MAP), r"its shape is \(41, 31\) .* `grid` \(\)"),
+    "body along a path": (
+        lambda: PLOT.body(MOMENTS, SPUN),
+        "`attitude` must be one quaternion",
+    ),
+    "map without grid": (
+        lambda: PLOT.chart(MAP),
+        r"its shape is \(41, 31\) .* `grid` \(\)",
+    ),
     "map over one axis": (
         lambda: PLOT.chart(MAP[0], {"b": AREA["b"]}),
         r"over two axes .* its shape is \(31,\)",
@@ -472,8 +528,11 @@ WRONG = {
         lambda: PLOT.chart(HALVES.astype(str), AREA, regions=("a", "b")),
         "`regions` must be left out for texts",
     ),
-    "level of codes": (lambda: PLOT.chart(HALVES, AREA, level=1.0), "`level` must be left out"),
-}  # fmt: skip
+    "level of codes": (
+        lambda: PLOT.chart(HALVES, AREA, level=1.0),
+        "`level` must be left out",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -503,7 +562,9 @@ def test_a_page_holds_all_frames_and_needs_nothing_else(film, tmp_path):
     assert data["times"] == [0.0, 20.0]
     np.testing.assert_allclose(data["attitudes"], film.attitudes, atol=1e-4)
     assert data["trace"] == [[0.0, 0.0, 1.0]]
-    assert {len(data[x]) for x in ("faces", "normals", "kinds")} == {len(film.surface.faces)}
+    assert {len(data[x]) for x in ("faces", "normals", "kinds")} == {
+        len(film.surface.faces)
+    }
     assert film._repr_html_().startswith("<iframe")
 
 
@@ -514,7 +575,9 @@ def test_frames_are_the_motion_between_its_states(film):
     body = jr.RigidBody(MOMENTS)
     trajectory = jr.simulate(body, START, TIMES[:20])
     cut = trajectory.states.attitude.at[10:].set(jnp.nan)  # an event
-    short = jr.plot.animate(MOMENTS, jr.State(cut, trajectory.states.omega), ts=TIMES[:20])
+    short = jr.plot.animate(
+        MOMENTS, jr.State(cut, trajectory.states.omega), ts=TIMES[:20]
+    )
     assert short.times[-1] == TIMES[9]
     assert short.trace.shape == (0, 3)
     twice = jnp.array([0, 1, 2, 2])
@@ -536,7 +599,9 @@ def test_a_gif_has_all_frames(film, tmp_path):
 
 
 def test_films_need_a_known_suffix_and_ffmpeg(film, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"`path` must be one of '.html', '.gif', '.mp4'"):
+    with pytest.raises(
+        ValueError, match=r"`path` must be one of '.html', '.gif', '.mp4'"
+    ):
         film.save(tmp_path / "top.avi")
     monkeypatch.setattr(FFMpegWriter, "isAvailable", classmethod(lambda _: False))
     with pytest.raises(RuntimeError, match="needs ffmpeg"):

@@ -11,7 +11,9 @@ import jrigid as jr
 MODULES = [
     x
     for name, x in vars(jr).items()
-    if inspect.ismodule(x) and x.__name__ == f"jrigid.{name}" and not name.startswith("_")
+    if inspect.ismodule(x)
+    and x.__name__ == f"jrigid.{name}"
+    and not name.startswith("_")
 ]
 
 

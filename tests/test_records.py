@@ -33,11 +33,13 @@ def said(reading, words):
     assert any(words in note for note in reading.notes), reading.notes
 
 
-# phyphox ------------------------------------------------------------------------------------------
+# phyphox
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("separator", "point"), [(",", "."), ("\t", "."), (";", "."), ("\t", ","), (";", ",")]
+    ("separator", "point"),
+    [(",", "."), ("\t", "."), (";", "."), ("\t", ","), (";", ",")],
 )
 def test_phyphox_in_all_its_separators(separator, point):
     text = PHYPHOX.replace(",", separator) + "\n" + scientific(ROWS, separator, point)
@@ -50,8 +52,11 @@ def test_phyphox_in_all_its_separators(separator, point):
 
 
 def test_decimal_commas_in_quotes_between_commas():
-    reading = read('"t (s)","gx (rad/s)","gy (rad/s)","gz (rad/s)"\n' + '"0,5","1,5","2","3"\n' * 1
-                   + '"0,6","1,5","2","3"\n')  # fmt: skip
+    reading = read(
+        '"t (s)","gx (rad/s)","gy (rad/s)","gz (rad/s)"\n'
+        + '"0,5","1,5","2","3"\n' * 1
+        + '"0,6","1,5","2","3"\n'
+    )
     np.testing.assert_array_equal(reading.times, [0.5, 0.6])
     np.testing.assert_array_equal(reading.rates[0], [1.5, 2.0, 3.0])
 
@@ -62,7 +67,9 @@ def test_phyphox_zip_with_a_clock_for_each_sensor(tmp_path):
     with zipfile.ZipFile(tmp_path / "both.zip", "w") as archive:
         archive.writestr("Accelerometer.csv", header + "\n" + scientific(forces))
         archive.writestr("Gyroscope.csv", PHYPHOX + "\n" + scientific(ROWS))
-        archive.writestr("meta/time.csv", '"event","experiment time","system time"\n"START",0,1\n')
+        archive.writestr(
+            "meta/time.csv", '"event","experiment time","system time"\n"START",0,1\n'
+        )
     reading = jr.records.read(tmp_path / "both.zip")
     np.testing.assert_allclose(reading.times, ROWS[:, 0], atol=1e-12)
     # linear in between, silent before the first and after the last
@@ -72,9 +79,16 @@ def test_phyphox_zip_with_a_clock_for_each_sensor(tmp_path):
 
 
 def test_two_time_columns_in_a_file_with_the_shorter_padded():
-    header = PHYPHOX + "," + PHYPHOX.replace("Gyroscope", "Acceleration").replace("rad/s", "m/s²")
+    header = (
+        PHYPHOX
+        + ","
+        + PHYPHOX.replace("Gyroscope", "Acceleration").replace("rad/s", "m/s²")
+    )
     rows = np.full((6, 8), np.nan)
-    rows[:, :4], rows[:3, 4:] = ROWS, [[0.0, 0, 0, 9.0], [0.02, 0, 0, 10.0], [0.04, 0, 0, 11.0]]
+    rows[:, :4], rows[:3, 4:] = (
+        ROWS,
+        [[0.0, 0, 0, 9.0], [0.02, 0, 0, 10.0], [0.04, 0, 0, 11.0]],
+    )
     reading = read(header + "\n" + scientific(rows))
     z = [9.0, 9.5, 10.0, 10.5, 11.0, np.nan]
     np.testing.assert_allclose(reading.specific_forces[:, 2], z)
@@ -87,19 +101,27 @@ def test_accelerations_without_gravity_are_no_specific_forces():
     assert reading.specific_forces is None
     said(reading, "no specific force")
     header += "".join(f',"Acceleration {a} (m/s^2)"' for a in "xyz")
-    reading = read(header + "\n" + scientific(np.hstack([ROWS, ROWS[:, 1:], 2 * ROWS[:, 1:]])))
+    reading = read(
+        header + "\n" + scientific(np.hstack([ROWS, ROWS[:, 1:], 2 * ROWS[:, 1:]]))
+    )
     np.testing.assert_allclose(reading.specific_forces, 2 * ROWS[:, 1:])
     assert "Linear Acceleration x (m/s^2)" in reading.columns
 
 
-# Sensor Logger ------------------------------------------------------------------------------------
+# Sensor Logger
+# ------------------------------------------------------------------------------------
 
 
 def sensor_logger(folder, **sensors):
     folder.mkdir(exist_ok=True)
     for name, rows in sensors.items():
-        lines = [f"{1727600000000000000 + round(1e9 * t)},{t},{z},{y},{x}\n" for t, x, y, z in rows]
-        (folder / f"{name}.csv").write_text("time,seconds_elapsed,z,y,x\n" + "".join(lines))
+        lines = [
+            f"{1727600000000000000 + round(1e9 * t)},{t},{z},{y},{x}\n"
+            for t, x, y, z in rows
+        ]
+        (folder / f"{name}.csv").write_text(
+            "time,seconds_elapsed,z,y,x\n" + "".join(lines)
+        )
     return folder
 
 
@@ -109,10 +131,13 @@ def still(force):
 
 def test_sensor_logger_columns_are_z_y_x(tmp_path):
     folder = sensor_logger(
-        tmp_path / "log", Gyroscope=ROWS, TotalAcceleration=still([1.0, 2.0, 9.5]),
-        Accelerometer=still([7.0, 7.0, 7.0]), Magnetometer=still([20.0, 0.0, -40.0]),
-    )  # fmt: skip
-    (folder / "Annotation.csv").write_text("time,seconds_elapsed,text\n1,2,throw\n")
+        tmp_path / "log",
+        Gyroscope=ROWS,
+        TotalAcceleration=still([1.0, 2.0, 9.5]),
+        Accelerometer=still([7.0, 7.0, 7.0]),
+        Magnetometer=still([20.0, 0.0, -40.0]),
+    )
+    (folder / "Annotation.csv").write_text("time,seconds_elapsed,text\n1,2,trial\n")
     reading = jr.records.read(folder)
     np.testing.assert_allclose(reading.times, ROWS[:, 0], atol=1e-12)
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
@@ -124,14 +149,22 @@ def test_sensor_logger_columns_are_z_y_x(tmp_path):
 
 def test_sensor_logger_of_an_iphone_adds_gravity_and_turns_the_sign(tmp_path):
     folder = sensor_logger(
-        tmp_path / "log", Gyroscope=ROWS, Accelerometer=still([0.5, 0.0, 0.0]),
+        tmp_path / "log",
+        Gyroscope=ROWS,
+        Accelerometer=still([0.5, 0.0, 0.0]),
         Gravity=still([0.0, 0.0, -9.8]),
-    )  # fmt: skip
+    )
     about = "version,device name,platform,standardisation\n3,phone,{},{}\n"
-    for platform, same, sign in (("ios", "false", -1), ("ios", "true", 1), ("android", "", 1)):
+    for platform, same, sign in (
+        ("ios", "false", -1),
+        ("ios", "true", 1),
+        ("android", "", 1),
+    ):
         (folder / "Metadata.csv").write_text(about.format(platform, same))
         reading = jr.records.read(folder)
-        np.testing.assert_allclose(reading.specific_forces[2], sign * np.array([0.5, 0, -9.8]))
+        np.testing.assert_allclose(
+            reading.specific_forces[2], sign * np.array([0.5, 0, -9.8])
+        )
 
 
 @pytest.mark.parametrize(("size", "unit"), [(1.0, "g"), (9.8, "m/s^2")])
@@ -156,7 +189,9 @@ def test_the_calibrated_gyro_is_taken(tmp_path):
 def test_sensor_logger_in_one_file():
     names = ["time", "seconds_elapsed", *(f"gyroscope_{a}" for a in "xyz")]
     names += [f"{what}_{a}" for what in ("accelerometer", "gravity") for a in "xyz"]
-    rows = np.column_stack([1e9 * ROWS[:, 0], ROWS, np.tile([0.5, 0, 0, 0, 0, 9.8], (6, 1))])
+    rows = np.column_stack(
+        [1e9 * ROWS[:, 0], ROWS, np.tile([0.5, 0, 0, 0, 0, 9.8], (6, 1))]
+    )
     reading = read(table(names, rows))
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
     np.testing.assert_allclose(reading.specific_forces, np.tile([0.5, 0, 9.8], (6, 1)))
@@ -166,21 +201,31 @@ def test_sensor_logger_in_one_file():
 def test_only_what_is_used_is_told_of(tmp_path):
     """And a column may be named that is in one of several files."""
     with zipfile.ZipFile(tmp_path / "some.zip", "w") as archive:
-        archive.writestr("Gyroscope.csv", PHYPHOX.replace(",", ";") + "\n" + scientific(ROWS, ";"))
+        archive.writestr(
+            "Gyroscope.csv", PHYPHOX.replace(",", ";") + "\n" + scientific(ROWS, ";")
+        )
         archive.writestr("meta/time.csv", '"event";"time";"system"\n"START";0,5;1,5\n')
-        archive.writestr("wind.csv", "t (s),label,u,v,w\n0,calm,1,2,3\n0.1,calm,1,2,3\n")
-    reading = jr.records.read(tmp_path / "some.zip", columns={"specific_forces": ("w", "u", "v")},
-                              unit={"specific_forces": "g"})  # fmt: skip
+        archive.writestr(
+            "wind.csv", "t (s),label,u,v,w\n0,calm,1,2,3\n0.1,calm,1,2,3\n"
+        )
+    reading = jr.records.read(
+        tmp_path / "some.zip",
+        columns={"specific_forces": ("w", "u", "v")},
+        unit={"specific_forces": "g"},
+    )
     assert reading.specific_forces[0].tolist() == [3 * GRAVITY, GRAVITY, 2 * GRAVITY]
     assert not any("commas" in note for note in reading.notes)
     with pytest.raises(
         ValueError, match=r"must name columns of one file, but \{'breeze'\} is apart"
     ):
         jr.records.read(tmp_path / "some.zip", columns={"breeze": "u"})
-    assert not any("commas" in x for x in read(PHYPHOX + ',n\n0,1,2,3,"a, b"\n1,1,2,3,"c"\n').notes)
+    assert not any(
+        "commas" in x for x in read(PHYPHOX + ',n\n0,1,2,3,"a, b"\n1,1,2,3,"c"\n').notes
+    )
 
 
-# Betaflight ---------------------------------------------------------------------------------------
+# Betaflight
+# ---------------------------------------------------------------------------------------
 
 
 BETAFLIGHT = (
@@ -199,8 +244,12 @@ def blackbox_csv(rates="", forces="", one=2048.0):
 
 def test_blackbox_decode_writes_degrees_and_counts():
     reading = read(blackbox_csv())
-    np.testing.assert_allclose(reading.times, 33.011567 + 5e-4 * np.arange(5), rtol=1e-12)
-    np.testing.assert_allclose(reading.rates[4], np.array([4, -90, 180]) * DEGREE, rtol=1e-9)
+    np.testing.assert_allclose(
+        reading.times, 33.011567 + 5e-4 * np.arange(5), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        reading.rates[4], np.array([4, -90, 180]) * DEGREE, rtol=1e-9
+    )
     assert reading.specific_forces is None
     said(reading, "left out: their unit is not stated")
     np.testing.assert_array_equal(reading.columns["motor[0]"], 158 + np.arange(5))
@@ -212,8 +261,10 @@ def raw_counts(most, settings="", integers=True, header=""):
     """A log of counts of a gyro that turns slowly, then as fast as `most` says."""
     shares = np.sin(np.linspace(0, 6, 200))
     values = np.round(most * shares) if integers else most * shares
-    rows = "".join(f"{i}, {1000 * i}, 0, {x:.7g}, 0, 5, 0, 0, 2048, 158, 0\n"
-                   for i, x in enumerate(values))  # fmt: skip
+    rows = "".join(
+        f"{i}, {1000 * i}, 0, {x:.7g}, 0, 5, 0, 0, 2048, 158, 0\n"
+        for i, x in enumerate(values)
+    )
     return settings + BETAFLIGHT.format(r=header, a="") + rows, values
 
 
@@ -271,9 +322,13 @@ def test_what_the_caller_says_of_blackbox_counts():
 
 
 def test_blackbox_numbers_that_are_no_counts_are_asked_about():
-    with pytest.raises(ValueError, match=r"Argument `unit` must say the unit of the rates"):
+    with pytest.raises(
+        ValueError, match=r"Argument `unit` must say the unit of the rates"
+    ):
         read(raw_counts(12100.5, integers=False)[0])
-    with pytest.raises(ValueError, match=r"Argument `unit` must say the unit of the rates"):
+    with pytest.raises(
+        ValueError, match=r"Argument `unit` must say the unit of the rates"
+    ):
         read(raw_counts(40000)[0])
 
 
@@ -285,17 +340,23 @@ def test_blackbox_decode_with_units_asked_for():
 
 
 def test_blackbox_viewer_puts_its_settings_above():
-    above = '"Product","Blackbox flight data recorder"\n"looptime","125"\n"acc_1G","2048"\n'
+    above = (
+        '"Product","Blackbox flight data recorder"\n"looptime","125"\n"acc_1G","2048"\n'
+    )
     above += '"gyro_scale","0x40000000"\n"rates","70,70,70"\n'
     header = BETAFLIGHT.format(r="", a="").replace(" (us)", "")
     reading = read(above + header + "".join(blackbox_csv().splitlines(True)[1:]))
     np.testing.assert_allclose(reading.specific_forces[:, 2], GRAVITY)
     # the bits of 2.0
-    np.testing.assert_allclose(reading.rates[4], 2 * np.array([4, -90, 180]) * DEGREE, rtol=1e-9)
+    np.testing.assert_allclose(
+        reading.rates[4], 2 * np.array([4, -90, 180]) * DEGREE, rtol=1e-9
+    )
     said(reading, "times (time) taken as us: their median step is 500")
     names = ("gyroADC[2]", "gyroADC[0]", "gyroADC[1]")
-    turned = read(above + header + "".join(blackbox_csv().splitlines(True)[1:]),
-                  columns={"rates": names})  # fmt: skip
+    turned = read(
+        above + header + "".join(blackbox_csv().splitlines(True)[1:]),
+        columns={"rates": names},
+    )
     np.testing.assert_array_equal(turned.rates, reading.rates[:, [2, 0, 1]])
 
 
@@ -311,23 +372,34 @@ def variable_byte(value):
 def blackbox_log(rows, scale="0x3f800000"):
     """A log with nothing but whole frames, in the format of blackbox version 2."""
     names = (
-        "loopIteration,time,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]"
+        "loopIteration,time,gyroADC[0],gyroADC[1],gyroADC[2],"
+        "accSmooth[0],accSmooth[1],accSmooth[2]"
     )
     signed = [0, 0, 1, 1, 1, 1, 1, 1]
     header = [
-        "Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2",
-        f"Field I name:{names}", f"Field I signed:{','.join(map(str, signed))}",
+        "Product:Blackbox flight data recorder by Nicholas Sherlock",
+        "Data version:2",
+        f"Field I name:{names}",
+        f"Field I signed:{','.join(map(str, signed))}",
         "Field I predictor:" + ",".join("0" * 8),
         "Field I encoding:" + ",".join(str(1 - x) for x in signed),  # 0 is zigzag
-        "Firmware type:Cleanflight", f"gyro_scale:{scale}", "acc_1G:2048", "I interval:1",
-        "P interval:1/1", "vbatref:0", "minthrottle:1070", "motorOutput:158,2047",
-    ]  # fmt: skip
+        "Firmware type:Cleanflight",
+        f"gyro_scale:{scale}",
+        "acc_1G:2048",
+        "I interval:1",
+        "P interval:1/1",
+        "vbatref:0",
+        "minthrottle:1070",
+        "motorOutput:158,2047",
+    ]
     frames = b"".join(
-        b"I" + b"".join(
-            variable_byte((x << 1 ^ x >> 31) if s else x) for x, s in zip(row, signed, strict=True)
+        b"I"
+        + b"".join(
+            variable_byte((x << 1 ^ x >> 31) if s else x)
+            for x, s in zip(row, signed, strict=True)
         )
         for row in rows
-    )  # fmt: skip
+    )
     return "".join(f"H {x}\n" for x in header).encode() + frames
 
 
@@ -351,20 +423,30 @@ def test_a_blackbox_log(tmp_path):
 def test_logs_in_one_blackbox_file_and_one_that_breaks_off(tmp_path):
     pytest.importorskip("orangebox")
     path = tmp_path / "LOG00001.TXT"  # by what is in it, not by its name
-    path.write_bytes(blackbox_log(FRAMES) + END + blackbox_log(FRAMES[:9], "0x40000000"))
+    path.write_bytes(
+        blackbox_log(FRAMES) + END + blackbox_log(FRAMES[:9], "0x40000000")
+    )
     first, second = (jr.records.read(path, log=i) for i in (1, 2))
     assert first.times.size == 20
     assert second.times.size in (8, 9)
     np.testing.assert_allclose(second.rates[1, 0], 180 * DEGREE)  # its own gyro_scale
     said(first, "log 1 of 2")
     said(second, "the log breaks off")
-    with pytest.raises(ValueError, match="must be of a log that can be decoded, but: Invalid log"):
+    with pytest.raises(
+        ValueError, match="must be of a log that can be decoded, but: Invalid log"
+    ):
         jr.records.read(path, log=3)
 
 
 def test_a_blackbox_log_through_a_decoder_that_stands_in(tmp_path, monkeypatch):
     class Parser:
-        field_names = ["time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]", "flightModeFlags"]  # noqa: RUF012
+        field_names = [  # noqa: RUF012
+            "time",
+            "gyroADC[0]",
+            "gyroADC[1]",
+            "gyroADC[2]",
+            "flightModeFlags",
+        ]
         headers = {"gyro_scale": 0x3F800000}  # noqa: RUF012
         reader = types.SimpleNamespace(log_count=1)
 
@@ -394,23 +476,32 @@ def test_a_blackbox_log_without_the_extra_names_it(tmp_path, monkeypatch):
         jr.records.read(path)
 
 
-# Anyone's columns, and their units ----------------------------------------------------------------
+# Anyone's columns, and their units
+# ----------------------------------------------------------------
 
 
 def table(names, columns, separator=","):
     lines = [separator.join(names)]
-    return "\n".join(lines + [separator.join(f"{x:.12g}" for x in row) for row in columns]) + "\n"
+    return (
+        "\n".join(lines + [separator.join(f"{x:.12g}" for x in row) for row in columns])
+        + "\n"
+    )
 
 
 @pytest.mark.parametrize(
     "names",
     [
-        "t,gx,gy,gz", "timestamp,gyro_x,gyro_y,gyro_z", "Time,GyroX,GyroY,GyroZ",
-        "time,omega_x,omega_y,omega_z", "ts,rotationRateX,rotationRateY,rotationRateZ",
-        "seconds,angular velocity x,angular velocity y,angular velocity z", "t,wx,wy,wz",
-        "time,gyro.x,gyro.y,gyro.z", "t,gyro[0],gyro[1],gyro[2]",
+        "t,gx,gy,gz",
+        "timestamp,gyro_x,gyro_y,gyro_z",
+        "Time,GyroX,GyroY,GyroZ",
+        "time,omega_x,omega_y,omega_z",
+        "ts,rotationRateX,rotationRateY,rotationRateZ",
+        "seconds,angular velocity x,angular velocity y,angular velocity z",
+        "t,wx,wy,wz",
+        "time,gyro.x,gyro.y,gyro.z",
+        "t,gyro[0],gyro[1],gyro[2]",
     ],
-)  # fmt: skip
+)
 def test_names_that_are_recognised(names):
     reading = read(table(names.split(","), ROWS), unit="rad/s")
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:])
@@ -418,16 +509,29 @@ def test_names_that_are_recognised(names):
 
 
 def test_columns_by_name_and_a_wheel():
-    names = ["clock [ms]", "a1", "a2", "a3", "b1", "b2", "b3", "speed (rpm)", "note", ""]
+    names = [
+        "clock [ms]",
+        "a1",
+        "a2",
+        "a3",
+        "b1",
+        "b2",
+        "b3",
+        "speed (rpm)",
+        "note",
+        "",
+    ]
     rows = [[10 * i, 1, 2, 3, 0, 0, 1, 60, np.nan, np.nan] for i in range(5)]
     reading = read(
         table(names, rows, ";"),
         columns={
-            "times": "clock", "rates": ("a3", "a1", "a2"), "wheel": "speed",
+            "times": "clock",
+            "rates": ("a3", "a1", "a2"),
+            "wheel": "speed",
             "specific_forces": ("b1", "b2", "b3"),
         },
         unit={"rates": "DPS", "specific_forces": "g"},
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(reading.times, 0.01 * np.arange(5))
     np.testing.assert_allclose(reading.rates[0], np.array([3, 1, 2]) * DEGREE)
     np.testing.assert_allclose(reading.specific_forces[0], [0, 0, GRAVITY])
@@ -436,14 +540,22 @@ def test_columns_by_name_and_a_wheel():
 
 
 def test_the_caller_is_right_and_the_header_is_told_of():
-    reading = read(table(["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"], ROWS), unit="°/s")
+    reading = read(
+        table(["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"], ROWS), unit="°/s"
+    )
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:] * DEGREE)
     said(reading, "`unit` says so, though the file says rad/s")
 
 
 @pytest.mark.parametrize(
     ("step", "unit", "factor"),
-    [(0.005, "s", 1.0), (0.1, "s", 1.0), (5.0, "ms", 1e-3), (125.0, "us", 1e-6), (2e6, "ns", 1e-9)],
+    [
+        (0.005, "s", 1.0),
+        (0.1, "s", 1.0),
+        (5.0, "ms", 1e-3),
+        (125.0, "us", 1e-6),
+        (2e6, "ns", 1e-9),
+    ],
 )
 def test_times_are_recognised_by_their_step(step, unit, factor):
     rows = np.column_stack([step * np.arange(6), ROWS[:, 1:]])
@@ -455,7 +567,9 @@ def test_times_are_recognised_by_their_step(step, unit, factor):
 def test_times_of_an_epoch_count_from_the_first_reading():
     rows = np.column_stack([1.7276e9 + 0.01 * np.arange(6), ROWS[:, 1:]])
     names = ["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"]
-    text = "\n".join([",".join(names), *(",".join(repr(float(x)) for x in r) for r in rows)])
+    text = "\n".join(
+        [",".join(names), *(",".join(repr(float(x)) for x in r) for r in rows)]
+    )
     reading = read(text)
     np.testing.assert_allclose(reading.times, ROWS[:, 0], atol=1e-6)
     said(reading, "times count from 1727600000.0")
@@ -463,7 +577,12 @@ def test_times_of_an_epoch_count_from_the_first_reading():
 
 @pytest.mark.parametrize(
     ("stated", "factor"),
-    [("rad/sec", 1.0), ("radians/second", 1.0), ("Degrees / s", DEGREE), ("mdps", 1e-3 * DEGREE)],
+    [
+        ("rad/sec", 1.0),
+        ("radians/second", 1.0),
+        ("Degrees / s", DEGREE),
+        ("mdps", 1e-3 * DEGREE),
+    ],
 )
 def test_spellings_of_units(stated, factor):
     names = ["time (seconds)", *(f"gyro {a} [{stated}]" for a in "xyz")]
@@ -474,12 +593,21 @@ def test_spellings_of_units(stated, factor):
 def test_rates_beyond_every_gyro_are_asked_about(stated, most):
     names = ["t (s)", *(f"gyro {a} ({stated})" for a in "xyz")]
     rows = ROWS * [1, 1, 1, most / 1.5]
-    with pytest.raises(ValueError, match=r"Argument `unit` must .* no common gyro reads") as error:
+    with pytest.raises(
+        ValueError, match=r"Argument `unit` must .* no common gyro reads"
+    ) as error:
         read(table(names, rows))
-    for words in (f"number, {most}, is", "`unit='rad/s'`", "`unit='deg/s'`", "`unit='counts'`"):
+    for words in (
+        f"number, {most}, is",
+        "`unit='rad/s'`",
+        "`unit='deg/s'`",
+        "`unit='counts'`",
+    ):
         assert words in str(error.value), words
     reading = read(table(names, rows), unit=stated)
-    assert reading.rates[0, 2] == pytest.approx(most * (DEGREE if stated == "deg/s" else 1))
+    assert reading.rates[0, 2] == pytest.approx(
+        most * (DEGREE if stated == "deg/s" else 1)
+    )
     said(reading, "though no common gyro reads")
 
 
@@ -489,16 +617,22 @@ def test_a_unit_may_be_a_factor():
     reading = read(table(names, rows), unit=0.001)
     np.testing.assert_allclose(reading.rates, 0.001 * ROWS[:, 1:])
     said(reading, "rates (gx, gy, gz) multiplied by 0.001: `unit` says so")
-    reading = read(table(names, rows), unit={"rates": 2, "specific_forces": GRAVITY / 2048})
+    reading = read(
+        table(names, rows), unit={"rates": 2, "specific_forces": GRAVITY / 2048}
+    )
     np.testing.assert_allclose(reading.rates, 2 * ROWS[:, 1:])
     np.testing.assert_allclose(reading.specific_forces[0], [0, 0, GRAVITY])
     for wrong in (0.0, -1.0, np.nan, np.inf, True):
-        with pytest.raises(ValueError, match=r"Argument `unit` must be a unit or a positive"):
+        with pytest.raises(
+            ValueError, match=r"Argument `unit` must be a unit or a positive"
+        ):
             read(table(names, rows), unit=wrong)
 
 
 def test_rows_without_numbers_are_counted():
-    rows = np.vstack([ROWS, [0.06, np.nan, 1, 2], [0.07, 1, 1, 1], [0.08, np.nan, np.nan, np.nan]])
+    rows = np.vstack(
+        [ROWS, [0.06, np.nan, 1, 2], [0.07, 1, 1, 1], [0.08, np.nan, np.nan, np.nan]]
+    )
     reading = read(table(["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)"], rows))
     assert reading.times.size == 7
     said(reading, "2 rows without numbers of all three axes dropped")
@@ -513,14 +647,18 @@ def test_degrees_are_recognised_by_the_range_of_gyros():
 @pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
 def test_the_unit_is_recognised_by_how_gravity_turns(unit, rng):
     times = np.arange(0, 10, 0.01)
-    rates = np.stack([np.sin(times), 0.8 * np.cos(1.7 * times), 0.5 * np.sin(2.3 * times)], axis=1)
+    rates = np.stack(
+        [np.sin(times), 0.8 * np.cos(1.7 * times), 0.5 * np.sin(2.3 * times)], axis=1
+    )
     turned = Rotation.identity()
     forces = []
     for rate in rates:
         forces.append(turned.inv().apply([0, 0, GRAVITY]))
         turned = turned * Rotation.from_rotvec(0.01 * rate)
     forces = np.array(forces) + 0.3 * rng.normal(size=rates.shape)
-    rows = np.column_stack([times, rates / (DEGREE if unit == "deg/s" else 1.0), forces])
+    rows = np.column_stack(
+        [times, rates / (DEGREE if unit == "deg/s" else 1.0), forces]
+    )
     text = table(["t", "gx", "gy", "gz", "ax", "ay", "az"], rows)
     reading = read(text)
     np.testing.assert_allclose(reading.rates, rates, atol=1e-9)
@@ -538,7 +676,9 @@ def test_the_unit_is_recognised_by_how_gravity_turns(unit, rng):
 def test_what_read_refuses(tmp_path):
     rates = ["t", "gx", "gy", "gz"]
     good = table(rates, ROWS)
-    with pytest.raises(ValueError, match="Argument `unit` must say the unit of the rates"):
+    with pytest.raises(
+        ValueError, match="Argument `unit` must say the unit of the rates"
+    ):
         read(good)
     with pytest.raises(ValueError, match="up to 30000 do not tell"):
         read(table(rates, ROWS * [1, 1, 1, 20000]))
@@ -546,11 +686,15 @@ def test_what_read_refuses(tmp_path):
         read(good, unit="knots")
     with pytest.raises(ValueError, match=r"Argument `unit` must be one of .*'speed'"):
         read(good, unit={"speed": "rpm"})
-    with pytest.raises(ValueError, match=r"unit of `rates`, but .* 'furlong' is not known"):
+    with pytest.raises(
+        ValueError, match=r"unit of `rates`, but .* 'furlong' is not known"
+    ):
         read(good.replace("gx", "gx (furlong)"))
     with pytest.raises(ValueError, match="steps of 1e-05 are neither"):
         read(table(rates, ROWS * [1e-3, 1, 1, 1]), unit="rad/s")
-    with pytest.raises(ValueError, match=r"Argument `columns` must name columns .* 'foo' is none"):
+    with pytest.raises(
+        ValueError, match=r"Argument `columns` must name columns .* 'foo' is none"
+    ):
         read(good, columns={"rates": ("foo", "gy", "gz")})
     with pytest.raises(ValueError, match="must name three columns for `rates`"):
         read(good, columns={"rates": ("gy", "gz")})
@@ -569,11 +713,19 @@ def test_what_read_refuses(tmp_path):
 def test_a_file_that_has_been_through_much(tmp_path):
     """Byte order mark, remarks, Windows lines, quotes, empty cells, a header twice, a cut end."""
     lines = [
-        "made by hand", '"Time (ms)","Gyro X (°/s)","Gyro Y (°/s)","Gyro Z (°/s)","Temp","µ"',
-        "0,1,2,3,20.5,", "10,1,2,3,20.5,", "", "20,,2,3,20.5,", "30,NaN,2,3,20.5,",
+        "made by hand",
         '"Time (ms)","Gyro X (°/s)","Gyro Y (°/s)","Gyro Z (°/s)","Temp","µ"',
-        "40,1,2,3,20.5,", "50,1,2,3,20.5,", "60,1,2,3,null,", "70,1,2",
-    ]  # fmt: skip
+        "0,1,2,3,20.5,",
+        "10,1,2,3,20.5,",
+        "",
+        "20,,2,3,20.5,",
+        "30,NaN,2,3,20.5,",
+        '"Time (ms)","Gyro X (°/s)","Gyro Y (°/s)","Gyro Z (°/s)","Temp","µ"',
+        "40,1,2,3,20.5,",
+        "50,1,2,3,20.5,",
+        "60,1,2,3,null,",
+        "70,1,2",
+    ]
     path = tmp_path / "worn.csv"
     path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
     reading = jr.records.read(path)
@@ -601,12 +753,20 @@ def test_rows_without_a_time_and_sensors_that_never_meet():
     late = np.column_stack([rows, 9.0 + rows[:, :1], rows[:, 1:]])
     reading = read(table([*header, "t", "ax", "ay", "az"], late), unit={"times": "s"})
     assert reading.specific_forces is None
-    assert np.isnan(read(table([*header, "t", "ax (g)", "ay (g)", "az (g)"], late),
-                         unit={"times": "s"}).specific_forces).all()  # fmt: skip
+    assert np.isnan(
+        read(
+            table([*header, "t", "ax (g)", "ay (g)", "az (g)"], late),
+            unit={"times": "s"},
+        ).specific_forces
+    ).all()
 
 
 def test_an_attitude_is_no_rate():
-    names = ["t (s)", *(f"ROTATION VECTOR {a}" for a in "XYZ"), *(f"gyro {a} (dps)" for a in "XYZ")]
+    names = [
+        "t (s)",
+        *(f"ROTATION VECTOR {a}" for a in "XYZ"),
+        *(f"gyro {a} (dps)" for a in "XYZ"),
+    ]
     reading = read(table(names, np.column_stack([ROWS, ROWS[:, 1:]])))
     np.testing.assert_allclose(reading.rates, ROWS[:, 1:] * DEGREE)
     assert "ROTATION VECTOR X" in reading.columns
@@ -616,13 +776,19 @@ def test_latin_1_does_not_stop_a_reading(tmp_path):
     header = "t (s),mag x (µT),mag y (µT),mag z (µT)\n"
     path = tmp_path / "old.csv"
     path.write_bytes((header + "0,10,20,30\n0.1,10,20,30\n").encode("latin-1"))
-    np.testing.assert_allclose(jr.records.read(path).magnetic_fields[0], [1e-5, 2e-5, 3e-5])
+    np.testing.assert_allclose(
+        jr.records.read(path).magnetic_fields[0], [1e-5, 2e-5, 3e-5]
+    )
 
 
 def test_a_reading_is_cut_and_printed():
     times = np.concatenate([np.arange(5), 100 + np.arange(5)]) / 100
-    reading = read(table(["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)", "n"],
-                         np.column_stack([times, np.ones((10, 3)), np.arange(10)])))  # fmt: skip
+    reading = read(
+        table(
+            ["t (s)", "gx (rad/s)", "gy (rad/s)", "gz (rad/s)", "n"],
+            np.column_stack([times, np.ones((10, 3)), np.arange(10)]),
+        )
+    )
     assert reading.breaks == (5,)
     first, second = reading.pieces()
     np.testing.assert_array_equal(second.columns["n"], np.arange(5, 10))
@@ -631,14 +797,17 @@ def test_a_reading_is_cut_and_printed():
     assert reading[3:8].rates.shape == (5, 3)
     assert reading.interval == pytest.approx(0.01)
     text = str(reading)
-    assert text.startswith("10 readings over 1.04 s, one in 10 ms\n  rates: 1.732 rad/s at most")
+    assert text.startswith(
+        "10 readings over 1.04 s, one in 10 ms\n  rates: 1.732 rad/s at most"
+    )
     assert "pieces without a break: 2" in text
     assert "- 1 gap, of 0.96 s after 0.04 s" in text
     with pytest.raises(ValueError, match="must be consecutive"):
         reading[::2]
 
 
-# Clocks -------------------------------------------------------------------------------------------
+# Clocks
+# -------------------------------------------------------------------------------------------
 
 
 def test_a_good_clock_is_left_alone(rng):
@@ -655,7 +824,10 @@ def test_rows_written_twice_and_late():
     clock = jr.records.repair(times[rows], rows[:, None].astype(float))
     np.testing.assert_allclose(clock.times, times, atol=1e-15)
     np.testing.assert_array_equal(rows[clock.rows], np.arange(100))
-    assert clock.notes == ("1 row out of order sorted in", "1 row written twice dropped")
+    assert clock.notes == (
+        "1 row out of order sorted in",
+        "1 row written twice dropped",
+    )
 
 
 def test_a_reset_clock_goes_on_after_a_break():
@@ -699,7 +871,9 @@ def test_times_rounded_to_milliseconds_are_put_on_a_line(interval):
         clock = jr.records.repair(rounded)
         np.testing.assert_array_equal(clock.rows, np.arange(1000))
         late = clock.times - true
-        assert np.ptp(late) < 0.1e-3  # but for the half digit that cutting takes from all
+        assert (
+            np.ptp(late) < 0.1e-3
+        )  # but for the half digit that cutting takes from all
         assert "rounded to 1 ms" in clock.notes[-1]
         kept = jr.records.repair(rounded, clock="recorded").times
         np.testing.assert_array_equal(kept, np.unique(rounded))
@@ -732,22 +906,26 @@ def test_times_that_say_nothing():
         jr.records.repair(np.arange(3.0), clock="atomic")
 
 
-# Flights ------------------------------------------------------------------------------------------
+# Flights
+# ------------------------------------------------------------------------------------------
 
 
 TENSOR = np.array([[2.0, 0.2, -0.1], [0.2, 3.0, 0.3], [-0.1, 0.3, 4.0]]) * 1e-3
 
 
 def thrown(rng, rate, flights, spin, lever, total=5.0, gyro=0.01, accelerometer=0.1):
-    """A hand that shakes, spins up, throws and catches, by scipy's integrator.
+    """A hand that shakes, spins up, trials and catches, by scipy's integrator.
 
-    In the hand the rates follow their target within 20 ms; in flight there is a little drag.
+    In the hand the rates follow their target within 20 ms; in flight there is a little
+    drag.
     """
     frequency, phase = rng.uniform(0.7, 4, (2, 3, 3)), rng.uniform(0, 6, (2, 3, 3))
     size = rng.uniform(0.5, 3, (2, 3, 3))
 
     def shaking(t, which):
-        return np.sum(size[which] * np.sin(6.28 * frequency[which] * t + phase[which]), axis=1)
+        return np.sum(
+            size[which] * np.sin(6.28 * frequency[which] * t + phase[which]), axis=1
+        )
 
     def free(t):
         return any(a <= t < b for a, b in flights)
@@ -755,7 +933,9 @@ def thrown(rng, rate, flights, spin, lever, total=5.0, gyro=0.01, accelerometer=
     def rates_of_change(t, state):
         omega, attitude = state[:3], state[3:]
         if free(t):
-            change = np.linalg.solve(TENSOR, -np.cross(omega, TENSOR @ omega) - 1e-5 * omega)
+            change = np.linalg.solve(
+                TENSOR, -np.cross(omega, TENSOR @ omega) - 1e-5 * omega
+            )
         else:
             ahead = [a - t for a, _ in flights if 0 < a - t < 0.25]
             target = spin * (1.2 - 3 * ahead[0]) if ahead else shaking(t, 0)
@@ -780,8 +960,8 @@ def thrown(rng, rate, flights, spin, lever, total=5.0, gyro=0.01, accelerometer=
     for i, t in enumerate(times):
         changes[i] = rates_of_change(t, states[i])[:3]
         since = min((t - b for _, b in flights if t >= b), default=9.0)
-        throw = 15.0 * any(0 < a - t < 0.12 for a, _ in flights)
-        up = GRAVITY + throw + 60 * np.exp(-since / 0.03)
+        trial = 15.0 * any(0 < a - t < 0.12 for a, _ in flights)
+        up = GRAVITY + trial + 60 * np.exp(-since / 0.03)
         space[i] = [0.1, 0, -0.3] if free(t) else shaking(t, 1) + np.array([0, 0, up])
     forces = Rotation.from_quat(states[:, 3:]).inv().apply(space)
     forces += np.cross(changes, lever) + np.cross(omega, np.cross(omega, lever))
@@ -801,8 +981,18 @@ def assert_within(found, flights, rate):
 
 
 CASES = {
-    "a tool, spinning": (200.0, [[1.5, 2.1], [3.2, 3.65]], [3.0, 14.0, -6.0], [0.03, -0.02, 0.05]),
-    "an accelerometer far out": (500.0, [[2.0, 2.5]], [10.0, -22.0, 6.0], [0.15, 0.1, -0.1]),
+    "a tool, spinning": (
+        200.0,
+        [[1.5, 2.1], [3.2, 3.65]],
+        [3.0, 14.0, -6.0],
+        [0.03, -0.02, 0.05],
+    ),
+    "an accelerometer far out": (
+        500.0,
+        [[2.0, 2.5]],
+        [10.0, -22.0, 6.0],
+        [0.15, 0.1, -0.1],
+    ),
     "a slow phone": (100.0, [[2.0, 2.7]], [3.0, 5.0, 2.0], [0.01, 0.02, 0.0]),
     "hardly turning": (100.0, [[2.0, 2.6]], [0.3, 0.2, -0.1], [0.0, 0.05, 0.0]),
 }
@@ -851,14 +1041,18 @@ def test_short_flights_breaks_and_silence(rng):
     forces = np.where(flying[:, None], 0.0, [0.0, 0.0, GRAVITY])
     reading = jr.records.Reading(times, np.zeros((300, 3)), forces)
     assert len(jr.records.flights(reading)) == 1
-    assert jr.records.flights(reading, least=0.7) == []
+    assert jr.records.flights(reading, min_duration=0.7) == []
     [wide], [narrow] = (jr.records.flights(reading, margin=m) for m in (0.0, 0.1))
-    # The margin counts from the last reading with contact, one interval before the first without.
+    # The margin counts from the last reading with contact, one interval before the
+    # first without.
     assert narrow.times[0] - wide.times[0] == pytest.approx(0.09)
     broken = jr.records.Reading(times, np.zeros((300, 3)), forces, breaks=(130,))
     assert [x.times.size > 20 for x in jr.records.flights(broken)] == [True, True]
     forces = np.where(np.arange(300)[:, None] == 130, np.nan, forces)
-    assert len(jr.records.flights(jr.records.Reading(times, np.zeros((300, 3)), forces))) == 2
+    assert (
+        len(jr.records.flights(jr.records.Reading(times, np.zeros((300, 3)), forces)))
+        == 2
+    )
     assert jr.records.flights(reading[:5]) == jr.records.flights(reading[:0]) == []
 
 
@@ -871,7 +1065,9 @@ def test_a_gyro_at_rest_keeps_its_bias_but_does_not_fly(rng):
 
 
 def test_a_loud_gyro_sees_flights_by_the_momentum(rng):
-    reading = thrown(rng, 400.0, [[2.0, 2.6]], np.array([4.0, -9.0, 3.0]), np.zeros(3), gyro=0.1)
+    reading = thrown(
+        rng, 400.0, [[2.0, 2.6]], np.array([4.0, -9.0, 3.0]), np.zeros(3), gyro=0.1
+    )
     [flight] = jr.records.flights(reading, by="momentum")
     assert 1.95 < flight.times[0] < 2.04
     assert 2.55 < flight.times[-1] < 2.6
@@ -880,7 +1076,9 @@ def test_a_loud_gyro_sees_flights_by_the_momentum(rng):
 def test_what_flights_needs():
     times = np.arange(100) / 100
     with pytest.raises(ValueError, match="Argument `reading` must have rates"):
-        jr.records.flights(jr.records.Reading(times, specific_forces=np.zeros((100, 3))))
+        jr.records.flights(
+            jr.records.Reading(times, specific_forces=np.zeros((100, 3)))
+        )
     with pytest.raises(ValueError, match="must have specific forces"):
         jr.records.flights(jr.records.Reading(times, np.zeros((100, 3))), by="forces")
     with pytest.raises(ValueError, match="Argument `by` must be one of"):
@@ -933,7 +1131,9 @@ def test_flicker_is_level(rng):
     values = np.fft.irfft(spectrum, size)
     allan = jr.records.allan(values[:, None], 1.0)
     level = (allan.times > 10) & (allan.times < 2000)
-    np.testing.assert_allclose(allan.deviations[level, 0], 0.664 * instability, rtol=0.12)
+    np.testing.assert_allclose(
+        allan.deviations[level, 0], 0.664 * instability, rtol=0.12
+    )
 
 
 def test_pieces_are_pooled(rng):
@@ -941,7 +1141,9 @@ def test_pieces_are_pooled(rng):
     pooled = jr.records.allan([x[:1000], x[1000:]], 1.0)
     short, long = jr.records.allan(x[:1000], 1.0), jr.records.allan(x[1000:], 1.0)
     weight = short.counts[0], long.counts[0]
-    expected = np.sqrt(np.average([short.deviations[0] ** 2, long.deviations[0] ** 2], 0, weight))
+    expected = np.sqrt(
+        np.average([short.deviations[0] ** 2, long.deviations[0] ** 2], 0, weight)
+    )
     np.testing.assert_allclose(pooled.deviations[0], expected)
     assert pooled.counts[0] == sum(weight)
     with pytest.raises(ValueError, match="must have 3 readings, but it has 2"):
@@ -992,7 +1194,10 @@ def test_bias_instability_of_white_noise_and_flicker(rng):
     noise = jr.records.noise(reading, at_rest=True)
     np.testing.assert_allclose(noise.sigma, 0.02, rtol=0.05)
     np.testing.assert_allclose(noise.density, 0.002, rtol=0.1)
-    assert np.all((noise.instability > 0.6 * instability) & (noise.instability < 1.4 * instability))
+    assert np.all(
+        (noise.instability > 0.6 * instability)
+        & (noise.instability < 1.4 * instability)
+    )
     assert np.all(noise.instability_times > 1.0)
 
 
@@ -1000,7 +1205,9 @@ def test_noise_of_a_gyro_that_filters(rng):
     """Averages over 10 readings: sigma small, the density that of the noise before the filter."""
     white = 0.1 * rng.normal(size=(60_009, 3))
     sums = np.cumsum(np.concatenate([np.zeros((1, 3)), white]), axis=0)
-    reading = jr.records.Reading(np.arange(60_000) / 1000, (sums[10:] - sums[:-10]) / 10)
+    reading = jr.records.Reading(
+        np.arange(60_000) / 1000, (sums[10:] - sums[:-10]) / 10
+    )
     noise = jr.records.noise(reading, at_rest=True)
     assert np.all(noise.sigma < 0.02)
     np.testing.assert_allclose(noise.density, 0.1 * np.sqrt(1e-3), rtol=0.15)
@@ -1014,7 +1221,11 @@ def test_no_rest(rng):
         jr.records.noise(moving)
     with pytest.raises(ValueError, match="must have rates"):
         jr.records.rests(jr.records.Reading(times))
-    shaken = jr.records.Reading(times, 2 * np.sin(130 * times[:, None] + np.arange(3.0)))
+    shaken = jr.records.Reading(
+        times, 2 * np.sin(130 * times[:, None] + np.arange(3.0))
+    )
     assert jr.records.rests(shaken) == []
-    steady = jr.records.Reading(times, np.tile([0.0, 0.0, 3.0], (2000, 1)))  # on a turntable
+    steady = jr.records.Reading(
+        times, np.tile([0.0, 0.0, 3.0], (2000, 1))
+    )  # on a turntable
     assert jr.records.rests(steady) == []

@@ -39,13 +39,20 @@ def unit(*components):
     return components / np.linalg.norm(components)
 
 
-# --- group axioms -----------------------------------------------------------------------------
+# --- group axioms
+# -----------------------------------------------------------------------------
 
-angles = st.one_of(st.sampled_from([*ANGLES, *(-a for a in ANGLES)]), st.floats(-np.pi, np.pi))
+angles = st.one_of(
+    st.sampled_from([*ANGLES, *(-a for a in ANGLES)]), st.floats(-np.pi, np.pi)
+)
 directions = st.tuples(*(st.integers(-9, 9),) * 3).filter(any).map(lambda v: unit(*v))
 rotations = st.builds(lambda axis, angle: axis * angle, directions, angles)
 axioms_of = settings(
-    derandomize=True, max_examples=60, deadline=None, database=None, phases=[Phase.generate]
+    derandomize=True,
+    max_examples=60,
+    deadline=None,
+    database=None,
+    phases=[Phase.generate],
 )
 
 
@@ -63,7 +70,8 @@ def axioms(u, v, w, x):
         "identity": ro.multiply(p, one) - p + ro.multiply(one, q) - q,
         "inverse": ro.multiply(p, ro.conjugate(p)) - one,
         "inverse of any": ro.multiply(ro.inverse(3 * p), 3 * p) - one,
-        "inverse of a product": ro.conjugate(pq) - ro.multiply(ro.conjugate(q), ro.conjugate(p)),
+        "inverse of a product": ro.conjugate(pq)
+        - ro.multiply(ro.conjugate(q), ro.conjugate(p)),
         "acts": ro.rotate(pq, x) - ro.rotate(p, ro.rotate(q, x)),
         "inverse acts": ro.rotate_inverse(p, ro.rotate(p, x)) - x,
         "keeps lengths": jnp.sum(ro.rotate(p, x) ** 2) - jnp.sum(x * x),
@@ -74,9 +82,13 @@ def axioms(u, v, w, x):
         "log after exp": ro.exp(ro.log(p)) - jnp.where(p[0] < 0, -p, p),
         "log of minus": jnp.where(pq[0] == 0, 0.0, ro.log(-pq) - ro.log(pq)),
         "from after to matrix": ro.to_matrix(ro.from_matrix(m)) - m,
-        "from after to euler": ro.to_matrix(ro.from_euler(ro.to_euler(pq))) - ro.to_matrix(pq),
+        "from after to euler": ro.to_matrix(ro.from_euler(ro.to_euler(pq)))
+        - ro.to_matrix(pq),
         "slerp ends": jnp.concatenate(
-            [ro.slerp(p, q, 0) - p, ro.to_matrix(ro.slerp(p, q, 1))[0] - ro.to_matrix(q)[0]]
+            [
+                ro.slerp(p, q, 0) - p,
+                ro.to_matrix(ro.slerp(p, q, 1))[0] - ro.to_matrix(q)[0],
+            ]
         ),
         "from after to roll, pitch and yaw": ro.to_matrix(
             ro.from_roll_pitch_yaw(ro.to_roll_pitch_yaw(pq))
@@ -85,7 +97,8 @@ def axioms(u, v, w, x):
         "adjoint": ro.hat(ro.rotate(p, x)) - m @ ro.hat(x) @ m.T,
         "distance is symmetric": ro.angle_between(p, q) - ro.angle_between(q, p),
         "distance is invariant": jnp.abs(
-            ro.angle_between(ro.multiply(r, p), ro.multiply(r, q)) - ro.angle_between(p, q)
+            ro.angle_between(ro.multiply(r, p), ro.multiply(r, q))
+            - ro.angle_between(p, q)
         )
         * jnp.minimum(1, ro.angle_between(p, q)),
     }
@@ -99,13 +112,15 @@ def test_group_axioms(dtype, u, v, w):
     for name, residual in axioms(*arrays).items():
         assert residual.dtype == dtype
         if name == "log of minus" and not np.all(np.abs(residual) < 1e-3):
-            # beside the half turn, where rounding decides which of its two vectors it is
+            # beside the half turn, where rounding decides which of its two vectors it
+            # is
             np.testing.assert_allclose(np.linalg.norm(residual), 2 * np.pi, atol=1e-3)
             continue
         assert np.max(np.abs(residual)) <= ulps(dtype, 20), (name, residual)
 
 
-# --- values against scipy and mpmath ----------------------------------------------------------
+# --- values against scipy and mpmath
+# ----------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -117,19 +132,26 @@ def test_exp_and_log_in_ulps(angle, dtype):
             v = [mpmath.mpf(float(c)) for c in vector]
             half = mpmath.sqrt(sum(c * c for c in v)) / 2
             sinc = mpmath.sin(half) / half if half else mpmath.mpf(1)
-            exact = np.array([float(c) for c in (mpmath.cos(half), *(sinc * c / 2 for c in v))])
+            exact = np.array(
+                [float(c) for c in (mpmath.cos(half), *(sinc * c / 2 for c in v))]
+            )
         q = np.asarray(ro.exp(jnp.asarray(vector)))
         assert q.dtype == dtype
-        # each component to ulps of itself, cos(angle / 2) near the half turn to ulps of 1
+        # each component to ulps of itself, cos(angle / 2) near the half turn to ulps of
+        # 1
         np.testing.assert_allclose(q[1:], exact[1:], rtol=ulps(dtype, 4), atol=0)
         np.testing.assert_allclose(q[0], exact[0], rtol=0, atol=ulps(dtype, 2))
         back = np.asarray(ro.log(jnp.asarray(q)))
         if angle >= 3.14 and np.linalg.norm(back + vector) < 1e-3:
             back = -back  # float32(pi) is more than a half turn
-        np.testing.assert_allclose(back, vector, rtol=ulps(dtype, 4), atol=ulps(dtype, 4 * angle))
+        np.testing.assert_allclose(
+            back, vector, rtol=ulps(dtype, 4), atol=ulps(dtype, 4 * angle)
+        )
         again = np.asarray(ro.log(-jnp.asarray(q)))
         np.testing.assert_allclose(np.abs(again), np.abs(back), rtol=ulps(dtype, 4))
-        length = float(ro.angle_between(jnp.asarray([1, 0, 0, 0], dtype), jnp.asarray(q)))
+        length = float(
+            ro.angle_between(jnp.asarray([1, 0, 0, 0], dtype), jnp.asarray(q))
+        )
         np.testing.assert_allclose(
             length, math.hypot(*vector.astype(float)), rtol=ulps(dtype, 4), atol=0
         )
@@ -186,7 +208,9 @@ def test_against_scipy_rotation():
         "back": qs,
     }
     for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, atol=ulps(float, 24), err_msg=name)
+        np.testing.assert_allclose(
+            found[name], value, atol=ulps(float, 24), err_msg=name
+        )
     assert same_attitude(found["from matrix"], qs) < ulps(float, 8)
     assert np.all(found["from matrix"][:, 0] >= 0)
     assert same_attitude(found["log"], qs) < ulps(float, 8)
@@ -194,12 +218,21 @@ def test_against_scipy_rotation():
         np.einsum("nij,nj->ni", found["hat"], along), np.cross(vectors, along)
     )
     for generator, rotation in zip(found["hat"], found["exp"], strict=True):
-        np.testing.assert_allclose(scipy.linalg.expm(generator), rotation, atol=ulps(float, 40))
+        np.testing.assert_allclose(
+            scipy.linalg.expm(generator), rotation, atol=ulps(float, 40)
+        )
 
 
 def test_quaternion_algebra_is_hamiltons():
     one, i, j, k = jnp.eye(4)
-    products = {(1, 1): -one, (2, 2): -one, (3, 3): -one, (1, 2): k, (2, 3): i, (3, 1): j}
+    products = {
+        (1, 1): -one,
+        (2, 2): -one,
+        (3, 3): -one,
+        (1, 2): k,
+        (2, 3): i,
+        (3, 1): j,
+    }
     basis = (one, i, j, k)
     for (a, b), expected in products.items():
         np.testing.assert_array_equal(ro.multiply(basis[a], basis[b]), expected)
@@ -219,7 +252,9 @@ def test_a_matrix_at_a_half_turn_gives_a_positive_largest_component():
         assert q[0] == 0
         largest = np.argmax(np.abs(axis))
         assert q[1 + largest] > 0
-        np.testing.assert_allclose(q[1:], axis * np.sign(axis[largest]), atol=ulps(float, 4))
+        np.testing.assert_allclose(
+            q[1:], axis * np.sign(axis[largest]), atol=ulps(float, 4)
+        )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -256,7 +291,16 @@ def test_axis_and_angle_about_no_axis_is_the_identity_with_gradient_zero_in_the_
 def sizes(dtype):
     """Norms over nearly all of the range of a dtype; squares of most of them are out of it."""
     tiny, most = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
-    return [256 * tiny, tiny**0.9, tiny**0.55, tiny**0.3, 1.0, most**0.3, most**0.55, most / 256]
+    return [
+        256 * tiny,
+        tiny**0.9,
+        tiny**0.55,
+        tiny**0.3,
+        1.0,
+        most**0.3,
+        most**0.55,
+        most / 256,
+    ]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -279,7 +323,9 @@ def test_the_norm_drops_out_whatever_it_is(dtype):
             "axis": ro.from_axis_angle(q[1:], jnp.asarray(1.3, dtype)),
         }
 
-    found = everything(np.stack([size * ATTITUDE for size in sizes(dtype)]).astype(dtype))
+    found = everything(
+        np.stack([size * ATTITUDE for size in sizes(dtype)]).astype(dtype)
+    )
     for name, values in found.items():
         values = np.asarray(values)
         expected = np.broadcast_to(values[4], values.shape)
@@ -299,20 +345,28 @@ OF_ANY_NORM = {
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_go_as_powers_of_the_norm_whatever_it_is(dtype, name):
     function = OF_ANY_NORM[name]
-    first = jax.jit(jax.vmap(lambda q: (jax.jacfwd(function)(q), jax.jacrev(function)(q))))
+    first = jax.jit(
+        jax.vmap(lambda q: (jax.jacfwd(function)(q), jax.jacrev(function)(q)))
+    )
     second = jax.jit(jax.vmap(jax.jacfwd(jax.jacrev(function))))
     powers = {1: sizes(dtype)[1:-1], 2: [x**0.5 for x in sizes(dtype)[1:-1]]}
-    q = {k: np.stack([x * ATTITUDE for x in (1.0, *powers[k])]).astype(dtype) for k in (1, 2)}
+    q = {
+        k: np.stack([x * ATTITUDE for x in (1.0, *powers[k])]).astype(dtype)
+        for k in (1, 2)
+    }
     for k, found in ((1, first(q[1])), (2, (second(q[2]),))):
         for derivative in found:
-            # in two steps: the powers of the greatest norms are at the edge of the range
+            # in two steps: the powers of the greatest norms are at the edge of the
+            # range
             scaled = np.asarray(derivative, np.float64)
             for _ in range(k):
                 size = np.array([1.0, *powers[k]]).reshape(-1, *[1] * (scaled.ndim - 1))
                 scaled = scaled * size
             scale = np.max(np.abs(scaled[0]))
             expected = np.broadcast_to(scaled[0], scaled.shape)
-            np.testing.assert_allclose(scaled, expected, rtol=0, atol=ulps(dtype, 32) * scale)
+            np.testing.assert_allclose(
+                scaled, expected, rtol=0, atol=ulps(dtype, 32) * scale
+            )
 
 
 def test_a_body_turns_by_a_quaternion_of_any_norm():
@@ -320,11 +374,16 @@ def test_a_body_turns_by_a_quaternion_of_any_norm():
     expected = body.rotated(ATTITUDE)
     for size in (1e-300, 1e-170, 1e170, 1e300):
         turned = body.rotated(size * ATTITUDE)
-        np.testing.assert_allclose(turned.inertia, expected.inertia, atol=ulps(float, 16))
-        np.testing.assert_allclose(turned.center_of_mass, expected.center_of_mass, atol=1e-15)
+        np.testing.assert_allclose(
+            turned.inertia, expected.inertia, atol=ulps(float, 16)
+        )
+        np.testing.assert_allclose(
+            turned.center_of_mass, expected.center_of_mass, atol=1e-15
+        )
 
 
-# --- z-x-z Euler angles -----------------------------------------------------------------------
+# --- z-x-z Euler angles
+# -----------------------------------------------------------------------
 
 
 def rz(a):
@@ -352,7 +411,9 @@ def test_euler_angles_are_z_x_z():
 
     matrices, back = both(np.stack(EULER))
     for (phi, theta, psi), matrix in zip(EULER, matrices, strict=True):
-        np.testing.assert_allclose(matrix, rz(phi) @ rx(theta) @ rz(psi), atol=ulps(float, 4))
+        np.testing.assert_allclose(
+            matrix, rz(phi) @ rx(theta) @ rz(psi), atol=ulps(float, 4)
+        )
     expected = Rotation.from_euler("ZXZ", np.stack(EULER)).as_matrix()
     np.testing.assert_allclose(matrices, expected, atol=ulps(float, 8))
     # phi - psi (or phi + psi at the other pole) carries the rounding over sin theta
@@ -364,7 +425,12 @@ def test_euler_angles_at_the_poles_choose_psi_zero(dtype):
     for turn in (-2.0, -0.3, 0.0, 1.4, 3.0):
         upright = jnp.asarray([np.cos(turn / 2), 0, 0, np.sin(turn / 2)], dtype)
         inverted = jnp.asarray([0, np.cos(turn / 2), np.sin(turn / 2), 0], dtype)
-        for q, theta in ((upright, 0.0), (inverted, np.pi), (-upright, 0.0), (-inverted, np.pi)):
+        for q, theta in (
+            (upright, 0.0),
+            (inverted, np.pi),
+            (-upright, 0.0),
+            (-inverted, np.pi),
+        ):
             found = ro.to_euler(q)
             assert found.dtype == dtype
             np.testing.assert_allclose(found, [turn, theta, 0.0], atol=ulps(dtype, 4))
@@ -385,7 +451,9 @@ def test_euler_rates_are_those_of_the_rotation():
     r, dr, omega, back = (np.asarray(x) for x in both(np.stack(EULER)))
     for k, (_, theta, psi) in enumerate(EULER):
         skew = r[k].T @ dr[k]
-        np.testing.assert_allclose(omega[k], skew[[2, 0, 1], [1, 2, 0]], atol=ulps(float, 16))
+        np.testing.assert_allclose(
+            omega[k], skew[[2, 0, 1], [1, 2, 0]], atol=ulps(float, 16)
+        )
         s, c = np.sin(psi), np.cos(psi)
         written_out = [
             rates[0] * np.sin(theta) * s + rates[1] * c,
@@ -417,12 +485,15 @@ def test_euler_rates_at_the_poles_are_those_of_the_choice(dtype):
         np.testing.assert_allclose(found[0], horizontal / theta, rtol=ulps(dtype, 8))
 
 
-# --- angular velocity -------------------------------------------------------------------------
+# --- angular velocity
+# -------------------------------------------------------------------------
 
 
 def euler_motion(t):
     """Euler angles of a motion that nothing singles out."""
-    return jnp.stack([0.3 + 1.1 * t - 0.2 * t**2, 1.2 + 0.5 * jnp.sin(t), 0.4 - 0.7 * t + t**3 / 9])
+    return jnp.stack(
+        [0.3 + 1.1 * t - 0.2 * t**2, 1.2 + 0.5 * jnp.sin(t), 0.4 - 0.7 * t + t**3 / 9]
+    )
 
 
 def motion(t):
@@ -470,7 +541,8 @@ def test_rotation_is_the_time_ordered_exponential_with_new_increments_on_the_rig
     assert error(128, False) > 0.1
 
 
-# --- dead reckoning ---------------------------------------------------------------------------
+# --- dead reckoning
+# ---------------------------------------------------------------------------
 
 integrate_rate = jax.jit(ro.integrate_rate)
 CONE, CONING = 0.3, 2 * np.pi
@@ -482,13 +554,22 @@ def coning(t):
     half = CONE / 2
     zero = np.zeros_like(t)
     attitude = np.stack(
-        [zero + np.cos(half), np.sin(half) * np.cos(CONING * t), np.sin(half) * np.sin(CONING * t),
-         zero], -1,
-    )  # fmt: skip
+        [
+            zero + np.cos(half),
+            np.sin(half) * np.cos(CONING * t),
+            np.sin(half) * np.sin(CONING * t),
+            zero,
+        ],
+        -1,
+    )
     omega = CONING * np.stack(
-        [-np.sin(CONE) * np.sin(CONING * t), np.sin(CONE) * np.cos(CONING * t),
-         zero + np.cos(CONE) - 1], -1,
-    )  # fmt: skip
+        [
+            -np.sin(CONE) * np.sin(CONING * t),
+            np.sin(CONE) * np.cos(CONING * t),
+            zero + np.cos(CONE) - 1,
+        ],
+        -1,
+    )
     return attitude, omega
 
 
@@ -500,7 +581,9 @@ def dead_reckoning_error(ts, exact=coning):
 
 
 def test_dead_reckoning_of_coning_is_of_fourth_order():
-    errors = [dead_reckoning_error(np.linspace(0, 2, n + 1))[-1] for n in (64, 128, 256)]
+    errors = [
+        dead_reckoning_error(np.linspace(0, 2, n + 1))[-1] for n in (64, 128, 256)
+    ]
     assert errors[-1] < 1e-6
     for coarse, fine in itertools.pairwise(errors):
         assert coarse / fine > 2**3.9
@@ -517,7 +600,11 @@ def test_dead_reckoning_of_coning_is_of_fourth_order():
 def test_dead_reckoning_of_unevenly_sampled_rates_is_of_fourth_order():
     def uneven(count):
         s = np.linspace(0, 1, count + 1)
-        jitter = 0.1 / count * np.where((s > 0) & (s < 1), np.sin(1e3 * np.arange(count + 1)), 0)
+        jitter = (
+            0.1
+            / count
+            * np.where((s > 0) & (s < 1), np.sin(1e3 * np.arange(count + 1)), 0)
+        )
         return 2 * (s + 0.12 * np.sin(2 * np.pi * s) + jitter)
 
     errors = [np.max(dead_reckoning_error(uneven(n))) for n in (64, 128, 256)]
@@ -540,7 +627,8 @@ def test_dead_reckoning_of_short_records():
         np.testing.assert_allclose(
             scipy_rotation(found).as_matrix(), expected, atol=ulps(float, 32)
         )
-    # two samples of a turning axis: omega is taken as linear in time, one step errs as h^5
+    # two samples of a turning axis: omega is taken as linear in time, one step errs as
+    # h^5
     linear = lambda t: np.array([1.0, 0.5, -0.3]) + np.array([-2.0, 0.7, 3.0]) * t  # noqa: E731
     errors = []
     for h in (0.2, 0.1):
@@ -558,9 +646,13 @@ def reference_attitude(omega, ts, attitude0=(1.0, 0.0, 0.0, 0.0)):
         w, x, y, z = q
         a, b, c = omega(t)
         return 0.5 * np.array(
-            [-x * a - y * b - z * c, w * a + y * c - z * b,
-             w * b + z * a - x * c, w * c + x * b - y * a]
-        )  # fmt: skip
+            [
+                -x * a - y * b - z * c,
+                w * a + y * c - z * b,
+                w * b + z * a - x * c,
+                w * c + x * b - y * a,
+            ]
+        )
 
     solution = scipy.integrate.solve_ivp(
         rate, (ts[0], ts[-1]), attitude0, "DOP853", ts, rtol=1e-13, atol=1e-14
@@ -577,7 +669,9 @@ def test_dead_reckoning_follows_a_tumbling_body():
 
     ts = np.linspace(0, 20, 1001)
     start = np.concatenate([ATTITUDE, OMEGA])
-    solution = scipy.integrate.solve_ivp(rate, (0, 20), start, "DOP853", ts, rtol=1e-13, atol=1e-14)
+    solution = scipy.integrate.solve_ivp(
+        rate, (0, 20), start, "DOP853", ts, rtol=1e-13, atol=1e-14
+    )
     found = integrate_rate(ts, solution.y[4:].T, ATTITUDE)
     assert same_attitude(found, solution.y[:4].T) < 1e-8
     norms = np.sum(np.asarray(found) ** 2, axis=1)
@@ -589,7 +683,8 @@ def test_dead_reckoning_does_not_mind_an_epoch_far_from_zero():
     _, omegas = coning(ts)
     near, far = integrate_rate(ts, omegas), integrate_rate(ts + 2.0**30, omegas)
     np.testing.assert_allclose(far, near, atol=ulps(float, 8))
-    # times at the resolution of the clock: what counts are the differences of the floats given
+    # times at the resolution of the clock: what counts are the differences of the
+    # floats given
     for dtype, epoch in ((np.float64, 1e9), (np.float32, 4e3)):
         late = (epoch + np.linspace(0, 0.64, 65)).astype(dtype)
         exact_times = (late - late[0]).astype(np.float64)
@@ -614,7 +709,9 @@ def test_derivatives_of_dead_reckoning():
 
     @quick_jit
     def both(omegas, ts):
-        forward = jax.jvp(final, (omegas, ts), (jnp.asarray(direction), jnp.asarray(nudge)))[1]
+        forward = jax.jvp(
+            final, (omegas, ts), (jnp.asarray(direction), jnp.asarray(nudge))
+        )[1]
         by_rates, by_times = jax.jacrev(final, (0, 1))(omegas, ts)
         return forward, jnp.einsum("ikj,kj->i", by_rates, direction) + by_times @ nudge
 
@@ -670,7 +767,9 @@ def test_bad_records_of_rates_are_nan_lanes_that_leave_the_others_alone():
     for of_lanes, of_good in zip(gradients[:3], expected[:3], strict=True):
         np.testing.assert_allclose(of_lanes[0], of_good[0], atol=ulps(float, 8))
         assert np.all(np.asarray(of_lanes[1:]) == 0)
-    np.testing.assert_allclose(gradients[3], expected[3] / len(lanes), atol=ulps(float, 8))
+    np.testing.assert_allclose(
+        gradients[3], expected[3] / len(lanes), atol=ulps(float, 8)
+    )
     assert np.all(np.isnan(ro.integrate_rate(*BAD_RECORDS["nan rate"])))  # eagerly too
 
 
@@ -684,7 +783,8 @@ def test_a_start_rounded_to_its_dtype_is_a_unit_quaternion(dtype):
     assert np.all(np.isfinite(integrate_rate(*record[:2])))
 
 
-# --- identity, inverse, interpolation, random attitudes ----------------------------------------
+# --- identity, inverse, interpolation, random attitudes
+# ----------------------------------------
 
 KEY = jax.random.key(3)
 
@@ -694,7 +794,9 @@ def test_identity_and_random_attitudes_are_of_the_dtype_asked_for(dtype):
     assert ro.identity(dtype).dtype == ro.random(KEY, dtype).dtype == dtype
     np.testing.assert_array_equal(ro.identity(dtype), [1, 0, 0, 0])
     assert ro.identity().dtype == ro.random(KEY).dtype == jnp.zeros(()).dtype
-    assert ro.multiply(np.float32(ATTITUDE), ro.identity(np.float32)).dtype == np.float32
+    assert (
+        ro.multiply(np.float32(ATTITUDE), ro.identity(np.float32)).dtype == np.float32
+    )
 
 
 def test_random_attitudes_are_uniform_on_the_sphere_of_quaternions():
@@ -777,10 +879,14 @@ def test_slerp_is_scipys_along_the_shortest_arc():
         scipy_rotation(found).as_matrix(), expected.as_matrix(), atol=ulps(float, 32)
     )
     theirs = [
-        scipy.spatial.transform.Slerp([0, 1], Rotation.concatenate([a, b]))(t).as_matrix()
+        scipy.spatial.transform.Slerp([0, 1], Rotation.concatenate([a, b]))(
+            t
+        ).as_matrix()
         for a, b, t in zip(first[:20], last[:20], s[:20], strict=True)
     ]
-    np.testing.assert_allclose(scipy_rotation(found[:20]).as_matrix(), theirs, atol=ulps(float, 32))
+    np.testing.assert_allclose(
+        scipy_rotation(found[:20]).as_matrix(), theirs, atol=ulps(float, 32)
+    )
     np.testing.assert_allclose(np.sum(found * found, axis=1), 1, atol=ulps(float, 8))
 
 
@@ -797,30 +903,41 @@ def test_derivatives_of_slerp_at_equal_and_at_opposite_attitudes(dtype):
     @jax.vmap
     def derivatives(x):
         first = jax.jacfwd(way)(x), jax.jacrev(way)(x)
-        return *first, jax.jacfwd(jax.jacrev(way))(x) if dtype == np.float64 else first[0]
+        return *first, jax.jacfwd(jax.jacrev(way))(x) if dtype == np.float64 else first[
+            0
+        ]
 
     equal = np.array([0, 0, 0, 0, 0, 0, 0.3])
     opposite = np.concatenate([np.zeros(3), np.pi * AXIS, [0.3]])
-    found = [np.asarray(x) for x in derivatives(np.stack([equal, opposite]).astype(dtype))]
+    found = [
+        np.asarray(x) for x in derivatives(np.stack([equal, opposite]).astype(dtype))
+    ]
     assert all(np.all(np.isfinite(x)) for x in found)
     forward, reverse, second = found
     w, x, y, z = ATTITUDE
     generators = 0.5 * np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
     for jacobian in (forward, reverse):
-        expected = np.concatenate([0.7 * generators, 0.3 * generators, np.zeros((4, 1))], axis=1)
+        expected = np.concatenate(
+            [0.7 * generators, 0.3 * generators, np.zeros((4, 1))], axis=1
+        )
         np.testing.assert_allclose(jacobian[0], expected, atol=ulps(dtype, 16))
         # half a turn apart the rate is half a turn about the axis, one way or the other
         rate = np.linalg.norm(generators @ (np.pi * AXIS))
-        np.testing.assert_allclose(np.linalg.norm(jacobian[1, :, 6]), rate, rtol=ulps(dtype, 64))
+        np.testing.assert_allclose(
+            np.linalg.norm(jacobian[1, :, 6]), rate, rtol=ulps(dtype, 64)
+        )
     if dtype == np.float32:
         return
     np.testing.assert_allclose(second[0, :, 3:6, 6], generators, atol=ulps(dtype, 32))
     for part, share in ((slice(0, 3), 0.7), (slice(3, 6), 0.3)):
         curvature = -ATTITUDE[:, None, None] * share**2 / 4 * np.eye(3)
-        np.testing.assert_allclose(second[0, :, part, part], curvature, atol=ulps(dtype, 32))
+        np.testing.assert_allclose(
+            second[0, :, part, part], curvature, atol=ulps(dtype, 32)
+        )
 
 
-# --- roll, pitch and yaw ------------------------------------------------------------------------
+# --- roll, pitch and yaw
+# ------------------------------------------------------------------------
 
 
 def about(k, angle):
@@ -831,7 +948,9 @@ def about(k, angle):
 FLIGHT = [
     np.array(angles)
     for angles in itertools.product(
-        (-3.0, -0.4, 0.0, 2.1), (1e-8 - np.pi / 2, -0.7, 0.0, 1.5), (-2.6, 0.0, 0.9, 3.1)
+        (-3.0, -0.4, 0.0, 2.1),
+        (1e-8 - np.pi / 2, -0.7, 0.0, 1.5),
+        (-2.6, 0.0, 0.9, 3.1),
     )
 ]
 
@@ -862,10 +981,21 @@ def test_roll_is_zero_at_the_poles_of_pitch_and_gradients_are_finite(dtype):
     @jax.vmap
     def everything(q):
         angles = ro.to_roll_pitch_yaw
-        return angles(q), jax.jacfwd(angles)(q), jax.jacrev(angles)(q), jax.hessian(angles)(q)
+        return (
+            angles(q),
+            jax.jacfwd(angles)(q),
+            jax.jacrev(angles)(q),
+            jax.hessian(angles)(q),
+        )
 
-    poles = [(sign * np.pi / 2, yaw) for sign in (1, -1) for yaw in (-2.0, -0.3, 0.0, 1.4, 3.0)]
-    qs = np.stack([ro.from_roll_pitch_yaw(np.array([0.0, *pole])) for pole in poles]).astype(dtype)
+    poles = [
+        (sign * np.pi / 2, yaw)
+        for sign in (1, -1)
+        for yaw in (-2.0, -0.3, 0.0, 1.4, 3.0)
+    ]
+    qs = np.stack(
+        [ro.from_roll_pitch_yaw(np.array([0.0, *pole])) for pole in poles]
+    ).astype(dtype)
     found, forward, reverse, second = everything(qs)
     np.testing.assert_allclose(found[:, 1:], poles, atol=ulps(dtype, 8))
     assert np.all(np.asarray(found[:, 0]) == 0)
@@ -874,7 +1004,9 @@ def test_roll_is_zero_at_the_poles_of_pitch_and_gradients_are_finite(dtype):
         assert np.all(np.isfinite(jacobian))
         assert np.all(np.asarray(jacobian[:, 1]) == 0)
         # yaw turns about the vertical, roll stays
-        turning = np.stack([np.asarray(ro.attitude_rate(q, ro.rotate_inverse(q, EZ))) for q in qs])
+        turning = np.stack(
+            [np.asarray(ro.attitude_rate(q, ro.rotate_inverse(q, EZ))) for q in qs]
+        )
         np.testing.assert_allclose(
             np.einsum("nij,nj->ni", jacobian, turning),
             np.broadcast_to([0, 0, 1], (len(qs), 3)),
@@ -893,14 +1025,23 @@ def test_derivatives_of_roll_pitch_and_yaw():
     def both(angles):
         q = ro.from_roll_pitch_yaw(angles)
         out = jax.jacfwd(ro.from_roll_pitch_yaw)(angles)
-        return q, out, jax.jacfwd(ro.to_roll_pitch_yaw)(q), jax.jacrev(ro.to_roll_pitch_yaw)(q)
+        return (
+            q,
+            out,
+            jax.jacfwd(ro.to_roll_pitch_yaw)(q),
+            jax.jacrev(ro.to_roll_pitch_yaw)(q),
+        )
 
     angles = np.stack([a for a in FLIGHT if abs(a[1]) < 1.5])
     q, out, forward, reverse = (np.asarray(x) for x in both(angles))
     for k, (roll, pitch, _) in enumerate(angles):
         for back in (forward, reverse):
-            np.testing.assert_allclose(back[k] @ out[k], np.eye(3), atol=ulps(float, 64))
-            np.testing.assert_allclose(back[k] @ q[k], np.zeros(3), atol=ulps(float, 64))
+            np.testing.assert_allclose(
+                back[k] @ out[k], np.eye(3), atol=ulps(float, 64)
+            )
+            np.testing.assert_allclose(
+                back[k] @ q[k], np.zeros(3), atol=ulps(float, 64)
+            )
         # omega of unit rates of roll, pitch and yaw (Stevens and Lewis, eq. 1.3-22)
         s, c = np.sin(roll), np.cos(roll)
         omega = [
@@ -913,16 +1054,21 @@ def test_derivatives_of_roll_pitch_and_yaw():
         np.testing.assert_allclose(out[k], generators @ omega, atol=ulps(float, 8))
 
 
-# --- scipy's rotations --------------------------------------------------------------------------
+# --- scipy's rotations
+# --------------------------------------------------------------------------
 
 
 def test_from_scipy_takes_a_rotation_itself():
     rotation = Rotation.from_euler("ZYX", [0.3, -0.2, 0.9])
     found = ro.from_scipy(rotation)
     np.testing.assert_array_equal(found, ro.from_scipy(rotation.as_quat()))
-    np.testing.assert_allclose(ro.to_matrix(found), rotation.as_matrix(), atol=ulps(float, 4))
+    np.testing.assert_allclose(
+        ro.to_matrix(found), rotation.as_matrix(), atol=ulps(float, 4)
+    )
     again = Rotation.from_quat(ro.to_scipy(found))
-    np.testing.assert_allclose(again.as_matrix(), rotation.as_matrix(), atol=ulps(float, 4))
+    np.testing.assert_allclose(
+        again.as_matrix(), rotation.as_matrix(), atol=ulps(float, 4)
+    )
 
 
 @pytest.mark.parametrize(
@@ -936,8 +1082,12 @@ def test_from_scipy_takes_a_rotation_itself():
     ],
 )
 def test_from_scipy_of_anything_else_says_what_it_takes(wrong, kind, untyped):
-    taken = "`rotation` must be a single scipy.spatial.transform.Rotation or a quaternion "
-    with pytest.raises(ValueError, match=rf"{taken}\(x, y, z, w\) .*, but it is {kind}"):
+    taken = (
+        "`rotation` must be a single scipy.spatial.transform.Rotation or a quaternion "
+    )
+    with pytest.raises(
+        ValueError, match=rf"{taken}\(x, y, z, w\) .*, but it is {kind}"
+    ):
         ro.from_scipy(wrong)
 
 
@@ -949,14 +1099,17 @@ def test_log_and_angle_at_the_zero_quaternion_are_zero_with_gradient_zero(dtype)
     def everything(zero, q):
         values = ro.log(zero), ro.angle_between(zero, q), ro.angle_between(q, zero)
         derivatives = [d(ro.log)(zero) for d in (jax.jacfwd, jax.jacrev, jax.hessian)]
-        derivatives += [d(ro.angle_between, (0, 1))(zero, q) for d in (jax.jacfwd, jax.jacrev)]
+        derivatives += [
+            d(ro.angle_between, (0, 1))(zero, q) for d in (jax.jacfwd, jax.jacrev)
+        ]
         return values, derivatives
 
     for x in jax.tree.leaves(everything(zero, q)):
         assert np.all(np.asarray(x) == 0)
 
 
-# --- derivatives at degenerate points ---------------------------------------------------------
+# --- derivatives at degenerate points
+# ---------------------------------------------------------
 
 
 def mp_jacobian(function, point, order=1):
@@ -968,7 +1121,9 @@ def mp_jacobian(function, point, order=1):
     for indices in itertools.combinations_with_replacement(range(n), order):
         counts = tuple(indices.count(k) for k in range(n))
         for component in range(m):
-            value = mpmath.diff(lambda *x, c=component: function(*x)[c], tuple(point), counts)
+            value = mpmath.diff(
+                lambda *x, c=component: function(*x)[c], tuple(point), counts
+            )
             for permuted in set(itertools.permutations(indices)):
                 result[(component, *permuted)] = float(value)
     return result
@@ -1016,7 +1171,9 @@ def test_derivatives_of_exp_to_third_order(dtype):
             np.testing.assert_allclose(forward[k], exact[0], atol=ulps(dtype, 4))
             np.testing.assert_allclose(reverse[k], exact[0], atol=ulps(dtype, 4))
             np.testing.assert_allclose(second[k], exact[1], atol=ulps(dtype, 16))
-            np.testing.assert_allclose(second_reverse[k], exact[1], atol=ulps(dtype, 16))
+            np.testing.assert_allclose(
+                second_reverse[k], exact[1], atol=ulps(dtype, 16)
+            )
             np.testing.assert_allclose(third[k], exact[2], atol=ulps(dtype, 128))
 
 
@@ -1071,20 +1228,30 @@ def test_derivatives_of_euler_angles_near_the_poles(dtype):
     for theta in thetas:
         c, s = np.cos(theta / 2), np.sin(theta / 2)
         half_sum, half_difference = -0.25, 0.95  # phi = 0.7, psi = -1.2
-        q = [c * np.cos(half_sum), s * np.cos(half_difference),
-             s * np.sin(half_difference), c * np.sin(half_sum)]  # fmt: skip
+        q = [
+            c * np.cos(half_sum),
+            s * np.cos(half_difference),
+            s * np.sin(half_difference),
+            c * np.sin(half_sum),
+        ]
         qs.append(np.array(q, dtype))
     forward, reverse, second = (np.asarray(x) for x in euler_derivatives(np.stack(qs)))
     for k, q in enumerate(qs):
         with mpmath.workdps(400 if k == 0 else 60):
             exact = mp_jacobian(mp_euler, q)
             scale = np.max(np.abs(exact), axis=1, keepdims=True)
-            np.testing.assert_allclose(forward[k] / scale, exact / scale, atol=ulps(dtype, 16))
-            np.testing.assert_allclose(reverse[k] / scale, exact / scale, atol=ulps(dtype, 16))
+            np.testing.assert_allclose(
+                forward[k] / scale, exact / scale, atol=ulps(dtype, 16)
+            )
+            np.testing.assert_allclose(
+                reverse[k] / scale, exact / scale, atol=ulps(dtype, 16)
+            )
             if k > 0:
                 exact = mp_jacobian(mp_euler, q, 2)
                 scale = np.max(np.abs(exact), axis=(1, 2), keepdims=True)
-                np.testing.assert_allclose(second[k] / scale, exact / scale, atol=ulps(dtype, 64))
+                np.testing.assert_allclose(
+                    second[k] / scale, exact / scale, atol=ulps(dtype, 64)
+                )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -1095,7 +1262,9 @@ def test_derivatives_of_euler_angles_at_the_poles_are_finite(dtype):
     forward, reverse, second = euler_derivatives(np.stack([upright, inverted]))
     assert np.all(np.isfinite(second))
     for found in (forward, reverse):
-        for jacobian, q, (a, b) in zip(found, (upright, inverted), ((0, 3), (1, 2)), strict=True):
+        for jacobian, q, (a, b) in zip(
+            found, (upright, inverted), ((0, 3), (1, 2)), strict=True
+        ):
             expected = np.zeros((3, 4))
             expected[0, a], expected[0, b] = -2 * q[b], 2 * q[a]
             np.testing.assert_allclose(jacobian, expected, atol=ulps(dtype, 4))
@@ -1119,7 +1288,9 @@ def test_derivatives_of_from_matrix_along_the_group(dtype):
         return ro.from_matrix(ro.to_matrix(q)), *(d(zero) for d in derivatives)
 
     qs = []
-    for axis, angle in itertools.product(MATRIX_AXES, (*ANGLES, np.pi / 2, 2 * np.pi / 3)):
+    for axis, angle in itertools.product(
+        MATRIX_AXES, (*ANGLES, np.pi / 2, 2 * np.pi / 3)
+    ):
         q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
         q[0] = 0.0 if angle == np.pi else q[0]
         qs.append(q)
@@ -1152,12 +1323,17 @@ def test_derivatives_of_the_angle_between_attitudes(dtype):
         np.testing.assert_allclose(value, angle, rtol=ulps(dtype, 8), atol=0)
         np.testing.assert_allclose(forward, AXIS, atol=ulps(dtype, 16))
         np.testing.assert_allclose(reverse, AXIS, atol=ulps(dtype, 16))
-    # between attitudes of order one rounding of their product is eps / angle of the direction
+    # between attitudes of order one rounding of their product is eps / angle of the
+    # direction
     p = jnp.asarray(ATTITUDE, dtype)
     for angle in (1e-4, 1e-2, 1.0, 3.1):
         _, forward, reverse = both(p, jnp.asarray(angle * AXIS, dtype))
-        np.testing.assert_allclose(forward, AXIS, atol=ulps(dtype, 16) * max(1, 1 / angle))
-        np.testing.assert_allclose(reverse, AXIS, atol=ulps(dtype, 16) * max(1, 1 / angle))
+        np.testing.assert_allclose(
+            forward, AXIS, atol=ulps(dtype, 16) * max(1, 1 / angle)
+        )
+        np.testing.assert_allclose(
+            reverse, AXIS, atol=ulps(dtype, 16) * max(1, 1 / angle)
+        )
     for q in (one, jnp.asarray([0.5, -0.5, 0.5, 0.5], dtype)):
         value, forward, reverse = both(q, jnp.zeros(3, dtype))
         assert value == 0
@@ -1165,42 +1341,100 @@ def test_derivatives_of_the_angle_between_attitudes(dtype):
         assert np.all(np.asarray(reverse) == 0)
 
 
-# --- shapes -----------------------------------------------------------------------------------
+# --- shapes
+# -----------------------------------------------------------------------------------
 
 THREE, FOUR, NINE = np.ones(3), np.ones(4), np.ones((3, 3))
 WRONG_SHAPES = {
-    "hat": (lambda: ro.hat(FOUR), r"`vector` must have shape \(3,\), but it has shape \(4,\)"),
+    "hat": (
+        lambda: ro.hat(FOUR),
+        r"`vector` must have shape \(3,\), but it has shape \(4,\)",
+    ),
     "vee": (lambda: ro.vee(THREE), r"`matrix` must have shape \(3, 3\), but"),
-    "to_matrix": (lambda: ro.to_matrix(THREE), r"`attitude` must have shape \(4,\), but"),
-    "from_matrix": (lambda: ro.from_matrix(FOUR), r"`matrix` must have shape \(3, 3\), but"),
+    "to_matrix": (
+        lambda: ro.to_matrix(THREE),
+        r"`attitude` must have shape \(4,\), but",
+    ),
+    "from_matrix": (
+        lambda: ro.from_matrix(FOUR),
+        r"`matrix` must have shape \(3, 3\), but",
+    ),
     "to_scipy": (lambda: ro.to_scipy(THREE), r"`attitude` must have shape \(4,\), but"),
     "inverse": (lambda: ro.inverse(THREE), r"`quaternion` must have shape \(4,\), but"),
     "slerp": (lambda: ro.slerp(FOUR, THREE, 0.5), r"`q` must have shape \(4,\), but"),
-    "slerp of many": (lambda: ro.slerp(FOUR, FOUR, FOUR), r"`s` must have shape \(\), but"),
-    "from_roll_pitch_yaw": (lambda: ro.from_roll_pitch_yaw(FOUR), r"`angles` must have shape"),
-    "to_roll_pitch_yaw": (lambda: ro.to_roll_pitch_yaw(THREE), r"`attitude` must have shape"),
-    "identity": (lambda: ro.identity(int), "`dtype` must be of floating point .* it is int64"),
-    "random": (lambda: ro.random(KEY, jnp.int32), "`dtype` must be of floating point .* int32"),
-    "from_euler": (lambda: ro.from_euler(FOUR), r"`angles` must have shape \(3,\), but"),
+    "slerp of many": (
+        lambda: ro.slerp(FOUR, FOUR, FOUR),
+        r"`s` must have shape \(\), but",
+    ),
+    "from_roll_pitch_yaw": (
+        lambda: ro.from_roll_pitch_yaw(FOUR),
+        r"`angles` must have shape",
+    ),
+    "to_roll_pitch_yaw": (
+        lambda: ro.to_roll_pitch_yaw(THREE),
+        r"`attitude` must have shape",
+    ),
+    "identity": (
+        lambda: ro.identity(int),
+        "`dtype` must be of floating point .* it is int64",
+    ),
+    "random": (
+        lambda: ro.random(KEY, jnp.int32),
+        "`dtype` must be of floating point .* int32",
+    ),
+    "from_euler": (
+        lambda: ro.from_euler(FOUR),
+        r"`angles` must have shape \(3,\), but",
+    ),
     "to_euler": (lambda: ro.to_euler(THREE), r"`attitude` must have shape \(4,\), but"),
-    "normalize": (lambda: ro.normalize(THREE), r"`quaternion` must have shape \(4,\), but"),
+    "normalize": (
+        lambda: ro.normalize(THREE),
+        r"`quaternion` must have shape \(4,\), but",
+    ),
     "multiply": (lambda: ro.multiply(FOUR, THREE), r"`q` must have shape \(4,\), but"),
-    "conjugate": (lambda: ro.conjugate(THREE), r"`quaternion` must have shape \(4,\), but"),
+    "conjugate": (
+        lambda: ro.conjugate(THREE),
+        r"`quaternion` must have shape \(4,\), but",
+    ),
     "rotate": (lambda: ro.rotate(FOUR, FOUR), r"`vector` must have shape \(3,\), but"),
-    "rotate batch": (lambda: ro.rotate(np.ones((5, 4)), THREE), r"`attitude` must .* \(5, 4\)"),
-    "rotate_inverse": (lambda: ro.rotate_inverse(FOUR, FOUR), r"`vector` must have shape"),
+    "rotate batch": (
+        lambda: ro.rotate(np.ones((5, 4)), THREE),
+        r"`attitude` must .* \(5, 4\)",
+    ),
+    "rotate_inverse": (
+        lambda: ro.rotate_inverse(FOUR, FOUR),
+        r"`vector` must have shape",
+    ),
     "exp": (lambda: ro.exp(FOUR), r"`rotation_vector` must have shape \(3,\), but"),
     "log": (lambda: ro.log(THREE), r"`attitude` must have shape \(4,\), but"),
-    "angle_between": (lambda: ro.angle_between(THREE, FOUR), r"`p` must have shape \(4,\), but"),
-    "axis": (lambda: ro.from_axis_angle(FOUR, 1.0), r"`axis` must have shape \(3,\), but"),
-    "angle": (lambda: ro.from_axis_angle(THREE, THREE), r"`angle` must have shape \(\), but"),
-    "attitude_rate": (lambda: ro.attitude_rate(FOUR, FOUR), r"`omega` must have shape \(3,\)"),
+    "angle_between": (
+        lambda: ro.angle_between(THREE, FOUR),
+        r"`p` must have shape \(4,\), but",
+    ),
+    "axis": (
+        lambda: ro.from_axis_angle(FOUR, 1.0),
+        r"`axis` must have shape \(3,\), but",
+    ),
+    "angle": (
+        lambda: ro.from_axis_angle(THREE, THREE),
+        r"`angle` must have shape \(\), but",
+    ),
+    "attitude_rate": (
+        lambda: ro.attitude_rate(FOUR, FOUR),
+        r"`omega` must have shape \(3,\)",
+    ),
     "angular_velocity": (
         lambda: ro.angular_velocity(NINE, THREE),
         r"`rotation_rate` must have shape \(3, 3\), but",
     ),
-    "rates": (lambda: ro.euler_rates_to_omega(THREE, FOUR), r"`rates` must have shape \(3,\)"),
-    "omega": (lambda: ro.omega_to_euler_rates(THREE, FOUR), r"`omega` must have shape \(3,\)"),
+    "rates": (
+        lambda: ro.euler_rates_to_omega(THREE, FOUR),
+        r"`rates` must have shape \(3,\)",
+    ),
+    "omega": (
+        lambda: ro.omega_to_euler_rates(THREE, FOUR),
+        r"`omega` must have shape \(3,\)",
+    ),
     "samples": (
         lambda: ro.integrate_rate(np.arange(5.0), np.ones((5, 4))),
         r"`omegas` must have shape \(5, 3\), but it has shape \(5, 4\)",

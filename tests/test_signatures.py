@@ -10,7 +10,9 @@ from jaxtyping import TypeCheckError
 import jrigid as jr
 from jrigid import _types
 
-ALIASES = [name for name in vars(_types) if name.endswith("Like") and name != "ArrayLike"]
+ALIASES = [
+    name for name in vars(_types) if name.endswith("Like") and name != "ArrayLike"
+]
 
 
 def test_an_alias_is_shown_by_its_name():
@@ -19,7 +21,7 @@ def test_an_alias_is_shown_by_its_name():
     assert shown.endswith("-> Scalar")
     assert "InertiaLike" in ALIASES
     assert all(str(getattr(_types, name)) == name for name in ALIASES)
-    assert "values: Optional[Real[ArrayLike, '*throws n k']]" in str(
+    assert "values: Optional[Real[ArrayLike, '*trials n k']]" in str(
         inspect.signature(jr.identify.Rates)
     )
 
@@ -43,7 +45,9 @@ def test_every_status_is_listed_with_a_text():
     names = [x for x in dir(status) if isinstance(getattr(status, x), status)]
     assert {"OK", "UNIDENTIFIABLE", "WRONG_BASIN", "BAD_INPUT"} <= set(names)
     assert all(status[getattr(status, name)] for name in names)
-    assert sorted(status.texts) == sorted(status[getattr(status, name)] for name in names)
+    assert sorted(status.texts) == sorted(
+        status[getattr(status, name)] for name in names
+    )
 
 
 def test_observations_say_what_their_fields_are():

@@ -17,7 +17,8 @@ FORWARD = diffrax.ForwardMode()
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-# Accuracy ------------------------------------------------------------------------------------
+# Accuracy
+# ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +37,16 @@ def _slow(*values):
 
 @pytest.mark.parametrize(
     ("rtol", "unit"),
-    [(1e-4, 1), _slow(1e-6, 1), _slow(1e-8, 1), _slow(1e-10, 1), (1e-12, 1), (1e-8, 1e-7),
-     _slow(1e-8, 1e4)],
-)  # fmt: skip
+    [
+        (1e-4, 1),
+        _slow(1e-6, 1),
+        _slow(1e-8, 1),
+        _slow(1e-10, 1),
+        (1e-12, 1),
+        (1e-8, 1e-7),
+        _slow(1e-8, 1e4),
+    ],
+)
 def test_ten_thousand_turns_keep_the_promised_accuracy(ten_thousand_turns, rtol, unit):
     """DESIGN.md's bars for integration; omega in other units of time behaves the same."""
     start, ts, attitudes, omegas = ten_thousand_turns
@@ -87,7 +95,9 @@ def test_what_is_delivered_is_what_is_promised_and_a_looser_tolerance_is_cheaper
     tolerances, size = np.repeat([1e-10, 1e-8, 1e-6], 200), (200, 1)
     omegas = np.tile(rng.normal(size=(200, 3)) * np.exp(rng.normal(size=size)), (3, 1))
     error, steps = _energy_errors(omegas, tolerances, 20.0)
-    worst = np.max((error / (tolerances * (1 + 20 * _rates(omegas)))).reshape(3, 200), axis=1)
+    worst = np.max(
+        (error / (tolerances * (1 + 20 * _rates(omegas)))).reshape(3, 200), axis=1
+    )
     assert np.all((worst > 1 / 30) & (worst < 1))
     dearest, default, cheapest = steps.reshape(3, 200).sum(axis=1)
     assert cheapest < 0.7 * default
@@ -97,7 +107,10 @@ def test_what_is_delivered_is_what_is_promised_and_a_looser_tolerance_is_cheaper
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Bosh3()])
 def test_methods_of_lower_order_keep_the_promise_too(solver, rng):
     omegas, rtol = rng.normal(size=(200, 3)), 1e-3
-    error, rates = _energy_errors(omegas, np.full(200, rtol), 10.0, solver)[0], _rates(omegas)
+    error, rates = (
+        _energy_errors(omegas, np.full(200, rtol), 10.0, solver)[0],
+        _rates(omegas),
+    )
     assert np.max(error / (rtol * (1 + 10 * rates))) < 1
 
 
@@ -115,7 +128,8 @@ def test_default_tolerance_follows_the_dtype_and_float32_warns():
         jr.simulate(body, state0, ts, rtol=1e-9)
 
 
-# Derivatives ---------------------------------------------------------------------------------
+# Derivatives
+# ---------------------------------------------------------------------------------
 
 WOBBLES = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 0.1)
 
@@ -127,7 +141,10 @@ def _spins():
             for wobble in WOBBLES:
                 omega = np.zeros(3)
                 omega[axis] = 1
-                omega[(axis + 1) % 3], omega[(axis + 2) % 3] = 0.8 * wobble, 0.6 * wobble
+                omega[(axis + 1) % 3], omega[(axis + 2) % 3] = (
+                    0.8 * wobble,
+                    0.6 * wobble,
+                )
                 cases.append((moments, omega, axis, wobble))
     return cases
 
@@ -145,7 +162,9 @@ def _final(attitude, omega, moments, weight, rtol):
     torque = None if weight is None else jr.torques.UniformGravity(1.0, weight, down)
     body = jr.RigidBody(moments, torque)
     state0 = jr.State(attitude, omega)
-    trajectory = jr.simulate(body, state0, jnp.array([40.0]), rtol=rtol, adjoint=FORWARD)
+    trajectory = jr.simulate(
+        body, state0, jnp.array([40.0]), rtol=rtol, adjoint=FORWARD
+    )
     return jnp.concatenate([trajectory.states.attitude[0], trajectory.states.omega[0]])
 
 
@@ -184,8 +203,9 @@ def test_jacobian_of_spin_about_each_axis(spin_jacobians, rtol):
     """At most 1000 rtol against the variational equations, also where plain integration fails."""
     cases, errors, _ = spin_jacobians
     for (moments, _, axis, wobble), error in zip(cases, errors[rtol], strict=True):
-        # At 1e-12 the arithmetic itself shows in one row: it comes back close by the separatrix,
-        # where the invariant that times the next flip is 1e-8, with a rounding error of some eps.
+        # At 1e-12 the arithmetic itself shows in one row: it comes back close by the
+        # separatrix, where the invariant that times the next flip is 1e-8, with a
+        # rounding error of some eps.
         returns = moments[1] == 2 and axis == 1 and wobble == 1e-4
         floor = 1e-7 if returns and rtol == 1e-12 else 0.0
         assert error <= 1000 * rtol + floor, (moments, axis, wobble, error)
@@ -195,7 +215,9 @@ def test_jacobian_of_pure_spin_is_a_matrix_exponential(spin_jacobians):
     """Euler's equations linearised about a pure spin have constant coefficients."""
     cases, _, found = spin_jacobians
     for rtol, jacobians in found.items():
-        for (moments, omega, axis, wobble), jacobian in zip(cases, jacobians, strict=True):
+        for (moments, omega, axis, wobble), jacobian in zip(
+            cases, jacobians, strict=True
+        ):
             if wobble > 0:
                 continue
             i1, i2, i3 = moments
@@ -213,7 +235,9 @@ def test_jacobian_of_the_sleeping_top():
     moments, weight = np.array([1.0, 1.0, 0.98]), np.array([0.0, 0.0, 1.0])
     threshold = 2 / 0.98
     cases = [(spin * threshold, tilt) for spin in (0.75, 1.25) for tilt in WOBBLES]
-    attitudes = np.array([[np.cos(tilt / 2), np.sin(tilt / 2), 0, 0] for _, tilt in cases])
+    attitudes = np.array(
+        [[np.cos(tilt / 2), np.sin(tilt / 2), 0, 0] for _, tilt in cases]
+    )
     omegas = np.array([[0, 0, spin] for spin, _ in cases])
     repeat = np.ones((len(cases), 1))
     _, exact = heavy_body(repeat * moments, attitudes, omegas, 40.0, repeat * weight)
@@ -230,23 +254,34 @@ def test_jacobian_of_the_sleeping_top():
         for k, (spin, tilt) in enumerate(cases):
             q = np.asarray(finals[k, :4])
             truth = _on_the_sphere(exact[k], attitudes[k], q)
-            error = np.linalg.norm(_on_the_sphere(jacobians[k], attitudes[k], q) - truth)
-            # One row is beyond arithmetic: a top let go at 1e-6 falls, and rises again to where
-            # tilt^2 = 1e-12 decides what follows; the last bit of the energy is 1e-16.
+            error = np.linalg.norm(
+                _on_the_sphere(jacobians[k], attitudes[k], q) - truth
+            )
+            # One row is beyond arithmetic: a top let go at 1e-6 falls, and rises again
+            # to where tilt^2 = 1e-12 decides what follows; the last bit of the energy
+            # is 1e-16.
             bit = 4 * 2.2e-16 / tilt**2 if spin < threshold and tilt == 1e-6 else 0.0
             error /= np.linalg.norm(truth)
             assert error <= 1000 * rtol + bit, (spin, tilt, rtol, error)
-            if tilt == 0:  # also the matrix exponential of (omega1, omega2, gamma1, gamma2)
+            if (
+                tilt == 0
+            ):  # also the matrix exponential of (omega1, omega2, gamma1, gamma2)
                 drag = (moments[0] - moments[2]) / moments[0] * spin
-                linear = [[0, drag, 0, 1], [-drag, 0, -1, 0], [0, -1, 0, spin], [1, 0, -spin, 0]]
+                linear = [
+                    [0, drag, 0, 1],
+                    [-drag, 0, -1, 0],
+                    [0, -1, 0, spin],
+                    [1, 0, -spin, 0],
+                ]
                 block = scipy.linalg.expm(40 * np.array(linear))[:2, :2]
                 difference = np.asarray(jacobians[k])[4:6, 4:6] - block
                 assert np.linalg.norm(difference) <= 1000 * rtol * np.linalg.norm(block)
 
 
-# Equilibria with a rate much faster than the turning itself, and d omega1 / d omega1 there, from
-# the matrix exponential of the linearised motion or, for the damper, of body and sphere together.
-# Of each: moments, the lever, the rotor and the drag that it has, spin and duration.
+# Equilibria with a rate much faster than the turning itself, and d omega1 / d omega1
+# there, from the matrix exponential of the linearised motion or, for the damper, of
+# body and sphere together. Of each: moments, the lever, the rotor and the drag that it
+# has, spin and duration.
 FAST = {
     "hanging at rest": ((1.0, 1.0, 0.5), -1.0, 0.0, 0.0, 0.0, 200.0),
     "gyrostat": ((1.0, 1.0, 1.5), 0.0, 50.0, 0.0, 0.1, 40.0),
@@ -266,7 +301,9 @@ def _first_rate_by_itself(moments, torque, spin, duration):
         body, state0 = jr.RigidBody(moments, torque), jr.State(UPRIGHT, omega)
         return jr.simulate(body, state0, duration, adjoint=FORWARD).states.omega
 
-    return jax.jvp(final, (jnp.array([0, 0, 1.0]) * spin,), (jnp.array([1.0, 0, 0]),))[1][0]
+    return jax.jvp(final, (jnp.array([0, 0, 1.0]) * spin,), (jnp.array([1.0, 0, 0]),))[
+        1
+    ][0]
 
 
 @pytest.fixture(scope="module")
@@ -292,27 +329,35 @@ def test_derivative_at_an_equilibrium_with_a_fast_rate(what, fast_slopes):
 
 
 def test_derivative_at_an_equilibrium_with_a_stiff_damper():
-    # omega = Omega to first order in the inertia over the coupling: see the linear system
-    # I (a' + i w a) = ..., solved here for (omega1, omega2, sphere1, sphere2).
+    # omega = Omega to first order in the inertia over the coupling: see the linear
+    # system I (a' + i w a) = ..., solved here for (omega1, omega2, sphere1, sphere2).
     ratio, coupling, inertia, spin, duration = 0.5, 1.0, 1e-3, 1.0, 40.0
     linear = np.zeros((4, 4))
     linear[:2, :2] = [[-coupling, -ratio * spin], [ratio * spin, -coupling]]
     linear[:2, 2:] = coupling * np.eye(2)
     linear[2:, :2] = coupling / inertia * np.eye(2) + spin * np.array([[0, -1], [1, 0]])
-    linear[2:, 2:] = -coupling / inertia * np.eye(2) + spin * np.array([[0, 1], [-1, 0]])
+    linear[2:, 2:] = -coupling / inertia * np.eye(2) + spin * np.array(
+        [[0, 1], [-1, 0]]
+    )
     start = np.array([1.0, 0, 1.0, 0])  # the sphere starts with the body
     exact = (scipy.linalg.expm(duration * linear) @ start)[0]
     damper = jr.torques.InternalDamper(inertia, coupling)
-    slope = jax.jit(lambda w: _first_rate_by_itself(np.array([1.0, 1.0, 1.5]), damper, w, duration))
+    slope = jax.jit(
+        lambda w: _first_rate_by_itself(np.array([1.0, 1.0, 1.5]), damper, w, duration)
+    )
     assert abs(float(slope(spin)) - exact) <= 1e-5
 
 
 def _observable(omega, adjoint=None, max_steps=None, rtol=1e-9):
     state0 = jr.State(jnp.asarray(UPRIGHT), omega)
     trajectory = jr.simulate(
-        jr.RigidBody(MOMENTS), state0, jnp.array([1.0, 2.0]), adjoint=adjoint, rtol=rtol,
+        jr.RigidBody(MOMENTS),
+        state0,
+        jnp.array([1.0, 2.0]),
+        adjoint=adjoint,
+        rtol=rtol,
         max_steps=max_steps,
-    )  # fmt: skip
+    )
     return trajectory.states.omega[-1, 0] * trajectory.states.attitude[-1, 1]
 
 
@@ -336,7 +381,9 @@ def test_reverse_forward_and_direct_agree():
     for k in range(3):
         e = step * np.eye(3)[k]
         up, down = (_observable(w, rtol=1e-14) for w in (omega + e, omega - e))
-        np.testing.assert_allclose(reverse[k], (up - down) / (2 * step), rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(
+            reverse[k], (up - down) / (2 * step), rtol=1e-7, atol=1e-9
+        )
     # where derivatives are taken the steps are finer
     np.testing.assert_allclose(_observable(omega), value, rtol=1e-9)
     np.testing.assert_allclose(_observable(omega, rtol=1e-12), value, rtol=1e-12)
@@ -366,7 +413,9 @@ def test_derivatives_in_times_and_initial_time():
         (lambda f: jax.jacfwd(jax.jit(f)), None, "adjoint=diffrax.ForwardMode()"),
         (jax.hessian, None, "adjoint=diffrax.DirectAdjoint()"),
         (lambda f: jax.jacrev(jax.jacrev(f)), None, "adjoint=diffrax.DirectAdjoint()"),
-        pytest.param(jax.grad, FORWARD, "RecursiveCheckpointAdjoint()", marks=pytest.mark.slow),
+        pytest.param(
+            jax.grad, FORWARD, "RecursiveCheckpointAdjoint()", marks=pytest.mark.slow
+        ),
         (lambda f: jax.jit(jax.grad(f)), FORWARD, "RecursiveCheckpointAdjoint()"),
     ],
 )
@@ -376,7 +425,8 @@ def test_a_mode_the_adjoint_cannot_serve_names_one_that_can(mode, adjoint, advic
     assert advice in str(caught.value)
 
 
-# Shapes, lanes, events -----------------------------------------------------------------------
+# Shapes, lanes, events
+# -----------------------------------------------------------------------
 
 
 def test_times_of_any_shape():
@@ -389,14 +439,18 @@ def test_times_of_any_shape():
     assert square.angular_momentum.shape == (2, 2, 3)
     order = jr.simulate(body, state0, np.array([2.0, 3.0])).states.omega
     np.testing.assert_allclose(square.states.omega[0, 1], order[0], atol=1e-9)
-    np.testing.assert_allclose(square.states.omega[1], [order[1], flat.states.omega[1]], atol=1e-9)
+    np.testing.assert_allclose(
+        square.states.omega[1], [order[1], flat.states.omega[1]], atol=1e-9
+    )
     np.testing.assert_allclose(single.states.omega, flat.states.omega[-1], atol=1e-9)
     np.testing.assert_array_equal(flat.states.omega[0], OMEGA)
 
 
 def test_repeated_times_and_all_times_at_the_start():
     body, state0 = jr.RigidBody(MOMENTS), jr.State(ATTITUDE, OMEGA)
-    repeated = jr.simulate(body, state0, np.array([0.0, 0.0, 2.0, 2.0]).reshape(2, 2)).states.omega
+    repeated = jr.simulate(
+        body, state0, np.array([0.0, 0.0, 2.0, 2.0]).reshape(2, 2)
+    ).states.omega
     np.testing.assert_array_equal(repeated[0], [OMEGA, OMEGA])
     np.testing.assert_array_equal(repeated[1, 0], repeated[1, 1])
     still = jr.simulate(body, state0, np.array([3.0, 3.0]), t0=3.0)
@@ -409,7 +463,10 @@ def test_a_time_an_ulp_after_the_end_of_a_step_is_not_a_stall():
     spacings = np.linspace(0.02, 0.6, 200)
 
     def lane(spacing):
-        body, state0 = jr.RigidBody(MOMENTS), jr.State(UPRIGHT, np.array([0.3, 0.4, 0.5]))
+        body, state0 = (
+            jr.RigidBody(MOMENTS),
+            jr.State(UPRIGHT, np.array([0.3, 0.4, 0.5])),
+        )
         ts = spacing * jnp.arange(1.0, 201.0)
         trajectory = jr.simulate(body, state0, ts, rtol=1e-11, throw=False)
         return trajectory.result, trajectory.stats["num_rejected_steps"]
@@ -421,7 +478,9 @@ def test_a_time_an_ulp_after_the_end_of_a_step_is_not_a_stall():
 
 def test_a_body_at_rest_stays_at_rest():
     body = jr.RigidBody(MOMENTS)
-    trajectory = jr.simulate(body, jr.State(ATTITUDE, np.zeros(3)), np.array([1.0, 1e6]))
+    trajectory = jr.simulate(
+        body, jr.State(ATTITUDE, np.zeros(3)), np.array([1.0, 1e6])
+    )
     np.testing.assert_array_equal(trajectory.states.omega, np.zeros((2, 3)))
 
 
@@ -429,7 +488,9 @@ def test_a_body_spun_up_from_rest_in_any_unit_of_time():
     for unit in (1e-7, 1.0, 1e4):
         torque = jr.torques.Constant([0.0, 0.0, 3 * unit**2])
         trajectory = jr.simulate(
-            jr.RigidBody(MOMENTS, torque), jr.State(UPRIGHT, jnp.zeros(3)), np.array([10 / unit])
+            jr.RigidBody(MOMENTS, torque),
+            jr.State(UPRIGHT, jnp.zeros(3)),
+            np.array([10 / unit]),
         )
         np.testing.assert_allclose(trajectory.states.omega[0, 2], 10 * unit, rtol=1e-9)
         # turned by t^2 / 2 = 50 rad
@@ -441,15 +502,23 @@ def test_invariants_of_a_vmapped_trajectory():
     body = jr.RigidBody(TENSOR, jr.torques.InternalDamper(0.1, 0.2))
     ts = np.linspace(0, 2, 3)
     omegas = jnp.stack([OMEGA, 2 * OMEGA])
-    many = eqx.filter_vmap(lambda w: jr.simulate(body, jr.State(ATTITUDE, w), ts))(omegas)
+    many = eqx.filter_vmap(lambda w: jr.simulate(body, jr.State(ATTITUDE, w), ts))(
+        omegas
+    )
     assert many.energy.shape == (2, 3)
     assert many.angular_momentum.shape == (2, 3, 3)
     states = many.states
     for k in range(3):  # of the other lane, as told by its states alone
-        state = jr.State(states.attitude[1, k], states.omega[1, k], (states.internal[0][1, k],))
-        np.testing.assert_allclose(many.energy[1, k], body.energy(0.0, state, None), rtol=1e-14)
+        state = jr.State(
+            states.attitude[1, k], states.omega[1, k], (states.internal[0][1, k],)
+        )
+        np.testing.assert_allclose(
+            many.energy[1, k], body.energy(0.0, state, None), rtol=1e-14
+        )
         momentum = body.angular_momentum(0.0, state, None)
-        np.testing.assert_allclose(many.angular_momentum[1, k], momentum, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(
+            many.angular_momentum[1, k], momentum, rtol=0, atol=1e-14
+        )
     assert np.all(many.result == jr.RESULTS.successful)
 
 
@@ -466,11 +535,18 @@ def test_a_trajectory_with_a_function_torque_passes_through_jit_and_vmap():
 
 
 def test_max_step_shows_a_pulse_that_falls_between_two_steps():
-    torque = jr.torques.Torque(lambda t, _s, _a: jnp.exp(-(((t - 50) / 0.05) ** 2)) * jnp.ones(3))
-    body, state0 = jr.RigidBody(np.ones(3), torque), jr.State(UPRIGHT, np.array([0, 0, 0.01]))
+    torque = jr.torques.Torque(
+        lambda t, _s, _a: jnp.exp(-(((t - 50) / 0.05) ** 2)) * jnp.ones(3)
+    )
+    body, state0 = (
+        jr.RigidBody(np.ones(3), torque),
+        jr.State(UPRIGHT, np.array([0, 0, 0.01])),
+    )
     trajectory = jr.simulate(body, state0, 100.0, max_step=0.05)
     gain = 0.05 * np.sqrt(np.pi)
-    np.testing.assert_allclose(trajectory.states.omega, [gain, gain, gain + 0.01], rtol=1e-6)
+    np.testing.assert_allclose(
+        trajectory.states.omega, [gain, gain, gain + 0.01], rtol=1e-6
+    )
     with pytest.raises(RuntimeError, match="max_step"):
         jr.simulate(body, state0, 100.0, max_step=-1.0)
 
@@ -482,7 +558,9 @@ def test_derivative_in_a_time_at_the_start():
         return jr.simulate(body, jr.State(ATTITUDE, OMEGA), ts).states.omega
 
     slope = quick_jit(jax.jacrev(omega))(jnp.array([0.0]))
-    np.testing.assert_allclose(slope[0, :, 0], jr.euler_equations(MOMENTS, OMEGA), atol=1e-9)
+    np.testing.assert_allclose(
+        slope[0, :, 0], jr.euler_equations(MOMENTS, OMEGA), atol=1e-9
+    )
 
 
 def test_progress_meter_prints(capfd):
@@ -503,7 +581,8 @@ def test_running_out_of_steps_is_reported():
         jr.simulate(body, state0, ts, max_steps=20)
 
 
-# Bad input -----------------------------------------------------------------------------------
+# Bad input
+# -----------------------------------------------------------------------------------
 
 GOOD = (MOMENTS, ATTITUDE, OMEGA, np.array([0.5, 1.0]))
 BAD = {
@@ -520,7 +599,9 @@ BAD = {
 
 
 def _omega_of(moments, attitude, omega, ts):
-    return jr.simulate(jr.RigidBody(moments), jr.State(attitude, omega), ts).states.omega
+    return jr.simulate(
+        jr.RigidBody(moments), jr.State(attitude, omega), ts
+    ).states.omega
 
 
 @eqx.filter_jit
@@ -555,7 +636,9 @@ def test_bad_value_raises_eagerly_and_under_jit_and_marks_its_lane(what):
     assert codes == [0, int(code._value), 0]
     assert np.all(np.isnan(omegas[1]))
     np.testing.assert_array_equal(omegas[0], omegas[2])
-    np.testing.assert_allclose(omegas[0], _omega_jitted(*map(jnp.asarray, GOOD)), atol=1e-9)
+    np.testing.assert_allclose(
+        omegas[0], _omega_jitted(*map(jnp.asarray, GOOD)), atol=1e-9
+    )
 
 
 def test_three_bodies_as_a_tensor_is_an_error():
@@ -579,7 +662,9 @@ def test_gradients_of_good_lanes_and_of_what_they_share_are_untouched_by_bad_one
 
     gradient = quick_jit(jax.grad(total, argnums=(0, 2)))
     shared, own = gradient(jnp.array(0.1), attitudes, omegas)
-    with_bad = gradient(jnp.array(0.1), attitudes.at[1].set(0.0), omegas.at[2].set(jnp.nan))
+    with_bad = gradient(
+        jnp.array(0.1), attitudes.at[1].set(0.0), omegas.at[2].set(jnp.nan)
+    )
     np.testing.assert_allclose(with_bad[0], shared / 2, rtol=1e-12)
     np.testing.assert_allclose(with_bad[1][::3], own[::3], rtol=1e-12)
     np.testing.assert_array_equal(with_bad[1][1:3], 0.0)
@@ -600,7 +685,9 @@ def reached_by_the_error():
     closed, shapes = jax.make_jaxpr(every, return_shape=True)(jnp.zeros(4))
     reached = set()
     for equation in closed.jaxpr.eqns:
-        raises = "callback" in str(equation.params) or "callback" in equation.primitive.name
+        raises = (
+            "callback" in str(equation.params) or "callback" in equation.primitive.name
+        )
         if raises or any(id(x) in reached for x in equation.invars):
             reached.update(id(x) for x in equation.outvars)
     leaves = [id(x) in reached for x in closed.jaxpr.outvars]
@@ -627,27 +714,44 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda b, s: jr.simulate(b, s, jnp.zeros((0,))), "`ts` must hold at least one time"),
-        (lambda _, s: jr.simulate(lambda t: t, s, 1.0), "`system` must be a jrigid system"),
+        (
+            lambda b, s: jr.simulate(b, s, jnp.zeros((0,))),
+            "`ts` must hold at least one time",
+        ),
+        (
+            lambda _, s: jr.simulate(lambda t: t, s, 1.0),
+            "`system` must be a jrigid system",
+        ),
         (lambda b, s: jr.simulate(b, s, 1.0, rtol=2.0), "`rtol` must be at least"),
         (lambda b, s: jr.simulate(b, s, 1.0, rtol=-1.0), "`rtol` must be at least"),
         (lambda b, s: jr.simulate(b, s, 1.0, atol=0.0), "`atol` must be at least"),
         (lambda b, s: jr.simulate(b, s, 1.0, t0=jnp.zeros(2)), "`t0` must have shape"),
-        (lambda b, s: jr.simulate(b, s, 1.0, solver=diffrax.Euler()), "`solver` must be"),
-        (lambda _b, _s: jr.RigidBody(jnp.ones(2)), r"`inertia` must have shape \(3,\) or"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, solver=diffrax.Euler()),
+            "`solver` must be",
+        ),
+        (
+            lambda _b, _s: jr.RigidBody(jnp.ones(2)),
+            r"`inertia` must have shape \(3,\) or",
+        ),
         (
             lambda b, s: jr.simulate(b, jr.State(jnp.ones(3), s.omega), 1.0),
             "`state0.attitude` must have shape",
         ),
         (
-            lambda b, s: jr.simulate(b, jr.State(s.attitude, s.omega, jnp.ones(3)), 1.0),
+            lambda b, s: jr.simulate(
+                b, jr.State(s.attitude, s.omega, jnp.ones(3)), 1.0
+            ),
             "`internal` of the state must be a tuple with an entry",
         ),
         (
             lambda b, s: jr.simulate(b, (s.attitude, s.omega), 1.0),
             "`state0` must be a State, but it is a tuple",
         ),
-        (lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t), "`event` must be a Event"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t),
+            "`event` must be a Event",
+        ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, max_steps=0),
             "`max_steps` must be an integer and at least 1",

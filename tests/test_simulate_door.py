@@ -18,7 +18,8 @@ STATE = jr.State(UPRIGHT, OMEGA)
 BODY = jr.RigidBody(MOMENTS)
 
 
-# What is compiled ----------------------------------------------------------------------------
+# What is compiled
+# ----------------------------------------------------------------------------
 
 
 def _turned_by(angle):
@@ -46,10 +47,16 @@ def test_the_compiled_function_holds_no_callback(event, mode):
 
     def number(rate):
         state0 = jr.State(UPRIGHT, rate * jnp.array([0, 0, 1.0]))
-        trajectory = jr.simulate(BODY, state0, 5.0, event=event, adjoint=adjoint, throw=False)
+        trajectory = jr.simulate(
+            BODY, state0, 5.0, event=event, adjoint=adjoint, throw=False
+        )
         return trajectory.final_time + trajectory.final_state.attitude[0]
 
-    function = {"value": number, "reverse": jax.grad(number), "forward": jax.jacfwd(number)}[mode]
+    function = {
+        "value": number,
+        "reverse": jax.grad(number),
+        "forward": jax.jacfwd(number),
+    }[mode]
     assert "callback" not in str(jax.make_jaxpr(function)(2.0))
 
 
@@ -107,7 +114,8 @@ def test_a_second_process_with_the_persistent_cache_compiles_nothing(work, tmp_p
         assert misses > 0 if process == 1 else (misses == 0 and hits > 0)
 
 
-# Events --------------------------------------------------------------------------------------
+# Events
+# --------------------------------------------------------------------------------------
 
 
 def test_an_event_is_located_without_being_asked_and_differentiated_twice():
@@ -118,8 +126,12 @@ def test_an_event_is_located_without_being_asked_and_differentiated_twice():
 
     trajectory = _spun(2.0, TURNED)
     assert trajectory.result == jr.RESULTS.event_occurred
-    np.testing.assert_allclose(trajectory.final_state.attitude[0], np.cos(0.65), atol=1e-12)
-    np.testing.assert_array_equal(np.isfinite(trajectory.states.omega[:, 0]), [True, False])
+    np.testing.assert_allclose(
+        trajectory.final_state.attitude[0], np.cos(0.65), atol=1e-12
+    )
+    np.testing.assert_array_equal(
+        np.isfinite(trajectory.states.omega[:, 0]), [True, False]
+    )
     twice = quick_jit(lambda r: jax.jvp(with_slope, (r,), (1.0,)))
     (time, slope), (_, curvature) = twice(2.0)
     np.testing.assert_allclose([time, slope], [0.65, -1.3 / 4], rtol=1e-8)
@@ -142,7 +154,9 @@ def test_derivatives_of_an_event_in_reverse_and_in_lanes(adjoint):
 def test_conditions_that_become_true_are_located_and_a_root_finder_is_used_if_given():
     exact = float(_spun(2.0, TURNED).final_time)
     assert float(_spun(2.0, BY_NEWTON).final_time) == pytest.approx(exact, abs=1e-9)
-    truth = diffrax.Event(lambda _t, state, _args, **_: state.attitude[0] < np.cos(0.65))
+    truth = diffrax.Event(
+        lambda _t, state, _args, **_: state.attitude[0] < np.cos(0.65)
+    )
     found = _spun(2.0, truth)
     assert found.result == jr.RESULTS.event_occurred
     # To the accuracy of a step's dense output; a number is refined by Newton's method.
@@ -179,14 +193,17 @@ def test_an_event_ends_the_motion_in_si_units():
     assert list(reached) == [True, False]
 
 
-# Runs that are too long ----------------------------------------------------------------------
+# Runs that are too long
+# ----------------------------------------------------------------------
 
 SLOWING = jr.RigidBody(MOMENTS, jr.torques.LinearDrag(1.0))
 
 
 def test_a_run_that_needs_more_than_the_default_steps_fails_before_its_first_one():
     rates = np.stack([OMEGA, 1e7 * OMEGA])
-    motion = jax.vmap(lambda w: jr.simulate(BODY, jr.State(UPRIGHT, w), 50.0, throw=False))(rates)
+    motion = jax.vmap(
+        lambda w: jr.simulate(BODY, jr.State(UPRIGHT, w), 50.0, throw=False)
+    )(rates)
     assert [int(x) for x in motion.result._value] == [0, _pick("max_steps_reached")]
     assert int(motion.stats["num_steps"][1]) == 0
     assert np.all(np.isfinite(motion.states.omega[0]))
@@ -198,7 +215,9 @@ def test_no_run_is_refused_that_would_succeed():
     state0 = jr.State(UPRIGHT, 2.0 * np.array([0, 0, 1.0]))
     ended = jr.simulate(BODY, state0, np.array([0.5, 1e9]), event=TURNED)
     np.testing.assert_allclose(ended.final_time, 0.65, atol=1e-8)
-    weight = jr.torques.UniformGravity(1.0, np.array([0, 0, 1e-3]), np.array([0, 0, -1.0]))
+    weight = jr.torques.UniformGravity(
+        1.0, np.array([0, 0, 1e-3]), np.array([0, 0, -1.0])
+    )
     kicked = jr.simulate(
         jr.RigidBody(MOMENTS, weight),
         jr.State(UPRIGHT, 1e8 * OMEGA),
@@ -218,7 +237,8 @@ def test_steps_are_never_longer_than_the_fastest_rate_at_the_start_allows():
     assert int(motion.stats["num_steps"]) > rate * 30.0 / _LARGEST_BOUNDS[0]
 
 
-# Stiffness -----------------------------------------------------------------------------------
+# Stiffness
+# -----------------------------------------------------------------------------------
 
 
 def test_an_implicit_solver_steps_over_what_is_damped():
@@ -226,7 +246,12 @@ def test_an_implicit_solver_steps_over_what_is_damped():
     drag = jr.torques.LinearDrag(1e6)
     body = jr.RigidBody(np.ones(3), drag + jr.torques.Constant(np.array([0, 0, 5e5])))
     trajectory = jr.simulate(
-        body, jr.State(UPRIGHT, OMEGA), 4.0, rtol=1e-6, solver=diffrax.Kvaerno5(), max_steps=2000
+        body,
+        jr.State(UPRIGHT, OMEGA),
+        4.0,
+        rtol=1e-6,
+        solver=diffrax.Kvaerno5(),
+        max_steps=2000,
     )
     assert trajectory.stats["num_steps"] < 500
     np.testing.assert_allclose(trajectory.states.omega, [0, 0, 0.5], atol=1e-6)
@@ -234,7 +259,8 @@ def test_an_implicit_solver_steps_over_what_is_damped():
     assert jr.rotation.angle_between(trajectory.states.attitude, turned) < 1e-5
 
 
-# What is refused -----------------------------------------------------------------------------
+# What is refused
+# -----------------------------------------------------------------------------
 
 
 def _fading_torque(t, state, end):
@@ -247,7 +273,9 @@ FADING = jr.RigidBody(MOMENTS, _fading_torque)
 
 def _faded(ends, throw=True):
     times = np.array([0.5, 2.0])
-    return jax.vmap(lambda end: jr.simulate(FADING, STATE, times, end, throw=throw))(ends)
+    return jax.vmap(lambda end: jr.simulate(FADING, STATE, times, end, throw=throw))(
+        ends
+    )
 
 
 def _in_twenty_steps(omegas, times):
@@ -272,14 +300,22 @@ def _pick(code):
             lambda: jr.simulate(BODY, jr.State(UPRIGHT, 1e160 * OMEGA), 1e-160),
             r"whose squares are in the range .* not: 9\.89.*e\+159\. \(Choose another unit of time",
         ),
-        (lambda: jr.simulate(BODY, STATE, np.array([1.0, 0.5])), r"`ts` must .* not: 0\.5\.$"),
-        (lambda: jr.simulate(BODY, STATE, np.array([1.0, 2.0]), t0=1.5), r"`t0`, .* not: 1\.0\.$"),
+        (
+            lambda: jr.simulate(BODY, STATE, np.array([1.0, 0.5])),
+            r"`ts` must .* not: 0\.5\.$",
+        ),
+        (
+            lambda: jr.simulate(BODY, STATE, np.array([1.0, 2.0]), t0=1.5),
+            r"`t0`, .* not: 1\.0\.$",
+        ),
         (
             lambda: _faded(jnp.array([10.0, 1.0])),
             r"became NaN or infinite .* after `final_time` \[s\]: (1\.0|0\.999)\d* in lane 1\.",
         ),
         (
-            lambda: _in_twenty_steps(np.stack([OMEGA, np.nan * OMEGA]), np.array([0.1, 0.1])),
+            lambda: _in_twenty_steps(
+                np.stack([OMEGA, np.nan * OMEGA]), np.array([0.1, 0.1])
+            ),
             r"`state0` must be finite, but a component is not: \[.*nan\] in lane 1\.",
         ),
         (
@@ -288,7 +324,7 @@ def _pick(code):
             r"\[ *0\.989\d* +98\.9\d*\] in lane 1\. \(.*`jrigid.free_rotation` of a free body",
         ),
     ],
-)  # fmt: skip
+)
 def test_an_error_is_one_sentence_with_the_value_and_the_lane(call, message):
     with pytest.raises(RuntimeError, match=message) as error:
         call()
@@ -299,9 +335,13 @@ def test_an_error_is_one_sentence_with_the_value_and_the_lane(call, message):
 def test_times_that_their_dtype_cannot_tell_apart_are_an_error():
     """Unix time in float32: its numbers are 128 seconds apart."""
     single = lambda *x: [np.asarray(a, np.float32) for a in x]  # noqa: E731
-    moments, attitude, omega, ts = single(MOMENTS, UPRIGHT, OMEGA, 1.7e9 + np.array([0.0, 10.0]))
+    moments, attitude, omega, ts = single(
+        MOMENTS, UPRIGHT, OMEGA, 1.7e9 + np.array([0.0, 10.0])
+    )
     body, state0 = jr.RigidBody(moments), jr.State(attitude, omega)
-    with pytest.raises(RuntimeError, match=r"1\.7e\+09.*\(Subtract the epoch.*jax_enable_x64"):
+    with pytest.raises(
+        RuntimeError, match=r"1\.7e\+09.*\(Subtract the epoch.*jax_enable_x64"
+    ):
         jr.simulate(body, state0, ts, t0=ts[0])
     trajectory = jr.simulate(body, state0, ts, t0=ts[0], throw=False)
     assert trajectory.result == jr.RESULTS.unresolved_times
@@ -314,7 +354,9 @@ def test_rates_near_the_ends_of_the_range_are_integrated():
     for unit in (1e-140, 1e140):
         trajectory = jr.simulate(BODY, jr.State(UPRIGHT, unit * OMEGA), 3.0 / unit)
         exact = jr.free_rotation(MOMENTS, jr.State(UPRIGHT, OMEGA), 3.0).omega
-        np.testing.assert_allclose(trajectory.states.omega / unit, exact, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(
+            trajectory.states.omega / unit, exact, rtol=1e-8, atol=1e-8
+        )
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ SINGLE = UPRIGHT.astype(np.float32)
 BODY = jr.MassProperties(2.0, np.zeros(3), SYMMETRIC)
 
 
-# Orbits --------------------------------------------------------------------------------------
+# Orbits
+# --------------------------------------------------------------------------------------
 
 
 def _attraction(_t, state, strength):
@@ -36,28 +37,45 @@ ORBIT = jr.FloatingBody(BODY, jr.systems.Force(_attraction, _potential))
 def _circle(turning, radians, rtol, unit):
     """Errors after a circular orbit of radius 1 at the rate `unit`, as fractions of the bars."""
     state0 = jr.FloatingState(
-        jnp.array([1.0, 0, 0]), jnp.array([0, 1.0, 0]) * unit, UPRIGHT,
+        jnp.array([1.0, 0, 0]),
+        jnp.array([0, 1.0, 0]) * unit,
+        UPRIGHT,
         jnp.array([0, 0, 1.0]) * turning * unit,
-    )  # fmt: skip
+    )
     ts = jnp.stack([jnp.zeros_like(radians), radians / unit])
     trajectory = jr.simulate(ORBIT, state0, ts, unit**2, rtol=rtol)
     bar = rtol * (1 + radians)
     c, s = jnp.cos(radians), jnp.sin(radians)
-    position, velocity = trajectory.states.position[1], trajectory.states.velocity[1] / unit
+    position, velocity = (
+        trajectory.states.position[1],
+        trajectory.states.velocity[1] / unit,
+    )
     energy = trajectory.energy
-    return jnp.stack([
-        jnp.abs(energy[1] / energy[0] - 1) / bar,
-        jnp.linalg.norm(position - jnp.stack([c, s, 0 * s])) / (10 * bar),
-        jnp.linalg.norm(velocity - jnp.stack([-s, c, 0 * s])) / (10 * bar),
-    ])  # fmt: skip
+    return jnp.stack(
+        [
+            jnp.abs(energy[1] / energy[0] - 1) / bar,
+            jnp.linalg.norm(position - jnp.stack([c, s, 0 * s])) / (10 * bar),
+            jnp.linalg.norm(velocity - jnp.stack([-s, c, 0 * s])) / (10 * bar),
+        ]
+    )
 
 
 @pytest.mark.parametrize(
     ("turning", "turns", "rtol", "unit"),
-    [(0.0, 100, 1e-6, 1), (0.0, 1000, 1e-8, 1), (1e-4, 100, 1e-8, 1), (1e-4, 1000, 1e-4, 1),
-     (0.0, 3000, 1e-8, 1), (1.0, 100, 1e-8, 1), (1e-4, 100, 1e-8, 1e-7), (0.0, 100, 1e-8, 1e4)],
-)  # fmt: skip
-def test_a_body_that_turns_slowly_or_not_at_all_keeps_its_orbit(turning, turns, rtol, unit):
+    [
+        (0.0, 100, 1e-6, 1),
+        (0.0, 1000, 1e-8, 1),
+        (1e-4, 100, 1e-8, 1),
+        (1e-4, 1000, 1e-4, 1),
+        (0.0, 3000, 1e-8, 1),
+        (1.0, 100, 1e-8, 1),
+        (1e-4, 100, 1e-8, 1e-7),
+        (0.0, 100, 1e-8, 1e4),
+    ],
+)
+def test_a_body_that_turns_slowly_or_not_at_all_keeps_its_orbit(
+    turning, turns, rtol, unit
+):
     errors = _circle(turning, 2 * np.pi * turns, rtol, float(unit))
     assert np.all(errors <= 1), errors
 
@@ -81,7 +99,8 @@ def test_a_projectile_that_does_not_turn_in_any_unit_of_time():
             np.testing.assert_allclose(position, exact, atol=1e-8)
 
 
-# Rates that rise after the start -------------------------------------------------------------
+# Rates that rise after the start
+# -------------------------------------------------------------
 
 
 def _motion(omega, case, adjoint=None):
@@ -113,10 +132,11 @@ def _damped():
     return decay * (-(10 * c + slope * s) + root * (slope * c - 10 * s))
 
 
-# Of each: moments, what spins the wheel up, what acts on the body, whether it is controlled, the
-# tolerance, the duration, its rate at the start about axis 3.
+# Of each: moments, what spins the wheel up, what acts on the body, whether it is
+# controlled, the tolerance, the duration, its rate at the start about axis 3.
 RISING = {
-    # a wheel spun up to h = 50 while a counter-torque holds the body: |d omega| is conserved
+    # a wheel spun up to h = 50 while a counter-torque holds the body: |d omega| is
+    # conserved
     "wheel": (SYMMETRIC, 0.5, 0.5, 0.0, 1e-8, 100.0, 0.0),
     # a body at rest whose attitude control is switched on
     "control": (MOMENTS, 0.0, 0.0, 1.0, 1e-8, 30.0, 0.0),
@@ -134,14 +154,17 @@ def rising_columns():
         final = lambda w: _motion(w, case, FORWARD)  # noqa: E731
         return jax.jvp(final, (jnp.zeros(3),), (jnp.array([1.0, 0, 0]),))[1]
 
-    return dict(zip(RISING, np.asarray(quick_jit(jax.vmap(column))(LANES)), strict=True))
+    return dict(
+        zip(RISING, np.asarray(quick_jit(jax.vmap(column))(LANES)), strict=True)
+    )
 
 
 @pytest.mark.parametrize("what", RISING)
 def test_derivative_where_a_fast_rate_appears_on_the_way(what, rising_columns):
     slope = rising_columns[what]
     if what == "control":
-        # About axis 1 the body is x'' = -(25 x + 2 x') with 2 log(q) halved: see _damped.
+        # About axis 1 the body is x'' = -(25 x + 2 x') with 2 log(q) halved: see
+        # _damped.
         np.testing.assert_allclose(abs(slope[0]), abs(_damped()), rtol=1e-5)
     else:
         np.testing.assert_allclose(np.hypot(*slope[:2]), 1.0, rtol=1e-5)
@@ -154,13 +177,16 @@ def test_reverse_mode_and_lanes_where_a_fast_rate_appears_on_the_way():
         case = (moments, 0.5 * scale, 0.5 * scale, *wheel)
         return lambda w: _motion(w, case)[0]
 
-    slopes = quick_jit(jax.vmap(lambda s: jax.grad(final(s))(jnp.zeros(3))))(jnp.array([1.0, 0.2]))
+    slopes = quick_jit(jax.vmap(lambda s: jax.grad(final(s))(jnp.zeros(3))))(
+        jnp.array([1.0, 0.2])
+    )
     # the turning plane has turned by the integral of h / I1
     np.testing.assert_allclose(slopes[0, :2], [np.cos(2500), -np.sin(2500)], atol=1e-4)
     np.testing.assert_allclose(slopes[1, :2], [np.cos(500), -np.sin(500)], atol=1e-4)
 
 
-# Derivatives ---------------------------------------------------------------------------------
+# Derivatives
+# ---------------------------------------------------------------------------------
 
 
 def test_gradient_in_float32_at_pure_spin():
@@ -199,7 +225,9 @@ def test_derivative_of_the_time_of_an_event():
             optx.Newton(1e-10, 1e-10),
         )
         state0 = jr.State(UPRIGHT, rate * jnp.array([0, 0, 1.0]))
-        return jr.simulate(jr.RigidBody(MOMENTS), state0, jnp.array([5.0]), event=event).final_time
+        return jr.simulate(
+            jr.RigidBody(MOMENTS), state0, jnp.array([5.0]), event=event
+        ).final_time
 
     np.testing.assert_allclose(quick_jit(jax.grad(when))(2.0), -1.3 / 4, rtol=1e-7)
 
@@ -209,14 +237,20 @@ def test_second_derivative_at_pure_spin():
 
     def final(omega):
         state0 = jr.State(UPRIGHT, omega)
-        states = jr.simulate(jr.RigidBody(MOMENTS), state0, 10.0, adjoint=FORWARD).states
+        states = jr.simulate(
+            jr.RigidBody(MOMENTS), state0, 10.0, adjoint=FORWARD
+        ).states
         return jnp.concatenate([states.attitude, states.omega])
 
     # direction first: one trace of two derivatives, instead of four
-    twice = quick_jit(lambda w: jax.jacfwd(lambda w: jax.jvp(final, (w,), (direction,))[1])(w))
+    twice = quick_jit(
+        lambda w: jax.jacfwd(lambda w: jax.jvp(final, (w,), (direction,))[1])(w)
+    )
     for spin in ([0, 0, 1.0], [0, 1.0, 0]):
         along = np.concatenate([np.zeros(4), direction, np.zeros(3)])
-        exact = free_hessian_vector(MOMENTS[None], UPRIGHT[None], np.array([spin]), 10.0, along)
+        exact = free_hessian_vector(
+            MOMENTS[None], UPRIGHT[None], np.array([spin]), 10.0, along
+        )
         exact = exact[0][:, 4:7].astype(float)
         error = np.linalg.norm(np.asarray(twice(jnp.array(spin))) - exact)
         assert error <= 1e-5 * np.linalg.norm(exact), spin
@@ -228,21 +262,27 @@ def test_jacobian_after_a_thousand_turns():
     duration = 2 * np.pi * 1000 / np.linalg.norm(omega)
 
     def final(w):
-        states = jr.simulate(jr.RigidBody(MOMENTS), jr.State(UPRIGHT, w), duration, adjoint=FORWARD)
+        states = jr.simulate(
+            jr.RigidBody(MOMENTS), jr.State(UPRIGHT, w), duration, adjoint=FORWARD
+        )
         return jnp.concatenate([states.states.attitude, states.states.omega])
 
     def closed(w):
         states = jr.free_rotation(MOMENTS, jr.State(UPRIGHT, w), duration)
         return jnp.concatenate([states.attitude, states.omega])
 
-    found, exact = quick_jit(jax.jacfwd(final))(omega), quick_jit(jax.jacfwd(closed))(omega)
+    found, exact = (
+        quick_jit(jax.jacfwd(final))(omega),
+        quick_jit(jax.jacfwd(closed))(omega),
+    )
     # q and -q are the same attitude
     sign = jnp.sign(found[:4].ravel() @ exact[:4].ravel())
     exact = exact.at[:4].multiply(sign)
     assert np.linalg.norm(found - exact) <= 1000 * 1e-8 * np.linalg.norm(exact)
 
 
-# Lanes that fail -----------------------------------------------------------------------------
+# Lanes that fail
+# -----------------------------------------------------------------------------
 
 
 def _total(lane):
@@ -259,9 +299,18 @@ def _fading(adjoint):
 
     def lane(drag, own):
         torque = lambda t, s, a: -a[0] * s.omega * jnp.sqrt(1 - a[1] * t)  # noqa: E731
-        body, state0 = jr.RigidBody(MOMENTS, torque), jr.State(UPRIGHT, jnp.array([0.1, 0.2, 0.3]))
+        body, state0 = (
+            jr.RigidBody(MOMENTS, torque),
+            jr.State(UPRIGHT, jnp.array([0.1, 0.2, 0.3])),
+        )
         trajectory = jr.simulate(
-            body, state0, 2.0, (drag, own), throw=False, adjoint=adjoint, max_steps=max_steps
+            body,
+            state0,
+            2.0,
+            (drag, own),
+            throw=False,
+            adjoint=adjoint,
+            max_steps=max_steps,
         )
         return trajectory.states.omega[0], trajectory.result
 
@@ -287,7 +336,9 @@ def test_bad_lanes_whose_force_closes_over_its_parameter_leave_shared_gradients_
         strength, start, omega = own
 
         def attraction(_t, state, _args):
-            return -shared * strength * state.position / jnp.sum(state.position**2) ** 1.5
+            return (
+                -shared * strength * state.position / jnp.sum(state.position**2) ** 1.5
+            )
 
         body = jr.FloatingBody(BODY, attraction)
         state0 = jr.FloatingState(start, jnp.array([0, 0.7, 0]), UPRIGHT, omega)
@@ -298,14 +349,18 @@ def test_bad_lanes_whose_force_closes_over_its_parameter_leave_shared_gradients_
     strengths, starts, omegas = good
     bad = strengths.at[1].set(jnp.nan), starts.at[2].set(0.0), omegas.at[3].set(jnp.nan)
     gradient = quick_jit(_total(lane))
-    np.testing.assert_allclose(gradient(2.0, bad)[0], gradient(2.0, good)[0] / 4, rtol=1e-12)
+    np.testing.assert_allclose(
+        gradient(2.0, bad)[0], gradient(2.0, good)[0] / 4, rtol=1e-12
+    )
 
 
 def test_a_bad_lane_does_not_keep_the_others_waiting():
     """The body that stands in for it would fall into the attractor of a real planet."""
 
     def lane(omega):
-        state0 = jr.FloatingState(np.array([7e6, 0, 0]), np.array([0, 7.5e3, 0]), UPRIGHT, omega)
+        state0 = jr.FloatingState(
+            np.array([7e6, 0, 0]), np.array([0, 7.5e3, 0]), UPRIGHT, omega
+        )
         body = jr.FloatingBody(BODY, lambda t, s, a: _attraction(t, s, 3.986e14))  # noqa: ARG005
         trajectory = jr.simulate(body, state0, 5000.0, throw=False)
         return trajectory.result, trajectory.stats["num_steps"]
@@ -321,7 +376,10 @@ def test_a_traced_tolerance_is_checked(which, value):
     tolerances = {"rtol": np.full(2, 1e-6), "atol": np.full(2, 1e-6)}
     tolerances[which][1] = value
     result, omega, steps = _lanes_with(tolerances["rtol"], tolerances["atol"])
-    assert [int(c) for c in result._value] == [0, int(jr.RESULTS.invalid_tolerance._value)]
+    assert [int(c) for c in result._value] == [
+        0,
+        int(jr.RESULTS.invalid_tolerance._value),
+    ]
     assert np.all(np.isfinite(omega[0]))
     assert np.all(np.isnan(omega[1]))
     assert steps[1] < 20
@@ -380,10 +438,13 @@ def test_the_origin_of_time_plays_no_role():
     state0 = jr.FloatingState(np.zeros(3), np.zeros(3), UPRIGHT, np.zeros(3))
     early, late = (jr.simulate(body, state0, t0 + 64.0, t0=t0) for t0 in (0.0, 4096.0))
     assert early.stats == late.stats
-    np.testing.assert_allclose(late.final_state.position, early.final_state.position, rtol=1e-12)
+    np.testing.assert_allclose(
+        late.final_state.position, early.final_state.position, rtol=1e-12
+    )
 
 
-# Precision -----------------------------------------------------------------------------------
+# Precision
+# -----------------------------------------------------------------------------------
 
 
 def test_times_in_more_digits_than_the_state():
@@ -401,7 +462,9 @@ def test_times_in_more_digits_than_the_state():
 
 def _starts(attitude, omega):
     state0, ts = jr.State(attitude, omega), np.array([0.05, 0.1])
-    trajectory = jr.simulate(jr.RigidBody(MOMENTS.astype(omega.dtype)), state0, ts, throw=False)
+    trajectory = jr.simulate(
+        jr.RigidBody(MOMENTS.astype(omega.dtype)), state0, ts, throw=False
+    )
     return bool(trajectory.result == jr.RESULTS.successful)
 
 
@@ -418,10 +481,13 @@ def test_what_counts_as_a_unit_quaternion(rng):
         assert _starts(normalised, float32)
         assert _starts(rounded.astype(np.float64), double)
     assert not _starts(np.array([0.7071, 0, 0, 0.7071]), double)
-    assert not _starts(np.array([0.7, 0, 0, 0.7106], np.float32), float32)  # |q| = 0.9975
+    assert not _starts(
+        np.array([0.7, 0, 0, 0.7106], np.float32), float32
+    )  # |q| = 0.9975
 
 
-# Options -------------------------------------------------------------------------------------
+# Options
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -432,14 +498,26 @@ def test_what_counts_as_a_unit_quaternion(rng):
         (lambda b, s: jr.simulate(b, s, 1.0, t0="x"), "`t0` must be numbers"),
         (lambda b, s: jr.simulate(b, s, 1.0, rtol="x"), "`rtol` must be numbers"),
         (lambda b, s: jr.simulate(b, s, 1.0, atol="x"), "`atol` must be numbers"),
-        (lambda b, s: jr.simulate(b, s, 1.0, max_step="x"), "`max_step` must be numbers"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, max_step="x"),
+            "`max_step` must be numbers",
+        ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, progress="x"),
             "`progress` must be a bool or a AbstractProgressMeter",
         ),
-        (lambda b, s: jr.simulate(b, s, 1.0, max_steps=1e5), "`max_steps` must be an integer"),
-        (lambda b, s: jr.simulate(b, jr.State(None, s.omega), 1.0), "`state0.attitude` must be an"),
-        (lambda b, s: jr.simulate(b, jr.State(s.attitude, 1), 1.0), "`state0.omega` must be an"),
+        (
+            lambda b, s: jr.simulate(b, s, 1.0, max_steps=1e5),
+            "`max_steps` must be an integer",
+        ),
+        (
+            lambda b, s: jr.simulate(b, jr.State(None, s.omega), 1.0),
+            "`state0.attitude` must be an",
+        ),
+        (
+            lambda b, s: jr.simulate(b, jr.State(s.attitude, 1), 1.0),
+            "`state0.omega` must be an",
+        ),
         (
             lambda _b, s: jr.simulate(
                 ORBIT, jr.FloatingState(None, np.ones(3), s.attitude, s.omega), 1.0

@@ -13,8 +13,12 @@ from chromium import Chromium
 import jrigid as jr
 
 SITE = Path(__file__).parents[1] / "build" / "docs"
-PROGRAM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
-built = pytest.mark.skipif(not (SITE / "objects.inv").exists(), reason="`make docs` builds it")
+PROGRAM = next(
+    filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None
+)
+built = pytest.mark.skipif(
+    not (SITE / "objects.inv").exists(), reason="`make docs` builds it"
+)
 seen = pytest.mark.skipif(PROGRAM is None, reason="no chromium on this machine")
 
 MODULES = {
@@ -23,7 +27,9 @@ MODULES = {
     if inspect.ismodule(module) and hasattr(module, "__all__")
 }
 NAMES = {
-    f"{module}.{name}": getattr(x, name) for module, x in MODULES.items() for name in x.__all__
+    f"{module}.{name}": getattr(x, name)
+    for module, x in MODULES.items()
+    for name in x.__all__
 }
 TOP = {
     f"jrigid.{k}": x
@@ -47,7 +53,9 @@ def is_told(name, shown):
     """Its own example, or that of a function of the module that returns it or speaks of it."""
     text = inspect.getdoc(shown) or ""
     module, _, short = name.rpartition(".")
-    others = [inspect.getdoc(x) or "" for k, x in ALL.items() if k.startswith(f"{module}.")]
+    others = [
+        inspect.getdoc(x) or "" for k, x in ALL.items() if k.startswith(f"{module}.")
+    ]
     returning = [
         inspect.getdoc(x) or ""
         for k, x in ALL.items()
@@ -92,7 +100,9 @@ def test_every_page_opens_with_its_images_scripts_and_links():
     wrong, pages, links = [], {}, []
     with Chromium(PROGRAM) as tab:
         for path in sorted(SITE.rglob("*.html")):
-            if "_static" in path.parts or path == SITE / "index.html":  # which leads to another
+            if (
+                "_static" in path.parts or path == SITE / "index.html"
+            ):  # which leads to another
                 continue
             tab.open(path.as_uri(), width=390)  # a telephone's: nothing may stand out
             look = tab.evaluate(LOOK)
@@ -110,7 +120,11 @@ def test_every_page_opens_with_its_images_scripts_and_links():
         ids = pages.get(target, set())
         if not target.exists():
             wrong.append((page, "dead link", link))
-        elif target.suffix == ".html" and unquote(address.fragment) not in {"", "top", *ids}:
+        elif target.suffix == ".html" and unquote(address.fragment) not in {
+            "",
+            "top",
+            *ids,
+        }:
             wrong.append((page, "dead anchor", link))
     assert len(pages) > 40
     assert not wrong, "\n".join(" ".join(map(str, x)) for x in wrong)

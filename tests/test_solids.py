@@ -1,4 +1,3 @@
-# ruff: noqa: E501
 import functools
 
 import equinox as eqx
@@ -11,7 +10,9 @@ from helpers import quick_jit
 import jrigid as jr
 
 EPS = np.finfo(float).eps
-CORNERS = np.array([[0.1, 0.0, 0.3], [1.0, 0.2, -0.1], [0.3, 1.5, 0.2], [0.2, 0.4, 2.0]])
+CORNERS = np.array(
+    [[0.1, 0.0, 0.3], [1.0, 0.2, -0.1], [0.3, 1.5, 0.2], [0.2, 0.4, 2.0]]
+)
 
 SOLIDS = {
     "box": (jr.solids.box, (2.0, np.array([1.0, 2.0, 3.0]))),
@@ -32,13 +33,17 @@ SOLIDS = {
 
 
 def test_every_public_name_is_in_the_table():
-    names = {n for n, value in vars(jr.solids).items() if callable(value) and n[0] != "_"}
+    names = {
+        n for n, value in vars(jr.solids).items() if callable(value) and n[0] != "_"
+    }
     assert set(SOLIDS) == names
 
 
 def assert_ulps(actual, expected, ulps):
     expected = np.asarray(expected)
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * EPS * np.max(np.abs(expected)))
+    np.testing.assert_allclose(
+        actual, expected, rtol=0, atol=ulps * EPS * np.max(np.abs(expected))
+    )
 
 
 def nodes(lower, upper, order=40):
@@ -54,7 +59,10 @@ def revolved(profiles, mass):
         a, b = inner(z), outer(z)
         area, polar = np.pi * (b**2 - a**2), np.pi * (b**4 - a**4) / 2
         volume, first = volume + np.sum(w * area), first + np.sum(w * area * z)
-        along, across = along + np.sum(w * polar), across + np.sum(w * (polar / 2 + area * z**2))
+        along, across = (
+            along + np.sum(w * polar),
+            across + np.sum(w * (polar / 2 + area * z**2)),
+        )
     centre = first / volume
     across -= volume * centre**2
     return centre, mass / volume * np.array([across, across, along])
@@ -64,7 +72,9 @@ def constant(x):
     return lambda z: x + 0 * z
 
 
-@pytest.mark.parametrize("name", ["sphere", "cylinder", "tube", "cone", "capsule", "shell"])
+@pytest.mark.parametrize(
+    "name", ["sphere", "cylinder", "tube", "cone", "capsule", "shell"]
+)
 def test_solid_of_revolution_equals_its_integral(name):
     m, r, h, zero = 2.0, 1.5, 0.7, constant(0.0)
 
@@ -74,8 +84,14 @@ def test_solid_of_revolution_equals_its_integral(name):
     profiles, body = {
         "sphere": ([(-r, r, zero, ball(r))], jr.solids.sphere(m, r)),
         "cylinder": ([(-h / 2, h / 2, zero, constant(r))], jr.solids.cylinder(m, r, h)),
-        "tube": ([(-h / 2, h / 2, constant(1.0), constant(r))], jr.solids.tube(m, 1.0, r, h)),
-        "cone": ([(-h / 4, 3 * h / 4, zero, lambda z: r * (0.75 - z / h))], jr.solids.cone(m, r, h)),
+        "tube": (
+            [(-h / 2, h / 2, constant(1.0), constant(r))],
+            jr.solids.tube(m, 1.0, r, h),
+        ),
+        "cone": (
+            [(-h / 4, 3 * h / 4, zero, lambda z: r * (0.75 - z / h))],
+            jr.solids.cone(m, r, h),
+        ),
         "capsule": (
             [
                 (-h / 2, h / 2, zero, constant(r)),
@@ -85,10 +101,14 @@ def test_solid_of_revolution_equals_its_integral(name):
             jr.solids.capsule(m, r, h),
         ),
         "shell": (
-            [(-1.0, 1.0, ball(1.0), ball(r)), (1.0, r, zero, ball(r)), (-r, -1.0, zero, ball(r))],
+            [
+                (-1.0, 1.0, ball(1.0), ball(r)),
+                (1.0, r, zero, ball(r)),
+                (-r, -1.0, zero, ball(r)),
+            ],
             jr.solids.shell(m, 1.0, r),
         ),
-    }[name]  # fmt: skip
+    }[name]
     centre, moments = revolved(profiles, m)
     assert abs(centre) < 1e-14
     assert_ulps(body.inertia, np.diag(moments), 32)
@@ -104,8 +124,13 @@ def test_torus_equals_its_integral():
     inner, outer = ring - tube * np.cos(a), ring + tube * np.cos(a)
     area, polar = np.pi * (outer**2 - inner**2), np.pi * (outer**4 - inner**4) / 2
     density = m / np.sum(dz * area)
-    along, across = density * np.sum(dz * polar), density * np.sum(dz * (polar / 2 + area * z**2))
-    assert_ulps(jr.solids.torus(m, ring, tube).inertia, np.diag([across, across, along]), 32)
+    along, across = (
+        density * np.sum(dz * polar),
+        density * np.sum(dz * (polar / 2 + area * z**2)),
+    )
+    assert_ulps(
+        jr.solids.torus(m, ring, tube).inertia, np.diag([across, across, along]), 32
+    )
 
 
 def test_thin_bodies_equal_sums_over_their_points():
@@ -113,7 +138,9 @@ def test_thin_bodies_equal_sums_over_their_points():
     angle = 2 * np.pi * np.arange(turns) / turns
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     assert_ulps(
-        jr.solids.hoop(m, r).inertia, jr.inertia_tensor(np.full(turns, m / turns), r * circle), 16
+        jr.solids.hoop(m, r).inertia,
+        jr.inertia_tensor(np.full(turns, m / turns), r * circle),
+        16,
     )
     rho, w = nodes(0, r, 8)
     rings = [
@@ -133,9 +160,9 @@ def test_thin_bodies_equal_sums_over_their_points():
     x, w = nodes(-0.5, 0.5, 4)
     line = jr.from_points(w * m, np.stack([0 * x, 0 * x, r * x], axis=1))
     assert_ulps(jr.solids.rod(m, r).inertia, line.inertia, 8)
-    grid = np.stack([*np.meshgrid(x, 2 * x, indexing="ij"), np.zeros((4, 4))], axis=-1).reshape(
-        -1, 3
-    )
+    grid = np.stack(
+        [*np.meshgrid(x, 2 * x, indexing="ij"), np.zeros((4, 4))], axis=-1
+    ).reshape(-1, 3)
     plate = jr.from_points(m * np.outer(w, w).ravel(), grid)
     assert_ulps(jr.solids.lamina(m, np.array([1.0, 2.0])).inertia, plate.inertia, 8)
 
@@ -143,9 +170,12 @@ def test_thin_bodies_equal_sums_over_their_points():
 def test_box_and_ellipsoid_equal_quadrature_in_three_dimensions():
     m, lengths = 2.0, np.array([1.0, 2.0, 3.0])
     density = m / np.prod(lengths)
-    box = jr.from_density(lambda r: density + 0 * r[0], -lengths / 2, lengths / 2, order=4)
+    box = jr.from_density(
+        lambda r: density + 0 * r[0], -lengths / 2, lengths / 2, order=4
+    )
     assert_ulps(jr.solids.box(m, lengths).inertia, box.inertia, 8)
-    # The ellipsoid's integral over spherical shells: x = (a, b, c) * radius * direction.
+    # The ellipsoid's integral over spherical shells: x = (a, b, c) * radius *
+    # direction.
     rho, w_rho = nodes(0, 1, 6)
     u, w_u = nodes(-1, 1, 6)
     phi = 2 * np.pi * np.arange(8) / 8
@@ -183,7 +213,10 @@ def test_limits_join_the_solids_to_each_other():
         (jr.solids.tube(m, r, r, 1e-9), jr.solids.hoop(m, r)),
         (jr.solids.torus(m, r, 1e-9), jr.solids.hoop(m, r)),
         (jr.solids.capsule(m, r, 1e-16), jr.solids.sphere(m, r)),
-        (jr.solids.box(m, np.array([1.0, 2.0, 1e-9])), jr.solids.lamina(m, np.array([1.0, 2.0]))),
+        (
+            jr.solids.box(m, np.array([1.0, 2.0, 1e-9])),
+            jr.solids.lamina(m, np.array([1.0, 2.0])),
+        ),
     ]
     for thick, thin in pairs:
         assert_ulps(thick.inertia, thin.inertia, 16)
@@ -191,16 +224,21 @@ def test_limits_join_the_solids_to_each_other():
 
 def test_two_half_cylinders_make_a_cylinder():
     half = jr.solids.cylinder(1.0, 1.5, 1.0)
-    up = half.translated(np.array([0, 0, 0.5])) + half.translated(np.array([0, 0, -0.5]))
+    up = half.translated(np.array([0, 0, 0.5])) + half.translated(
+        np.array([0, 0, -0.5])
+    )
     assert_ulps(up.inertia, jr.solids.cylinder(2.0, 1.5, 2.0).inertia, 8)
 
 
 def test_every_solid_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
-    # Mass properties scale with mass and length: mass I = dI/dmass, sum of length dI/dlength = 2 I.
+    # Mass properties scale with mass and length: mass I = dI/dmass, sum of length
+    # dI/dlength = 2 I.
     def everything(scale, arguments):
         def scaled(name, mass_scale, length_scale):
             mass, *lengths = arguments[name]
-            return SOLIDS[name][0](mass * mass_scale, *(x * length_scale for x in lengths))
+            return SOLIDS[name][0](
+                mass * mass_scale, *(x * length_scale for x in lengths)
+            )
 
         bodies, by_mass, by_length = {}, {}, {}
         ones = jnp.stack([jnp.ones_like(scale), scale])
@@ -211,14 +249,18 @@ def test_every_solid_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
                 jax.tree.map(jnp.zeros_like, body),
                 jnp.eye(3, dtype=scale.dtype),
             )
-            bodies[name], by_mass[name] = body, along(jnp.array([1.0, 0.0], scale.dtype))
+            bodies[name], by_mass[name] = (
+                body,
+                along(jnp.array([1.0, 0.0], scale.dtype)),
+            )
             by_length[name] = jax.linear_transpose(along, ones)(trace)[0][1]
         return bodies, by_mass, by_length
 
     batched = quick_jit(jax.vmap(everything, in_axes=(0, None)))
     for dtype in (np.float32, np.float64):
         arguments = jax.tree.map(
-            lambda x, dtype=dtype: jnp.asarray(x, dtype), {k: v[1] for k, v in SOLIDS.items()}
+            lambda x, dtype=dtype: jnp.asarray(x, dtype),
+            {k: v[1] for k, v in SOLIDS.items()},
         )
         scale = jnp.asarray([1.0, 2.0], dtype)
         bodies, by_mass, by_length = batched(scale, arguments)
@@ -229,7 +271,9 @@ def test_every_solid_under_jit_vmap_grad_and_jacfwd_in_both_precisions():
             np.testing.assert_allclose(inertia[1], 4 * inertia[0], rtol=tolerance)
             np.testing.assert_allclose(by_mass[name].inertia, inertia, rtol=tolerance)
             trace = np.trace(inertia, axis1=1, axis2=2)
-            np.testing.assert_allclose(by_length[name], 2 * trace / scale, rtol=tolerance)
+            np.testing.assert_allclose(
+                by_length[name], 2 * trace / scale, rtol=tolerance
+            )
             for k in range(2):  # real bodies
                 jr.MassProperties(*(x[k] for x in jax.tree.leaves(bodies[name])))
 
@@ -252,12 +296,16 @@ def test_a_bad_lane_is_nan_and_leaves_the_others_and_their_gradients_alone():
 
     def size(function, arguments):
         leaves = jax.tree.leaves(function(*arguments))
-        return sum(jnp.sum(jnp.sin(jnp.where(jnp.isnan(x), 0.0, x))) for x in leaves), leaves
+        return sum(
+            jnp.sum(jnp.sin(jnp.where(jnp.isnan(x), 0.0, x))) for x in leaves
+        ), leaves
 
     @quick_jit  # one compilation for all
     def gradients(lanes):
         return {
-            name: jax.vmap(jax.grad(functools.partial(size, SOLIDS[name][0]), has_aux=True))(own)
+            name: jax.vmap(
+                jax.grad(functools.partial(size, SOLIDS[name][0]), has_aux=True)
+            )(own)
             for name, own in lanes.items()
         }
 
@@ -274,7 +322,9 @@ def test_a_bad_lane_is_nan_and_leaves_the_others_and_their_gradients_alone():
     for name in SOLIDS:
         (slopes, leaves), (alone, expected) = together[name], good_alone[name]
         for found, good in ((slopes, alone), (leaves, expected)):
-            jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), found, good)
+            jax.tree.map(
+                lambda a, b: np.testing.assert_array_equal(a[0], b[0]), found, good
+            )
         for leaf in leaves:
             assert np.all(np.isfinite(leaf[0]))
             assert np.all(np.isnan(leaf[1:]))
@@ -294,12 +344,16 @@ def test_a_bad_lane_leaves_the_gradient_in_shared_arguments_alone():
         traces = [jnp.trace(body.inertia) for body in bodies]
         return sum(jnp.where(jnp.isnan(x), 0.0, x) for x in traces)
 
-    both = quick_jit(jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad))))
+    both = quick_jit(
+        jax.grad(lambda x, bad: jnp.sum(jax.vmap(total, (None, 0))(x, bad)))
+    )
     alone = both(2.0, np.array([1.0, 1.0])) / 2
     for bad in (np.nan, np.inf, 0.0, -1.0):
         lanes = both(2.0, np.array([1.0, bad]))
         # Corners times 0 or -1 are good.
-        corners = jr.solids.tetrahedron(1.0, CORNERS * np.nan_to_num(bad, posinf=0.0)).inertia
+        corners = jr.solids.tetrahedron(
+            1.0, CORNERS * np.nan_to_num(bad, posinf=0.0)
+        ).inertia
         np.testing.assert_allclose(lanes, alone + jnp.trace(corners), rtol=16 * EPS)
 
 

@@ -33,7 +33,9 @@ def by_steps_and_at_once(inertia, t0, t1, dt0, ts):
 @pytest.mark.parametrize(
     ("t0", "t1", "dt0"), [(0.5, 40.0, 39.5), (0.5, 40.0, 3.1), (1.0, -9.0, -2.0)]
 )
-def test_one_step_or_many_and_output_between_them_are_the_exact_motion(inertia, t0, t1, dt0):
+def test_one_step_or_many_and_output_between_them_are_the_exact_motion(
+    inertia, t0, t1, dt0
+):
     ts = np.linspace(t0, t1, 6)
     found, exact = by_steps_and_at_once(inertia, t0, t1, dt0, ts)
     np.testing.assert_allclose(found.attitude, exact.attitude, atol=2e-13)
@@ -43,7 +45,9 @@ def test_one_step_or_many_and_output_between_them_are_the_exact_motion(inertia, 
 def test_dense_output():
     @quick_jit
     def both(t):
-        solution = solve(MOMENTS, 0.0, 10.0, 10.0, diffrax.SaveAt(dense=True), throw=False)
+        solution = solve(
+            MOMENTS, 0.0, 10.0, 10.0, diffrax.SaveAt(dense=True), throw=False
+        )
         exact = jr.free_rotation(MOMENTS, STATE, t, throw=False)
         return solution.evaluate(t).attitude, exact.attitude
 
@@ -52,8 +56,15 @@ def test_dense_output():
 
 def test_the_term_works_with_any_solver():
     controller = diffrax.PIDController(rtol=1e-11, atol=1e-12)
-    found = solve(MOMENTS, 0.0, 10.0, 0.01, diffrax.SaveAt(t1=True), diffrax.Dopri8(),
-                  stepsize_controller=controller).ys  # fmt: skip
+    found = solve(
+        MOMENTS,
+        0.0,
+        10.0,
+        0.01,
+        diffrax.SaveAt(t1=True),
+        diffrax.Dopri8(),
+        stepsize_controller=controller,
+    ).ys
     exact = jr.free_rotation(MOMENTS, STATE, 10.0)
     np.testing.assert_allclose(found.attitude[0], exact.attitude, atol=1e-9)
 
@@ -68,7 +79,11 @@ def slope_at_once():
 
 @pytest.mark.parametrize("mode", ["reverse", "forward"])
 def test_derivatives_are_those_of_the_flow(mode, slope_at_once):
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if mode == "reverse" else diffrax.ForwardMode()
+    adjoint = (
+        diffrax.RecursiveCheckpointAdjoint()
+        if mode == "reverse"
+        else diffrax.ForwardMode()
+    )
     derivative = jax.grad if mode == "reverse" else jax.jacfwd
 
     def by_steps(moments):
@@ -93,14 +108,18 @@ def test_simulate_with_the_exact_solver_is_the_closed_form_in_one_step(inertia):
     assert found.stats["num_steps"] == 1
     np.testing.assert_allclose(found.states.omega[0], exact.omega[0], atol=1e-14)
     np.testing.assert_allclose(found.states.attitude, exact.attitude, atol=1e-8)
-    np.testing.assert_allclose(found.energy, np.full((2, 2), found.energy[0, 0]), rtol=1e-13)
+    np.testing.assert_allclose(
+        found.energy, np.full((2, 2), found.energy[0, 0]), rtol=1e-13
+    )
 
 
 def test_simulate_with_the_exact_solver_has_its_derivatives_and_lanes():
     def final(omega, solver, adjoint=None):
         state = jr.State(STATE.attitude, omega)
         body = jr.RigidBody(MOMENTS)
-        return jr.simulate(body, state, 20.0, solver=solver, adjoint=adjoint, throw=False).states
+        return jr.simulate(
+            body, state, 20.0, solver=solver, adjoint=adjoint, throw=False
+        ).states
 
     @quick_jit
     @jax.vmap
@@ -129,15 +148,21 @@ def test_simulate_with_the_exact_solver_has_its_derivatives_and_lanes():
 @pytest.mark.slow
 def test_simulate_with_the_exact_solver_has_events():
     event = diffrax.Event(
-        lambda _t, y, _args, **_: y.omega[0], optimistix.Newton(1e-12, 1e-12), direction=True
+        lambda _t, y, _args, **_: y.omega[0],
+        optimistix.Newton(1e-12, 1e-12),
+        direction=True,
     )
 
     @quick_jit
     def until(state):
         body = jr.RigidBody(MOMENTS)
-        end = jr.simulate(body, state, 30.0, solver=ExactFree(), event=event, throw=False)
+        end = jr.simulate(
+            body, state, 30.0, solver=ExactFree(), event=event, throw=False
+        )
         ts = jnp.linspace(0.0, 1.0, 200) * end.final_time
-        return end.final_time, jr.free_rotation(MOMENTS, state, ts, throw=False).omega[:, 0]
+        return end.final_time, jr.free_rotation(MOMENTS, state, ts, throw=False).omega[
+            :, 0
+        ]
 
     stop, first = map(np.asarray, until(STATE))
     assert 0 < stop < 30
@@ -155,7 +180,8 @@ def test_the_exact_solver_is_for_free_bodies(untyped):
         jr.simulate(jr.RigidBody(MOMENTS), STATE, 1.0, solver=diffrax.Euler())
 
 
-# Verner's method ----------------------------------------------------------------------------
+# Verner's method
+# ----------------------------------------------------------------------------
 
 
 def test_verners_weights_integrate_polynomials_of_their_degrees():
@@ -181,7 +207,9 @@ def test_verners_dense_output_has_the_order_it_claims():
 
     @quick_jit
     def error(h):
-        found = solve(MOMENTS, 0.0, h, h, diffrax.SaveAt(ts=0.37 * h[None]), jr.solvers.Verner9())
+        found = solve(
+            MOMENTS, 0.0, h, h, diffrax.SaveAt(ts=0.37 * h[None]), jr.solvers.Verner9()
+        )
         exact = jr.free_rotation(MOMENTS, STATE, 0.37 * h, throw=False)
         return jnp.linalg.norm(found.ys.omega[0] - exact.omega)
 
@@ -193,26 +221,41 @@ def test_verners_dense_output_of_a_lane_that_is_through_keeps_its_gradient():
 
     def middle(a):
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda _, y, a: jnp.cos(a * y)), jr.solvers.Verner9(), 0.0, 1.0, 0.1,
-            jnp.ones(()), a, saveat=diffrax.SaveAt(ts=jnp.array([0.3, 1.0])), max_steps=32,
-            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8), throw=False,
+            diffrax.ODETerm(lambda _, y, a: jnp.cos(a * y)),
+            jr.solvers.Verner9(),
+            0.0,
+            1.0,
+            0.1,
+            jnp.ones(()),
+            a,
+            saveat=diffrax.SaveAt(ts=jnp.array([0.3, 1.0])),
+            max_steps=32,
+            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+            throw=False,
             adjoint=diffrax.DirectAdjoint(),
-        ).ys[0]  # fmt: skip
+        ).ys[0]
 
     rates = jnp.array([1.0, 10.0])
     alone = [quick_jit(jax.grad(middle))(a) for a in rates]
-    np.testing.assert_allclose(quick_jit(jax.vmap(jax.grad(middle)))(rates), alone, rtol=1e-7)
+    np.testing.assert_allclose(
+        quick_jit(jax.vmap(jax.grad(middle)))(rates), alone, rtol=1e-7
+    )
 
 
-# Splitting ----------------------------------------------------------------------------------
+# Splitting
+# ----------------------------------------------------------------------------------
 
-WEIGHT = jr.torques.UniformGravity(1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0]))
+WEIGHT = jr.torques.UniformGravity(
+    1.0, np.array([0.3, 0.1, 0.5]), np.array([0.0, 0.0, -1.0])
+)
 TOP = jr.RigidBody(MOMENTS, WEIGHT)
 
 
 def split(body, ts, order, step, state=STATE, **options):
     solver = jr.solvers.Splitting(order)
-    return jr.simulate(body, state, ts, solver=solver, max_step=step, throw=False, **options)
+    return jr.simulate(
+        body, state, ts, solver=solver, max_step=step, throw=False, **options
+    )
 
 
 @pytest.mark.parametrize("order", [2, 4, 6])
@@ -224,16 +267,24 @@ def test_splitting_is_of_its_order_and_keeps_what_is_to_be_kept(order, inertia):
     @quick_jit
     def found(step):
         motion = split(body, jnp.array([0.0, 8.0]), order, step)
-        return motion.final_state, motion.energy, motion.angular_momentum, motion.stats["num_steps"]
+        return (
+            motion.final_state,
+            motion.energy,
+            motion.angular_momentum,
+            motion.stats["num_steps"],
+        )
 
     errors = []
     for steps in (40, 80):
         state, energy, momentum, taken = found(8.0 / steps)
         assert int(taken) == steps
         assert abs(np.linalg.norm(state.attitude) - 1) < 1e-15
-        # About the vertical; each of the hundreds of exact turns adds a rounding of its own.
+        # About the vertical; each of the hundreds of exact turns adds a rounding of its
+        # own.
         assert abs(momentum[1, 2] - momentum[0, 2]) < 2e-14
-        errors.append([np.linalg.norm(state.omega - exact.omega), abs(energy[1] - energy[0])])
+        errors.append(
+            [np.linalg.norm(state.omega - exact.omega), abs(energy[1] - energy[0])]
+        )
     state_order, energy_order = np.log2(np.array(errors[0]) / errors[1])
     assert state_order == pytest.approx(order, abs=0.4)
     assert energy_order > order - 0.6
@@ -246,9 +297,17 @@ def test_splitting_is_its_own_inverse_and_its_dense_output_a_shorter_step():
     def there_and_back(state):
         def run(state, t0, t1, dt0, ts):
             found = diffrax.diffeqsolve(
-                solver.terms(body), solver, t0, t1, dt0, state, saveat=diffrax.SaveAt(ts=ts),
-                stepsize_controller=diffrax.ConstantStepSize(), max_steps=64, throw=False,
-            )  # fmt: skip
+                solver.terms(body),
+                solver,
+                t0,
+                t1,
+                dt0,
+                state,
+                saveat=diffrax.SaveAt(ts=ts),
+                stepsize_controller=diffrax.ConstantStepSize(),
+                max_steps=64,
+                throw=False,
+            )
             return found.ys
 
         there = run(state, 0.0, 4.0, 0.125, jnp.array([0.0625, 4.0]))
@@ -270,7 +329,9 @@ def test_splitting_follows_a_potential_that_moves():
     body, force = jr.RigidBody(MOMENTS, pushed), jnp.asarray(1.3)
     exact = jr.simulate(body, STATE, 5.0, force, t0=1.0, rtol=1e-12).final_state
     solver = jr.solvers.Splitting(6)
-    found = jr.simulate(body, STATE, 5.0, force, t0=1.0, solver=solver, max_step=0.05).final_state
+    found = jr.simulate(
+        body, STATE, 5.0, force, t0=1.0, solver=solver, max_step=0.05
+    ).final_state
     np.testing.assert_allclose(found.omega, exact.omega, atol=1e-8)
 
 
@@ -290,9 +351,12 @@ def test_the_rounding_of_splitting_does_not_drift():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_steps_of_splitting_are_as_many_as_asked_for_and_equal(dtype):
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), STATE)
-    gravity = jr.torques.UniformGravity(*map(dtype, (1.0, np.array([0.3, 0.1, 0.5]))),
-                                        np.array([0, 0, -1], dtype))  # fmt: skip
-    body = jr.RigidBody(jnp.asarray(1e20 * MOMENTS, dtype), gravity)  # L^2 is beyond float32
+    gravity = jr.torques.UniformGravity(
+        *map(dtype, (1.0, np.array([0.3, 0.1, 0.5]))), np.array([0, 0, -1], dtype)
+    )
+    body = jr.RigidBody(
+        jnp.asarray(1e20 * MOMENTS, dtype), gravity
+    )  # L^2 is beyond float32
 
     @quick_jit
     def motion(ts, step):
@@ -301,7 +365,10 @@ def test_steps_of_splitting_are_as_many_as_asked_for_and_equal(dtype):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for ts, step, count in ((np.linspace(0, 100, 1001), 0.1, 1000), ([10.0], 0.01, 1000)):
+        for ts, step, count in (
+            (np.linspace(0, 100, 1001), 0.1, 1000),
+            ([10.0], 0.01, 1000),
+        ):
             taken, omega = motion(jnp.asarray(ts, dtype), jnp.asarray(step, dtype))
             assert int(taken) == count
             assert np.all(np.isfinite(omega))
@@ -309,12 +376,20 @@ def test_steps_of_splitting_are_as_many_as_asked_for_and_equal(dtype):
 
 @pytest.mark.parametrize("mode", ["reverse", "forward", "direct"])
 def test_derivatives_of_splitting_are_those_of_the_motion(mode):
-    adjoint = {"forward": diffrax.ForwardMode(), "direct": diffrax.DirectAdjoint()}.get(mode)
+    adjoint = {"forward": diffrax.ForwardMode(), "direct": diffrax.DirectAdjoint()}.get(
+        mode
+    )
     derivative = jax.jacfwd if mode == "forward" else jax.grad
 
     def end(moments, **options):
-        return jr.simulate(jr.RigidBody(moments, WEIGHT), STATE, 3.0, throw=False,
-                           adjoint=adjoint, **options).final_state.omega[0]  # fmt: skip
+        return jr.simulate(
+            jr.RigidBody(moments, WEIGHT),
+            STATE,
+            3.0,
+            throw=False,
+            adjoint=adjoint,
+            **options,
+        ).final_state.omega[0]
 
     exact = quick_jit(derivative(end))(MOMENTS)
     options = {"solver": jr.solvers.Splitting(6), "max_step": 0.05}
@@ -346,9 +421,14 @@ def test_splitting_takes_a_compiled_torque_and_one_with_branches():
     @jax.jit
     def weight(t, state, args):
         push = lambda state: WEIGHT(t, state, args)  # noqa: E731
-        return jax.lax.cond(state.attitude[0] > 2, lambda state: 0 * push(state), push, state)
+        return jax.lax.cond(
+            state.attitude[0] > 2, lambda state: 0 * push(state), push, state
+        )
 
-    ends = [split(jr.RigidBody(MOMENTS, x), 1.0, 2, 0.1).final_state for x in (weight, WEIGHT)]
+    ends = [
+        split(jr.RigidBody(MOMENTS, x), 1.0, 2, 0.1).final_state
+        for x in (weight, WEIGHT)
+    ]
     np.testing.assert_allclose(ends[0].omega, ends[1].omega, atol=1e-14)
 
 
@@ -360,7 +440,9 @@ def test_splitting_says_what_it_is_for():
     with pytest.raises(ValueError, match="its step given as `max_step`"):
         jr.simulate(TOP, STATE, 1.0, solver=solver)
     dragged = jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1))
-    with pytest.raises(ValueError, match="where the torque depends on the angular velocity"):
+    with pytest.raises(
+        ValueError, match="where the torque depends on the angular velocity"
+    ):
         jr.simulate(dragged, STATE, 1.0, solver=solver, max_step=0.1)
     damped = jr.RigidBody(MOMENTS, jr.torques.InternalDamper(0.1, 0.1))
     with pytest.raises(ValueError, match="moving parts"):

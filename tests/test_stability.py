@@ -67,7 +67,12 @@ def six_gyrostats(moments, axis, rate, rotor):
 
 def gyrostats(moments, axes, rate, rotors):
     count = len(rotors)
-    lanes = [np.broadcast_to(moments, (count, 3)), np.eye(3)[axes], np.full(count, rate), rotors]
+    lanes = [
+        np.broadcast_to(moments, (count, 3)),
+        np.eye(3)[axes],
+        np.full(count, rate),
+        rotors,
+    ]
     found = six_gyrostats(*(x[np.arange(6) % count] for x in map(np.asarray, lanes)))
     return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
@@ -85,7 +90,9 @@ def test_theorem_of_the_tennis_racket_over_a_million_bodies():
     rows = np.arange(333_333)
     moments[rows, near] = moments[rows, (near + 1) % 3] * (1 + gap)
     for axis in range(3):
-        square = jax.jit(jax.vmap(lambda m, axis=axis: st.growth_rate_squared(m, axis, 1.0)))
+        square = jax.jit(
+            jax.vmap(lambda m, axis=axis: st.growth_rate_squared(m, axis, 1.0))
+        )
         found = np.asarray(square(moments))
         own, others = moments[:, axis], np.delete(moments, axis, axis=1)
         between = (own - others[:, 0]) * (own - others[:, 1]) < 0
@@ -103,7 +110,9 @@ def after_a_turn(omega, momentum):
 
     def after(omega):
         state = jr.State(jnp.asarray(UP), omega)
-        motion = jr.simulate(body, state, period, rtol=1e-13, adjoint=adjoint, throw=False)
+        motion = jr.simulate(
+            body, state, period, rtol=1e-13, adjoint=adjoint, throw=False
+        )
         return motion.states.omega
 
     return jax.jacfwd(after)(omega)
@@ -122,7 +131,9 @@ def test_growth_rates_and_frequencies_are_those_of_the_monodromy_matrix(axis, ro
     exponent = np.sqrt(complex(square)) * period
     others = [i for i in range(3) if i != axis]
     block = monodromy[np.ix_(others, others)]
-    np.testing.assert_allclose(np.trace(block), 2 * np.cosh(exponent).real, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        np.trace(block), 2 * np.cosh(exponent).real, rtol=1e-8, atol=1e-8
+    )
     np.testing.assert_allclose(np.linalg.det(block), 1.0, rtol=1e-8)
     growth = st.growth_rate(moments, axis, rate, rotor)
     turning = st.frequency(moments, axis, rate, rotor)
@@ -134,7 +145,9 @@ def test_growth_rates_and_frequencies_are_those_of_the_monodromy_matrix(axis, ro
     cyclic = monodromy[np.ix_(order, order)]
     for value, shape in zip(found.rates, found.shapes, strict=True):
         multiplier = np.exp(complex(value) * period)
-        np.testing.assert_allclose(cyclic @ np.asarray(shape), multiplier * shape, atol=1e-8)
+        np.testing.assert_allclose(
+            cyclic @ np.asarray(shape), multiplier * shape, atol=1e-8
+        )
         assert np.linalg.norm(shape) == pytest.approx(1.0, rel=1e-12)
     ratio = np.abs(found.shapes[0, 1] / found.shapes[0, 0])
     np.testing.assert_allclose(found.amplitude_ratio, ratio, rtol=1e-12)
@@ -149,11 +162,16 @@ def test_a_rotor_steadies_the_intermediate_axis_at_its_threshold():
 
     @quick_jit
     def edge(low, high, rate):
-        return jax.value_and_grad(lambda w: st.boundary(square, low, high, w, throw=False))(rate)
+        return jax.value_and_grad(
+            lambda w: st.boundary(square, low, high, w, throw=False)
+        )(rate)
 
     # About axis 2 the couplings vanish at h = (l3 - l2) spin and h = (l1 - l2) spin.
     for rate in (1.0, 3.0):
-        for end, low, high in ((0.7 * rate, 0.0, 2.0 * rate), (-1.0 * rate, -2.0 * rate, 0.0)):
+        for end, low, high in (
+            (0.7 * rate, 0.0, 2.0 * rate),
+            (-1.0 * rate, -2.0 * rate, 0.0),
+        ):
             found, slope = edge(low, high, rate)
             assert float(found) == pytest.approx(end, abs=1e-10 * rate)
             assert float(slope) == pytest.approx(end / rate, rel=1e-9)
@@ -174,7 +192,9 @@ def test_slope_of_the_growth_rate_is_finite_at_the_threshold():
         slope = jax.grad(rate)(m)
         assert np.isfinite(slope)
         if expected is None:
-            np.testing.assert_allclose(slope, central_difference(rate, m, 1.0), atol=1e-8)
+            np.testing.assert_allclose(
+                slope, central_difference(rate, m, 1.0), atol=1e-8
+            )
         else:
             assert float(slope) == expected
     assert np.isfinite(jax.grad(jax.grad(rate))(1.0))
@@ -215,7 +235,9 @@ def test_rates_outside_their_domain_are_nan_in_that_lane_alone(bad):
         else:
             np.testing.assert_allclose(of_both, of_good / 2, rtol=1e-12)
     assert np.isnan(st.growth_rate(moments[1], 1, jnp.inf))
-    waves = st.linearized(moments[1], 1, jnp.array([0.1, 1.0, 0.0]), jnp.array([[1.0, np.nan]]))
+    waves = st.linearized(
+        moments[1], 1, jnp.array([0.1, 1.0, 0.0]), jnp.array([[1.0, np.nan]])
+    )
     np.testing.assert_array_equal(np.isnan(waves), [[[False] * 3, [True] * 3]])
 
 
@@ -288,7 +310,9 @@ def test_sleeping_top_map_against_the_formula():
         exact = 2 * np.sqrt(1.3 * mgl) / 0.6
         edge = st.boundary(square, 0.0, 20.0, mgl)
         assert float(edge) == pytest.approx(exact, abs=1e-10)
-        assert float(jr.top.sleeping_spin(jr.SymmetricTop(1.3, 0.6, mgl))) == pytest.approx(exact)
+        assert float(
+            jr.top.sleeping_spin(jr.SymmetricTop(1.3, 0.6, mgl))
+        ) == pytest.approx(exact)
 
 
 @pytest.mark.parametrize(
@@ -296,11 +320,15 @@ def test_sleeping_top_map_against_the_formula():
 )
 def test_sleeping_top_linearised(omega3, name):
     top = jr.SymmetricTop(1.0, 0.5, 1.0)
-    found = about(top.as_rigid_body(), jr.top.initial_state(top, 0.0, omega3=omega3), NONE, NONE)
+    found = about(
+        top.as_rigid_body(), jr.top.initial_state(top, 0.0, omega3=omega3), NONE, NONE
+    )
     closed = st.top_stability(top, omega3)
     assert st.STABILITY[found.stability] == name
     np.testing.assert_allclose(found.growth_rate, closed.growth_rate, atol=1e-7)
-    if name == "stable":  # the frame turns with the body: the tilt goes round at omega3 less
+    if (
+        name == "stable"
+    ):  # the frame turns with the body: the tilt goes round at omega3 less
         seen = np.sort(np.abs(omega3 - np.asarray(closed.frequencies)))
         positive = np.sort(found.eigenvalues.imag[found.eigenvalues.imag > 1e-6])
         np.testing.assert_allclose(positive, seen, rtol=1e-12)
@@ -313,12 +341,17 @@ def test_steady_precession_linearised_and_in_closed_form(theta, which):
     closed = st.precession_stability(top, theta, 6.0)
     i = ("slow", "fast").index(which)
     state = jr.top.initial_state(top, theta, omega3=6.0, phi_dot=which)
-    own = jnp.array([0.0, 0.0, 6.0]) - closed.precession[i] * jnp.cos(theta) * jnp.eye(3)[2]
+    own = (
+        jnp.array([0.0, 0.0, 6.0])
+        - closed.precession[i] * jnp.cos(theta) * jnp.eye(3)[2]
+    )
     found = about(top.as_rigid_body(), state, own, NONE)
     assert st.STABILITY[found.stability] == "stable"
     np.testing.assert_allclose(found.margin, -closed.growth_rate_squared[i], rtol=1e-10)
     nutation = np.max(found.eigenvalues.imag)
-    np.testing.assert_allclose(-(nutation**2), closed.growth_rate_squared[i], rtol=1e-10)
+    np.testing.assert_allclose(
+        -(nutation**2), closed.growth_rate_squared[i], rtol=1e-10
+    )
     # A nutation of 1e-5 has that frequency.
     period = 2 * np.pi / nutation
     tilted = jr.top.initial_state(
@@ -326,7 +359,10 @@ def test_steady_precession_linearised_and_in_closed_form(theta, which):
     )
     np.testing.assert_allclose(jr.top.nutation_period(top, tilted), period, rtol=1e-4)
     # In a frame that does not turn with the body's own turning there is no equilibrium.
-    assert about(top.as_rigid_body(), state, NONE, NONE).result == jr.RESULTS.no_equilibrium
+    assert (
+        about(top.as_rigid_body(), state, NONE, NONE).result
+        == jr.RESULTS.no_equilibrium
+    )
 
 
 def test_no_steady_precession_is_marked():
@@ -341,7 +377,9 @@ def test_satellites_against_linearisation_and_the_sign_of_the_energy(rng):
 
     closed = quick_jit(jax.vmap(st.satellite_stability))(moments)
     each = [about_satellite(m, 0.0, 1.0) for m in moments]
-    growth, margin = (np.array([getattr(x, n) for x in each]) for n in ("growth_rate", "margin"))
+    growth, margin = (
+        np.array([getattr(x, n) for x in each]) for n in ("growth_rate", "margin")
+    )
     stability = np.array([int(x.stability._value) for x in each])
     np.testing.assert_allclose(growth, closed.growth_rate, atol=1e-7)
     unstable = stability == int(st.STABILITY.unstable._value)
@@ -401,8 +439,12 @@ def test_satellite_growth_is_that_of_the_integrated_motion():
     def after(x):
         state = jr.State(jr.rotation.exp(x[:3]), jnp.array([0.0, 0.0, 1.0]) + x[3:])
         adjoint = diffrax.ForwardMode()
-        end = jr.simulate(body, state, 2 * np.pi, rtol=1e-13, adjoint=adjoint, throw=False).states
-        turn = jr.rotation.log(jr.rotation.multiply(jr.rotation.conjugate(-UP), end.attitude))
+        end = jr.simulate(
+            body, state, 2 * np.pi, rtol=1e-13, adjoint=adjoint, throw=False
+        ).states
+        turn = jr.rotation.log(
+            jr.rotation.multiply(jr.rotation.conjugate(-UP), end.attitude)
+        )
         return jnp.concatenate([turn, end.omega])
 
     found = quick_jit(jax.jacfwd(after))(np.zeros(6))
@@ -426,7 +468,9 @@ def test_what_is_at_rest():
     upright = about(top.as_rigid_body(), jr.top.initial_state(top, 0.0), NONE, up)
     np.testing.assert_allclose(upright.growth_rate, 1.0, rtol=1e-12)
     sphere = st.linearize(jr.RigidBody(jnp.ones(3)), spin(0))
-    assert st.STABILITY[sphere.stability] == "stable"  # another spin turns about another axis
+    assert (
+        st.STABILITY[sphere.stability] == "stable"
+    )  # another spin turns about another axis
     across = st.linearize(jr.RigidBody(jnp.array([1.0, 1.0, 2.0])), spin(0))
     assert st.STABILITY[across.stability] == "marginal"  # it drifts along the equator
 
@@ -441,9 +485,15 @@ def test_zeros_that_drift_nowhere_are_stable():
         held, _ = gyrostats(body.inertia, [2], 1.0, np.array([1.0]))
         assert st.STABILITY.texts[held.stability._value[0]] == name
     top = jr.SymmetricTop(1.0, 1.5, 1.0)
-    asleep, own = jr.top.initial_state(top, 0.0, omega3=2**0.5), np.array([0.0, 0.0, 2**0.5])
+    asleep, own = (
+        jr.top.initial_state(top, 0.0, omega3=2**0.5),
+        np.array([0.0, 0.0, 2**0.5]),
+    )
     for rate in (NONE, own):
-        assert st.STABILITY[about(top.as_rigid_body(), asleep, rate, NONE).stability] == "stable"
+        assert (
+            st.STABILITY[about(top.as_rigid_body(), asleep, rate, NONE).stability]
+            == "stable"
+        )
 
 
 @pytest.mark.slow  # programs of its own
@@ -454,7 +504,9 @@ def test_a_stiff_part_hides_nothing():
     @quick_jit
     def stability(damping, e, turn):
         damper = jr.torques.InternalDamper(0.1, damping)
-        gradient = jr.torques.GravityGradient(n**2, jr.torques.KeplerOrbit(n**2, 1.0, e))
+        gradient = jr.torques.GravityGradient(
+            n**2, jr.torques.KeplerOrbit(n**2, 1.0, e)
+        )
         rate = n * ((1 + e) / (1 - e) ** 3) ** 0.5
         normal = jnp.array([0.0, 0.0, 1.0])
         state = jr.State(jr.rotation.exp(turn * normal), rate * normal)
@@ -462,7 +514,10 @@ def test_a_stiff_part_hides_nothing():
 
     for damping in (0.1, 1.0):
         assert st.STABILITY[stability(damping, 0.0, 0.0)] == "stable"
-        for e, turn, message in ((0.0, 0.5, "be an equilibrium"), (0.3, 0.0, "same at all times")):
+        for e, turn, message in (
+            (0.0, 0.5, "be an equilibrium"),
+            (0.3, 0.0, "same at all times"),
+        ):
             with pytest.raises(Exception, match=message):
                 jax.block_until_ready(stability(damping, e, turn))
     found = about_damped(np.array([1.0, 2.0, 3.0]), 1e6, np.eye(3)[1])
@@ -474,7 +529,11 @@ def test_a_stiff_part_hides_nothing():
 
 def test_a_damper_makes_the_largest_axis_attract_and_the_others_repel():
     found = [about_damped(np.array([1.0, 2.0, 3.0]), 0.2, axis) for axis in np.eye(3)]
-    assert [st.STABILITY[x.stability] for x in found] == ["unstable", "unstable", "stable"]
+    assert [st.STABILITY[x.stability] for x in found] == [
+        "unstable",
+        "unstable",
+        "stable",
+    ]
     # Beside the zeros of its own turning and the turning of L in space all decay.
     falling = np.sort(np.asarray(found[2].eigenvalues.real))[:5]
     assert np.all(falling < -1e-3)
@@ -516,14 +575,20 @@ def test_bad_requests(untyped):
     damped = jr.RigidBody(jnp.ones(3), jr.torques.InternalDamper(0.3, 0.2))
     with pytest.raises(ValueError, match="body_rate"):
         st.linearize(damped, spin(0), body_rate=np.ones(3))
-    for function in (lambda x: x**2 + 1, lambda x: 1e-200 * (1 + x), lambda x: 1 / (x - 0.3)):
+    for function in (
+        lambda x: x**2 + 1,
+        lambda x: 1e-200 * (1 + x),
+        lambda x: 1 / (x - 0.3),
+    ):
         with pytest.raises(RuntimeError, match="change of sign"):
             st.boundary(function, 0.0, 1.0)
 
     def torque(t, state, args):
         """Switched on slowly, or constant."""
         switched, constant = args
-        return switched * jnp.sin(t) * jnp.array([0.0, 0.0, 1.0]) + constant * jnp.ones(3)
+        return switched * jnp.sin(t) * jnp.array([0.0, 0.0, 1.0]) + constant * jnp.ones(
+            3
+        )
 
     @quick_jit
     def pushed(size, rate, args):
@@ -534,7 +599,9 @@ def test_bad_requests(untyped):
     assert pushed(1.0, 1.0, (0.0, 0.0)) == jr.RESULTS.successful
     assert pushed(1.0, 1.0, (1.0, 0.0)) == jr.RESULTS.no_equilibrium
     assert pushed(1e7, 0.0, (0.0, 1.0)) == jr.RESULTS.no_equilibrium
-    lanes = quick_jit(jax.vmap(lambda w: st.linearize(body, jr.State(UP, w), throw=False)))
+    lanes = quick_jit(
+        jax.vmap(lambda w: st.linearize(body, jr.State(UP, w), throw=False))
+    )
     found = lanes(jnp.array([[1.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.0, np.nan, 0.0]]))
     stable, undefined = st.STABILITY.stable, st.STABILITY.undefined
     np.testing.assert_array_equal(found.stability == stable, [True, False, False])
@@ -561,7 +628,9 @@ def test_margin_of_a_spin_is_minus_the_square_of_its_growth_rate():
     def closed(h):
         """About each axis."""
         return [
-            jax.value_and_grad(lambda h, a=axis: -st.growth_rate_squared(moments, a, 1.3, h))(h)
+            jax.value_and_grad(
+                lambda h, a=axis: -st.growth_rate_squared(moments, a, 1.3, h)
+            )(h)
             for axis in range(3)
         ]
 
@@ -569,11 +638,15 @@ def test_margin_of_a_spin_is_minus_the_square_of_its_growth_rate():
         value, slope = closed(h)[axis]
         np.testing.assert_allclose(found.margin[i], value, rtol=1e-12)
         np.testing.assert_allclose(slopes[i], slope, rtol=1e-9, atol=1e-12)
-    assert np.all((found.stability._value == st.STABILITY.stable._value) == (found.margin > 0))
+    assert np.all(
+        (found.stability._value == st.STABILITY.stable._value) == (found.margin > 0)
+    )
 
 
 STEP = float(np.finfo(float).eps) ** (1 / 3)
-SLEEPING = np.array([1.0, 3.9, 4 - 1e-9, 4.0, 4 + 1e-9, 4.1, 6.0, 3.0, 3 + STEP, 3 - STEP])
+SLEEPING = np.array(
+    [1.0, 3.9, 4 - 1e-9, 4.0, 4 + 1e-9, 4.1, 6.0, 3.0, 3 + STEP, 3 - STEP]
+)
 
 
 @pytest.fixture(scope="module")
@@ -603,7 +676,9 @@ def test_margin_of_a_sleeping_top_is_smooth_through_the_collision(sleeping):
     @jax.vmap
     @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def closed(omega3, mgl):
-        return -st.top_stability(jr.SymmetricTop(1.0, 0.5, mgl), omega3).growth_rate_squared
+        return -st.top_stability(
+            jr.SymmetricTop(1.0, 0.5, mgl), omega3
+        ).growth_rate_squared
 
     found, slopes, *_ = sleeping
     values, exact = closed(SLEEPING, np.ones(SLEEPING.size))
@@ -623,7 +698,9 @@ def test_a_boundary_by_the_margin_of_a_linearisation():
         state = jr.State(UP, omega3 * jnp.array([0.0, 0.0, 1.0]))
         return st.linearize(body, state, throw=False).margin
 
-    edge = quick_jit(jax.value_and_grad(lambda m: st.boundary(margin, 2.0, 7.0, m, throw=False)))
+    edge = quick_jit(
+        jax.value_and_grad(lambda m: st.boundary(margin, 2.0, 7.0, m, throw=False))
+    )
     value, slope = edge(1.0)
     assert float(value) == pytest.approx(4.0, abs=1e-10)
     assert float(slope) == pytest.approx(2.0, rel=1e-9)
@@ -633,7 +710,9 @@ def test_margin_with_damping_is_minus_the_largest_real_part():
     """The largest axis attracts; the sign changes where it is no longer the largest."""
     seconds = np.array([1.5, 1.9, 2 - 1e-5, 2.0, 2 + 1e-5, 2.1, 2.6])
     found = [about_damped(np.array([1.0, x, 2.0]), 0.2, np.eye(3)[2]) for x in seconds]
-    margin, growth = (np.array([getattr(x, n) for x in found]) for n in ("margin", "growth_rate"))
+    margin, growth = (
+        np.array([getattr(x, n) for x in found]) for n in ("margin", "growth_rate")
+    )
     assert np.all(margin[:3] > 0)
     assert np.all(margin[4:] < 0)
     assert abs(margin[3]) < 1e-12
@@ -670,7 +749,9 @@ def test_slopes_of_eigenvalues_are_those_of_the_simple_ones(rng):
         i = np.argmin(abs(exact - value))
         y, x = left[:, i].conj(), right[:, i]
         np.testing.assert_allclose(slope, y @ change @ x / (y @ x), rtol=1e-11)
-    ahead, behind = (np.asarray(slopes_at(matrix + h * change)[1]) for h in (1e-5, -1e-5))
+    ahead, behind = (
+        np.asarray(slopes_at(matrix + h * change)[1]) for h in (1e-5, -1e-5)
+    )
     np.testing.assert_allclose(second, (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-7)
 
 
@@ -732,7 +813,9 @@ def test_a_function_may_be_a_module_of_arrays():
 
     axes = {"x": np.arange(3.0), "y": np.arange(4)}
     found = st.stability_map(Line(jnp.array(2.0)), axes)
-    np.testing.assert_array_equal(found.values, 2 * axes["x"][:, None] + axes["y"][None, :])
+    np.testing.assert_array_equal(
+        found.values, 2 * axes["x"][:, None] + axes["y"][None, :]
+    )
 
 
 def test_points_that_are_undefined_are_marked():
@@ -746,7 +829,10 @@ def test_points_that_are_undefined_are_marked():
 
     def truth(x, y):
         order = st.ORDER.where(x > 0.5, st.ORDER.chaotic, st.ORDER.regular)
-        return {"order": st.ORDER.where(x > y, order, st.ORDER.undefined), "count": jnp.array(3)}
+        return {
+            "order": st.ORDER.where(x > y, order, st.ORDER.undefined),
+            "count": jnp.array(3),
+        }
 
     found = st.stability_map(truth, axes, block_size=50)
     assert np.all(found.valid == (axes["x"][:, None] > axes["y"][None, :]))
@@ -763,12 +849,21 @@ def test_points_that_are_undefined_are_marked():
 
 
 def test_a_boundary_at_an_end_and_lanes_without_one():
-    edges = jax.vmap(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p, throw=False))
+    edges = jax.vmap(
+        lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p, throw=False)
+    )
     found = edges(jnp.array([1.0, 1.5, 2.0, 3.0]))
     np.testing.assert_allclose(found, [1.0, 1.5, 2.0, np.nan], atol=1e-13)
-    falling = jax.vmap(lambda p: st.boundary(lambda x, p: p - x, 1.0, 2.0, p, throw=False))
-    np.testing.assert_allclose(falling(jnp.array([1.0, 1.5, 2.0])), [1.0, 1.5, 2.0], atol=1e-13)
-    assert float(jax.grad(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p))(1.0)) == 1.0
+    falling = jax.vmap(
+        lambda p: st.boundary(lambda x, p: p - x, 1.0, 2.0, p, throw=False)
+    )
+    np.testing.assert_allclose(
+        falling(jnp.array([1.0, 1.5, 2.0])), [1.0, 1.5, 2.0], atol=1e-13
+    )
+    assert (
+        float(jax.grad(lambda p: st.boundary(lambda x, p: x - p, 1.0, 2.0, p))(1.0))
+        == 1.0
+    )
 
 
 def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
@@ -783,7 +878,8 @@ def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
     faces = np.array(
         [
             s
-            if np.dot(np.cross(cube[s[1]] - cube[s[0]], cube[s[2]] - cube[s[0]]), e[:3]) > 0
+            if np.dot(np.cross(cube[s[1]] - cube[s[0]], cube[s[2]] - cube[s[0]]), e[:3])
+            > 0
             else s[::-1]
             for s, e in zip(hull.simplices, hull.equations, strict=True)
         ]
@@ -830,7 +926,9 @@ def test_orbits_obey_kepler_and_have_his_slopes():
         np.testing.assert_allclose(anomaly - e * np.sin(anomaly), n * ts, atol=1e-12)
         r = np.linalg.norm(position, axis=1, keepdims=True)
         np.testing.assert_allclose(pull, -2.0 * position / r**3, rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(jr.torques.KeplerOrbit(2.0, 1.5, 0.99).mean_motion, n, rtol=1e-15)
+    np.testing.assert_allclose(
+        jr.torques.KeplerOrbit(2.0, 1.5, 0.99).mean_motion, n, rtol=1e-15
+    )
     for e in (0.999, 0.99999):  # near the pericentre, by the radius at the anomaly
         anomaly = 10 ** np.linspace(-5, 0, 301)
         position, _ = position_and_pull(e, (anomaly - e * np.sin(anomaly)) / n)
@@ -852,4 +950,7 @@ def test_float32_is_as_good_as_float32():
     np.testing.assert_allclose(single.growth_rate, 3**-0.5, rtol=1e-5)
     slopes = quick_jit(jax.jacfwd(lambda m: st.satellite_stability(m).margins))(moments)
     assert np.isfinite(slopes).all()
-    assert quick_jit(lambda m: st.satellite_stability(m).growth_rate)(moments).dtype == np.float32
+    assert (
+        quick_jit(lambda m: st.satellite_stability(m).growth_rate)(moments).dtype
+        == np.float32
+    )

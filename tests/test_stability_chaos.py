@@ -49,7 +49,9 @@ def spectrum_of_heavy(lanes, count):
     @jax.jit
     @jax.vmap
     def lane(turn):
-        q = jr.rotation.multiply(jr.rotation.exp(turn), jr.rotation.exp(jnp.asarray(TILTED)))
+        q = jr.rotation.multiply(
+            jr.rotation.exp(turn), jr.rotation.exp(jnp.asarray(TILTED))
+        )
         start = jr.State(q, jnp.asarray(SPINNING))
         return st.lyapunov_spectrum(body, start, 1200.0, 9600, count=count, throw=False)
 
@@ -72,7 +74,9 @@ def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
     start = state(TILTED, [0.3, 0.2, 0.6])
     size = 9 if damped else 6
     vectors = rng.normal(size=(3, size)) + 2 * np.eye(3, size)
-    found = st.lyapunov_spectrum(body, start, 4.0, 60, vectors=vectors, every=60, samples=1)
+    found = st.lyapunov_spectrum(
+        body, start, 4.0, 60, vectors=vectors, every=60, samples=1
+    )
 
     def after(x):
         q = jr.rotation.multiply(start.attitude, jr.rotation.exp(x[:3]))
@@ -87,14 +91,18 @@ def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
         ends = []
         for sign in (1, -1):
             end = after(sign * h * jnp.asarray(row))
-            turn = jr.rotation.multiply(jr.rotation.conjugate(reference.attitude), end.attitude)
+            turn = jr.rotation.multiply(
+                jr.rotation.conjugate(reference.attitude), end.attitude
+            )
             parts = [jr.rotation.log(turn), end.omega - reference.omega]
             if damped:
                 parts.append(end.internal[0] - reference.internal[0])
             ends.append(np.concatenate(parts))
         columns.append((ends[0] - ends[1]) / (2 * h))
     lengths = np.abs(np.diagonal(np.linalg.qr(np.array(columns).T)[1]))
-    np.testing.assert_allclose(np.exp(4.0 * np.asarray(found.exponents)), lengths, rtol=1e-7)
+    np.testing.assert_allclose(
+        np.exp(4.0 * np.asarray(found.exponents)), lengths, rtol=1e-7
+    )
     np.testing.assert_allclose(found.final_state.omega, reference.omega, atol=1e-9)
 
 
@@ -106,12 +114,17 @@ def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
     [
         (jr.RigidBody(MOMENTS), state([0.3, 0.2, 0.1], [0.5, 0.3, 0.8])),
         (jr.RigidBody(MOMENTS), state([0.3, 0.2, 0.1], [0.02, 1.0, 0.01])),
-        (jr.SymmetricTop(1.0, 0.6, 1.0).as_rigid_body(), state([0.9, 0.0, 0.0], [0.1, 0.4, 3.0])),
+        (
+            jr.SymmetricTop(1.0, 0.6, 1.0).as_rigid_body(),
+            state([0.9, 0.0, 0.0], [0.1, 0.4, 3.0]),
+        ),
         (kovalevskaya(), state([0.9, 0.4, 0.0], [0.3, 0.5, 0.9])),
     ],
     ids=["free", "near the separatrix", "Lagrange", "Kovalevskaya"],
 )
-def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_over_t(body, start):
+def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_over_t(
+    body, start
+):
     times = np.array([250.0, 1000.0, 4000.0])
     found = st.lyapunov_spectrum(body, start, times[-1], 32_000, samples=16)
     largest = np.asarray(found.history)[:, 0][[0, 3, 15]]
@@ -119,7 +132,9 @@ def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_ove
     np.testing.assert_array_less(np.abs(largest), 2.5 * np.log(times) / times)
     assert largest[2] < 0.6 * largest[0]
     assert np.abs(np.sum(found.exponents)) < 1e-6
-    np.testing.assert_allclose(found.exponents, -found.exponents[::-1], atol=5 / times[-1])
+    np.testing.assert_allclose(
+        found.exponents, -found.exponents[::-1], atol=5 / times[-1]
+    )
     indicator = st.megno(body, start, times[-1], 32_000)
     assert st.ORDER[indicator.order] == "regular"
     assert 1.5 < float(indicator.megno) < 2.2
@@ -139,14 +154,16 @@ def euler_poisson(y, moments, lever):
     """Rates of (omega, up in the body), (6,) or (6, lanes): another way to write the heavy top."""
     (i, j, k), (r, s, t) = moments.tolist(), lever.tolist()
     a, b, c, x, y, z = y
-    return np.array([
-        ((j - k) * b * c - s * z + t * y) / i,
-        ((k - i) * c * a - t * x + r * z) / j,
-        ((i - j) * a * b - r * y + s * x) / k,
-        y * c - z * b,
-        z * a - x * c,
-        x * b - y * a,
-    ])  # fmt: skip
+    return np.array(
+        [
+            ((j - k) * b * c - s * z + t * y) / i,
+            ((k - i) * c * a - t * x + r * z) / j,
+            ((i - j) * a * b - r * y + s * x) / k,
+            y * c - z * b,
+            z * a - x * c,
+            x * b - y * a,
+        ]
+    )
 
 
 @pytest.mark.slow  # half a minute of running
@@ -159,9 +176,13 @@ def test_exponent_of_an_asymmetric_top_by_two_trajectories():
     turns, found = spectrum_of_heavy(lanes, 1)
     moments, lever = HEAVY
     q = jax.vmap(
-        lambda t: jr.rotation.multiply(jr.rotation.exp(t), jr.rotation.exp(jnp.asarray(TILTED)))
+        lambda t: jr.rotation.multiply(
+            jr.rotation.exp(t), jr.rotation.exp(jnp.asarray(TILTED))
+        )
     )(turns)
-    up = np.asarray(jax.vmap(lambda q: jr.rotation.rotate_inverse(q, jnp.array([0.0, 0, 1])))(q))
+    up = np.asarray(
+        jax.vmap(lambda q: jr.rotation.rotate_inverse(q, jnp.array([0.0, 0, 1])))(q)
+    )
     y = np.concatenate([np.broadcast_to(SPINNING, up.shape), up], axis=1).T
     near = y + 1e-8 * np.random.default_rng(0).normal(size=y.shape)
     y, step, total = np.concatenate([y, near], axis=1), 0.03, np.zeros(lanes)
@@ -208,13 +229,18 @@ def planar(orbits):
         axis = jnp.array([0.0, 0.0, 1.0])
         start = jr.State(jr.rotation.exp(axis * start[0]), axis * start[1])
         time, steps = TURN * orbits, 50 * orbits
-        spectrum = st.lyapunov_spectrum(body, start, time, steps, vectors=plane, throw=False)
-        indicator = st.megno(body, start, time, steps, vector=plane[0] + plane[1], throw=False)
+        spectrum = st.lyapunov_spectrum(
+            body, start, time, steps, vectors=plane, throw=False
+        )
+        indicator = st.megno(
+            body, start, time, steps, vector=plane[0] + plane[1], throw=False
+        )
         return spectrum, indicator
 
     found = lane(starts)
     return [
-        jax.tree.map(lambda x, s=s: np.asarray(x)[s], found) for s in (slice(16), slice(16, 24))
+        jax.tree.map(lambda x, s=s: np.asarray(x)[s], found)
+        for s in (slice(16), slice(16, 24))
     ]
 
 
@@ -249,7 +275,8 @@ def test_exponent_of_hyperion_is_the_published_one():
 
 
 @pytest.mark.parametrize(
-    ("orbits", "least"), [(250, 0.009), pytest.param(1000, 0.003, marks=pytest.mark.slow)]
+    ("orbits", "least"),
+    [(250, 0.009), pytest.param(1000, 0.003, marks=pytest.mark.slow)],
 )
 def test_regular_islands_of_hyperion_are_regular(orbits, least):
     spectrum, indicator = planar(orbits)[1]
@@ -264,7 +291,9 @@ def test_planar_hyperion_is_the_pendulum_on_an_ellipse():
         mean = np.remainder(t + np.pi, TURN) - np.pi
         anomaly = mean
         for _ in range(50):
-            anomaly -= (anomaly - 0.1 * np.sin(anomaly) - mean) / (1 - 0.1 * np.cos(anomaly))
+            anomaly -= (anomaly - 0.1 * np.sin(anomaly) - mean) / (
+                1 - 0.1 * np.cos(anomaly)
+            )
         r = 1 - 0.1 * np.cos(anomaly)
         f = np.arctan2(np.sqrt(0.99) * np.sin(anomaly), np.cos(anomaly) - 0.1)
         return [y[1], -1.5 * 0.26 / r**3 * np.sin(2 * (y[0] - f))]
@@ -297,7 +326,9 @@ def test_crossings_are_those_of_scipy_and_keep_the_energy():
     energy = jax.vmap(lambda s: body.energy(0.0, s, None))(found.states)
     np.testing.assert_allclose(energy, body.energy(0.0, start, None), rtol=1e-8)
     assert np.abs(found.states.omega[:, 0]).max() < 1e-8
-    up = np.asarray(jr.rotation.rotate_inverse(start.attitude, jnp.array([0.0, 0.0, 1.0])))
+    up = np.asarray(
+        jr.rotation.rotate_inverse(start.attitude, jnp.array([0.0, 0.0, 1.0]))
+    )
 
     def rises(_, y):
         return y[0]
@@ -305,10 +336,17 @@ def test_crossings_are_those_of_scipy_and_keep_the_energy():
     rises.direction = 1
     y0 = np.concatenate([SPINNING, up])
     theirs = solve_ivp(
-        lambda _, y: euler_poisson(y, *HEAVY), (0, float(found.ts[-1]) + 0.1), y0,
-        method="DOP853", rtol=1e-12, atol=1e-13, events=rises,
-    ).t_events[0]  # fmt: skip
-    np.testing.assert_allclose(found.ts[:7], theirs[:7], atol=1e-6)  # later they part: chaos
+        lambda _, y: euler_poisson(y, *HEAVY),
+        (0, float(found.ts[-1]) + 0.1),
+        y0,
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+        events=rises,
+    ).t_events[0]
+    np.testing.assert_allclose(
+        found.ts[:7], theirs[:7], atol=1e-6
+    )  # later they part: chaos
 
 
 def test_crossings_in_either_direction_and_those_there_are_not():
@@ -318,8 +356,12 @@ def test_crossings_in_either_direction_and_those_there_are_not():
     down = st.poincare_section(body, start, FIRST, 4, 0.1, direction=False)
     both = st.poincare_section(body, start, FIRST, 8, 0.1, direction=None)
     np.testing.assert_allclose(np.diff(up.ts), period, rtol=1e-8)
-    np.testing.assert_allclose(np.sort(np.concatenate([up.ts, down.ts])), both.ts, atol=1e-8)
-    none = st.poincare_section(body, start, lambda _, s: s.omega[0] - 9, 3, 0.1, steps=50)
+    np.testing.assert_allclose(
+        np.sort(np.concatenate([up.ts, down.ts])), both.ts, atol=1e-8
+    )
+    none = st.poincare_section(
+        body, start, lambda _, s: s.omega[0] - 9, 3, 0.1, steps=50
+    )
     assert not none.valid.any()
     assert np.isnan(none.ts).all()
 
@@ -333,15 +375,24 @@ def test_sections_of_many_lanes_and_of_starts_on_the_surface():
             body, start, lambda _, s: s.omega[0], 2, 0.1, steps=300, throw=False
         )
 
-    omegas = np.array([[0.5, 0.3, 0.8], [1, 0.1, 0.1], [np.nan, 0, 0], [0, -0.583, 0.746]])
+    omegas = np.array(
+        [[0.5, 0.3, 0.8], [1, 0.1, 0.1], [np.nan, 0, 0], [0, -0.583, 0.746]]
+    )
     found = jax.jit(jax.vmap(lane))(omegas)
-    assert found.valid.tolist() == [[True, True], [False, False], [False, False], [True, True]]
+    assert found.valid.tolist() == [
+        [True, True],
+        [False, False],
+        [False, False],
+        [True, True],
+    ]
     assert bool((found.result == jr.RESULTS.invalid_state)[2])
     assert np.isnan(found.ts[1:3]).all()
     for i in (0, 3):
         period = float(jr.free.polhode_period(MOMENTS, omegas[i]))
         np.testing.assert_allclose(np.diff(found.ts[i]), period, rtol=1e-8)
-    np.testing.assert_allclose(found.ts[3, 0], period, rtol=1e-8)  # not the start itself
+    np.testing.assert_allclose(
+        found.ts[3, 0], period, rtol=1e-8
+    )  # not the start itself
     single = jr.State(UP.astype(np.float32), omegas[0].astype(np.float32))
     small = jr.RigidBody(MOMENTS.astype(np.float32))
     found = st.poincare_section(small, single, lambda _, s: s.omega[0], 2, 0.1)
@@ -373,7 +424,8 @@ def test_flip_time_is_that_between_events(offset):
         body, jr.State(UP, omega), lambda _, s: s.omega[1], 3, 0.1, direction=None
     )
     np.testing.assert_allclose(np.diff(found.ts), closed, rtol=1e-7)
-    # Near the separatrix: log(4 over the offset in its own measure), twice over the growth rate.
+    # Near the separatrix: log(4 over the offset in its own measure), twice over the
+    # growth rate.
     rate = float(st.growth_rate(MOMENTS, 1, 1.0))
     slow = st.flip_time(MOMENTS, np.array([offset**2, 1.0, 0.0])) - closed
     assert float(slow) == pytest.approx(-2 * np.log(offset) / rate, rel=0.02)
@@ -401,10 +453,18 @@ def test_a_body_flips_if_it_now_and_then_turns_mainly_about_its_intermediate_axi
     curves, half = map(np.asarray, lane(omegas))
     flips = np.any(np.argmax(np.abs(curves), axis=2) == 1, axis=1)
     assert 10 < flips.sum() < 50
-    turn = np.asarray(jr.rotation.to_matrix(jr.rotation.exp(jnp.array([0.3, -0.8, 0.5]))))
+    turn = np.asarray(
+        jr.rotation.to_matrix(jr.rotation.exp(jnp.array([0.3, -0.8, 0.5])))
+    )
     tensor = turn @ np.diag(MOMENTS) @ turn.T
     expected = np.where(flips, half, np.inf)
-    steady = [[1.0, 0.01, 0.0], [0.0, 0.01, 1.0], [0.0, 1.0, 0.0], [1.0, 0, 0], [0.0, 0, 0]]
+    steady = [
+        [1.0, 0.01, 0.0],
+        [0.0, 0.01, 1.0],
+        [0.0, 1.0, 0.0],
+        [1.0, 0, 0],
+        [0.0, 0, 0],
+    ]
     others = [[0.1, 1.0, 0.0], [np.nan, 1.0, 0.0]]
     found, slopes = flip_times(MOMENTS, [*omegas, *steady, *others])
     np.testing.assert_allclose(found[:60], expected)
@@ -428,11 +488,15 @@ def test_compiled_work_has_no_callbacks():
         lambda s: st.lyapunov_spectrum(body, s, 10.0, 100, throw=False),
         lambda s: st.final_spin(body, s, 10.0, 100, throw=False),
         lambda s: st.linearize(body, s, throw=False),
-        lambda s: st.poincare_section(body, s, lambda _, s: s.omega[0], 2, 0.1, throw=False),
+        lambda s: st.poincare_section(
+            body, s, lambda _, s: s.omega[0], 2, 0.1, throw=False
+        ),
         lambda s: st.boundary(lambda x, w: x - w, 0.0, 1.0, s.omega[0], throw=False),
     )
     for call in calls:
-        assert "callback" not in str(jax.make_jaxpr(lambda s, c=call: jax.tree.leaves(c(s)))(start))
+        assert "callback" not in str(
+            jax.make_jaxpr(lambda s, c=call: jax.tree.leaves(c(s)))(start)
+        )
 
 
 def test_damped_bodies_end_about_the_largest_axis_on_either_side():
@@ -458,7 +522,9 @@ def test_damped_bodies_end_about_the_largest_axis_on_either_side():
     assert np.all(np.diff(motion.energy) < 1e-12)
     assert np.all(np.diff(motion.energy)[:8] < -1e-3)
     momentum = np.asarray(motion.angular_momentum)
-    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (61, 3)), atol=1e-7)
+    np.testing.assert_allclose(
+        momentum, np.broadcast_to(momentum[0], (61, 3)), atol=1e-7
+    )
     assert np.sign(motion.states.omega[-1, 2]) == np.sign(found.alignment[7])
     undamped = st.final_spin(jr.RigidBody(MOMENTS), start, 100.0, 600)
     assert st.SIDES[undamped.side] == "not settled"
@@ -502,7 +568,9 @@ def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
     with pytest.raises(ValueError, match="state0"):
         st.final_spin(body, UP, 10.0, 100)
     with pytest.raises(ValueError, match="direction"):
-        st.poincare_section(body, start, lambda _, s: s.omega[0], 3, 0.1, direction="up")
+        st.poincare_section(
+            body, start, lambda _, s: s.omega[0], 3, 0.1, direction="up"
+        )
 
     def lane(omega):
         return st.megno(body, jr.State(jnp.asarray(UP), omega), 100.0, 200, throw=False)
@@ -511,7 +579,9 @@ def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
         jnp.array([[0.5, 0.3, 0.8], [np.nan, 0, 0], [50.0, 30.0, 80.0]])
     )
     np.testing.assert_array_equal(found.order == st.ORDER.regular, [True, False, False])
-    np.testing.assert_array_equal(found.order == st.ORDER.undefined, [False, True, True])
+    np.testing.assert_array_equal(
+        found.order == st.ORDER.undefined, [False, True, True]
+    )
     assert bool((found.result == jr.RESULTS.invalid_state)[1])
     assert bool((found.result == jr.RESULTS.inaccurate)[2])
     assert np.isnan(found.history[1:]).all()
@@ -523,7 +593,8 @@ def test_a_map_of_order_and_chaos_marks_what_fails():
 
     def point(tilt, spin):
         start = jr.State(
-            jr.rotation.exp(tilt * jnp.array([1.0, 0, 0])), spin * jnp.array([0, 0, 1.0])
+            jr.rotation.exp(tilt * jnp.array([1.0, 0, 0])),
+            spin * jnp.array([0, 0, 1.0]),
         )
         return st.megno(heavy(*HEAVY), start, 200.0, 1000, throw=False).megno
 

@@ -55,7 +55,9 @@ def test_a_sweep_is_the_function_at_each_point_whatever_the_blocks(size):
     np.testing.assert_array_equal(found.values["vector"], np.stack([a, b, c], axis=-1))
     np.testing.assert_allclose(found.values["product"], a * b + c)
     np.testing.assert_array_equal(found.valid, c <= 1)
-    np.testing.assert_array_equal(found.values["order"] == ORDER.chaotic, (a > b) & (c <= 1))
+    np.testing.assert_array_equal(
+        found.values["order"] == ORDER.chaotic, (a > b) & (c <= 1)
+    )
     assert found.labels == ("a", "b", "c")
     assert found.failures == ()
 
@@ -70,7 +72,11 @@ def test_points_may_be_a_list_of_any_tree():
         return scale * jr.kinetic_energy(jnp.array([1.0, 2, 3]), state.omega)
 
     found = quiet(energy, points=(states, np.arange(1.0, 12.0)), block_size=4)
-    wanted = 0.5 * np.sum(np.asarray(states.omega) ** 2 * [1, 2, 3], axis=1) * np.arange(1, 12)
+    wanted = (
+        0.5
+        * np.sum(np.asarray(states.omega) ** 2 * [1, 2, 3], axis=1)
+        * np.arange(1, 12)
+    )
     np.testing.assert_allclose(found.values, wanted, rtol=1e-14)
     assert found.labels == ("point",)
 
@@ -126,14 +132,23 @@ def test_a_store_opens_in_xarray_with_names_units_and_meanings(tmp_path):
 def test_a_store_that_is_half_finished_opens_and_plots(tmp_path):
     plt = pytest.importorskip("matplotlib.pyplot")
     axes = {"x": np.linspace(0, 1, 8), "y": np.linspace(0, 2, 4)}
-    quiet(lambda x, y: {"sum": x + y, "n": jnp.int32(3)}, axes, store=tmp_path / "s", block_size=8)
+    quiet(
+        lambda x, y: {"sum": x + y, "n": jnp.int32(3)},
+        axes,
+        store=tmp_path / "s",
+        block_size=8,
+    )
     for block in (1, 2):
         for name in ("valid", "sum", "n"):
             (tmp_path / "s" / name / "c" / str(block) / "0").unlink()
     dataset = xarray.open_zarr(tmp_path / "s")
     known = np.isin(np.arange(8) // 2, (0, 3))
-    np.testing.assert_array_equal(np.isfinite(dataset["sum"]), known[:, None] & np.ones(4, bool))
-    np.testing.assert_array_equal(np.isfinite(dataset["n"]), np.isfinite(dataset["sum"]))
+    np.testing.assert_array_equal(
+        np.isfinite(dataset["sum"]), known[:, None] & np.ones(4, bool)
+    )
+    np.testing.assert_array_equal(
+        np.isfinite(dataset["n"]), np.isfinite(dataset["sum"])
+    )
     dataset["sum"].plot()
     plt.close("all")
 
@@ -307,8 +322,11 @@ def job(mode, store, blocks):
     environment = os.environ | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"}
     return subprocess.run(
         [sys.executable, JOB, mode, store, str(blocks)],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_the_same_store_bit_for_bit_wherever_it_was_computed(tmp_path):
@@ -324,14 +342,18 @@ def test_the_same_store_bit_for_bit_wherever_it_was_computed(tmp_path):
 
 @pytest.fixture(scope="module")
 def pool():
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as executor:
+    with ProcessPoolExecutor(
+        1, mp_context=multiprocessing.get_context("spawn")
+    ) as executor:
         yield executor
 
 
 def test_lambdas_and_trees_go_to_other_processes_and_back(pool):
     a, b, c = expected()
     factor = jnp.array(2.0)
-    found = quiet(lambda a, b, c: factor * a + b * c, AXES, executor=pool, block_size=10)
+    found = quiet(
+        lambda a, b, c: factor * a + b * c, AXES, executor=pool, block_size=10
+    )
     np.testing.assert_array_equal(found.values, 2 * a + b * c)
     assert quiet(tree, AXES, executor=pool).values["vector"].shape == (5, 7, 3, 3)
     lock = threading.Lock()
@@ -339,13 +361,17 @@ def test_lambdas_and_trees_go_to_other_processes_and_back(pool):
         quiet(lambda x: (lock, x)[1], {"x": np.ones(3)}, executor=pool)
 
 
-def test_a_block_that_fails_is_tried_thrice_recorded_and_the_others_go_on(pool, tmp_path):
+def test_a_block_that_fails_is_tried_thrice_recorded_and_the_others_go_on(
+    pool, tmp_path
+):
     def picky(x, y):
         return eqx.error_if(x + y, (x == 2) & (y == 3), "not this one")
 
     axes = {"x": np.arange(4.0), "y": np.arange(6.0)}
     for more in ({}, {"executor": pool}, {"store": tmp_path / "s"}):
-        with pytest.warns(UserWarning, match=r"1 of 8 blocks failed three times.*not this one"):
+        with pytest.warns(
+            UserWarning, match=r"1 of 8 blocks failed three times.*not this one"
+        ):
             found = quiet(picky, axes, block_size=3, **more)
         (failure,) = found.failures
         assert failure.first == (2, 3)
@@ -402,7 +428,12 @@ def test_a_worker_with_an_older_module_is_refused(tmp_path, monkeypatch):
         module.write_text("def scaled(x):\n    return 5.0 * x + 0.0\n")
         importlib.reload(edited)
         with pytest.raises(RuntimeError, match="start it anew"):
-            quiet(edited.scaled, points=np.ones(3), executor=executor, store=tmp_path / "s")
+            quiet(
+                edited.scaled,
+                points=np.ones(3),
+                executor=executor,
+                store=tmp_path / "s",
+            )
 
 
 def die():
@@ -432,7 +463,9 @@ class Lazy(ThreadPoolExecutor):
 
 def test_what_an_executor_loses_is_sent_again():
     with Lazy(OSError("the worker went away")) as executor:
-        found = quiet(jnp.sin, points=np.linspace(0, 1, 40), executor=executor, block_size=10)
+        found = quiet(
+            jnp.sin, points=np.linspace(0, 1, 40), executor=executor, block_size=10
+        )
     assert found.valid.all()
     bare = Lazy(ModuleNotFoundError("No module named 'jrigid'"))
     with bare as executor, pytest.raises(ImportError, match="Workers need jrigid"):
@@ -478,7 +511,9 @@ def test_a_refined_map_finds_the_boundary_at_a_part_of_the_points(tmp_path):
         known = refined.valid[...]
         assert 0.02 < known.mean() < 0.12
         np.testing.assert_allclose(
-            refined.values["value"][...][known], whole.values["value"][known], atol=1e-14
+            refined.values["value"][...][known],
+            whole.values["value"][known],
+            atol=1e-14,
         )
         assert np.isnan(refined.values["value"][...][~known]).all()
         np.testing.assert_array_equal(refined.to_xarray()["classes"], found.classes)
@@ -523,7 +558,10 @@ def test_a_refined_map_beside_failures_nan_and_stores_in_rows(tmp_path):
         quiet(disk, axes, store=tmp_path / "rows", refine=inside)
 
     def partly(x, y):
-        return {"v": jnp.where(x + y > 0.9, jnp.nan, 1.0), "k": jnp.where(disk(x, y) > 0, 1, 0)}
+        return {
+            "v": jnp.where(x + y > 0.9, jnp.nan, 1.0),
+            "k": jnp.where(disk(x, y) > 0, 1, 0),
+        }
 
     found = quiet(partly, axes, refine=lambda values: values["k"], block_size=64)
     np.testing.assert_array_equal(found.classes, wanted)
@@ -583,8 +621,14 @@ def test_names_of_values_are_made_good(tmp_path):
     for more in ({}, {"store": tmp_path / "s"}, {"store": tmp_path / "s"}):
         found = quiet(named, axes, **more).to_xarray()
         assert set(found.data_vars) == {
-            "valid", "valid_", "x_", "v_", "odd_a_b_zarr_json", "odd___", "odd_partial_partial",
-        }  # fmt: skip
+            "valid",
+            "valid_",
+            "x_",
+            "v_",
+            "odd_a_b_zarr_json",
+            "odd___",
+            "odd_partial_partial",
+        }
         np.testing.assert_array_equal(found["valid_"][:, 0], np.arange(3))
         np.testing.assert_array_equal(found["x_"][:, 0], 2 * np.arange(3))
     for name in ("valid", "a/b"):

@@ -24,8 +24,11 @@ def start(mode, store):
     environment = os.environ | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"}
     return subprocess.Popen(
         [sys.executable, sweep_job.__file__, mode, store, str(BLOCKS)],
-        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
 
 
 def finished(store):
@@ -109,7 +112,9 @@ def test_a_killed_sweep_goes_on(mode, what, tmp_path, undisturbed):
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["driver", "worker", "group"])
 @pytest.mark.parametrize("mode", ["pool", "dask"])
-def test_a_sweep_killed_ten_times_at_any_moment_goes_on(mode, what, tmp_path, undisturbed, rng):
+def test_a_sweep_killed_ten_times_at_any_moment_goes_on(
+    mode, what, tmp_path, undisturbed, rng
+):
     for trial, count in enumerate(rng.integers(0, BLOCKS, 10)):
         goes_on(mode, what, int(count), tmp_path / str(trial), undisturbed)
     np.testing.assert_equal(len(list(tmp_path.iterdir())), 10)

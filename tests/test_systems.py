@@ -47,14 +47,16 @@ def along_the_motion(system, t, state, args=None):
     return both(t, state)
 
 
-# --- a body with a fixed point ----------------------------------------------------------------
+# --- a body with a fixed point
+# ----------------------------------------------------------------
 
 CONSERVATIVE = {
     "free": None,
     "heavy": tq.UniformGravity(MASS, LEVER, GRAVITY),
     "attracted": tq.GravityGradient(4.0, orbit),
     "with a free wheel": tq.SpinningMass(0.3, LEVER),
-    "heavy with a wheel": tq.UniformGravity(MASS, LEVER, GRAVITY) + tq.SpinningMass(0.3, LEVER),
+    "heavy with a wheel": tq.UniformGravity(MASS, LEVER, GRAVITY)
+    + tq.SpinningMass(0.3, LEVER),
     "sprung": tq.Torque(
         lambda _t, s, k: -k * s.attitude[0] * s.attitude[1:],
         lambda _t, s, k: -k * s.attitude[0] ** 2,
@@ -69,7 +71,9 @@ def test_energy_is_constant_where_nothing_takes_any(name, inertia):
     state = jr.State(ATTITUDE, OMEGA, tq.as_torque(torque).internal_at_rest(STATE))
     if "wheel" in name:
         state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(4.0),))
-    energy, _, power, _ = along_the_motion(jr.RigidBody(inertia, torque), 0.4, state, 1.7)
+    energy, _, power, _ = along_the_motion(
+        jr.RigidBody(inertia, torque), 0.4, state, 1.7
+    )
     assert np.isfinite(energy)
     assert abs(power) <= ulps(float, 128)
     kinetic = OMEGA @ (inertia @ OMEGA if inertia.ndim == 2 else inertia * OMEGA) / 2
@@ -130,14 +134,18 @@ def test_a_heavy_body_with_any_inertia_and_lever_is_lagranges_equation():
     state = jr.State(ro.from_euler(angles), omega)
     found = system.vector_field(0.0, state, None)
     np.testing.assert_allclose(found.omega, expected, atol=ulps(float, 128))
-    np.testing.assert_allclose(found.attitude, ro.attitude_rate(state.attitude, omega), atol=0)
+    np.testing.assert_allclose(
+        found.attitude, ro.attitude_rate(state.attitude, omega), atol=0
+    )
 
 
 def test_a_custom_function_gets_time_state_and_arguments():
     system = jr.RigidBody(MOMENTS, lambda t, s, args: args["k"] * t * s.attitude[1:])
     found = system.vector_field(2.0, STATE, {"k": 3.0}).omega
     torque = 6.0 * ATTITUDE[1:]
-    np.testing.assert_allclose(found, jr.euler_equations(MOMENTS, OMEGA, torque), atol=0)
+    np.testing.assert_allclose(
+        found, jr.euler_equations(MOMENTS, OMEGA, torque), atol=0
+    )
     assert system.energy(0.0, STATE, {"k": 3.0}) == jr.kinetic_energy(MOMENTS, OMEGA)
 
 
@@ -159,7 +167,9 @@ def test_the_gradient_of_gravity_acts_on_the_bodys_own_inertia(inertia):
     def every(inertia, other):
         bodies = jnp.stack([inertia, other])
         replaced = eqx.tree_at(lambda body: body.inertia, swinging(inertia), other)
-        slopes = [d(f)(inertia) for d in (jax.jacfwd, jax.jacrev) for f in (rate, by_hand)]
+        slopes = [
+            d(f)(inertia) for d in (jax.jacfwd, jax.jacrev) for f in (rate, by_hand)
+        ]
         torques = (
             swinging(inertia).torque_on(0.7, STATE, None),
             gradient.of_body(inertia)(0.7, STATE, None) - 0.1 * OMEGA,
@@ -199,7 +209,8 @@ def test_a_state_without_its_parts_is_an_error_that_says_how_to_add_them():
         ).ys
 
     message = (
-        r"`internal` of the state must be a tuple .*\[\('\[0\]', \(\)\), \('\[1\]', \(3,\)\)\]"
+        r"`internal` of the state must be a tuple "
+        r".*\[\('\[0\]', \(\)\), \('\[1\]', \(3,\)\)\]"
     )
     for call in (
         lambda: solve(STATE),
@@ -211,10 +222,14 @@ def test_a_state_without_its_parts_is_an_error_that_says_how_to_add_them():
         lambda: body.with_parts(jr.State(ATTITUDE, OMEGA, (jnp.ones(()),))),
         lambda: body.vector_field(0.0, jr.State(ATTITUDE, OMEGA, jnp.ones(3)), None),
     ):
-        with pytest.raises(ValueError, match=message + r".*`system.with_parts\(state\)`"):
+        with pytest.raises(
+            ValueError, match=message + r".*`system.with_parts\(state\)`"
+        ):
             call()
     with pytest.raises(ValueError, match="carries parts, here of the shapes \\[\\]"):
-        jr.RigidBody(TENSOR).vector_field(0.0, jr.State(ATTITUDE, OMEGA, (jnp.ones(()),)), None)
+        jr.RigidBody(TENSOR).vector_field(
+            0.0, jr.State(ATTITUDE, OMEGA, (jnp.ones(()),)), None
+        )
 
     state = body.with_parts(STATE)
     spin, sphere = state.internal
@@ -227,7 +242,8 @@ def test_a_state_without_its_parts_is_an_error_that_says_how_to_add_them():
     assert len(flying.with_parts(FLYING).internal) == 2
 
 
-# --- a body in flight -------------------------------------------------------------------------
+# --- a body in flight
+# -------------------------------------------------------------------------
 
 
 def test_kinetic_energy_splits_as_koenig_says_and_momentum_sums_over_points():
@@ -235,24 +251,38 @@ def test_kinetic_energy_splits_as_koenig_says_and_momentum_sums_over_points():
     masses, points = random.uniform(0.1, 1, 9), random.normal(size=(9, 3))
     points -= masses @ points / masses.sum()
     inertia = sum(
-        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, points, strict=True)
+        m * (p @ p * np.eye(3) - np.outer(p, p))
+        for m, p in zip(masses, points, strict=True)
     )
     body = jr.FloatingBody(MassProperties(masses.sum(), np.zeros(3), inertia))
     r = np.asarray(ro.to_matrix(ATTITUDE))
     places = POSITION + points @ r.T
     velocities = VELOCITY + np.cross(OMEGA, points) @ r.T
     kinetic = 0.5 * np.sum(masses[:, None] * velocities**2)
-    translational, rotational = body.translational_energy(FLYING), body.rotational_energy(FLYING)
-    np.testing.assert_allclose(translational + rotational, kinetic, rtol=ulps(float, 16))
+    translational, rotational = (
+        body.translational_energy(FLYING),
+        body.rotational_energy(FLYING),
+    )
+    np.testing.assert_allclose(
+        translational + rotational, kinetic, rtol=ulps(float, 16)
+    )
     np.testing.assert_allclose(
         translational, masses.sum() * VELOCITY @ VELOCITY / 2, rtol=ulps(float, 8)
     )
-    np.testing.assert_allclose(rotational, OMEGA @ inertia @ OMEGA / 2, rtol=ulps(float, 8))
-    np.testing.assert_allclose(body.energy(0.0, FLYING, None), kinetic, rtol=ulps(float, 16))
-    np.testing.assert_allclose(body.momentum(FLYING), masses @ velocities, rtol=ulps(float, 32))
+    np.testing.assert_allclose(
+        rotational, OMEGA @ inertia @ OMEGA / 2, rtol=ulps(float, 8)
+    )
+    np.testing.assert_allclose(
+        body.energy(0.0, FLYING, None), kinetic, rtol=ulps(float, 16)
+    )
+    np.testing.assert_allclose(
+        body.momentum(FLYING), masses @ velocities, rtol=ulps(float, 32)
+    )
     about_the_origin = np.einsum("n,ni->i", masses, np.cross(places, velocities))
     np.testing.assert_allclose(
-        body.angular_momentum(0.0, FLYING, None), about_the_origin, atol=ulps(float, 128)
+        body.angular_momentum(0.0, FLYING, None),
+        about_the_origin,
+        atol=ulps(float, 128),
     )
 
 
@@ -261,12 +291,19 @@ def test_a_projectile_flies_a_parabola_and_tumbles_as_if_it_hung_still():
     flight = jr.simulate(jr.FloatingBody(BODY, WEIGHT), FLYING, ts, rtol=1e-11)
     parabola = POSITION + VELOCITY * ts[:, None] + GRAVITY * ts[:, None] ** 2 / 2
     scale = np.max(np.abs(parabola))
-    np.testing.assert_allclose(flight.states.position, parabola, rtol=0, atol=1e-11 * scale)
     np.testing.assert_allclose(
-        flight.states.velocity, VELOCITY + GRAVITY * ts[:, None], rtol=0, atol=1e-11 * scale
+        flight.states.position, parabola, rtol=0, atol=1e-11 * scale
+    )
+    np.testing.assert_allclose(
+        flight.states.velocity,
+        VELOCITY + GRAVITY * ts[:, None],
+        rtol=0,
+        atol=1e-11 * scale,
     )
     free = lambda _, w: np.linalg.solve(TENSOR, np.cross(TENSOR @ w, w))  # noqa: E731
-    still = scipy.integrate.solve_ivp(free, (0, 8), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14)
+    still = scipy.integrate.solve_ivp(
+        free, (0, 8), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14
+    )
     np.testing.assert_allclose(flight.states.omega, still.y.T, atol=1e-10)
     momentum = TENSOR @ np.asarray(flight.states.omega)[..., None]
     in_space = jax.vmap(ro.rotate)(flight.states.attitude, momentum[..., 0])
@@ -274,7 +311,9 @@ def test_a_projectile_flies_a_parabola_and_tumbles_as_if_it_hung_still():
     np.testing.assert_allclose(in_space, np.tile(expected, (5, 1)), atol=1e-10)
     energy = np.asarray(flight.energy)
     kinetic = MASS * VELOCITY @ VELOCITY / 2 + OMEGA @ TENSOR @ OMEGA / 2
-    np.testing.assert_allclose(energy[0], kinetic - MASS * GRAVITY @ POSITION, rtol=1e-14)
+    np.testing.assert_allclose(
+        energy[0], kinetic - MASS * GRAVITY @ POSITION, rtol=1e-14
+    )
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
 
 
@@ -291,7 +330,9 @@ def test_laws_of_momentum_of_a_body_in_flight():
     _, _, power, rate = along_the_motion(body, t, FLYING, args)
     expected = np.cross(POSITION, force) + ro.rotate(ATTITUDE, LEVER)
     np.testing.assert_allclose(rate, expected, atol=ulps(float, 64))
-    np.testing.assert_allclose(power, force @ VELOCITY + LEVER @ OMEGA, rtol=ulps(float, 64))
+    np.testing.assert_allclose(
+        power, force @ VELOCITY + LEVER @ OMEGA, rtol=ulps(float, 64)
+    )
 
 
 def test_a_force_with_a_potential_conserves_energy_and_a_plain_one_does_not_pretend_to():
@@ -327,8 +368,12 @@ def test_internal_parts_fly_along():
     inner = np.array([1.0, 2.0, 3.0])
     state = jr.FloatingState(POSITION, VELOCITY, ATTITUDE, OMEGA, (jnp.asarray(inner),))
     energy, momentum, power, rate = along_the_motion(body, 0.0, state)
-    np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 512))
-    np.testing.assert_allclose(rate, MASS * np.cross(POSITION, GRAVITY), atol=ulps(float, 256))
+    np.testing.assert_allclose(
+        power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 512)
+    )
+    np.testing.assert_allclose(
+        rate, MASS * np.cross(POSITION, GRAVITY), atol=ulps(float, 256)
+    )
     r = np.asarray(ro.to_matrix(ATTITUDE))
     own = r @ (TENSOR @ OMEGA + 0.2 * inner)
     expected = MASS * np.cross(POSITION, VELOCITY) + own
@@ -347,7 +392,8 @@ def test_the_centre_of_mass_in_body_coordinates_plays_no_role():
         np.testing.assert_array_equal(a, b)
 
 
-# --- pytrees, dtypes, errors ------------------------------------------------------------------
+# --- pytrees, dtypes, errors
+# ------------------------------------------------------------------
 
 
 def test_systems_and_states_are_pytrees_whose_data_are_leaves():
@@ -367,7 +413,9 @@ def test_systems_and_states_are_pytrees_whose_data_are_leaves():
     energies = jax.jit(jax.vmap(lambda i: jr.RigidBody(i).energy(0.0, STATE, None)))
     lanes = np.stack([MOMENTS, 2 * MOMENTS])
     single = jr.kinetic_energy(MOMENTS, OMEGA)
-    np.testing.assert_allclose(energies(lanes), [single, 2 * single], rtol=ulps(float, 4))
+    np.testing.assert_allclose(
+        energies(lanes), [single, 2 * single], rtol=ulps(float, 4)
+    )
 
 
 def findings_of(system):
@@ -385,7 +433,9 @@ def test_a_bad_inertia_is_found_whatever_the_torque(inertia):
         findings = findings_of(jr.RigidBody(inertia, torque))
         assert findings.result == jr.RESULTS.invalid_inertia
         shown = str(inertia.ravel()[0])[:2]
-        with pytest.raises(RuntimeError, match=rf"`inertia` .*, but it is not: \[+{shown}"):
+        with pytest.raises(
+            RuntimeError, match=rf"`inertia` .*, but it is not: \[+{shown}"
+        ):
             findings.guard(jnp.zeros(()), throw=True)
 
 
@@ -412,7 +462,9 @@ def test_a_bad_body_in_flight_is_found_by_its_mass_or_inertia():
 
 def test_systems_and_states_show_their_numbers():
     assert "velocity=[ 0.4, 3. , -1.2]" in repr(FLYING)
-    assert repr(jr.RigidBody(MOMENTS)).startswith("RigidBody(inertia=[1., 2., 3.], torque=")
+    assert repr(jr.RigidBody(MOMENTS)).startswith(
+        "RigidBody(inertia=[1., 2., 3.], torque="
+    )
     assert repr(tq.LinearDrag(0.1)) == "LinearDrag(coefficient=0.1)"
 
 
@@ -423,7 +475,10 @@ WRONG = {
         r"`inertia` must have shape \(3,\) or \(3, 3\), but it has shape \(4,\)",
     ),
     "torque": (lambda: jr.RigidBody(MOMENTS, 3.0), r"`torque` must be a callable"),
-    "floating torque": (lambda: jr.FloatingBody(BODY, None, 3.0), r"`torque` must be a callable"),
+    "floating torque": (
+        lambda: jr.FloatingBody(BODY, None, 3.0),
+        r"`torque` must be a callable",
+    ),
     "force": (
         lambda: jr.FloatingBody(BODY, 3.0),
         r"`force` must be a callable \(t, state, args\) -> \(3,\), but it is 3.0",
@@ -474,9 +529,14 @@ def test_a_vector_field_is_diffrax_s_with_states_saved():
         ),
     ):
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field), diffrax.Tsit5(), 0.0, 1.0, 0.01, state,
+            diffrax.ODETerm(system.vector_field),
+            diffrax.Tsit5(),
+            0.0,
+            1.0,
+            0.01,
+            state,
             saveat=diffrax.SaveAt(ts=jnp.array([0.5, 1.0])),
-        )  # fmt: skip
+        )
         state = jr.State(jr.rotation.normalize(ATTITUDE), OMEGA, state.internal)
         exact = jr.simulate(system, state, 1.0).states
         np.testing.assert_allclose(solution.ys.omega[1], exact.omega, atol=1e-7)

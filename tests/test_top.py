@@ -1,7 +1,7 @@
 """The exact flow of Lagrange's top: values, invariants, derivatives, edges, bad input.
 
-tests/data/top_motion.npz holds Taylor series at 30 digits, top_derivatives.npz variational
-equations in 80-bit arithmetic (tests/data/make_top_motion.py).
+tests/data/top_motion.npz holds Taylor series at 30 digits, top_derivatives.npz
+variational equations in 80-bit arithmetic (tests/data/make_top_motion.py).
 """
 
 from pathlib import Path
@@ -67,8 +67,13 @@ def state_and_rate(parameters, attitude, omega, t):
 
 def rows(regime):
     chosen = RECORD["regime"] == regime
-    parameters = np.concatenate([RECORD["moments"], RECORD["mgl"][:, None]], axis=1)[chosen]
-    return (parameters, *(RECORD[name][chosen] for name in ("attitude", "omega", "time")))
+    parameters = np.concatenate([RECORD["moments"], RECORD["mgl"][:, None]], axis=1)[
+        chosen
+    ]
+    return (
+        parameters,
+        *(RECORD[name][chosen] for name in ("attitude", "omega", "time")),
+    )
 
 
 def rates(parameters, omega):
@@ -85,7 +90,9 @@ LANES = 168  # of one compilation for every regime
 def of_lanes(function):
     def call(*arrays):
         rows = len(arrays[0])
-        padded = (np.concatenate([x, np.repeat(x[:1], LANES - rows, axis=0)]) for x in arrays)
+        padded = (
+            np.concatenate([x, np.repeat(x[:1], LANES - rows, axis=0)]) for x in arrays
+        )
         return jax.tree.map(lambda x: np.asarray(x)[:rows], function(*padded))
 
     return call
@@ -103,21 +110,27 @@ def test_the_record_holds_at_least_fifty_cases_a_regime():
     assert all(np.sum(RECORD["regime"] == regime) >= 50 for regime in REGIMES)
     assert len(REGIMES) >= 19
     near = RECORD["regime"] == "near sleeping spin"
-    assert all(np.sum(near & (RECORD["level"] == level)) >= 50 for level in (1e-3, 1e-8, 1e-12))
+    assert all(
+        np.sum(near & (RECORD["level"] == level)) >= 50 for level in (1e-3, 1e-8, 1e-12)
+    )
 
 
 @pytest.mark.parametrize("regime", REGIMES)
 def test_values_to_the_bar_against_30_digits(regime, compiled):
     parameters, attitude, omega, time = rows(regime)
     chosen = RECORD["regime"] == regime
-    exact = np.concatenate([RECORD["attitude_out"], RECORD["omega_out"]], axis=1)[chosen]
+    exact = np.concatenate([RECORD["attitude_out"], RECORD["omega_out"]], axis=1)[
+        chosen
+    ]
     found = compiled["value"](parameters, attitude, omega, time)  # sign included
     rate = rates(parameters, omega)[:, None]
     unit = np.concatenate([np.ones((len(rate), 4)), np.tile(rate, (1, 3))], axis=1)
     error = np.max(np.abs(found - exact) / unit, axis=1)
     radians = rate[:, 0] * np.abs(time)
     bar = 1e-13 * (1 + radians)
-    if regime in UNSTABLE:  # near a separatrix the motion amplifies the inputs' last bits
+    if (
+        regime in UNSTABLE
+    ):  # near a separatrix the motion amplifies the inputs' last bits
         forward, _ = compiled["jacobians"](parameters, attitude, omega, time)
         columns = np.split(forward, [4, 7], axis=2)
         for column, x in zip(columns, (attitude, omega, parameters), strict=True):
@@ -155,29 +168,41 @@ def test_a_million_turns_err_no_more_than_their_phase(compiled):
     for k in range(0, 60, 6):
         q, w = closed_form(*parameters[k], attitude[k], omega[k], time[k])
         exact = np.array([*q, *w], float)
-        unit = np.where(np.arange(7) < 4, 1.0, rates(parameters[k : k + 1], omega[k : k + 1]))
+        unit = np.where(
+            np.arange(7) < 4, 1.0, rates(parameters[k : k + 1], omega[k : k + 1])
+        )
         assert np.max(np.abs(found[k] - exact) / unit) < 1e-13 * 2e6 * np.pi
 
 
-@pytest.mark.parametrize("regime", ["generic nutation", "loops", "through upright", "fast spin"])
+@pytest.mark.parametrize(
+    "regime", ["generic nutation", "loops", "through upright", "fast spin"]
+)
 def test_the_closed_form_at_50_digits_is_the_taylor_series(regime):
     parameters, attitude, omega, time = rows(regime)
     stored = [
-        [[mp.mpf(x) for x in row] for row in RECORD[name][RECORD["regime"] == regime].tolist()]
+        [
+            [mp.mpf(x) for x in row]
+            for row in RECORD[name][RECORD["regime"] == regime].tolist()
+        ]
         for name in ("attitude_out", "attitude_low", "omega_out", "omega_low")
     ]
     for k in range(0, len(time), 6):
         q, w = closed_form(*parameters[k], attitude[k], omega[k], time[k])
         with mp.workdps(40):
             high, low = ([*stored[i][k], *stored[i + 2][k]] for i in (0, 1))
-            assert max(abs(a - b - c) for a, b, c in zip((*q, *w), high, low, strict=True)) < 1e-29
+            assert (
+                max(abs(a - b - c) for a, b, c in zip((*q, *w), high, low, strict=True))
+                < 1e-29
+            )
 
 
 @pytest.mark.parametrize("spin", [3.0, 4.0, 4.5])
 @pytest.mark.parametrize("t", [1e3, 1e6])
 def test_a_top_asleep_turns_about_the_vertical_for_ever(spin, t):
     """Below, at and above the threshold, where a nutation lasts without end."""
-    found = state_at(jnp.array([1.0, 0.5, 1.0]), np.eye(4)[0], jnp.array([0, 0, spin]), t)
+    found = state_at(
+        jnp.array([1.0, 0.5, 1.0]), np.eye(4)[0], jnp.array([0, 0, spin]), t
+    )
     half = mp.mpf(spin) * mp.mpf(t) / 2
     exact = [float(mp.cos(half)), 0, 0, float(mp.sin(half)), 0, 0, spin]
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-13 * (1 + spin * t))
@@ -191,7 +216,9 @@ def test_rates_whose_squares_underflow_and_angles_that_overflow():
             rate * OMEGA,
             0.5 / rate,
         )
-        slow = state_at(jnp.array([1.0, 0.5, 0.0]), ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 0.5)
+        slow = state_at(
+            jnp.array([1.0, 0.5, 0.0]), ATTITUDE / np.linalg.norm(ATTITUDE), OMEGA, 0.5
+        )
         np.testing.assert_allclose(found[:4], slow[:4], atol=1e-14)
         np.testing.assert_allclose(found[4:] / rate, slow[4:], atol=1e-14)
     single = jr.top_motion(
@@ -224,7 +251,11 @@ def test_a_fall_that_begins_very_near_upright_goes_through(mgl):
     """At any time the motion obeys Euler's equations, and it comes down."""
     top = jr.SymmetricTop(1.0, 0.5, mgl)
     tilt = 1e-25
-    attitude = np.array([1.0, 0.5 * tilt, 0, 0]) if mgl > 0 else np.array([0.5 * tilt, 1.0, 0, 0])
+    attitude = (
+        np.array([1.0, 0.5 * tilt, 0, 0])
+        if mgl > 0
+        else np.array([0.5 * tilt, 1.0, 0, 0])
+    )
     body = top.as_rigid_body()
     vector_field = quick_jit(lambda body, state: body.vector_field(0.0, state, None))
     x = np.array([1.0, 0.5, mgl])
@@ -240,7 +271,8 @@ def test_a_fall_that_begins_very_near_upright_goes_through(mgl):
     assert lowest < -0.5
 
 
-# --- Derivatives --------------------------------------------------------------------------------
+# --- Derivatives
+# --------------------------------------------------------------------------------
 
 
 def test_derivatives_equal_the_variational_equations(compiled):
@@ -272,7 +304,12 @@ def test_stored_derivatives_are_those_of_the_variational_equations():
         q, w = taylor_top(z[1], z[2], z[3], x[:4], [z[0], x[5], x[6]], 2.0)
         return np.array([*q, *w], float)
 
-    columns = [full[0, :, 4], full[0, :, 7] + full[0, :, 8], full[0, :, 9], full[0, :, 12]]
+    columns = [
+        full[0, :, 4],
+        full[0, :, 7] + full[0, :, 8],
+        full[0, :, 9],
+        full[0, :, 12],
+    ]
     for k, column in enumerate(columns):
         slope = central_difference(motion, x[[4, 7, 8, 9]], np.eye(4)[k], 2.0**-17)
         np.testing.assert_allclose(column.astype(float), slope, atol=1e-9)
@@ -314,7 +351,8 @@ def test_derivative_in_time_is_euler_s_equation():
         np.testing.assert_allclose(found[4:], exact.omega, atol=1e-13)
 
 
-# --- float32, shapes, modes ---------------------------------------------------------------------
+# --- float32, shapes, modes
+# ---------------------------------------------------------------------
 
 FLOAT32_MULTIPLE = 32
 
@@ -328,16 +366,22 @@ def test_float32_within_a_multiple_of_its_eps(regime, compiled):
     wide = [x.astype(float) for x in (parameters, attitude, omega, time)]
     exact = compiled["value"](*wide)
     rate = rates(wide[0], wide[2])[:, None]
-    error = np.abs(found - exact) / np.concatenate([0 * rate + np.ones(4), rate + np.zeros(3)], 1)
+    error = np.abs(found - exact) / np.concatenate(
+        [0 * rate + np.ones(4), rate + np.zeros(3)], 1
+    )
     columns = np.split(compiled["jacobians"](*wide)[0], [4, 7], axis=2)
-    scaled = sum(np.linalg.norm(c, axis=(1, 2)) for c in columns) / np.minimum(1, rate[:, 0])
+    scaled = sum(np.linalg.norm(c, axis=(1, 2)) for c in columns) / np.minimum(
+        1, rate[:, 0]
+    )
     eps = float(np.finfo(np.float32).eps)
     bar = FLOAT32_MULTIPLE * eps * (1 + rate[:, 0] * np.abs(wide[3]))
     # Where the motion does not amplify its inputs' last bits.
     calm = scaled < 30 * (1 + rate[:, 0] * np.abs(wide[3]))
     assert np.mean(calm) > (0.2 if regime in UNSTABLE else 0.5)
     assert np.all(np.isfinite(found))
-    assert np.all(np.max(error, axis=1)[calm] <= bar[calm]), np.max((np.max(error, 1) / bar)[calm])
+    assert np.all(np.max(error, axis=1)[calm] <= bar[calm]), np.max(
+        (np.max(error, 1) / bar)[calm]
+    )
 
 
 def test_times_of_any_shape_and_the_time_of_the_start():
@@ -351,30 +395,68 @@ def test_times_of_any_shape_and_the_time_of_the_start():
     assert jr.top_motion(top, state, np.zeros((0,))).omega.shape == (0, 3)
 
 
-# --- Bad input ----------------------------------------------------------------------------------
+# --- Bad input
+# ----------------------------------------------------------------------------------
 
-GOOD = {"I1": 1.0, "I3": 0.5, "mgl": 1.0, "q": np.eye(4)[0], "w": OMEGA, "t": 1.0, "t0": 0.0}
+GOOD = {
+    "I1": 1.0,
+    "I3": 0.5,
+    "mgl": 1.0,
+    "q": np.eye(4)[0],
+    "w": OMEGA,
+    "t": 1.0,
+    "t0": 0.0,
+}
 BAD = {
-    "negative I1": ("I1", -1.0, "invalid_top", r"`top` must have I1 > 0.*: \[-1\. +0\.5 +1\. *\]"),
+    "negative I1": (
+        "I1",
+        -1.0,
+        "invalid_top",
+        r"`top` must have I1 > 0.*: \[-1\. +0\.5 +1\. *\]",
+    ),
     "I3 zero": ("I3", 0.0, "invalid_top", "`top` must have I1 > 0, I3 > 0"),
     "I3 infinite": ("I3", np.inf, "invalid_top", "`top` must have I1 > 0, I3 > 0"),
     "mgl NaN": ("mgl", np.nan, "invalid_top", "finite mgl, but it has not: .*nan"),
-    "omega infinite": ("w", np.array([np.inf, 0, 0]), "invalid_state", "`state0` .*finite.*inf"),
-    "attitude of norm 2": ("q", 2 * np.eye(4)[0], "invalid_attitude", r"unit quaternion.*\[2\. 0"),
-    "time NaN": ("t", np.nan, "invalid_times", "`ts` must be finite, but it is not: nan"),
-    "start infinite": ("t0", np.inf, "invalid_times", "`t0` must be finite, but it is not: inf"),
+    "omega infinite": (
+        "w",
+        np.array([np.inf, 0, 0]),
+        "invalid_state",
+        "`state0` .*finite.*inf",
+    ),
+    "attitude of norm 2": (
+        "q",
+        2 * np.eye(4)[0],
+        "invalid_attitude",
+        r"unit quaternion.*\[2\. 0",
+    ),
+    "time NaN": (
+        "t",
+        np.nan,
+        "invalid_times",
+        "`ts` must be finite, but it is not: nan",
+    ),
+    "start infinite": (
+        "t0",
+        np.inf,
+        "invalid_times",
+        "`t0` must be finite, but it is not: inf",
+    ),
 }
 
 
 def motion_of(I1, I3, mgl, q, w, t, t0, throw=False):
-    return jr.top_motion(jr.SymmetricTop(I1, I3, mgl), jr.State(q, w), t, t0=t0, throw=throw)
+    return jr.top_motion(
+        jr.SymmetricTop(I1, I3, mgl), jr.State(q, w), t, t0=t0, throw=throw
+    )
 
 
 @pytest.fixture(scope="module")
 def in_lanes():
     """All bad inputs, each a lane, and the good one as the last."""
     inputs = [{**GOOD, name: value} for name, value, _, _ in BAD.values()] + [GOOD]
-    lanes = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y, float) for y in x]), *inputs)
+    lanes = jax.tree.map(
+        lambda *x: jnp.stack([jnp.asarray(y, float) for y in x]), *inputs
+    )
     return lanes, jax.vmap(lambda x: motion_of(**x))(lanes)
 
 
@@ -395,8 +477,12 @@ def test_bad_values_are_errors_with_a_code(name, in_lanes):
 def test_a_good_lane_among_bad_ones_is_as_alone_and_the_first_is_named(in_lanes):
     lanes, motion = in_lanes
     alone = motion_of(**GOOD, throw=True)
-    np.testing.assert_allclose(motion.attitude[-1], alone.attitude, rtol=0, atol=ulps(float, 4))
-    np.testing.assert_allclose(motion.omega[-1], alone.omega, rtol=0, atol=ulps(float, 4))
+    np.testing.assert_allclose(
+        motion.attitude[-1], alone.attitude, rtol=0, atol=ulps(float, 4)
+    )
+    np.testing.assert_allclose(
+        motion.omega[-1], alone.omega, rtol=0, atol=ulps(float, 4)
+    )
     assert (motion.result == jr.RESULTS.successful)[-1]
     assert alone.result == jr.RESULTS.successful
     with pytest.raises(RuntimeError, match=f"in lane 0 and {len(BAD) - 1} more"):
@@ -412,7 +498,10 @@ def test_a_bad_lane_leaves_the_others_and_shared_gradients_alone():
     def total(i1, omegas):
         def one(omega):
             state = jr.top_motion(
-                jr.SymmetricTop(i1, 0.5, 1.0), jr.State(np.eye(4)[0], omega), 2.0, throw=False
+                jr.SymmetricTop(i1, 0.5, 1.0),
+                jr.State(np.eye(4)[0], omega),
+                2.0,
+                throw=False,
             )
             return jnp.where(jnp.isnan(state.omega), 0.0, state.omega)
 
@@ -428,9 +517,15 @@ def test_a_bad_lane_leaves_the_others_and_shared_gradients_alone():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((np.array([1.0, 1.0, 0.5]), jr.State(np.eye(4)[0], OMEGA), 1.0), "`top` must be a Symm"),
+        (
+            (np.array([1.0, 1.0, 0.5]), jr.State(np.eye(4)[0], OMEGA), 1.0),
+            "`top` must be a Symm",
+        ),
         ((jr.SymmetricTop(1.0, 0.5, 1.0), OMEGA, 1.0), "`state0` must be a State"),
-        ((jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(3)[0], OMEGA), 1.0), "shape \\(4,\\)"),
+        (
+            (jr.SymmetricTop(1.0, 0.5, 1.0), jr.State(np.eye(3)[0], OMEGA), 1.0),
+            "shape \\(4,\\)",
+        ),
     ],
 )
 def test_wrong_shapes_and_types_are_value_errors(arguments, message, untyped):

@@ -23,7 +23,12 @@ STARTS = {
     "loop": {"theta": 0.7, "omega3": 5.0, "phi_dot": -0.4},
     "steady, slow": {"theta": 0.7, "omega3": 5.0, "phi_dot": "slow"},
     "steady, fast": {"theta": 0.7, "omega3": 5.0, "phi_dot": "fast"},
-    "below the horizontal": {"theta": 2.1, "omega3": 1.0, "phi_dot": 0.8, "theta_dot": 0.3},
+    "below the horizontal": {
+        "theta": 2.1,
+        "omega3": 1.0,
+        "phi_dot": 0.8,
+        "theta_dot": 0.3,
+    },
     "spherical pendulum": {"theta": 2.0, "phi_dot": 0.7, "theta_dot": 0.2},
     "plane pendulum": {"theta": 2.0, "theta_dot": 0.4},
     "through upright": {"theta": 0.0, "omega3": 1.5, "theta_dot": 0.8},
@@ -81,7 +86,8 @@ def state_of_angles(q, q_dot):
     return jr.State(rotation.from_euler(q), rotation.euler_rates_to_omega(q, q_dot))
 
 
-# --- Four ways ----------------------------------------------------------------------------------
+# --- Four ways
+# ----------------------------------------------------------------------------------
 
 
 TIMES = jnp.linspace(0.0, 12.0, 13)[1:]
@@ -89,10 +95,17 @@ TIMES = jnp.linspace(0.0, 12.0, 13)[1:]
 
 def integrated(field, y0, args):
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, TIMES[-1], 1e-3, y0, args,
-        saveat=diffrax.SaveAt(ts=TIMES), max_steps=100_000,
+        diffrax.ODETerm(field),
+        diffrax.Dopri8(),
+        0.0,
+        TIMES[-1],
+        1e-3,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(ts=TIMES),
+        max_steps=100_000,
         stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12),
-    )  # fmt: skip
+    )
     return solution.ys
 
 
@@ -118,14 +131,22 @@ def heights_by_cubic(state0):
     slope = jnp.polyder(top.cubic(TOP, top.conserved(TOP, state0)))
     up = rotation.rotate_inverse(state0.attitude, jnp.array([0.0, 0.0, 1.0]))
     u0 = jnp.stack([up[2], jnp.cross(up, state0.omega)[2]])
-    return integrated(lambda _t, y, _: jnp.stack([y[1], 0.5 * jnp.polyval(slope, y[0])]), u0, None)
+    return integrated(
+        lambda _t, y, _: jnp.stack([y[1], 0.5 * jnp.polyval(slope, y[0])]), u0, None
+    )
 
 
 @pytest.fixture(scope="module")
 def routes():
     def two(state0):
-        by_quaternions = jr.simulate(TOP.as_rigid_body(), state0, TIMES, rtol=1e-11).states
-        return jr.top_motion(TOP, state0, TIMES), by_quaternions, heights_by_cubic(state0)
+        by_quaternions = jr.simulate(
+            TOP.as_rigid_body(), state0, TIMES, rtol=1e-11
+        ).states
+        return (
+            jr.top_motion(TOP, state0, TIMES),
+            by_quaternions,
+            heights_by_cubic(state0),
+        )
 
     return quick_jit(two), quick_jit(
         lambda q0, rates: (by_lagrangian(q0, rates), by_reduction(q0, rates))
@@ -154,7 +175,8 @@ def test_where_the_angles_fail_the_accelerations_are_nan():
     assert np.isnan(lagrangian.acceleration(top.lagrangian, q, q_dot, TOP)).all()
 
 
-# --- Momenta, energy, potential -----------------------------------------------------------------
+# --- Momenta, energy, potential
+# -----------------------------------------------------------------
 
 ANGLES, RATES = jnp.array([0.4, 1.1, -0.7]), jnp.array([0.8, -0.5, 2.0])
 
@@ -180,11 +202,15 @@ def test_potential_cubic_and_rates_of_the_angles():
     left = 0.5 * TOP.I1 * RATES[1] ** 2 + v
     np.testing.assert_allclose(left, keeps.energy - spin_energy, rtol=1e-14)
     u_dot = -jnp.sin(theta) * RATES[1]
-    np.testing.assert_allclose(jnp.polyval(top.cubic(TOP, keeps), jnp.cos(theta)), u_dot**2, 1e-13)
+    np.testing.assert_allclose(
+        jnp.polyval(top.cubic(TOP, keeps), jnp.cos(theta)), u_dot**2, 1e-13
+    )
     _, theta_dot, _, theta_acceleration = top.reduced_vector_field(TOP, keeps)(
         0.0, jnp.array([*ANGLES, RATES[1]]), None
     )
-    slope = jax.grad(top.effective_potential, argnums=1)(TOP, theta, keeps.p_phi, keeps.p_psi)
+    slope = jax.grad(top.effective_potential, argnums=1)(
+        TOP, theta, keeps.p_phi, keeps.p_psi
+    )
     np.testing.assert_allclose(theta_acceleration, -slope / TOP.I1, rtol=1e-13)
     assert theta_dot == RATES[1]
 
@@ -205,7 +231,9 @@ def test_potential_at_the_vertical():
 def of_the_momenta():
     def both(p):
         rates = top.angle_rates(TOP, 1.0, p, 3.0)
-        return jnp.stack([top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi])
+        return jnp.stack(
+            [top.effective_potential(TOP, 1.0, p, 3.0), rates.phi, rates.psi]
+        )
 
     def slope(p):
         value, slope = jax.jvp(both, (p,), (1.0,))
@@ -224,19 +252,29 @@ def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
     np.testing.assert_allclose(curvature, [1 / np.sin(1.0) ** 2, 0, 0], atol=1e-13)
 
 
-# --- Nutation -----------------------------------------------------------------------------------
+# --- Nutation
+# -----------------------------------------------------------------------------------
 
 
 def quadratures(one, state):
     """Bounds, period and advance of phi and psi by integrals over u = cos theta, 25 digits."""
     p_phi, p_psi, energy = (mp.mpf(float(x)) for x in top.conserved(one, state))
     i1, i3, mgl = (mp.mpf(float(x)) for x in (one.I1, one.I3, one.mgl))
-    alpha, beta, a, b = (2 * energy - p_psi**2 / i3) / i1, 2 * mgl / i1, p_psi / i1, p_phi / i1
+    alpha, beta, a, b = (
+        (2 * energy - p_psi**2 / i3) / i1,
+        2 * mgl / i1,
+        p_psi / i1,
+        p_phi / i1,
+    )
     u1, u2, u3 = sorted(
-        mp.re(x) for x in mp.polyroots(
-            [alpha - b * b, 2 * a * b - beta, -alpha - a * a, beta], 200, extraprec=200, asc=True
+        mp.re(x)
+        for x in mp.polyroots(
+            [alpha - b * b, 2 * a * b - beta, -alpha - a * a, beta],
+            200,
+            extraprec=200,
+            asc=True,
         )
-    )  # fmt: skip
+    )
 
     def over(f):
         # u = u1 + (u2 - u1) sin^2 x: no singular ends
@@ -258,7 +296,9 @@ def test_bounds_period_and_advance_are_the_textbook_s_integrals(name):
         low, high, period, phi, psi = (float(x) for x in quadratures(TOP, start(name)))
     state = start(name)
     bounds = nutation(TOP, state).bounds
-    np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13)
+    np.testing.assert_allclose(
+        [bounds.theta_min, bounds.theta_max], [low, high], rtol=1e-13
+    )
     assert nutation(TOP, state).period == pytest.approx(period, rel=1e-13)
     advance = nutation(TOP, state).advance
     np.testing.assert_allclose([advance.phi, advance.psi], [phi, psi], rtol=1e-12)
@@ -271,21 +311,33 @@ def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
     for _ in range(6):
         one = jr.SymmetricTop(1.3, rng.uniform(0.3, 2), mgl)
         q = rng.normal(size=4)
-        state = jr.State(q / np.linalg.norm(q), rng.normal(size=3) * rng.choice([0.3, 1, 3]))
+        state = jr.State(
+            q / np.linalg.norm(q), rng.normal(size=3) * rng.choice([0.3, 1, 3])
+        )
         period = float(nutation(one, state).period)
-        motion = np.asarray(jr.top_motion(one, state, np.linspace(0, period, 4001)).attitude)
+        motion = np.asarray(
+            jr.top_motion(one, state, np.linspace(0, period, 4001)).attitude
+        )
         sum_ = np.unwrap(np.arctan2(motion[:, 3], motion[:, 0]))
         difference = np.unwrap(np.arctan2(motion[:, 2], motion[:, 1]))
         phi, psi = sum_ + difference, sum_ - difference
-        tilt = np.arccos(np.clip(2 * (motion[:, 0] ** 2 + motion[:, 3] ** 2) - 1, -1, 1))
+        tilt = np.arccos(
+            np.clip(2 * (motion[:, 0] ** 2 + motion[:, 3] ** 2) - 1, -1, 1)
+        )
         bounds = nutation(one, state).bounds
         extent = [tilt.min(), tilt.max()]
-        np.testing.assert_allclose([bounds.theta_min, bounds.theta_max], extent, atol=1e-4)
+        np.testing.assert_allclose(
+            [bounds.theta_min, bounds.theta_max], extent, atol=1e-4
+        )
         assert tilt[-1] == pytest.approx(tilt[0], abs=1e-11)
         advance = nutation(one, state).advance
-        np.testing.assert_allclose(advance, [phi[-1] - phi[0], psi[-1] - psi[0]], atol=1e-11)
+        np.testing.assert_allclose(
+            advance, [phi[-1] - phi[0], psi[-1] - psi[0]], atol=1e-11
+        )
         steps = np.diff(phi)
-        kind = top.CLASSES.loop if np.min(steps) < 0 < np.max(steps) else top.CLASSES.wave
+        kind = (
+            top.CLASSES.loop if np.min(steps) < 0 < np.max(steps) else top.CLASSES.wave
+        )
         assert nutation(one, state).kind == kind
 
 
@@ -293,7 +345,8 @@ def test_bounds_and_advance_are_those_of_the_motion(mgl, rng):
 def test_kinds_of_motion(name):
     state = start(name)
     assert top.CLASSES[nutation(TOP, state).kind] == KINDS[name]
-    # Any later state is of the same kind, and so is the same motion with the axis named backward.
+    # Any later state is of the same kind, and so is the same motion with the axis named
+    # backward.
     later = jr.top_motion(TOP, state, 1.7).states
     assert top.CLASSES[nutation(TOP, later).kind] == KINDS[name]
     back = rotation.multiply(state.attitude, np.array([0.0, 1, 0, 0]))
@@ -316,7 +369,15 @@ def test_a_bad_state_has_no_kind():
 
 
 def test_kinds_are_listed_with_their_texts():
-    texts = ["wave", "cusp", "loop", "steady", "sleeping", "pendulum", "through the vertical"]
+    texts = [
+        "wave",
+        "cusp",
+        "loop",
+        "steady",
+        "sleeping",
+        "pendulum",
+        "through the vertical",
+    ]
     assert top.CLASSES.texts == [*texts, "undefined"]
     assert {"wave", "through_the_vertical", "undefined"} <= set(dir(top.CLASSES))
 
@@ -326,7 +387,9 @@ def slopes():
     def both(s, direction, state):
         x = jnp.concatenate([jnp.array([1.0, 0.5, 1.0]), state.omega]) + s * direction
         one, moved = jr.SymmetricTop(x[0], x[1], x[2]), jr.State(state.attitude, x[3:])
-        return jnp.stack([top.nutation_period(one, moved), top.mean_precession(one, moved)])
+        return jnp.stack(
+            [top.nutation_period(one, moved), top.mean_precession(one, moved)]
+        )
 
     @quick_jit
     def every(s, direction, state):
@@ -340,7 +403,9 @@ def slopes():
 def test_derivatives_of_period_and_precession_are_differences(name, slopes):
     state = start(name)
     direction = np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])
-    if name == "plane pendulum" or name in AT_THE_VERTICAL:  # stay in the plane, or at the vertical
+    if (
+        name == "plane pendulum" or name in AT_THE_VERTICAL
+    ):  # stay in the plane, or at the vertical
         moves = not name.startswith("plane") and state.omega[0] == 0
         direction[3:] = [0.0, 0.0, 0.4] if moves else [0.4, 0.0, 0.0]
 
@@ -359,16 +424,23 @@ def test_small_swings_keep_their_relative_size():
     for small in (1e-3, 1e-7, 1e-12):
         attitude = np.array([np.sin(small / 2), np.cos(small / 2), 0, 0])
         bounds = nutation(TOP, jr.State(attitude, np.zeros(3))).bounds
-        assert np.pi - bounds.theta_min == pytest.approx(small, rel=1e-12 + 5e-16 / small)
+        assert np.pi - bounds.theta_min == pytest.approx(
+            small, rel=1e-12 + 5e-16 / small
+        )
         bounds = nutation(TOP, top.initial_state(TOP, small, omega3=6.0)).bounds
         # theta_max^2 / theta_min^2 = spin^2 / (spin^2 - 4 mgl I1 / I3^2)
-        assert bounds.theta_max / bounds.theta_min == pytest.approx((36 / 20) ** 0.5, rel=1e-6)
+        assert bounds.theta_max / bounds.theta_min == pytest.approx(
+            (36 / 20) ** 0.5, rel=1e-6
+        )
 
 
 def test_the_endless_motion_comes_to_the_vertical_at_its_rate():
     for mgl, sign in ((1.0, 1.0), (-1.0, -1.0)):
         attitude = np.array([1.0, 0, 0, 0]) if mgl > 0 else np.array([0.0, 1, 0, 0])
-        one, state = jr.SymmetricTop(1.0, 0.5, mgl), jr.State(attitude, np.array([0, 0, 2.0]))
+        one, state = (
+            jr.SymmetricTop(1.0, 0.5, mgl),
+            jr.State(attitude, np.array([0, 0, 2.0])),
+        )
         assert nutation(one, state).period == np.inf
         assert nutation(one, state).precession == pytest.approx(sign * 0.5)
 
@@ -419,7 +491,8 @@ def test_no_nan_in_any_derivative_at_the_special_motions(name, mgl, special):
         assert np.all(np.isfinite(found))
 
 
-# --- Special motions ----------------------------------------------------------------------------
+# --- Special motions
+# ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("branch", ["slow", "fast"])
@@ -448,11 +521,15 @@ def test_when_steady_precession_exists():
     np.testing.assert_allclose(at_least.slow, at_least.fast, rtol=1e-7)
     assert top.steady_precession(TOP, 2.0, 0.0).exists
     for mgl in (1.0, -1.0):
-        assert not top.steady_precession(jr.SymmetricTop(1.0, 0.5, mgl), np.pi / 2, 0.0).exists
+        assert not top.steady_precession(
+            jr.SymmetricTop(1.0, 0.5, mgl), np.pi / 2, 0.0
+        ).exists
     level = top.steady_precession(TOP, np.pi / 2, 5.0)
     assert level.slow == pytest.approx(1 / (0.5 * 5.0))
     assert level.fast == np.inf
-    with pytest.raises(RuntimeError, match=r"`omega3` must be large enough for steady.*: 1\.0"):
+    with pytest.raises(
+        RuntimeError, match=r"`omega3` must be large enough for steady.*: 1\.0"
+    ):
         top.initial_state(TOP, theta, omega3=1.0, phi_dot="slow")
     with pytest.raises(RuntimeError, match="`psi_dot` must be large enough for steady"):
         top.initial_state(TOP, theta, psi_dot=1.0, phi_dot="slow")
@@ -469,7 +546,9 @@ def test_when_steady_precession_exists():
     )
 
 
-@pytest.mark.parametrize(("factor", "least", "most"), [(0.999, 5.12, 5.13), (1.001, 1e-4, 5e-3)])
+@pytest.mark.parametrize(
+    ("factor", "least", "most"), [(0.999, 5.12, 5.13), (1.001, 1e-4, 5e-3)]
+)
 def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least, most):
     """Started at a tilt of 1e-6: below, the largest tilt is arccos(2 0.999^2 - 1) = 5.125 deg."""
     spin = factor * float(top.sleeping_spin(TOP))
@@ -478,7 +557,9 @@ def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least
     largest = np.degrees(nutation(TOP, state).bounds.theta_max)
     assert least < largest < most
     if factor < 1:
-        assert largest == pytest.approx(np.degrees(np.arccos(2 * factor**2 - 1)), rel=1e-6)
+        assert largest == pytest.approx(
+            np.degrees(np.arccos(2 * factor**2 - 1)), rel=1e-6
+        )
     times = np.linspace(0.0, 2 * float(nutation(TOP, state).period), 4001)
     motion = np.asarray(jr.top_motion(TOP, state, times).attitude)
     reached = np.degrees(2 * np.arcsin(np.hypot(motion[:, 1], motion[:, 2]).max()))
@@ -505,7 +586,9 @@ def test_gyroscopic_approximation_becomes_exact():
 
 
 def test_starts_mean_what_they_say(untyped):
-    state = top.initial_state(TOP, 0.7, psi_dot=4.0, phi_dot=0.3, theta_dot=-0.2, phi=0.5, psi=1.1)
+    state = top.initial_state(
+        TOP, 0.7, psi_dot=4.0, phi_dot=0.3, theta_dot=-0.2, phi=0.5, psi=1.1
+    )
     angles = angles_of(state)
     np.testing.assert_allclose(angles, [0.5, 0.7, 1.1], atol=1e-14)
     rates = rotation.omega_to_euler_rates(angles, state.omega)
@@ -518,7 +601,9 @@ def test_starts_mean_what_they_say(untyped):
     with pytest.raises(ValueError, match="must be one of 'slow', 'fast'"):
         top.initial_state(TOP, 0.7, omega3=5.0, phi_dot="quick")
     for name in ("psi_dot", "omega3", "phi_dot", "theta_dot", "phi", "psi"):
-        with pytest.raises(RuntimeError, match=f"`{name}` must be finite, but it is not: inf"):
+        with pytest.raises(
+            RuntimeError, match=f"`{name}` must be finite, but it is not: inf"
+        ):
             top.initial_state(TOP, 0.7, **{name: np.inf})
     with pytest.raises(
         RuntimeError, match=r"`top` must have I1 > 0, .* not: \[ 1\. +-0\.5 +1\. \]"
@@ -528,13 +613,17 @@ def test_starts_mean_what_they_say(untyped):
 
 @pytest.mark.parametrize("theta", [30.0, -0.1, 3.2, np.nan, np.inf])
 def test_a_tilt_beyond_half_a_turn_is_an_error_that_says_radians(theta):
-    with pytest.raises(RuntimeError, match=f"`theta` must be from 0 to pi.*: {theta}.*radians"):
+    with pytest.raises(
+        RuntimeError, match=f"`theta` must be from 0 to pi.*: {theta}.*radians"
+    ):
         top.initial_state(TOP, theta)
     with pytest.raises(RuntimeError, match="in lane 1"):
         jax.vmap(lambda x: top.initial_state(TOP, x))(jnp.array([0.5, theta, 0.6]))
 
     def heights(tilts, omega3):
-        states = jax.vmap(lambda x: top.initial_state(TOP, x, omega3=omega3, throw=False))(tilts)
+        states = jax.vmap(
+            lambda x: top.initial_state(TOP, x, omega3=omega3, throw=False)
+        )(tilts)
         first = states.attitude[:, 0] * states.omega[:, 2]
         return jnp.sum(jnp.where(jnp.isnan(first), 0.0, first)), states
 
@@ -546,7 +635,13 @@ def test_a_tilt_beyond_half_a_turn_is_an_error_that_says_radians(theta):
 
 
 def test_tilts_of_the_vertical_pass_in_either_precision():
-    for theta in (0.0, np.pi, np.float32(np.pi), float(np.float32(np.pi)), np.radians(180)):
+    for theta in (
+        0.0,
+        np.pi,
+        np.float32(np.pi),
+        float(np.float32(np.pi)),
+        np.radians(180),
+    ):
         assert np.all(np.isfinite(top.initial_state(TOP, theta).attitude))
 
 
@@ -563,17 +658,23 @@ def test_a_top_from_mass_properties():
     np.testing.assert_allclose(held.mgl, 9.8 * (0.3 * 0.08 + 0.1 * 0.1), rtol=1e-14)
     for lever, pull in ((-body.center_of_mass, down), (body.center_of_mass, -down)):
         below = jr.SymmetricTop.from_mass_properties(body, lever, pull)
-        np.testing.assert_allclose([below.I1, below.mgl], [held.I1, -held.mgl], rtol=1e-14)
+        np.testing.assert_allclose(
+            [below.I1, below.mgl], [held.I1, -held.mgl], rtol=1e-14
+        )
     on_earth = jr.SymmetricTop.from_mass_properties(body, body.center_of_mass)
     np.testing.assert_allclose(on_earth.mgl / held.mgl, 9.80665 / 9.8, rtol=1e-14)
-    with pytest.raises(RuntimeError, match=r"`lever` must lie along body axis 3.*: \[0\.01 0\. "):
+    with pytest.raises(
+        RuntimeError, match=r"`lever` must lie along body axis 3.*: \[0\.01 0\. "
+    ):
         jr.SymmetricTop.from_mass_properties(body, np.array([0.01, 0.0, 0.1]))
     with pytest.raises(RuntimeError, match="`gravity` must lie along z in space"):
         jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, down + 0.1)
     with pytest.raises(RuntimeError, match=r"`gravity` must lie along z in space.*nan"):
         jr.SymmetricTop.from_mass_properties(body, body.center_of_mass, down * np.nan)
     box = jr.solids.box(1.0, np.array([1.0, 2.0, 3.0]))
-    with pytest.raises(RuntimeError, match=r"`body` .* symmetric about its axis 3.*: \[1\.08"):
+    with pytest.raises(
+        RuntimeError, match=r"`body` .* symmetric about its axis 3.*: \[1\.08"
+    ):
         jr.SymmetricTop.from_mass_properties(box, np.array([0.0, 0.0, 1.5]))
 
 
@@ -582,7 +683,9 @@ def test_a_bad_lever_is_nan_in_its_lane_alone():
 
     def weights(mass_scale, levers):
         def one(lever):
-            scaled = jr.MassProperties(body.mass * mass_scale, np.zeros(3), body.inertia)
+            scaled = jr.MassProperties(
+                body.mass * mass_scale, np.zeros(3), body.inertia
+            )
             return jr.SymmetricTop.from_mass_properties(scaled, lever, throw=False).mgl
 
         mgl = jax.vmap(one)(levers)
@@ -599,8 +702,12 @@ def test_a_cone_on_its_tip_is_the_top_of_the_example():
     radius, height = 0.03, 0.08
     cone = jr.solids.cone(0.5, radius, height)
     tip_down = cone.rotated(rotation.exp(np.array([np.pi, 0.0, 0.0])))
-    one = jr.SymmetricTop.from_mass_properties(tip_down, np.array([0.0, 0.0, 0.75 * height]))
-    np.testing.assert_allclose(one.I1, 3 * 0.5 * (radius**2 + 4 * height**2) / 20, rtol=1e-14)
+    one = jr.SymmetricTop.from_mass_properties(
+        tip_down, np.array([0.0, 0.0, 0.75 * height])
+    )
+    np.testing.assert_allclose(
+        one.I1, 3 * 0.5 * (radius**2 + 4 * height**2) / 20, rtol=1e-14
+    )
     np.testing.assert_allclose(one.I3, 3 * 0.5 * radius**2 / 10, rtol=1e-14)
     # The mean height of its points above the pivot, from those of the solid.
     zs = (np.arange(1000) + 0.5) / 1000 * height
@@ -614,11 +721,14 @@ def test_a_top_prints_its_numbers():
     assert repr(slope) == "SymmetricTop(I1=2., I3=-8., mgl=2.)"
 
 
-# --- Other integrable bodies --------------------------------------------------------------------
+# --- Other integrable bodies
+# --------------------------------------------------------------------
 
 
 def heavy(moments, lever):
-    gravity = jr.torques.UniformGravity(1.0, np.array(lever), np.array([0.0, 0.0, -1.0]))
+    gravity = jr.torques.UniformGravity(
+        1.0, np.array(lever), np.array([0.0, 0.0, -1.0])
+    )
     return jr.RigidBody(np.array(moments), gravity)
 
 
@@ -663,10 +773,14 @@ def long_motions(turns=100):
     def run(moments, lever, attitude, omega, ts):
         gravity = jr.torques.UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
         body = jr.RigidBody(moments, gravity)
-        return jr.simulate(body, jr.State(attitude, omega), ts, rtol=1e-13, max_step=0.05).states
+        return jr.simulate(
+            body, jr.State(attitude, omega), ts, rtol=1e-13, max_step=0.05
+        ).states
 
     attitudes = [*[ATTITUDE] * len(INTEGRABLE), FROM_BENCHMARK, TILTED]
-    ends = [turns * 2 * np.pi / np.linalg.norm(omega) for _, omega in INTEGRABLE.values()]
+    ends = [
+        turns * 2 * np.pi / np.linalg.norm(omega) for _, omega in INTEGRABLE.values()
+    ]
     lanes = (
         np.stack([body.inertia for body, _ in LONG.values()]),
         np.stack([body.torque.lever for body, _ in LONG.values()]),
@@ -675,7 +789,9 @@ def long_motions(turns=100):
         np.linspace(0.0, [*ends, 2.0, 10.0], 101, axis=1),
     )
     states = jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(*lanes))
-    return {name: jax.tree.map(lambda x, k=k: x[k], states) for k, name in enumerate(LONG)}
+    return {
+        name: jax.tree.map(lambda x, k=k: x[k], states) for k, name in enumerate(LONG)
+    }
 
 
 @pytest.mark.parametrize("turns", [100, pytest.param(1000, marks=pytest.mark.slow)])
@@ -684,15 +800,25 @@ def test_extra_integrals_are_constant_to_1e_12(case, turns):
     body, _ = INTEGRABLE[case]
     integrals = quick_jit(jax.vmap(lambda s: top.integrals(body, s, case)))
     for values in map(np.asarray, integrals(long_motions(turns)[case])):
-        assert np.max(np.abs(values - values[0])) < 1e-12 * max(1.0, abs(float(values[0])))
+        assert np.max(np.abs(values - values[0])) < 1e-12 * max(
+            1.0, abs(float(values[0]))
+        )
 
 
 def test_the_extra_integral_s_rate_is_zero_for_generic_bodies_of_the_case(rng):
     """By the chain rule along the vector field: no integration."""
-    for case, ratio in (("kovalevskaya", 2.0), ("goryachev-chaplygin", 4.0), ("lagrange", None)):
+    for case, ratio in (
+        ("kovalevskaya", 2.0),
+        ("goryachev-chaplygin", 4.0),
+        ("lagrange", None),
+    ):
         i3 = rng.uniform(0.5, 2)
         i1 = rng.uniform(0.5, 2) if ratio is None else ratio * i3
-        lever = np.array([0, 0, 0.7]) if ratio is None else np.array([*rng.normal(size=2), 0])
+        lever = (
+            np.array([0, 0, 0.7])
+            if ratio is None
+            else np.array([*rng.normal(size=2), 0])
+        )
         pull = rng.normal(size=3)
         gravity = jr.torques.UniformGravity(1.7, lever, pull)
         body = jr.RigidBody(np.array([i1, i1, i3]), gravity)
@@ -700,21 +826,30 @@ def test_the_extra_integral_s_rate_is_zero_for_generic_bodies_of_the_case(rng):
         q /= np.linalg.norm(q)
         omega = rng.normal(size=3)
         if case == "goryachev-chaplygin":
-            up = -Rotation.from_quat(q, scalar_first=True).inv().apply(pull) / np.linalg.norm(pull)
+            up = -Rotation.from_quat(q, scalar_first=True).inv().apply(
+                pull
+            ) / np.linalg.norm(pull)
             momentum = np.asarray(body.inertia) * omega
             omega = (momentum - (momentum @ up) * up) / np.asarray(body.inertia)
         state = jr.State(q, omega)
         rate = body.vector_field(0.0, state, None)
         values, slopes = jax.jvp(
-            lambda s, body=body, case=case: top.integrals(body, s, case), (state,), (rate,)
+            lambda s, body=body, case=case: top.integrals(body, s, case),
+            (state,),
+            (rate,),
         )
         assert np.max(np.abs(jax.tree.leaves(slopes))) < 1e-13
-        assert values.energy == pytest.approx(float(body.energy(0.0, state, None)), rel=1e-13)
-        # Of a body that is not of the case, though the check lets it pass, it is not a constant.
+        assert values.energy == pytest.approx(
+            float(body.energy(0.0, state, None)), rel=1e-13
+        )
+        # Of a body that is not of the case, though the check lets it pass, it is not a
+        # constant.
         nearly = jr.RigidBody(np.array([i1 * (1 + 1e-8), i1, i3]), gravity)
         rate = nearly.vector_field(0.0, state, None)
         _, moved = jax.jvp(
-            lambda s, body=nearly, case=case: top.integrals(body, s, case), (state,), (rate,)
+            lambda s, body=nearly, case=case: top.integrals(body, s, case),
+            (state,),
+            (rate,),
         )
         assert abs(moved.extra) > 1e-11
 
@@ -745,7 +880,9 @@ def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
 
     def total(mass, moments, attitude, pull):
         gravity = jr.torques.UniformGravity(mass, body.torque.lever, pull)
-        values = top.integrals(jr.RigidBody(moments, gravity), jr.State(attitude, omega), case)
+        values = top.integrals(
+            jr.RigidBody(moments, gravity), jr.State(attitude, omega), case
+        )
         return sum(jnp.where(jnp.isnan(x), 0.0, x) for x in values), values
 
     @quick_jit
@@ -759,11 +896,16 @@ def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
     moments, down = body.inertia, np.array([0.0, 0.0, -1.0])
     good = moments, ATTITUDE, down
     bad = [
-        (-moments, ATTITUDE, down), (moments * np.nan, ATTITUDE, down),
-        (moments, 2 * ATTITUDE, down), (moments, ATTITUDE * np.nan, down),
-        (moments, ATTITUDE, down * np.nan), (moments, ATTITUDE, np.array([np.inf, 0.0, 0.0])),
-    ]  # fmt: skip
-    (_, values), slope = lanes(1.0, *(jnp.stack(x) for x in zip(good, *bad, good, strict=True)))
+        (-moments, ATTITUDE, down),
+        (moments * np.nan, ATTITUDE, down),
+        (moments, 2 * ATTITUDE, down),
+        (moments, ATTITUDE * np.nan, down),
+        (moments, ATTITUDE, down * np.nan),
+        (moments, ATTITUDE, np.array([np.inf, 0.0, 0.0])),
+    ]
+    (_, values), slope = lanes(
+        1.0, *(jnp.stack(x) for x in zip(good, *bad, good, strict=True))
+    )
     for value in values:
         assert list(np.isnan(value)) == [False, *(True for _ in bad), False]
     _, alone = lanes(1.0, *(jnp.stack([x] * (2 + len(bad))) for x in good))
@@ -771,25 +913,44 @@ def test_integrals_outside_their_domain_are_nan_in_their_lane_alone(case):
     assert np.all(np.isnan(total(-1.0, *good)[1]))
 
 
-# --- Printed numbers ----------------------------------------------------------------------------
+# --- Printed numbers
+# ----------------------------------------------------------------------------
 
 
 def test_bruls_cardona_heavy_top_in_closed_form():
     """See tests/test_published.py: symmetric about body axis 2, which is axis 3 here.
 
-    At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own error is
-    1.2e-7 m; at 0.03 s and 0.2 s the five digits of EXUDYN.
+    At 1 s and 2 s against the reference solution of github.com/kynema/kynema, whose own
+    error is 1.2e-7 m; at 0.03 s and 0.2 s the five digits of EXUDYN.
     """
     bruls = jr.SymmetricTop(15.234375, 0.46875, 15.0 * 9.81)
     p = FROM_BENCHMARK
     state0 = jr.State(p, np.array([-4.61538, 0.0, 150.0]))
     motion = jr.top_motion(bruls, state0, np.array([0.03, 0.2, 1.0, 2.0]))
-    attitudes = jax.vmap(lambda q: rotation.multiply(q, rotation.conjugate(p)))(motion.attitude)
+    attitudes = jax.vmap(lambda q: rotation.multiply(q, rotation.conjugate(p)))(
+        motion.attitude
+    )
     printed = [
         ([-0.62679, 0.057939, 0.77611, 0.037845], 5e-6),
         ([-0.70828, 0.43878, 0.54573, 0.0894], 5e-6),
-        ([0.7329439942283007, -0.2782856278135421, 0.5318246439927058, -0.3201761370231893], 5e-7),
-        ([0.1229471344095339, -0.4910798717314375, 0.3504301068655838, -0.7879868665928781], 5e-7),
+        (
+            [
+                0.7329439942283007,
+                -0.2782856278135421,
+                0.5318246439927058,
+                -0.3201761370231893,
+            ],
+            5e-7,
+        ),
+        (
+            [
+                0.1229471344095339,
+                -0.4910798717314375,
+                0.3504301068655838,
+                -0.7879868665928781,
+            ],
+            5e-7,
+        ),
     ]
     for found, (quaternion, digit) in zip(np.asarray(attitudes), printed, strict=True):
         found = found * np.sign(found @ np.array(quaternion))
@@ -814,29 +975,39 @@ def test_simo_wong_heavy_top_in_closed_form():
     states = jr.top_motion(simo, state0, times)
     energies = jax.vmap(lambda s: top.conserved(simo, s).energy)(states.states)
     np.testing.assert_allclose(energies, keeps.energy, rtol=1e-14)
-    assert np.cos(nutation(simo, state0).bounds.theta_min) == pytest.approx(0.99875, abs=5e-6)
-    np.testing.assert_allclose(states.attitude, long_motions()["simo"].attitude, atol=1e-9)
+    assert np.cos(nutation(simo, state0).bounds.theta_min) == pytest.approx(
+        0.99875, abs=5e-6
+    )
+    np.testing.assert_allclose(
+        states.attitude, long_motions()["simo"].attitude, atol=1e-9
+    )
     with mp.workdps(25):
         _, _, period, phi, _ = quadratures(simo, state0)
     assert nutation(simo, state0).period == pytest.approx(float(period), rel=1e-12)
-    assert nutation(simo, state0).precession == pytest.approx(float(phi / period), rel=1e-11)
+    assert nutation(simo, state0).precession == pytest.approx(
+        float(phi / period), rel=1e-11
+    )
 
 
 def test_curtis_example_11_15():
     """Steady precession of a top at 60 degrees and 1000 rpm: 51.93 rpm as printed.
 
-    H. D. Curtis, Orbital Mechanics for Engineering Students, 4th ed., example 11.15: moments 12e-4
-    and 4.5e-4 kg m^2 about the fixed point, 0.5 kg at 5 cm, g = 9.807 m/s^2.
+    H. D. Curtis, Orbital Mechanics for Engineering Students, 4th ed., example 11.15:
+    moments 12e-4 and 4.5e-4 kg m^2 about the fixed point, 0.5 kg at 5 cm, g = 9.807
+    m/s^2.
     """
     curtis = jr.SymmetricTop(12e-4, 4.5e-4, 0.5 * 9.807 * 0.05)
     rpm = 2 * np.pi / 60
     rates = top.steady_precession(curtis, np.radians(60), psi_dot=1000 * rpm)
     assert rates.slow / rpm == pytest.approx(51.93, abs=0.005)
-    state = top.initial_state(curtis, np.radians(60), psi_dot=1000 * rpm, phi_dot="slow")
+    state = top.initial_state(
+        curtis, np.radians(60), psi_dot=1000 * rpm, phi_dot="slow"
+    )
     assert nutation(curtis, state).precession / rpm == pytest.approx(51.93, abs=0.005)
 
 
-# --- Bad input ----------------------------------------------------------------------------------
+# --- Bad input
+# ----------------------------------------------------------------------------------
 
 
 FORMULAS = {
@@ -845,26 +1016,34 @@ FORMULAS = {
     "nutation_period": top.nutation_period,
     "mean_precession": top.mean_precession,
     "advance_per_nutation": top.advance_per_nutation,
-    "cubic": lambda one, s: top.cubic(one, top.Conserved(s.omega[2], 2.0, s.attitude[0])),
+    "cubic": lambda one, s: top.cubic(
+        one, top.Conserved(s.omega[2], 2.0, s.attitude[0])
+    ),
     "angle_rates": lambda one, s: top.angle_rates(one, s.attitude[0], s.omega[2], 2.0),
     "effective_potential": lambda one, s: top.effective_potential(
         one, jnp.stack([s.attitude[0], s.attitude[0]]), s.omega[2], 2.0
     ),
-    "steady_precession": lambda one, s: top.steady_precession(one, s.attitude[0], s.omega[2])[:2],
+    "steady_precession": lambda one, s: top.steady_precession(
+        one, s.attitude[0], s.omega[2]
+    )[:2],
     "gyroscopic": lambda one, s: top.gyroscopic(one, s.attitude[0], s.omega[2]),
     "sleeping_spin": lambda one, _: top.sleeping_spin(one),
 }
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_alone(name):
+def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_alone(
+    name,
+):
     """Bad tops, then bad states; the slopes of what all lanes share are those of the good ones."""
     state = start("wave", psi=0.3, theta_dot=0.1)
 
     def total(shared, i1, attitudes, omegas):
         def one(i1, attitude, omega):
             own = jr.SymmetricTop(i1 + shared[0], 0.5 + shared[1], 1 + shared[2])
-            return FORMULAS[name](own, jr.State(attitude + shared[3], omega + shared[4]))
+            return FORMULAS[name](
+                own, jr.State(attitude + shared[3], omega + shared[4])
+            )
 
         values = jax.tree.leaves(jax.vmap(one)(i1, attitudes, omegas))
         return sum(jnp.sum(jnp.where(jnp.isnan(x), 0.0, x)) for x in values), values
@@ -878,12 +1057,17 @@ def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_
     outside = ~(i1 < 2) | (i1 < 0) | (bad & (name != "sleeping_spin"))
     for value in values:
         isnan = np.isnan(value).reshape(8, -1)
-        np.testing.assert_array_equal(isnan, np.broadcast_to(outside[:, None], isnan.shape))
+        np.testing.assert_array_equal(
+            isnan, np.broadcast_to(outside[:, None], isnan.shape)
+        )
     tame = np.flatnonzero(~outside)
     assert np.all(np.isfinite(slopes[0]))
     assert np.all(np.asarray(slopes[1])[outside] == 0)
     alone = sum(
-        both(jnp.zeros(5), *(np.stack([x[k]] * 8) for x in (i1, attitudes, omegas)))[1][0] / 8
+        both(jnp.zeros(5), *(np.stack([x[k]] * 8) for x in (i1, attitudes, omegas)))[1][
+            0
+        ]
+        / 8
         for k in tame
     )
     np.testing.assert_allclose(slopes[0], alone, rtol=1e-12, atol=1e-12)
@@ -914,7 +1098,9 @@ def test_an_attitude_that_is_none_is_outside_of_every_formula(attitude):
 
 def test_kinds_of_bad_lanes_are_undefined():
     i1 = jnp.array([1.0, -1.0, np.nan])
-    kinds = jax.vmap(lambda x: top.motion_class(jr.SymmetricTop(x, 0.5, 1.0), start("wave")))(i1)
+    kinds = jax.vmap(
+        lambda x: top.motion_class(jr.SymmetricTop(x, 0.5, 1.0), start("wave"))
+    )(i1)
     np.testing.assert_array_equal(kinds == top.CLASSES.undefined, [False, True, True])
     np.testing.assert_array_equal(kinds == top.CLASSES.wave, [True, False, False])
 
@@ -934,11 +1120,15 @@ def test_no_steady_precession_leaves_shared_slopes_alone():
 
 def test_no_spin_is_nan_of_the_fast_top_alone():
     def total(i3, spins):
-        fast = jax.vmap(lambda w: top.gyroscopic(jr.SymmetricTop(1.0, i3, 1.0), 0.7, w))(spins)
+        fast = jax.vmap(
+            lambda w: top.gyroscopic(jr.SymmetricTop(1.0, i3, 1.0), 0.7, w)
+        )(spins)
         return sum(jnp.nansum(x) for x in fast)
 
     slope = jax.grad(total)(0.5, jnp.array([6.0, 0.0, 7.0]))
-    np.testing.assert_allclose(slope, jax.grad(total)(0.5, jnp.array([6.0, 7.0])), rtol=1e-13)
+    np.testing.assert_allclose(
+        slope, jax.grad(total)(0.5, jnp.array([6.0, 7.0])), rtol=1e-13
+    )
 
 
 def test_special_motions_outside_their_domain():
@@ -951,7 +1141,10 @@ def test_special_motions_outside_their_domain():
     with pytest.raises(ValueError, match="must be given, and one only"):
         top.steady_precession(TOP, 0.5)
     assert top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, -1.0)) == 0
-    assert float(jax.grad(lambda m: top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, m)))(-1.0)) == 0
+    assert (
+        float(jax.grad(lambda m: top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, m)))(-1.0))
+        == 0
+    )
     assert top.sleeping_spin(TOP) == pytest.approx(4.0, abs=ulps(float, 4))
 
 
@@ -959,17 +1152,31 @@ def test_special_motions_outside_their_domain():
     ("call", "message"),
     [
         (lambda: top.sleeping_spin(np.ones(3)), "`top` must be a SymmetricTop"),
-        (lambda: top.conserved(np.ones(3), start("wave")), "`top` must be a SymmetricTop"),
+        (
+            lambda: top.conserved(np.ones(3), start("wave")),
+            "`top` must be a SymmetricTop",
+        ),
         (lambda: top.conserved(TOP, np.ones(7)), "`state` must be a State"),
         (lambda: top.gyroscopic(TOP, np.ones(2), 1.0), "`theta` must have shape"),
-        (lambda: top.steady_precession(TOP, 0.5, psi_dot=np.ones(2)), "`psi_dot` must have shape"),
+        (
+            lambda: top.steady_precession(TOP, 0.5, psi_dot=np.ones(2)),
+            "`psi_dot` must have shape",
+        ),
         (lambda: top.angle_rates(TOP, 0.5, np.ones(2), 1.0), "`p_phi` must have shape"),
-        (lambda: top.effective_potential(TOP, 0.5, 1.0, np.ones(2)), "`p_psi` must have shape"),
-        (lambda: top.cubic(TOP, top.Conserved(1.0, 2.0, np.ones(2))), "`energy` must have shape"),
+        (
+            lambda: top.effective_potential(TOP, 0.5, 1.0, np.ones(2)),
+            "`p_psi` must have shape",
+        ),
+        (
+            lambda: top.cubic(TOP, top.Conserved(1.0, 2.0, np.ones(2))),
+            "`energy` must have shape",
+        ),
         (lambda: top.initial_state(TOP, np.ones(2)), "`theta` must have shape"),
         (lambda: top.initial_state(np.ones(3), 0.5), "`top` must be a SymmetricTop"),
         (
-            lambda: jr.SymmetricTop.from_mass_properties(jr.solids.disk(1.0, 1.0), np.ones(3), 9.8),
+            lambda: jr.SymmetricTop.from_mass_properties(
+                jr.solids.disk(1.0, 1.0), np.ones(3), 9.8
+            ),
             r"`gravity` must have shape \(3,\)",
         ),
     ],

@@ -39,7 +39,8 @@ POTENTIALS["dipole, field of time"] = tq.MagneticDipole(LEVER, lambda t, _: orbi
 POTENTIALS["both and a drag"] = POTENTIALS["gravity"] + POTENTIALS["gradient, tensor"]
 
 
-# --- torques that are not smooth --------------------------------------------------------------
+# --- torques that are not smooth
+# --------------------------------------------------------------
 
 PUSH = np.array([0.0, 0.0, 1.0])
 TURNING = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, 0.01]))
@@ -87,11 +88,14 @@ def test_jumps_are_collected_from_all_parts_of_a_torque_and_a_force():
     }
     for torque, expected in known.values():
         np.testing.assert_array_equal(jr.RigidBody(MOMENTS, torque).jumps, expected)
-    flying = jr.FloatingBody(jr.solids.sphere(1.0, 0.1), light.force, Pulse(PUSH, ON, OFF))
+    flying = jr.FloatingBody(
+        jr.solids.sphere(1.0, 0.1), light.force, Pulse(PUSH, ON, OFF)
+    )
     np.testing.assert_array_equal(flying.jumps, [ON, OFF, 1.5, 2.5, 4.5])
 
 
-# --- torques that have a potential ------------------------------------------------------------
+# --- torques that have a potential
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", POTENTIALS)
@@ -115,9 +119,13 @@ def test_uniform_gravity_against_numpy():
     r = np.asarray(ro.to_matrix(ATTITUDE))
     gravity = POTENTIALS["gravity"]
     in_space = np.cross(r @ LEVER, 2.0 * GRAVITY)
-    np.testing.assert_allclose(gravity(0.0, STATE, None), r.T @ in_space, atol=ulps(float, 64))
     np.testing.assert_allclose(
-        gravity.potential(0.0, STATE, None), -2.0 * GRAVITY @ (r @ LEVER), rtol=ulps(float, 16)
+        gravity(0.0, STATE, None), r.T @ in_space, atol=ulps(float, 64)
+    )
+    np.testing.assert_allclose(
+        gravity.potential(0.0, STATE, None),
+        -2.0 * GRAVITY @ (r @ LEVER),
+        rtol=ulps(float, 16),
     )
 
 
@@ -139,7 +147,9 @@ def test_gravity_gradient_is_that_of_a_body_of_points(inertia):
         energy += -0.5 * MU * (1 / distance - 1 / np.linalg.norm(center))
     body = tq.GravityGradient(MU, orbit).of_body(size**2 * inertia)
     np.testing.assert_allclose(body(0.7, STATE, None), torque, atol=1e-5 * size**2)
-    np.testing.assert_allclose(body.potential(0.7, STATE, None), energy, atol=1e-5 * size**2)
+    np.testing.assert_allclose(
+        body.potential(0.7, STATE, None), energy, atol=1e-5 * size**2
+    )
 
 
 def test_gravity_gradient_of_the_earth_seen_in_float32():
@@ -173,7 +183,9 @@ def test_a_dipole_against_numpy_in_a_field_of_time_and_place():
     place = np.array([2.0, -1.0, 0.5])
     flying = jr.FloatingState(place, OMEGA, ATTITUDE, OMEGA)
     of_place = tq.MagneticDipole(LEVER, lambda t, s: t * s.position)(0.7, flying, None)
-    np.testing.assert_allclose(of_place, np.cross(LEVER, r.T @ (0.7 * place)), atol=ulps(float, 4))
+    np.testing.assert_allclose(
+        of_place, np.cross(LEVER, r.T @ (0.7 * place)), atol=ulps(float, 4)
+    )
 
 
 def test_a_compass_needle_swings_at_its_frequency():
@@ -181,13 +193,17 @@ def test_a_compass_needle_swings_at_its_frequency():
     moment, field, inertia = 2.0, 3e-5, 0.01
     needle = tq.MagneticDipole(np.array([moment, 0, 0]), np.array([field, 0, 0]))
     body = jr.RigidBody(np.full(3, inertia), needle)
-    rate = lambda e: body.vector_field(0.0, jr.State(ro.exp(e), np.zeros(3)), None).omega  # noqa: E731
+
+    def rate(e):
+        return body.vector_field(0.0, jr.State(ro.exp(e), np.zeros(3)), None).omega
+
     stiffness = jax.jit(jax.jacfwd(rate))(jnp.zeros(3))
     expected = -moment * field / inertia * np.diag([0.0, 1.0, 1.0])
     np.testing.assert_allclose(stiffness, expected, atol=ulps(float, 4) * 6e-3)
 
 
-# --- sunlight -------------------------------------------------------------------------------------
+# --- sunlight
+# -------------------------------------------------------------------------------------
 
 NORMALS = np.array([[0.0, 0.0, 2.0], [0.6, 0.0, -0.8], [0.0, 3.0, 0.0]])
 PLATES = {
@@ -231,19 +247,30 @@ def test_sunlight_pushes_by_the_momentum_it_loses(name):
         **PLATES, sun=lambda t: t * jnp.asarray(SUN), specular=specular, diffuse=diffuse
     )
     lit = set()
-    for q in (ATTITUDE, np.eye(4)[0], np.array([0.0, 0.6, 0.0, -0.8]), np.array([0.6, 0, -0.8, 0])):
+    for q in (
+        ATTITUDE,
+        np.eye(4)[0],
+        np.array([0.0, 0.6, 0.0, -0.8]),
+        np.array([0.6, 0, -0.8, 0]),
+    ):
         r, state = np.asarray(ro.to_matrix(q)), jr.State(q, OMEGA)
         lit.add(tuple(NORMALS @ r.T @ SUN > 0))
         force, moment = momentum_of_light(r.T @ SUN / 3, specular, diffuse)
         for one in (light, of_time):
-            np.testing.assert_allclose(one(0.4, state, None), moment, rtol=0, atol=1e-20)
-            np.testing.assert_allclose(one.force(0.4, state, None), r @ force, rtol=0, atol=1e-20)
+            np.testing.assert_allclose(
+                one(0.4, state, None), moment, rtol=0, atol=1e-20
+            )
+            np.testing.assert_allclose(
+                one.force(0.4, state, None), r @ force, rtol=0, atol=1e-20
+            )
     assert len(lit) >= 3  # plates in the light and in the dark
 
 
 def test_a_sail_in_flight_feels_force_and_torque():
     light = tq.SolarPressure(**PLATES, sun=SUN, specular=0.3)
-    body = jr.FloatingBody(jr.MassProperties(2.0, np.zeros(3), TENSOR), light.force, light)
+    body = jr.FloatingBody(
+        jr.MassProperties(2.0, np.zeros(3), TENSOR), light.force, light
+    )
     place = np.array([2.0, -1.0, 0.5])
     flying = jr.FloatingState(place, OMEGA, ATTITUDE, OMEGA)
     rates = body.vector_field(0.0, flying, None)
@@ -265,9 +292,13 @@ def test_no_light_no_torque_and_clean_derivatives_edge_on():
     def torque_and_derivatives(sun):
         light = tq.SolarPressure(**one, sun=sun, diffuse=0.4)
         torque = lambda e: light(0.0, jr.State(ro.exp(e), OMEGA), None)  # noqa: E731
-        return [f(jnp.zeros(3)) for f in (torque, jax.jacfwd(torque), jax.jacrev(torque))]
+        return [
+            f(jnp.zeros(3)) for f in (torque, jax.jacfwd(torque), jax.jacrev(torque))
+        ]
 
-    for found in torque_and_derivatives(np.array([[0.0, 0, 0], [-1, 0.5, 0], [0, 1, 0]])):
+    for found in torque_and_derivatives(
+        np.array([[0.0, 0, 0], [-1, 0.5, 0], [0, 1, 0]])
+    ):
         assert np.all(np.asarray(found) == 0)
     eclipse = lambda t: jnp.where(t > 1, 0.0, 1.0) * jnp.asarray(SUN)  # noqa: E731
     dark = tq.SolarPressure(**PLATES, sun=eclipse)
@@ -275,9 +306,14 @@ def test_no_light_no_torque_and_clean_derivatives_edge_on():
     assert np.any(np.asarray(dark(0.0, upright, None)) != 0)
 
 
-# --- drag -------------------------------------------------------------------------------------
+# --- drag
+# -------------------------------------------------------------------------------------
 
-COEFFICIENTS = {"number": 0.3, "axes": np.array([0.1, 0.2, 0.4]), "tensor": 0.1 * TENSOR}
+COEFFICIENTS = {
+    "number": 0.3,
+    "axes": np.array([0.1, 0.2, 0.4]),
+    "tensor": 0.1 * TENSOR,
+}
 
 
 @pytest.mark.parametrize("name", COEFFICIENTS)
@@ -285,7 +321,9 @@ def test_drag_against_numpy(name):
     coefficient = COEFFICIENTS[name]
     matrix = coefficient * np.eye(3) if np.ndim(coefficient) < 2 else coefficient
     linear, quadratic = tq.LinearDrag(coefficient), tq.QuadraticDrag(coefficient)
-    np.testing.assert_allclose(linear(0.0, STATE, None), -matrix @ OMEGA, atol=ulps(float, 2))
+    np.testing.assert_allclose(
+        linear(0.0, STATE, None), -matrix @ OMEGA, atol=ulps(float, 2)
+    )
     np.testing.assert_allclose(
         quadratic(0.0, STATE, None),
         -np.linalg.norm(OMEGA) * matrix @ OMEGA,
@@ -307,14 +345,21 @@ def runs():
     @jax.jit
     @jax.vmap
     def lanes(moments, linear, quadratic, friction, momentum, state0, ts, rtol):
-        torque = tq.LinearDrag(linear) + tq.QuadraticDrag(quadratic) + tq.Rotor(momentum)
+        torque = (
+            tq.LinearDrag(linear) + tq.QuadraticDrag(quadratic) + tq.Rotor(momentum)
+        )
         torque += tq.CoulombFriction(friction, FRICTION["width"], FRICTION_AXIS)
         run = jr.simulate(jr.RigidBody(moments, torque), state0, ts, rtol=rtol)
         return run.states, run.stats["num_steps"], run.energy, run.angular_momentum
 
     spheres, rest = np.full((2, 3), 0.8), np.full(3, FRICTION["moment"])
     stop = FRICTION["moment"] * FRICTION["start"] / FRICTION["coefficient"]  # 10 s
-    states = [STATE, STATE, jr.State(np.eye(4)[0], FRICTION["start"] * FRICTION_AXIS), STATE]
+    states = [
+        STATE,
+        STATE,
+        jr.State(np.eye(4)[0], FRICTION["start"] * FRICTION_AXIS),
+        STATE,
+    ]
     zero, fall = np.zeros(6), np.array([0.3, 0.7, 0.95, 0.999, 2.0, 3.0]) * stop
     found = lanes(
         np.stack([*spheres, rest, MOMENTS]),
@@ -328,7 +373,9 @@ def runs():
     )
     names = ("linear", "quadratic", "friction", "gyrostat")
     found = jax.tree.map(np.asarray, found)
-    return {name: jax.tree.map(lambda x, k=k: x[k], found) for k, name in enumerate(names)}
+    return {
+        name: jax.tree.map(lambda x, k=k: x[k], found) for k, name in enumerate(names)
+    }
 
 
 def test_a_sphere_slows_down_as_linear_and_quadratic_drag_say(runs):
@@ -339,12 +386,17 @@ def test_a_sphere_slows_down_as_linear_and_quadratic_drag_say(runs):
     exact = OMEGA * np.exp(-c * ts / moment)[:, None]
     np.testing.assert_allclose(slow, exact, rtol=1e-9)
     rate = np.linalg.norm(OMEGA)
-    np.testing.assert_allclose(slower, OMEGA / (1 + c * rate * ts / moment)[:, None], rtol=1e-9)
+    np.testing.assert_allclose(
+        slower, OMEGA / (1 + c * rate * ts / moment)[:, None], rtol=1e-9
+    )
 
 
 def test_quadratic_drag_at_rest_has_value_and_gradient_zero():
     for coefficient in COEFFICIENTS.values():
-        drag = lambda w, c=coefficient: tq.QuadraticDrag(c)(0.0, jr.State(ATTITUDE, w), None)  # noqa: E731
+
+        def drag(w, c=coefficient):
+            return tq.QuadraticDrag(c)(0.0, jr.State(ATTITUDE, w), None)
+
         for derivative in (jax.jacfwd, jax.jacrev):
             both = quick_jit(lambda w, f=drag, d=derivative: (f(w), d(f)(w)))
             value, jacobian = both(jnp.zeros(3))
@@ -363,11 +415,15 @@ def test_friction_is_of_one_size_and_linear_below_its_width(dtype):
     close = {"rtol": 2e-6}  # the width over the speed, squared
     np.testing.assert_allclose(joint(0.0, state(omega), None), -0.3 * fast, **close)
     turning = np.sign(unit @ omega)
-    np.testing.assert_allclose(bearing(0.0, state(omega), None), -0.3 * turning * unit, **close)
+    np.testing.assert_allclose(
+        bearing(0.0, state(omega), None), -0.3 * turning * unit, **close
+    )
     at_width = np.linalg.norm(joint(0.0, state(1e-3 * fast), None))
     np.testing.assert_allclose(at_width, 0.3 / np.sqrt(2), rtol=ulps(dtype, 8))
     across = np.cross(unit, omega)  # turning about another axis is free
-    np.testing.assert_allclose(bearing(0.0, state(across), None), np.zeros(3), atol=2e-5)
+    np.testing.assert_allclose(
+        bearing(0.0, state(across), None), np.zeros(3), atol=2e-5
+    )
     for friction, slope in ((joint, np.eye(3)), (bearing, np.outer(unit, unit))):
         torque = lambda w, f=friction: f(0.0, jr.State(ATTITUDE.astype(dtype), w), None)  # noqa: E731
         for derivative in (jax.jacfwd, jax.jacrev):
@@ -389,18 +445,23 @@ def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps(runs):
     fall = lambda w: np.hypot(w, width) - width * np.arcsinh(width / w)  # noqa: E731
     for t, omega in zip(ts[:4], states.omega, strict=False):
         exact = scipy.optimize.brentq(
-            lambda w, t=t: fall(w) - fall(start) + c * t / moment, 1e-12, start, xtol=1e-14
+            lambda w, t=t: fall(w) - fall(start) + c * t / moment,
+            1e-12,
+            start,
+            xtol=1e-14,
         )
         np.testing.assert_allclose(omega, exact * axis, atol=1e-8)
     assert np.linalg.norm(states.omega[4:]) < 1e-9
-    # the energy went into heat, and the angle is that of a constant torque, to the width
+    # the energy went into heat, and the angle is that of a constant torque, to the
+    # width
     assert np.all(np.diff(energy[:5]) < 0)
     angle = start**2 * moment / (2 * c)
     turned = ro.angle_between(states.attitude[-1], ro.from_axis_angle(axis, angle))
     assert turned < 1e-4
 
 
-# --- sums and states of internal parts --------------------------------------------------------
+# --- sums and states of internal parts
+# --------------------------------------------------------
 
 WHEEL = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]))
 DAMPER, SLOSH = tq.InternalDamper(0.2, 0.05), tq.InternalDamper(0.4, 0.02)
@@ -411,16 +472,26 @@ def test_torques_add_with_plus_and_sum_and_with_plain_functions():
     constant, drag = tq.Constant(H), tq.LinearDrag(0.3)
     expected = np.asarray(H) - 0.3 * OMEGA + (-2.0 * OMEGA + 0.5)
     sums = [constant + drag + spring, sum([constant, drag, tq.Torque(spring)])]
-    sums += [spring + constant + drag, constant + (drag + spring), sum([constant, drag, spring])]
+    sums += [
+        spring + constant + drag,
+        constant + (drag + spring),
+        sum([constant, drag, spring]),
+    ]
     for total in sums:
         assert len(total.terms) == 3  # flat, whatever the brackets
-        np.testing.assert_allclose(total(0.5, STATE, 2.0), expected, atol=ulps(float, 4))
+        np.testing.assert_allclose(
+            total(0.5, STATE, 2.0), expected, atol=ulps(float, 4)
+        )
         assert total.potential(0.5, STATE, 2.0) == 0
     assert sum([drag]) is drag
     in_any_order = tq.Sum([spring, constant, tq.Sum((drag,))])
     assert len(in_any_order.terms) == 3
-    np.testing.assert_allclose(in_any_order(0.5, STATE, 2.0), expected, atol=ulps(float, 4))
-    with pytest.raises(TypeError, match="unsupported operand"):  # Python's own: 0 + function
+    np.testing.assert_allclose(
+        in_any_order(0.5, STATE, 2.0), expected, atol=ulps(float, 4)
+    )
+    with pytest.raises(
+        TypeError, match="unsupported operand"
+    ):  # Python's own: 0 + function
         sum([spring, constant])
     nothing = tq.as_torque(None)
     assert np.all(np.asarray(nothing(0.0, STATE, None)) == 0)
@@ -431,7 +502,9 @@ def test_potentials_add():
     height = tq.Torque(lambda *_: jnp.zeros(3), lambda _t, s, _a: 2 * s.attitude[0])
     total = POTENTIALS["gravity"] + height + tq.LinearDrag(1.0)
     expected = POTENTIALS["gravity"].potential(0.0, STATE, None) + 2 * ATTITUDE[0]
-    np.testing.assert_allclose(total.potential(0.0, STATE, None), expected, rtol=ulps(float, 2))
+    np.testing.assert_allclose(
+        total.potential(0.0, STATE, None), expected, rtol=ulps(float, 2)
+    )
 
 
 def test_internal_states_of_a_sum_are_a_tuple_in_the_order_of_the_terms():
@@ -444,22 +517,37 @@ def test_internal_states_of_a_sum_are_a_tuple_in_the_order_of_the_terms():
     np.testing.assert_array_equal(rest[2], OMEGA)
     structure = jax.tree.structure
     inner, spin, outer = np.array([1.0, 2, 3]), 5.0, np.array([-0.5, 0.2, 0.1])
-    state = jr.State(ATTITUDE, OMEGA, (jnp.asarray(inner), jnp.asarray(spin), jnp.asarray(outer)))
+    state = jr.State(
+        ATTITUDE, OMEGA, (jnp.asarray(inner), jnp.asarray(spin), jnp.asarray(outer))
+    )
     rate = total.internal_rate(0.0, state, None)
-    assert structure(rate) == structure(rest) == structure(total.internal_scale(jnp.array(2.0)))
+    assert (
+        structure(rate)
+        == structure(rest)
+        == structure(total.internal_scale(jnp.array(2.0)))
+    )
 
     momentum = 0.2 * inner + 0.3 * spin * axis + 0.4 * outer + H
     found = total.internal_momentum(0.0, state, None)
     np.testing.assert_allclose(found, momentum, atol=ulps(float, 4))
     energy = 0.1 * inner @ inner + 0.15 * spin**2 + 0.2 * outer @ outer
-    np.testing.assert_allclose(total.internal_energy(0.0, state, None), energy, rtol=ulps(float, 4))
+    np.testing.assert_allclose(
+        total.internal_energy(0.0, state, None), energy, rtol=ulps(float, 4)
+    )
     torque = (
-        H - 0.1 * OMEGA + 0.05 * (inner - OMEGA) + 0.02 * (outer - OMEGA)
+        H
+        - 0.1 * OMEGA
+        + 0.05 * (inner - OMEGA)
+        + 0.02 * (outer - OMEGA)
         - np.cross(OMEGA, 0.3 * spin * axis + H)
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(total(0.0, state, None), torque, atol=ulps(float, 8))
     pulls = 0.05 * (inner - OMEGA) / 0.2, 0.02 * (outer - OMEGA) / 0.4
-    expected = [-pulls[0] - np.cross(OMEGA, inner), 0.0, -pulls[1] - np.cross(OMEGA, outer)]
+    expected = [
+        -pulls[0] - np.cross(OMEGA, inner),
+        0.0,
+        -pulls[1] - np.cross(OMEGA, outer),
+    ]
     for a, b in zip(rate, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=ulps(float, 8))
 
@@ -475,7 +563,9 @@ def test_the_internal_state_of_one_carrier_is_a_tuple_of_one():
         total.internal_rate(0.0, state, None), DAMPER.internal_rate(0.0, alone, None)
     )
     # at rest relative to the body it exerts nothing
-    np.testing.assert_allclose(total(0.0, state, None), -0.1 * OMEGA, atol=ulps(float, 1))
+    np.testing.assert_allclose(
+        total(0.0, state, None), -0.1 * OMEGA, atol=ulps(float, 1)
+    )
 
 
 def test_a_plain_torque_sees_the_whole_internal_state_alone_and_in_a_sum():
@@ -511,12 +601,16 @@ def test_the_potential_of_a_part_in_a_sum_is_that_of_its_own_state():
     total = DAMPER + Sprung(0.2, 0.05) + POTENTIALS["gravity"]
     state = jr.State(ATTITUDE, OMEGA, (jnp.ones(3), jnp.array([0.3, 0.1, 0.3])))
     expected = 1.4 + POTENTIALS["gravity"].potential(0.0, STATE, None)
-    np.testing.assert_allclose(total.potential(0.0, state, None), expected, rtol=ulps(float, 4))
+    np.testing.assert_allclose(
+        total.potential(0.0, state, None), expected, rtol=ulps(float, 4)
+    )
 
 
 def test_internal_parts_exert_what_they_lose():
     """The space rate of their own momentum is minus their torque, whatever they do."""
-    wheel = tq.SpinningMass(0.3, np.array([1.0, 2.0, -2.0]), lambda t, s, _a: 0.7 * t + s.omega[0])
+    wheel = tq.SpinningMass(
+        0.3, np.array([1.0, 2.0, -2.0]), lambda t, s, _a: 0.7 * t + s.omega[0]
+    )
     parts = {
         "damper": (DAMPER, (jnp.array([1.0, 2, 3]),)),
         "wheel": (wheel, (jnp.array(5.0),)),
@@ -530,7 +624,10 @@ def test_internal_parts_exert_what_they_lose():
             jr.euler_equations(TENSOR, OMEGA, part(t, state, None)),
             part.internal_rate(t, state, None),
         )
-        momentum = lambda t, s, p=part: ro.rotate(s.attitude, p.internal_momentum(t, s, None))  # noqa: E731
+
+        def momentum(t, s, p=part):
+            return ro.rotate(s.attitude, p.internal_momentum(t, s, None))
+
         _, rate = jax.jvp(momentum, (t, state), (jnp.ones_like(t), rates))
         expected = -ro.rotate(ATTITUDE, part(t, state, None))
         np.testing.assert_allclose(rate, expected, atol=ulps(float, 32), err_msg=name)
@@ -542,19 +639,25 @@ def test_a_damper_loses_energy_as_its_coupling_says():
     state = jr.State(ATTITUDE, OMEGA, (inner,))
     rates = body.vector_field(0.0, state, None)
     _, power = jax.jvp(lambda s: body.energy(0.0, s, None), (state,), (rates,))
-    np.testing.assert_allclose(power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 32))
+    np.testing.assert_allclose(
+        power, -0.05 * np.sum((inner - OMEGA) ** 2), rtol=ulps(float, 32)
+    )
 
 
 def test_damping_ends_in_spin_about_the_major_axis_with_all_momentum_kept():
     """From near the minor axis through the separatrix; two dampers and a free wheel's state."""
-    body = jr.RigidBody(MOMENTS, tq.InternalDamper(0.3, 0.5) + tq.InternalDamper(0.2, 0.1))
+    body = jr.RigidBody(
+        MOMENTS, tq.InternalDamper(0.3, 0.5) + tq.InternalDamper(0.2, 0.1)
+    )
     state0 = jr.State(ATTITUDE, np.array([3.0, 0.2, 0.1]))
     ts = np.linspace(0, 100, 201)
     run = jr.simulate(body, state0, ts, rtol=1e-12)
     assert [x.shape for x in run.states.internal] == [(201, 3), (201, 3)]
     momentum = np.asarray(run.angular_momentum)
     np.testing.assert_allclose(
-        momentum, np.broadcast_to(momentum[0], (201, 3)), atol=1e-12 * np.linalg.norm(momentum[0])
+        momentum,
+        np.broadcast_to(momentum[0], (201, 3)),
+        atol=1e-12 * np.linalg.norm(momentum[0]),
     )
     energy = np.asarray(run.energy)
     alive = energy - energy[-1] > 1e-9
@@ -562,11 +665,14 @@ def test_damping_ends_in_spin_about_the_major_axis_with_all_momentum_kept():
     assert np.all(np.diff(energy)[alive[:-1]] < 0)
     omega, total = np.asarray(run.states.omega[-1]), np.linalg.norm(momentum[0])
     assert np.linalg.norm(omega[:2]) < 1e-3 * abs(omega[2])
-    np.testing.assert_allclose(energy[-1], total**2 / (2 * (3.0 + 0.3 + 0.2)), rtol=1e-5)
+    np.testing.assert_allclose(
+        energy[-1], total**2 / (2 * (3.0 + 0.3 + 0.2)), rtol=1e-5
+    )
     assert np.argmax(np.abs(run.states.omega[0])) == 0
 
 
-# --- rotors -----------------------------------------------------------------------------------
+# --- rotors
+# -----------------------------------------------------------------------------------
 
 
 def test_a_gyrostat_follows_hand_derived_equations(runs):
@@ -584,10 +690,16 @@ def test_a_gyrostat_follows_hand_derived_equations(runs):
 
     ts = np.linspace(0, 20, 6)
     states, _, _, momentum = runs["gyrostat"]
-    exact = scipy.integrate.solve_ivp(rate, (0, 20), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14)
+    exact = scipy.integrate.solve_ivp(
+        rate, (0, 20), OMEGA, "DOP853", ts, rtol=1e-13, atol=1e-14
+    )
     np.testing.assert_allclose(states.omega, exact.y.T, atol=1e-10)
-    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (6, 3)), atol=2e-12)
-    np.testing.assert_allclose(momentum[0], ro.rotate(ATTITUDE, MOMENTS * OMEGA + H), atol=1e-14)
+    np.testing.assert_allclose(
+        momentum, np.broadcast_to(momentum[0], (6, 3)), atol=2e-12
+    )
+    np.testing.assert_allclose(
+        momentum[0], ro.rotate(ATTITUDE, MOMENTS * OMEGA + H), atol=1e-14
+    )
 
 
 def test_a_prescribed_function_of_time_may_be_constant():
@@ -628,7 +740,12 @@ def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
 
     @jax.jit
     def rates(state):
-        invariants = lambda s: (body.energy(0.0, s, None), body.angular_momentum(0.0, s, None))  # noqa: E731
+        def invariants(s):
+            return (
+                body.energy(0.0, s, None),
+                body.angular_momentum(0.0, s, None),
+            )
+
         rate = body.vector_field(0.0, state, None)
         return rate, *jax.jvp(invariants, (state,), (rate,))[1]
 
@@ -654,7 +771,8 @@ def test_a_wheel_started_without_a_state_turns_with_the_body():
     )
 
 
-# --- values of parameters ---------------------------------------------------------------------
+# --- values of parameters
+# ---------------------------------------------------------------------
 
 
 def sunlit(**changes):
@@ -683,7 +801,11 @@ BAD_VALUES = {
     "wheel": (tq.SpinningMass(-1.0, LEVER), "invalid_torque", "inertia"),
     "axis": (tq.SpinningMass(1.0, np.zeros(3)), "invalid_torque", "axis"),
     "linear": (tq.LinearDrag(-0.1), "invalid_torque", "coefficient"),
-    "linear, axes": (tq.LinearDrag(np.array([1.0, -1.0, 0.0])), "invalid_torque", "coefficient"),
+    "linear, axes": (
+        tq.LinearDrag(np.array([1.0, -1.0, 0.0])),
+        "invalid_torque",
+        "coefficient",
+    ),
     "linear, tensor": (tq.LinearDrag(INDEFINITE), "invalid_torque", "coefficient"),
     "quadratic": (tq.QuadraticDrag(np.inf), "invalid_torque", "coefficient"),
     "quadratic, tensor": (tq.QuadraticDrag(SKEW), "invalid_torque", "coefficient"),
@@ -699,7 +821,11 @@ BAD_VALUES = {
     "center": (sunlit(centers=np.full((3, 3), np.nan)), "invalid_torque", "centers"),
     "sun": (sunlit(sun=NAN3), "invalid_torque", "sun"),
     "specular": (sunlit(specular=-0.1), "invalid_torque", "specular"),
-    "diffuse": (sunlit(diffuse=np.array([0.1, np.nan, 0.2])), "invalid_torque", "diffuse"),
+    "diffuse": (
+        sunlit(diffuse=np.array([0.1, np.nan, 0.2])),
+        "invalid_torque",
+        "diffuse",
+    ),
     "pressure": (sunlit(pressure=-1.0), "invalid_torque", "pressure"),
 }
 
@@ -716,16 +842,38 @@ def test_a_bad_parameter_is_found_alone_and_in_a_sum(name):
 
 def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
     good = [tq.UniformGravity(0.0, LEVER, GRAVITY), tq.GravityGradient(0.0), DAMPER]
-    good += [tq.InternalDamper(0.1, 0.0), WHEEL, tq.Rotor(H), tq.Rotor(momentum_of_time)]
-    good += [POTENTIALS["dipole"], tq.CoulombFriction(0.0, 1.0), tq.CoulombFriction(1.0, 1.0, H)]
-    good += [sunlit(specular=0.4, diffuse=0.6), sunlit(sun=np.zeros(3)), sunlit(sun=lambda _: SUN)]
+    good += [
+        tq.InternalDamper(0.1, 0.0),
+        WHEEL,
+        tq.Rotor(H),
+        tq.Rotor(momentum_of_time),
+    ]
+    good += [
+        POTENTIALS["dipole"],
+        tq.CoulombFriction(0.0, 1.0),
+        tq.CoulombFriction(1.0, 1.0, H),
+    ]
+    good += [
+        sunlit(specular=0.4, diffuse=0.6),
+        sunlit(sun=np.zeros(3)),
+        sunlit(sun=lambda _: SUN),
+    ]
     good += [tq.LinearDrag(c) for c in (0.0, TENSOR, np.zeros((3, 3)), MOMENTS)]
-    good += [tq.QuadraticDrag(1e-30 * np.outer(ROW, ROW)), tq.Constant(H), tq.as_torque(None)]
-    good += [tq.LinearDrag(np.float32(1e20 * np.outer(ROW, ROW))), tq.Torque(lambda *_: NAN3)]
+    good += [
+        tq.QuadraticDrag(1e-30 * np.outer(ROW, ROW)),
+        tq.Constant(H),
+        tq.as_torque(None),
+    ]
+    good += [
+        tq.LinearDrag(np.float32(1e20 * np.outer(ROW, ROW))),
+        tq.Torque(lambda *_: NAN3),
+    ]
     for torque in good:
         assert findings_of(torque).ok, torque
 
-    lanes = jax.jit(jax.vmap(lambda c: findings_of(tq.LinearDrag(c) + tq.Constant(H)).result))
+    lanes = jax.jit(
+        jax.vmap(lambda c: findings_of(tq.LinearDrag(c) + tq.Constant(H)).result)
+    )
     codes = lanes(np.array([0.1, -0.1, np.nan]))
     for k, code in enumerate(("successful", "invalid_torque", "invalid_torque")):
         assert (codes == getattr(jr.RESULTS, code))[k]
@@ -733,8 +881,14 @@ def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
 
 def test_what_a_torque_says_of_a_bad_value_shows_it():
     for torque, message in (
-        (tq.LinearDrag(-0.25), r"`coefficient` of `LinearDrag` must be .*, but it is not: -0\.25"),
-        (tq.SpinningMass(1.0, np.zeros(3)), r"`axis` of `SpinningMass` .* not: \[0\. 0\. 0\.\]"),
+        (
+            tq.LinearDrag(-0.25),
+            r"`coefficient` of `LinearDrag` must be .*, but it is not: -0\.25",
+        ),
+        (
+            tq.SpinningMass(1.0, np.zeros(3)),
+            r"`axis` of `SpinningMass` .* not: \[0\. 0\. 0\.\]",
+        ),
         (
             sunlit(specular=0.7, diffuse=np.array([0.1, 0.4, 0.0])),
             r"`specular` and `diffuse` .* at most 1, but .* not: \[0\.8 1\.1 0\.7\]",
@@ -744,7 +898,8 @@ def test_what_a_torque_says_of_a_bad_value_shows_it():
             findings_of(torque).guard(jnp.zeros(()), throw=True)
 
 
-# --- arguments --------------------------------------------------------------------------------
+# --- arguments
+# --------------------------------------------------------------------------------
 
 FOUR = np.ones(4)
 WRONG = {
@@ -753,7 +908,10 @@ WRONG = {
         r"`torque` must be a callable \(t, state, args\) -> \(3,\), but it is 3.0",
     ),
     "sum with a number": (lambda: DAMPER + 3.0, r"`torque` must be a callable"),
-    "constant": (lambda: tq.Constant(FOUR), r"`torque` must have shape \(3,\), but it has"),
+    "constant": (
+        lambda: tq.Constant(FOUR),
+        r"`torque` must have shape \(3,\), but it has",
+    ),
     "lever": (
         lambda: tq.UniformGravity(1.0, FOUR, GRAVITY),
         r"`lever` must have shape \(3,\), but it has shape \(4,\)",
@@ -778,7 +936,10 @@ WRONG = {
         lambda: tq.GravityGradient(MU, orbit)(0.0, STATE, None),
         r"`torque` must know the inertia of its body, but this `GravityGradient` does not",
     ),
-    "dipole": (lambda: tq.MagneticDipole(FOUR, FIELD), r"`moment` must have shape \(3,\), but"),
+    "dipole": (
+        lambda: tq.MagneticDipole(FOUR, FIELD),
+        r"`moment` must have shape \(3,\), but",
+    ),
     "field of time": (
         lambda: tq.MagneticDipole(LEVER, lambda *_: jnp.ones(4))(0.0, STATE, None),
         r"`field` must have shape \(3,\), but it has shape \(4,\)",
@@ -819,7 +980,9 @@ WRONG = {
         r"`momentum` must have shape \(3,\), but it has shape \(4,\)",
     ),
     "orbit": (
-        lambda: tq.GravityGradient(MU, lambda _: jnp.ones(2)).of_body(MOMENTS)(0.0, STATE, None),
+        lambda: tq.GravityGradient(MU, lambda _: jnp.ones(2)).of_body(MOMENTS)(
+            0.0, STATE, None
+        ),
         r"`position` must have shape \(3,\), but it has shape \(2,\)",
     ),
     "function": (

@@ -28,21 +28,34 @@ class Table(jr.torques.AbstractTorque):
 
 
 class Scene:
-    """Thirty throws of a phone in thick air, read by a gyro with a memory."""
+    """Thirty trials of a phone in thick air, read by a gyro with a memory."""
 
     def __init__(self):
-        seen = worlds.throws(
-            np.random.default_rng(4), 30, spin=(5.0, 15.0), duration=(0.4, 0.5), sigma=1e-3,
-            drag=0.02, wobble=0.0, time_constant=0.004,
-        )  # fmt: skip
-        gyro, self.tensor = identify.Gyro(time_constant=jnp.asarray(0.004)), seen[0].tensor
-        self.throws = [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in seen]
+        seen = worlds.trials(
+            np.random.default_rng(4),
+            30,
+            spin=(5.0, 15.0),
+            duration=(0.4, 0.5),
+            sigma=1e-3,
+            drag=0.02,
+            wobble=0.0,
+            time_constant=0.004,
+        )
+        gyro, self.tensor = (
+            identify.Gyro(time_constant=jnp.asarray(0.004)),
+            seen[0].tensor,
+        )
+        self.trials = [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in seen]
         mean = jnp.trace(jnp.asarray(self.tensor)) / 3
         self.body = jr.RigidBody(self.tensor, Table(mean, jnp.zeros(7)))
 
     def train(self, body=None, **options):
-        given = {"key": jax.random.key(0), "free": lambda body: body.torque.table, "batch": 8}
-        return identify.train(body or self.body, self.throws, ADAM, **given | options)
+        given = {
+            "key": jax.random.key(0),
+            "free": lambda body: body.torque.table,
+            "batch": 8,
+        }
+        return identify.train(body or self.body, self.trials, ADAM, **given | options)
 
 
 @pytest.fixture(scope="module")
@@ -85,25 +98,35 @@ def test_training_stops_when_validation_has_stopped_to_fall(scene, learnt, capsy
 
 @pytest.mark.slow
 def test_the_loss_of_the_truth_is_one(rng):
-    """A gyro with a memory, pictures at other times; long and short throws, of a few segments."""
+    """A gyro with a memory, pictures at other times; long and short trials, of a few segments."""
     tensor, lag = worlds.random_body(rng), 0.004
     grid = np.arange(-400, 1001) / 1000
     start = rng.normal(size=(12, 3))
     start *= 8 / np.linalg.norm(start, axis=1, keepdims=True)
     drag = worlds.quadratic_drag(0.01)
     motion = worlds.tumble(tensor, start, grid, drag, attitude0=ATTITUDE)
-    throws = []
+    trials = []
     for i in range(12):
         ts, seen = np.arange(100)[: 100 - 7 * i] / 100, slice(405, 1405, 40)
         values = worlds.gyro((grid, motion.omega[i]), ts, rng, 0.01, time_constant=lag)
         turns = jax.vmap(jr.rotation.exp)(0.002 * rng.normal(size=(25, 3)))
         pictures = jax.vmap(jr.rotation.multiply)(motion.attitude[i, seen], turns)
         gyro = identify.Gyro(time_constant=lag)
-        throws.append((identify.Record(gyro, ts, values, 0.01),
-                       identify.Attitudes(grid[seen], pictures, 0.002)))  # fmt: skip
+        trials.append(
+            (
+                identify.Record(gyro, ts, values, 0.01),
+                identify.Attitudes(grid[seen], pictures, 0.002),
+            )
+        )
     body = jr.RigidBody(tensor, jr.torques.QuadraticDrag(0.01))
     learnt = identify.train(
-        body, throws, ADAM, key=jax.random.key(0), validation=range(11), segment=30, epochs=1
+        body,
+        trials,
+        ADAM,
+        key=jax.random.key(0),
+        validation=range(11),
+        segment=30,
+        epochs=1,
     )
     # 4300 numbers: 1 +- 0.02
     assert abs(learnt.validation[0] - 1) < 0.08
@@ -112,30 +135,34 @@ def test_the_loss_of_the_truth_is_one(rng):
 def test_bad_arguments_are_named(scene, untyped):
     train, body = scene.train, scene.body
     key = jax.random.key(0)
-    with pytest.raises(ValueError, match="`observations` must hold two throws or more"):
-        identify.train(body, scene.throws[:1], ADAM, key=key)
-    unsaid = [eqx.tree_at(lambda x: x.sigma, r, None) for r in scene.throws]
+    with pytest.raises(ValueError, match="`observations` must hold two trials or more"):
+        identify.train(body, scene.trials[:1], ADAM, key=key)
+    unsaid = [eqx.tree_at(lambda x: x.sigma, r, None) for r in scene.trials]
     with pytest.raises(ValueError, match="must state the noise"):
         identify.train(body, unsaid, ADAM, key=key)
-    with pytest.raises(ValueError, match="`validation` must be indices of some of 30 throws"):
+    with pytest.raises(
+        ValueError, match="`validation` must be indices of some of 30 trials"
+    ):
         train(validation=[30])
     with pytest.raises(ValueError, match=r"`validation` must be indices .* not all"):
         train(validation=range(30))
     with pytest.raises(ValueError, match="`free` must pick floating point arrays"):
         train(free=lambda body: body)
     with pytest.raises(ValueError, match="`free` must pick floating point arrays"):
-        identify.train(jr.RigidBody(scene.tensor), scene.throws, ADAM, key=key)
+        identify.train(jr.RigidBody(scene.tensor), scene.trials, ADAM, key=key)
     with pytest.raises(ValueError, match="`segment` in each segment"):
         train(segment=1)
     with pytest.raises(ValueError, match="`batch` must be an integer"):
         train(batch=0)
-    with pytest.raises(ValueError, match="`optimizer` must be a GradientTransformation"):
-        identify.train(body, scene.throws, "adam", key=key)
+    with pytest.raises(
+        ValueError, match="`optimizer` must be a GradientTransformation"
+    ):
+        identify.train(body, scene.trials, "adam", key=key)
     with pytest.raises(ValueError, match="`system` must be a RigidBody"):
-        identify.train(scene.tensor, scene.throws, ADAM, key=key)
+        identify.train(scene.tensor, scene.trials, ADAM, key=key)
     upright = jr.torques.MagneticDipole(np.ones(3), np.ones(3))
     with pytest.raises(ValueError, match="must tell the whole state"):
-        identify.train(jr.RigidBody(scene.tensor, upright), scene.throws, ADAM, key=key)
+        identify.train(jr.RigidBody(scene.tensor, upright), scene.trials, ADAM, key=key)
     with pytest.raises(RuntimeError, match="`inertia` must"):
         train(jr.RigidBody(-scene.tensor, body.torque))
     broken = eqx.tree_at(lambda x: x.torque.table, body, np.nan * body.torque.table)

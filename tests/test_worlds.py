@@ -12,7 +12,7 @@ TS = np.linspace(0.0, 20.0, 101)
 
 
 def spread(values):
-    """Largest deviation from the first of each throw."""
+    """Largest deviation from the first of each trial."""
     return np.max(np.abs(values - values[..., :1, :]))
 
 
@@ -38,14 +38,16 @@ def test_a_free_body_keeps_energy_and_momentum():
 def test_the_symmetric_top_is_two_steady_turns():
     tensor, omega0 = np.diag([1.0, 1.0, 1.6]), np.array([0.6, 0.0, 0.8])
     motion = worlds.tumble(tensor, omega0, TS, attitude0=UNTURNED)
-    # About the momentum by L / I_1, about the figure axis back by (I_3 - I_1) omega_3 / I_1.
+    # About the momentum by L / I_1, about the figure axis back by (I_3 - I_1) omega_3 /
+    # I_1.
     momentum, slip = tensor @ omega0, 0.6 * 0.8
     figure = np.array([0.0, 0.0, 1.0])
     back = turned(about(figure, slip * TS), omega0)
     assert np.max(np.abs(motion.omega - back)) < 1e-8
     v = np.array([0.2, -0.7, 0.4])
     expected = turned(
-        about(momentum, np.linalg.norm(momentum) * TS), turned(about(figure, -slip * TS), v)
+        about(momentum, np.linalg.norm(momentum) * TS),
+        turned(about(figure, -slip * TS), v),
     )
     assert np.max(np.abs(turned(motion.attitude, v) - expected)) < 1e-8
 
@@ -61,7 +63,9 @@ def test_alpha_is_the_derivative_of_the_rates(part):
 
 
 def test_a_wheel_inside_takes_momentum_and_reports_it_with_its_errors():
-    true, reported = worlds.wheel_profile([1.0, 2.0, 2.0], 1.5, 2.0, 6.0, scale=1.03, delay=0.2)
+    true, reported = worlds.wheel_profile(
+        [1.0, 2.0, 2.0], 1.5, 2.0, 6.0, scale=1.03, delay=0.2
+    )
     motion = worlds.tumble(TENSOR, OMEGA, TS, wheel=true, attitude0=UNTURNED)
     momentum, rate = true(TS)
     assert spread(in_space(motion, TENSOR, momentum)) < 1e-8
@@ -91,7 +95,9 @@ def test_a_loose_part_keeps_momentum_and_loses_energy_to_its_damper_alone(dampin
 def test_a_stiffer_part_moves_the_body_less():
     free = worlds.tumble(TENSOR, OMEGA, TS[:20])
     moved = [
-        np.max(np.abs(worlds.tumble(TENSOR, OMEGA, TS[:20], part=part).omega - free.omega))
+        np.max(
+            np.abs(worlds.tumble(TENSOR, OMEGA, TS[:20], part=part).omega - free.omega)
+        )
         for part in (worlds.LoosePart(0.05, 2.0), worlds.LoosePart(0.05, 4.0))
     ]
     assert moved[0] < 0.01
@@ -101,7 +107,9 @@ def test_a_stiffer_part_moves_the_body_less():
 def test_drag_about_a_principal_axis_decays_as_it_should():
     tensor, c, ts = np.diag([1.0, 2.0, 2.5]), 0.3, np.linspace(0.0, 5.0, 11)
     axes = worlds.random_axes(np.random.default_rng(0))
-    motion = worlds.tumble(axes @ tensor @ axes.T, 3.0 * axes[:, 2], ts, worlds.quadratic_drag(c))
+    motion = worlds.tumble(
+        axes @ tensor @ axes.T, 3.0 * axes[:, 2], ts, worlds.quadratic_drag(c)
+    )
     expected = 3.0 / (1 + c * 3.0 * ts / 2.5)
     assert motion.omega @ axes[:, 2] == pytest.approx(expected, rel=1e-8)
 
@@ -126,10 +134,17 @@ def test_kicks_between_samples_have_their_variance(rng, substeps):
     # Of 200 * 59 squares of standard normals: one standard error is 1.3 %.
     assert np.mean(scaled**2, axis=(0, 1)) == pytest.approx(1.0, abs=0.05)
     motion = worlds.tumble(
-        TENSOR, np.tile(OMEGA[:2], (50, 1)), ts, kick=0.01, rng=rng, substeps=substeps,
+        TENSOR,
+        np.tile(OMEGA[:2], (50, 1)),
+        ts,
+        kick=0.01,
+        rng=rng,
+        substeps=substeps,
         attitude0=UNTURNED,
-    )  # fmt: skip
-    scaled = np.diff(in_space(motion, TENSOR), axis=1) / (0.01 * np.sqrt(np.diff(ts))[:, None])
+    )
+    scaled = np.diff(in_space(motion, TENSOR), axis=1) / (
+        0.01 * np.sqrt(np.diff(ts))[:, None]
+    )
     assert np.mean(scaled**2, axis=(0, 1)) == pytest.approx(1.0, abs=0.07)
     flat = (scaled - np.mean(scaled, axis=0)).reshape(-1, 3)
     assert np.corrcoef(flat.T) == pytest.approx(np.eye(3), abs=0.07)
@@ -151,7 +166,7 @@ def test_a_held_torque_forgets_itself_within_its_time(rng, tau):
     variance = size**2 * (1 - like) / (1 + like) / step
     if tau:
         assert variance == pytest.approx(size**2 / (2 * tau), rel=0.01)
-    # Of 2000 throws: of a variance one standard error is 3.2 %.
+    # Of 2000 trials: of a variance one standard error is 3.2 %.
     for row in (0, 200, 399):
         assert np.var(torque[:, row], axis=0) == pytest.approx(variance, rel=0.15)
     product = np.mean(torque[:, 1:] * torque[:, :-1], axis=(0, 1))
@@ -166,7 +181,9 @@ def test_a_held_torque_is_one_of_the_body(rng):
     axis = np.array([0.0, 0.0, 1.0])
     held = np.zeros((3, 100, 3))
     free = worlds.tumble(TENSOR, OMEGA, TS)
-    assert worlds.tumble(TENSOR, OMEGA, TS, held=held).omega == pytest.approx(free.omega, abs=1e-5)
+    assert worlds.tumble(TENSOR, OMEGA, TS, held=held).omega == pytest.approx(
+        free.omega, abs=1e-5
+    )
     # Constant, it does work on the body at the rate of torque times omega.
     ts = np.linspace(0.0, 5.0, 2001)
     held = np.broadcast_to(0.3 * axis, (3, 2000, 3))
@@ -187,7 +204,12 @@ def test_a_lag_turns_and_shrinks_a_sinusoid(rng, dense):
 
     grid = np.linspace(-1.0, 3.0, 20001)
     readings = worlds.gyro(
-        (grid, source(grid)) if dense else source, ts, rng, 0.0, delay=delay, time_constant=constant
+        (grid, source(grid)) if dense else source,
+        ts,
+        rng,
+        0.0,
+        delay=delay,
+        time_constant=constant,
     )
     x = rate * constant
     expected = source(ts - delay - np.arctan(x) / rate) / np.sqrt(1 + x**2)
@@ -197,7 +219,9 @@ def test_a_lag_turns_and_shrinks_a_sinusoid(rng, dense):
 def test_a_lagged_ramp_has_settled_from_the_first_sample():
     t = np.arange(50) * 0.1
     ramp = t[:, None] * np.array([1.0, -2.0, 0.0])
-    assert worlds.lagged(ramp, 0.1, 0.3) == pytest.approx(ramp - 0.3 * np.array([1.0, -2.0, 0.0]))
+    assert worlds.lagged(ramp, 0.1, 0.3) == pytest.approx(
+        ramp - 0.3 * np.array([1.0, -2.0, 0.0])
+    )
 
 
 def test_a_gyro_adds_its_errors(rng):
@@ -214,7 +238,9 @@ def test_a_gyro_adds_its_errors(rng):
     noisy = worlds.gyro(rest, ts, rng, [0.1, 0.2, 0.3], bias=[1.0, 2.0, 3.0], drift=0.5)
     free = noisy - 0.5 * ts[:, None] - np.array([1.0, 2.0, 3.0])
     assert np.std(free, axis=0) == pytest.approx([0.1, 0.2, 0.3], rel=0.05)
-    assert worlds.gyro(steady, ts[:5], rng, 0.0, matrix=turn)[0] == pytest.approx([1.02, 1.97, 3.0])
+    assert worlds.gyro(steady, ts[:5], rng, 0.0, matrix=turn)[0] == pytest.approx(
+        [1.02, 1.97, 3.0]
+    )
     stopped = worlds.gyro(steady, ts, rng, 0.5, limit=2.0, quantum=0.25)
     assert np.max(np.abs(stopped)) == 2.0
     assert np.all(stopped % 0.25 == 0)
@@ -274,9 +300,9 @@ def test_random_records_are_of_every_sort_and_repeat_themselves():
 
 
 @pytest.mark.parametrize("kick", [0.0, 0.01])
-def test_throws_are_what_they_say(kick):
+def test_trials_are_what_they_say(kick):
     clean = {"drag": 0.0, "wobble": 0.0, "time_constant": 0.0, "kick": kick}
-    records = worlds.throws(np.random.default_rng(1), 8, "racquet", **clean)
+    records = worlds.trials(np.random.default_rng(1), 8, "racquet", **clean)
     moments = np.linalg.eigvalsh(records[0].tensor)
     assert moments == pytest.approx(worlds.THROWN["racquet"])
     for record in records:
@@ -288,14 +314,27 @@ def test_throws_are_what_they_say(kick):
         assert steady < 1e-8 if kick == 0 else 1e-4 < steady < 0.1
 
 
-def test_throws_under_a_held_torque_gain_momentum_with_their_spin():
+def test_trials_under_a_held_torque_gain_momentum_with_their_spin():
     axes = worlds.random_axes(np.random.default_rng(3))
-    clean = {"drag": 0.0, "wobble": 0.0, "time_constant": 0.0, "sigma": 0.0, "axes": axes}
+    clean = {
+        "drag": 0.0,
+        "wobble": 0.0,
+        "time_constant": 0.0,
+        "sigma": 0.0,
+        "axes": axes,
+    }
     size = np.array([0.0, 0.0, 0.01])
-    records = worlds.throws(
-        np.random.default_rng(1), 200, "racquet", spin=(2.0, 40.0), duration=(0.5, 0.5),
-        rate=200.0, ou=size, tau=0.0, **clean,
-    )  # fmt: skip
+    records = worlds.trials(
+        np.random.default_rng(1),
+        200,
+        "racquet",
+        spin=(2.0, 40.0),
+        duration=(0.5, 0.5),
+        rate=200.0,
+        ou=size,
+        tau=0.0,
+        **clean,
+    )
     gained = []
     for record in records:
         mean = np.trace(record.tensor) / 3
@@ -310,7 +349,7 @@ def test_throws_under_a_held_torque_gain_momentum_with_their_spin():
 
 
 def test_a_phone_in_the_air_is_measured_late():
-    records = worlds.throws(np.random.default_rng(2), 6, sigma=0.0, time_constant=0.005)
+    records = worlds.trials(np.random.default_rng(2), 6, sigma=0.0, time_constant=0.005)
     for record in records:
         # The second term of the low-pass is (T turned)^2 times the rate.
         late = record.omega - 0.005 * record.alpha

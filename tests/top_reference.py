@@ -24,7 +24,12 @@ def _elapsed(mu, a, b, g_alpha, g_beta, h):
             2
             * s
             * slope
-            / mp.sqrt(1 - 2 * b * z**2 + 8 * g_beta**2 * z**3 + (b * b + 4 * a * g_beta**2) * z**4)
+            / mp.sqrt(
+                1
+                - 2 * b * z**2
+                + 8 * g_beta**2 * z**3
+                + (b * b + 4 * a * g_beta**2) * z**4
+            )
         )
     return s, w_alpha, w_beta
 
@@ -53,7 +58,9 @@ def closed_form(i1, i3, mgl, attitude, omega, time):
         d_alpha = (1j * spin * alpha - beta * mp.conj(across)) / 2
         d_beta = (alpha * across - 1j * spin * beta) / 2
         sigma = abs(beta) ** 2
-        a = (3 * mu - 2 * (abs(d_alpha) ** 2 + abs(d_beta) ** 2) - mu * (1 - 2 * sigma)) / 2
+        a = (
+            3 * mu - 2 * (abs(d_alpha) ** 2 + abs(d_beta) ** 2) - mu * (1 - 2 * sigma)
+        ) / 2
         b = -mu * (abs(d_beta) ** 2 + sigma * (mu * sigma - a))
         g_alpha = mu * (mp.conj(alpha) * d_alpha).imag
         g_beta = -mu * (mp.conj(beta) * d_beta).imag
@@ -71,18 +78,31 @@ def closed_form(i1, i3, mgl, attitude, omega, time):
             mp.expj(whole * (4 * g * w + 2 * mp.atan(g / (r * height)) + mp.pi))
             for g, w, height in ((g_alpha, w_alpha, x + mu), (g_beta, w_beta, x))
         )
-        s, w_alpha, w_beta = _elapsed(mu, a, b, g_alpha, g_beta, (time - whole * period) / 2)
+        s, w_alpha, w_beta = _elapsed(
+            mu, a, b, g_alpha, g_beta, (time - whole * period) / 2
+        )
         z = s * s
         slope = mp.sqrt(1 + a * z + b * z**2 - g_beta**2 * z**3)
         low = 1 / (1 + mu * z)
         lower = s * mp.sqrt(low), slope * low * mp.sqrt(low)
         for _ in range(2):
             alpha, d_alpha = _carried(
-                alpha, d_alpha, mu, a - 3 * mu, b + mu * (3 * mu - 2 * a), g_alpha, *lower, w_alpha
+                alpha,
+                d_alpha,
+                mu,
+                a - 3 * mu,
+                b + mu * (3 * mu - 2 * a),
+                g_alpha,
+                *lower,
+                w_alpha,
             )
             beta, d_beta = _carried(beta, d_beta, -mu, a, b, g_beta, s, slope, w_beta)
         across = 2 * (mp.conj(alpha) * d_beta - beta * mp.conj(d_alpha))
         turn = mp.expj((w3 - spin) * time / 2)
         alpha, beta = alpha * turn_alpha * turn, beta * turn_beta * mp.conj(turn)
         across = across * turn_beta * mp.conj(turn_alpha) * mp.conj(turn) ** 2
-        return [alpha.real, beta.real, beta.imag, alpha.imag], [across.real, across.imag, w3]
+        return [alpha.real, beta.real, beta.imag, alpha.imag], [
+            across.real,
+            across.imag,
+            w3,
+        ]

@@ -42,12 +42,32 @@ def main() -> int:
         here = Path(folder)
         venv.create(here / "env", with_pip=True)
         python = here / "env" / "bin" / "python"
-        pip = [python, "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt"]
-        build = [python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", here, ROOT]
+        pip = [
+            python,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--constraint",
+            ROOT / "constraints.txt",
+        ]
+        build = [
+            python,
+            "-m",
+            "pip",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--wheel-dir",
+            here,
+            ROOT,
+        ]
         subprocess.run(build, check=True)
         wheel = next(here.glob("jrigid-*.whl"))
         subprocess.run([*pip, wheel], check=True)
-        print(sys.version.split()[0], wheel.name, f"{wheel.stat().st_size / 1e3:.0f} kB")
+        print(
+            sys.version.split()[0], wheel.name, f"{wheel.stat().st_size / 1e3:.0f} kB"
+        )
         (here / "flight.bbl").write_text(
             "H Product:Blackbox flight data recorder by Nicholas Sherlock"
         )
@@ -55,7 +75,11 @@ def main() -> int:
         subprocess.run([*pip, f"{wheel}[{EXTRAS}]", *OTHERS], check=True)
         (here / "part.stl").write_bytes(box())
         (here / "dask_jobqueue.py").write_text(CLUSTER)
-        pages = [ROOT / "README.md", ROOT / "docs" / "getting_started.md", *RECIPES.glob("*.md")]
+        pages = [
+            ROOT / "README.md",
+            ROOT / "docs" / "getting_started.md",
+            *RECIPES.glob("*.md"),
+        ]
         failed += [page.stem for page in pages if not runs(python, here, page)]
         print("failed:", *failed or ["nothing"])
         return len(failed)
@@ -64,7 +88,9 @@ def main() -> int:
 def names(python: Path, here: Path, group: str, call: str) -> bool:
     """Whether the error of a call says which extra is missing."""
     code = f"import numpy as np, jrigid as jr\n{call}"
-    done = subprocess.run([python, "-c", code], cwd=here, capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-c", code], cwd=here, capture_output=True, text=True
+    )
     last = done.stderr.strip().splitlines()[-1] if done.returncode else "no error"
     print(f"without {group}:", last)
     return "ImportError" in last and f'pip install "jrigid[{group}]"' in last
@@ -78,21 +104,36 @@ def runs(python: Path, here: Path, page: Path) -> bool:
     start = time.perf_counter()
     try:
         command = [python, "-W", "error::DeprecationWarning:__main__", script]
-        done = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            command, cwd=here, capture_output=True, text=True, timeout=300
+        )
         good, last = done.returncode == 0, done.stderr[-2000:]
     except subprocess.TimeoutExpired:
         subprocess.run(["pkill", "-f", str(here / "env")], check=False)
         good, last = any((here / "chaos.zarr").glob("valid/c/*/*")), "took too long"
-    print(f"{page.stem}: {time.perf_counter() - start:.0f} s", "" if good else "FAILED\n" + last)
+    print(
+        f"{page.stem}: {time.perf_counter() - start:.0f} s",
+        "" if good else "FAILED\n" + last,
+    )
     return good
 
 
 def box() -> bytes:
     """An STL file of a box, 240 x 170 x 30 mm; every triangle has its own corners, as they have."""
     corners = [(x, y, z) for x in (0, 240) for y in (0, 170) for z in (0, 30)]
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    sides = [
+        (0, 1, 3, 2),
+        (4, 6, 7, 5),
+        (0, 4, 5, 1),
+        (2, 3, 7, 6),
+        (0, 2, 6, 4),
+        (1, 5, 7, 3),
+    ]
     faces = [x for a, b, c, d in sides for x in ((a, b, c), (a, c, d))]
-    rows = [struct.pack("<12fH", 0, 0, 0, *(x for i in f for x in corners[i]), 0) for f in faces]
+    rows = [
+        struct.pack("<12fH", 0, 0, 0, *(x for i in f for x in corners[i]), 0)
+        for f in faces
+    ]
     return bytes(80) + struct.pack("<I", len(faces)) + b"".join(rows)
 
 

@@ -1,11 +1,13 @@
-"""Records as real sensors see them: bodies, throws, drag, loose parts, wheels, gyros.
+"""Records as real sensors see them: bodies, trials, drag, loose parts, wheels, gyros.
 
-An independent judge of what is identified from records: numpy and scipy alone. Everything is in the
-body's frame; L = I omega + (what turns inside) is its angular momentum, and
+An independent judge of what is identified from records: numpy and scipy alone.
+Everything is in the body's frame; L = I omega + (what turns inside) is its angular
+momentum, and
 
     L' = L x omega + torque,    R' = R hat(omega),
 
-R from body to space. Everything random takes a generator and repeats itself with its seed.
+R from body to space. Everything random takes a generator and repeats itself with its
+seed.
 """
 
 from dataclasses import dataclass
@@ -30,7 +32,8 @@ class Motion:
         omega: Rates (..., samples, 3) [rad/s].
         alpha: Their derivatives without the part of white or held torque [rad/s^2].
         attitude: Quaternions body to space, scalar first (..., samples, 4), or None.
-        inner: Angles and rates of the loose part (..., samples, 6) [rad, rad/s], or None.
+        inner: Angles and rates of the loose part (..., samples, 6) [rad, rad/s], or
+            None.
     """
 
     ts: np.ndarray
@@ -44,11 +47,12 @@ class Motion:
 class LoosePart:
     """A ball inside the body on a spring and a damper, free to turn a little about any axis.
 
-    The body's tensor is with the ball locked. Angles phi' = nu of the ball against the body are
-    small; j (omega' + nu' + omega x nu) = -k phi - c nu with k = j (2 pi frequency)^2 and
-    c = 2 damping sqrt(j k). Momentum I omega + j nu is conserved in space, energy falls by c nu^2.
-    Locked until ts[0], it rings from there: a stiff spring moves the body's rates by some
-    (inertia / I) times spin / (2 pi frequency) of themselves.
+    The body's tensor is with the ball locked. Angles phi' = nu of the ball against the
+    body are small; j (omega' + nu' + omega x nu) = -k phi - c nu with k = j (2 pi
+    frequency)^2 and c = 2 damping sqrt(j k). Momentum I omega + j nu is conserved in
+    space, energy falls by c nu^2. Locked until ts[0], it rings from there: a stiff
+    spring moves the body's rates by some (inertia / I) times spin / (2 pi frequency) of
+    themselves.
 
     Attributes:
         inertia: j [kg m^2], a number below every moment of the body.
@@ -85,7 +89,9 @@ def times(matrix, vector):
 def turned(quaternion, vector):
     """The vector in space of one in the body."""
     scalar, axis = quaternion[..., :1], quaternion[..., 1:]
-    across = cross(np.broadcast_to(axis, np.broadcast_shapes(axis.shape, vector.shape)), vector)
+    across = cross(
+        np.broadcast_to(axis, np.broadcast_shapes(axis.shape, vector.shape)), vector
+    )
     return vector + 2 * (scalar * across + cross(axis, across))
 
 
@@ -100,7 +106,12 @@ class _Body:
 
     def __init__(self, tensor, torque, wheel, part, followed):
         self.tensor, self.inverse = tensor, np.linalg.inv(tensor)
-        self.torque, self.wheel, self.part, self.followed = torque, wheel, part, followed
+        self.torque, self.wheel, self.part, self.followed = (
+            torque,
+            wheel,
+            part,
+            followed,
+        )
         self.size = 3 + 4 * followed + 6 * (part is not None)
         if part is not None:
             self.outer = np.linalg.inv(tensor - part.inertia * np.eye(3))
@@ -139,7 +150,7 @@ class _Body:
 
 
 def _smooth(body, state, ts):
-    """States at the times, by DOP853 over all throws at once."""
+    """States at the times, by DOP853 over all trials at once."""
     shape = state.shape
     scale = np.max(np.abs(state[..., :3]))
 
@@ -149,7 +160,13 @@ def _smooth(body, state, ts):
     atol = np.full(shape, _TOLERANCE)
     atol[..., :3] *= scale
     done = solve_ivp(
-        rates, (ts[0], ts[-1]), state.ravel(), "DOP853", ts, rtol=_TOLERANCE, atol=atol.ravel()
+        rates,
+        (ts[0], ts[-1]),
+        state.ravel(),
+        "DOP853",
+        ts,
+        rtol=_TOLERANCE,
+        atol=atol.ravel(),
     )
     assert done.success, done.message
     return np.moveaxis(done.y.reshape(*shape, len(ts)), -1, -2)
@@ -175,36 +192,51 @@ def _kicked(body, state, ts, kick, rng, substeps, held):
             state = body.step(start + i * dt, dt, state, torque)
             state[..., :3] += noise[1]
             if body.followed:
-                state[..., 3:7] /= np.linalg.norm(state[..., 3:7], axis=-1, keepdims=True)
+                state[..., 3:7] /= np.linalg.norm(
+                    state[..., 3:7], axis=-1, keepdims=True
+                )
         states.append(state)
     return np.stack(states, axis=-2)
 
 
 def tumble(
-    tensor, omega0, ts, torque=None, wheel=None, kick=0.0, rng=None, substeps=None,
-    attitude0=None, part=None, held=None,
-):  # fmt: skip
+    tensor,
+    omega0,
+    ts,
+    torque=None,
+    wheel=None,
+    kick=0.0,
+    rng=None,
+    substeps=None,
+    attitude0=None,
+    part=None,
+    held=None,
+):
     """A rigid body turns about its centre of mass: I w' = (I w + h) x w - h' + torque + noise.
 
-    Without noise one DOP853 over all throws, relative tolerance 1e-10. With it each substep is half
-    a kick, a step of Runge-Kutta's order 4, half a kick: the momentum gets N(0, kick^2 dt) in all,
-    so its sum between two samples has the variance kick^2 (t' - t) whatever the substeps; where in
-    a substep it falls is right to second order in the angle turned.
+    Without noise one DOP853 over all trials, relative tolerance 1e-10. With it each
+    substep is half a kick, a step of Runge-Kutta's order 4, half a kick: the momentum
+    gets N(0, kick^2 dt) in all, so its sum between two samples has the variance kick^2
+    (t' - t) whatever the substeps; where in a substep it falls is right to second order
+    in the angle turned.
 
     Args:
-        tensor: Inertia about the centre of mass (3, 3), or of each throw (throws, 3, 3) [kg m^2].
-        omega0: Rates at ts[0], (3,) or (throws, 3) [rad/s].
-        ts: Times, growing, of all throws (samples,) [s].
+        tensor: Inertia about the centre of mass (3, 3), or of each trial (trials, 3, 3)
+            [kg m^2].
+        omega0: Rates at ts[0], (3,) or (trials, 3) [rad/s].
+        ts: Times, growing, of all trials (samples,) [s].
         torque: A function of t and omega (..., 3) in body axes [N m]; smooth.
-        wheel: A function of t, the momentum (3,) of wheels along body axes and its derivative;
-            see `wheel_profile`.
-        kick: White torque, the root of its spectral density, a number or (3,) [N m sqrt(s)].
+        wheel: A function of t, the momentum (3,) of wheels along body axes and its
+            derivative; see `wheel_profile`.
+        kick: White torque, the root of its spectral density, a number or (3,) [N m
+            sqrt(s)].
         rng: A generator, for the kick.
-        substeps: Of each sample with a kick; None: at most 0.05 rad of the first rates each.
-        attitude0: Quaternion at ts[0], (4,) or (throws, 4), if attitudes are wanted.
+        substeps: Of each sample with a kick; None: at most 0.05 rad of the first rates
+            each.
+        attitude0: Quaternion at ts[0], (4,) or (trials, 4), if attitudes are wanted.
         part: A LoosePart, at rest in the body at ts[0].
-        held: A torque in body axes (..., samples - 1, 3) [N m], constant from each time to the
-            next; steps are as with a kick. See `ou_torque`.
+        held: A torque in body axes (..., samples - 1, 3) [N m], constant from each time
+            to the next; steps are as with a kick. See `ou_torque`.
 
     Returns:
         Motion.
@@ -249,8 +281,8 @@ def wobble_torque(rng, tensor, omega0, size, frequencies=(0.3, 2.0)):
     Args:
         rng: A generator.
         tensor: Inertia (3, 3) [kg m^2].
-        omega0: Rates (3,) or (throws, 3) [rad/s]; each throw has a torque of its own.
-        size: Root mean square over |(I w) x w| averaged over the throws.
+        omega0: Rates (3,) or (trials, 3) [rad/s]; each trial has a torque of its own.
+        size: Root mean square over |(I w) x w| averaged over the trials.
         frequencies: Least and largest, in turns of the mean rate.
     """
     omega0 = np.asarray(omega0, float)
@@ -267,10 +299,10 @@ def wobble_torque(rng, tensor, omega0, size, frequencies=(0.3, 2.0)):
 def ou_torque(rng, ts, size, tau):
     """An unmodelled torque: along each axis an Ornstein-Uhlenbeck process, held between times.
 
-    The process is stationary and sampled exactly: neighbours correlate by a = exp(-dt / tau). Its
-    variance is size^2 (1 - a) / (1 + a) / dt, so that the spectral density of the held torque at
-    frequency 0 is size^2 whatever tau; where dt is much smaller than tau, that is the variance
-    size^2 / (2 tau) of the process.
+    The process is stationary and sampled exactly: neighbours correlate by a = exp(-dt /
+    tau). Its variance is size^2 (1 - a) / (1 + a) / dt, so that the spectral density of
+    the held torque at frequency 0 is size^2 whatever tau; where dt is much smaller than
+    tau, that is the variance size^2 / (2 tau) of the process.
 
     Args:
         rng: A generator.
@@ -305,7 +337,8 @@ def wheel_profile(axis, size, start, duration, scale=1.0, delay=0.0):
         delay: Of the report [s]: it tells scale h(t - delay).
 
     Returns:
-        Two functions of t (a number or (samples,)) that give h and h' (..., 3): true, reported.
+        Two functions of t (a number or (samples,)) that give h and h' (..., 3): true,
+        reported.
     """
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
 
@@ -325,7 +358,8 @@ def wheel_profile(axis, size, start, duration, scale=1.0, delay=0.0):
 def lagged(values, step, time_constant):
     """First-order low-pass y' = (x - y) / T of samples (..., n, 3) on a uniform grid.
 
-    Exact for x linear between the samples; y has settled on the first slope at the start.
+    Exact for x linear between the samples; y has settled on the first slope at the
+    start.
     """
     if not time_constant:
         return values
@@ -340,15 +374,26 @@ def lagged(values, step, time_constant):
 
 
 def gyro(
-    source, ts, rng, sigma, bias=0.0, drift=0.0, walk=0.0, matrix=None, delay=0.0,
-    time_constant=0.0, limit=None, quantum=None,
-):  # fmt: skip
+    source,
+    ts,
+    rng,
+    sigma,
+    bias=0.0,
+    drift=0.0,
+    walk=0.0,
+    matrix=None,
+    delay=0.0,
+    time_constant=0.0,
+    limit=None,
+    quantum=None,
+):
     """Readings of a gyro: matrix (lagged rates at t - delay) + bias + drift (t - ts[0]) + noise.
 
     Args:
-        source: A function that gives the rates (..., n, 3) at times (n,), or a pair of a uniform
-            grid of times and the rates on it (cubic splines between). It should begin a few time
-            constants and the delay before ts[0]; a function is asked there.
+        source: A function that gives the rates (..., n, 3) at times (n,), or a pair of
+            a uniform grid of times and the rates on it (cubic splines between). It
+            should begin a few time constants and the delay before ts[0]; a function is
+            asked there.
         ts: Times of the readings (samples,) [s].
         rng: A generator.
         sigma: Standard deviation of each reading, a number or (3,) [rad/s].
@@ -381,7 +426,9 @@ def gyro(
     values = values + bias + drift * since + sigma * rng.normal(size=values.shape)
     if walk:
         steps = np.sqrt(np.diff(ts, prepend=ts[0]))[:, None]
-        values = values + walk * np.cumsum(steps * rng.normal(size=values.shape), axis=-2)
+        values = values + walk * np.cumsum(
+            steps * rng.normal(size=values.shape), axis=-2
+        )
     if quantum is not None:
         values = quantum * np.round(values / quantum)
     return values if limit is None else np.clip(values, -limit, limit)
@@ -391,7 +438,9 @@ def _at(grid, values, ts, time_constant):
     """Lagged values of a grid at times within it."""
     assert grid[0] <= ts[0] + 1e-12, "the grid begins too late"
     assert ts[-1] <= grid[-1] + 1e-12, "the grid ends too early"
-    return CubicSpline(grid, lagged(values, grid[1] - grid[0], time_constant), axis=-2)(ts)
+    return CubicSpline(grid, lagged(values, grid[1] - grid[0], time_constant), axis=-2)(
+        ts
+    )
 
 
 def accelerometer(motion, lever, rng, sigma, bias=0.0, gravity=None):
@@ -403,8 +452,8 @@ def accelerometer(motion, lever, rng, sigma, bias=0.0, gravity=None):
         rng: A generator.
         sigma: Standard deviation of each reading [m/s^2].
         bias: A number or (3,) [m/s^2].
-        gravity: Of a body that is held at its centre of mass, in space (3,) [m/s^2]: -g in body
-            axes is added. None: free fall.
+        gravity: Of a body that is held at its centre of mass, in space (3,) [m/s^2]: -g
+            in body axes is added. None: free fall.
     """
     lever, omega = np.asarray(lever, float), motion.omega
     force = cross(motion.alpha, lever) + cross(omega, cross(omega, lever))
@@ -432,9 +481,9 @@ def random_body(rng, kind="general"):
 
     Args:
         rng: A generator.
-        kind: "general"; "symmetric", two moments equal; "nearly sphere", moments within a few
-            per cent; "flat", a plate with no thickness to speak of; "rod", the smallest moment
-            below a tenth of the others.
+        kind: "general"; "symmetric", two moments equal; "nearly sphere", moments within
+            a few per cent; "flat", a plate with no thickness to speak of; "rod", the
+            smallest moment below a tenth of the others.
     """
     if kind == "general":
         second = np.exp(rng.normal(scale=0.7, size=3))
@@ -443,7 +492,9 @@ def random_body(rng, kind="general"):
     elif kind == "nearly sphere":
         second = np.exp(rng.normal(scale=0.02, size=3))
     elif kind == "flat":
-        second = np.array([*np.exp(rng.normal(scale=0.5, size=2)), np.exp(rng.uniform(-9, -4))])
+        second = np.array(
+            [*np.exp(rng.normal(scale=0.5, size=2)), np.exp(rng.uniform(-9, -4))]
+        )
     elif kind == "rod":
         second = np.array([1.0, *np.exp(rng.uniform(-7, -3.2, size=2))])
     else:
@@ -485,8 +536,9 @@ class Record:
 def random_record(rng, kind=None, largest=3000):
     """A free body of any kind and size of time: what a fit may be given without warning.
 
-    5 to `largest` samples, 0.03 to 1.5 rad each but at most 1000 rad in all, jitter up to 90 % of
-    a step, gaps; rates of 1 rad/s times 10^(-3 to 3); noise 0.1 to 5 % of the rate.
+    5 to `largest` samples, 0.03 to 1.5 rad each but at most 1000 rad in all, jitter up
+    to 90 % of a step, gaps; rates of 1 rad/s times 10^(-3 to 3); noise 0.1 to 5 % of
+    the rate.
     """
     kind = kind or str(rng.choice(KINDS))
     tensor = random_body(rng, kind)
@@ -508,42 +560,62 @@ def random_record(rng, kind=None, largest=3000):
 THROWN = {"phone": (8.2e-5, 3.43e-4, 4.24e-4), "racquet": (1.5e-3, 1.50e-2, 1.64e-2)}
 
 
-def throws(
-    rng, count=100, body="phone", rate=100.0, duration=(0.3, 1.0), spin=(6.0, 14.0), drag=0.01,
-    wobble=0.01, wobble_frequency=15.0, kick=0.0, time_constant=0.005, sigma=0.005, bias=0.0,
-    delay=0.0, limit=None, quantum=None, ou=None, tau=0.1, ou_scatter=0.0, axes=None,
-):  # fmt: skip
+def trials(
+    rng,
+    count=100,
+    body="phone",
+    rate=100.0,
+    duration=(0.3, 1.0),
+    spin=(6.0, 14.0),
+    drag=0.01,
+    wobble=0.01,
+    wobble_frequency=15.0,
+    kick=0.0,
+    time_constant=0.005,
+    sigma=0.005,
+    bias=0.0,
+    delay=0.0,
+    limit=None,
+    quantum=None,
+    ou=None,
+    tau=0.1,
+    ou_scatter=0.0,
+    axes=None,
+):
     """One body thrown many times: the scene of most home-made records.
 
-    Each throw turns about a direction of its own, half of them within 0.3 rad of a principal axis;
-    its gyro has run before the first sample (no jump of the low-pass at the start).
+    Each trial turns about a direction of its own, half of them within 0.3 rad of a
+    principal axis; its gyro has run before the first sample (no jump of the low-pass at
+    the start).
 
     Args:
         rng: A generator.
-        count: Throws.
-        body: "phone", "racquet", or principal moments (3,) [kg m^2]; its axes are at random.
+        count: Trials.
+        body: "phone", "racquet", or principal moments (3,) [kg m^2]; its axes are at
+            random.
         rate: Samples a second [Hz].
-        duration: Least and largest of a throw [s].
+        duration: Least and largest of a trial [s].
         spin: Least and largest [rad/s].
         drag: C of quadratic drag over the mean moment: the loss of rate in one radian.
         wobble: Inertia of a loose part over the smallest moment; 0 for none.
         wobble_frequency: Of its spring [Hz].
         kick: White torque over the mean moment [rad / s^1.5].
         time_constant: Of the gyro's low-pass [s].
-        sigma: Noise of the gyro over each throw's spin.
+        sigma: Noise of the gyro over each trial's spin.
         bias: Of the gyro [rad/s].
         delay: Of the gyro [s].
         limit: Of the gyro [rad/s].
         quantum: Of the gyro [rad/s].
-        ou: Ornstein-Uhlenbeck torque along each principal axis (3,), or None: the root of its
-            spectral density at frequency 0 over the mean moment and over the throw's spin
-            [1 / sqrt(s)].
+        ou: Ornstein-Uhlenbeck torque along each principal axis (3,), or None: the root
+            of its spectral density at frequency 0 over the mean moment and over the
+            trial's spin [1 / sqrt(s)].
         tau: Its correlation time [s]; 0: white.
-        ou_scatter: Of the logarithm of its level from throw to throw.
+        ou_scatter: Of the logarithm of its level from trial to trial.
         axes: Principal axes in body axes (3, 3), columns; None: at random.
 
     Returns:
-        A Record of each throw, with rates in true body axes at the times of its samples.
+        A Record of each trial, with rates in true body axes at the times of its
+        samples.
     """
     moments = np.asarray(THROWN[body] if isinstance(body, str) else body, float)
     axes = random_axes(rng) if axes is None else np.asarray(axes, float)
@@ -555,22 +627,39 @@ def throws(
         -1, 1, size=(np.count_nonzero(near), 3)
     )
     spins = rng.uniform(*spin, size=count)
-    omega0 = spins[:, None] * (directions / np.linalg.norm(directions, axis=1)[:, None]) @ axes.T
-    lengths = np.maximum(5, np.round(rng.uniform(*duration, size=count) * rate)).astype(int)
-    # The dense grid leads the samples by whole samples, enough for the low-pass and the delay.
-    fine = max(4, int(np.ceil(20 * np.max(spins) / rate)), int(np.ceil(8 / rate / time_constant))
-               if time_constant else 0)  # fmt: skip
+    omega0 = (
+        spins[:, None]
+        * (directions / np.linalg.norm(directions, axis=1)[:, None])
+        @ axes.T
+    )
+    lengths = np.maximum(5, np.round(rng.uniform(*duration, size=count) * rate)).astype(
+        int
+    )
+    # The dense grid leads the samples by whole samples, enough for the low-pass and the
+    # delay.
+    fine = max(
+        4,
+        int(np.ceil(20 * np.max(spins) / rate)),
+        int(np.ceil(8 / rate / time_constant)) if time_constant else 0,
+    )
     lead = int(np.ceil((delay + 5 * time_constant) * rate))
     grid = np.arange(-lead * fine, (np.max(lengths) - 1) * fine + 1) / (rate * fine)
     held = None
     if ou is not None:
         levels = mean * spins * np.exp(ou_scatter * rng.normal(size=count))
-        held = ou_torque(rng, grid, levels[:, None] * np.asarray(ou, float), tau) @ axes.T
+        held = (
+            ou_torque(rng, grid, levels[:, None] * np.asarray(ou, float), tau) @ axes.T
+        )
     motion = tumble(
-        tensor, omega0, grid, quadratic_drag(drag * mean) if drag else None,
-        kick=kick * mean, rng=rng, held=held,
+        tensor,
+        omega0,
+        grid,
+        quadratic_drag(drag * mean) if drag else None,
+        kick=kick * mean,
+        rng=rng,
+        held=held,
         part=LoosePart(wobble * moments[0], wobble_frequency) if wobble else None,
-    )  # fmt: skip
+    )
     first = lead * fine
     records = []
     for i, length in enumerate(lengths):
@@ -578,9 +667,16 @@ def throws(
         rows = slice(first, first + (length - 1) * fine + 1, fine)
         noise = sigma * spins[i]
         readings = gyro(
-            (grid, motion.omega[i]), ts, rng, noise, bias, delay=delay,
-            time_constant=time_constant, limit=limit, quantum=quantum,
-        )  # fmt: skip
+            (grid, motion.omega[i]),
+            ts,
+            rng,
+            noise,
+            bias,
+            delay=delay,
+            time_constant=time_constant,
+            limit=limit,
+            quantum=quantum,
+        )
         omega, alpha = motion.omega[i, rows], motion.alpha[i, rows]
         records.append(Record(tensor, ts, omega, readings, noise, alpha, str(body)))
     return records

@@ -52,6 +52,18 @@ from jrigid.top import top_motion as top_motion
 __version__ = _version("jrigid")
 
 _list_public_names(
-    *(datasets, dynamics, elliptic, free, identify, io, lagrangian, mass, plot, records, rotation),
+    *(
+        datasets,
+        dynamics,
+        elliptic,
+        free,
+        identify,
+        io,
+        lagrangian,
+        mass,
+        plot,
+        records,
+        rotation,
+    ),
     *(solids, solvers, stability, systems, top, torques),
 )

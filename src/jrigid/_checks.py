@@ -1,11 +1,12 @@
 """Input validation: converts arguments, checks shapes and values, raises errors.
 
-Shapes, dtypes and options are checked when a call is traced (ValueError). Values are checked by
-`Findings`, in three ways that `docs/design.md` tells apart: a formula is NaN outside its domain
-(`where_defined`), a builder raises or is NaN (`Findings.guard`), a solver or an estimator raises
-or returns its result code (`settle`). An error is raised in Python where the values are known,
-which leaves the compiled function without callbacks, and by `equinox.error_if` inside of someone's
-jit. Calls that raise compile nothing after the first (tests/test_no_leak.py).
+Shapes, dtypes and options are checked when a call is traced (ValueError). Values are
+checked by `Findings`, in three ways that `docs/design.md` tells apart: a formula is NaN
+outside its domain (`where_defined`), a builder raises or is NaN (`Findings.guard`), a
+solver or an estimator raises or returns its result code (`settle`). An error is raised
+in Python where the values are known, which leaves the compiled function without
+callbacks, and by `equinox.error_if` inside of someone's jit. Calls that raise compile
+nothing after the first (tests/test_no_leak.py).
 """
 
 import functools
@@ -67,7 +68,9 @@ class RESULTS(diffrax.RESULTS, metaclass=_Listed):  # pyright: ignore[reportGene
         "symmetric, positive definite (3, 3) tensor, but it is not. (Three bodies are three lanes "
         "of `jax.vmap`, not the rows of a (3, 3) array.)"
     )
-    invalid_top = "Argument `top` must have I1 > 0, I3 > 0 and a finite mgl, but it has not."
+    invalid_top = (
+        "Argument `top` must have I1 > 0, I3 > 0 and a finite mgl, but it has not."
+    )
     unphysical_inertia = (
         "Argument `inertia` must be the tensor of a real body, whose principal moments satisfy "
         "I3 <= I1 + I2, but they do not."
@@ -160,11 +163,15 @@ def internal_parts(internal: Any) -> Any:
     return None if isinstance(internal, tuple) and not internal else internal
 
 
-def check_shape(name: str, value: Array | np.ndarray, *shapes: tuple[int | None, ...]) -> None:
+def check_shape(
+    name: str, value: Array | np.ndarray, *shapes: tuple[int | None, ...]
+) -> None:
     """Raise ValueError unless `value` has one of the shapes; None stands for any length."""
     for shape in shapes:
         pairs = zip(value.shape, shape, strict=False)
-        if len(shape) == value.ndim and all(wanted in (None, length) for length, wanted in pairs):
+        if len(shape) == value.ndim and all(
+            wanted in (None, length) for length, wanted in pairs
+        ):
             return
     wanted = " or ".join(str(shape).replace("None", "n") for shape in shapes)
     hint = _hint(name, value.shape, shapes)
@@ -173,7 +180,9 @@ def check_shape(name: str, value: Array | np.ndarray, *shapes: tuple[int | None,
     )
 
 
-def _hint(name: str, shape: tuple[int, ...], wanted: Sequence[tuple[int | None, ...]]) -> str:
+def _hint(
+    name: str, shape: tuple[int, ...], wanted: Sequence[tuple[int | None, ...]]
+) -> str:
     """What a wrong shape may come from."""
     if any(x and shape[len(shape) - len(x) :] == x for x in wanted):
         return " (For many, `jax.vmap`.)"
@@ -183,7 +192,9 @@ def _hint(name: str, shape: tuple[int, ...], wanted: Sequence[tuple[int | None, 
             "minus the sum of m x y; programs differ in order and sign.)"
         )
     is_omega = name.endswith("attitude") and shape == (3,)
-    return " (`State(attitude, omega)`, the attitude as (w, x, y, z).)" if is_omega else ""
+    return (
+        " (`State(attitude, omega)`, the attitude as (w, x, y, z).)" if is_omega else ""
+    )
 
 
 def array_of_shape(name: str, value: Any, *shape: Any) -> Array:
@@ -195,8 +206,9 @@ def shaped(**arguments: tuple[Any, ...]) -> tuple[Array, ...]:
     """Convert arguments to one dtype, or raise ValueError if a shape is wrong.
 
     Args:
-        **arguments: By name: the value, then the lengths of its axes (`vector=(vector, 3)`) or the
-            shapes it may have (`inertia=(inertia, *INERTIA)`).
+        **arguments: By name: the value, then the lengths of its axes
+            (`vector=(vector, 3)`) or the shapes it may have
+            (`inertia=(inertia, *INERTIA)`).
     """
     arrays = float_arrays(*(value for value, *_ in arguments.values()))
     for array, (name, (_, *shape)) in zip(arrays, arguments.items(), strict=True):
@@ -216,14 +228,18 @@ def check_option(name: str, value: Any, options: Sequence[Any]) -> None:
     check_known(name, value)
     if value not in options:
         listed = ", ".join(map(repr, options))
-        raise ValueError(f"Argument `{name}` must be one of {listed}, but it is {value!r}.")
+        raise ValueError(
+            f"Argument `{name}` must be one of {listed}, but it is {value!r}."
+        )
 
 
 def check_type(name: str, value: Any, *types: type) -> None:
     """Raise ValueError unless `value` is of one of the types."""
     if not isinstance(value, types):
         wanted = " or a ".join(x.__name__ for x in types)
-        raise ValueError(f"Argument `{name}` must be a {wanted}, but it is {kind_of(value)}.")
+        raise ValueError(
+            f"Argument `{name}` must be a {wanted}, but it is {kind_of(value)}."
+        )
 
 
 def kind_of(value: Any) -> str:
@@ -231,7 +247,9 @@ def kind_of(value: Any) -> str:
     if isinstance(value, type):
         return f"the class `{value.__name__}`, not `{value.__name__}(...)`"
     is_array = eqx.is_array(value) or isinstance(value, np.ndarray)
-    return f"an array of shape {value.shape}" if is_array else f"a {type(value).__name__}"
+    return (
+        f"an array of shape {value.shape}" if is_array else f"a {type(value).__name__}"
+    )
 
 
 def check_known(name: str, value: Any) -> None:
@@ -275,7 +293,11 @@ def traced_by_jax(function: str) -> Iterator[None]:
 def whole_number(name: str, value: Any, least: int = 1) -> int:
     """A Python integer of some size, which fixes a cost at trace time, or ValueError."""
     check_known(name, value)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | np.integer)
+        or value < least
+    ):
         raise ValueError(
             f"Argument `{name}` must be an integer and at least {least}, but it is {value!r}."
         )
@@ -292,7 +314,9 @@ def is_concrete(value: Any) -> bool:
 def _holds(condition: Callable[[Array], Array], tree: Any) -> Bool[Array, ""]:
     """True where a condition holds for every inexact leaf of a pytree."""
     leaves = [x for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)]
-    return functools.reduce(lambda ok, x: ok & jnp.all(condition(x)), leaves, jnp.array(True))
+    return functools.reduce(
+        lambda ok, x: ok & jnp.all(condition(x)), leaves, jnp.array(True)
+    )
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
@@ -352,8 +376,9 @@ def is_inertia(inertia: Array) -> Bool[Array, ""]:
 def harmless(ok: Array, tree: Tree) -> Tree:
     """Ones, and unit tensors, in place of the arrays of a bad lane.
 
-    Derivatives of NaN are NaN, even those that a mask multiplies by zero: a bad lane that went on
-    with its values would spoil the derivatives of what it shares with the others.
+    Derivatives of NaN are NaN, even those that a mask multiplies by zero: a bad lane
+    that went on with its values would spoil the derivatives of what it shares with the
+    others.
     """
 
     def replaced(x: Any) -> Any:
@@ -371,7 +396,9 @@ def nan_where(bad: AnyBool, tree: Tree) -> Tree:
     )
 
 
-def where_defined(ok: Bool[Array, ""], formula: Callable[..., Tree], *arguments: Any) -> Tree:
+def where_defined(
+    ok: Bool[Array, ""], formula: Callable[..., Tree], *arguments: Any
+) -> Tree:
     """A formula's values where `ok`, NaN elsewhere; its derivatives stay clean everywhere."""
     return nan_where(~ok, formula(*harmless(ok, arguments)))
 
@@ -432,7 +459,9 @@ class Findings:
     def diagnosis_of(self, result: RESULTS) -> _Diagnosis:
         """As `diagnosis`, but where no condition fails the result code tells what is wrong."""
         code = code_of(result)
-        first = jnp.where(self.ok, len(self._failed) + code, _first_failed(self._failed))
+        first = jnp.where(
+            self.ok, len(self._failed) + code, _first_failed(self._failed)
+        )
         messages = (*self._messages, *RESULTS.texts)
         values = (*self._values, *[None] * len(RESULTS.texts))
         return _Diagnosis(first, messages, values)
@@ -453,22 +482,25 @@ def settle(
 ) -> Tree:
     """Return the answer of a solver or an estimator, or raise if it failed and `throw`.
 
-    What is wrong is looked up by a compiled program of its own, which the next failing call uses
-    again. So `findings` must be a function of the module and all else be in the arguments: a
-    closure would be compiled, and kept in memory, anew for each error.
+    What is wrong is looked up by a compiled program of its own, which the next failing
+    call uses again. So `findings` must be a function of the module and all else be in
+    the arguments: a closure would be compiled, and kept in memory, anew for each error.
 
     Args:
         answer: With a `result` of `RESULTS`.
         throw: Whether to raise.
         findings: Checks the arguments once more, to tell which of them is wrong.
-        arguments: Passed to `findings`: pytrees of arrays and of hashable configuration.
+        arguments: Passed to `findings`: pytrees of arrays and of hashable
+            configuration.
     """
     check_known("throw", throw)
     if not throw:
         return answer
     result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]
     good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    return _refuse(answer, ~good, lambda: _diagnosis(findings, ~good, result, *arguments))
+    return _refuse(
+        answer, ~good, lambda: _diagnosis(findings, ~good, result, *arguments)
+    )
 
 
 @eqx.filter_jit
@@ -521,7 +553,9 @@ def _all_lanes(*values: Any) -> list[np.ndarray]:
     def _(size: int, batched: list[bool], *values: Any) -> tuple[Any, bool]:
         pairs = zip(values, batched, strict=True)
         found.extend(
-            _all_lanes(*(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in pairs))
+            _all_lanes(
+                *(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in pairs)
+            )
         )
         return values[0], batched[0]
 

@@ -17,16 +17,26 @@ from jrigid.systems import RigidBody
 _LEAST = 4  # rows of a piece that is fitted
 # 1 is for what cannot be used, 2 for what argparse does not understand.
 _EXIT = {
-    "OK": 0, "UNIDENTIFIABLE": 3, "MISFIT": 4, "AT_BOUNDARY": 5, "WRONG_BASIN": 6,
+    "OK": 0,
+    "UNIDENTIFIABLE": 3,
+    "MISFIT": 4,
+    "AT_BOUNDARY": 5,
+    "WRONG_BASIN": 6,
     "NOT_CONVERGED": 7,
-}  # fmt: skip
+}
 _OPTIONS = {
     "`unmodelled`": "`--unmodelled`",
     "`free`": "`--bias`",
     "`sigma`": "`--sigma`",
     "`absolute_sigma=False`": "no `--sigma`",
 }
-_SHAPES = "tensor", "moments", "symmetric", "top", "flat"  # of `jrigid.identify`
+_INERTIA_MODELS = (
+    "tensor",
+    "moments",
+    "symmetric",
+    "top",
+    "flat",
+)  # of `jrigid.identify`
 
 
 def _torque(text: str) -> str | identify.GaussMarkov:
@@ -38,32 +48,62 @@ def _torque(text: str) -> str | identify.GaussMarkov:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("jrigid", description="The rotation of rigid bodies.")
+    parser = argparse.ArgumentParser(
+        "jrigid", description="The rotation of rigid bodies."
+    )
     codes = ", ".join(f"{code} {name}" for name, code in _EXIT.items())
     command = parser.add_subparsers(required=True).add_parser(
-        "fit", help="inertia from a file with a gyro's record of free motion",
-        description="Inertia from a file with a gyro's record of free motion, of one throw or "
+        "fit",
+        help="inertia from a file with a gyro's record of free motion",
+        description="Inertia from a file with a gyro's record of free motion, of one trial or "
         "several; units, clocks and repairs are said.",
         epilog=f"Exit status: {codes}; 1 for a file that cannot be used, 2 for these arguments. "
         "`--flights` takes noise and bias from where the body rests; without a sigma the noise is "
         "taken from the residuals.",
-    )  # fmt: skip
+    )
     add = command.add_argument
     add("path", help="a file, or a folder, as `jrigid.records.read` takes it")
     units = "of the rates: deg/s, counts or a factor; or times=ms, any number"
     add("--unit", action="append", default=[], help=units)
-    add("--columns", action="append", default=[], metavar="NAME=HEADERS",
-        help="times=t, rates=gx,gy,gz, any number")  # fmt: skip
-    add("--flights", action="store_true", help="find throws in the record; else it is one throw")
-    add("--sigma", type=float, help="noise of a reading [rad/s], whatever the file's unit")
+    add(
+        "--columns",
+        action="append",
+        default=[],
+        metavar="NAME=HEADERS",
+        help="times=t, rates=gx,gy,gz, any number",
+    )
+    add(
+        "--flights",
+        action="store_true",
+        help="find trials in the record; else it is one trial",
+    )
+    add(
+        "--sigma",
+        type=float,
+        help="noise of a reading [rad/s], whatever the file's unit",
+    )
     add("--bias", action="store_true", help="seek the gyro's bias")
-    add("--shape", choices=_SHAPES, default="tensor", help="what is known of it (tensor: nothing)")
-    add("--unmodelled", type=_torque, default=identify.GaussMarkov(0.0), metavar="LEVEL[,TIME]",
+    add(
+        "--inertia-model",
+        choices=_INERTIA_MODELS,
+        default="tensor",
+        help="what is known of it (tensor: nothing)",
+    )
+    add(
+        "--unmodelled",
+        type=_torque,
+        default=identify.GaussMarkov(0.0),
+        metavar="LEVEL[,TIME]",
         help="of an unmodelled torque over the mean moment [rad/s^1.5], and its correlation time "
-        "[s] (white without one); or estimate")  # fmt: skip
+        "[s] (white without one); or estimate",
+    )
     add("--robust", action="store_true", help="leave outliers out")
     add("--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)")
-    add("--save", metavar="PKL", help="where to keep the fit, for `jrigid.identify.load`")
+    add(
+        "--save",
+        metavar="PKL",
+        help="where to keep the fit, for `jrigid.identify.load`",
+    )
     return parser
 
 
@@ -74,9 +114,12 @@ def _with_options(report: str) -> str:
     return report
 
 
-def _throws(reading: records.Reading, fly: bool) -> list[records.Reading]:
+def _trials(reading: records.Reading, fly: bool) -> list[records.Reading]:
     """What is fitted: flights, or the stretches without a break."""
-    demand(reading.rates is not None, "Argument `path` must hold rates of a gyro, but it has none.")
+    demand(
+        reading.rates is not None,
+        "Argument `path` must hold rates of a gyro, but it has none.",
+    )
     if fly:
         parts = records.flights(reading)
         for part in parts:
@@ -116,7 +159,7 @@ def _fit(options: argparse.Namespace) -> int:
     columns = {name: tuple(x.split(",")) if "," in x else x for name, _, x in named}
     reading = records.read(options.path, unit=units, columns=columns)
     print(reading)
-    throws = _throws(reading, options.flights)
+    trials = _trials(reading, options.flights)
     noise, bias = _at_rest(reading) if options.flights else (None, np.zeros(3))
     sigma = noise if options.sigma is None else options.sigma
     gyro = identify.Gyro(jnp.asarray(bias))
@@ -124,9 +167,9 @@ def _fit(options: argparse.Namespace) -> int:
     def fit(throw: bool) -> identify.FitResult:
         return identify.fit(
             RigidBody(np.ones(3)),
-            [identify.Record(gyro, x.times, x.rates, sigma) for x in throws],
+            [identify.Record(gyro, x.times, x.rates, sigma) for x in trials],
             free=(lambda _, gyro: gyro.bias) if options.bias else None,
-            shape=getattr(identify, options.shape.title())(),
+            inertia_model=getattr(identify, options.inertia_model.title())(),
             unmodelled=options.unmodelled,
             loss="robust" if options.robust else "squares",
             throw=throw,
@@ -141,7 +184,9 @@ def _fit(options: argparse.Namespace) -> int:
     if options.plot:
         os.environ.setdefault("MPLBACKEND", "Agg")
         plot.fit(found)["record"].figure.savefig(options.plot)
-    return next(code for name, code in _EXIT.items() if found.status == getattr(Status, name))
+    return next(
+        code for name, code in _EXIT.items() if found.status == getattr(Status, name)
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,4 +12,6 @@ def extra(group: str, module: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         package = package.replace("_", "-")
-        raise ImportError(f'This needs {package}: pip install "jrigid[{group}]".') from error
+        raise ImportError(
+            f'This needs {package}: pip install "jrigid[{group}]".'
+        ) from error

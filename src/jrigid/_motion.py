@@ -49,27 +49,35 @@ class HasRigidBody(Protocol):
 
 
 def motion_arguments(
-    system: Any, state: Any, kind: type = AbstractSystem, name: str = "state0", **times: Any
+    system: Any,
+    state: Any,
+    kind: type = AbstractSystem,
+    name: str = "state0",
+    **times: Any,
 ) -> tuple[Any, Any, tuple[Array, ...]]:
     """System, state and times with types and shapes checked, or ValueError.
 
     Args:
         system: Of the kind, or with a method `as_rigid_body`.
-        state: Its state. Internal parts that are not given start at rest relative to the body.
+        state: Its state. Internal parts that are not given start at rest relative to
+            the body.
         kind: What the system must be.
         name: What the state is called.
         times: By their names: `ts` of any shape, the others numbers.
 
     Returns:
-        The system; the state, all of it in one dtype; the times in one dtype, theirs: they may have
-        more digits than the state, and are to be subtracted before they are rounded to its own.
+        The system; the state, all of it in one dtype; the times in one dtype, theirs:
+        they may have more digits than the state, and are to be subtracted before they
+        are rounded to its own.
     """
     if isinstance(system, HasRigidBody):
         system = system.as_rigid_body()
     if not isinstance(system, kind):
         names = "jrigid system (a RigidBody, a FloatingBody)"
         wanted = names if kind is AbstractSystem else kind.__name__
-        raise ValueError(f"Argument `system` must be a {wanted}, but it is {kind_of(system)}.")
+        raise ValueError(
+            f"Argument `system` must be a {wanted}, but it is {kind_of(system)}."
+        )
     check_type(name, state, system.state_type)
     state, _ = _in_one_dtype(name, state)
     return system, system.with_parts(state), numbers(**times)
@@ -89,7 +97,9 @@ def _in_one_dtype(name: str, state: Any, *others: Any) -> tuple[Any, tuple[Array
     parts, structure = jtu.tree_flatten((known, state.internal))
     arrays = float_arrays(*parts, *others)
     if arrays[0].dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"Arguments must be float32 or float64, but they are {arrays[0].dtype}.")
+        raise ValueError(
+            f"Arguments must be float32 or float64, but they are {arrays[0].dtype}."
+        )
     known, internal = structure.unflatten(arrays[: len(parts)])
     return dataclasses.replace(state, **known, internal=internal), arrays[len(parts) :]
 
@@ -124,29 +134,45 @@ def numbers(**values: Any) -> tuple[Array, ...]:
         try:
             (array,) = float_arrays(value)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"Argument `{name}` must be numbers, but it is {value!r}.") from error
+            raise ValueError(
+                f"Argument `{name}` must be numbers, but it is {value!r}."
+            ) from error
         if name != "ts":
             check_shape(name, array, ())
         elif array.size == 0:
-            raise ValueError("Argument `ts` must hold at least one time, but it is empty.")
+            raise ValueError(
+                "Argument `ts` must hold at least one time, but it is empty."
+            )
     return float_arrays(*values.values())
 
 
 def _check_state(findings: Findings, state: Any) -> None:
-    findings.require(all_finite(state), RESULTS.invalid_state, value=ravel_pytree(state)[0])
-    findings.require(is_unit(state.attitude), RESULTS.invalid_attitude, value=state.attitude)
+    findings.require(
+        all_finite(state), RESULTS.invalid_state, value=ravel_pytree(state)[0]
+    )
+    findings.require(
+        is_unit(state.attitude), RESULTS.invalid_attitude, value=state.attitude
+    )
 
 
-def check_motion(findings: Findings, system: Any, state: Any, t: Array, args: Any) -> None:
+def check_motion(
+    findings: Findings, system: Any, state: Any, t: Array, args: Any
+) -> None:
     """Note bad values of a system and its state at a time in the precision of the state."""
     system.check(findings)
     _check_state(findings, state)
     field = system.vector_field(t, state, args)
     turning, spinning_up = safe_norm(jnp.stack([state.omega, field.omega]))
-    rate = jnp.maximum(turning, jnp.where(spinning_up < jnp.inf, jnp.sqrt(spinning_up), 0.0))
-    # Rates whose squares, and the last bits of those, are within the range of the dtype.
+    rate = jnp.maximum(
+        turning, jnp.where(spinning_up < jnp.inf, jnp.sqrt(spinning_up), 0.0)
+    )
+    # Rates whose squares, and the last bits of those, are within the range of the
+    # dtype.
     info = np.finfo(rate.dtype)
-    slowest, fastest = float(info.tiny / info.eps) ** 0.5, float(info.max * info.eps) ** 0.5
+    slowest, fastest = (
+        float(info.tiny / info.eps) ** 0.5,
+        float(info.max * info.eps) ** 0.5,
+    )
     in_range = (rate == 0) | ((rate > slowest) & (rate < fastest))
     findings.require(in_range, RESULTS.rate_out_of_range, value=rate)
     # The rate of the attitude is finite where the state is.
@@ -157,8 +183,9 @@ def check_motion(findings: Findings, system: Any, state: Any, t: Array, args: An
 def harmless_motion(ok: Array, motion: Motion) -> Motion:
     """A named tuple with a `state0`, whose attitude is normalised; where it is bad, ones.
 
-    No other lane is to wait for a bad one, and no NaN to reach the derivatives of what it shares
-    with the others: ones, since there are forces that are singular at the origin.
+    No other lane is to wait for a bad one, and no NaN to reach the derivatives of what
+    it shares with the others: ones, since there are forces that are singular at the
+        origin.
     """
     motion = harmless(ok, motion)
     attitude = normalize(motion.state0.attitude)
@@ -180,28 +207,35 @@ def depends_on(function: Callable[[Array], Any], x: Array) -> bool:
     return used_inputs(jax.make_jaxpr(function)(x))[0]
 
 
-def exact_motion(check: Callable, flow: Callable, throw: bool, *motion: Any) -> ExactStates:
+def exact_motion(
+    check: Callable, flow: Callable, throw: bool, *motion: Any
+) -> ExactStates:
     """A motion in closed form at times of any shape; a bad value is an error or NaN and a code.
 
     Args:
         check: Of findings and a body: notes what is wrong with it.
         flow: Of a body, a state and a time since then: attitude and angular velocity.
         throw: Whether to raise.
-        motion: The body, its state at `t0` (as from `plain_state`), the times and `t0`, all in one
-            dtype.
+        motion: The body, its state at `t0` (as from `plain_state`), the times and `t0`,
+            all in one dtype.
     """
     check_shape("t0", motion[-1], ())
     answer = _exact_states(check, flow, *motion)
     return settle(answer, throw, _motion_findings, check, *motion)
 
 
-def _motion_findings(check: Callable, body: Any, state0: State, ts: Array, t0: Array) -> Findings:
+def _motion_findings(
+    check: Callable, body: Any, state0: State, ts: Array, t0: Array
+) -> Findings:
     findings = Findings()
     check(findings, body)
     _check_state(findings, state0)
     for name, times in (("t0", t0), ("ts", ts)):
-        message = f"Argument `{name}` must be finite, but it is not."  # the sum shows in what way
-        findings.require(all_finite(times), RESULTS.invalid_times, message, jnp.sum(times))
+        # The sum shows in what way
+        message = f"Argument `{name}` must be finite, but it is not."
+        findings.require(
+            all_finite(times), RESULTS.invalid_times, message, jnp.sum(times)
+        )
     told_apart = resolves(t0, safe_norm(state0.omega))
     findings.require(told_apart, RESULTS.unresolved_times, value=t0)
     return findings

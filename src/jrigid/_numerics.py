@@ -1,7 +1,8 @@
 r"""Safe primitives; each states its value and its gradient at the edge.
 
-Functions of an angle or a norm that are even in it are written as functions of its square, which
-makes them analytic where `sqrt`, `norm` and `sin(x) / x` have none or NaN derivatives.
+Functions of an angle or a norm that are even in it are written as functions of its
+square, which makes them analytic where `sqrt`, `norm` and `sin(x) / x` have none or NaN
+derivatives.
 """
 
 import functools
@@ -34,11 +35,13 @@ def sum_of_squares(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     return _over_components(jnp.add, vector * vector)
 
 
-def _over_components(combine: Any, vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
+def _over_components(
+    combine: Any, vector: Float[Array, "*many n"]
+) -> Float[Array, "*many"]:
     """A reduction over the last axis, by a ufunc.
 
-    Of few components it is written out: XLA then computes it together with what is around
-    it, where a reduction is a program of its own.
+    Of few components it is written out: XLA then computes it together with what is
+    around it, where a reduction is a program of its own.
     """
     if vector.shape[-1] > _FEW:
         return combine.reduce(vector, axis=-1)
@@ -52,7 +55,11 @@ def or_one(size: AnyArray) -> AnyArray:
 
 def without_gradient(value: AnyArray) -> AnyArray:
     """`jax.lax.stop_gradient`, which would make an array of JAX of one of numpy."""
-    return value if isinstance(value, np.ndarray | np.generic) else jax.lax.stop_gradient(value)
+    return (
+        value
+        if isinstance(value, np.ndarray | np.generic)
+        else jax.lax.stop_gradient(value)
+    )
 
 
 def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
@@ -104,7 +111,9 @@ def sinc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0."""
     small = z < _SERIES_BELOW
     root = jnp.sqrt(jnp.where(small, 1.0, z))
-    return jnp.where(small, _series(_SINC, jnp.where(small, z, 0.0)), jnp.sin(root) / root)
+    return jnp.where(
+        small, _series(_SINC, jnp.where(small, z, 0.0)), jnp.sin(root) / root
+    )
 
 
 def _within_range(root: Array) -> Array:
@@ -129,14 +138,19 @@ def sinhc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
 def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """The power of two next above |x|, to scale by without rounding; 1 at 0.
 
-    In the bits of the exponent: `frexp` and `ldexp` take longer than what is scaled, to compile
-    too. It and its inverse are normal numbers also where |x| is not, is infinite or NaN.
+    In the bits of the exponent: `frexp` and `ldexp` take longer than what is scaled, to
+    compile too. It and its inverse are normal numbers also where |x| is not, is
+    infinite or NaN.
     """
     info = jnp.finfo(x.dtype)
     least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
     greatest = ((1 << info.nexp) - 4) * least
-    bits = jax.lax.bitcast_convert_type(jnp.abs(x), jnp.dtype(f"int{info.bits}")) & -least
-    power = jax.lax.bitcast_convert_type(jnp.clip(bits, least, greatest) + least, x.dtype)
+    bits = (
+        jax.lax.bitcast_convert_type(jnp.abs(x), jnp.dtype(f"int{info.bits}")) & -least
+    )
+    power = jax.lax.bitcast_convert_type(
+        jnp.clip(bits, least, greatest) + least, x.dtype
+    )
     return jax.lax.stop_gradient(jnp.where(x == 0, 1.0, power))
 
 
@@ -149,9 +163,9 @@ def gauss_legendre(count: int, dtype: Any) -> tuple[Array, Array]:
 def materialize(*arrays: Array) -> tuple[Array, ...]:
     """The arrays themselves, computed once.
 
-    XLA's CPU compiler fuses by computing what is used twice twice: a long formula, and more so
-    its derivative, then runs hundreds of times slower than its operations. It does not
-    look into a loop, and a loop of two trips is not removed.
+    XLA's CPU compiler fuses by computing what is used twice twice: a long formula, and
+    more so its derivative, then runs hundreds of times slower than its operations. It
+    does not look into a loop, and a loop of two trips is not removed.
     """
 
     def trip(i: Array, values: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -178,16 +192,19 @@ def product(subscripts: str, *operands: AnyArray) -> AnyArray:
 def with_columns(function: Callable[..., Components]) -> Callable[..., Components]:
     """Give a function of scalars a derivative rule that computes its Jacobian with its value.
 
-    Reverse mode then transposes a small matrix, not the loops in `function`. The rule is plain
-    code, which every mode differentiates again.
+    Reverse mode then transposes a small matrix, not the loops in `function`. The rule
+    is plain code, which every mode differentiates again.
     """
     wrapped = jax.custom_jvp(function)
 
     @wrapped.defjvp
-    def rule(arguments: Components, changes: Components) -> tuple[Components, Components]:
+    def rule(
+        arguments: Components, changes: Components
+    ) -> tuple[Components, Components]:
         columns = jnp.eye(len(arguments), dtype=arguments[0].dtype)
         values, jacobian = jax.vmap(
-            lambda column: jax.jvp(function, arguments, tuple(column)), out_axes=(None, 0)
+            lambda column: jax.jvp(function, arguments, tuple(column)),
+            out_axes=(None, 0),
         )(columns)
         weights = jnp.stack(changes)
         return values, tuple(jnp.sum(row * weights) for row in jacobian)
@@ -206,7 +223,9 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @arctanc_sqrt.defjvp
-def _arctanc_sqrt_jvp(arguments: Components, changes: Components) -> tuple[Array, Array]:
+def _arctanc_sqrt_jvp(
+    arguments: Components, changes: Components
+) -> tuple[Array, Array]:
     """The slope once, for any number of tangents; plain code, which every mode differentiates."""
     function = arctanc_sqrt.__wrapped__
     value, slope = jax.jvp(function, arguments, (jnp.ones_like(arguments[0]),))

@@ -7,8 +7,8 @@ from types import ModuleType
 def list_public_names(*modules: ModuleType) -> None:
     """Give modules an `__all__`, and a `dir`, of their public names alone.
 
-    Of a package these are what its `__init__` imports without an underscore; of a plain module
-    what is defined in it.
+    Of a package these are what its `__init__` imports without an underscore; of a plain
+    module what is defined in it.
     """
     for module in modules:
         package = hasattr(module, "__path__")

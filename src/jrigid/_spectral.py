@@ -18,8 +18,9 @@ _NODES = 8
 
 
 def _rotate(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
-    # One rotation in the plane (1, 2), then the axes are renamed 2 -> 1, 3 -> 2, 1 -> 3.
-    # Golub and Van Loan, Matrix Computations, 4th ed., 8.5.2; Numerical Recipes 11.1.
+    # One rotation in the plane (1, 2), then the axes are renamed 2 -> 1, 3 -> 2, 1 ->
+    # 3. Golub and Van Loan, Matrix Computations, 4th ed., 8.5.2; Numerical Recipes
+    # 11.1.
     a11, a22, a33, a12, a13, a23, x1, x2, x3, y1, y2, y3, z1, z2, z3 = state
     gap = a22 - a11
     below = jnp.abs(gap) + jnp.sqrt(gap * gap + 4 * a12 * a12)
@@ -46,18 +47,20 @@ def eigh(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """Moments, ascending, and axes, the columns of a rotation, of a symmetric tensor.
 
-    Cyclic Jacobi: high relative accuracy of small moments, and a GPU needs no LAPACK. Signs: in
-    axes 1 and 3 the first component of at least 0.9 of the largest magnitude is positive; axis 2
-    completes the rotation. Gradients: d moments = diag(axes^T dI axes), which is right for
-    symmetric functions of the moments also where they repeat; d axes has 1 / gap replaced by 0
-    where the gap is below rounding or, of `distinct` moments, by NaN where it is below 1e-6 of the
-    largest.
+    Cyclic Jacobi: high relative accuracy of small moments, and a GPU needs no LAPACK.
+    Signs: in axes 1 and 3 the first component of at least 0.9 of the largest magnitude
+    is positive; axis 2 completes the rotation. Gradients: d moments = diag(axes^T dI
+    axes), which is right for symmetric functions of the moments also where they repeat;
+    d axes has 1 / gap replaced by 0 where the gap is below rounding or, of `distinct`
+    moments, by NaN where it is below 1e-6 of the largest.
     """
     del distinct  # the derivatives need it
     unit = power_of_two(jnp.max(jnp.abs(tensor)))
     scaled = tensor / unit
     scaled = 0.5 * (scaled + scaled.T)
-    entries = [scaled[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    entries = [
+        scaled[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    ]
     identity = [jnp.asarray(x, tensor.dtype) for x in np.eye(3).ravel()]
     state = jax.lax.fori_loop(0, _ROTATIONS, _rotate, (*entries, *identity))
     columns = [[state[j], *state[6 + j :: 3]] for j in range(3)]
@@ -87,14 +90,21 @@ def _eigh_jvp(distinct: bool, primals: tuple, tangents: tuple) -> tuple:
     moments, axes = eigh(tensor)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     gap = moments[None, :] - moments[:, None]
-    closest, otherwise = (1e-6, jnp.nan) if distinct else (4 * jnp.finfo(gap.dtype).eps, 0.0)
+    closest, otherwise = (
+        (1e-6, jnp.nan) if distinct else (4 * jnp.finfo(gap.dtype).eps, 0.0)
+    )
     resolved = jnp.abs(gap) > closest * jnp.max(jnp.abs(moments))
     unresolved = jnp.where(np.eye(3, dtype=bool), 0.0, otherwise)
     inverse = jnp.where(resolved, 1 / jnp.where(resolved, gap, 1.0), unresolved)
-    return (moments, axes), (jnp.diagonal(inside), product("ik,kj->ij", axes, inverse * inside))
+    return (moments, axes), (
+        jnp.diagonal(inside),
+        product("ik,kj->ij", axes, inverse * inside),
+    )
 
 
-def from_principal_axes(axes: Array, quaternion: Array, vector: Array) -> tuple[Array, Array]:
+def from_principal_axes(
+    axes: Array, quaternion: Array, vector: Array
+) -> tuple[Array, Array]:
     """A rotation and a vector in body axes, from their components in the principal axes."""
     turned = product("ij,j->i", axes, quaternion[1:])
     return jnp.concatenate([quaternion[:1], turned]), product("ij,j->i", axes, vector)
@@ -106,8 +116,8 @@ def spectral_function(
 ) -> Float[Array, "3 3"]:
     """Tensor axes diag(f(moments, *parameters)) axes^T of a symmetric tensor.
 
-    Gradients: first and second, in every mode and in `parameters`, at any moments at which f is
-    smooth. A third derivative in the tensor raises NotImplementedError.
+    Gradients: first and second, in every mode and in `parameters`, at any moments at
+    which f is smooth. A third derivative in the tensor raises NotImplementedError.
     """
     moments, axes = eigh(tensor)
     values = jax.vmap(lambda moment: f(moment, *parameters))(moments)
@@ -115,8 +125,11 @@ def spectral_function(
 
 
 @spectral_function.defjvp
-def _spectral_function_jvp(f: Callable[..., Array], primals: tuple, tangents: tuple) -> tuple:
-    # The rule is plain algebra, so every mode differentiates it again without further rules.
+def _spectral_function_jvp(
+    f: Callable[..., Array], primals: tuple, tangents: tuple
+) -> tuple:
+    # The rule is plain algebra, so every mode differentiates it again without further
+    # rules.
     _, tangent = jax.jvp(functools.partial(_expansion, f), primals, tangents)
     return spectral_function(f, *primals), tangent
 
@@ -124,8 +137,8 @@ def _spectral_function_jvp(f: Callable[..., Array], primals: tuple, tangents: tu
 def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Array:
     """Taylor series to second order of f(tensor) about the value of `tensor` itself.
 
-    With E = axes^T (tensor - its value) axes, zero but not constant, it is axes M axes^T,
-    M_ij = f[i] delta_ij + f[i, j] E_ij + sum_k f[i, k, j] E_ik E_kj.
+    With E = axes^T (tensor - its value) axes, zero but not constant, it is axes M
+    axes^T, M_ij = f[i] delta_ij + f[i, j] E_ij + sum_k f[i, k, j] E_ik E_kj.
     Source: Higham, Functions of Matrices (2008), theorem 3.11 (Daleckii-Krein) and 3.4.
     """
     fixed = jax.lax.stop_gradient(tensor)
@@ -140,7 +153,9 @@ def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Ar
         """Of all sets of so many moments; each is computed once, in ascending order."""
         wanted = np.sort(np.moveaxis(np.indices((3,) * count), 0, -1), axis=-1)
         sets, which = np.unique(wanted.reshape(-1, count), axis=0, return_inverse=True)
-        values = jax.vmap(functools.partial(_difference, g))(*(moments[k] for k in sets.T))
+        values = jax.vmap(functools.partial(_difference, g))(
+            *(moments[k] for k in sets.T)
+        )
         return values[which.reshape(wanted.shape[:-1])]
 
     matrix = (
@@ -168,13 +183,17 @@ def _difference(f: Callable[[Array], Array], *moments: Array) -> Array:
     return jnp.where(near, integral, quotient / jnp.where(near, 1.0, gap))
 
 
-def _hermite_genocchi(f: Callable[[Array], Array], first: Array, *others: Array) -> Array:
+def _hermite_genocchi(
+    f: Callable[[Array], Array], first: Array, *others: Array
+) -> Array:
     """f[a, b, ...] = integral of s^n f'[a + s (b - a), ...] over s from 0 to 1, n + 2 moments."""
     if not others:
         return f(first)
 
     def integrand(s: Array) -> Array:
-        return _hermite_genocchi(_derivative(f), *(first + s * (x - first) for x in others))
+        return _hermite_genocchi(
+            _derivative(f), *(first + s * (x - first) for x in others)
+        )
 
     nodes, weights = gauss_legendre(_NODES, first.dtype)
     return jnp.sum(weights * nodes ** (len(others) - 1) * jax.vmap(integrand)(nodes))

@@ -20,7 +20,9 @@ QuaternionLike = TypeAliasType("QuaternionLike", _Real[ArrayLike, "4"])
 Matrix = TypeAliasType("Matrix", Float[Array, "3 3"])
 MatrixLike = TypeAliasType("MatrixLike", _Real[ArrayLike, "3 3"])
 RandomKey = TypeAliasType("RandomKey", PRNGKeyArray)
-InertiaLike = TypeAliasType("InertiaLike", _Real[ArrayLike, "3"] | _Real[ArrayLike, "3 3"])
+InertiaLike = TypeAliasType(
+    "InertiaLike", _Real[ArrayLike, "3"] | _Real[ArrayLike, "3 3"]
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Real as Real
@@ -31,7 +33,9 @@ else:
     #: An array of JAX, or of numpy on the host: to a type checker the two have nothing in common.
     AnyArray = Array | np.ndarray | np.generic
     #: A matrix of either kind, shown in signatures by this name.
-    AnyMatrix = TypeAliasType("AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"])
+    AnyMatrix = TypeAliasType(
+        "AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"]
+    )
 
     class Real:
         """`jaxtyping.Real[ArrayLike, "..."]`, shown as it is written."""
@@ -57,7 +61,9 @@ class Readable(eqx.Module):
 def _brief(value: Any) -> str:
     if isinstance(value, Readable):
         return repr(value)
-    known = isinstance(value, Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
+    known = isinstance(value, Array | np.ndarray) and not isinstance(
+        value, jax.core.Tracer
+    )
     if not known or value.size > _FEW:
         return eqx.tree_pformat(value)
     text = np.array2string(np.asarray(value), precision=6, separator=", ")

@@ -1,7 +1,7 @@
 """Small records of real and synthetic rotation, to fit and to test against.
 
-Records are NumPy arrays in float64 whatever JAX's precision is set to: turn them into JAX arrays
-where they are used.
+Records are NumPy arrays in float64 whatever JAX's precision is set to: turn them into
+JAX arrays where they are used.
 """
 
 import importlib.resources
@@ -20,17 +20,19 @@ _DAY = 86400.0
 class EarthPole(Readable):
     """Daily polar motion of the Earth, as published.
 
-    The coordinates are those of the celestial intermediate pole in the terrestrial frame. `x` is
-    positive toward the meridian of Greenwich, `y` positive toward 90 degrees WEST. With the
-    terrestrial axes (Greenwich, 90 degrees east, north) the pole is therefore at (x, -y): its
-    complex number is `x - 1j * y`, and it turns counter-clockwise, with the spin. Read as
-    `x + 1j * y` the pole turns backwards, as that of a prolate body.
+    The coordinates are those of the celestial intermediate pole in the terrestrial
+    frame. `x` is positive toward the meridian of Greenwich, `y` positive toward 90
+    degrees WEST. With the terrestrial axes (Greenwich, 90 degrees east, north) the pole
+    is therefore at (x, -y): its complex number is `x - 1j * y`, and it turns
+    counter-clockwise, with the spin. Read as `x + 1j * y` the pole turns backwards, as
+    that of a prolate body.
 
     Attributes:
         mjd: Modified Julian Date [days, UTC, 0h], one a day.
         x: Pole coordinate toward Greenwich [rad].
         y: Pole coordinate toward 90 degrees west [rad].
-        x_sigma: Published standard error of `x` [rad]: 30 mas in 1962, 0.05 mas since about 2000.
+        x_sigma: Published standard error of `x` [rad]: 30 mas in 1962, 0.05 mas since
+            about 2000.
         y_sigma: Published standard error of `y` [rad].
     """
 
@@ -44,12 +46,13 @@ class EarthPole(Readable):
 class ToutatisRecord(Readable):
     """Attitude and spin of the asteroid 4179 Toutatis, observed by radar, with a published fit.
 
-    Body axes: x the principal axis of the intermediate moment, y of the short body axis (largest
-    moment), z of the long body axis (smallest moment). In this order they are right-handed.
-    Space axes: ecliptic J2000.
+    Body axes: x the principal axis of the intermediate moment, y of the short body axis
+    (largest moment), z of the long body axis (smallest moment). In this order they are
+    right-handed. Space axes: ecliptic J2000.
 
     Attributes:
-        times: Seconds since 1992-11-09T17:49:47 UTC; 17 days of December 1992, and one of 2008.
+        times: Seconds since 1992-11-09T17:49:47 UTC; 17 days of December 1992, and one
+            of 2008.
         attitudes: Unit quaternions (w, x, y, z), body to space.
         omegas: Angular velocity, body components [rad/s].
         moments: Published principal moments about (x, y, z), in units of the smallest.
@@ -72,7 +75,8 @@ class GyroRecord(Readable):
         times: Sampling times [s], equally spaced from 0.
         omegas: Readings [rad/s], body components, with noise.
         sigma: Standard deviation of the noise on each component [rad/s].
-        true_moments: Principal moments of the body about the gyro's axes, scaled to a trace of 1.
+        true_moments: Principal moments of the body about the gyro's axes, scaled to a
+            trace of 1.
         true_omegas: What a perfect gyro would have read [rad/s].
     """
 
@@ -86,8 +90,8 @@ class GyroRecord(Readable):
 def earth_pole() -> EarthPole:
     """The Earth's polar motion since 1962: the IERS 20 C04 record, one pole a day.
 
-    Read from the package astropy-iers-data, which ships the file `eopc04.1962-now`; no network is
-    touched. A newer version of that package has a longer record.
+    Read from the package astropy-iers-data, which ships the file `eopc04.1962-now`; no
+    network is touched. A newer version of that package has a longer record.
 
     Returns:
         The whole record, about 24 000 days; pole coordinates and their errors in rad.
@@ -100,38 +104,43 @@ def earth_pole() -> EarthPole:
     >>> print(record.mjd[0], f"{record.y[0]:.4g} rad")
     37665.0 1.033e-06 rad
 
-    Source: IERS Earth Orientation Centre, Paris Observatory, EOP 20 C04, consistent with ITRF 2020;
-    Bizouard et al., J. Geodesy 93, 621 (2019).
+    Source: IERS Earth Orientation Centre, Paris Observatory, EOP 20 C04, consistent
+    with ITRF 2020; Bizouard et al., J. Geodesy 93, 621 (2019).
     """
     iers = extra("data", "astropy_iers_data")
-    columns = np.loadtxt(iers.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True)
+    columns = np.loadtxt(
+        iers.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True
+    )
     return EarthPole(columns[0], *(columns[1:] * _ARCSECOND))
 
 
 def toutatis_1992() -> ToutatisRecord:
     """Radar observations of Toutatis, a body that tumbles about no axis, and their published fit.
 
-    Free rotation with the published moments from the published epoch state passes the 17 attitudes
-    of 1992 at a median of 5.6 degrees (16 at most) and their spins at a median of 6.6 degrees a
-    day, which is what the observations are worth. The spins of rows 5 and 12 alone are off by 45
-    degrees a day, though the attitudes beside them fit. The tides of the Earth's passage on
-    8 December 1992 (day 29) and of all those since are no free rotation: the row of 2008 is off by
-    130 degrees.
+    Free rotation with the published moments from the published epoch state passes the
+    17 attitudes of 1992 at a median of 5.6 degrees (16 at most) and their spins at a
+    median of 6.6 degrees a day, which is what the observations are worth. The spins of
+    rows 5 and 12 alone are off by 45 degrees a day, though the attitudes beside them
+    fit. The tides of the Earth's passage on 8 December 1992 (day 29) and of all those
+    since are no free rotation: the row of 2008 is off by 130 degrees.
 
     Returns:
-        The record: times in s from the epoch, unit quaternions (body to space), rates in rad/s.
+        The record: times in s from the epoch, unit quaternions (body to space), rates
+            in rad/s.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.toutatis_1992()
     >>> print(record.attitudes.shape, record.moments)
     (18, 4) [3.0836 3.235  1.    ]
 
-    Source: Takahashi, Busch and Scheeres, Astron. J. 146, 95 (2013), tables 1 and 2; observations
-    by Hudson, Ostro and others.
+    Source: Takahashi, Busch and Scheeres, Astron. J. 146, 95 (2013), tables 1 and 2;
+    observations by Hudson, Ostro and others.
     """
     path = importlib.resources.files("jrigid") / "data" / "toutatis_1992.csv"
     with path.open(encoding="ascii") as file:
-        table = np.loadtxt(file, delimiter=",", skiprows=6)  # remarks and the names of the columns
+        table = np.loadtxt(
+            file, delimiter=",", skiprows=6
+        )  # remarks and the names of the columns
     degree = math.pi / 180.0
     return ToutatisRecord(
         times=table[:, 0] * _DAY,
@@ -146,8 +155,9 @@ def toutatis_1992() -> ToutatisRecord:
 def gyro_example() -> GyroRecord:
     """A SYNTHETIC gyro record of a tumbling box: 200 readings, 2 % noise, the same at every call.
 
-    A body of moments in the ratio 2 : 3 : 4 spins about its middle axis, flips over every 5.7 s,
-    and is watched for 20 s at 10 Hz. Made for examples and tests; nothing was measured.
+    A body of moments in the ratio 2 : 3 : 4 spins about its middle axis, flips over
+    every 5.7 s, and is watched for 20 s at 10 Hz. Made for examples and tests; nothing
+    was measured.
 
     Returns:
         Readings and truth: times in s, rates in rad/s, moments in units of their sum.
@@ -171,7 +181,12 @@ def _attitude(angles: Shaped[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4"]
     cosine, sine = np.cos(b / 2), np.sin(b / 2)
     plus, minus = (a + c) / 2, (a - c) / 2
     return np.stack(
-        [cosine * np.cos(plus), sine * np.cos(minus), sine * np.sin(minus), cosine * np.sin(plus)],
+        [
+            cosine * np.cos(plus),
+            sine * np.cos(minus),
+            sine * np.sin(minus),
+            cosine * np.sin(plus),
+        ],
         axis=-1,
     )
 

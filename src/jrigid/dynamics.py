@@ -24,9 +24,10 @@ class State(Readable):
     Attributes:
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
-        internal: A tuple with an entry for each torque that carries parts, in the order of the
-            torques (see `jrigid.torques`): one wheel's spin is `(spin,)`. None if there are none,
-            and before `system.with_parts(state)`, or `simulate`, adds parts at rest in the body.
+        internal: A tuple with an entry for each torque that carries parts, in the order
+            of the torques (see `jrigid.torques`): one wheel's spin is `(spin,)`. None
+            if there are none, and before `system.with_parts(state)`, or `simulate`,
+            adds parts at rest in the body.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 0.0, 5.0]))
@@ -43,9 +44,10 @@ class ExactStates(Readable):
     """States of a motion in closed form, and what became of the call.
 
     Attributes:
-        states: State at each time; the leading axes of its leaves are those of the times.
-        result: `jrigid.RESULTS.successful`, or what is wrong with the arguments; one for each lane
-            under vmap. `jrigid.RESULTS[motion.result]` is its text.
+        states: State at each time; the leading axes of its leaves are those of the
+            times.
+        result: `jrigid.RESULTS.successful`, or what is wrong with the arguments; one
+            for each lane under vmap. `jrigid.RESULTS[motion.result]` is its text.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
@@ -68,7 +70,9 @@ class ExactStates(Readable):
         return self.states.omega
 
 
-def _inertia_and_vector(inertia: InertiaLike, vector: VectorLike) -> tuple[Array, Array]:
+def _inertia_and_vector(
+    inertia: InertiaLike, vector: VectorLike
+) -> tuple[Array, Array]:
     inertia, vector = shaped(inertia=(inertia, *INERTIA), omega=(vector, 3))
     return inertia, vector
 
@@ -78,14 +82,17 @@ def _inertia_times(inertia: Array, vector: Array) -> tuple[Array, ...]:
     a, b, c = vector
     if inertia.ndim == 1:
         return inertia[0] * a, inertia[1] * b, inertia[2] * c
-    return tuple(inertia[i, 0] * a + inertia[i, 1] * b + inertia[i, 2] * c for i in range(3))
+    return tuple(
+        inertia[i, 0] * a + inertia[i, 1] * b + inertia[i, 2] * c for i in range(3)
+    )
 
 
 def _inverse_times(inertia: Array, vector: Array) -> Array:
     """I^-1 v for a symmetric tensor, through the cofactors."""
     if inertia.ndim == 1:
         return vector / inertia
-    # In units of the largest moment: a product of three can be out of the range of float32.
+    # In units of the largest moment: a product of three can be out of the range of
+    # float32.
     unit = jax.lax.stop_gradient(jnp.max(jnp.diagonal(inertia)))
     inertia, vector = inertia / unit, vector / unit
     a, b, c = inertia[0, 0], inertia[1, 1], inertia[2, 2]
@@ -94,7 +101,11 @@ def _inverse_times(inertia: Array, vector: Array) -> Array:
     dd, ee, ff = e * f - d * c, d * f - b * e, d * e - a * f
     determinant = a * aa + d * dd + e * ee
     x, y, z = vector
-    rows = [aa * x + dd * y + ee * z, dd * x + bb * y + ff * z, ee * x + ff * y + cc * z]
+    rows = [
+        aa * x + dd * y + ee * z,
+        dd * x + bb * y + ff * z,
+        ee * x + ff * y + cc * z,
+    ]
     return jnp.stack(rows) / determinant
 
 
@@ -106,7 +117,8 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        Angular momentum [kg m^2/s], body components; `rotation.rotate` takes it to space.
+        Angular momentum [kg m^2/s], body components; `rotation.rotate` takes it to
+        space.
 
     Gradients: bilinear, finite everywhere.
 
@@ -143,8 +155,8 @@ def euler_equations(
 ) -> Vector:
     """Euler's equations: the rate of the angular velocity in body components.
 
-    I omega' = N - omega x (I omega). Moments may be any positive numbers: the triangle inequality
-    is not asked for.
+    I omega' = N - omega x (I omega). Moments may be any positive numbers: the triangle
+    inequality is not asked for.
 
     Args:
         inertia: Principal moments or symmetric tensor [kg m^2].
@@ -176,7 +188,8 @@ def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
         # Differences of moments first: exactly zero for a sphere.
         i1, i2, i3 = inertia
         return jnp.stack([(i2 - i3) * b * c, (i3 - i1) * c * a, (i1 - i2) * a * b])
-    # An isotropic part of the tensor gives no torque; without it a sphere's is exactly zero.
+    # An isotropic part of the tensor gives no torque; without it a sphere's is exactly
+    # zero.
     i, shift = inertia, inertia[2, 2]
     p = (i[0, 0] - shift) * a + i[0, 1] * b + i[0, 2] * c
     q = i[1, 0] * a + (i[1, 1] - shift) * b + i[1, 2] * c
@@ -188,7 +201,8 @@ def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
     """Torque of the supports that keep a rotation steady: omega x (I omega).
 
     Args:
-        inertia: Principal moments or symmetric tensor [kg m^2], about a point on the axis.
+        inertia: Principal moments or symmetric tensor [kg m^2], about a point on the
+            axis.
         omega: The constant angular velocity, body components [rad/s].
 
     Returns:

@@ -1,8 +1,9 @@
 """Mechanics from any Lagrangian: accelerations, canonical momenta, energy, cyclic coordinates.
 
-A Lagrangian is a pure function `L(q, q_dot, *params) -> scalar` of n generalised coordinates,
-their rates and whatever parameters it needs (numbers, arrays, any pytree); one that is not a real
-scalar is a ValueError. Time is no argument: along a motion the parameters are constants.
+A Lagrangian is a pure function `L(q, q_dot, *params) -> scalar` of n generalised
+coordinates, their rates and whatever parameters it needs (numbers, arrays, any pytree);
+one that is not a real scalar is a ValueError. Time is no argument: along a motion the
+parameters are constants.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jrigid._checks import all_finite, check_shape, float_arrays, nan_where, shaped, where_defined
+from jrigid._checks import (
+    all_finite,
+    check_shape,
+    float_arrays,
+    nan_where,
+    shaped,
+    where_defined,
+)
 from jrigid._numerics import power_of_two, product
 from jrigid._types import Real, Scalar
 
@@ -30,7 +38,9 @@ _ROUNDING_ERRORS = 64
 def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
     q, q_dot = shaped(q=(q, None), q_dot=(q_dot, *np.shape(q)))
     if q.size == 0:
-        raise ValueError("Argument `q` must have one coordinate at least, but it has none.")
+        raise ValueError(
+            "Argument `q` must have one coordinate at least, but it has none."
+        )
     return q, q_dot
 
 
@@ -60,8 +70,8 @@ def _equations(lagrangian: _Bound, q: Array, q_dot: Array) -> tuple[Array, Array
 def _scales(mass: Array) -> Array:
     """Powers of two s, such that the rows of s_i M_ij s_j are all of order one.
 
-    The diagonal is enough for a definite matrix; Ruiz's iteration (RAL-TR-2001-034) is for one
-    with zeros on its diagonal.
+    The diagonal is enough for a definite matrix; Ruiz's iteration (RAL-TR-2001-034) is
+    for one with zeros on its diagonal.
     """
     mass = jnp.abs(mass)
     diagonal = jnp.diagonal(mass)
@@ -92,27 +102,31 @@ def acceleration(
 ) -> Coordinates:
     r"""Accelerations q'' of the motion that a Lagrangian makes stationary.
 
-    Solves $M q'' = \partial L/\partial q - (\partial^2 L/\partial\dot q\,\partial q)\,\dot q$
-    with the mass matrix $M = \partial^2 L/\partial\dot q^2$, which need not be positive definite.
-    M counts as singular when, in units that bring its rows to order one, its reciprocal condition
-    number (row-sum norm) is below 16 n rounding errors: the answer would have no correct digit.
+    Solves $M q'' = \partial L/\partial q - (\partial^2 L/\partial\dot q\,\partial
+    q)\,\dot q$ with the mass matrix $M = \partial^2 L/\partial\dot
+    q^2$, which need not be positive definite. M counts as singular when, in units that
+    bring its rows to order one, its reciprocal condition number (row-sum norm) is below
+    16 n rounding errors: the answer would have no correct digit.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
         q: Generalised coordinates [coordinate units].
         q_dot: Their rates [coordinate units/s].
-        params: Further arguments of the Lagrangian, constants of the motion. A time among them is
-            right where the momenta do not depend on it, as in a driven potential; with a moving
-            support write L without the total time derivative, as a force of inertia.
+        params: Further arguments of the Lagrangian, constants of the motion. A time
+            among them is right where the momenta do not depend on it, as in a driven
+            potential; with a moving support write L without the total time derivative,
+            as a force of inertia.
 
     Returns:
-        q'' [coordinate units/s^2], in the dtype of `q` and `q_dot`. NaN where M is singular, as
-        that of Euler angles is at theta = 0 (`jrigid.RigidBody` turns without any), and where
-        coordinates, derivatives of L or q'' itself are not finite.
+        q'' [coordinate units/s^2], in the dtype of `q` and `q_dot`. NaN where M is
+        singular, as that of Euler angles is at theta = 0 (`jrigid.RigidBody` turns
+        without any), and where coordinates, derivatives of L or q'' itself are not
+        finite.
 
-    Gradients: those of the solution, of any order that L has. Zero where M is singular or a
-        coordinate is not finite, so that such a lane spoils none of what it shares with others;
-        where derivatives of L are not finite those of what it shares are NaN.
+    Gradients: those of the solution, of any order that L has. Zero where M is singular
+        or a coordinate is not finite, so that such a lane spoils none of what it shares
+        with others; where derivatives of L are not finite those of what it shares are
+        NaN.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 1.57.
 
     >>> import jax.numpy as jnp
@@ -131,20 +145,23 @@ def acceleration(
     return where_defined(all_finite((q, q_dot)), formula, q, q_dot, params)
 
 
-def vector_field(lagrangian: Lagrangian) -> Callable[..., tuple[Coordinates, Coordinates]]:
+def vector_field(
+    lagrangian: Lagrangian,
+) -> Callable[..., tuple[Coordinates, Coordinates]]:
     """Vector field of the motion for diffrax: `(t, (q, q_dot), args) -> (q_dot, q'')`.
 
-    Where `acceleration` is NaN so is q'' here, never infinite or a large wrong number: an adaptive
-    solve that meets it rejects its steps and ends with an error at `max_steps`, one of constant
-    steps goes on with NaN. Steps may jump over an isolated point such as theta = 0 and not see it.
+    Where `acceleration` is NaN so is q'' here, never infinite or a large wrong number:
+    an adaptive solve that meets it rejects its steps and ends with an error at
+    `max_steps`, one of constant steps goes on with NaN. Steps may jump over an isolated
+    point such as theta = 0 and not see it.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
 
     Returns:
-        A function of the time, which is not passed on; the pair (q, q_dot) [coordinate units,
-        coordinate units/s]; and `args`, the tuple of the Lagrangian's parameters, None for none.
-        It gives the pair of rates.
+        A function of the time, which is not passed on; the pair (q, q_dot) [coordinate
+        units, coordinate units/s]; and `args`, the tuple of the Lagrangian's
+        parameters, None for none. It gives the pair of rates.
 
     Gradients: as of `acceleration`.
 
@@ -214,8 +231,8 @@ def energy(
 ) -> Scalar:
     """Energy function q_dot . p - L, constant along a motion of constant parameters.
 
-    It is the kinetic plus the potential energy where the kinetic energy is quadratic in q_dot;
-    terms linear in q_dot, as of a magnetic field, drop out.
+    It is the kinetic plus the potential energy where the kinetic energy is quadratic in
+    q_dot; terms linear in q_dot, as of a magnetic field, drop out.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
@@ -237,7 +254,9 @@ def energy(
     4.0
     """
     q, q_dot = _coordinates(q, q_dot)
-    value, slope = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=1)(q, q_dot)
+    value, slope = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=1)(
+        q, q_dot
+    )
     return product("i,i->", q_dot, slope) - value
 
 
@@ -250,25 +269,25 @@ def cyclic_coordinates(
 ) -> Bool[Array, " n"]:
     """Which coordinates the Lagrangian does not depend on: their momenta are conserved.
 
-    A numerical verdict: dL/dq_i must vanish, to 64 rounding errors of the largest of the terms
-    p_j q_dot_j and reach_j dL/dq_j, at four fixed generic points about `q`, each at rest and in
-    motion. So an angle that drops out of L only because cos^2 + sin^2 = 1 is found to be cyclic.
-    A term of L that is switched off about `q`, or so weak that it is lost in rounding, is not
-    seen; a point where L is not finite makes every coordinate count as not cyclic; and only the
-    given coordinates are asked, not their combinations (of two coupled bodies neither position is
-    cyclic).
+    A numerical verdict: dL/dq_i must vanish, to 64 rounding errors of the largest of
+    the terms p_j q_dot_j and reach_j dL/dq_j, at four fixed generic points about `q`,
+    each at rest and in motion. So an angle that drops out of L only because cos^2 +
+    sin^2 = 1 is found to be cyclic. A term of L that is switched off about `q`, or so
+    weak that it is lost in rounding, is not seen; a point where L is not finite makes
+    every coordinate count as not cyclic; and only the given coordinates are asked, not
+    their combinations (of two coupled bodies neither position is cyclic).
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
         q: Generalised coordinates where L is defined [coordinate units].
         q_dot: Their rates, of typical size [coordinate units/s]; all zero stands for 1.
         params: Further arguments of the Lagrangian.
-        reach: How far the points lie from `q`, at most [coordinate units], one number or one a
-            coordinate. By default (1 + |q_i|) / 4, which suits angles.
+        reach: How far the points lie from `q`, at most [coordinate units], one number
+            or one a coordinate. By default (1 + |q_i|) / 4, which suits angles.
 
     Returns:
-        True for a cyclic coordinate. `jnp.where(cyclic, p, 0)` with p of `momenta` are then
-        constants of the motion. False where something is NaN.
+        True for a cyclic coordinate. `jnp.where(cyclic, p, 0)` with p of `momenta` are
+        then constants of the motion. False where something is NaN.
 
     Gradients: none, the answer is boolean.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 2.6.
@@ -283,7 +302,11 @@ def cyclic_coordinates(
     """
     q, q_dot = _coordinates(q, q_dot)
     slopes = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=(0, 1))
-    spread = 0.25 * (1 + jnp.abs(q)) if reach is None else float_arrays(reach)[0].astype(q.dtype)
+    spread = (
+        0.25 * (1 + jnp.abs(q))
+        if reach is None
+        else float_arrays(reach)[0].astype(q.dtype)
+    )
     if spread.shape != ():
         check_shape("reach", spread, q.shape)
     fastest = jnp.max(jnp.abs(q_dot))

@@ -62,16 +62,20 @@ class AbstractSystem(Readable):
     def with_parts(self, state: Any) -> Any:
         """A state with all that the body carries: its own parts, or parts at rest in the body.
 
-        `simulate` takes a state without them; a vector field in one's own `diffeqsolve` does not.
+        `simulate` takes a state without them; a vector field in one's own `diffeqsolve`
+        does not.
 
         Args:
-            state: State, with an entry in `internal` for each torque that carries parts, or none.
+            state: State, with an entry in `internal` for each torque that carries
+                parts, or none.
 
         Returns:
             The state itself, if it has its parts.
         """
         if state.internal is None:
-            state = dataclasses.replace(state, internal=self.torque.internal_at_rest(state))
+            state = dataclasses.replace(
+                state, internal=self.torque.internal_at_rest(state)
+            )
         self._inertia_and_torque(state)  # which looks at the parts
         return state
 
@@ -105,7 +109,9 @@ class AbstractSystem(Readable):
         Args:
             findings: What has been found so far; `require` adds to it.
         """
-        findings.require(is_inertia(self.inertia), RESULTS.invalid_inertia, value=self.inertia)
+        findings.require(
+            is_inertia(self.inertia), RESULTS.invalid_inertia, value=self.inertia
+        )
         self.torque.check(findings)
 
 
@@ -117,7 +123,8 @@ class FloatingState(Readable):
         velocity: Velocity of the centre of mass, space components [m/s].
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
-        internal: A tuple with an entry for each torque that carries parts, as in `State`.
+        internal: A tuple with an entry for each torque that carries parts, as in
+            `State`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.FloatingState(
@@ -136,7 +143,8 @@ class RigidBody(AbstractSystem):
     """A body that turns about a fixed point or about its centre of mass.
 
     Attributes:
-        inertia: Principal moments or symmetric tensor about that point [kg m^2], body axes.
+        inertia: Principal moments or symmetric tensor about that point [kg m^2], body
+            axes.
         torque: The torque on the body.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -166,7 +174,9 @@ class RigidBody(AbstractSystem):
         """True of a body without torque."""
         return isinstance(self.torque, Sum) and not self.torque.terms
 
-    def vector_field(self, t: ScalarLike, state: State | FloatingState, args: Any) -> State:
+    def vector_field(
+        self, t: ScalarLike, state: State | FloatingState, args: Any
+    ) -> State:
         """Time derivative of the state.
 
         Args:
@@ -204,9 +214,15 @@ class RigidBody(AbstractSystem):
         """
         inertia, torque = self._inertia_and_torque(state)
         own = kinetic_energy(inertia, state.omega)
-        return own + torque.internal_energy(t, state, args) + torque.potential(t, state, args)
+        return (
+            own
+            + torque.internal_energy(t, state, args)
+            + torque.potential(t, state, args)
+        )
 
-    def angular_momentum(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Vector:
+    def angular_momentum(
+        self, t: ScalarLike, state: State | FloatingState, args: Any
+    ) -> Vector:
         """Total angular momentum about the fixed point, internal parts included.
 
         Args:
@@ -250,7 +266,8 @@ class FloatingBody(AbstractSystem):
     """A body in flight: its centre of mass moves under forces while it turns.
 
     Attributes:
-        mass_properties: Mass and inertia; where in the body the centre of mass is plays no role.
+        mass_properties: Mass and inertia; where in the body the centre of mass is plays
+            no role.
         force: `(t, state, args) -> (3,)` total force, space components [N], or None.
         torque: The torque about the centre of mass.
 
@@ -274,7 +291,8 @@ class FloatingBody(AbstractSystem):
 
         Args:
             mass_properties: Mass and inertia about the centre of mass.
-            force: `(t, state, args) -> (3,)` space components [N]; a `Force` adds a potential.
+            force: `(t, state, args) -> (3,)` space components [N]; a `Force` adds a
+                potential.
             torque: About the centre of mass, as for `RigidBody`.
         """
         check_type("mass_properties", mass_properties, MassProperties)
@@ -311,7 +329,9 @@ class FloatingBody(AbstractSystem):
         findings.require(all_positive(mass), RESULTS.invalid_mass, value=mass)
         self.rotation.check(findings)
 
-    def vector_field(self, t: ScalarLike, state: FloatingState, args: Any) -> FloatingState:
+    def vector_field(
+        self, t: ScalarLike, state: FloatingState, args: Any
+    ) -> FloatingState:
         """Time derivative of the state.
 
         Args:
@@ -343,7 +363,8 @@ class FloatingBody(AbstractSystem):
             state: State of the body.
 
         Returns:
-            Energy [J]; with the rotational kinetic energy the whole kinetic energy (Koenig).
+            Energy [J]; with the rotational kinetic energy the whole kinetic energy
+            (Koenig).
         """
         return 0.5 * jnp.sum(state.velocity * self.momentum(state))
 
@@ -373,7 +394,9 @@ class FloatingBody(AbstractSystem):
         """
         total = self.translational_energy(state) + self.rotation.energy(t, state, args)
         if isinstance(self.force, Force):
-            total = total + jnp.asarray(self.force.potential(t, state, args), total.dtype)
+            total = total + jnp.asarray(
+                self.force.potential(t, state, args), total.dtype
+            )
         return total
 
     def momentum(self, state: FloatingState) -> Vector:
@@ -387,7 +410,9 @@ class FloatingBody(AbstractSystem):
         """
         return self.mass_properties.mass.astype(state.velocity.dtype) * state.velocity
 
-    def angular_momentum(self, t: ScalarLike, state: FloatingState, args: Any) -> Vector:
+    def angular_momentum(
+        self, t: ScalarLike, state: FloatingState, args: Any
+    ) -> Vector:
         """Total angular momentum about the origin of space: orbital plus rotational.
 
         Args:

@@ -1,14 +1,14 @@
 """Write free_rotation.npz: free motions of every kind at 30 digits, for tests of the exact flow.
 
-Run as `python tests/data/make_free_rotation.py`; it takes about ten seconds. The cases are drawn
-with a fixed seed, and the motions come from tests/free_reference.py.
+Run as `python tests/data/make_free_rotation.py`; it takes about ten seconds. The cases
+are drawn with a fixed seed, and the motions come from tests/free_reference.py.
 
-Arrays, one row a case: `regime` (name), `level` (how far from the degenerate case the regime is
-named after; 0 where that means nothing), `inertia` (n, 3), `tensor` (n, 3, 3; the case's inertia
-in regime "tensor", where `inertia` is NaN; else diagonal), `attitude`, `omega`, `time`, and the
-state then, `attitude_out` and `omega_out`, each the nearest double, with `attitude_low` and
-`omega_low` what is left of it: value = out + low to 32 digits. The sign of the attitude is
-continuous in time.
+Arrays, one row a case: `regime` (name), `level` (how far from the degenerate case the
+regime is named after; 0 where that means nothing), `inertia` (n, 3), `tensor` (n, 3, 3;
+the case's inertia in regime "tensor", where `inertia` is NaN; else diagonal),
+`attitude`, `omega`, `time`, and the state then, `attitude_out` and `omega_out`, each
+the nearest double, with `attitude_low` and `omega_low` what is left of it: value = out
++ low to 32 digits. The sign of the attitude is continuous in time.
 """
 
 import itertools
@@ -31,7 +31,9 @@ NEAR = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15)
 
 def excess(moments, omega):
     """L^2 - 2 E I2, exactly; 0 on the separatrix."""
-    pairs = sorted(zip((Fraction(x) for x in moments), (Fraction(x) for x in omega), strict=True))
+    pairs = sorted(
+        zip((Fraction(x) for x in moments), (Fraction(x) for x in omega), strict=True)
+    )
     square = sum((i * w) ** 2 for i, w in pairs)
     return square - sum(i * w * w for i, w in pairs) * pairs[1][0]
 
@@ -44,7 +46,9 @@ def separatrices():
         root = isqrt(up * down)
         if root * root == up * down:
             ratio = Fraction(root, down)
-            out.append(((float(i1), float(i2), float(i3)), ratio.numerator, ratio.denominator))
+            out.append(
+                ((float(i1), float(i2), float(i3)), ratio.numerator, ratio.denominator)
+            )
     return out
 
 
@@ -102,7 +106,11 @@ class Cases:
                 self.add("reordered", self.physical()[list(order)], self.direction())
         for regime, unit in (("omega x 1e-7", 1e-7), ("omega x 1e4", 1e4)):
             for _ in range(50):
-                self.add(regime, self.rng.permutation(self.physical()), unit * self.direction())
+                self.add(
+                    regime,
+                    self.rng.permutation(self.physical()),
+                    unit * self.direction(),
+                )
         for regime, decades in (("unphysical 1e3", 3), ("unphysical 1e6", 6)):
             for _ in range(50):
                 self.add(regime, self.unphysical(decades), self.direction())
@@ -115,7 +123,11 @@ class Cases:
         order = self.rng.permutation(3)
         scale = 2.0 ** self.rng.integers(-6, 4)
         moments = np.array(moments) * 2.0 ** self.rng.integers(-3, 4)
-        return moments[order], scale * np.array(omega)[order], int(np.argmin(moments[order]))
+        return (
+            moments[order],
+            scale * np.array(omega)[order],
+            int(np.argmin(moments[order])),
+        )
 
     def separatrix(self):
         for _ in range(60):
@@ -163,14 +175,22 @@ class Cases:
 
     def tensors(self):
         for k in range(60):
-            moments = self.physical() if k % 2 else self.unphysical(self.rng.uniform(0.1, 3))
+            moments = (
+                self.physical() if k % 2 else self.unphysical(self.rng.uniform(0.1, 3))
+            )
             rotation, _ = np.linalg.qr(self.rng.normal(size=(3, 3)))
             tensor = rotation @ np.diag(moments) @ rotation.T
             self.add("tensor", (tensor + tensor.T) / 2, self.direction())
-        for k in range(10):  # exactly symmetric bodies, about an axis of small whole numbers
+        for k in range(
+            10
+        ):  # exactly symmetric bodies, about an axis of small whole numbers
             axis = self.rng.integers(-3, 4, 3) + np.array([0.5, 0, 0])
             outer = np.outer(axis, axis)
-            body = 4 * np.eye(3) + outer if k % 2 else (1 + axis @ axis) * np.eye(3) - outer
+            body = (
+                4 * np.eye(3) + outer
+                if k % 2
+                else (1 + axis @ axis) * np.eye(3) - outer
+            )
             self.add("tensor", body, self.direction())
 
 
@@ -209,7 +229,9 @@ def main():
         inertia=np.array(
             [np.full(3, np.nan) if f else i for f, i in zip(full, inertia, strict=True)]
         ),
-        tensor=np.array([i if f else np.diag(i) for f, i in zip(full, inertia, strict=True)]),
+        tensor=np.array(
+            [i if f else np.diag(i) for f, i in zip(full, inertia, strict=True)]
+        ),
         attitude=np.array(attitude),
         omega=np.array(omega),
         time=np.array(time),

@@ -1,13 +1,14 @@
 """Write top_motion.npz and top_derivatives.npz: heavy symmetric tops of every kind at 30 digits.
 
-Run as `python tests/data/make_top_motion.py`; it takes about ten minutes. The cases are drawn
-with a fixed seed, and the motions come from tests/taylor_reference.py.
+Run as `python tests/data/make_top_motion.py`; it takes about ten minutes. The cases are
+drawn with a fixed seed, and the motions come from tests/taylor_reference.py.
 
-Arrays, one row a case: `regime` (name), `level` (how far from the degenerate case the regime is
-named after; 0 where that means nothing), `moments` (n, 2; I1 = I2 and I3), `mgl`, `attitude`,
-`omega`, `time`, and the state then, `attitude_out` and `omega_out`, each the nearest double, with
-`attitude_low` and `omega_low` what is left of it: value = out + low to 30 digits of the state's
-units (for omega, `fastest` below). The sign of the attitude is continuous in time.
+Arrays, one row a case: `regime` (name), `level` (how far from the degenerate case the
+regime is named after; 0 where that means nothing), `moments` (n, 2; I1 = I2 and I3),
+`mgl`, `attitude`, `omega`, `time`, and the state then, `attitude_out` and `omega_out`,
+each the nearest double, with `attitude_low` and `omega_low` what is left of it: value =
+out + low to 30 digits of the state's units (for omega, `fastest` below). The sign of
+the attitude is continuous in time.
 """
 
 import itertools
@@ -61,7 +62,9 @@ class Cases:
     def tilted(self, cos, sin):
         """An attitude with these cosine and sine of half the tilt; any turn about each vertical."""
         a, b = self.rng.uniform(0, 2 * np.pi, 2)
-        return np.array([cos * np.cos(a), sin * np.cos(b), sin * np.sin(b), cos * np.sin(a)])
+        return np.array(
+            [cos * np.cos(a), sin * np.cos(b), sin * np.sin(b), cos * np.sin(a)]
+        )
 
     def tilt(self, angle):
         return self.tilted(np.cos(angle / 2), np.sin(angle / 2))
@@ -82,9 +85,17 @@ class Cases:
         return sign * self.power(np.log10(shortest), np.log10(longest))
 
     def add(
-        self, regime, top, attitude, omega, level=0.0, unstable=False, span=None, shortest=0.1,
+        self,
+        regime,
+        top,
+        attitude,
+        omega,
+        level=0.0,
+        unstable=False,
+        span=None,
+        shortest=0.1,
         bits=BITS,
-    ):  # fmt: skip
+    ):
         """Add a case; `span` is the time times `fastest`, else drawn."""
         attitude, omega = attitude + 0.0, np.asarray(omega, float) + 0.0  # no -0.0
         if span is None:
@@ -100,7 +111,9 @@ class Cases:
         for k in range(60):
             top = self.top()
             span = 2000.0 * (-1) ** k if k < 4 else None
-            self.add("generic nutation", top, self.anywhere(), self.omega(top), span=span)
+            self.add(
+                "generic nutation", top, self.anywhere(), self.omega(top), span=span
+            )
         for _ in range(50):
             i1, i3, mgl = top = self.top()
             self.add("negative mgl", (i1, i3, -mgl), self.anywhere(), self.omega(top))
@@ -127,11 +140,14 @@ class Cases:
             i1, i3, mgl = top = self.top()
             attitude, omega = self.anywhere(), self.omega(top) * [1, 1, 3]
             w, x, y, z = attitude
-            # The precession changes sign where cos(tilt) = turn, if the nutation reaches it
+            # The precession changes sign where cos(tilt) = turn, if the nutation
+            # reaches it
             height = w * w + z * z - x * x - y * y
             swing = 2 * (omega[0] * (x * z - w * y) + omega[1] * (y * z + w * x))
             turn = height + i1 * swing / (i3 * omega[2])
-            if abs(turn) < 1 and i1 * (omega[0] ** 2 + omega[1] ** 2) > 2 * mgl * (turn - height):
+            if abs(turn) < 1 and i1 * (omega[0] ** 2 + omega[1] ** 2) > 2 * mgl * (
+                turn - height
+            ):
                 self.add("loops", top, attitude, omega)
                 count += 1
 
@@ -164,12 +180,28 @@ class Cases:
             top = self.top()
             kind = k % 5
             spin = self.sign() * threshold(*top)
-            spin *= (self.power(0, 0.7), self.power(-1, 0), 1, self.rng.uniform(0.95, 1), 1)[kind]
+            spin *= (
+                self.power(0, 0.7),
+                self.power(-1, 0),
+                1,
+                self.rng.uniform(0.95, 1),
+                1,
+            )[kind]
             if kind == 4:  # at the threshold exactly
-                top = (2.0 ** self.rng.integers(-2, 3), 1.0, 2.0 ** self.rng.integers(-2, 3))
-                top = (top[0], top[0] * self.rng.choice([0.25, 0.5, 1]), top[0] * top[2] ** 2)
+                top = (
+                    2.0 ** self.rng.integers(-2, 3),
+                    1.0,
+                    2.0 ** self.rng.integers(-2, 3),
+                )
+                top = (
+                    top[0],
+                    top[0] * self.rng.choice([0.25, 0.5, 1]),
+                    top[0] * top[2] ** 2,
+                )
                 spin = self.sign() * 2 * np.sqrt(top[2] * top[0]) / top[1]
-            self.add("sleeping", top, self.upright(), [0, 0, spin], unstable=kind in (1, 3))
+            self.add(
+                "sleeping", top, self.upright(), [0, 0, spin], unstable=kind in (1, 3)
+            )
 
     def passing(self):
         for k in range(60):
@@ -182,8 +214,13 @@ class Cases:
                     angle = self.rng.uniform(0, 2 * np.pi)
                     attitude = np.array([np.cos(angle), np.sin(angle), 0, 0])
                     energy = mgl * (1 + self.power(-1, 1))
-                    omega = [self.sign() * np.sqrt(2 * (energy - mgl * np.cos(2 * angle)) / i1)]
-                    self.add(regime, top, attitude, [*omega, 0, 0], unstable=True, shortest=3)
+                    omega = [
+                        self.sign()
+                        * np.sqrt(2 * (energy - mgl * np.cos(2 * angle)) / i1)
+                    ]
+                    self.add(
+                        regime, top, attitude, [*omega, 0, 0], unstable=True, shortest=3
+                    )
                     continue
                 omega = self.omega(top)
                 before = self.rng.uniform(1, 3)
@@ -211,10 +248,25 @@ class Cases:
             omega = self.omega(top) * min(k, 1) * tilt
             omega[2] = spin
             if k < repeats:
-                self.add("near sleeping spin", top, self.tilt(tilt), omega, level, unstable=True)
+                self.add(
+                    "near sleeping spin",
+                    top,
+                    self.tilt(tilt),
+                    omega,
+                    level,
+                    unstable=True,
+                )
                 continue
             span = self.sign() * self.power(2.5, 3.2)
-            self.add("near sleeping spin", top, self.tilt(tilt), omega, level, span=span, bits=412)
+            self.add(
+                "near sleeping spin",
+                top,
+                self.tilt(tilt),
+                omega,
+                level,
+                span=span,
+                bits=412,
+            )
 
     def pendulum(self):
         for k in range(60):
@@ -242,7 +294,12 @@ class Cases:
             if k % 2:
                 top = (i1, i3, -mgl)
             if k < 20:
-                self.add("hanging", top, self.upright() if k % 2 else self.upside_down(), spin)
+                self.add(
+                    "hanging",
+                    top,
+                    self.upright() if k % 2 else self.upside_down(),
+                    spin,
+                )
                 continue
             level = 10.0 ** -self.rng.integers(3, 9)
             cos, sin = np.cos(level / 2), np.sin(level / 2)
@@ -273,7 +330,8 @@ def draw():
     return cases.rows
 
 
-# --- Derivatives --------------------------------------------------------------------------------
+# --- Derivatives
+# --------------------------------------------------------------------------------
 
 SCALES = ("slow units", "fast units")
 
@@ -281,9 +339,9 @@ SCALES = ("slow units", "fast units")
 def derivatives(rows):
     """Some tops of every kind in units in which their rates are below 1, and their Jacobians.
 
-    By variational equations in 80-bit Taylor series (tests/reference.py): the last state with
-    respect to attitude (4, its norm free), omega (3), I1, I3 and mgl. Over 200 only what is stable:
-    exp(lambda t) of the rest is beyond 80 bits.
+    By variational equations in 80-bit Taylor series (tests/reference.py): the last
+    state with respect to attitude (4, its norm free), omega (3), I1, I3 and mgl. Over
+    200 only what is stable: exp(lambda t) of the rest is beyond 80 bits.
     """
     regimes, inputs, durations = [], [], []
     for regime in dict.fromkeys(row[0] for row in rows if row[0] not in SCALES):
@@ -292,19 +350,35 @@ def derivatives(rows):
         for k, (_, _, (i1, i3), mgl, attitude, omega, _, bits) in enumerate(picked):
             unit = 2.0 ** np.ceil(np.log2(fastest(i1, i3, mgl, omega) or 1.0))
             x = np.array(
-                [*attitude / np.linalg.norm(attitude), *omega / unit, i1, i3, mgl / unit**2]
+                [
+                    *attitude / np.linalg.norm(attitude),
+                    *omega / unit,
+                    i1,
+                    i3,
+                    mgl / unit**2,
+                ]
             )
             inputs.append(x)
             regimes.append(regime)
-            durations.append((20.0, -20.0, 20.0, -200.0 if bits == BITS else -20.0)[k % 4])
+            durations.append(
+                (20.0, -20.0, 20.0, -200.0 if bits == BITS else -20.0)[k % 4]
+            )
     inputs, durations = np.array(inputs), np.array(durations)
     states, jacobians = np.zeros((len(inputs), 7)), np.zeros((len(inputs), 7, 10))
     for duration in np.unique(durations):
         chosen = durations == duration
-        q, w, (i1, i3, mgl) = inputs[chosen, :4], inputs[chosen, 4:7], inputs[chosen, 7:].T
+        q, w, (i1, i3, mgl) = (
+            inputs[chosen, :4],
+            inputs[chosen, 4:7],
+            inputs[chosen, 7:].T,
+        )
         lever = np.stack([0 * mgl, 0 * mgl, mgl], axis=1)
         state, full = heavy_body(np.stack([i1, i1, i3], axis=1), q, w, duration, lever)
-        columns = [full[:, :, :7], (full[:, :, 7] + full[:, :, 8])[:, :, None], full[:, :, [9, 12]]]
+        columns = [
+            full[:, :, :7],
+            (full[:, :, 7] + full[:, :, 8])[:, :, None],
+            full[:, :, [9, 12]],
+        ]
         states[chosen] = state
         jacobians[chosen] = np.concatenate(columns, axis=2)
     names = "regime", "inputs", "duration", "state", "jacobian"

@@ -12,12 +12,15 @@ from jrigid._core import third_party
 def inlined(function: Callable[..., Any], *arguments: Any) -> Any:
     """The results of a function of arrays, as `function(*arguments)`.
 
-    Under several nested vmaps JAX traces each call of a jitted function (each `jnp.where`) once
-    more for every vmap. Here the function is traced once by itself, and what surrounds it sees
-    its arithmetic only: half of the time to trace a fit.
+    Under several nested vmaps JAX traces each call of a jitted function (each
+    `jnp.where`) once more for every vmap. Here the function is traced once by itself,
+    and what surrounds it sees its arithmetic only: half of the time to trace a fit.
     """
     leaves, structure = jtu.tree_flatten(arguments)
-    shapes = [jax.ShapeDtypeStruct(jax.numpy.shape(x), jax.numpy.result_type(x)) for x in leaves]
+    shapes = [
+        jax.ShapeDtypeStruct(jax.numpy.shape(x), jax.numpy.result_type(x))
+        for x in leaves
+    ]
 
     def flat(*leaves: Any) -> Any:
         return function(*structure.unflatten(leaves))
@@ -27,12 +30,20 @@ def inlined(function: Callable[..., Any], *arguments: Any) -> Any:
     return jtu.tree_structure(results).unflatten(found)
 
 
-def _evaluate(jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+def _evaluate(
+    jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Any]
+) -> list[Any]:
     """Evaluate a program, and within it the programs that it calls."""
-    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
+    values = dict(
+        zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True)
+    )
 
     def read(variable: Any) -> Any:
-        return variable.val if isinstance(variable, third_party.Literal) else values[variable]
+        return (
+            variable.val
+            if isinstance(variable, third_party.Literal)
+            else values[variable]
+        )
 
     for equation in jaxpr.eqns:
         inputs = [read(x) for x in equation.invars]

@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from jrigid._core.lanes_last import lanes_last
 
-# So many lanes have their stages in a core's second-level cache; a vector register holds 8 of them.
-# Elsewhere than on a CPU many more are needed to keep it busy.
+# So many lanes have their stages in a core's second-level cache; a vector register
+# holds 8 of them. Elsewhere than on a CPU many more are needed to keep it busy.
 _WIDTH, _WIDTH_ELSEWHERE, _REGISTER = 128, 2**14, 8
 
 
@@ -37,7 +37,9 @@ def in_blocks(function: Callable[..., Any], problem: Any, *own: Any) -> Any:
             whole = lambda each, own: function(eqx.combine(each, shared), *own)  # noqa: E731
             return lanes_last(whole, each, own)
 
-        return some_at_a_time(block, jnp.arange(jtu.tree_leaves(own)[0].shape[0]), each, own)
+        return some_at_a_time(
+            block, jnp.arange(jtu.tree_leaves(own)[0].shape[0]), each, own
+        )
 
     return as_lanes(of_all, problem, *own)
 
@@ -49,7 +51,9 @@ def some_at_a_time(function: Callable[..., Any], order: Array, *lanes: Any) -> A
     order = order[jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)]
 
     def block(numbers: Array) -> Any:
-        found = function(*jtu.tree_map(lambda x: jnp.moveaxis(x[numbers], 0, -1), lanes))
+        found = function(
+            *jtu.tree_map(lambda x: jnp.moveaxis(x[numbers], 0, -1), lanes)
+        )
         return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), found)
 
     def in_place(x: Array) -> Array:
@@ -68,10 +72,11 @@ def as_lanes(
 ) -> Any:
     """`function(problem, nothing, *own)`; under vmap `function(shared, each, *own)` of all lanes.
 
-    The leaves of `each` and of `own` have a lane to each index in front; what is shared has none.
-    With tangents `function` takes one argument more and gives a pair, of which the second depends
-    on it: where only they have another axis it is they alone that are mapped. `alone` serves what
-    is not mapped, as `alone(problem, *own)`, where that is another function.
+    The leaves of `each` and of `own` have a lane to each index in front; what is shared
+    has none. With tangents `function` takes one argument more and gives a pair, of
+    which the second depends on it: where only they have another axis it is they alone
+    that are mapped. `alone` serves what is not mapped, as `alone(problem, *own)`, where
+    that is another function.
     """
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, structure = jtu.tree_flatten((arrays, own, tangents))
@@ -151,10 +156,14 @@ class _Call(NamedTuple):
     def of_all(self, leaves: Any, batched: Any) -> Any:
         """The result for lanes, from leaves some of which have an axis of lanes in front."""
         count = next(x.shape[0] for x, has in zip(leaves, batched, strict=True) if has)
-        (problem, *own), (has, *own_has) = (self.structure.unflatten(x) for x in (leaves, batched))
+        (problem, *own), (has, *own_has) = (
+            self.structure.unflatten(x) for x in (leaves, batched)
+        )
         each, shared = eqx.partition(problem, has)
         own = jtu.tree_map(
-            lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), own, own_has
+            lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)),
+            own,
+            own_has,
         )
         return self.called(shared, each, *own)
 
@@ -191,7 +200,10 @@ def _without_axis(found: Any) -> tuple[Any, Any]:
 
 def _of_tangents(found: tuple[Any, Any]) -> tuple[Any, Any]:
     motion, tangent = found
-    return found, (jtu.tree_map(lambda _: False, motion), jtu.tree_map(lambda _: True, tangent))
+    return found, (
+        jtu.tree_map(lambda _: False, motion),
+        jtu.tree_map(lambda _: True, tangent),
+    )
 
 
 def _flat(x: Array, has: bool, out: bool, size: int, count: int) -> Array:

@@ -1,9 +1,9 @@
 """A function of one lane, on many lanes along the last axis.
 
-`jax.vmap(..., in_axes=-1, out_axes=-1)` means the same, but its rules move the lanes to the front
-and back again, which takes longer than the work where the work is a few numbers a lane. Here what
-goes number by number, or takes arrays apart and puts them together, leaves the lanes where they
-are; all else is left to `vmap`.
+`jax.vmap(..., in_axes=-1, out_axes=-1)` means the same, but its rules move the lanes to
+the front and back again, which takes longer than the work where the work is a few
+numbers a lane. Here what goes number by number, or takes arrays apart and puts them
+together, leaves the lanes where they are; all else is left to `vmap`.
 """
 
 import functools
@@ -53,7 +53,11 @@ def _apply(equation: Any, values: list, batched: list[bool], lanes: int) -> list
 
 
 def _in_lanes(x: Any, has: bool, lanes: int) -> Any:
-    return x if has else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+    return (
+        x
+        if has
+        else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+    )
 
 
 def _results_vary(jaxpr: Any, batched: Sequence[bool]) -> list[bool]:
@@ -103,7 +107,9 @@ class _Evaluation:
         self.lanes = lanes
         self.functions: dict[Any, Any] = {}
 
-    def __call__(self, jaxpr: Any, consts: Any, arguments: Any) -> list[tuple[Any, bool]]:
+    def __call__(
+        self, jaxpr: Any, consts: Any, arguments: Any
+    ) -> list[tuple[Any, bool]]:
         """Values, and whether they have lanes."""
         known: dict[Any, tuple[Any, bool]] = {}
 
@@ -117,7 +123,9 @@ class _Evaluation:
             known.update(zip(eqn.outvars, self.results(eqn, pairs), strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def results(self, eqn: Any, pairs: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+    def results(
+        self, eqn: Any, pairs: list[tuple[Any, bool]]
+    ) -> list[tuple[Any, bool]]:
         """The results of an operation, and whether they have lanes."""
         values = [x for x, _ in pairs]
         batched = [has for _, has in pairs]
@@ -143,7 +151,9 @@ class _Evaluation:
             return self.call(called, values, tuple(batched))
         return [(x, True) for x in _apply(eqn, values, batched, self.lanes)]
 
-    def call(self, called: Any, values: list, batched: tuple[bool, ...]) -> list[tuple[Any, bool]]:
+    def call(
+        self, called: Any, values: list, batched: tuple[bool, ...]
+    ) -> list[tuple[Any, bool]]:
         """A function's; one that is called often is traced once."""
         key = id(called), batched
         if key not in self.functions:
@@ -191,7 +201,9 @@ class _Evaluation:
             return found[: len(carry)], found[len(carry) :]
 
         rows_alone = [x for x, _ in rows]
-        end, stacked = jax.lax.scan(step, in_lanes(carry), rows_alone, scan.length, scan.reverse)
+        end, stacked = jax.lax.scan(
+            step, in_lanes(carry), rows_alone, scan.length, scan.reverse
+        )
         return list(zip((*end, *stacked), varies, strict=True))
 
     def cond(
@@ -203,7 +215,9 @@ class _Evaluation:
         """A branch that all lanes take."""
 
         def branch(closed: Any) -> Callable[..., list]:
-            return lambda *values: self.whole(closed, zip(values, batched[1:], strict=True))
+            return lambda *values: self.whole(
+                closed, zip(values, batched[1:], strict=True)
+            )
 
         in_lanes = [branch(x) for x in branches]
         return [(x, True) for x in jax.lax.switch(values[0], in_lanes, *values[1:])]

@@ -23,12 +23,12 @@ _TOO_LONG = 2.0
 # on at an equilibrium.
 _JUMP = 4.0
 _CONFINED = 1e-6
-# A step may commit the whole tolerance if it covers so many radians, a shorter one less:
-# steps are short where a torque is not smooth, and there the estimate is no bound.
-# Errors in proportion to the radians would be enough for steps whose estimates are bounds;
-# with the square the worst of 16 torques of each kind was 1.8 times the promise, where it
-# had been 10.7 (benchmarks/bench_nonsmooth.py, on whose motions the numbers below were
-# chosen). A jump can be passed because there is a smallest part,
+# A step may commit the whole tolerance if it covers so many radians, a shorter one
+# less: steps are short where a torque is not smooth, and there the estimate is no
+# bound. Errors in proportion to the radians would be enough for steps whose estimates
+# are bounds; with the square the worst of 16 torques of each kind was 1.8 times the
+# promise, where it had been 10.7 (benchmarks/bench_nonsmooth.py, on whose motions the
+# numbers below were chosen). A jump can be passed because there is a smallest part,
 # and because steps of a few times the shortest length may commit the whole again.
 _WHOLE = 1.0
 _SMALLEST_PART = 3e-3
@@ -133,7 +133,9 @@ def judge(
     error = error / part
     beyond_noise = jnp.maximum(error * limits.rtol, noise) / limits.rtol
     factor = _SAFETY * beyond_noise ** (-1 / order)
-    factor = jnp.where(small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY))
+    factor = jnp.where(
+        small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY)
+    )
     following = factor * h
     # A step that was cut short says little about the next one.
     following = jnp.where(small & (h < step), jnp.maximum(following, step), following)

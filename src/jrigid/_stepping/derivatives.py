@@ -81,7 +81,9 @@ def solve_forward(engine: Engine, motion: Motion) -> Ends:
 
         return of_states(*eqx.filter_jvp(ends, (moved,), (tangent,)))
 
-    def together(shared: Motion, rest: Motion, moved: Motion, tangent: Motion) -> tuple[Ends, Ends]:
+    def together(
+        shared: Motion, rest: Motion, moved: Motion, tangent: Motion
+    ) -> tuple[Ends, Ends]:
         def ends(moved: Motion) -> Ends:
             return run_in_lanes(engine, shared, eqx.combine(moved, rest))
 
@@ -90,7 +92,9 @@ def solve_forward(engine: Engine, motion: Motion) -> Ends:
     @solved.def_jvp
     def _(primals: Any, tangents: Any) -> tuple[Ends, Ends]:
         (motion,), (tangent,) = primals, tangents
-        perturbed = jtu.tree_map(lambda x: x is not None, tangent, is_leaf=lambda x: x is None)
+        perturbed = jtu.tree_map(
+            lambda x: x is not None, tangent, is_leaf=lambda x: x is None
+        )
         moved, rest = _split(_finely(motion), perturbed, start=True)
         tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, moved))
         return as_lanes(together, rest, moved, tangents=tangent, alone=alone)
@@ -98,7 +102,9 @@ def solve_forward(engine: Engine, motion: Motion) -> Ends:
     return solved(steps_fixed(motion))
 
 
-def _split(motion: Motion, perturbed: Any, start: bool = False) -> tuple[Motion, Motion]:
+def _split(
+    motion: Motion, perturbed: Any, start: bool = False
+) -> tuple[Motion, Motion]:
     """The parameters that have derivatives, and the start if asked, apart from the rest."""
     which = jtu.tree_map(lambda _: False, motion)
     which = which._replace(parameters=perturbed.parameters, y0=start)

@@ -42,7 +42,8 @@ class _Passage(NamedTuple):
     """What a step means for the conditions of an event.
 
     Attributes:
-        keep: Whether the step is accepted; one that passes the place is repeated, up to it.
+        keep: Whether the step is accepted; one that passes the place is repeated, up to
+            it.
         repeat: Whether it is repeated.
         ended: Whether the motion ends with it.
         end: Where the motion ends now.
@@ -121,7 +122,9 @@ class Engine(NamedTuple):
         if motion.jumps.size == 0:
             return self.field
         beside = motion.beside[0]
-        padded = jnp.concatenate([jnp.full_like(motion.jumps[:1], -jnp.inf), motion.jumps])
+        padded = jnp.concatenate(
+            [jnp.full_like(motion.jumps[:1], -jnp.inf), motion.jumps]
+        )
         padded = jnp.append(padded, jnp.inf)
         low, high = padded[jump] + beside, padded[jump + 1] - beside
 
@@ -139,10 +142,14 @@ class Engine(NamedTuple):
             goal = jnp.minimum(goal, _entry(motion.jumps, jump))
         t1 = self.stepper.end(t, step, goal)
         field = self.smooth_field(motion, jump)
-        trial = self.stepper.attempt(field, motion, progress, t1, self.in_lanes, self.keeps_rates)
+        trial = self.stepper.attempt(
+            field, motion, progress, t1, self.in_lanes, self.keeps_rates
+        )
         return self._settled(motion, progress, t1, trial)
 
-    def _settled(self, motion: Motion, progress: Progress, t1: Array, trial: Trial) -> Attempt:
+    def _settled(
+        self, motion: Motion, progress: Progress, t1: Array, trial: Trial
+    ) -> Attempt:
         """Where the motion is after a step was tried."""
         y, _, clock, counts, values = progress
         t, step, _, end = clock

@@ -28,7 +28,9 @@ class Conditions(NamedTuple):
         """Which conditions end the motion, by their values before and after a step."""
         old, new = jnp.sign(before), jnp.sign(after)
         each = []
-        for i, (boolean, up) in enumerate(zip(self.boolean, self.direction, strict=True)):
+        for i, (boolean, up) in enumerate(
+            zip(self.boolean, self.direction, strict=True)
+        ):
             if boolean:
                 each.append(new[i] > 0)
             elif up is None:
@@ -50,8 +52,8 @@ class Conditions(NamedTuple):
     ) -> tuple[Float[Array, ""], Bool[Array, " conditions"]]:
         """When the first of the conditions that happened in a step came to hold.
 
-        A number changes its sign there, a boolean becomes true. It is found by bisection,
-        which cannot miss it.
+        A number changes its sign there, a boolean becomes true. It is found by
+        bisection, which cannot miss it.
 
         Args:
             observed: Arrays that the conditions depend on.

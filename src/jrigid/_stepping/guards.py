@@ -1,8 +1,8 @@
 """Guards: a mode of differentiation that an adjoint cannot serve raises an error that helps.
 
 Each guard is the identity on values. What it does is carried by its derivative rules: a
-linear map that can be transposed but not evaluated (reverse mode only), or evaluated but
-not transposed (forward mode only).
+linear map that can be transposed but not evaluated (reverse mode only), or evaluated
+but not transposed (forward mode only).
 """
 
 from collections.abc import Callable, Iterator
@@ -45,8 +45,8 @@ def _primitive(name: str, run: Callable[[Any], Any] = lambda x: x) -> Primitive:
 # Forward mode only: a linear map that can be evaluated, not transposed.
 _forward_only = _primitive("jrigid_forward_only")
 ad.deflinear2(_forward_only, _refuse)
-# Reverse mode only: the tangent map can be transposed, not run; and the cotangent that it gives,
-# the first derivative, cannot be differentiated again.
+# Reverse mode only: the tangent map can be transposed, not run; and the cotangent that
+# it gives, the first derivative, cannot be differentiated again.
 _reverse_only = _primitive("jrigid_reverse_only")
 _tangent = _primitive("jrigid_reverse_only_tangent", _refuse)
 _cotangent = _primitive("jrigid_reverse_only_cotangent")
@@ -68,14 +68,18 @@ def forward_only(adjoint: diffrax.AbstractAdjoint) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        if isinstance(adjoint, diffrax.ForwardMode) and "Linearization failed" in str(error):
+        if isinstance(adjoint, diffrax.ForwardMode) and "Linearization failed" in str(
+            error
+        ):
             raise UnsupportedDerivative(_MESSAGE) from error
         raise
 
 
 def guard_inputs(adjoint: diffrax.AbstractAdjoint, tree: Any) -> Any:
     """Guard what goes into an integration whose adjoint serves reverse mode only."""
-    return _through(_reverse_only, isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint), tree)
+    return _through(
+        _reverse_only, isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint), tree
+    )
 
 
 def guard_derivative(tree: Any) -> Any:

@@ -23,8 +23,8 @@ class Method(NamedTuple):
     Attributes:
         order: Order of the error of a step's result.
         times: Fractions of the step at which the stages are.
-        rows: Coefficients of the places of the stages; the last row is that of the error
-            estimate.
+        rows: Coefficients of the places of the stages; the last row is that of the
+            error estimate.
         groups: Consecutive rows that use nearly the same stages.
         reverse_groups: The same of the rows, and of the columns of the same numbers, by
             which the reverse of a step sums.
@@ -92,10 +92,14 @@ def _groups(first: int, *tables: np.ndarray) -> Groups:
 
     def divided(cuts: tuple[int, ...]) -> list[tuple[int, list[set[int]], int]]:
         pairs = itertools.pairwise((0, *cuts, count))
-        return [(a, [set().union(*rows[a:b]) for rows in used], b - a) for a, b in pairs]
+        return [
+            (a, [set().union(*rows[a:b]) for rows in used], b - a) for a, b in pairs
+        ]
 
     def terms(cuts: tuple[int, ...]) -> int:
-        return sum(length * sum(map(len, columns)) for _, columns, length in divided(cuts))
+        return sum(
+            length * sum(map(len, columns)) for _, columns, length in divided(cuts)
+        )
 
     best = min(itertools.combinations(range(1, count), groups - 1), key=terms)
     # A sum has a term, if only one with the coefficient zero.

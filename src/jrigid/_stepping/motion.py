@@ -24,9 +24,11 @@ class Motion(NamedTuple):
         times: Output times, in order.
         jumps: Times at which the vector field is not smooth, in order; infinite ones
             are none.
-        beside: For each jump, the distance from it at which the vector field is evaluated.
+        beside: For each jump, the distance from it at which the vector field is
+            evaluated.
         scales: Scales of the components of the state.
-        limits: What holds the steps. A motion whose fastest rate is zero ends at its start.
+        limits: What holds the steps. A motion whose fastest rate is zero ends at its
+            start.
     """
 
     parameters: list[Array]

@@ -121,17 +121,27 @@ class _Replay(NamedTuple):
                 return eqx.combine(moved, fixed).parameters
 
             of_parameters, change = self.engine.stepper.pull_back(
-                smooth, complete, moved, (t, h, y), step.rates, change, self.engine.in_lanes
+                smooth,
+                complete,
+                moved,
+                (t, h, y),
+                step.rates,
+                change,
+                self.engine.in_lanes,
             )
             return change, jtu.tree_map(jnp.add, total, of_parameters)
 
-        return self.over(one, self.fixed, self.moved, self.changes, step, (change, total))
+        return self.over(
+            one, self.fixed, self.moved, self.changes, step, (change, total)
+        )
 
     def forwards(self, back: _Back, kept: _Kept, log: _Step) -> tuple:
         """Run from the last of the states that are kept to where cotangents are."""
         size = log.output.shape[0]
         start = kept.count - 1
-        progress, attempt = jtu.tree_map(lambda x: x[start], (kept.progress, kept.attempts))
+        progress, attempt = jtu.tree_map(
+            lambda x: x[start], (kept.progress, kept.attempts)
+        )
         room = _KEPT - kept.count
         left = jnp.minimum(back.attempt, self.estimate) - attempt
         stretch = jnp.maximum(size, -(-left // (room + 1)))
@@ -211,7 +221,9 @@ class _Replay(NamedTuple):
             count = jnp.maximum(jnp.sum(valid), 1).astype(kept.count.dtype)
             return back, kept._replace(count=count), log
 
-        back, _, _ = jax.lax.while_loop(lambda carry: carry[0].attempt > 0, part, (back, kept, log))
+        back, _, _ = jax.lax.while_loop(
+            lambda carry: carry[0].attempt > 0, part, (back, kept, log)
+        )
 
         def at_start(fixed: Any, changes: Changes) -> Array:
             early = (fixed.times <= 0)[:, None]
@@ -253,7 +265,9 @@ def pull_in_lanes(
 
     def block(rest: Any, moved: Any, changes: Changes, tried: Array) -> Any:
         def over(function: Callable[..., Any], fixed: Any, *arguments: Any) -> Any:
-            return lanes_last(lambda x, *y: function(eqx.combine(x, shared), *y), fixed, *arguments)
+            return lanes_last(
+                lambda x, *y: function(eqx.combine(x, shared), *y), fixed, *arguments
+            )
 
         replay = _Replay(engine, over, rest, moved, changes, jnp.max(tried))
         return replay.pull()

@@ -1,8 +1,9 @@
 """Motions from their start to their end: one alone, or many in lanes.
 
-Under `jax.vmap` a loop goes on until its slowest lane has ended, and each operation goes
-through all lanes, out of the cache. Here few lanes step together, along the last axis of
-their arrays. A lane whose motion has ended stores its result and takes the next motion.
+Under `jax.vmap` a loop goes on until its slowest lane has ended, and each operation
+goes through all lanes, out of the cache. Here few lanes step together, along the last
+axis of their arrays. A lane whose motion has ended stores its result and takes the next
+motion.
 """
 
 from collections.abc import Callable
@@ -54,7 +55,9 @@ def run_alone(engine: Engine, motion: Motion) -> Ends:
         progress, saved = carry
         progress, _, _, output = engine.attempt(motion, progress)
         # What is stored after the last of the times is not read.
-        return progress, jax.lax.dynamic_update_index_in_dim(saved, progress.y, output, 0)
+        return progress, jax.lax.dynamic_update_index_in_dim(
+            saved, progress.y, output, 0
+        )
 
     start = engine.begin(motion), _states_at_start(motion)
     progress, saved = jax.lax.while_loop(lambda carry: carry[0].running, step, start)
@@ -96,7 +99,9 @@ def record_alone(engine: Engine, motion: Motion) -> tuple[Progress, Record]:
         jnp.zeros(engine.max_steps, jnp.int32),
         jnp.full(engine.max_steps, motion.times.size, jnp.int32),
     )
-    return jax.lax.while_loop(lambda carry: carry[0].running, step, (engine.begin(motion), record))
+    return jax.lax.while_loop(
+        lambda carry: carry[0].running, step, (engine.begin(motion), record)
+    )
 
 
 def any_of(lanes: Bool[Array, " lanes"]) -> Bool[Array, ""]:
@@ -173,10 +178,14 @@ class _Batch(NamedTuple):
 
     def take(self, number: Int[Array, " lanes"]) -> _Lanes:
         """The motions of these numbers at their start."""
-        own = jtu.tree_map(lambda x: jnp.moveaxis(x.at[number].get(mode="clip"), 0, -1), self.table)
+        own = jtu.tree_map(
+            lambda x: jnp.moveaxis(x.at[number].get(mode="clip"), 0, -1), self.table
+        )
         progress = lanes_last(lambda own: self.engine.begin(self.motion_of(own)), own)
         state = jnp.where(number < self.count, progress.counts[0], EMPTY)
-        return _Lanes(number, own, progress._replace(counts=progress.counts.at[0].set(state)))
+        return _Lanes(
+            number, own, progress._replace(counts=progress.counts.at[0].set(state))
+        )
 
     def refilled(
         self, lanes: _Lanes, started: Int[Array, ""], results: _Results
@@ -192,7 +201,9 @@ class _Batch(NamedTuple):
             counts=results.counts.at[number].set(progress.counts.T, mode="drop"),
         )
         behind = jnp.cumsum(ended.astype(started.dtype))
-        following = self.order.at[started + behind - 1].get(mode="fill", fill_value=self.count)
+        following = self.order.at[started + behind - 1].get(
+            mode="fill", fill_value=self.count
+        )
         fresh = self.take(jnp.where(ended, following, lanes.number))
         lanes = jtu.tree_map(lambda a, b: jnp.where(ended, a, b), fresh, lanes)
         return lanes, started + behind[-1], results
@@ -256,7 +267,9 @@ def run_in_lanes(engine: Engine, shared: Any, each: Any) -> Ends:
     empty = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     empty = empty._replace(
         number=lanes,
-        progress=empty.progress._replace(counts=jnp.full_like(empty.progress.counts, EMPTY)),
+        progress=empty.progress._replace(
+            counts=jnp.full_like(empty.progress.counts, EMPTY)
+        ),
     )
     results = _Results(
         ys,
@@ -274,7 +287,9 @@ def run_in_lanes(engine: Engine, shared: Any, each: Any) -> Ends:
         look,
         (empty, jnp.zeros((), order.dtype), results),
     )
-    return Ends(results.ys[:, :-1], results.ends[:, 0], results.ends[:, 1:], results.counts)
+    return Ends(
+        results.ys[:, :-1], results.ends[:, 0], results.ends[:, 1:], results.counts
+    )
 
 
 def _packed(each: Any, dtype: Any) -> tuple[Any, Callable[[Any], Any]]:

@@ -92,8 +92,8 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 def undamped_rate(matrix: Array) -> Array:
     """Largest magnitude of an eigenvalue that does not die away within a radian of its own.
 
-    What an implicit solver has to follow: it may step over the others. A matrix that is not finite
-    has none.
+    What an implicit solver has to follow: it may step over the others. A matrix that is
+    not finite has none.
     """
     matrix = jax.lax.stop_gradient(matrix)
     values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
@@ -102,7 +102,11 @@ def undamped_rate(matrix: Array) -> Array:
 
 
 def spread(
-    system: AbstractSystem, state: Any, rate: Array, length: Any = None, speed: Any = None
+    system: AbstractSystem,
+    state: Any,
+    rate: Array,
+    length: Any = None,
+    speed: Any = None,
 ) -> Array:
     """A scale for each component of the state of what turns at a rate; length and speed of flight.
 
@@ -115,7 +119,10 @@ def spread(
         "omega": rate,
         "internal": internal_parts(system.torque.internal_scale(rate)),
     }
-    full = {x: jtu.tree_map(jnp.full_like, value, scale[x]) for x, value in vars(state).items()}
+    full = {
+        x: jtu.tree_map(jnp.full_like, value, scale[x])
+        for x, value in vars(state).items()
+    }
     return ravel_pytree(dataclasses.replace(state, **full))[0]
 
 
@@ -129,9 +136,9 @@ def units(
 ) -> tuple[Array, Array]:
     """The fastest rate of the motion [rad/s], and a scale for each component of the state.
 
-    The rate is what `fastest_of` says of the Jacobian, by default its spectral radius, and at least
-    that of turning: a body at rest turns at the rate its torque would give it within a radian, and
-    one that nothing turns is measured by the length of the run.
+    The rate is what `fastest_of` says of the Jacobian, by default its spectral radius,
+    and at least that of turning: a body at rest turns at the rate its torque would give
+    it within a radian, and one that nothing turns is measured by the length of the run.
     """
     rates = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
@@ -153,14 +160,17 @@ def units(
     if not isinstance(state0, FloatingState):
         scales = powers(rate, rate)
         return fastest(scales), scales
-    # First scales of the place alone, to find how fast the motion of the centre of mass changes;
-    # then its way in that time, or in the whole run if that is shorter. A run of many orbits is
-    # not to be measured by |a| T^2. A body at rest on which no force acts is measured in metres.
+    # First scales of the place alone, to find how fast the motion of the centre of mass
+    # changes; then its way in that time, or in the whole run if that is shorter. A run
+    # of many orbits is not to be measured by |a| T^2. A body at rest on which no force
+    # acts is measured in metres.
     position, velocity, pull = (
         safe_norm(x) for x in (state0.position, state0.velocity, rates.velocity)
     )
 
-    def length_and_speed(length: Array, speed: Array, time: Array) -> tuple[Array, Array]:
+    def length_and_speed(
+        length: Array, speed: Array, time: Array
+    ) -> tuple[Array, Array]:
         length = jnp.where(length > 0, length, speed * time)
         length = jnp.where(length > 0, length, 1.0)
         return length, jnp.where(speed > 0, speed, length / time)

@@ -1,9 +1,9 @@
 """A step of an explicit Runge-Kutta method as a loop over its stages, and its reverse.
 
 The vector field stands once in the loop, so the compiled program does not grow with the
-number of stages. The reverse of a step is another Runge-Kutta step (E. Hairer, C. Lubich,
-G. Wanner, Geometric Numerical Integration, 2nd ed., section VI.3): it is written out here,
-as a loop too.
+number of stages. The reverse of a step is another Runge-Kutta step (E. Hairer, C.
+Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed., section VI.3): it is
+written out here, as a loop too.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from jrigid._core.third_party import arithmetic_operations
 from jrigid._stepping.method import Groups, Method
 
-# A computation of so many operations is short. The field of a heavy top has 179, that of a
-# heavy top with a tangent beside it 474.
+# A computation of so many operations is short. The field of a heavy top has 179, that
+# of a heavy top with a tangent beside it 474.
 _SHORT = 250
 
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
@@ -41,8 +41,8 @@ class _Sums(NamedTuple):
     Attributes:
         tables: A row of coefficients for each sum. Those of several tables are computed
             together.
-        groups: Of the rows. In lanes, where sums take a large part of the time of a step,
-            a sum has the terms of its group. Elsewhere it has all of its zeros.
+        groups: Of the rows. In lanes, where sums take a large part of the time of a
+            step, a sum has the terms of its group. Elsewhere it has all of its zeros.
         row: The row for a trip of the loop.
         in_lanes: Whether there are many lanes.
     """
@@ -68,7 +68,9 @@ class _Sums(NamedTuple):
             arguments: Of the function.
         """
 
-        def weighted(trip: Array, terms: tuple[Array, ...]) -> list[tuple[Array, Array]]:
+        def weighted(
+            trip: Array, terms: tuple[Array, ...]
+        ) -> list[tuple[Array, Array]]:
             number = self.row(trip)
             return [
                 (_row(table[:, : len(x)], number, x.dtype), x)
@@ -77,13 +79,16 @@ class _Sums(NamedTuple):
 
         if not self.in_lanes:
             pairs = weighted(trip, terms)
-            return function(*(jnp.sum(a[:, None] * x, axis=0) for a, x in pairs), *arguments)
+            return function(
+                *(jnp.sum(a[:, None] * x, axis=0) for a, x in pairs), *arguments
+            )
 
         def of_group(columns: tuple[tuple[int, ...], ...]) -> Callable[..., Any]:
             def result(trip: Array, terms: tuple[Array, ...], *arguments: Array) -> Any:
                 pairs = zip(weighted(trip, terms), columns, strict=True)
                 totals = [
-                    _sum([a[i] for i in used], [x[i] for i in used]) for (a, x), used in pairs
+                    _sum([a[i] for i in used], [x[i] for i in used])
+                    for (a, x), used in pairs
                 ]
                 return function(*totals, *arguments)
 
@@ -127,7 +132,9 @@ def apart(function: Callable[..., Any], true: Array, *arguments: Any) -> Any:
 
         def anything(shape: Any) -> Array:
             # An array that is there already costs no kernel, as a new one would.
-            alike = (x for x in given if x.shape == shape.shape and x.dtype == shape.dtype)
+            alike = (
+                x for x in given if x.shape == shape.shape and x.dtype == shape.dtype
+            )
             return next(alike, jnp.zeros(shape.shape, shape.dtype))
 
         return jtu.tree_map(anything, shapes)
@@ -175,8 +182,8 @@ def _loop(
     """The rates of the first `count` stages, and the place of the stage after them.
 
     The place of the last stage is the result of the step. If `joined`, the kernel that
-    computes a rate also puts it into the table: this takes less time in lanes, unless the
-    field is not short. Of such a kernel LLVM makes slow code.
+    computes a rate also puts it into the table: this takes less time in lanes, unless
+    the field is not short. Of such a kernel LLVM makes slow code.
     """
     t, h, y = step
 
@@ -250,15 +257,15 @@ def pull_back(
     """Cotangents of the parameters and of the start of a step, from that of its result.
 
     With the places Y_i of the stages, p_i the cotangent of Y_i, and p of the last place
-    given: u_i = h sum_j a_ji p_j, p_i = J(Y_i)^T u_i, and that of the start is the sum of
-    all p_i.
+    given: u_i = h sum_j a_ji p_j, p_i = J(Y_i)^T u_i, and that of the start is the sum
+    of all p_i.
 
     Args:
         method: The method.
         field: The vector field, of parameters, time and state.
         parameters: Those whose cotangents are asked for.
-        step: Where it starts, its length, the state at its start. A step of length 0 was
-            not taken: its rates do not matter.
+        step: Where it starts, its length, the state at its start. A step of length 0
+            was not taken: its rates do not matter.
         rates: Of its stages.
         change: Cotangent of its result.
         in_lanes: Whether it will have many lanes.

@@ -76,7 +76,9 @@ class Stepper(Protocol):
         """
         ...
 
-    def state_at(self, parameters: list[Array], step: Stretch, t: Array) -> Float[Array, " n"]:
+    def state_at(
+        self, parameters: list[Array], step: Stretch, t: Array
+    ) -> Float[Array, " n"]:
         """The state within a step."""
         ...
 
@@ -160,7 +162,9 @@ class ErrorControlled(NamedTuple):
         else:
             y1, estimate, rates = apart(step_to, counts[1] >= 0, h, y)
         # What decides on steps is not differentiated.
-        before, there, estimate, base = jax.lax.stop_gradient((y, y1, estimate, rates[-1]))
+        before, there, estimate, base = jax.lax.stop_gradient(
+            (y, y1, estimate, rates[-1])
+        )
         error = in_tolerances(limits, motion.scales, before, there, estimate)
         fastest, along = rate_along(
             lambda y: jax.lax.stop_gradient(rates_at(t1, y)),
@@ -173,11 +177,15 @@ class ErrorControlled(NamedTuple):
         verdict = judge(limits, self.method.order, step, h, error, rate0, rate1)
         return Trial(y1, along, verdict, ~(error < jnp.inf), rates)
 
-    def state_at(self, parameters: list[Array], step: Stretch, t: Array) -> Float[Array, " n"]:
+    def state_at(
+        self, parameters: list[Array], step: Stretch, t: Array
+    ) -> Float[Array, " n"]:
         """The state within a step, by the dense output of the method."""
         del parameters
         known = (step.t1 - step.t0) * step.rates[: self.method.own]
-        curve = self.interpolation(t0=step.t0, t1=step.t1, y0=step.y0, y1=step.y1, k=known)
+        curve = self.interpolation(
+            t0=step.t0, t1=step.t1, y0=step.y0, y1=step.y1, k=known
+        )
         return curve.evaluate(t)
 
     def taken(
@@ -240,7 +248,9 @@ class EqualSteps(NamedTuple):
         none = jnp.zeros((0, *y.shape), y.dtype)
         return Trial(y1, direction, Verdict(yes, no, step, rate), no, none)
 
-    def state_at(self, parameters: list[Array], step: Stretch, t: Array) -> Float[Array, " n"]:
+    def state_at(
+        self, parameters: list[Array], step: Stretch, t: Array
+    ) -> Float[Array, " n"]:
         """The state within a step, by a shorter one."""
         return self.advance(parameters, step.t0, t - step.t0, step.y0)
 

@@ -1,10 +1,11 @@
 r"""Elliptic integrals and functions: Carlson's, Legendre's and Jacobi's.
 
-Functions of real arguments of any broadcastable shapes, elementwise like scipy's; they follow the
-dtype of their arguments. The parameter is m = k^2, as in scipy; every function of m also takes the
-keyword `mc` = 1 - m, which wins, and keeps its digits where m is near 1. Outside the real domain
-the answer is NaN. Every loop has a fixed length, and every derivative, of any order and in any
-mode, is a closed form or comes of a loop of positive terms.
+Functions of real arguments of any broadcastable shapes, elementwise like scipy's; they
+follow the dtype of their arguments. The parameter is m = k^2, as in scipy; every
+function of m also takes the keyword `mc` = 1 - m, which wins, and keeps its digits
+where m is near 1. Outside the real domain the answer is NaN. Every loop has a fixed
+length, and every derivative, of any order and in any mode, is a closed form or comes of
+a loop of positive terms.
 """
 
 from jrigid.elliptic._carlson import rc as rc

@@ -1,9 +1,10 @@
 """Carlson's symmetric elliptic integrals, and the kernels that the other functions are made of.
 
-The kernels take the square roots a, b, c, q of the arguments x, y, z, p. In them the duplication
-step is a' = sqrt((a + b)(a + c)) / 2: free of subtractions, smooth where an argument is zero, and
-never out of range. Every tangent of that step is positive, so differentiating it along an axis is
-as stable as the step itself, also where arguments coincide.
+The kernels take the square roots a, b, c, q of the arguments x, y, z, p. In them the
+duplication step is a' = sqrt((a + b)(a + c)) / 2: free of subtractions, smooth where an
+argument is zero, and never out of range. Every tangent of that step is positive, so
+differentiating it along an axis is as stable as the step itself, also where arguments
+coincide.
 """
 
 import functools
@@ -25,7 +26,9 @@ ValuesLike: TypeAlias = Real[ArrayLike, "..."]
 
 def elementwise(*values: Any) -> list[Array] | tuple[Array, ...]:
     """Arrays of one floating point dtype and one shape."""
-    return jnp.broadcast_arrays(*float_arrays(*values))  # a list or, of newer jax, a tuple
+    return jnp.broadcast_arrays(
+        *float_arrays(*values)
+    )  # a list or, of newer jax, a tuple
 
 
 def _steps(x: Array) -> int:
@@ -33,7 +36,8 @@ def _steps(x: Array) -> int:
     return 15 if x.dtype == jnp.float64 else 11
 
 
-# --- kernels of roots of order one -------------------------------------------------------------
+# --- kernels of roots of order one
+# -------------------------------------------------------------
 
 
 def _next_roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
@@ -80,7 +84,9 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     total = 1 / ((c + a) * (c + b))
     start = (*_next_roots(a, b, c), 0.25 * c, total)
     a, b, c, weight, total = jax.lax.fori_loop(1, _steps(a), step, start)
-    return _rf_series(a, b, c), total + weight * _rj_series(a * a, b * b, c * c, c * c) / 3
+    return _rf_series(a, b, c), total + weight * _rj_series(
+        a * a, b * b, c * c, c * c
+    ) / 3
 
 
 def _rc_of_one(root: Array) -> Array:
@@ -108,7 +114,8 @@ def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]
     return _rf_series(a, b, c), total + weight * _rj_series(a * a, b * b, c * c, q * q)
 
 
-# --- kernels of any roots, with their derivatives ----------------------------------------------
+# --- kernels of any roots, with their derivatives
+# ----------------------------------------------
 
 
 def _varied(tangents: Any) -> list[int]:
@@ -122,7 +129,9 @@ def _two_zero(a: Array, b: Array, c: Array) -> Array:
 def _scale(*roots: Array) -> Array:
     """The largest root, by which all are divided; NaN where one is NaN, 1 where all are 0."""
     largest = functools.reduce(jnp.maximum, roots)
-    return jax.lax.stop_gradient(jnp.where(largest == 0, jnp.ones_like(largest), largest))
+    return jax.lax.stop_gradient(
+        jnp.where(largest == 0, jnp.ones_like(largest), largest)
+    )
 
 
 def _of_any_roots(kernel: Callable[..., Any], degree: int) -> Callable[..., Any]:
@@ -131,14 +140,18 @@ def _of_any_roots(kernel: Callable[..., Any], degree: int) -> Callable[..., Any]
     def scaled(a: Array, b: Array, c: Array, *q: Array) -> tuple[Array, Array]:
         scale = _scale(a, b, c, *q)
         nan, two = jnp.isnan(scale), _two_zero(a, b, c)
-        pole = functools.reduce(jnp.logical_or, [x == 0 for x in q], two)  # of the second alone
+        pole = functools.reduce(
+            jnp.logical_or, [x == 0 for x in q], two
+        )  # of the second alone
         # Where the answer is infinite or zero the loop runs on ones.
         size = jnp.where(jnp.isinf(scale), 1.0, scale)
         plain = [~bad & (scale < jnp.inf) | nan for bad in (two, pole)]
         roots = [jnp.where(plain[0], x / size, 1.0) for x in (a, b, c)]
         values = kernel(*roots, *(jnp.where(plain[1], x / size, 1.0) for x in q))
         answers = []
-        for value, fine, bad, power in zip(values, plain, (two, pole), (1, degree), strict=True):
+        for value, fine, bad, power in zip(
+            values, plain, (two, pole), (1, degree), strict=True
+        ):
             for _ in range(power):
                 value = value * (1 / size)
             answers.append(jnp.where(fine, value, jnp.where(bad, jnp.inf, 0.0)))
@@ -150,24 +163,34 @@ def _of_any_roots(kernel: Callable[..., Any], degree: int) -> Callable[..., Any]
 def _along_axes(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """A kernel with its partial derivatives in one loop, which the tangents do not enter.
 
-    An argument that is not varied costs nothing, and its infinite derivative does no harm.
+    An argument that is not varied costs nothing, and its infinite derivative does no
+    harm.
     """
     function = jax.custom_jvp(kernel)
 
     def rule(roots: Any, tangents: Any) -> Any:
         varied = _varied(tangents)
-        axes = [jnp.stack([jnp.full_like(x, i == k) for i in varied]) for k, x in enumerate(roots)]
-        along = jax.vmap(functools.partial(jax.jvp, kernel, list(roots)), out_axes=(None, 0))
+        axes = [
+            jnp.stack([jnp.full_like(x, i == k) for i in varied])
+            for k, x in enumerate(roots)
+        ]
+        along = jax.vmap(
+            functools.partial(jax.jvp, kernel, list(roots)), out_axes=(None, 0)
+        )
         values, partials = along(axes)
-        slopes = jax.tree.map(lambda x, d: jnp.where(x == jnp.inf, -jnp.inf, d), values, partials)
-        return values, tuple(sum(d[n] * tangents[i] for n, i in enumerate(varied)) for d in slopes)
+        slopes = jax.tree.map(
+            lambda x, d: jnp.where(x == jnp.inf, -jnp.inf, d), values, partials
+        )
+        return values, tuple(
+            sum(d[n] * tangents[i] for n, i in enumerate(varied)) for d in slopes
+        )
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
 
 
-# R_F(a^2, b^2, c^2) and G = (c / 3) R_D(a^2, b^2, c^2), the derivative of -R_F by c. G is 1 / (a b)
-# at c = 0; where two roots are zero both are infinite.
+# R_F(a^2, b^2, c^2) and G = (c / 3) R_D(a^2, b^2, c^2), the derivative of -R_F by c. G
+# is 1 / (a b) at c = 0; where two roots are zero both are infinite.
 rf_g = _along_axes(_of_any_roots(_rf_g_kernel, 2))
 # R_F and R_J of the squares, for q not many times the largest of the others.
 rf_rj = _along_axes(_of_any_roots(_rf_rj_kernel, 3))
@@ -194,7 +217,9 @@ def rc_of(a: Array, b: Array) -> Array:
     circular = jnp.arctan2(root, a) / root
     hyperbolic = jnp.log1p((a - b + root) / jnp.where(b > 0, b, 1.0)) / root
     value = jnp.where(b > a, circular, hyperbolic)
-    edge = jnp.where(b == 0, jnp.inf, jnp.where(jnp.isinf(a + b), 0.0, 1 / jnp.where(b > 0, b, 1)))
+    edge = jnp.where(
+        b == 0, jnp.inf, jnp.where(jnp.isinf(a + b), 0.0, 1 / jnp.where(b > 0, b, 1))
+    )
     return jnp.where(safe | jnp.isnan(a + b), value, edge)
 
 
@@ -212,14 +237,17 @@ _by_slopes(rf_of, lambda a, b, c: g_of(b, c, a), lambda a, b, c: g_of(a, c, b), 
 _by_slopes(rc_of, lambda a, b: g_of(b, b, a), lambda a, b: 2 * g_of(a, b, b))
 
 
-# --- principal values --------------------------------------------------------------------------
+# --- principal values
+# --------------------------------------------------------------------------
 
 
 def rc_signed(a: Array, y: Array) -> Array:
     """R_C(a^2, y), for y < 0 its Cauchy principal value, DLMF 19.2.20."""
     negative = y < 0
     shifted = jnp.sqrt(jnp.where(negative, a * a - y, 1.0))
-    values = rc_of(jnp.where(negative, shifted, a), jnp.sqrt(jnp.where(negative, -y, y)))
+    values = rc_of(
+        jnp.where(negative, shifted, a), jnp.sqrt(jnp.where(negative, -y, y))
+    )
     return jnp.where(negative, a / shifted, 1.0) * values
 
 
@@ -231,7 +259,8 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p), for p < 0 its Cauchy principal value.
 
     A negative and a very large p are replaced by the q of DLMF 19.21.12,
-    (p - x)(q - x) = (y - x)(z - x), where x is the middle, or the largest, of the three arguments.
+    (p - x)(q - x) = (y - x)(z - x), where x is the middle, or the largest, of the three
+    arguments.
     """
     size = _scale(a, b, c, 1e-10 * jnp.sqrt(jnp.abs(p)))
     size = jnp.where(jnp.isinf(size), 1.0, size)
@@ -258,7 +287,8 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     return rf * per, jnp.where(other, moved, rj) * per * per * per
 
 
-# --- the public face ---------------------------------------------------------------------------
+# --- the public face
+# ---------------------------------------------------------------------------
 
 # Compiled, so that a call outside of jit does not compile its loop anew.
 
@@ -295,10 +325,11 @@ def rf(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
         z: Non-negative; at most one of the three zero.
 
     Returns:
-        R_F to 6 ulps, over the whole range of the dtype; inf where two arguments are zero, 0 where
-        one is infinite, NaN where one is negative. Arguments broadcast.
+        R_F to 6 ulps, over the whole range of the dtype; inf where two arguments are
+        zero, 0 where one is infinite, NaN where one is negative. Arguments broadcast.
 
-    Gradients: R_D of the same arguments, to any order; -inf with respect to an argument at 0.
+    Gradients: R_D of the same arguments, to any order; -inf with respect to an argument
+        at 0.
     Source: DLMF 19.16.1; the duplication theorem 19.26.18, the series 19.36.1.
 
     >>> import jrigid.elliptic
@@ -318,7 +349,8 @@ def rc(x: ValuesLike, y: ValuesLike) -> Values:
     Returns:
         R_C to 6 ulps; inf where y = 0, NaN where x < 0. Arguments broadcast.
 
-    Gradients: R_D, to any order, right also at x = y; infinite with respect to x at x = 0.
+    Gradients: R_D, to any order, right also at x = y; infinite with respect to x at x =
+        0.
     Source: DLMF 19.2.17-19.2.20.
 
     >>> import jrigid.elliptic
@@ -339,11 +371,11 @@ def rd(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
         z: Positive.
 
     Returns:
-        R_D to 8 ulps; inf where z = 0 or x = y = 0, NaN where an argument is negative. Arguments
-        broadcast.
+        R_D to 8 ulps; inf where z = 0 or x = y = 0, NaN where an argument is negative.
+        Arguments broadcast.
 
-    Gradients: of the duplication along each argument, which has no cancellation: right also where
-        arguments coincide; -inf with respect to an argument at 0.
+    Gradients: of the duplication along each argument, which has no cancellation: right
+        also where arguments coincide; -inf with respect to an argument at 0.
     Source: DLMF 19.16.5; Carlson, Numerical Algorithms 10 (1995) 13.
 
     >>> import jrigid.elliptic
@@ -356,7 +388,8 @@ def rd(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
 def rj(x: ValuesLike, y: ValuesLike, z: ValuesLike, p: ValuesLike) -> Values:
     r"""Carlson's symmetric elliptic integral of the third kind.
 
-    $R_J(x, y, z, p) = \frac32 \int_0^\infty dt / ((t + p) \sqrt{(t + x)(t + y)(t + z)})$.
+    $R_J(x, y, z, p) = \frac32 \int_0^\infty dt / ((t + p) \sqrt{(t + x)(t + y)(t +
+    z)})$.
 
     Args:
         x: Non-negative.
@@ -365,12 +398,12 @@ def rj(x: ValuesLike, y: ValuesLike, z: ValuesLike, p: ValuesLike) -> Values:
         p: Not zero; where it is negative the value is Cauchy's principal value.
 
     Returns:
-        R_J to 8 ulps for p > 0, and as well as the terms of DLMF 19.21.12 allow for p < 0 (it
-        changes sign there); inf where p = 0 or two of x, y, z are zero, NaN where one of them is
-        negative. Arguments broadcast.
+        R_J to 8 ulps for p > 0, and as well as the terms of DLMF 19.21.12 allow for p <
+        0 (it changes sign there); inf where p = 0 or two of x, y, z are zero, NaN where
+        one of them is negative. Arguments broadcast.
 
-    Gradients: of the duplication along each argument, which has no cancellation: right also where
-        arguments coincide; -inf with respect to x, y or z at 0.
+    Gradients: of the duplication along each argument, which has no cancellation: right
+        also where arguments coincide; -inf with respect to x, y or z at 0.
     Source: DLMF 19.16.2, 19.26.22, 19.36.2; Carlson, Numerical Algorithms 10 (1995) 13.
 
     >>> import jrigid.elliptic

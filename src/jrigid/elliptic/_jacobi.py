@@ -50,7 +50,8 @@ def _sides(cotangent: Array) -> tuple[Array, Array]:
 def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
     """Sn, |cn|, dn of u - 2 j K and the half turns j, for 0 < mc; Bulirsch (1965), `sncndn`.
 
-    His arithmetic-geometric means a, b enter as their quotients b / a, which stay in range.
+    His arithmetic-geometric means a, b enter as their quotients b / a, which stay in
+    range.
     """
     steps = _LANDEN_STEPS.get(u.dtype.name, _LANDEN_STEPS_OTHERS)
 
@@ -100,14 +101,21 @@ def _reduced_rule(primals: Any, tangents: Any) -> Any:
     turns = jax.lax.stop_gradient(turns)
     # d am / d mc = dn dF/dm, dF/dm = s^3 R_D(c^2, 1, dn^2) / 6 + 2 j K'(m)
     one = jnp.ones_like(s)
-    root = jnp.sqrt(jnp.where(turns == 0, 1.0, mc))  # no infinite slopes where nothing is turned
+    root = jnp.sqrt(
+        jnp.where(turns == 0, 1.0, mc)
+    )  # no infinite slopes where nothing is turned
     tiny = jnp.finfo(s.dtype).tiny
     low = jnp.maximum(dn, 4 * tiny)
     reduced = 0.5 * s * s * s * g_of(jnp.maximum(c, 4 * tiny), one, low)
     turned = turns * g_of(jnp.zeros_like(one), one, root) / root
     d_am = dn * d_u + (reduced + dn * turned) * d_mc
     of_dn = (0.5 * s * s - m * s * (c * reduced)) / low - m * s * c * turned
-    return values, (c * d_am, -s * d_am, of_dn * d_mc - m * s * c * d_u, jnp.zeros_like(u))
+    return values, (
+        c * d_am,
+        -s * d_am,
+        of_dn * d_mc - m * s * c * d_u,
+        jnp.zeros_like(u),
+    )
 
 
 @jax.jit  # so that a call outside of jit does not compile its loops anew
@@ -126,26 +134,31 @@ def _ellipj(u: Array, m: Array, mc: Array) -> JacobiFunctions:
     return JacobiFunctions(sn, cn, dn, am + jnp.where(above, 0.0, turns * jnp.pi))
 
 
-def ellipj(u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> JacobiFunctions:
+def ellipj(
+    u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+) -> JacobiFunctions:
     r"""Jacobi's elliptic functions sn, cn, dn and the amplitude, as `scipy.special.ellipj`.
 
-    am is defined by $u = F(am, m)$, or for all m by am' = dn: then sn = sin(am), cn = cos(am).
+    am is defined by $u = F(am, m)$, or for all m by am' = dn: then sn = sin(am), cn =
+    cos(am).
 
     Args:
         u: Argument, any.
-        m: Parameter, the square of the modulus, any: for m > 1 the amplitude oscillates between
-            +-arcsin(1 / sqrt(m)) and dn changes sign.
+        m: Parameter, the square of the modulus, any: for m > 1 the amplitude oscillates
+            between +-arcsin(1 / sqrt(m)) and dn changes sign.
         mc: 1 - m; where it is given m may be None.
 
     Returns:
-        sn, cn, dn and am, with an error of 4e-15 (1 + |u|) in float64 and 2e-6 (1 + |u|) in
-        float32 (of 1 + |u| sqrt(|m|) and, for dn, times sqrt(|m|), where |m| > 1: there they turn
-        that much faster). NaN where u or m is NaN or infinite. Arguments broadcast.
+        sn, cn, dn and am, with an error of 4e-15 (1 + |u|) in float64 and 2e-6 (1 +
+        |u|) in float32. Where |m| > 1 they turn faster by sqrt(|m|): the error is in
+        units of 1 + |u| sqrt(|m|) and, for dn, sqrt(|m|) times as large. NaN where u or
+        m is NaN or infinite. Arguments broadcast.
 
-    Gradients: by u closed; by m dn dF/dm, with F's derivative in R_D: right at m = 0, m = 1 and
-        across it, in every mode and to any order. At m = 1 they grow as sinh(u); the second one
-        by m there loses a factor of cosh(u)^2 to cancellation.
-    Source: DLMF 22.16.1, 22.20(ii), 22.17.2-22.17.4; Bulirsch, Numer. Math. 7 (1965) 78.
+    Gradients: by u closed; by m dn dF/dm, with F's derivative in R_D: right at m = 0, m
+        = 1 and across it, in every mode and to any order. At m = 1 they grow as
+        sinh(u); the second one by m there loses a factor of cosh(u)^2 to cancellation.
+    Source: DLMF 22.16.1, 22.20(ii), 22.17.2-22.17.4; Bulirsch, Numer. Math. 7 (1965)
+        78.
 
     >>> import jrigid.elliptic
     >>> sn, cn, dn, am = jrigid.elliptic.ellipj(1.0, 0.5)
@@ -164,8 +177,9 @@ def am(u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> 
         mc: 1 - m; where it is given m may be None.
 
     Returns:
-        Amplitude [rad], as by `ellipj`. For m < 1 it is continuous and grows by pi with 2 K; at
-        m = 1 it is the Gudermannian; for m > 1 it oscillates between +-arcsin(1 / sqrt(m)).
+        Amplitude [rad], as by `ellipj`. For m < 1 it is continuous and grows by pi with
+        2 K; at m = 1 it is the Gudermannian; for m > 1 it oscillates between +-arcsin(1
+        / sqrt(m)).
 
     Gradients: as of `ellipj`.
     Source: DLMF 22.16.1.

@@ -1,7 +1,8 @@
 """Legendre's elliptic integrals, as sums of positive terms in Carlson's.
 
-Inside, m and mc = 1 - m travel together: each is exact where the other is rounded. A derivative
-with respect to the parameter is taken along mc, whose tangent is minus that of m.
+Inside, m and mc = 1 - m travel together: each is exact where the other is rounded. A
+derivative with respect to the parameter is taken along mc, whose tangent is minus that
+of m.
 """
 
 import functools
@@ -48,16 +49,20 @@ def _complete(integral: Callable[..., Array], *parameters: Array) -> Array:
     return integral(zero + 1, zero, *parameters)
 
 
-def _of_any_turns(integral: Callable[..., Array], phi: Array, *parameters: Array) -> Array:
+def _of_any_turns(
+    integral: Callable[..., Array], phi: Array, *parameters: Array
+) -> Array:
     """An integral `(sine, cosine, *parameters)` up to any amplitude; the last parameter is mc."""
     turns, sine, cosine = reduce_amplitude(phi)
-    # Where there are no turns, the complete one is asked at m = 0, far from its infinite slopes.
+    # Where there are no turns, the complete one is asked at m = 0, far from its
+    # infinite slopes.
     *others, mc = (jnp.where(turns == 0, 0.0, x) for x in parameters)
     whole = _complete(integral, *others, jnp.where(turns == 0, 1.0, mc))
     return integral(sine, cosine, *parameters) + 2 * turns * whole
 
 
-# --- within a quarter turn ---------------------------------------------------------------------
+# --- within a quarter turn
+# ---------------------------------------------------------------------
 
 
 def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
@@ -105,20 +110,23 @@ def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     s = k * sine
     c, d = jnp.where(above, delta, cosine), jnp.where(above, cosine, delta)
     n, mc = n / (k * k), jnp.where(above, -mc / (k * k), mc)
-    # DLMF 19.25.14; for n far below 0, where its terms cancel, (t + 1) / (t + p) is split into
-    # 1 / (1 - n) and a part to which 19.21.12 is applied: q - c^2 = s^2 mc / (1 - n)
+    # DLMF 19.25.14; for n far below 0, where its terms cancel, (t + 1) / (t + p) is
+    # split into 1 / (1 - n) and a part to which 19.21.12 is applied: q - c^2 = s^2 mc /
+    # (1 - n)
     negative = n * s * s < -0.5
     share = jnp.where(negative, 1 / (1 - n), 1.0)
     p = c * c + (1 - n) * s * s
     step = s * s * mc * share
-    # Complete and mc out of range or 0: what tends to a limit has reached it, what else there is
-    # diverges at 0.
+    # Complete and mc out of range or 0: what tends to a limit has reached it, what else
+    # there is diverges at 0.
     limit = (c == 0) & (step < 64 * jnp.finfo(s.dtype).tiny)
     split = negative & ~limit
     q = jnp.where(split, c * c + step, 1.0)
     # In units in which d is 1, where R_J itself can be out of range below.
     unit = jax.lax.stop_gradient(jnp.where(split, 1 / jnp.maximum(d, 1.0), 1.0))
-    rf, rj = rf_rj_signed(c * unit, d * unit, unit, jnp.where(negative, (q * unit) * unit, p))
+    rf, rj = rf_rj_signed(
+        c * unit, d * unit, unit, jnp.where(negative, (q * unit) * unit, p)
+    )
     rf = rf * unit
     of_n = jnp.where(limit, jnp.where(negative, p, 1.0), p * q)
     rc = rc_of(jnp.where(limit, 1.0, d), jnp.sqrt(jnp.where(negative, of_n, 1.0)))
@@ -128,7 +136,8 @@ def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     return jnp.where(end, infinite, s / k * value)
 
 
-# --- complete ----------------------------------------------------------------------------------
+# --- complete
+# ----------------------------------------------------------------------------------
 
 
 @jax.custom_jvp
@@ -156,7 +165,8 @@ def ellipk(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
         mc: 1 - m; where it is given m may be None.
 
     Returns:
-        K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments broadcast.
+        K to 6 ulps, also for mc = 1e-300; inf at m = 1, NaN for m > 1. Arguments
+        broadcast.
 
     Gradients: R_D(0, 1, mc) / 6, positive, to any order, right at m = 0; inf at m = 1.
     Source: DLMF 19.2.8, 19.25.1.
@@ -182,7 +192,8 @@ def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
     Returns:
         E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
 
-    Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m = 1.
+    Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m =
+        1.
     Source: DLMF 19.2.8, 19.25.1.
 
     >>> import jrigid.elliptic
@@ -192,24 +203,29 @@ def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
     return _e_compiled(*with_parameters(m, mc))
 
 
-def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+def ellippi(
+    n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+) -> Values:
     r"""Complete elliptic integral of the third kind, as `mpmath.ellippi`.
 
-    $\Pi(n, m) = \int_0^{\pi/2} d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
+    $\Pi(n, m) = \int_0^{\pi/2} d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2
+    \theta})$.
 
     Args:
-        n: Characteristic. For n > 1 the value is Cauchy's principal value, the real part of
-            mpmath's.
+        n: Characteristic. For n > 1 the value is Cauchy's principal value, the real
+            part of mpmath's.
         m: Parameter, the square of the modulus, at most 1.
         mc: 1 - m; where it is given m may be None.
 
     Returns:
-        The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n, m) for
-        n > 1; inf at n = 1 and at m = 1 (-inf there for n > 1), NaN for m > 1. Arguments
-        broadcast.
+        The integral to 8 ulps for n < 1, and to 8 ulps of its terms K(m) and Pi(m / n,
+        m) for n > 1; inf at n = 1 and at m = 1 (-inf there for n > 1), NaN for m > 1.
+        Arguments broadcast.
 
-    Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at m = 1.
-    Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive terms.
+    Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at
+        m = 1.
+    Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive
+        terms.
 
     >>> import jrigid.elliptic
     >>> print(jrigid.elliptic.ellippi(0.3, 0.5).round(12))
@@ -218,7 +234,8 @@ def ellippi(n: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
     return _pi_compiled(*with_parameters(m, mc, n))
 
 
-# --- incomplete --------------------------------------------------------------------------------
+# --- incomplete
+# --------------------------------------------------------------------------------
 
 
 @jax.custom_jvp
@@ -230,7 +247,9 @@ def _f_incomplete(phi: Array, mc: Array) -> Array:
 def _f_incomplete_rule(primals: Any, tangents: Any) -> Any:
     phi, mc = primals
     slope = _of_any_turns(_f_by_m, phi, mc)
-    return _f_incomplete(phi, mc), tangents[0] / _delta_of(phi, mc) - slope * tangents[1]
+    return _f_incomplete(phi, mc), tangents[0] / _delta_of(phi, mc) - slope * tangents[
+        1
+    ]
 
 
 @jax.custom_jvp
@@ -242,7 +261,9 @@ def _e_incomplete(phi: Array, m: Array, mc: Array) -> Array:
 def _e_incomplete_rule(primals: Any, tangents: Any) -> Any:
     phi, m, mc = primals
     slope = _of_any_turns(_e_by_mc, phi, mc)
-    return _e_incomplete(phi, m, mc), _delta_of(phi, mc) * tangents[0] + slope * tangents[2]
+    return _e_incomplete(phi, m, mc), _delta_of(phi, mc) * tangents[
+        0
+    ] + slope * tangents[2]
 
 
 @jax.custom_jvp
@@ -262,10 +283,14 @@ def _pi_incomplete_rule(primals: Any, tangents: Any) -> Any:
     return _pi_incomplete(phi, n, m, mc), d_phi / pole + by_parameters
 
 
-_f_of_phi, _e_of_phi, _pi_of_phi = map(jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete))
+_f_of_phi, _e_of_phi, _pi_of_phi = map(
+    jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete)
+)
 
 
-def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+def ellipkinc(
+    phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+) -> Values:
     r"""Incomplete elliptic integral of the first kind, as `scipy.special.ellipkinc`.
 
     $F(\phi, m) = \int_0^\phi d\theta / \sqrt{1 - m \sin^2 \theta}$.
@@ -277,11 +302,12 @@ def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
         mc: 1 - m; where it is given m may be None.
 
     Returns:
-        F to 8 ulps (8 ulps of the amplitude where F itself is steep); +-inf at m = 1 beyond
+        F to 8 ulps (8 ulps of the amplitude where F itself is steep); +-inf at m = 1
+        beyond
         |phi| = pi/2, NaN outside the domain. Arguments broadcast.
 
-    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; infinite where
-        m sin^2 phi = 1.
+    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; infinite
+        where m sin^2 phi = 1.
     Source: DLMF 19.2.4, 19.25.5; derivative 19.4.4 in the form of 19.18.1.
 
     >>> import jrigid.elliptic
@@ -292,7 +318,9 @@ def ellipkinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
     return _f_of_phi(phi, mc)
 
 
-def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
+def ellipeinc(
+    phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+) -> Values:
     r"""Incomplete elliptic integral of the second kind, as `scipy.special.ellipeinc`.
 
     $E(\phi, m) = \int_0^\phi \sqrt{1 - m \sin^2 \theta} \, d\theta$.
@@ -306,8 +334,8 @@ def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
     Returns:
         E to 8 ulps, NaN outside the domain. Arguments broadcast.
 
-    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; at m = 1 -inf with
-        respect to m beyond |phi| = pi/2.
+    Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; at m = 1
+        -inf with respect to m beyond |phi| = pi/2.
     Source: DLMF 19.2.5, 19.25.9-19.25.11.
 
     >>> import jrigid.elliptic
@@ -318,11 +346,16 @@ def ellipeinc(phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = 
 
 
 def ellippiinc(
-    n: ValuesLike, phi: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
+    n: ValuesLike,
+    phi: ValuesLike,
+    m: ValuesLike | None,
+    *,
+    mc: ValuesLike | None = None,
 ) -> Values:
     r"""Incomplete elliptic integral of the third kind, as `mpmath.ellippi(n, phi, m)`.
 
-    $\Pi(n, \phi, m) = \int_0^\phi d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2 \theta})$.
+    $\Pi(n, \phi, m) = \int_0^\phi d\theta / ((1 - n \sin^2 \theta) \sqrt{1 - m \sin^2
+    \theta})$.
 
     Args:
         n: Characteristic. Where n sin^2 phi > 1 the value is Cauchy's principal value.
@@ -333,11 +366,11 @@ def ellippiinc(
 
     Returns:
         The integral to 10 ulps (of its terms for a principal value); infinite where
-        n sin^2 phi = 1 and at m = 1 beyond |phi| = pi/2, NaN outside the domain. Arguments
-        broadcast.
+        n sin^2 phi = 1 and at m = 1 beyond |phi| = pi/2, NaN outside the domain.
+        Arguments broadcast.
 
-    Gradients: in phi the integrand; in n and m those of R_F and R_J, to any order, right at
-        m = 0, m = 1 and n = 0.
+    Gradients: in phi the integrand; in n and m those of R_F and R_J, to any order,
+        right at m = 0, m = 1 and n = 0.
     Source: DLMF 19.2.7, 19.25.14, 19.21.12.
 
     >>> import jrigid.elliptic

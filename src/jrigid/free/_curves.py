@@ -12,10 +12,16 @@ from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.free._flow import invariants
-from jrigid.free._motion import free_rotation, in_principal_axes, relative_rotation, where_moving
+from jrigid.free._motion import (
+    free_rotation,
+    in_principal_axes,
+    relative_rotation,
+    where_moving,
+)
 from jrigid.rotation import rotate
 
-# Phase on either side of the start within which the polhode of an endless motion is drawn.
+# Phase on either side of the start within which the polhode of an endless motion is
+# drawn.
 _ENDLESS_PHASE = 20.0
 
 
@@ -24,9 +30,9 @@ def polhode(
 ) -> Float[Array, "{points} 3"]:
     """The curve of the angular velocity in the body, over one period from the given point.
 
-    It is closed and the attitude plays no part in it: inertia and one of its points say which it
-    is, and no times are asked for. At given times the points are `free_rotation(...).omega`, and
-    as seen from space `herpolhode`.
+    It is closed and the attitude plays no part in it: inertia and one of its points say
+    which it is, and no times are asked for. At given times the points are
+    `free_rotation(...).omega`, and as seen from space `herpolhode`.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -34,8 +40,9 @@ def polhode(
         points: Number of points, equally spaced in time; the last equals the first.
 
     Returns:
-        Body components [rad/s]. An endless motion (the separatrix) is drawn over 20 e-folding
-        times before and after. NaN outside positive definite inertia and finite rates.
+        Body components [rad/s]. An endless motion (the separatrix) is drawn over 20
+        e-folding times before and after. NaN outside positive definite inertia and
+        finite rates.
 
     Gradients: of the points at fixed fractions of the period.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -60,13 +67,17 @@ def polhode(
 
 
 def herpolhode(
-    inertia: InertiaLike, state0: State, ts: Real[ArrayLike, "..."], *, t0: ScalarLike = 0.0
+    inertia: InertiaLike,
+    state0: State,
+    ts: Real[ArrayLike, "..."],
+    *,
+    t0: ScalarLike = 0.0,
 ) -> Float[Array, "... 3"]:
     """The curve of the angular velocity in space, in a plane at right angles to the momentum.
 
-    In general it never closes, and its pace is that of the precession, not of the polhode (the
-    Earth's goes round in a day, its polhode in 305), so that the times are asked for; the attitude
-    places it in space.
+    In general it never closes, and its pace is that of the precession, not of the
+    polhode (the Earth's goes round in a day, its polhode in 305), so that the times are
+    asked for; the attitude places it in space.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -75,8 +86,9 @@ def herpolhode(
         t0: Time of `state0` [s].
 
     Returns:
-        Space components [rad/s], with the shape of `ts` in front. Along the momentum they are
-        2 E / |L|, always. NaN outside positive definite inertia, unit attitude and finite values.
+        Space components [rad/s], with the shape of `ts` in front. Along the momentum
+        they are 2 E / |L|, always. NaN outside positive definite inertia, unit attitude
+        and finite values.
 
     Gradients: as those of `free_rotation`.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -87,7 +99,9 @@ def herpolhode(
     [0. 0. 1.]
     """
     motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
-    return jnp.vectorize(rotate, signature="(4),(3)->(3)")(motion.attitude, motion.omega)
+    return jnp.vectorize(rotate, signature="(4),(3)->(3)")(
+        motion.attitude, motion.omega
+    )
 
 
 class Separatrix(NamedTuple):
@@ -115,8 +129,9 @@ def separatrix(inertia: InertiaLike) -> Separatrix:
         inertia: Principal moments in any order, or a tensor [kg m^2].
 
     Returns:
-        Ratios and angles. For an oblate body the planes are at 0, for a prolate one at 90 degrees.
-        NaN for a sphere, which has none, and outside positive definite inertia.
+        Ratios and angles. For an oblate body the planes are at 0, for a prolate one at
+        90 degrees. NaN for a sphere, which has none, and outside positive definite
+        inertia.
 
     Gradients: infinite in two equal moments, as the truth is.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
@@ -147,10 +162,10 @@ class Poinsot(NamedTuple):
 
     Attributes:
         sphere_radius: |L| [kg m^2/s].
-        momentum_ellipsoid: Semi-axes sqrt(2 E I) of the ellipsoid of constant energy on which the
-            momentum moves [kg m^2/s], in the order of the moments.
-        omega_ellipsoid: Semi-axes sqrt(2 E / I) of the ellipsoid of the angular velocity [rad/s],
-            which rolls on the invariable plane.
+        momentum_ellipsoid: Semi-axes sqrt(2 E I) of the ellipsoid of constant energy on
+            which the momentum moves [kg m^2/s], in the order of the moments.
+        omega_ellipsoid: Semi-axes sqrt(2 E / I) of the ellipsoid of the angular
+            velocity [rad/s], which rolls on the invariable plane.
         plane_distance: Distance 2 E / |L| of that plane from the centre [rad/s].
     """
 
@@ -168,8 +183,8 @@ def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        Radius, semi-axes along the principal axes, and the distance of the plane; zeros at rest.
-        NaN outside positive definite inertia and finite rates.
+        Radius, semi-axes along the principal axes, and the distance of the plane; zeros
+        at rest. NaN outside positive definite inertia and finite rates.
 
     Gradients: finite; zero at rest.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -187,6 +202,8 @@ def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
         root = safe_norm(jnp.sqrt(moments) * omega)
         resting = momentum == 0
         distance = jnp.where(resting, 0.0, twice / jnp.where(resting, 1.0, momentum))
-        return Poinsot(momentum, root * jnp.sqrt(moments), root / jnp.sqrt(moments), distance)
+        return Poinsot(
+            momentum, root * jnp.sqrt(moments), root / jnp.sqrt(moments), distance
+        )
 
     return where_moving(surfaces, inertia, omega=omega)

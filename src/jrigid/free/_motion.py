@@ -30,16 +30,18 @@ from jrigid.rotation import multiply, normalize
 
 Tree = TypeVar("Tree")
 
-# Moments whose gap turns the motion by less than this [rad] are near: wider ones interpolate to
-# 1e-13, and so much is lost in a quotient.
+# Moments whose gap turns the motion by less than this [rad] are near: wider ones
+# interpolate to 1e-13, and so much is lost in a quotient.
 _NEAR = {8: 2e-3, 4: 3e-2}
-# Where to look besides: how many times further apart, and the weight of what is found there.
+# Where to look besides: how many times further apart, and the weight of what is found
+# there.
 _NODES = (-4.0, -3.0, -2.0, 2.0, 3.0, 4.0)
 _LOOKS = [
     *((0.0, 0.0), (1.0, 0.0)),
     *((x, math.prod(y / (y - x) for y in _NODES if y != x)) for x in _NODES),
 ]
-# The second look is at a gap of this, over the square of the radians: no motion changes within it.
+# The second look is at a gap of this, over the square of the radians: no motion changes
+# within it.
 _PROBE = 1e-2
 
 
@@ -53,27 +55,28 @@ def free_rotation(
 ) -> ExactStates:
     r"""Exact state of a free body at any times, at a cost that does not depend on the time.
 
-    One formula serves every body and every motion: any order of the moments, symmetric and
-    spherical bodies and their neighbours, spin about any axis, the separatrix, rest. The moments
-    need not obey the triangle inequality.
+    One formula serves every body and every motion: any order of the moments, symmetric
+    and spherical bodies and their neighbours, spin about any axis, the separatrix,
+    rest. The moments need not obey the triangle inequality.
 
     Args:
         inertia: Principal moments, or a symmetric tensor in body axes [kg m^2].
         state0: State at `t0`, without internal parts.
         ts: Times [s], in any order, before or after `t0`, of any shape.
         t0: Time of `state0` [s].
-        throw: If False, bad values give NaN states instead of an error, in their lane alone;
-            `result` tells why.
+        throw: If False, bad values give NaN states instead of an error, in their lane
+            alone; `result` tells why.
 
     Returns:
-        Attitude and angular velocity, with the shape of `ts` in front. The error is below
-        1e-13 (1 + radians turned) in float64, plus what the last bits of the arguments do; energy
-        and angular momentum keep their values to 1e-14, whatever the time.
+        Attitude and angular velocity, with the shape of `ts` in front. The error is
+        below 1e-13 (1 + radians turned) in float64, plus what the last bits of the
+        arguments do; energy and angular momentum keep their values to 1e-14, whatever
+        the time.
 
-    Gradients: of any order and in every mode those of the motion, also at equal moments, at spin
-    about an axis, on the separatrix and at rest; reverse mode costs a few values. In a (3, 3)
-    tensor first derivatives are right everywhere; second ones need distinct moments, and are NaN
-    where the gap is below 1e-6 of the largest.
+    Gradients: of any order and in every mode those of the motion, also at equal
+    moments, at spin about an axis, on the separatrix and at rest; reverse mode costs a
+    few values. In a (3, 3) tensor first derivatives are right everywhere; second ones
+    need distinct moments, and are NaN where the gap is below 1e-6 of the largest.
     Source: Jacobi's solution in the form derived in docs/free_rotation.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -107,8 +110,9 @@ def relative_rotation(
         duration: Time since then [s], of either sign.
 
     Returns:
-        The unit quaternion p of the rotation since the start, q(t) = q(0) p(t), and the angular
-        velocity, body components [rad/s]. NaN outside positive definite inertia and finite values.
+        The unit quaternion p of the rotation since the start, q(t) = q(0) p(t), and the
+        angular velocity, body components [rad/s]. NaN outside positive definite inertia
+        and finite values.
 
     Gradients: as those of `free_rotation`.
     Source: as `free_rotation`.
@@ -121,7 +125,9 @@ def relative_rotation(
     return where_moving(_turn, inertia, omega=omega, duration=duration)
 
 
-def from_invariants(formula: Callable[[Invariants], Tree], inertia: Any, omega: Any) -> Tree:
+def from_invariants(
+    formula: Callable[[Invariants], Tree], inertia: Any, omega: Any
+) -> Tree:
     """A formula of the invariants of a motion; NaN outside positive inertia and finite rates."""
 
     def of_body(inertia: Array, omega: Array) -> Tree:
@@ -132,9 +138,13 @@ def from_invariants(formula: Callable[[Invariants], Tree], inertia: Any, omega: 
 
 def where_moving(formula: Callable[..., Tree], inertia: Any, **others: Any) -> Tree:
     """A formula of inertia, `omega` and scalars; NaN outside positive definite and finite ones."""
-    shapes = {x: (value, 3) if x == "omega" else (value,) for x, value in others.items()}
+    shapes = {
+        x: (value, 3) if x == "omega" else (value,) for x, value in others.items()
+    }
     inertia, *numbers = shaped(inertia=(inertia, *INERTIA), **shapes)
-    return where_defined(is_inertia(inertia) & all_finite(numbers), formula, inertia, *numbers)
+    return where_defined(
+        is_inertia(inertia) & all_finite(numbers), formula, inertia, *numbers
+    )
 
 
 def in_principal_axes(inertia: Array, omega: Array) -> tuple[Array, Array]:
@@ -157,20 +167,24 @@ def _of_moments(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
 @jax.custom_jvp
 def _of_tensor(tensor: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     moments, axes = eigh(tensor)
-    return from_principal_axes(axes, *_of_moments(moments, product("ji,j->i", axes, omega), t))
+    return from_principal_axes(
+        axes, *_of_moments(moments, product("ji,j->i", axes, omega), t)
+    )
 
 
 @_of_tensor.defjvp
 def _of_tensor_jvp(primals: tuple, tangents: tuple) -> tuple:
-    # In the principal axes a change of the tensor changes the moments, and, off its diagonal, turns
-    # the axes: a motion about turned axes is the turned motion.
+    # In the principal axes a change of the tensor changes the moments, and, off its
+    # diagonal, turns the axes: a motion about turned axes is the turned motion.
     (tensor, omega, t), (change, omega_change, t_change) = primals, tangents
     moments, axes = eigh(tensor, distinct=True)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     omega, omega_change = (product("ji,j->i", axes, x) for x in (omega, omega_change))
     value, slopes = _with_slopes(moments, omega, t)
     elements = jnp.stack([inside[1, 2], inside[2, 0], inside[0, 1]])
-    changes = jnp.concatenate([jnp.diagonal(inside), omega_change, t_change[None], elements])
+    changes = jnp.concatenate(
+        [jnp.diagonal(inside), omega_change, t_change[None], elements]
+    )
     found = value, product("k,kn->n", changes, slopes)
     return tuple(from_principal_axes(axes, x[:4], x[4:]) for x in found)
 
@@ -195,11 +209,13 @@ def _with_slopes_jvp(primals: tuple, tangents: tuple) -> tuple:
 def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     """The motion with a diagonal tensor, as seven numbers, and its derivatives (10, 7).
 
-    They are those in the moments, which ascend, in `omega` and t, and in the elements 23, 31 and
-    12. Of these each is the effect of turning the body's axes divided by the gap of two moments.
-    Both vanish together: across a near gap the quotient is interpolated from wider ones, which
-    costs seven looks more at the motion, unless no lane asks for it. How near is near depends on
-    how fast the motion changes with a gap, which the first two looks tell.
+    They are those in the moments, which ascend, in `omega` and t, and in the elements
+    23, 31 and
+    12. Of these each is the effect of turning the body's axes divided by the gap of two
+    moments. Both vanish together: across a near gap the quotient is interpolated from
+    wider ones, which costs seven looks more at the motion, unless no lane asks for it.
+    How near is near depends on how fast the motion changes with a gap, which the first
+    two looks tell.
     """
     directions = jnp.eye(7, dtype=t.dtype)
 
@@ -212,7 +228,11 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         value, columns = jax.vmap(slope, out_axes=(None, 0))(directions)
         gaps = jnp.roll(moments, -1) - jnp.roll(moments, -2)
         quotients = jax.vmap(_turned, (0, 0, None, None, None))(
-            directions[:3, :3], jnp.where(gaps == 0, 1.0, gaps), omega, value, columns[3:6]
+            directions[:3, :3],
+            jnp.where(gaps == 0, 1.0, gaps),
+            omega,
+            value,
+            columns[3:6],
         )
         return value, columns, quotients
 
@@ -225,14 +245,20 @@ def _looks(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         found, columns, quotients = slopes_at(moments + node * wider)
         near = _near_pairs(wider)
         steep = jnp.where(first, steepest(columns[:3]), steep)
-        steep = jnp.where(second, steep + steepest(jnp.where(near, quotients, 0.0)), steep)
-        probe, reach = (_wider(moments, omega, t, steep, probing=x) for x in (True, False))
+        steep = jnp.where(
+            second, steep + steepest(jnp.where(near, quotients, 0.0)), steep
+        )
+        probe, reach = (
+            _wider(moments, omega, t, steep, probing=x) for x in (True, False)
+        )
         wider = jnp.where(first, probe, jnp.where(second, reach, wider))
         slopes = jnp.where(first, jnp.concatenate([columns, quotients]), slopes)
         total = total + jnp.where(weight == 0, 0.0, weight * quotients)
         return wider, steep, jnp.where(first, found, value), slopes, total
 
-    def visit(known: tuple[Array, ...], of_node: Array) -> tuple[tuple[Array, ...], None]:
+    def visit(
+        known: tuple[Array, ...], of_node: Array
+    ) -> tuple[tuple[Array, ...], None]:
         node, weight = of_node
         asked = (node == 0) | unvmap_any(known[0] != 0)
         unchanged = lambda _, __, known: known  # noqa: E731
@@ -251,7 +277,12 @@ def _near_pairs(wider: Array) -> Array:
 
 
 def _wider(
-    moments: Array, omega: Array, t: Array, steep: Array | float = 0.0, *, probing: bool = False
+    moments: Array,
+    omega: Array,
+    t: Array,
+    steep: Array | float = 0.0,
+    *,
+    probing: bool = False,
 ) -> Array:
     """How moments are moved to widen the gaps that are near, zero where none is."""
     low, phase = moments[:2], safe_norm(omega) * jnp.abs(t)
@@ -261,7 +292,9 @@ def _wider(
     return jnp.stack([-low, jnp.zeros_like(t), high])
 
 
-def _turned(axis: Array, gap: Array, omega: Array, value: Array, columns: Array) -> Array:
+def _turned(
+    axis: Array, gap: Array, omega: Array, value: Array, columns: Array
+) -> Array:
     """The effect of turning the body's axes, divided by a gap."""
     turned = jnp.cross(axis, value[1:].reshape(2, 3)).reshape(6)
     change = product("k,kn->n", jnp.cross(axis, omega), columns)

@@ -21,15 +21,18 @@ class REGIMES(Enumeration):
     about_smallest = "about the axis of the smallest moment"
     about_largest = "about the axis of the largest moment"
     separatrix = "separatrix"
-    undefined = "undefined: the inertia is not positive definite, or a rate is not finite"
+    undefined = (
+        "undefined: the inertia is not positive definite, or a rate is not finite"
+    )
 
 
 def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time after which the angular velocity of a free body comes back, in the body.
 
-    4 K(m) / lam of Jacobi's solution; 2 pi / |wobble rate| for a symmetric body; of spin about a
-    stable axis the limit of small wobbles. Infinite where nothing comes round: sphere, separatrix,
-    spin about the middle axis or an axis of no distinction, rest.
+    4 K(m) / lam of Jacobi's solution; 2 pi / |wobble rate| for a symmetric body; of
+    spin about a stable axis the limit of small wobbles. Infinite where nothing comes
+    round: sphere, separatrix, spin about the middle axis or an axis of no distinction,
+        rest.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -62,7 +65,8 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     Returns:
         Rate [rad/s]; NaN outside positive definite inertia and finite rates.
 
-    Gradients: right off the separatrix; there the rate has infinite slope, and |L| / I2's is given.
+    Gradients: right off the separatrix; there the rate has infinite slope, and |L| /
+        I2's is given.
     Source: the complete integral of the third kind in docs/free_rotation.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -70,7 +74,9 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(rate.round(4))
     2.0008
     """
-    return from_invariants(lambda motion: motion.unit * _mean_rate(motion), inertia, omega)
+    return from_invariants(
+        lambda motion: motion.unit * _mean_rate(motion), inertia, omega
+    )
 
 
 def _mean_rate(motion: Invariants) -> Scalar:
@@ -89,8 +95,9 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        Angle [rad], not reduced: `mean_precession_rate` times `polhode_period`; infinite where the
-        period is. NaN outside positive definite inertia and finite rates.
+        Angle [rad], not reduced: `mean_precession_rate` times `polhode_period`;
+        infinite where the period is. NaN outside positive definite inertia and finite
+        rates.
 
     Gradients: right wherever the angle is finite; zero where it is infinite.
     Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
@@ -101,24 +108,26 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     12.5821
     """
     return from_invariants(
-        lambda x: jnp.where(x.circles, 4 * x.quarter * _mean_rate(x), jnp.inf), inertia, omega
+        lambda x: jnp.where(x.circles, 4 * x.quarter * _mean_rate(x), jnp.inf),
+        inertia,
+        omega,
     )
 
 
 def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Part of `precession_per_period` beyond the dynamic phase 2 E T / |L|.
 
-    Up to whole turns it is minus the solid angle that the momentum circles in the body (positive
-    where it goes round the axis in the right-handed sense): it depends on the shape of the polhode
-    and not on the pace.
+    Up to whole turns it is minus the solid angle that the momentum circles in the body
+    (positive where it goes round the axis in the right-handed sense): it depends on the
+    shape of the polhode and not on the pace.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        Angle [rad], not reduced; 0 where the period is infinite and nothing is circled. NaN outside
-        positive definite inertia and finite rates.
+        Angle [rad], not reduced; 0 where the period is infinite and nothing is circled.
+        NaN outside positive definite inertia and finite rates.
 
     Gradients: right wherever the period is finite; zero where it is infinite.
     Source: R. Montgomery, Am. J. Phys. 59 (1991) 394.
@@ -136,7 +145,9 @@ def _geometric_phase(motion: Invariants) -> Scalar:
     size = safe_norm(jnp.stack(motion.momentum))
     # 1 / I2 - 2 E / |L|^2, without the difference: al be (2 E - |L|^2 / I2) is -al v
     gap = motion.v / jnp.where(motion.be == 0, 1.0, motion.be)
-    gap = jnp.where(motion.be == 0, motion.u / jnp.where(motion.al == 0, 1.0, motion.al), gap)
+    gap = jnp.where(
+        motion.be == 0, motion.u / jnp.where(motion.al == 0, 1.0, motion.al), gap
+    )
     slow = motion.quarter * gap / jnp.where(square == 0, 1.0, square)
     phase = 4 * size * (slow + motion.al * motion.v * motion.quarter_w)
     return jnp.where(motion.circles, phase, 0.0)
@@ -150,11 +161,11 @@ def parameter(inertia: InertiaLike, omega: VectorLike) -> Scalar:
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest. NaN outside
-        positive definite inertia and finite rates.
+        m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest. NaN
+        outside positive definite inertia and finite rates.
 
-    Gradients: right where no two moments are equal; where two are, m has a kink at 0 and the slope
-    of one side is given; zero for a sphere and at rest.
+    Gradients: right where no two moments are equal; where two are, m has a kink at 0
+    and the slope of one side is given; zero for a sphere and at rest.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -182,7 +193,8 @@ def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     Returns:
         k = sqrt(m), see `parameter`; NaN where that is.
 
-    Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth at a stable spin.
+    Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth at a stable
+        spin.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -201,9 +213,9 @@ def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        A member of `free.REGIMES`, `undefined` outside positive definite inertia and finite rates.
-        A symmetric body goes about the axis of its smallest moment (prolate) or its largest
-        (oblate). Equalities hold to a few eps.
+        A member of `free.REGIMES`, `undefined` outside positive definite inertia and
+        finite rates. A symmetric body goes about the axis of its smallest moment
+        (prolate) or its largest (oblate). Equalities hold to a few eps.
 
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
 
@@ -222,7 +234,10 @@ def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
     first, third = jnp.abs(al) * l1 * l1, jnp.abs(be) * l3 * l3
     kind = REGIMES.where(i3 < i1, REGIMES.about_smallest, REGIMES.about_largest)
     for case, code in (
-        (jnp.abs(first - third) <= rounding * jnp.maximum(first, third), REGIMES.separatrix),
+        (
+            jnp.abs(first - third) <= rounding * jnp.maximum(first, third),
+            REGIMES.separatrix,
+        ),
         (jnp.max(jnp.abs(rate)) <= rounding * size, REGIMES.steady_rotation),
         (jnp.abs(i3 - i1) <= rounding * jnp.maximum(i1, i3), REGIMES.sphere),
         (motion.momentum_square == 0, REGIMES.at_rest),

@@ -43,7 +43,9 @@ def _where_symmetric(
         i1, i2, i3 = jnp.diagonal(tensor)
         uneven = jnp.stack([i1 - i2, tensor[0, 1], tensor[0, 2], tensor[1, 2]])
         eps = jnp.finfo(tensor.dtype).eps
-        tolerance = jnp.sqrt(eps) * jnp.abs(i3 - i1) + 16 * eps * jnp.max(jnp.abs(tensor))
+        tolerance = jnp.sqrt(eps) * jnp.abs(i3 - i1) + 16 * eps * jnp.max(
+            jnp.abs(tensor)
+        )
         even = jnp.all(jnp.abs(jax.lax.stop_gradient(uneven)) <= tolerance)
         return where_defined(even, formula, 0.5 * (i1 + i2), i3, omega)
 
@@ -123,8 +125,11 @@ def cone_angles(inertia: InertiaLike, omega: VectorLike) -> ConeAngles:
         across, along = safe_norm(w[:2]), w[2]
         # tan(alpha - theta), without the difference of two angles
         space = safe_arctan2(
-            jnp.abs(i3 - i1) * across * jnp.abs(along), i1 * across * across + i3 * along * along
+            jnp.abs(i3 - i1) * across * jnp.abs(along),
+            i1 * across * across + i3 * along * along,
         )
-        return ConeAngles(safe_arctan2(across, along), safe_arctan2(i1 * across, i3 * along), space)
+        return ConeAngles(
+            safe_arctan2(across, along), safe_arctan2(i1 * across, i3 * along), space
+        )
 
     return _where_symmetric(angles, inertia, omega)

@@ -11,14 +11,26 @@ from jrigid.identify._diagnostics import Diagnostics as Diagnostics
 from jrigid.identify._disturbance import GaussMarkov as GaussMarkov
 from jrigid.identify._fit import fit as fit
 from jrigid.identify._fit import fit_each as fit_each
+from jrigid.identify._inertia_models import AbstractInertiaModel as AbstractInertiaModel
+from jrigid.identify._inertia_models import Fixed as Fixed
+from jrigid.identify._inertia_models import Flat as Flat
+from jrigid.identify._inertia_models import LogCholesky as LogCholesky
+from jrigid.identify._inertia_models import Moments as Moments
+from jrigid.identify._inertia_models import Symmetric as Symmetric
+from jrigid.identify._inertia_models import Tensor as Tensor
+from jrigid.identify._inertia_models import Top as Top
 from jrigid.identify._noise import block_bootstrap as block_bootstrap
 from jrigid.identify._noise import coloured_covariance as coloured_covariance
 from jrigid.identify._optimal import Optimum as Optimum
-from jrigid.identify._optimal import optimal_throw as optimal_throw
+from jrigid.identify._optimal import optimal_trial as optimal_trial
 from jrigid.identify._parameters import body_from_log_cholesky as body_from_log_cholesky
-from jrigid.identify._parameters import inertia_from_parameters as inertia_from_parameters
+from jrigid.identify._parameters import (
+    inertia_from_parameters as inertia_from_parameters,
+)
 from jrigid.identify._parameters import log_cholesky_from_body as log_cholesky_from_body
-from jrigid.identify._parameters import parameters_from_inertia as parameters_from_inertia
+from jrigid.identify._parameters import (
+    parameters_from_inertia as parameters_from_inertia,
+)
 from jrigid.identify._records import AngularMomenta as AngularMomenta
 from jrigid.identify._records import Attitudes as Attitudes
 from jrigid.identify._records import Directions as Directions
@@ -39,15 +51,7 @@ from jrigid.identify._sensors import FunctionSensor as FunctionSensor
 from jrigid.identify._sensors import Gyro as Gyro
 from jrigid.identify._sensors import Magnetometer as Magnetometer
 from jrigid.identify._sensors import MomentumSensor as MomentumSensor
-from jrigid.identify._shapes import AbstractShape as AbstractShape
-from jrigid.identify._shapes import Fixed as Fixed
-from jrigid.identify._shapes import Flat as Flat
-from jrigid.identify._shapes import LogCholesky as LogCholesky
-from jrigid.identify._shapes import Moments as Moments
-from jrigid.identify._shapes import Symmetric as Symmetric
-from jrigid.identify._shapes import Tensor as Tensor
-from jrigid.identify._shapes import Top as Top
-from jrigid.identify._starts import LinearStart as LinearStart
+from jrigid.identify._starts import LinearEstimate as LinearEstimate
 from jrigid.identify._starts import gyrostat as gyrostat
 from jrigid.identify._starts import momentum as momentum
 from jrigid.identify._starts import weak_form as weak_form

@@ -1,8 +1,8 @@
 """Whether what is left of a record is white: no band of frequencies stands out.
 
-A sum of squares sees how much is left, not how it is arranged. A torque at the spin rate that
-changes it by less than its scatter moves the answer by many errors: its power is in a few
-frequencies, where nothing but noise should be.
+A sum of squares sees how much is left, not how it is arranged. A torque at the spin
+rate that changes it by less than its scatter moves the answer by many errors: its power
+is in a few frequencies, where nothing but noise should be.
 """
 
 from collections.abc import Sequence
@@ -22,15 +22,16 @@ def stands_out(power: float, deviations: float) -> bool:
 def loudest_band(residuals: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
     """Power in the band that stands out most, and by how many standard deviations it does.
 
-    Bands have 1, 2, 4, ... neighbouring frequencies, of one record in one trial or of all trials.
-    The mean power is that of the residuals, whatever their size.
+    Bands have 1, 2, 4, ... neighbouring frequencies, of one record in one trial or of
+    all trials. The mean power is that of the residuals, whatever their size.
 
     Args:
-        residuals: Whitened (throws, samples, degrees), zero where nothing was seen.
+        residuals: Whitened (trials, samples, degrees), zero where nothing was seen.
         parts: Where each record's samples are.
 
     Returns:
-        The power over the mean, and the deviations; (1, 0) where there are too few samples.
+        The power over the mean, and the deviations; (1, 0) where there are too few
+        samples.
     """
     best = 1.0, 0.0
     for part in parts:

@@ -1,4 +1,4 @@
-"""Which of several models a record asks for: by what they leave, and by throws they never saw."""
+"""Which of several models a record asks for: by what they leave, and by trials they never saw."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
@@ -13,8 +13,8 @@ from jrigid._checks import demand
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
+from jrigid.identify._inertia_models import Fixed
 from jrigid.identify._result import FitResult
-from jrigid.identify._shapes import Fixed
 from jrigid.systems import RigidBody
 
 _LEAST = 1e-3  # of the largest level, where one of an axis is zero
@@ -47,8 +47,13 @@ class Comparison(NamedTuple):
         lines = ["model".ljust(first) + "".join(x.rjust(12) for x in heads)]
         columns = *self[1:4], self.aic - jnp.min(self.aic), self.bic - jnp.min(self.bic)
         for i in jnp.argsort(self.bic).tolist():
-            numbers = (f"{x[i].item():.1f}" if x.dtype.kind == "f" else str(x[i]) for x in columns)
-            lines.append(self.names[i].ljust(first) + "".join(x.rjust(12) for x in numbers))
+            numbers = (
+                f"{x[i].item():.1f}" if x.dtype.kind == "f" else str(x[i])
+                for x in columns
+            )
+            lines.append(
+                self.names[i].ljust(first) + "".join(x.rjust(12) for x in numbers)
+            )
         return "\n".join(lines)
 
 
@@ -77,7 +82,7 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
     >>> whole = jr.identify.fit(body, readings)
-    >>> known_axes = jr.identify.fit(body, readings, shape=jr.identify.Moments())
+    >>> known_axes = jr.identify.fit(body, readings, inertia_model=jr.identify.Moments())
     >>> print(jr.identify.compare({"axes known": known_axes, "any body": whole}))
     model       chi-square     freedom    unknowns         AIC         BIC
     axes known       594.7         595           5         0.0         0.0
@@ -95,17 +100,22 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     states = [jnp.sum(x > SHOWN * x[:, :1]) for x in values]
     counts = [x.numbers.size + x.diagnostics.torque_numbers for x in fits]
     unknowns = jnp.stack([x + y for x, y in zip(counts, states, strict=True)])
-    square, freedom = (jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3])
-    left, k = square if asked[0][1] else n * jnp.log(square / n), unknowns.astype(n.dtype)
+    square, freedom = (
+        jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3]
+    )
+    left, k = (
+        square if asked[0][1] else n * jnp.log(square / n),
+        unknowns.astype(n.dtype),
+    )
     left = left + jnp.stack([x.diagnostics.log_determinant for x in fits])
     criteria = left + 2 * k, left + k * jnp.log(n)
     return Comparison(tuple(results), square, freedom, unknowns, *criteria)
 
 
-def _split(throw: Any) -> tuple[RigidBody | None, tuple[Any, ...]]:
-    """The body of a throw, if it has one of its own, and its records."""
-    is_pair = isinstance(throw, tuple) and isinstance(throw[0], RigidBody)
-    body, records = throw if is_pair else (None, throw)
+def _split(trial: Any) -> tuple[RigidBody | None, tuple[Any, ...]]:
+    """The body of a trial, if it has one of its own, and its records."""
+    is_pair = isinstance(trial, tuple) and isinstance(trial[0], RigidBody)
+    body, records = trial if is_pair else (None, trial)
     return body, records if isinstance(records, tuple) else (records,)
 
 
@@ -115,47 +125,53 @@ def _with_what_was_found(found: FitResult, body: RigidBody | None) -> RigidBody:
         return found.system
     sensors = found.unknowns.original(0)[1:]
     leaves = jtu.tree_leaves(eqx.filter((body, *sensors), eqx.is_inexact_array))
-    leaves += [jnp.zeros_like(x[0]) for x in found.unknowns.groups.values()]  # it is in none
+    leaves += [
+        jnp.zeros_like(x[0]) for x in found.unknowns.groups.values()
+    ]  # it is in none
     return found.unknowns.parts(found.numbers, found.own_numbers[0], tuple(leaves))[0]
 
 
-def _with_its_own_state(found: FitResult, throws: list[Any]) -> FitResult:
+def _with_its_own_state(found: FitResult, trials: list[Any]) -> FitResult:
     options = found.problem.options
-    sensors = found.parts()[1:]
-    bodies, records = zip(*map(_split, throws), strict=True)
+    sensors = found.fitted()[1:]
+    bodies, records = zip(*map(_split, trials), strict=True)
     systems = [_with_what_was_found(found, x) for x in bodies]
-    records = [eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records]
-    stated = all(x.states_noise for throw in records for x in throw)
-    demand(stated, "Argument `throws` must state the noise, but one does not.")
+    records = [
+        eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records
+    ]
+    stated = all(x.states_noise for trial in records for x in trial)
+    demand(stated, "Argument `trials` must state the noise, but one does not.")
     level = jnp.maximum(found.level, _LEAST * jnp.max(found.level))
     torque = GaussMarkov(level, found.correlation_time)
     loss = "robust" if options.robust else "squares"
     rest = {"unmodelled": torque, "loss": loss, "motion": options.motion}
-    return fit(systems, records, shape=Fixed(), throw=False, **rest)
+    return fit(systems, records, inertia_model=Fixed(), throw=False, **rest)
 
 
 def cross_validate(
-    fit_function: Callable[[list[Any]], FitResult], throws: Sequence[Any], *,
+    fit_function: Callable[[list[Any]], FitResult],
+    trials: Sequence[Any],
+    *,
     refit: Callable[[FitResult, list[Any]], FitResult] = _with_its_own_state,
-) -> Float[Array, " throws"]:  # fmt: skip
-    """How well throws that a fit has not seen are described: chi-square of each, left out in turn.
+) -> Float[Array, " trials"]:
+    """How well trials that a fit has not seen are described: chi-square of each, left out in turn.
 
-    A fit of the others gives the body, its torque and the sensors; of the throw left out only the
-    state is sought. Models are compared throw by throw: the difference and its scatter tell which
+    A fit of the others gives the body, its torque and the sensors; of the trial left out only the
+    state is sought. Models are compared trial by trial: the difference and its scatter tell which
     predicts better, with no count of unknowns.
 
     Args:
-        fit_function: Fits a list of throws: `lambda throws: jr.identify.fit(body, throws, ...)`.
-        throws: Of each a record or a tuple of records; or, where throws have bodies of their own,
+        fit_function: Fits a list of trials: `lambda trials: jr.identify.fit(body, trials, ...)`.
+        trials: Of each a record or a tuple of records; or, where trials have bodies of their own,
             as with a record of a wheel for each, a pair of the body and these, which
-            `fit_function` then takes apart. A list of throws is left out as a group.
-        refit: What finds the states of throws left out from the fit of the others, where the
+            `fit_function` then takes apart. A list of trials is left out as a group.
+        refit: What finds the states of trials left out from the fit of the others, where the
             default cannot: numbers sought by `each`, a motion that depends on an attitude that was
             not observed. The default keeps the level and the correlation time of an unmodelled
             torque, the loss and the motion.
 
     Returns:
-        Chi-square of each throw or group.
+        Chi-square of each trial or group.
 
     Gradients: none.
 
@@ -163,14 +179,14 @@ def cross_validate(
     >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
     >>> parts = [slice(0, 100), slice(50, 150), slice(100, 200)]
     >>> rates = lambda x: jr.identify.Rates(record.times[x], record.omegas[x], record.sigma)
-    >>> throws = [rates(x) for x in parts]  # of 300 numbers each, less three of its state
-    >>> print(jr.identify.cross_validate(lambda x: jr.identify.fit(body, x), throws).round())
+    >>> trials = [rates(x) for x in parts]  # of 300 numbers each, less three of its state
+    >>> print(jr.identify.cross_validate(lambda x: jr.identify.fit(body, x), trials).round())
     [293. 300. 307.]
     """
-    groups = [x if isinstance(x, list) else [x] for x in throws]
+    groups = [x if isinstance(x, list) else [x] for x in trials]
     demand(
         len(groups) > 1,
-        f"Argument `throws` must hold two throws or groups at least, but it holds {len(groups)}.",
+        f"Argument `trials` must hold two trials or groups at least, but it holds {len(groups)}.",
     )
     others = ([*chain(*groups[:i], *groups[i + 1 :])] for i in range(len(groups)))
     fits = map(refit, map(fit_function, others), groups)

@@ -10,13 +10,14 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-# On a CPU a third of the time goes into code that runs no faster for it, or into many parts.
+# On a CPU a third of the time goes into code that runs no faster for it, or into many
+# parts.
 _ON_CPU = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 2,
 }
-# LLVM's second level of optimisation takes a fifth and makes a fit 3 % faster; of what runs once
-# in a fit, no optimisation takes a third of the time for code half as fast.
+# LLVM's second level of optimisation takes a fifth and makes a fit 3 % faster; of what
+# runs once in a fit, no optimisation takes a third of the time for code half as fast.
 _LEVEL, _LEVEL_ONCE = 1, 0
 
 
@@ -41,7 +42,8 @@ def _options(level: int) -> dict[str, Any] | None:
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """`equinox.filter_jit`, with options for the CPU's compiler where it is called by itself.
 
-    Within another jit, vmap or derivative it is the plain one: options are for whole programs.
+    Within another jit, vmap or derivative it is the plain one: options are for whole
+        programs.
     """
     plain = eqx.filter_jit(function)
 
@@ -103,4 +105,6 @@ class Static:
         self.value = value
 
 
-jtu.register_pytree_node(Static, lambda x: ((), x.value), lambda value, _: Static(value))
+jtu.register_pytree_node(
+    Static, lambda x: ((), x.value), lambda value, _: Static(value)
+)

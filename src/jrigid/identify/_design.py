@@ -22,15 +22,15 @@ from jrigid.identify import _problem as problems
 from jrigid.identify._compile import Static, program, quick_jit
 from jrigid.identify._disturbance import no_disturbance
 from jrigid.identify._errors import conclude
-from jrigid.identify._flow import depends_on_attitude
+from jrigid.identify._flow import needs_attitude
+from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor, as_tensor
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
 from jrigid.identify._minimise import FIRST_DAMPING, STEPS, Minimum, Settings
 from jrigid.identify._quality import Fit
-from jrigid.identify._records import Samples, of_throws, samples_of
+from jrigid.identify._records import Samples, of_trials, samples_of
 from jrigid.identify._result import FitResult, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
-from jrigid.identify._shapes import AbstractShape, Tensor, as_tensor
 from jrigid.identify._smoother import Point, Rows
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.simulate import simulate
@@ -41,8 +41,8 @@ class Bound(NamedTuple):
     """The least errors a planned record allows, by Cramer and Rao.
 
     Attributes:
-        covariance: Of the numbers sought and the states, as in `FitResult`; very large numbers
-            where the record tells nothing.
+        covariance: Of the numbers sought and the states, as in `FitResult`; very large
+            numbers where the record tells nothing.
         ratios_covariance: Of I2/I1 and I3/I1.
     """
 
@@ -53,26 +53,26 @@ class Bound(NamedTuple):
 class Plan(Readable):
     """A record before it is taken: what it would tell, with derivatives in all that is planned.
 
-    Made within a function of the rate, the times, a wheel's samples, it can be improved by descent:
-    see `optimal_throw`.
+    Made within a function of the rate, the times, a wheel's samples, it can be improved
+    by descent: see `optimal_trial`.
 
     Attributes:
         system: The body as it is thought to be.
-        state: State at `t0`, of one throw, or with an axis of throws in front.
-        observations: When and how well it will be observed, as for `fit`; values play no role and
-            may be None.
-        t0: Time of the state [s], or of that of each throw; under a torque not later than the first
-            observation, or all is NaN.
-        free: What is sought beside the inertia, as for `fit`; nothing of each throw.
+        state: State at `t0`, of one trial, or with an axis of trials in front.
+        observations: When and how well it will be observed, as for `fit`; values play
+            no role and may be None.
+        t0: Time of the state [s], or of that of each trial; under a torque not later
+            than the first observation, or all is NaN.
+        free: What is sought beside the inertia, as for `fit`; nothing of each trial.
         scale: "trace", "known" or "rotor".
-        shape: What is known of the tensor.
+        inertia_model: What is known of the tensor.
 
     Raises:
         ValueError: A request that no record could answer, or noise that is not stated.
 
-    Gradients: of `information` and `bound` in the state, the times and the noise, of the bound
-    where the record tells all that is sought; in the tensor they are not to be relied on. Under a
-    torque in forward mode.
+    Gradients: of `information` and `bound` in the state, the times and the noise, of
+    the bound where the record tells all that is sought; in the tensor they are not to
+    be relied on. Under a torque in forward mode.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> body, ts = jr.RigidBody(jnp.array([1.0, 1.7, 2.3])), jnp.linspace(0.0, 20.0, 100)
@@ -87,23 +87,32 @@ class Plan(Readable):
     system: RigidBody
     state: State
     observations: Any
-    t0: Float[Array, "*throws"]
+    t0: Float[Array, "*trials"]
     free: Callable[..., Any] | None = eqx.field(static=True)
     scale: str = eqx.field(static=True)
-    shape: AbstractShape
+    inertia_model: AbstractInertiaModel
 
     def __init__(
-        self, system: RigidBody, state: State, observations: Any, *,
-        t0: Real[_ArrayLike, "*throws"] = 0.0, free: Callable[..., Any] | None = None,
-        scale: str = "trace", shape: AbstractShape | None = None,
-    ):  # fmt: skip
+        self,
+        system: RigidBody,
+        state: State,
+        observations: Any,
+        *,
+        t0: Real[_ArrayLike, "*trials"] = 0.0,
+        free: Callable[..., Any] | None = None,
+        scale: str = "trace",
+        inertia_model: AbstractInertiaModel | None = None,
+    ):
         """A body, its state at `t0`, and what will be seen of it."""
         check_type("system", system, RigidBody)
         check_type("state", state, State)
         check_shape("inertia", system.inertia, *INERTIA)
-        shape, records = Tensor() if shape is None else shape, of_throws(observations)
-        check_type("shape", shape, AbstractShape)
-        refuse(system, records, scale, shape)
+        inertia_model, records = (
+            Tensor() if inertia_model is None else inertia_model,
+            of_trials(observations),
+        )
+        check_type("inertia_model", inertia_model, AbstractInertiaModel)
+        refuse(system, records, scale, inertia_model)
         demand(
             all(x.states_noise for x in records),
             "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
@@ -111,14 +120,14 @@ class Plan(Readable):
         )
         self.system, self.state, self.observations = system, state, observations
         self.t0 = jnp.asarray(t0, records[0].ts.dtype)
-        self.free, self.scale, self.shape = free, scale, shape
+        self.free, self.scale, self.inertia_model = free, scale, inertia_model
 
     @property
     @quick_jit
     def information(self) -> Float[Array, "all all"]:
-        """Fisher's, about the numbers sought (the shape's, the scale's, what is picked) and states.
+        """Fisher information about all numbers that are sought, and the states.
 
-        These are at `t0`, of each throw the rate and, if it matters, a small turn.
+        These are at `t0`, of each trial the rate and, if it matters, a small turn.
         """
         jacobian = _jacobian(_planned(self)[1].rows)
         return product("ri,rj->ij", jacobian, jacobian)
@@ -130,7 +139,9 @@ class Plan(Readable):
         problem, found, _ = _planned(self)
         # From the derivatives themselves: their squares lose digits.
         jacobian, numbers = _jacobian(found.rows), found.point.numbers
-        size = or_one(jax.lax.stop_gradient(jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0))))
+        size = or_one(
+            jax.lax.stop_gradient(jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0)))
+        )
         # Where nothing is told the last rows keep the bound finite, and very large.
         eye = jnp.eye(size.size, dtype=jacobian.dtype)
         floor = 64 * jnp.finfo(eye.dtype).eps * eye
@@ -141,22 +152,24 @@ class Plan(Readable):
             moments = jnp.linalg.eigvalsh(problem.unknowns.inertia(numbers))
             return moments[1:] / moments[0]
 
-        of_ratios = product("ij,jk->ik", jax.jacfwd(ratios)(numbers), half[: numbers.size])
+        of_ratios = product(
+            "ij,jk->ik", jax.jacfwd(ratios)(numbers), half[: numbers.size]
+        )
         return Bound(*(product("ij,kj->ik", x, x) for x in (half, of_ratios)))
 
     @property
-    def told(self) -> FitResult:
+    def predicted(self) -> FitResult:
         """A result before there is a record, of chi-square 0; no gradients, outside of jit.
 
-        Its errors are those of `bound`, its `status` says whether all that is sought is told, and
-        `null_directions` what is not, in words.
+        Its errors are those of `bound`, its `status` says whether all that is sought is
+        told, and `null_directions` what is not, in words.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
         >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
         >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
         >>> plan = jr.identify.Plan(top, start, record, free=lambda body, gyro: gyro.scale)
-        >>> print(plan.told.null_directions)
+        >>> print(plan.predicted.null_directions)
         ('overall scale', 'I3/I1 against gyro scale')
         """
         problem, minimum, layout = jtu.tree_map(np.asarray, _planned_once(self))
@@ -173,23 +186,32 @@ class Plan(Readable):
 
 def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
     """Derivatives of a record that is what the body and the state say."""
-    system, state, shape = plan.system, plan.state, plan.shape
-    records = of_throws(plan.observations)
+    system, state, inertia_model = plan.system, plan.state, plan.inertia_model
+    records = of_trials(plan.observations)
     records = tuple(x.with_values(jnp.ones_like(x.values)) for x in records)
     one = jnp.ones((), records[0].ts.dtype)
     samples, sensors = samples_of(records, one), tuple(x.sensor for x in records)
-    (throws, _), dtype = samples.ts.shape, samples.ts.dtype
+    (trials, _), dtype = samples.ts.shape, samples.ts.dtype
     sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
-    scaled = plan.scale != "trace" and not shape.absolute
-    unknowns = unknowns_of((system,), sensors, sizes, plan.free, shape, scaled, rate, throws)
+    scaled = plan.scale != "trace" and not inertia_model.absolute
+    unknowns = unknowns_of(
+        (system,), sensors, sizes, plan.free, inertia_model, scaled, rate, trials
+    )
     shared = not any(x.own for x in unknowns.sought) and not unknowns.groups
-    demand(shared, "Argument `free` must pick nothing of `each` throw, but it does.")
+    demand(shared, "Argument `free` must pick nothing of `each` trial, but it does.")
     unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype)), 1e-9)
-    attitude = jnp.broadcast_to(state.attitude.astype(dtype), (throws, 4))[:, None]
-    omega = jnp.broadcast_to(state.omega.astype(dtype), (throws, 3))[:, None]
-    point = Point(numbers, unknowns.own_start(throws, dtype), attitude, omega, omega[..., :0])
-    on_attitude = any(x.on_attitude for x in sensors) or depends_on_attitude(system)
-    options, layout = problems.Options(system.is_free, on_attitude), whole(samples, 1, plan.t0)
+    attitude = jnp.broadcast_to(state.attitude.astype(dtype), (trials, 4))[:, None]
+    omega = jnp.broadcast_to(state.omega.astype(dtype), (trials, 3))[:, None]
+    point = Point(
+        numbers, unknowns.own_start(trials, dtype), attitude, omega, omega[..., :0]
+    )
+    depends_on_attitude = any(x.depends_on_attitude for x in sensors) or needs_attitude(
+        system
+    )
+    options, layout = (
+        problems.Options(system.is_free, depends_on_attitude),
+        whole(samples, 1, plan.t0),
+    )
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
     # Values as they would be seen: a residual of zero.
     seen = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
@@ -200,7 +222,9 @@ def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
         first = first_and_last(samples.ts, samples.seen)[0]
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
     prior = problem.known - problem.held
-    weight = jnp.pad(samples.seen.astype(dtype), ((0, 0), (0, prior)), constant_values=1)
+    weight = jnp.pad(
+        samples.seen.astype(dtype), ((0, 0), (0, prior)), constant_values=1
+    )
     none = jnp.zeros((), dtype)
     minimum = Minimum(
         point=point,
@@ -223,23 +247,28 @@ _planned_once = quick_jit(_planned)
 
 
 def _jacobian(rows: Rows) -> Array:
-    """Of all residuals in the numbers and in each throw's state."""
-    throws, samples, width = rows.residual.shape
+    """Of all residuals in the numbers and in each trial's state."""
+    trials, samples, width = rows.residual.shape
     count = samples * width
     locals_ = rows.of_state.shape[-1]
-    jg = rows.of_border.reshape(throws, count, rows.of_border.shape[-1])
-    jl = rows.of_state.reshape(throws, count, locals_)
-    eye = jnp.eye(throws, dtype=jl.dtype)
-    apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(throws * count, throws * locals_)
-    return jnp.concatenate([jg.reshape(throws * count, jg.shape[-1]), apart], axis=1)
+    jg = rows.of_border.reshape(trials, count, rows.of_border.shape[-1])
+    jl = rows.of_state.reshape(trials, count, locals_)
+    eye = jnp.eye(trials, dtype=jl.dtype)
+    apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(
+        trials * count, trials * locals_
+    )
+    return jnp.concatenate([jg.reshape(trials * count, jg.shape[-1]), apart], axis=1)
 
 
 def profile(
-    result: FitResult, function: Callable[[Array], Array], values: Real[_ArrayLike, " n"]
+    result: FitResult,
+    function: Callable[[Array], Array],
+    values: Real[_ArrayLike, " n"],
 ) -> Float[Array, " n"]:
     """Profile likelihood: how chi-square grows as a function of the tensor is held at values.
 
-    Errors that are not symmetric, and bounds that the quadratic form at the best fit misses, show
+    Errors that are not symmetric, and bounds that the quadratic form at the best fit
+    misses, show
     here: the interval in which the growth is below 1 holds 68 %, that below 3.84 95 %.
 
     Args:
@@ -289,14 +318,20 @@ class _Held(eqx.Module):
         return (self.function(unknowns.inertia(numbers)) - self.value) / self.unit
 
 
-def _profile(result: FitResult, function: Callable[[Array], Array], values: Array) -> Array:
+def _profile(
+    result: FitResult, function: Callable[[Array], Array], values: Array
+) -> Array:
     """Fit anew at each value, all of them side by side."""
-    options = result.problem.options._replace(shooting=False, unmodelled="none", nodes=1)
+    options = result.problem.options._replace(
+        shooting=False, unmodelled="none", nodes=1
+    )
     result = jtu.tree_map(np.asarray, result)
     problem = dataclasses.replace(result.problem, options=options)
     unknowns, numbers, dtype = result.unknowns, result.numbers, result.numbers.dtype
     slope = np.asarray(_held_on(unknowns, numbers, Static(function)))
-    unit = 1e-3 * np.sqrt(slope @ result.numbers_covariance @ slope / result.diagnostics.inflation)
+    unit = 1e-3 * np.sqrt(
+        slope @ result.numbers_covariance @ slope / result.diagnostics.inflation
+    )
     single = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
     states = result.state.attitude[:, None], result.state.omega[:, None]
     one = np.ones((), dtype)
@@ -326,27 +361,32 @@ def _profile(result: FitResult, function: Callable[[Array], Array], values: Arra
 
 
 def residuals(
-    system: RigidBody, state: State, observations: Any, *,
-    t0: Real[_ArrayLike, "*throws"] = 0.0, adjoint: diffrax.AbstractAdjoint | None = None,
-) -> Float[Array, "throws rows"]:  # fmt: skip
+    system: RigidBody,
+    state: State,
+    observations: Any,
+    *,
+    t0: Real[_ArrayLike, "*trials"] = 0.0,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Float[Array, "trials rows"]:
     """Whitened residuals of a motion, for a loss or an optimiser of one's own (optax, say).
 
     Args:
         system: The body.
-        state: Its state at `t0`, of one throw, or with an axis of throws in front.
+        state: Its state at `t0`, of one trial, or with an axis of trials in front.
         observations: As for `fit`.
-        t0: Time of the state [s], or of that of each throw: `found.t0` for that of a fit. Under a
-            torque not later than the first sample.
+        t0: Time of the state [s], or of that of each trial: `found.t0` for that of a
+            fit. Under a torque not later than the first sample.
         adjoint: For `jrigid.simulate`, if there is a torque.
 
     Returns:
-        Predicted less observed, in units of the noise where that is stated; zero where nothing was
-        seen.
+        Predicted less observed, in units of the noise where that is stated; zero where
+        nothing was seen.
 
     Raises:
         RuntimeError: What `free_rotation` or `simulate` raises.
 
-    Gradients: those of the motion, in every mode that `free_rotation` or `simulate` has.
+    Gradients: those of the motion, in every mode that `free_rotation` or `simulate`
+        has.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -359,12 +399,12 @@ def residuals(
     """
     check_type("system", system, RigidBody)
     check_type("state", state, State)
-    records = of_throws(observations)
+    records = of_trials(observations)
     guess = jnp.ones((), records[0].values.dtype)
     samples, sensors = samples_of(records, guess), [x.sensor for x in records]
-    throws, begin = samples.ts.shape[0], jnp.asarray(t0, samples.ts.dtype)
+    trials, begin = samples.ts.shape[0], jnp.asarray(t0, samples.ts.dtype)
     shapes = (state.attitude, (4,)), (state.omega, (3,)), (begin, ())
-    q, w, begin = (jnp.broadcast_to(x, (throws, *shape)) for x, shape in shapes)
+    q, w, begin = (jnp.broadcast_to(x, (trials, *shape)) for x, shape in shapes)
 
     def motion(system: Any, start: State, ts: Array, t0: Array) -> State:
         if system.is_free:
@@ -373,8 +413,10 @@ def residuals(
 
     options = problems.Options(False, True, motion=motion)
 
-    def throw(q: Array, w: Array, begin: Array, samples: Samples) -> Array:
-        values = problems.shown_by(options, system, sensors, State(q, w), begin, samples)
+    def trial(q: Array, w: Array, begin: Array, samples: Samples) -> Array:
+        values = problems.shown_by(
+            options, system, sensors, State(q, w), begin, samples
+        )
         return problems.whitened(sensors, samples, values).reshape(-1)
 
-    return jax.vmap(throw)(q, w, begin, samples)
+    return jax.vmap(trial)(q, w, begin, samples)

@@ -13,27 +13,35 @@ class Diagnostics(eqx.Module):
 
     Attributes:
         residuals: Whitened, records side by side; zero where nothing was seen.
-        jacobian: Their derivatives in the numbers and in the state of the throw.
-        chi_square_by_throw: Mean square of the residuals of each throw.
-        whiteness: Correlation of neighbouring residuals, and how many standard deviations that is
-            from 0. Near 0 for noise; what a model leaves out changes slowly and brings it near 1.
-        loudest_band: Power of what is left in the band of frequencies that stands out most, over
-            the mean, and how many standard deviations that is from what noise has.
+        jacobian: Their derivatives in the numbers and in the state of the trial.
+        chi_square_by_trial: Mean square of the residuals of each trial.
+        whiteness: Correlation of neighbouring residuals, and how many standard
+            deviations that is from 0. Near 0 for noise; what a model leaves out changes
+            slowly and brings it near 1.
+        loudest_band: Power of what is left in the band of frequencies that stands out
+            most, over the mean, and how many standard deviations that is from what
+            noise has.
         unexplained: Of the square of what was observed, beyond the noise.
-        singular_values: Of the derivatives in the numbers, the states' part removed, descending.
+        singular_values: Of the derivatives in the numbers, the states' part removed,
+            descending.
         directions: In the numbers, columns for the singular values.
-        state_singular_values: Of the derivatives in each throw's state, of unit columns; a zero is
-            a change of the state that the record does not show.
-        sensor_covariance: The part of the numbers' covariance that the sensors' noise makes.
-        local_covariance: Of each throw's state at `t0` (rate, then, if it matters, a small turn of
-            the attitude about the body axes) and own numbers, beside given numbers.
-        follow: How these follow the numbers, with the sign turned (throws, local, numbers).
-        scores: What each throw adds to the gradient of half the squares, zero in sum.
+        state_singular_values: Of the derivatives in each trial's state, of unit
+            columns; a zero is a change of the state that the record does not show.
+        sensor_covariance: The part of the numbers' covariance that the sensors' noise
+            makes.
+        local_covariance: Of each trial's state at `t0` (rate, then, if it matters, a
+            small turn of the attitude about the body axes) and own numbers, beside
+            given numbers.
+        follow: How these follow the numbers, with the sign turned (trials, local,
+            numbers).
+        scores: What each trial adds to the gradient of half the squares, zero in sum.
         inflation: Of covariances, beyond what the noise stated makes.
         torque_numbers: How many numbers of the unmodelled torque were sought.
-        log_determinant: Of the covariance of the record that it makes, in units of the noise: with
-            `chi_square` it is -2 log likelihood, but for a constant; 0 without such a torque.
-        scales: Of each record's residuals, in units of the noise, in the median of a robust fit.
+        log_determinant: Of the covariance of the record that it makes, in units of the
+            noise: with `chi_square` it is -2 log likelihood, but for a constant; 0
+                without such a torque.
+        scales: Of each record's residuals, in units of the noise, in the median of a
+            robust fit.
         history: Sum of squares of the record after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
@@ -47,19 +55,19 @@ class Diagnostics(eqx.Module):
     (1, 200, 3)
     """
 
-    residuals: Float[Array, "throws samples degrees"]
-    jacobian: Float[Array, "throws samples degrees unknowns"]
-    chi_square_by_throw: Float[Array, " throws"]
+    residuals: Float[Array, "trials samples degrees"]
+    jacobian: Float[Array, "trials samples degrees unknowns"]
+    chi_square_by_trial: Float[Array, " trials"]
     whiteness: tuple[Scalar, Scalar]
     loudest_band: tuple[Scalar, Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]
-    state_singular_values: Float[Array, "throws local"]
+    state_singular_values: Float[Array, "trials local"]
     sensor_covariance: Float[Array, "numbers numbers"]
-    local_covariance: Float[Array, "throws local local"]
-    follow: Float[Array, "throws local numbers"]
-    scores: Float[Array, "throws numbers"]
+    local_covariance: Float[Array, "trials local local"]
+    follow: Float[Array, "trials local numbers"]
+    scores: Float[Array, "trials numbers"]
     inflation: Scalar
     torque_numbers: Int[Array, ""]
     log_determinant: Scalar

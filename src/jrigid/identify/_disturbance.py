@@ -1,8 +1,8 @@
 """A torque that no model has: what it adds to the body's momentum between two nodes.
 
-Along each body axis it is a Gauss-Markov process (Ornstein-Uhlenbeck), which forgets itself within
-a correlation time; white torque is the limit of none. Its value at each node, in units of its rms,
-is one more state of the smoother.
+Along each body axis it is a Gauss-Markov process (Ornstein-Uhlenbeck), which forgets
+itself within a correlation time; white torque is the limit of none. Its value at each
+node, in units of its rms, is one more state of the smoother.
 """
 
 from collections.abc import Callable
@@ -19,21 +19,25 @@ from jrigid.identify._smoother import Links, Rows
 
 # Steps, in correlation times, beyond which the torque counts as white, or as constant.
 _LONGEST, _SHORTEST = 1e6, 1e-4
-_POINTS = 8  # of a quadrature that is exact to rounding for steps below a correlation time
+_POINTS = (
+    8  # of a quadrature that is exact to rounding for steps below a correlation time
+)
 
 
 class GaussMarkov(eqx.Module):
     """A random torque along the body axes, for `fit(unmodelled=...)`.
 
-    Its spectral density is level^2 at low frequencies, and half of that at 1 / time [rad/s]; the
-    rms of the torque is level / sqrt(2 time). A time of zero is white torque.
+    Its spectral density is level^2 at low frequencies, and half of that at 1 / time
+    [rad/s]; the rms of the torque is level / sqrt(2 time). A time of zero is white
+    torque.
 
     Args:
         level: Root of the spectral density [N m sqrt(s)], for all axes or for each.
         time: Correlation time [s], for all axes or for each.
 
-    Source: R. A. Singer, "Estimating optimal tracking filter performance for manned maneuvering
-    targets", IEEE Transactions on Aerospace and Electronic Systems 6 (1970) 473.
+    Source: R. A. Singer, "Estimating optimal tracking filter performance for manned
+    maneuvering targets", IEEE Transactions on Aerospace and Electronic Systems 6 (1970)
+    473.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -57,8 +61,8 @@ class Disturbance(NamedTuple):
     """The torque of a fit.
 
     Attributes:
-        level: Root of its spectral density at low frequencies, of each trial about each axis
-            (throws, 3) [N m sqrt(s)].
+        level: Root of its spectral density at low frequencies, of each trial about each
+            axis (trials, 3) [N m sqrt(s)].
         time: Correlation time about each axis (3,) [s].
     """
 
@@ -70,10 +74,11 @@ class Push(NamedTuple):
     """What the torque does over each link, in rates and turns.
 
     Attributes:
-        covariance: Of what it adds at random (throws, nodes, local, local).
-        whitener: Turns that into independent numbers of unit variance; zero where no link is.
-        carried: How the state at the end follows the torque at the start, in units of its rms
-            (throws, nodes, local, 3).
+        covariance: Of what it adds at random (trials, nodes, local, local).
+        whitener: Turns that into independent numbers of unit variance; zero where no
+            link is.
+        carried: How the state at the end follows the torque at the start, in units of
+            its rms (trials, nodes, local, 3).
     """
 
     covariance: Array
@@ -88,8 +93,8 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
         steps: Lengths in correlation times.
 
     Returns:
-        Matrices (..., 3, 3) and columns (..., 3), in units of level dt^(1/2) for the momentum,
-        level dt^(3/2) for its integral and the rms for the torque.
+        Matrices (..., 3, 3) and columns (..., 3), in units of level dt^(1/2) for the
+        momentum, level dt^(3/2) for its integral and the rms for the torque.
     """
     a = jnp.clip(steps, _SHORTEST, _LONGEST)
     x = -jnp.expm1(-a)
@@ -99,7 +104,9 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
     r = jnp.asarray(0.5 + 0.5 * points, a.dtype)
     r = jnp.broadcast_to(r, (*a.shape, r.size))
     faded = -jnp.expm1(-a[..., None] * r)
-    responses = jnp.stack([faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1)
+    responses = jnp.stack(
+        [faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1
+    )
     weights = jnp.asarray(0.5 * weights, a.dtype)
     short = product("r,...ri,...rj->...ij", weights, responses, responses)
     # The same integrals in closed form lose their digits in short steps.
@@ -121,27 +128,35 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
 
 
 def push_of(
-    disturbance: Disturbance, span: Array, linked: Array, tensor: Array, on_attitude: bool
+    disturbance: Disturbance,
+    span: Array,
+    linked: Array,
+    tensor: Array,
+    depends_on_attitude: bool,
 ) -> Push:
     """What the torque does over links.
 
     Args:
         disturbance: The torque.
-        span: Length of each link (throws, nodes) [s].
+        span: Length of each link (trials, nodes) [s].
         linked: Which links there are.
         tensor: Inertia, which turns momentum into rates.
-        on_attitude: Whether the state has an attitude.
+        depends_on_attitude: Whether the state has an attitude.
     """
-    kinds = [0, 1, 2] if on_attitude else [0, 2]
+    kinds = [0, 1, 2] if depends_on_attitude else [0, 2]
     dt = jnp.where(linked, span, 1.0)
     time = jnp.maximum(disturbance.time, jnp.finfo(dt.dtype).tiny)
-    covariance, carried = _of_a_step(jnp.minimum(dt[..., None] / time[None, None], _LONGEST))
+    covariance, carried = _of_a_step(
+        jnp.minimum(dt[..., None] / time[None, None], _LONGEST)
+    )
     level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
     units = [level, level * dt[..., None], jnp.ones_like(level)]
     eye = jnp.eye(3, dtype=dt.dtype)
     momenta = [tensor, tensor, eye]  # from rates and turns
     rates = [jnp.linalg.inv(tensor), jnp.linalg.inv(tensor), eye]  # and back
-    whitener = _inverse_cholesky([[covariance[..., i, j] for j in kinds] for i in kinds])
+    whitener = _inverse_cholesky(
+        [[covariance[..., i, j] for j in kinds] for i in kinds]
+    )
 
     # Matrices of blocks of three by three, for rates, turns and torques.
     def spread(i: int, j: int) -> Array:
@@ -158,7 +173,9 @@ def push_of(
         return jnp.concatenate(rows, axis=-2)
 
     there = linked.astype(dt.dtype)[..., None, None]
-    along = [product("ab,...b->...ab", rates[i], units[i] * carried[..., i]) for i in kinds]
+    along = [
+        product("ab,...b->...ab", rates[i], units[i] * carried[..., i]) for i in kinds
+    ]
     return Push(
         covariance=there * assembled(spread),
         whitener=there * assembled(white),
@@ -183,14 +200,16 @@ def _inverse_cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
     return inverse
 
 
-def with_torque(rows: Rows, links: Links, push: Push, torque: Array) -> tuple[Rows, Links]:
+def with_torque(
+    rows: Rows, links: Links, push: Push, torque: Array
+) -> tuple[Rows, Links]:
     """Rows and links of states that hold the torque too.
 
     Args:
         rows: Of states without the torque.
         links: Between them.
         push: What the torque does over each link.
-        torque: At each node (throws, nodes, 3), in units of its rms.
+        torque: At each node (trials, nodes, 3), in units of its rms.
     """
     local = links.gap.shape[-1]
     linked = jnp.any(push.whitener != 0, axis=(-2, -1))[..., None]
@@ -205,6 +224,6 @@ def with_torque(rows: Rows, links: Links, push: Push, torque: Array) -> tuple[Ro
     return rows._replace(of_state=wider), links
 
 
-def no_disturbance(throws: int, dtype: Any) -> Disturbance:
+def no_disturbance(trials: int, dtype: Any) -> Disturbance:
     """White, of level one: for fits that have no such torque."""
-    return Disturbance(np.ones((throws, 3), dtype), np.zeros(3, dtype))
+    return Disturbance(np.ones((trials, 3), dtype), np.zeros(3, dtype))

@@ -24,44 +24,54 @@ from jrigid.identify._records import Samples
 from jrigid.identify._result import LARGEST_ERROR, Status, errors_of
 from jrigid.identify._smoother import Links, Rows
 
-SHOWN = 1e-9  # of the largest singular value: a change of the state that the record shows
+SHOWN = (
+    1e-9  # of the largest singular value: a change of the state that the record shows
+)
 _FAR = 1.0  # a change of a number beyond which the tensor is another one
 HISTORY = 512  # steps whose sums of squares are returned
 _FEWEST = 8  # trials whose scatter says how large errors are
-_DISAGREEING = 3.0  # times the errors stated: the scatter of trials of which something is missing
-_TRIED = 0.03  # of the level that moves a rate by its noise: where one of zero is judged
+_DISAGREEING = (
+    3.0  # times the errors stated: the scatter of trials of which something is missing
+)
+_TRIED = (
+    0.03  # of the level that moves a rate by its noise: where one of zero is judged
+)
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
-    """Rows in the first state of each throw: along the links, as if nothing came between."""
+    """Rows in the first state of each trial: along the links, as if nothing came between."""
     if not np.any(rows.node):
         return rows
-    throws, nodes, local = links.gap.shape
+    trials, nodes, local = links.gap.shape
     border = rows.of_border.shape[-1]
-    state = np.zeros((throws, local, border + local), links.gap.dtype)
+    state = np.zeros((trials, local, border + local), links.gap.dtype)
     state[:, :, border:] = np.eye(local)
-    states = np.zeros((throws, nodes, local, border + local), links.gap.dtype)
+    states = np.zeros((trials, nodes, local, border + local), links.gap.dtype)
     for node in range(nodes):
         states[:, node] = state
         state = links.of_state[:, node] @ state
         state[:, :, :border] += links.of_border[:, node]
-    through = rows.of_state @ np.take_along_axis(states, rows.node[:, :, None, None], axis=1)
+    through = rows.of_state @ np.take_along_axis(
+        states, rows.node[:, :, None, None], axis=1
+    )
     of_border = rows.of_border + through[..., :border]
-    return Rows(rows.residual, of_border, through[..., border:], np.zeros_like(rows.node))
+    return Rows(
+        rows.residual, of_border, through[..., border:], np.zeros_like(rows.node)
+    )
 
 
 class Precision(NamedTuple):
     """What rows determine of the numbers.
 
     Attributes:
-        values: Singular values of the derivatives in natural units, descending; the inverse of
-            each is an error.
+        values: Singular values of the derivatives in natural units, descending; the
+            inverse of each is an error.
         directions: In the numbers, columns for the values.
         covariance: Of the numbers.
-        local: Of a throw's first state and own numbers beside given numbers.
+        local: Of a trial's first state and own numbers beside given numbers.
         follow: How these follow the numbers, with the sign turned.
-        of_state: Singular values of each throw's state, of unit columns, descending.
-        scores: What each throw adds to the gradient of half the squares in the numbers.
+        of_state: Singular values of each trial's state, of unit columns, descending.
+        scores: What each trial adds to the gradient of half the squares in the numbers.
     """
 
     values: np.ndarray
@@ -73,15 +83,17 @@ class Precision(NamedTuple):
     scores: np.ndarray
 
 
-def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarray) -> Precision:
+def precision_of_rows(
+    rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
+) -> Precision:
     """By a QR decomposition of weighted rows in first states: their squares would lose digits."""
     root = np.sqrt(weight)[..., None]
-    throws, count, width = rows.residual.shape
-    residual = (root * rows.residual).reshape(throws, count * width)
+    trials, count, width = rows.residual.shape
+    residual = (root * rows.residual).reshape(trials, count * width)
     local = np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    local = (root[..., None] * local).reshape(throws, count * width, local.shape[-1])
+    local = (root[..., None] * local).reshape(trials, count * width, local.shape[-1])
     shared = root[..., None] * rows.of_border[..., own:]
-    shared = shared.reshape(throws, count * width, units.size)
+    shared = shared.reshape(trials, count * width, units.size)
     shared = np.nan_to_num(shared * units)
     local = np.nan_to_num(local)
     eps, size = np.finfo(units.dtype).eps, units.size
@@ -95,7 +107,7 @@ def precision_of_rows(rows: Rows, weight: np.ndarray, own: int, units: np.ndarra
     follow = np.where(shown[:, None], half, 0.0) @ along
     rest = shared - u @ along
     scores = (residual[:, None] @ rest)[:, 0] / units
-    r = np.linalg.qr(rest.reshape(throws * count * width, size), mode="r")
+    r = np.linalg.qr(rest.reshape(trials * count * width, size), mode="r")
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
     floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
@@ -117,8 +129,8 @@ class Independent(NamedTuple):
     Attributes:
         rows: Innovations where a torque may have acted, else residuals.
         weight: Of each row.
-        log_determinant: Of the covariance of what was observed, in units of the noise: with the
-            sum of squares it makes -2 log likelihood.
+        log_determinant: Of the covariance of what was observed, in units of the noise:
+            with the sum of squares it makes -2 log likelihood.
     """
 
     rows: Rows
@@ -132,12 +144,16 @@ def independent_rows(problem: Problem, fit: Fit) -> Independent:
     if not problem.options.dense:
         return Independent(condensed(minimum.rows, minimum.links), minimum.weight, 0.0)
     found = innovations(quality.linearised(fit), fit.disturbance)
-    columns = np.concatenate([np.asarray(found.rows), quality.columns_of_prior(fit)], axis=1)
+    columns = np.concatenate(
+        [np.asarray(found.rows), quality.columns_of_prior(fit)], axis=1
+    )
     border = 1 + minimum.links.gap.shape[-1]
     of_border, of_state = columns[..., border:], columns[..., 1:border]
     rows = Rows(columns[..., 0], of_border, of_state, np.zeros_like(minimum.rows.node))
     # They have their weights already.
-    return Independent(rows, np.ones_like(minimum.weight), float(np.sum(found.log_determinant)))
+    return Independent(
+        rows, np.ones_like(minimum.weight), float(np.sum(found.log_determinant))
+    )
 
 
 class Weakest(NamedTuple):
@@ -146,8 +162,10 @@ class Weakest(NamedTuple):
     Attributes:
         square: Chi-square.
         noise: Its unit: the variance of a residual.
-        error: Of the combination of the inertia's numbers with the largest error, natural units.
-        normal: That combination: its product with a change of all numbers is the change of it.
+        error: Of the combination of the inertia's numbers with the largest error,
+            natural units.
+        normal: That combination: its product with a change of all numbers is the change
+            of it.
         direction: The change of all numbers, others following, that changes it by one.
     """
 
@@ -170,9 +188,9 @@ def weakest(problem: Problem, fit: Fit) -> Weakest:
     minimum, units = fit.minimum, fit.minimum.units
     square, noise = float(minimum.square + minimum.kicks), 1.0
     if not problem.options.noise_known:
-        throws, local = minimum.links.gap.shape[0], minimum.links.gap.shape[-1]
+        trials, local = minimum.links.gap.shape[0], minimum.links.gap.shape[-1]
         counted = np.sum(quality.weights_of(problem, fit.kept))
-        noise = square / max(float(counted) - units.size - local * throws, 1.0)
+        noise = square / max(float(counted) - units.size - local * trials, 1.0)
     covariance = precision(problem, fit).covariance
     error, normal, direction = weakest_of(problem.unknowns.judged, covariance, units)
     return Weakest(square, noise, np.sqrt(noise) * error, normal, direction)
@@ -211,13 +229,13 @@ def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
 
 def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
     """Level and correlation time of the unmodelled torque, with errors."""
-    throws, none = fit.kept.shape[0], np.zeros(3)
+    trials, none = fit.kept.shape[0], np.zeros(3)
     fields = {
         "level": none,
         "level_errors": none,
         "correlation_time": none,
         "correlation_time_errors": none,
-        "level_by_trial": np.ones(throws),
+        "level_by_trial": np.ones(trials),
     }
     if not problem.options.dense:
         return fields
@@ -228,7 +246,9 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
     torque = fit.torque
     if torque is None:
         given = fit.disturbance
-        torque = levels.known(np.asarray(given.level[0], float), np.asarray(given.time, float))
+        torque = levels.known(
+            np.asarray(given.level[0], float), np.asarray(given.time, float)
+        )
     faint = search.are_faint(torque)
     tried = torque.with_levels(np.where(faint, _TRIED * first, torque.levels))
     typical, errors = tried.typical, search.errors(tried, fit)
@@ -241,13 +261,18 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
     fields |= {"level": np.where(faint, 0.0, level), "level_errors": level * of_levels}
     if np.all(faint):
         return fields
-    fields |= {"correlation_time": typical.time, "level_by_trial": np.exp(torque.trials)}
+    fields |= {
+        "correlation_time": typical.time,
+        "level_by_trial": np.exp(torque.trials),
+    }
     if torque.form.times:
         fields["correlation_time_errors"] = typical.time * of_times
     return fields
 
 
-def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dict[str, Any]:
+def derive(
+    problem: Problem, numbers: np.ndarray, covariance: np.ndarray
+) -> dict[str, Any]:
     """Moments, axes and ratios, with errors, from the numbers and their covariance."""
     found = jtu.tree_map(np.asarray, spectrum(problem.unknowns, numbers))
     tensor, moments, axes, slopes = found
@@ -268,7 +293,9 @@ def derive(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> dic
         "moments_covariance": spread[:3, :3],
         "ratios_covariance": spread[3:5, 3:5],
         "shares_covariance": spread[5:, 5:],
-        "axes_errors": np.sqrt(np.maximum(np.sum((turns @ covariance) * turns, axis=1), 0.0)),
+        "axes_errors": np.sqrt(
+            np.maximum(np.sum((turns @ covariance) * turns, axis=1), 0.0)
+        ),
     }
 
 
@@ -279,7 +306,9 @@ def _of_moments(moments: np.ndarray) -> np.ndarray:
     return np.concatenate([moments, ratios, moments / total], axis=-1)
 
 
-def _spread_of_moments(problem: Problem, numbers: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _spread_of_moments(
+    problem: Problem, numbers: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
     """Covariance of moments, ratios and shares: as `FitResult.spread`."""
     size = problem.unknowns.of_inertia.stop
     inside = covariance[:size, :size]
@@ -287,7 +316,9 @@ def _spread_of_moments(problem: Problem, numbers: np.ndarray, covariance: np.nda
         return np.full((8, 8), 0.0 if not size else np.nan, numbers.dtype)
     values, axes = np.linalg.eigh(inside)
     sizes = np.sqrt(np.maximum(values, 0.0) * size)
-    near = np.minimum(sizes, _FAR)  # what is known worse is continued as a straight line
+    near = np.minimum(
+        sizes, _FAR
+    )  # what is known worse is continued as a straight line
     steps = np.pad((axes * near).T, ((0, 0), (0, numbers.size - size)))
     points = numbers + np.concatenate([steps, -steps, np.zeros((1, numbers.size))])
     tensors = np.asarray(tensors_at(problem.unknowns, points.astype(numbers.dtype)))
@@ -325,11 +356,15 @@ def conclude(
     residuals, jacobian = _weighted(fit, rows, own)
     parts, count = problem.samples.parts, fit.kept.shape[1]
     # Weights of innovations are ones.
-    judged_by = (np.sqrt(independent.weight)[..., None] * independent.rows.residual)[:, :count]
+    judged_by = (np.sqrt(independent.weight)[..., None] * independent.rows.residual)[
+        :, :count
+    ]
     judged = _judged(problem, fit, known, judged_by)
     inflation, covariance = judged["inflation"], judged["numbers_covariance"]
     derived = derive(problem, point.numbers, covariance)
-    loose = np.any(errors_of(derived["ratios_covariance"]) > LARGEST_ERROR * derived["ratios"])
+    loose = np.any(
+        errors_of(derived["ratios_covariance"]) > LARGEST_ERROR * derived["ratios"]
+    )
     if not is_good(input_result):
         judged["status"] = "BAD_INPUT"
     elif loose and judged["status"] == "OK":
@@ -388,9 +423,12 @@ def _of_dtype(fields: dict[str, Any], good: bool, dtype: Any) -> dict[str, Any]:
 
 
 def _resized(
-    x: np.ndarray, parts: Sequence[slice], lengths: Sequence[int], mode: str = "constant"
+    x: np.ndarray,
+    parts: Sequence[slice],
+    lengths: Sequence[int],
+    mode: str = "constant",
 ) -> np.ndarray:
-    """The samples of each record (throws, samples, ...), so many: cut, or filled with zeros."""
+    """The samples of each record (trials, samples, ...), so many: cut, or filled with zeros."""
     resized = []
     for part, n in zip(parts, lengths, strict=True):
         own = x[:, part][:, :n]
@@ -415,26 +453,36 @@ def _of_lengths(samples: Samples, lengths: Sequence[int]) -> Samples:
     )
 
 
-def _with_error(part: slice, covariance: np.ndarray, units: np.ndarray, error: float) -> np.ndarray:
+def _with_error(
+    part: slice, covariance: np.ndarray, units: np.ndarray, error: float
+) -> np.ndarray:
     """With an error of the inertia's weakest direction, in natural units, of at least this size."""
     before, _, direction = weakest_of(part, covariance, units)
     return covariance + max(error**2 - before**2, 0.0) * np.outer(direction, direction)
 
 
-def _with_larger_errors(known: Precision, factors: np.ndarray, units: np.ndarray) -> np.ndarray:
+def _with_larger_errors(
+    known: Precision, factors: np.ndarray, units: np.ndarray
+) -> np.ndarray:
     """The covariance with errors so many times larger along each direction."""
     directions = known.directions * units[:, None] / np.maximum(known.values, 1e-150)
     more = directions * np.sqrt(factors**2 - 1)
     return known.covariance + more @ more.T
 
 
-def _scatter_of_trials(known: Precision, alive: np.ndarray, units: np.ndarray) -> np.ndarray:
+def _scatter_of_trials(
+    known: Precision, alive: np.ndarray, units: np.ndarray
+) -> np.ndarray:
     """Errors by the scatter of trials over those stated, along each direction; 1 of few trials."""
-    throws = np.sum(alive)
-    if throws < _FEWEST or not np.all(np.isfinite(known.scores)):
+    trials = np.sum(alive)
+    if trials < _FEWEST or not np.all(np.isfinite(known.scores)):
         return np.ones(units.size)
-    along = (known.scores[alive] * units) @ known.directions / np.maximum(known.values, 1e-150)
-    return np.sqrt(np.sum(along**2, axis=0) * throws / (throws - 1))
+    along = (
+        (known.scores[alive] * units)
+        @ known.directions
+        / np.maximum(known.values, 1e-150)
+    )
+    return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1))
 
 
 def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
@@ -456,7 +504,8 @@ class _Left(NamedTuple):
     """What a fit leaves of its record.
 
     Attributes:
-        chi_square: Sum of squares, of what is known beforehand and of an unmodelled torque too.
+        chi_square: Sum of squares, of what is known beforehand and of an unmodelled
+            torque too.
         freedom: Its degrees of freedom.
         noise: The one over the other.
         band: Power in the band that stands out most, and its standard deviations.
@@ -474,7 +523,9 @@ class _Left(NamedTuple):
     inflation: float
 
 
-def _what_is_left(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray) -> _Left:
+def _what_is_left(
+    problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray
+) -> _Left:
     count = fit.kept.shape[1]
     weight = quality.weights_of(problem, fit.kept)
     alive = np.any(fit.kept > 0, axis=1)[:, None]
@@ -492,21 +543,33 @@ def _what_is_left(problem: Problem, fit: Fit, known: Precision, residuals: np.nd
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
         more = noise > 1 + gate or np.max(fit.scales) > 2
         less = 0 < noise < 1 - gate  # a plan has no residuals
-    inflation = noise if not problem.options.noise_known else max(noise, 1.0) if more else 1.0
+    inflation = (
+        noise if not problem.options.noise_known else max(noise, 1.0) if more else 1.0
+    )
     # A band that stands out may be the one that tells the numbers.
     inflation = inflation * band if coloured else inflation
     misfit = bool(more or coloured)
-    return _Left(chi_square, freedom, noise, (band, sure), misfit, bool(less), inflation)
+    return _Left(
+        chi_square, freedom, noise, (band, sure), misfit, bool(less), inflation
+    )
 
 
-def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray) -> dict[str, Any]:
+def _judged(
+    problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray
+) -> dict[str, Any]:
     """How well a fit describes the record, by residuals or innovations, and its name."""
-    units, settled, unknowns = fit.minimum.units, bool(fit.minimum.settled), problem.unknowns
+    units, settled, unknowns = (
+        fit.minimum.units,
+        bool(fit.minimum.settled),
+        problem.unknowns,
+    )
     left = _what_is_left(problem, fit, known, residuals)
     apart = _scatter_of_trials(known, np.any(fit.kept > 0, axis=1), units)
     apart = apart / np.sqrt(left.inflation)
     misfit = left.misfit or np.any(apart > _DISAGREEING)
-    covariance = left.inflation * _with_larger_errors(known, np.maximum(apart, 1.0), units)
+    covariance = left.inflation * _with_larger_errors(
+        known, np.maximum(apart, 1.0), units
+    )
     if fit.probed_error > 0:
         covariance = _with_error(unknowns.judged, covariance, units, fit.probed_error)
     pure = quality.is_pure(problem, fit, left.inflation)
@@ -518,12 +581,16 @@ def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray)
         status = "NOT_CONVERGED"
     elif misfit:
         follows = unexplained <= quality.FOLLOWED and not flat
-        status = "MISFIT" if follows else ("WRONG_BASIN" if settled else "NOT_CONVERGED")
+        status = (
+            "MISFIT" if follows else ("WRONG_BASIN" if settled else "NOT_CONVERGED")
+        )
     elif pure or fit.ambiguous:
         status = "UNIDENTIFIABLE"
     elif flat:
         status = "AT_BOUNDARY"
-    elif largest > LARGEST_ERROR:  # a fit that creeps along what is not determined is good
+    elif (
+        largest > LARGEST_ERROR
+    ):  # a fit that creeps along what is not determined is good
         status = "UNIDENTIFIABLE"
     elif not settled:
         status = "NOT_CONVERGED"
@@ -536,7 +603,7 @@ def _judged(problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray)
         "degrees_of_freedom": np.asarray(int(left.freedom)),
         "whiteness": _whiteness(residuals, problem.samples.parts),
         "loudest_band": left.band,
-        "chi_square_by_throw": np.sum(residuals**2, axis=(1, 2)) / seen,
+        "chi_square_by_trial": np.sum(residuals**2, axis=(1, 2)) / seen,
         "inflation": np.asarray(left.inflation),
         "unexplained": np.asarray(unexplained),
         "pure_spin": np.asarray(pure),

@@ -1,11 +1,11 @@
 """A record's innovations: what each sample adds to what the samples before it foretold.
 
-Where an unknown torque pushes the body, the residuals of a smooth path through the record are no
-independent numbers; the innovations of a Kalman filter are. The filter runs over residuals and,
-with the same gains, over their derivatives in a trial's first state, its own numbers and the
-numbers of all trials: what comes out are rows of an ordinary least-squares problem, and the
-log determinant that completes their likelihood (P. de Jong, "The diffuse Kalman filter", Annals of
-Statistics 19, 1991).
+Where an unknown torque pushes the body, the residuals of a smooth path through the
+record are no independent numbers; the innovations of a Kalman filter are. The filter
+runs over residuals and, with the same gains, over their derivatives in a trial's first
+state, its own numbers and the numbers of all trials: what comes out are rows of an
+ordinary least-squares problem, and the log determinant that completes their likelihood
+(P. de Jong, "The diffuse Kalman filter", Annals of Statistics 19, 1991).
 """
 
 from typing import Any, NamedTuple
@@ -29,8 +29,8 @@ class Linearised(NamedTuple):
         tensor: The inertia.
         rows: Residuals of the samples and their derivatives.
         links: Gaps between states and their derivatives, without the torque.
-        weight: Of each sample (throws, samples).
-        own: Numbers of each trial's own (throws, own).
+        weight: Of each sample (trials, samples).
+        own: Numbers of each trial's own (trials, own).
     """
 
     layout: Layout
@@ -45,8 +45,8 @@ class Innovations(NamedTuple):
     """Innovations of all samples, in units of what was expected of them.
 
     Attributes:
-        rows: (throws, samples, degrees, columns): first the innovations, then their derivatives in
-            the first state, the trial's own numbers and the numbers.
+        rows: (trials, samples, degrees, columns): first the innovations, then their
+            derivatives in the first state, the trial's own numbers and the numbers.
         log_determinant: Of the covariance expected, of each trial.
     """
 
@@ -66,7 +66,9 @@ class OfTrials(NamedTuple):
     alone: Any
 
 
-def _of_trial(rows: Rows, links: Links, weight: Array, push: Push) -> tuple[Array, Array]:
+def _of_trial(
+    rows: Rows, links: Links, weight: Array, push: Push
+) -> tuple[Array, Array]:
     """Innovations of one trial, whose states hold the torque."""
     local = links.gap.shape[-1]
     inner = local - 3  # without the torque
@@ -74,7 +76,9 @@ def _of_trial(rows: Rows, links: Links, weight: Array, push: Push) -> tuple[Arra
     # Rows and links are affine in the first state and the border: offsets come first.
     root = jnp.sqrt(weight)[:, None, None]
     still = jnp.zeros((*rows.residual.shape, inner), dtype)
-    offsets = jnp.concatenate([rows.residual[..., None], still, rows.of_border], axis=-1)
+    offsets = jnp.concatenate(
+        [rows.residual[..., None], still, rows.of_border], axis=-1
+    )
     still = jnp.zeros((*links.gap.shape, inner), dtype)
     gaps = jnp.concatenate([links.gap[..., None], still, links.of_border], axis=-1)
     columns = offsets.shape[-1]
@@ -91,7 +95,9 @@ def _of_trial(rows: Rows, links: Links, weight: Array, push: Push) -> tuple[Arra
         offset, shown, moves, link = sample
         of_state = links.of_state[link]
         ahead = product("ij,jc->ic", of_state, state) + gaps[link]
-        wider = product("ij,jk,lk->il", of_state, spread, of_state) + push.covariance[link]
+        wider = (
+            product("ij,jk,lk->il", of_state, spread, of_state) + push.covariance[link]
+        )
         state = jnp.where(moves, ahead, state)
         spread = jnp.where(moves, wider, spread)
         logs = jnp.zeros((), dtype)
@@ -133,17 +139,23 @@ def innovations(record: Linearised, torque: Disturbance) -> Innovations:
 
 @program
 def likelihood(
-    record: Linearised, prior: Any, freedom: Any, noise_known: Any, levels: Any, times: Any,
+    record: Linearised,
+    prior: Any,
+    freedom: Any,
+    noise_known: Any,
+    levels: Any,
+    times: Any,
     trials: Any,
-) -> tuple[tuple[Array, OfTrials], tuple[Array, Array, Array]]:  # fmt: skip
+) -> tuple[tuple[Array, OfTrials], tuple[Array, Array, Array]]:
     """-2 log likelihood of a torque, of the record and of each trial, and the former's derivatives.
 
     Args:
         record: Where it was linearised.
-        prior: Products of the columns of what is known beforehand (throws, columns, columns).
+        prior: Products of the columns of what is known beforehand (trials, columns,
+            columns).
         freedom: Numbers of the record less those sought.
-        noise_known: Whether the noise is what was stated; else it is as large as makes the record
-            most likely.
+        noise_known: Whether the noise is what was stated; else it is as large as makes
+            the record most likely.
         levels: Logarithms of the levels about each axis.
         times: Logarithms of the correlation times.
         trials: Logarithms of each trial's size beside that.
@@ -158,7 +170,9 @@ def likelihood(
         def without_own(products: Array) -> tuple[Array, Array]:
             """Of one trial, its state and own numbers eliminated."""
             inside = slice(1, 1 + own)
-            rest = jnp.concatenate([jnp.arange(1), jnp.arange(1 + own, products.shape[0])])
+            rest = jnp.concatenate(
+                [jnp.arange(1), jnp.arange(1 + own, products.shape[0])]
+            )
             across = products[inside][:, rest]
             solved, log_determinant = solve_positive(products[inside, inside], across)
             return products[rest][:, rest] - across.T @ solved, log_determinant
@@ -178,7 +192,9 @@ def likelihood(
         alone = jax.vmap(at_best_numbers)(left)[0]
         of_trials = OfTrials(left[:, 0, 0] / noise + logs, alone / noise + logs)
         of_noise = freedom * jnp.log(jnp.maximum(chi_square, 1e-30))
-        whole = jnp.where(noise_known, chi_square, of_noise) + jnp.sum(logs) + of_numbers
+        whole = (
+            jnp.where(noise_known, chi_square, of_noise) + jnp.sum(logs) + of_numbers
+        )
         return whole, of_trials
 
     differentiated = jax.value_and_grad(value, argnums=(0, 1, 2), has_aux=True)

@@ -16,8 +16,9 @@ from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import conclude
-from jrigid.identify._flow import depends_on_attitude
+from jrigid.identify._flow import needs_attitude
 from jrigid.identify._host import on_host
+from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor
 from jrigid.identify._inputs import (
     GUESS,
     judge,
@@ -45,19 +46,21 @@ from jrigid.identify._records import (
     Record,
     Samples,
     lengthened,
-    of_throws,
+    of_trials,
     samples_of,
     tells,
 )
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
 from jrigid.identify._search import Case, Effort, Line, no_search, run, search
-from jrigid.identify._shapes import AbstractShape, Tensor
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
-_LENGTHS = {True: 3.0, False: 0.75}  # radians of a segment, of free motion and of forced
+_LENGTHS = {
+    True: 3.0,
+    False: 0.75,
+}  # radians of a segment, of free motion and of forced
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
 _FLAT = 1e-3  # least second moment of a body to start from
@@ -70,7 +73,7 @@ def fit(
     *,
     free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: AbstractShape | None = None,
+    inertia_model: AbstractInertiaModel | None = None,
     start: tuple[Any, State | None] | State | None = None,
     unmodelled: Any = 0.0,
     loss: str = "squares",
@@ -83,61 +86,67 @@ def fit(
 ) -> FitResult:
     r"""Inertia, and what else is asked for, from what was observed of a rotating body.
 
-    No start and no knobs are needed where rates or attitudes were observed: linear equations in the
-    tensor give a start, multiple shooting brings it into the basin of the answer, and
-    Levenberg-Marquardt ends there, with the exact flow where the motion is free.
+    No start and no knobs are needed where rates or attitudes were observed: linear
+    equations in the tensor give a start, multiple shooting brings it into the basin of
+    the answer, and Levenberg-Marquardt ends there, with the exact flow where the motion
+    is free.
 
     Args:
-        system: The body: its torque, and what is known beforehand of the tensor (see `scale` and
-            `shape`); the tensor itself is only a start, and none is needed for a free body. A
-            sequence has one for each throw, of the same kind: its own record of a wheel, say.
-        observations: A `Record` (`Rates`, `Attitudes`, ...); a tuple of several of one motion; or a
-            list with one entry (a tuple, or a single one) for each throw. Records with an axis of
-            throws in front of their times do as well as a list.
-        free: What is sought beside the inertia: a function of the system and the sensors that picks
-            arrays of theirs, `lambda body, gyro: (body.torque.coefficient, gyro.bias)`; of those
-            `prior(array, sigma)` is known beforehand, `each(array)` sought anew in each throw.
-            Drags and what else cannot be negative are kept positive.
-        scale: What sets the scale of the tensor. "trace": nothing does, it keeps the trace of the
-            system's; "known": a torque or a momentum whose size is known; "rotor": the known
-            momentum of a `torques.Rotor`.
-        shape: What is known of the tensor: `Tensor()`, nothing, any real body; `Moments()`,
-            `Symmetric()`, `Top()`, `Flat()`, `Fixed()`, a `LogCholesky` of ten numbers about a
-            fixed point, or one's own.
-        start: Where to start: a `State` at each throw's first sample (`t0` of what is returned), of
-            one throw or with an axis of throws in front; or (inertia or None, State or None).
-            Needed where the attitude matters and was not observed: an attitude nearer than about
-            half a turn will do.
-        unmodelled: A torque that no model has: the level [N m sqrt(s)] of a white one (its spectral
-            density is the level squared), for all body axes or for each; a `GaussMarkov`, which has
-            a memory; or "estimate": of white torques and those with a memory, with levels and
-            times for all axes or for each, and levels in proportion to the spin of a trial or of
-            its own, the one whose likelihood asks for it.
-        loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard deviations
-            are left out, throws with more than a quarter of such samples altogether, and the rest
-            is fitted by squares.
-        absolute_sigma: False: the noise stated is relative, its level is that of the residuals.
-        motion: `(system, state, ts, t0) -> State` in place of the exact flow or `simulate`; it must
-            allow forward mode.
-        doublings: Where no start can be made from the observations, the first 2^-doublings of the
-            record is fitted first, then twice as much, and so on.
+        system: The body: its torque, and what is known beforehand of the tensor (see
+            `scale` and `inertia_model`); the tensor itself is only a start, and none is
+            needed for a free body. A sequence has one for each trial, of the same kind:
+                its own record of a wheel, say.
+        observations: A `Record` (`Rates`, `Attitudes`, ...); a tuple of several of one
+            motion; or a list with one entry (a tuple, or a single one) for each trial.
+            Records with an axis of trials in front of their times do as well as a list.
+        free: What is sought beside the inertia: a function of the system and the
+            sensors that picks arrays of theirs,
+            `lambda body, gyro: (body.torque.coefficient, gyro.bias)`; of those
+            `prior(array, sigma)` is known beforehand, `each(array)` sought anew in each
+            trial. Drags and what else cannot be negative are kept positive.
+        scale: What sets the scale of the tensor. "trace": nothing does, it keeps the
+            trace of the system's; "known": a torque or a momentum whose size is known;
+            "rotor": the known momentum of a `torques.Rotor`.
+        inertia_model: What is known of the tensor: `Tensor()`, nothing, any real body;
+            `Moments()`, `Symmetric()`, `Top()`, `Flat()`, `Fixed()`, a `LogCholesky` of
+            ten numbers about a fixed point, or one's own.
+        start: Where to start: a `State` at each trial's first sample (`t0` of what is
+            returned), of one trial or with an axis of trials in front; or (inertia or
+            None, State or None). Needed where the attitude matters and was not
+            observed: an attitude nearer than about half a turn will do.
+        unmodelled: A torque that no model has: the level [N m sqrt(s)] of a white one
+            (its spectral density is the level squared), for all body axes or for each;
+            a `GaussMarkov`, which has a memory; or "estimate": of white torques and
+            those with a memory, with levels and times for all axes or for each, and
+            levels in proportion to the spin of a trial or of its own, the one whose
+            likelihood asks for it.
+        loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard
+            deviations are left out, trials with more than a quarter of such samples
+            altogether, and the rest is fitted by squares.
+        absolute_sigma: False: the noise stated is relative, its level is that of the
+            residuals.
+        motion: `(system, state, ts, t0) -> State` in place of the exact flow or
+            `simulate`; it must allow forward mode.
+        doublings: Where no start can be made from the observations, the first
+            2^-doublings of the record is fitted first, then twice as much, and so on.
         max_steps: Steps of the last stage.
-        progress: Print each stage as it ends. None: where the standard error is a terminal, show
-            it there from two seconds on, in a bar if tqdm is installed.
-        throw: True: bad input, and fits that end WRONG_BASIN or NOT_CONVERGED, are errors. False:
-            they are results with that status (bad input: of NaN).
+        progress: Print each stage as it ends. None: where the standard error is a
+            terminal, show it there from two seconds on, in a bar if tqdm is installed.
+        throw: True: bad input, and fits that end WRONG_BASIN or NOT_CONVERGED, are
+            errors. False: they are results with that status (bad input: of NaN).
 
     Returns:
-        What was found, with errors, and what the record does not tell; `print` it. Its `state` is
-        at its `t0`, the first sample of each throw: `state0, t0 = found.start()` hands out both.
+        What was found, with errors, and what the record does not tell; `print` it. Its
+        `state` is at its `t0`, the first sample of each trial:
+        `state0, t0 = found.initial_state()` hands out both.
 
     Raises:
         ValueError: A request that no record could answer.
         RuntimeError: A failed fit.
 
     Gradients: none to be relied on; `residuals` and `Plan.bound` have theirs.
-    Source: H. G. Bock, multiple shooting (1983); J. J. More, Levenberg-Marquardt (1978);
-    docs/identify.md.
+    Source: H. G. Bock, multiple shooting (1983); J. J. More, Levenberg-Marquardt
+    (1978); docs/identify.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -149,7 +158,16 @@ def fit(
     ('overall scale',)
     """
     request = _asked(
-        system, observations, free, scale, shape, start, unmodelled, loss, absolute_sigma, motion
+        system,
+        observations,
+        free,
+        scale,
+        inertia_model,
+        start,
+        unmodelled,
+        loss,
+        absolute_sigma,
+        motion,
     )
     with _reporter(progress) as report:
         (fields,) = _fits([request], Effort(max_steps, doublings, report), throw)
@@ -162,7 +180,7 @@ def fit_each(
     *,
     free: Callable[..., Any] | None = None,
     scale: str = "trace",
-    shape: AbstractShape | None = None,
+    inertia_model: AbstractInertiaModel | None = None,
     start: Sequence[Any] | None = None,
     unmodelled: Any = 0.0,
     loss: str = "squares",
@@ -174,15 +192,16 @@ def fit_each(
 ) -> FitResult:
     """Fit each of many records, which share compiled programs and run side by side.
 
-    It is `fit` in a loop, with the same results, in a fraction of the time: for studies of
-    coverage, or a catalogue of bodies. Records may differ in length.
+    It is `fit` in a loop, with the same results, in a fraction of the time: for studies
+    of coverage, or a catalogue of bodies. Records may differ in length.
 
     Args:
-        system: The body for all fits; or a sequence of what `fit` takes, once for each fit.
+        system: The body for all fits; or a sequence of what `fit` takes, once for each
+            fit.
         observations: What `fit` takes, once for each fit; the same sensors in all.
         free: As for `fit`.
         scale: As for `fit`.
-        shape: As for `fit`.
+        inertia_model: As for `fit`.
         start: What `fit` takes, once for each fit.
         unmodelled: As for `fit`.
         loss: As for `fit`.
@@ -193,11 +212,12 @@ def fit_each(
         throw: True: the first fit that fails is an error. False: it has its status.
 
     Returns:
-        One result whose arrays have an axis of fits in front. `residuals`, `kept` and `jacobian`
-        are as long as the longest record.
+        One result whose arrays have an axis of fits in front. `residuals`, `kept` and
+        `jacobian` are as long as the longest record.
 
     Raises:
-        ValueError: A request that no record could answer, or records of different kinds.
+        ValueError: A request that no record could answer, or records of different
+            kinds.
 
     Gradients: none.
 
@@ -210,7 +230,9 @@ def fit_each(
     >>> print(found.ratios.shape, found)
     (4, 2) 4 fits: 4 OK
     """
-    demand(len(observations) > 0, "Argument `observations` must not be empty, but it is.")
+    demand(
+        len(observations) > 0, "Argument `observations` must not be empty, but it is."
+    )
     count = len(observations)
     systems = [system] * count if isinstance(system, RigidBody) else system
     starts = [None] * count if start is None else start
@@ -220,7 +242,18 @@ def fit_each(
         f"{count} fits, but they have {len(systems)} and {len(starts)}.",
     )
     requests = [
-        _asked(x, y, free, scale, shape, z, unmodelled, loss, absolute_sigma, motion)
+        _asked(
+            x,
+            y,
+            free,
+            scale,
+            inertia_model,
+            z,
+            unmodelled,
+            loss,
+            absolute_sigma,
+            motion,
+        )
         for x, y, z in zip(systems, observations, starts, strict=True)
     ]
     found = _fits(requests, Effort(max_steps, doublings), throw)
@@ -268,7 +301,7 @@ class _Asked(NamedTuple):
     torque: GaussMarkov
     free: Callable[..., Any] | None
     scale: str
-    shape: AbstractShape
+    inertia_model: AbstractInertiaModel
 
 
 def _asked(
@@ -276,7 +309,7 @@ def _asked(
     observations: Any,
     free: Callable[..., Any] | None,
     scale: str,
-    shape: AbstractShape | None,
+    inertia_model: AbstractInertiaModel | None,
     start: Any,
     unmodelled: Any,
     loss: str,
@@ -284,14 +317,14 @@ def _asked(
     motion: Callable[..., State] | None,
 ) -> _Asked:
     """Check options and shapes of arguments; ValueError for what no record could answer."""
-    records = of_throws(observations)
-    throws = records[0].ts.shape[0]
-    shape = Tensor() if shape is None else shape
-    systems = systems_of(system, throws)
-    check_type("shape", shape, AbstractShape)
+    records = of_trials(observations)
+    trials = records[0].ts.shape[0]
+    inertia_model = Tensor() if inertia_model is None else inertia_model
+    systems = systems_of(system, trials)
+    check_type("inertia_model", inertia_model, AbstractInertiaModel)
     check_option("loss", loss, ("squares", "robust"))
-    refuse(systems[0], records, scale, shape)
-    tensor, state = start_of(start, throws)
+    refuse(systems[0], records, scale, inertia_model)
+    tensor, state = start_of(start, trials)
     stated = all(x.states_noise for x in records)
     kind, torque = _torque(unmodelled, absolute_sigma and stated)
     demand(
@@ -301,14 +334,17 @@ def _asked(
     )
     options = Options(
         free_motion=systems[0].is_free and motion is None,
-        on_attitude=any(x.sensor.on_attitude for x in records) or depends_on_attitude(systems[0]),
+        depends_on_attitude=any(x.sensor.depends_on_attitude for x in records)
+        or needs_attitude(systems[0]),
         unmodelled=kind,
         robust=loss == "robust",
         noise_known=absolute_sigma and stated,
         motion=motion,
     )
     options = options._replace(shooting=_shoots(options, systems[0], records, state))
-    return _Asked(systems, records, options, tensor, state, torque, free, scale, shape)
+    return _Asked(
+        systems, records, options, tensor, state, torque, free, scale, inertia_model
+    )
 
 
 def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
@@ -334,12 +370,15 @@ def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
 
 
 def _shoots(
-    options: Options, system: RigidBody, records: tuple[Record, ...], state: State | None
+    options: Options,
+    system: RigidBody,
+    records: tuple[Record, ...],
+    state: State | None,
 ) -> bool:
     """Whether each segment has a state of its own; ValueError for a fit that cannot be begun."""
     by_attitude = any(tells(x, "attitude") for x in records)
     demand(
-        not options.on_attitude or state is not None or by_attitude,
+        not options.depends_on_attitude or state is not None or by_attitude,
         "Argument `start` must hold a State whose attitude the fit can start from, since the "
         "motion or an observation depends on the attitude and none was observed, but it does not.",
     )
@@ -385,7 +424,9 @@ def _observed(
     if told is not None:
         angle = float(np.max(angle_turned(told)[:, -1]))
         coarse = longest_turn(told) > np.pi
-    return _Observed(samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate))
+    return _Observed(
+        samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate)
+    )
 
 
 class _Begun(NamedTuple):
@@ -409,12 +450,14 @@ def _begun(
 ) -> _Begun:
     """Where the search begins."""
     told, samples = observed.told, observed.samples
-    throws, dtype = samples.ts.shape[0], samples.ts.dtype
+    trials, dtype = samples.ts.shape[0], samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
-    unknowns, numbers = unknowns.starts(tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1))
+    unknowns, numbers = unknowns.starts(
+        tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1)
+    )
     unknowns = on_host(unknowns)
     single = cut = whole(samples, options.nodes)
-    attitude = np.zeros((throws, options.nodes, 4), dtype)
+    attitude = np.zeros((trials, options.nodes, 4), dtype)
     attitude[..., 0] = 1
     if options.shooting and told is not None:
         cut, opening = segments(samples, told, options.nodes, length)
@@ -423,11 +466,13 @@ def _begun(
     else:
         assert state is not None
         omega, attitude = (
-            np.broadcast_to(x.astype(dtype)[:, None], (throws, options.nodes, x.shape[-1]))
+            np.broadcast_to(
+                x.astype(dtype)[:, None], (trials, options.nodes, x.shape[-1])
+            )
             for x in (state.omega, state.attitude)
         )
     torque = np.zeros_like(omega if options.dense else omega[..., :0])
-    own = unknowns.own_start(throws, dtype)
+    own = unknowns.own_start(trials, dtype)
     point = Point(numbers[0], own, attitude, omega, torque)
     return _Begun(unknowns, numbers, single, cut, point, tensors[0])
 
@@ -441,7 +486,7 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
         records = tuple(lengthened(x) for x in records)
     dtype = records[0].values.dtype
     attitude0 = None
-    if state is not None and options.on_attitude:
+    if state is not None and options.depends_on_attitude:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
     result = judge(asked.systems, records, tensor, state, observed.told, throw)
@@ -454,8 +499,8 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
         tuple(x.sensor for x in records),
         observed.sizes,
         asked.free,
-        on_host(asked.shape),
-        asked.scale != "trace" and not asked.shape.absolute,
+        on_host(asked.inertia_model),
+        asked.scale != "trace" and not asked.inertia_model.absolute,
         observed.rate,
         records[0].ts.shape[0],
     )
@@ -485,11 +530,17 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     return case, result
 
 
-def _fits(requests: Sequence[_Asked], effort: Effort, throw: bool) -> list[dict[str, Any]]:
+def _fits(
+    requests: Sequence[_Asked], effort: Effort, throw: bool
+) -> list[dict[str, Any]]:
     """Fit records side by side: the fields of each result."""
     cases = [_case(x, effort, throw) for x in requests]
-    searches = [search(case) if is_good(result) else no_search(case) for case, result in cases]
-    lengths = [max(x) for x in zip(*(_lengths(y.records) for y in requests), strict=True)]
+    searches = [
+        search(case) if is_good(result) else no_search(case) for case, result in cases
+    ]
+    lengths = [
+        max(x) for x in zip(*(_lengths(y.records) for y in requests), strict=True)
+    ]
     results = []
     for (case, input_result), found in zip(cases, run(searches), strict=True):
         fields = conclude(case.problem, found, lengths, input_result)

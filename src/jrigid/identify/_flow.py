@@ -1,8 +1,9 @@
 """Where a body is some time later, with derivatives made for least squares.
 
-The free motion's derivative in a tensor is put together from the one in moments and rates, which
-takes a tenth of the time of `free_rotation`'s, whose every digit holds at repeated moments: moments
-nearer than a ten-millionth are taken that far apart, in the derivatives alone.
+The free motion's derivative in a tensor is put together from the one in moments and
+rates, which takes a tenth of the time of `free_rotation`'s, whose every digit holds at
+repeated moments: moments nearer than a ten-millionth are taken that far apart, in the
+derivatives alone.
 """
 
 from typing import Any
@@ -59,14 +60,22 @@ def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
     # Off the diagonal a change of the tensor turns the principal axes.
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     a, b, c = moments
-    turn = jnp.stack([inside[1, 2] / (b - c), inside[2, 0] / (c - a), inside[0, 1] / (a - b)])
-    columns = jnp.concatenate([jnp.diagonal(inside), omega_change - jnp.cross(turn, omega)])
-    p_change, w_change = (product("ij,j->i", x, columns) for x in (p_columns, w_columns))
+    turn = jnp.stack(
+        [inside[1, 2] / (b - c), inside[2, 0] / (c - a), inside[0, 1] / (a - b)]
+    )
+    columns = jnp.concatenate(
+        [jnp.diagonal(inside), omega_change - jnp.cross(turn, omega)]
+    )
+    p_change, w_change = (
+        product("ij,j->i", x, columns) for x in (p_columns, w_columns)
+    )
     vector = p_change[1:] + jnp.cross(turn, p[1:])
     p_change = jnp.concatenate([p_change[:1], vector]) + t_change * attitude_rate(p, w)
     slope = jnp.cross(moments * w, w) / moments
     w_change = w_change + jnp.cross(turn, w) + t_change * slope
-    return from_principal_axes(axes, p, w), from_principal_axes(axes, p_change, w_change)
+    return from_principal_axes(axes, p, w), from_principal_axes(
+        axes, p_change, w_change
+    )
 
 
 def forced_flow(
@@ -74,34 +83,34 @@ def forced_flow(
     state: State,
     t0: Array,
     t1: Array,
-    on_attitude: bool,
+    depends_on_attitude: bool,
     method: Method = ONE_STEP,
     steps: int = 1,
 ) -> State:
     """State at t1, later or earlier than t0, by equal steps without an error estimate.
 
-    The default is one step, for a part of a turn. Where nothing depends on the attitude,
-    the attitude stays as it is.
+    The default is one step, for a part of a turn. Where nothing depends on the
+    attitude, the attitude stays as it is.
 
     Gradients: in every mode, of every order.
     """
 
     def rates(t: Array, y: Array) -> Array:
-        attitude = y[:4] if on_attitude else state.attitude
+        attitude = y[:4] if depends_on_attitude else state.attitude
         slope = system.vector_field(t, State(attitude, y[-3:]), None)
-        if not on_attitude:
+        if not depends_on_attitude:
             return slope.omega
         return jnp.concatenate([slope.attitude, slope.omega])
 
     start = state.omega
-    if on_attitude:
+    if depends_on_attitude:
         start = jnp.concatenate([state.attitude, state.omega])
     end = equal_steps(method, rates, t0, (t1 - t0) / steps, start, steps)
-    attitude = normalize(end[:4]) if on_attitude else state.attitude
+    attitude = normalize(end[:4]) if depends_on_attitude else state.attitude
     return State(attitude, end[-3:])
 
 
-def depends_on_attitude(system: RigidBody) -> bool:
+def needs_attitude(system: RigidBody) -> bool:
     """Whether the torque looks at the attitude, as far as its program shows."""
 
     def torque(q: Array) -> Array:

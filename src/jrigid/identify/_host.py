@@ -1,8 +1,8 @@
 """Quaternions and small matrices of numpy arrays, which need no compiled programs.
 
-A fit reads its records once, on the host. JAX would compile every operation anew for each
-length of a record, which takes longer than the work itself. Functions of tensors take JAX
-arrays too, for plans, which are traced.
+A fit reads its records once, on the host. JAX would compile every operation anew for
+each length of a record, which takes longer than the work itself. Functions of tensors
+take JAX arrays too, for plans, which are traced.
 """
 
 from typing import Any
@@ -63,7 +63,9 @@ def exp(vectors: np.ndarray) -> np.ndarray:
     angle = np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))
     half = 0.5 * angle
     # sin(x / 2) / x, whose error at small angles is below rounding.
-    ratio = np.where(angle > 1e-10, np.sin(half) / np.where(angle > 1e-10, angle, 1.0), 0.5)
+    ratio = np.where(
+        angle > 1e-10, np.sin(half) / np.where(angle > 1e-10, angle, 1.0), 0.5
+    )
     return np.concatenate([np.cos(half), ratio * vectors], axis=-1)
 
 

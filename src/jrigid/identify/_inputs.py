@@ -24,39 +24,45 @@ from jrigid._numerics import or_one, rms, without_gradient
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._compile import small_program
+from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
 from jrigid.identify._layout import Told
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor
-from jrigid.identify._shapes import AbstractShape, as_tensor
 from jrigid.systems import RigidBody
 from jrigid.torques import Rotor, Sampled, SpinningMass, Sum
 
 GUESS = 0.02  # of the size of values, for a noise that is not known
 
 
-def systems_of(system: Any, throws: int) -> tuple[RigidBody, ...]:
-    """One body, or one for each throw."""
+def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
+    """One body, or one for each trial."""
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
         of_flight = " (of a body in flight, rotation about its centre of mass)"
         text = f"Argument `system` must be a RigidBody{of_flight}, but it is {type(x).__name__}."
         demand(isinstance(x, RigidBody), text)
     demand(
-        len(systems) in (1, throws),
-        f"Argument `system` must hold one body for each of {throws} throws, but it holds "
+        len(systems) in (1, trials),
+        f"Argument `system` must hold one body for each of {trials} trials, but it holds "
         f"{len(systems)}.",
     )
-    return _padded(systems) if len(set(map(jtu.tree_structure, systems))) == 1 else systems
+    return (
+        _padded(systems) if len(set(map(jtu.tree_structure, systems))) == 1 else systems
+    )
 
 
 def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
-    """With samples of one length where those of throws differ."""
+    """With samples of one length where those of trials differ."""
     is_sampled = lambda x: isinstance(x, Sampled)  # noqa: E731
-    leaves, trees = zip(*(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True)
+    leaves, trees = zip(
+        *(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True
+    )
 
     def alike(*column: Any) -> list[Any]:
         counts = [x.ts.size if is_sampled(x) else 0 for x in column]
-        return [_longer(x, max(counts) - n) for x, n in zip(column, counts, strict=True)]
+        return [
+            _longer(x, max(counts) - n) for x, n in zip(column, counts, strict=True)
+        ]
 
     columns = map(alike, *leaves)
     return tuple(map(jtu.tree_unflatten, trees, zip(*columns, strict=True)))
@@ -69,9 +75,11 @@ def _longer(function: Any, count: int) -> Any:
     return eqx.tree_at(arrays, function, replace_fn=longer) if count else function
 
 
-def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
-    """The tensor to start from, if one is given, and the state of each throw."""
-    inertia, state = start if isinstance(start, tuple) and len(start) == 2 else (None, start)
+def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
+    """The tensor to start from, if one is given, and the state of each trial."""
+    inertia, state = (
+        start if isinstance(start, tuple) and len(start) == 2 else (None, start)
+    )
     inertia = inertia.inertia if isinstance(inertia, RigidBody) else inertia
     demand(
         state is None or isinstance(state, State),
@@ -79,23 +87,28 @@ def start_of(start: Any, throws: int) -> tuple[Any, State | None]:
         f"None), but it is {start!r}.",
     )
     if isinstance(state, State):
-        attitude = jnp.broadcast_to(state.attitude, (throws, 4))
-        state = State(attitude, jnp.broadcast_to(state.omega, (throws, 3)))
+        attitude = jnp.broadcast_to(state.attitude, (trials, 4))
+        state = State(attitude, jnp.broadcast_to(state.omega, (trials, 3)))
     return None if inertia is None else as_tensor(jnp.asarray(inertia)), state  # type: ignore[return-value]
 
 
-def refuse(system: RigidBody, records: Sequence[Record], scale: str, shape: AbstractShape) -> None:
+def refuse(
+    system: RigidBody,
+    records: Sequence[Record],
+    scale: str,
+    inertia_model: AbstractInertiaModel,
+) -> None:
     """ValueError for a scale that nothing tells, and numbers that hold it without one."""
     check_option("scale", scale, ("trace", "known", "rotor"))
     demand(
-        not (shape.absolute and shape.names and scale == "trace"),
-        f"Argument `scale` must be 'known' or 'rotor' where `shape` is a {type(shape).__name__}, "
-        "whose numbers hold the scale, but it is 'trace'.",
+        not (inertia_model.absolute and inertia_model.names and scale == "trace"),
+        "Argument `scale` must be 'known' or 'rotor' where `inertia_model` is a "
+        f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is 'trace'.",
     )
     terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
     has_rotor = any(isinstance(x, Rotor | SpinningMass) for x in terms)
     demand(
-        scale != "trace" or not has_rotor or shape.absolute,
+        scale != "trace" or not has_rotor or inertia_model.absolute,
         "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose momentum sets "
         "the scale of the tensor, but it is 'trace', which would keep the trace of `system`.",
     )
@@ -106,7 +119,7 @@ def refuse(system: RigidBody, records: Sequence[Record], scale: str, shape: Abst
     )
     momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
     demand(
-        scale != "known" or not system.is_free or momenta or shape.absolute,
+        scale != "known" or not system.is_free or momenta or inertia_model.absolute,
         "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
         "motion tells ratios of the moments, never their scale.",
     )
@@ -128,11 +141,15 @@ def sizes_of(samples: Samples) -> tuple[AnyArray, ...]:
     return tuple(rms(values, samples.seen[:, part]) for values, part in pairs)
 
 
-def noise_of(records: tuple[Record, ...], samples: Samples, rate: AnyArray) -> np.ndarray:
+def noise_of(
+    records: tuple[Record, ...], samples: Samples, rate: AnyArray
+) -> np.ndarray:
     """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
     white = np.diagonal(samples.whitener, axis1=-2, axis2=-1)
     sigma = np.where(samples.weight > 0, 1 / or_one(white), np.nan)
-    pairs = [(x, _median(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)]
+    pairs = [
+        (x, _median(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)
+    ]
     rates = [median for x, median in pairs if tells(x, "rates")]
     angles = [median for x, median in pairs if x.sensor.unit_length]
     angle = [*angles, *(x / rate for x in rates), GUESS][0]
@@ -147,12 +164,16 @@ def _median(x: np.ndarray) -> np.floating:
 
 
 @small_program
-def result_of_start(systems: tuple[RigidBody, ...], tensor: Any, state: State | None) -> Any:
+def result_of_start(
+    systems: tuple[RigidBody, ...], tensor: Any, state: State | None
+) -> Any:
     """The result code of `findings_of_start`."""
     return findings_of_start(systems, tensor, state).result
 
 
-def findings_of_start(systems: tuple[RigidBody, ...], tensor: Any, state: State | None) -> Findings:
+def findings_of_start(
+    systems: tuple[RigidBody, ...], tensor: Any, state: State | None
+) -> Findings:
     """What is wrong with the values of the systems and the start."""
     findings = Findings()
     for system in systems:
@@ -161,7 +182,9 @@ def findings_of_start(systems: tuple[RigidBody, ...], tensor: Any, state: State 
         findings.require(is_inertia(tensor), RESULTS.invalid_inertia)
     if state is not None:
         findings.require(all_finite(state), RESULTS.invalid_state)
-        findings.require(jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude)
+        findings.require(
+            jnp.all(jax.vmap(is_unit)(state.attitude)), RESULTS.invalid_attitude
+        )
     return findings
 
 
@@ -176,9 +199,13 @@ def findings_of_records(records: tuple[Record, ...], told: Told | None) -> Findi
 
 
 def judge(
-    systems: tuple[RigidBody, ...], records: tuple[Record, ...], tensor: Any, state: State | None,
-    told: Told | None, throw: bool,
-) -> Any:  # fmt: skip
+    systems: tuple[RigidBody, ...],
+    records: tuple[Record, ...],
+    tensor: Any,
+    state: State | None,
+    told: Told | None,
+    throw: bool,
+) -> Any:
     """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`."""
     result = result_of_start(systems, tensor, state)
     if not is_good(result):

@@ -1,8 +1,9 @@
 """The unmodelled torque that a record makes most likely: its levels and correlation times.
 
-The likelihood is that of the innovations, restricted to what the states and numbers leave open
-(REML). It is smooth in the logarithms of levels and times, and little is asked of it: where the
-record was linearised once, many torques are tried without another evaluation of the motion.
+The likelihood is that of the innovations, restricted to what the states and numbers
+leave open (REML). It is smooth in the logarithms of levels and times, and little is
+asked of it: where the record was linearised once, many torques are tried without
+another evaluation of the motion.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,9 @@ _ROUNDS = 40
 _HIGHEST = 30.0  # logarithm of a level, in units of the first, that no record asks for
 _TRIED = 2.0  # logarithm of a time to begin with, in units of the shortest
 _GAIN = 2.0  # of -2 log likelihood, for each number more (Akaike)
-_FOREIGN = 30.0  # fall of -2 log likelihood, beyond one for each number, for another body
+_FOREIGN = (
+    30.0  # fall of -2 log likelihood, beyond one for each number, for another body
+)
 _FEWEST = 5  # trials that show which of them is of another body
 _MOST_FOREIGN = 0.25  # of all trials: beyond, nobody knows who is foreign
 _SPREAD = 0.7  # of the logarithms of trials' levels, as far as is known beforehand
@@ -55,7 +58,8 @@ class Torque(NamedTuple):
     Attributes:
         form: Which numbers there are.
         numbers: Logarithms of levels and of times.
-        trials: Of the size of the torque in each trial, beside that of others (throws,).
+        trials: Of the size of the torque in each trial, beside that of others
+            (trials,).
         own_sizes: Whether these were sought, too.
         minus_two_log_likelihood: Of the record; infinite where it was not computed.
     """
@@ -111,8 +115,8 @@ class Likelihood:
         record = linearised(fit)
         inner = record.links.gap.shape[-1]
         prior = columns_of_prior(fit)
-        throws, unknown = record.weight.shape[0], fit.minimum.point.numbers.size
-        unknown += throws * (inner + record.own.shape[-1])
+        trials, unknown = record.weight.shape[0], fit.minimum.point.numbers.size
+        unknown += trials * (inner + record.own.shape[-1])
         freedom = max(float(np.sum(weights_of(problem, fit.kept))) - unknown, 1.0)
         self._dtype = record.tensor.dtype
         self._arguments = (
@@ -133,14 +137,16 @@ class Likelihood:
         of_levels, of_times, of_trials = slopes
         slope = [np.sum(of_levels, keepdims=True) if form.levels == 1 else of_levels]
         if form.times:
-            slope.append(np.sum(of_times, keepdims=True) if form.times == 1 else of_times)
+            slope.append(
+                np.sum(of_times, keepdims=True) if form.times == 1 else of_times
+            )
         return float(value), np.concatenate(slope), of_trials
 
     def as_of_another_body(self, torque: Torque) -> np.ndarray:
         """By how much -2 log likelihood of each trial falls with numbers of its own.
 
-        The torque in it has the size that suits the trial best in either case, so that a trial
-        with a larger torque is not taken for one of another body.
+        The torque in it has the size that suits the trial best in either case, so that
+        a trial with a larger torque is not taken for one of another body.
         """
         sizes = np.linspace(-2.0, 2.0, 9)[:, None] + torque.trials
         found = [self._found(torque.form, torque.numbers, x)[0][1] for x in sizes]
@@ -163,7 +169,11 @@ Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 def descend(
-    function: Function, x: np.ndarray, low: np.ndarray, high: np.ndarray, inverse: np.ndarray
+    function: Function,
+    x: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    inverse: np.ndarray,
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Minimise a smooth function within bounds: BFGS with a backtracking search along its steps.
 
@@ -219,21 +229,24 @@ class Search:
         end = np.where(layout.linked, layout.end, -np.inf).max(axis=1)
         duration = np.max(end - layout.start[:, 0], initial=0.0)
         self._first = np.log(first)
-        # A memory shorter than a step is none; one longer than the record, a constant torque.
+        # A memory shorter than a step is none; one longer than the record, a constant
+        # torque.
         step = float(np.min(span, initial=1e9))
         self._shortest = np.log(0.2 * step)
         self._longest = np.log(max(duration, step))
 
-    def start(self, level: float, throws: int) -> Torque:
+    def start(self, level: float, trials: int) -> Torque:
         """White torque of a level about all axes."""
-        return Torque(Form(1, 0), np.log(np.full(1, level)), np.zeros(throws))
+        return Torque(Form(1, 0), np.log(np.full(1, level)), np.zeros(trials))
 
     def improved(self, torque: Torque, fit: Fit) -> Torque:
         """The most likely torque of the same form at a fit; its sizes in trials stay."""
         return self._descended(torque, Likelihood(self._problem, fit))
 
     def _bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
-        low = [self._first + np.log(FAINT)] * form.levels + [self._shortest] * form.times
+        low = [self._first + np.log(FAINT)] * form.levels + [
+            self._shortest
+        ] * form.times
         high = [self._first + _HIGHEST] * form.levels + [self._longest] * form.times
         return np.array(low), np.array(high)
 
@@ -291,15 +304,17 @@ class Search:
         levels, times = np.split(torque.numbers, [torque.form.levels])
         levels = np.resize(levels, form.levels)
         if not times.size:
-            times = np.full(1, min(self._shortest + _TRIED, 0.5 * (self._shortest + self._longest)))
+            times = np.full(
+                1, min(self._shortest + _TRIED, 0.5 * (self._shortest + self._longest))
+            )
         times = np.resize(times, form.times)
         return torque._replace(form=form, numbers=np.concatenate([levels, times]))
 
     def _with_trials(self, torque: Torque, likelihood: Likelihood) -> Torque:
         """With a size of its own in each trial, if that is more likely.
 
-        Sizes are known beforehand to be alike within a factor; what this costs in likelihood is
-        counted by Laplace's method.
+        Sizes are known beforehand to be alike within a factor; what this costs in
+        likelihood is counted by Laplace's method.
         """
         size, start, precision = torque.form.size, torque.trials, 1 / _SPREAD**2
 
@@ -309,23 +324,29 @@ class Search:
             slopes[1] = slopes[1] + 2 * precision * own
             return value + precision * float(np.sum(own**2)), np.concatenate(slopes)
 
-        throws = start.size
+        trials = start.size
         low, high = self._bounds(torque.form)
-        low = np.concatenate([low, np.full(throws, -_HIGHEST)])
-        high = np.concatenate([high, np.full(throws, _HIGHEST)])
-        x = np.concatenate([torque.numbers, np.zeros(throws)])
-        scale = np.concatenate([np.full(size, 1.0), np.full(throws, float(throws))])
+        low = np.concatenate([low, np.full(trials, -_HIGHEST)])
+        high = np.concatenate([high, np.full(trials, _HIGHEST)])
+        x = np.concatenate([torque.numbers, np.zeros(trials)])
+        scale = np.concatenate([np.full(size, 1.0), np.full(trials, float(trials))])
         x, at, _ = descend(function, x, low, high, np.diag(scale / likelihood.kicks))
         # Trials hardly know of each other: moving all shows how each bends.
-        move = np.concatenate([np.zeros(size), np.full(throws, _DIFFERENCE)])
-        bend = (function(x + move)[1] - function(x - move)[1])[size:] / (2 * _DIFFERENCE)
+        move = np.concatenate([np.zeros(size), np.full(trials, _DIFFERENCE)])
+        bend = (function(x + move)[1] - function(x - move)[1])[size:] / (
+            2 * _DIFFERENCE
+        )
         cost = float(np.sum(np.log(np.maximum(bend / (2 * precision), 1.0))))
         if torque.minus_two_log_likelihood - at < cost:
             return torque
         own = x[size:]
         at = likelihood(torque.form, x[:size], start + own)[0]
         return Torque(
-            torque.form, x[:size], start + own, own_sizes=True, minus_two_log_likelihood=at
+            torque.form,
+            x[:size],
+            start + own,
+            own_sizes=True,
+            minus_two_log_likelihood=at,
         )
 
     def foreign(self, torque: Torque, fit: Fit) -> np.ndarray:

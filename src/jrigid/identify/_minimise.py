@@ -1,8 +1,9 @@
 """The compiled part of a fit: Levenberg-Marquardt for many records, or attempts, at once.
 
-`minimise` is the one program that a fit of a record needs. All its arguments have an axis of
-lanes in front; a lane is a record, or one attempt at a record. Which minimisation comes next,
-and what follows from one, is decided in Python: see `_search.py`.
+`minimise` is the one program that a fit of a record needs. All its arguments have an
+axis of lanes in front; a lane is a record, or one attempt at a record. Which
+minimisation comes next, and what follows from one, is decided in Python: see
+`_search.py`.
 """
 
 from collections.abc import Callable
@@ -29,7 +30,8 @@ from jrigid.identify._smoother import (
 )
 from jrigid.identify._unknowns import Unknowns
 
-STEPS = 400  # at most, of one call: a stage that is cut in two may end elsewhere in a bent valley
+# At most, of one call: a stage that is cut in two may end elsewhere in a bent valley
+STEPS = 400
 FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-12
 _STUCK = 1e8
@@ -40,7 +42,8 @@ class Settings(NamedTuple):
     """What one minimisation is asked for.
 
     Attributes:
-        kept: 1 for each sample that takes part, 0 for one that does not (throws, samples).
+        kept: 1 for each sample that takes part, 0 for one that does not (trials,
+            samples).
         scales: Size of each record's residuals, in units of the noise.
         disturbance: The unmodelled torque, where there is one.
         weight: Of the links, in units of the noise, where there is none.
@@ -68,8 +71,9 @@ class Minimum(NamedTuple):
     Attributes:
         point: Numbers and states.
         rows: Residuals there and their derivatives.
-        links: Gaps between segments and their derivatives, without the unmodelled torque.
-        weight: Of each row (throws, rows).
+        links: Gaps between segments and their derivatives, without the unmodelled
+            torque.
+        weight: Of each row (trials, rows).
         kicks: Sum of squares of the whitened gaps.
         square: Sum of squares of the rows, or what stands for it under Cauchy's loss.
         settled: Whether no step was worth taking any more.
@@ -97,19 +101,21 @@ class Minimum(NamedTuple):
 def of_samples(problem: Problem, of_records: Array) -> Array:
     """Repeat a number of each record for each of its samples."""
     parts = problem.samples.parts
-    repeated = [jnp.broadcast_to(of_records[i], x.stop - x.start) for i, x in enumerate(parts)]
+    repeated = [
+        jnp.broadcast_to(of_records[i], x.stop - x.start) for i, x in enumerate(parts)
+    ]
     return jnp.concatenate(repeated)
 
 
 def weights(
     problem: Problem, layout: Layout, settings: Settings, rows: Rows
 ) -> tuple[Array, Array]:
-    """Weights of rows (throws, n), and their sum of squares, or what stands for it."""
+    """Weights of rows (trials, n), and their sum of squares, or what stands for it."""
     square = jnp.sum(rows.residual**2, axis=-1)
     count = settings.kept.shape[1]
     kept = jnp.where(layout.since <= settings.horizon, settings.kept, 0.0)
-    # Rows of prior knowledge follow those of samples; last come the rows that hold a fit near
-    # its start, which count while only a part of the record takes part.
+    # Rows of prior knowledge follow those of samples; last come the rows that hold a
+    # fit near its start, which count while only a part of the record takes part.
     known = jnp.ones_like(square[:, count:])
     early = jnp.where(settings.horizon < 1, 1.0, 0.0)
     known = known.at[:, known.shape[1] - problem.held :].set(early)
@@ -127,13 +133,17 @@ def weights(
     return jnp.where(soft, weight / (1 + square / bend), weight), total
 
 
-def push_over(problem: Problem, layout: Layout, numbers: Array, settings: Settings) -> Push:
+def push_over(
+    problem: Problem, layout: Layout, numbers: Array, settings: Settings
+) -> Push:
     """What may come between the end of a segment and the start of the next."""
     if problem.options.dense:
         tensor, span = problem.unknowns.inertia(numbers), layout.end - layout.start
-        on_attitude = problem.options.on_attitude
-        return push_of(settings.disturbance, span, layout.linked, tensor, on_attitude)
-    local = 6 if problem.options.on_attitude else 3
+        depends_on_attitude = problem.options.depends_on_attitude
+        return push_of(
+            settings.disturbance, span, layout.linked, tensor, depends_on_attitude
+        )
+    local = 6 if problem.options.depends_on_attitude else 3
     linked = layout.linked.astype(numbers.dtype)
     size = jnp.diag(settings.weight / problem.noise[:local])
     whitener = product("ts,ij->tsij", linked, size)
@@ -179,8 +189,8 @@ def _chosen(which: Array, new: Any, old: Any) -> Any:
 def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array]:
     """The damping after a trial, and by how much it grows if the next trial fails.
 
-    Nielsen's rule: ease it by how well the gain was foretold, and raise it ever faster while
-    steps fail. The first evaluation has nothing to be compared with.
+    Nielsen's rule: ease it by how well the gain was foretold, and raise it ever faster
+    while steps fail. The first evaluation has nothing to be compared with.
     """
     first = jnp.isinf(loop.best.cost)
     gain = jnp.where(first | ~(loop.gain > 0), 1.0, loop.gain)
@@ -194,13 +204,13 @@ def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array
 def _start(problem: Problem, point: Point, settings: Settings) -> _Loop:
     """The loop of one lane before its first evaluation: nothing is known of the point."""
     dtype = point.omega.dtype
-    local = 6 if problem.options.on_attitude else 3
+    local = 6 if problem.options.depends_on_attitude else 3
     still = jnp.zeros((*point.omega.shape[:-1], local), dtype)
     move = jnp.concatenate([still, jnp.zeros_like(point.torque)], axis=-1)
     border = point.own.shape[-1] + point.numbers.shape[-1]
-    throws, samples, width = problem.samples.weight.shape
+    trials, samples, width = problem.samples.weight.shape
     # Shapes as `evaluation` returns them.
-    residual = jnp.zeros((throws, samples + problem.known, width), dtype)
+    residual = jnp.zeros((trials, samples + problem.known, width), dtype)
     rows = Rows(
         residual=residual,
         of_border=jnp.zeros((*residual.shape, border), dtype),
@@ -247,7 +257,9 @@ def _of_one_lane(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @program
-def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings) -> Minimum:
+def minimise(
+    problem: Problem, layout: Layout, point: Point, settings: Settings
+) -> Minimum:
     """Minimise sums of squares by Levenberg-Marquardt; all arguments have lanes in front.
 
     Args:
@@ -256,16 +268,25 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
         point: Where to start.
         settings: What is asked for.
 
-    Source: J. J. More (1978); H. B. Nielsen, "Damping parameter in Marquardt's method" (1999).
+    Source: J. J. More (1978); H. B. Nielsen, "Damping parameter in Marquardt's method"
+        (1999).
     """
     over_lanes = jax.vmap if settings.steps.shape[0] > 1 else _of_one_lane
-    evaluate = over_lanes(lambda problem, layout, point: evaluation(problem, layout)(point))
+    evaluate = over_lanes(
+        lambda problem, layout, point: evaluation(problem, layout)(point)
+    )
     push = over_lanes(push_over)(problem, layout, point.numbers, settings)
     own = point.own.shape[-1]
 
-    def whole(rows: Rows, links: Links, push: Push, torque: Array) -> tuple[Rows, Links]:
+    def whole(
+        rows: Rows, links: Links, push: Push, torque: Array
+    ) -> tuple[Rows, Links]:
         """Rows and links of states that hold the torque, if there is one."""
-        return with_torque(rows, links, push, torque) if torque.shape[-1] else (rows, links)
+        return (
+            with_torque(rows, links, push, torque)
+            if torque.shape[-1]
+            else (rows, links)
+        )
 
     def kicks_of(rows: Rows, links: Links, push: Push, torque: Array) -> Array:
         links = whole(rows, links, push, torque)[1]
@@ -274,7 +295,9 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
 
     def next_step(place: _Place, push: Push, damping: Array) -> Any:
         rows, links = whole(place.rows, place.links, push, place.point.torque)
-        return step_of(blocks_of(rows, links, place.weight, push.whitener), own, damping)
+        return step_of(
+            blocks_of(rows, links, place.weight, push.whitener), own, damping
+        )
 
     def worth(cost: Array) -> Array:
         """The gain below which a step is not worth taking."""
@@ -290,7 +313,9 @@ def minimise(problem: Problem, layout: Layout, point: Point, settings: Settings)
         weight, square = over_lanes(weights)(problem, layout, settings, rows)
         kicks = over_lanes(kicks_of)(rows, links, push, point.torque)
         cost = square + kicks
-        finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(rows.of_border), axis=(1, 2, 3, 4))
+        finite = jnp.isfinite(cost) & jnp.all(
+            jnp.isfinite(rows.of_border), axis=(1, 2, 3, 4)
+        )
         better = loop.going & finite & (cost <= loop.best.cost)
         trial = _Place(point, rows, links, weight, kicks, square, cost)
         best: _Place = _chosen(better, trial, loop.best)

@@ -13,8 +13,8 @@ from jrigid._types import RandomKey
 def _influence(jacobian: Float[Array, "rows params"]) -> Float[Array, "params rows"]:
     """Shift of the fitted parameters for each unit of noise in each row (the pseudo-inverse).
 
-    By a QR decomposition, so the condition number is not squared. A Jacobian without full rank
-    gives infinities or NaN: the record cannot tell these parameters apart.
+    By a QR decomposition, so the condition number is not squared. A Jacobian without
+    full rank gives infinities or NaN: the record cannot tell these parameters apart.
     """
     q, r = jnp.linalg.qr(jacobian)
     return jax.scipy.linalg.solve_triangular(r, q.T)
@@ -27,8 +27,8 @@ def coloured_covariance(
 
     Args:
         jacobian: Of the residuals, as fitted.
-        colour: Takes a vector of rows to `B^T` times it, where the noise is `B` times independent
-            draws of unit variance, that is, its covariance is `B B^T`.
+        colour: Takes a vector of rows to `B^T` times it, where the noise is `B` times
+            independent draws of unit variance, that is, its covariance is `B B^T`.
 
     Returns:
         `A B B^T A^T`, A the pseudo-inverse of the Jacobian.
@@ -42,18 +42,23 @@ def coloured_covariance(
 
 
 def block_bootstrap(
-    jacobian: Float[Array, "times outputs params"], residuals: Float[Array, "times outputs"],
-    block: int, key: RandomKey, *, samples: int = 1000,
-) -> Float[Array, "samples params"]:  # fmt: skip
+    jacobian: Float[Array, "times outputs params"],
+    residuals: Float[Array, "times outputs"],
+    block: int,
+    key: RandomKey,
+    *,
+    samples: int = 1000,
+) -> Float[Array, "samples params"]:
     """Shifts of the parameters when blocks of residuals are dealt out anew.
 
-    The moving-block bootstrap of Kuensch (1989), with the fit linearised at its optimum, so that no
-    refit is needed. It keeps the correlation of the noise up to the length of a block and loses
-    what is longer: for noise with a longer memory the spread comes out too small.
+    The moving-block bootstrap of Kuensch (1989), with the fit linearised at its
+    optimum, so that no refit is needed. It keeps the correlation of the noise up to the
+    length of a block and loses what is longer: for noise with a longer memory the
+        spread comes out too small.
 
     Args:
-        jacobian: Of the residuals, as fitted: `found.rows()` gives both, for one record of one
-            throw.
+        jacobian: Of the residuals, as fitted: `found.linearization()` gives both, for
+            one record of one trial.
         residuals: At the optimum, equally spaced in time.
         block: Length of a block in samples.
         key: Random key.
@@ -72,7 +77,9 @@ def block_bootstrap(
     (1000, 1)
     """
     times, outputs, params = jacobian.shape
-    text = f"Argument `block` must be at least 1 and less than {times}, but it is {block}."
+    text = (
+        f"Argument `block` must be at least 1 and less than {times}, but it is {block}."
+    )
     demand(1 <= block < times, text)
     gain = _influence(jacobian.reshape(times * outputs, params))
     centred = residuals - jnp.mean(residuals, axis=0, keepdims=True)

@@ -6,7 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import INERTIA, all_finite, check_type, is_inertia, shaped, where_defined
+from jrigid._checks import (
+    INERTIA,
+    all_finite,
+    check_type,
+    is_inertia,
+    shaped,
+    where_defined,
+)
 from jrigid._numerics import product
 from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
 from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
@@ -17,29 +24,33 @@ _LOWER, _UPPER = ([1, 0, 0], [4, 2, 0], [5, 6, 3]), ([1, 4, 6], [0, 2, 5], [0, 0
 
 def squared(diagonal: Array, sides: Array, places: Any = _LOWER) -> Matrix:
     """L L^T of a triangle, whose numbers have places in (0, diagonal, sides)."""
-    factor = jnp.concatenate([jnp.zeros_like(sides[:1]), diagonal, sides])[np.array(places)]
+    factor = jnp.concatenate([jnp.zeros_like(sides[:1]), diagonal, sides])[
+        np.array(places)
+    ]
     return product("ik,jk->ij", factor, factor)
 
 
 def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
     """Inertia tensor of a real body from six numbers without bounds.
 
-    The tensor of second moments of the mass, Sigma = (trace I / 2) 1 - I, is L L^T, L lower
-    triangular with a positive diagonal: then I is positive definite and its principal moments obey
-    I3 < I1 + I2, whatever the numbers are. The first is the scale, log L11; the others are the
-    shape, which is what free motion tells: log(L22 / L11), log(L33 / L11), L21 / L11, L31 / L11,
-    L32 / L11. All zero is a sphere of moments 2.
+    The tensor of second moments of the mass, Sigma = (trace I / 2) 1 - I, is L L^T, L
+    lower triangular with a positive diagonal: then I is positive definite and its
+    principal moments obey I3 < I1 + I2, whatever the numbers are. The first is the
+    scale, log L11; the others are the shape, which is what free motion tells: log(L22 /
+    L11), log(L33 / L11), L21 / L11, L31 / L11, L32 / L11. All zero is a sphere of
+    moments 2.
 
     Args:
-        parameters: The six numbers [-], the first the logarithm of a number in sqrt(kg) m.
+        parameters: The six numbers [-], the first the logarithm of a number in sqrt(kg)
+            m.
 
     Returns:
         Inertia tensor [kg m^2]; NaN unless all six are finite.
 
-    Gradients: analytic; every tensor of a body with extent in three directions is reached by one
-    set of numbers, so that nothing singular is in the way.
-    Source: P. M. Wensing, S. Kim, J.-J. Slotine, IEEE Robotics and Automation Letters 3 (2018) 60,
-    for the second moments; docs in `parameters_from_inertia`.
+    Gradients: analytic; every tensor of a body with extent in three directions is
+    reached by one set of numbers, so that nothing singular is in the way.
+    Source: P. M. Wensing, S. Kim, J.-J. Slotine, IEEE Robotics and Automation Letters 3
+    (2018) 60, for the second moments; docs in `parameters_from_inertia`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.identify.inertia_from_parameters(jnp.zeros(6)))
@@ -63,10 +74,11 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
         inertia: Principal moments, or tensor [kg m^2], with I3 < I1 + I2.
 
     Returns:
-        The numbers; NaN for a tensor that is not symmetric, or of no body with extent in three
-        directions.
+        The numbers; NaN for a tensor that is not symmetric, or of no body with extent
+        in three directions.
 
-    Gradients: right for symmetric changes of the tensor; they grow as the body gets flat.
+    Gradients: right for symmetric changes of the tensor; they grow as the body gets
+        flat.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> numbers = jr.identify.parameters_from_inertia(jnp.array([1.0, 2.0, 2.5]))
@@ -92,10 +104,11 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
 def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     """Mass properties of a real body from the ten numbers of its log-Cholesky parametrisation.
 
-    The pseudo-inertia [[Sigma, m c], [m c^T, m]], Sigma the second moments of the mass about the
-    origin of the coordinates, is U U^T with U = exp(alpha) [[exp(d1), s12, s13, t1], [0, exp(d2),
-    s23, t2], [0, 0, exp(d3), t3], [0, 0, 0, 1]]. The numbers are (alpha, d1, d2, d3, s12, s23, s13,
-    t1, t2, t3), in the order of the source (and of Pinocchio and MuJoCo); t is the centre of mass.
+    The pseudo-inertia [[Sigma, m c], [m c^T, m]], Sigma the second moments of the mass
+    about the origin of the coordinates, is U U^T with U = exp(alpha) [[exp(d1), s12,
+    s13, t1], [0, exp(d2), s23, t2], [0, 0, exp(d3), t3], [0, 0, 0, 1]]. The numbers are
+    (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3), in the order of the source (and of
+    Pinocchio and MuJoCo); t is the centre of mass.
 
     Args:
         parameters: The ten numbers.
@@ -104,8 +117,8 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
         The body; NaN unless all ten are finite.
 
     Gradients: analytic.
-    Source: C. Rucker, P. M. Wensing, "Smooth parameterization of rigid-body inertia", IEEE Robotics
-    and Automation Letters 7 (2022) 2771.
+    Source: C. Rucker, P. M. Wensing, "Smooth parameterization of rigid-body inertia",
+    IEEE Robotics and Automation Letters 7 (2022) 2771.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.identify.body_from_log_cholesky(jnp.zeros(10))
@@ -120,7 +133,9 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
         sigma = squared(jnp.exp(p[1:4]), p[4:7], _UPPER)
         return mass, p[7:], mass * inertia_of_second_moment(sigma)
 
-    return MassProperties.unchecked(*where_defined(all_finite(parameters), body, parameters))
+    return MassProperties.unchecked(
+        *where_defined(all_finite(parameters), body, parameters)
+    )
 
 
 def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
@@ -132,7 +147,8 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     Returns:
         (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3); NaN for a flat body.
 
-    Gradients: right for symmetric changes of the tensor; they grow as the body gets flat.
+    Gradients: right for symmetric changes of the tensor; they grow as the body gets
+        flat.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> numbers = jr.identify.log_cholesky_from_body(jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0])))

@@ -31,8 +31,8 @@ class Options(NamedTuple):
     """What is fixed when a fit is compiled."""
 
     free_motion: bool
-    on_attitude: bool
-    shooting: bool = False  # from a state of each segment, or from one of each throw
+    depends_on_attitude: bool
+    shooting: bool = False  # from a state of each segment, or from one of each trial
     nodes: int = 1
     unmodelled: str = "none"  # a torque that no model has: or "known", "estimate"
     robust: bool = False
@@ -57,10 +57,13 @@ class Problem(eqx.Module):
     def known(self) -> int:
         """How many samples stand for what is known beforehand, and for a fit held near its start.
 
-        Those of the throw come first, then, beside the first throw, those of all throws.
+        Those of the trial come first, then, beside the first trial, those of all
+        trials.
         """
         x = self.unknowns
-        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (x.hold is not None)
+        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (
+            x.hold is not None
+        )
         return count + self.held
 
     @property
@@ -77,41 +80,53 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
     return State(states.attitude[back], states.omega[back])
 
 
-def _flow(options: Options, system: Any, before: State, start: Array, end: Array) -> State:
+def _flow(
+    options: Options, system: Any, before: State, start: Array, end: Array
+) -> State:
     """States a short time later, or earlier, each of its own start."""
     if not options.free_motion:
 
         def flow(state: State, start: Array, end: Array) -> State:
-            return forced_flow(system, state, start, end, options.on_attitude)
+            return forced_flow(system, state, start, end, options.depends_on_attitude)
 
         return jax.vmap(flow)(before, start, end)
-    turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(before.omega, end - start)
-    if options.on_attitude:
+    turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(
+        before.omega, end - start
+    )
+    if options.depends_on_attitude:
         turn = jax.vmap(multiply)(before.attitude, turn)
     return State(turn, omega)
 
 
-def _integrated(options: Options, system: Any, first: State, ts: Array, t0: Array) -> State:
-    """A throw from its first state, by `simulate`, or by the motion that was given."""
+def _integrated(
+    options: Options, system: Any, first: State, ts: Array, t0: Array
+) -> State:
+    """A trial from its first state, by `simulate`, or by the motion that was given."""
     first = State(normalize(first.attitude), first.omega)
 
     def motion(times: Array) -> State:
         if options.motion is not None:
             return options.motion(system, first, times, t0)
         return simulate(
-            system, first, times, t0=t0, rtol=RTOL[times.dtype.itemsize], throw=False,
-            adjoint=diffrax.ForwardMode(), max_steps=100_000,
-        ).states  # fmt: skip
+            system,
+            first,
+            times,
+            t0=t0,
+            rtol=RTOL[times.dtype.itemsize],
+            throw=False,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=100_000,
+        ).states
 
     return in_any_order(motion, ts)
 
 
-class _Throw(NamedTuple):
-    """What is a throw's own: (nodes, ...), (samples, ...)."""
+class _Trial(NamedTuple):
+    """What is a trial's own: (nodes, ...), (samples, ...)."""
 
     layout: Layout
     samples: Samples
-    first: Array  # 1 for the first throw
+    first: Array  # 1 for the first trial
 
 
 def _picked(state: State, index: Any) -> State:
@@ -119,12 +134,12 @@ def _picked(state: State, index: Any) -> State:
 
 
 def _seen(
-    options: Options, system: Any, sensors: Any, nodes: State, throw: _Throw
+    options: Options, system: Any, sensors: Any, nodes: State, trial: _Trial
 ) -> tuple[list[Array], State]:
     """What each sensor shows at its times (n, k); states at the ends of the links."""
-    layout, dtype = throw.layout, throw.layout.ts.dtype
+    layout, dtype = trial.layout, trial.layout.ts.dtype
     samples, lags, weights = [], [], []
-    for sensor, part in zip(sensors, throw.samples.parts, strict=True):
+    for sensor, part in zip(sensors, trial.samples.parts, strict=True):
         late, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
         samples.append(jnp.tile(jnp.arange(part.start, part.stop), late.size))
         lags.append(jnp.repeat(late.astype(dtype), part.stop - part.start))
@@ -138,7 +153,9 @@ def _seen(
         states = _flow(options, system, before, begin, end)
         ends = _picked(states, slice(sample.size, None))
     else:
-        whole = _integrated(options, system, _picked(nodes, 0), layout.ts, layout.start[0])
+        whole = _integrated(
+            options, system, _picked(nodes, 0), layout.ts, layout.start[0]
+        )
         states, ends = _picked(whole, sample), nodes
         if any(x.memory() is not None for x in sensors):
             states = _flow(options, system, states, layout.ts[sample], times)
@@ -147,25 +164,34 @@ def _seen(
         part = slice(first, first + index.size)
         first = part.stop
         one = lambda t, q, w, sensor=sensor: sensor.predict(t, State(q, w), system)  # noqa: E731
-        values = jax.vmap(one)(layout.ts[index], states.attitude[part], states.omega[part])
+        values = jax.vmap(one)(
+            layout.ts[index], states.attitude[part], states.omega[part]
+        )
         values = values.reshape(weight.size, -1, *values.shape[1:])
-        shown.append(product("l,lnk->nk", weight, values) if weight.size > 1 else values[0])
+        shown.append(
+            product("l,lnk->nk", weight, values) if weight.size > 1 else values[0]
+        )
     return shown, ends
 
 
 def shown_by(
-    options: Options, system: Any, sensors: Any, start: State, t0: Array, samples: Samples
+    options: Options,
+    system: Any,
+    sensors: Any,
+    start: State,
+    t0: Array,
+    samples: Samples,
 ) -> list[Array]:
     """What sensors show at their times (n, k) of the motion from a state at t0."""
     first, ts = t0[None], samples.ts
     layout = Layout(ts, jnp.zeros(ts.shape, int), first, first, first > t0, ts)
     nodes = State(start.attitude[None], start.omega[None])
-    throw = _Throw(layout, samples, t0)
-    return _seen(options._replace(shooting=False), system, sensors, nodes, throw)[0]
+    trial = _Trial(layout, samples, t0)
+    return _seen(options._replace(shooting=False), system, sensors, nodes, trial)[0]
 
 
 def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
-    """Residuals of a throw (n, D) in units of their noise; zero where nothing was seen."""
+    """Residuals of a trial (n, D) in units of their noise; zero where nothing was seen."""
     parts, width = [], samples.weight.shape[-1]
     for sensor, values, predicted in zip(sensors, samples.values, shown, strict=True):
         if predicted.shape != values.shape:
@@ -176,64 +202,77 @@ def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
         part = jax.vmap(sensor.difference)(values, predicted)
         parts.append(jnp.pad(part, ((0, 0), (0, width - part.shape[1]))))
     rows = product("nij,nj->ni", samples.whitener, jnp.concatenate(parts))
-    if any(x.largest() is not None for x in sensors):
+    if any(x.saturation() is not None for x in sensors):
         # A saturated number says "at least": the square is -2 log of its probability.
-        beyond = jnp.where(samples.sign != 0, jnp.clip(samples.sign * rows, -1e3, _SURE), 0.0)
+        beyond = jnp.where(
+            samples.sign != 0, jnp.clip(samples.sign * rows, -1e3, _SURE), 0.0
+        )
         likely = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
         rows = jnp.where(samples.sign != 0, -samples.sign * likely, rows)
     return rows * samples.weight
 
 
 def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
-    """Values of each record (throws, n, k) as its sensor would show them, one body for all."""
+    """Values of each record (trials, n, k) as its sensor would show them, one body for all."""
     unknowns = problem.unknowns
-    system, *sensors = unknowns.parts(point.numbers, point.own[0], unknowns.leaves_of(0))
+    system, *sensors = unknowns.parts(
+        point.numbers, point.own[0], unknowns.leaves_of(0)
+    )
 
-    def throw(attitude: Array, omega: Array, data: _Throw) -> list[Array]:
+    def trial(attitude: Array, omega: Array, data: _Trial) -> list[Array]:
         return _seen(problem.options, system, sensors, State(attitude, omega), data)[0]
 
-    data = _Throw(layout, problem.samples, layout.start[:, 0])
-    return jax.vmap(throw)(point.attitude, point.omega, data)
+    data = _Trial(layout, problem.samples, layout.start[:, 0])
+    return jax.vmap(trial)(point.attitude, point.omega, data)
 
 
-def _of_throw(
-    problem: Problem, moves: tuple[Array, Array, Array], point: Point, leaves: Any, throw: _Throw
+def _of_trial(
+    problem: Problem,
+    moves: tuple[Array, Array, Array],
+    point: Point,
+    leaves: Any,
+    trial: _Trial,
 ) -> tuple[Array, Array]:
-    """Rows and gaps of one throw, of numbers, own numbers and states moved from those of a point.
+    """Rows and gaps of one trial, of numbers, own numbers and states moved from those of a point.
 
-    Rows are those of the samples; then each number that is known beforehand has one; last come the
-    numbers themselves, which hold a fit near its start.
+    Rows are those of the samples; then each number that is known beforehand has one;
+    last come the numbers themselves, which hold a fit near its start.
     """
     options, unknowns, (numbers, own, move) = problem.options, problem.unknowns, moves
     system, *sensors = unknowns.parts(numbers, own, leaves)
     attitude = point.attitude
-    if options.on_attitude:
+    if options.depends_on_attitude:
         attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
     nodes = State(attitude, point.omega + move[:, :3])
-    shown, ends = _seen(options, system, sensors, nodes, throw)
+    shown, ends = _seen(options, system, sensors, nodes, trial)
     held = numbers[unknowns.slices["scale"].stop :]
-    shared = throw.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
+    shared = trial.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
     known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
-    width = throw.samples.weight.shape[-1]
-    rows = [whitened(sensors, throw.samples, shown), jnp.pad(known, ((0, 0), (0, width - 1)))]
+    width = trial.samples.weight.shape[-1]
+    rows = [
+        whitened(sensors, trial.samples, shown),
+        jnp.pad(known, ((0, 0), (0, width - 1))),
+    ]
     gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
-    if options.on_attitude:
+    if options.depends_on_attitude:
         following = jnp.roll(point.attitude, -1, axis=0)
-        turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(following, ends.attitude)
+        turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(
+            following, ends.attitude
+        )
         side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
         gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
-    return jnp.concatenate(rows), jnp.where(throw.layout.linked[:, None], gap, 0.0)
+    return jnp.concatenate(rows), jnp.where(trial.layout.linked[:, None], gap, 0.0)
 
 
-def _over_throws(function: Callable[..., Any], problem: Problem, layout: Layout) -> Any:
-    """A function of a throw's point, arrays and data, and of moves, over all throws."""
+def _over_trials(function: Callable[..., Any], problem: Problem, layout: Layout) -> Any:
+    """A function of a trial's point, arrays and data, and of moves, over all trials."""
     stacked = tuple(0 if own else None for own in problem.unknowns.stacked)
     first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
-    data = _Throw(layout, problem.samples, first)
-    of_throws: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+    data = _Trial(layout, problem.samples, first)
+    of_trials: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
 
     def over(point: Point, *moves: Array) -> Any:
-        axes = of_throws, stacked, 0, *(0 for _ in moves)
+        axes = of_trials, stacked, 0, *(0 for _ in moves)
         one = partial(inlined, function)
         return jax.vmap(one, in_axes=axes)(point, problem.unknowns.leaves, data, *moves)
 
@@ -241,19 +280,23 @@ def _over_throws(function: Callable[..., Any], problem: Problem, layout: Layout)
 
 
 def rows_at(problem: Problem, layout: Layout) -> Callable[[Point, Array], Array]:
-    """Rows (throws, n, D) at a point, its states (throws, nodes, local) moved."""
+    """Rows (trials, n, D) at a point, its states (trials, nodes, local) moved."""
 
-    def throw(point: Point, leaves: Any, data: _Throw, move: Array) -> Array:
-        return _of_throw(problem, (point.numbers, point.own, move), point, leaves, data)[0]
+    def trial(point: Point, leaves: Any, data: _Trial, move: Array) -> Array:
+        return _of_trial(
+            problem, (point.numbers, point.own, move), point, leaves, data
+        )[0]
 
-    return _over_throws(throw, problem, layout)
+    return _over_trials(trial, problem, layout)
 
 
-def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows, Links]]:
+def evaluation(
+    problem: Problem, layout: Layout
+) -> Callable[[Point], tuple[Rows, Links]]:
     """Rows and links, with their derivatives in the border and the states of the nodes."""
-    local = 6 if problem.options.on_attitude else 3
+    local = 6 if problem.options.depends_on_attitude else 3
 
-    def throw(point: Point, leaves: Any, data: _Throw) -> tuple[Rows, Links]:
+    def trial(point: Point, leaves: Any, data: _Trial) -> tuple[Rows, Links]:
         border = [point.own.size, point.own.size + point.numbers.size]
         still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
         start = point.numbers, point.own, still
@@ -261,7 +304,7 @@ def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows
         def along(direction: Array) -> Any:
             own, numbers, state = jnp.split(direction, border)
             change = numbers, own, jnp.broadcast_to(state, still.shape)
-            moved = lambda x: _of_throw(problem, x, point, leaves, data)  # noqa: E731
+            moved = lambda x: _of_trial(problem, x, point, leaves, data)  # noqa: E731
             return jax.jvp(moved, (start,), (change,))
 
         directions = jnp.eye(border[1] + local, dtype=still.dtype)
@@ -272,4 +315,4 @@ def evaluation(problem: Problem, layout: Layout) -> Callable[[Point], tuple[Rows
         links = Links(gap, gap_of_border, gap_of_state, jnp.zeros(0, gap.dtype))
         return Rows(rows, of_border, of_state, node), links
 
-    return _over_throws(throw, problem, layout)
+    return _over_trials(trial, problem, layout)

@@ -7,16 +7,18 @@ import numpy as np
 from jrigid.identify._colour import loudest_band, stands_out
 from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import Linearised
+from jrigid.identify._inertia_models import BOUNDARY, Fixed, Flat
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import Minimum
 from jrigid.identify._problem import Problem
-from jrigid.identify._shapes import BOUNDARY, Fixed, Flat
 from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
-_REJECTED = 16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
-_SPOILT = 0.25  # fraction of samples rejected that excludes a throw
+_REJECTED = (
+    16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
+)
+_SPOILT = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
 
@@ -27,7 +29,7 @@ class Fit(NamedTuple):
     Attributes:
         minimum: Of one record.
         layout: Its segments.
-        kept: 1 for each sample that took part, 0 for the others (throws, samples).
+        kept: 1 for each sample that took part, 0 for the others (trials, samples).
         scales: Sizes of the residuals of each record, in units of the noise.
         disturbance: The unmodelled torque.
         torque: The same as it was sought, None where it was known.
@@ -48,7 +50,7 @@ class Fit(NamedTuple):
 
     @property
     def residual(self) -> np.ndarray:
-        """Whitened residuals of the samples (throws, samples, degrees)."""
+        """Whitened residuals of the samples (trials, samples, degrees)."""
         return self.minimum.rows.residual[:, : self.kept.shape[1]]
 
 
@@ -61,11 +63,13 @@ def linearised(fit: Fit) -> Linearised:
 
 
 def columns_of_prior(fit: Fit) -> np.ndarray:
-    """What is known beforehand, as columns of innovations, (throws, known, degrees, columns)."""
+    """What is known beforehand, as columns of innovations, (trials, known, degrees, columns)."""
     minimum, count = fit.minimum, fit.kept.shape[1]
     root = np.sqrt(minimum.weight[:, count:, None, None])
     residual = minimum.rows.residual[:, count:, :, None]
-    still = np.zeros((*residual.shape[:-1], minimum.links.gap.shape[-1]), residual.dtype)
+    still = np.zeros(
+        (*residual.shape[:-1], minimum.links.gap.shape[-1]), residual.dtype
+    )
     columns = [residual, still, minimum.rows.of_border[:, count:]]
     return root * np.concatenate(columns, axis=-1)
 
@@ -100,7 +104,7 @@ def without_outliers(
     square = np.sum(residual**2, axis=-1)
     good = square / of_samples(problem, scales**2) < width + _REJECTED
     spoilt = np.zeros(kept.shape[0], bool)
-    for part in problem.samples.parts:  # a throw that one record excludes is excluded
+    for part in problem.samples.parts:  # a trial that one record excludes is excluded
         bad = np.sum(np.where(good, 0.0, kept)[:, part], axis=1)
         spoilt |= bad > _SPOILT * np.sum(kept[:, part], axis=1)
     return np.where(good & ~spoilt[:, None], kept, 0.0)
@@ -158,7 +162,7 @@ def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
 
 def is_at_boundary(problem: Problem, fit: Fit) -> bool:
     """Whether a body that need not be is flat: its mass lies in a plane or on a line."""
-    if isinstance(problem.unknowns.shape, Fixed | Flat):
+    if isinstance(problem.unknowns.inertia_model, Fixed | Flat):
         return False
     tensor = np.asarray(fit.minimum.tensor, float)
     if not np.all(np.isfinite(tensor)):
@@ -168,17 +172,21 @@ def is_at_boundary(problem: Problem, fit: Fit) -> bool:
 
 
 def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
-    """Whether a constant rate in each throw describes a gyro's record as well.
+    """Whether a constant rate in each trial describes a gyro's record as well.
 
-    Where the rates do not vary the Fisher information at the estimate is no guide: a motion
-    fitted to the noise seems to determine what the true one does not. The best of many wobbles
-    gains something from any noise, the more the longer the record.
+    Where the rates do not vary the Fisher information at the estimate is no guide: a
+    motion fitted to the noise seems to determine what the true one does not. The best
+    of many wobbles gains something from any noise, the more the longer the record.
     """
     sensors = problem.unknowns.original(0)[1:]
-    if not problem.unknowns.shape.names or any(x.on_attitude or x.width != 3 for x in sensors):
+    if not problem.unknowns.inertia_model.names or any(
+        x.depends_on_attitude or x.width != 3 for x in sensors
+    ):
         return False
     weight = weights_of(problem, fit.kept)
     constant = np.sum(weight * signal_of(problem, weight) ** 2)
     fitted = np.sum(weight * fit.residual**2)
-    chance = 5 + GATE * 10**0.5 + 4 * np.log(max(np.sum(weight), 1.0))  # of five numbers
+    chance = (
+        5 + GATE * 10**0.5 + 4 * np.log(max(np.sum(weight), 1.0))
+    )  # of five numbers
     return bool(constant - fitted < noise * chance)

@@ -1,7 +1,7 @@
 """Why a fit does not describe its record, as far as the record shows it, and what to pass.
 
-One sentence for the first line of a report: a unit, a noise, an error of the sensor that is not
-sought, or something that swings.
+One sentence for the first line of a report: a unit, a noise, an error of the sensor
+that is not sought, or something that swings.
 """
 
 import math
@@ -10,12 +10,16 @@ import numpy as np
 
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
+from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
 from jrigid.identify._result import FitResult, Status
 from jrigid.identify._sensors import Gyro
-from jrigid.identify._shapes import AbstractShape, Flat, Moments, Tensor
 
-_NEARLY_A_SPHERE = 1.03  # I3/I1: degrees for radians shrink the gaps of the moments by 57
-_TOO_FAST = 3.0  # radians of a swing while the body turns by one: no free body does that
+_NEARLY_A_SPHERE = (
+    1.03  # I3/I1: degrees for radians shrink the gaps of the moments by 57
+)
+_TOO_FAST = (
+    3.0  # radians of a swing while the body turns by one: no free body does that
+)
 _EXPLAINED = 0.5  # of what is left, for a bias to be named
 _WHITE, _WHITE_SURE = 0.1, 5.0  # correlation of neighbours, and its standard deviations
 _FEWEST = 16  # samples whose spectrum says something
@@ -56,9 +60,11 @@ def reason(result: FitResult) -> str:
 
 def _by_gyro(result: FitResult) -> bool:
     """Whether nothing but a gyro was read, and the inertia is not known beforehand."""
-    sensors = result.parts()[1:]
-    shape: AbstractShape = result.unknowns.shape
-    return all(isinstance(x, Gyro) for x in sensors) and isinstance(shape, Tensor | Moments | Flat)
+    sensors = result.fitted()[1:]
+    inertia_model: AbstractInertiaModel = result.unknowns.inertia_model
+    return all(isinstance(x, Gyro) for x in sensors) and isinstance(
+        inertia_model, Tensor | Moments | Flat
+    )
 
 
 def _is_nearly_a_sphere(result: FitResult) -> bool:
@@ -95,7 +101,7 @@ def _swing(result: FitResult) -> float:
 def _bias(result: FitResult) -> np.ndarray | None:
     """A bias that explains most of what the fit leaves, where none was sought."""
     options = result.problem.options
-    gyros = [i for i, x in enumerate(result.parts()[1:]) if isinstance(x, Gyro)]
+    gyros = [i for i, x in enumerate(result.fitted()[1:]) if isinstance(x, Gyro)]
     sought = any(x.name.endswith("bias") for x in result.unknowns.sought)
     if not gyros or sought or options.dense or not options.noise_known:
         return None
@@ -105,7 +111,9 @@ def _bias(result: FitResult) -> np.ndarray | None:
     # Residuals are those of what is predicted, to which a bias is added.
     of_bias = np.zeros((*residuals.shape, 3))
     used = (residuals != 0)[:, part, :, None]
-    of_bias[:, part] = used * np.asarray(result.problem.samples.whitener)[:, part, :, :3]
+    of_bias[:, part] = (
+        used * np.asarray(result.problem.samples.whitener)[:, part, :, :3]
+    )
     before = np.sum(residuals**2)
     excess = before - int(result.degrees_of_freedom)
     if not excess > 0 or not np.all(np.isfinite(jacobian)):
@@ -115,7 +123,11 @@ def _bias(result: FitResult) -> np.ndarray | None:
     for i, left in enumerate(residuals):
         derivatives = jacobian[i].reshape(-1, jacobian.shape[-1])
         state = derivatives[:, numbers:]
-        others = [derivatives[:, :numbers], of_bias[i].reshape(-1, 3), left.reshape(-1, 1)]
+        others = [
+            derivatives[:, :numbers],
+            of_bias[i].reshape(-1, 3),
+            left.reshape(-1, 1),
+        ]
         columns = np.concatenate(others, axis=1)
         # What a state of the trial's own can do is taken out.
         rows.append(columns - state @ np.linalg.lstsq(state, columns, rcond=1e-12)[0])
@@ -133,7 +145,11 @@ def _of_noise(result: FitResult) -> str:
     size = math.sqrt(result.reduced_chi_square)
     found = f"The residuals are {size:.2g} times the stated noise"
     if size < 1:
-        degrees = " (it is 57 times too large if it is in deg/s)" if 0.01 < size < 0.03 else ""
+        degrees = (
+            " (it is 57 times too large if it is in deg/s)"
+            if 0.01 < size < 0.03
+            else ""
+        )
         return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
     if stands_out(band, sure):

@@ -1,4 +1,4 @@
-"""What was seen of a rotating body: a sensor, times, values and their noise, one throw or many."""
+"""What was seen of a rotating body: a sensor, times, values and their noise, one trial or many."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
@@ -11,33 +11,42 @@ import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, Findings, check_type, demand, float_arrays, is_concrete
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    check_type,
+    demand,
+    float_arrays,
+    is_concrete,
+)
 from jrigid._types import AnyArray, Readable, Real, VectorLike
 from jrigid.identify import _sensors as sensors
 
-Times = Real[_ArrayLike, "*throws n"]
-Values = Real[_ArrayLike, "*throws n k"] | None
+Times = Real[_ArrayLike, "*trials n"]
+Values = Real[_ArrayLike, "*trials n k"] | None
 Noise = Real[_ArrayLike, "..."] | None
 
 
 class Record(Readable):
     """What a sensor showed at some times, and how well.
 
-    NaN stands for "not seen": in a component of `values` (that number is left out; the whole sample
-    where the components hang together, in attitudes, directions and beside a `covariance`), in a
-    whole row, or in `ts` and its row (padding, which brings throws to one length). What was not
-    seen weighs nothing, and its `sigma` may be NaN; it costs what any sample costs.
+    NaN stands for "not seen": in a component of `values` (that number is left out; the
+    whole sample where the components hang together, in attitudes, directions and beside
+    a `covariance`), in a whole row, or in `ts` and its row (padding, which brings
+    trials to one length). What was not seen weighs nothing, and its `sigma` may be NaN;
+    it costs what any sample costs.
 
     Attributes:
         sensor: What showed the values.
-        ts: Times [s] (n,), increasing among the samples seen, their origin that of `t0` elsewhere;
-            with an axis of throws in front, (throws, n).
-        values: One row for each time (n, k); a plan, whose values play no role, takes None.
-        sigma: Standard deviation of the noise, in units of the residual: one number for all, (k,)
-            for each component, (n,) for each sample, or (n, k); kept as (n, k). None where it is
-            not known: `fit` takes it from the residuals.
-        covariance: Of the components of a sample, (k, k) or (n, k, k), kept as the latter; then no
-            `sigma`.
+        ts: Times [s] (n,), increasing among the samples seen, their origin that of `t0`
+            elsewhere; with an axis of trials in front, (trials, n).
+        values: One row for each time (n, k); a plan, whose values play no role, takes
+            None.
+        sigma: Standard deviation of the noise, in units of the residual: one number for
+            all, (k,) for each component, (n,) for each sample, or (n, k); kept as (n,
+            k). None where it is not known: `fit` takes it from the residuals.
+        covariance: Of the components of a sample, (k, k) or (n, k, k), kept as the
+            latter; then no `sigma`.
 
     Raises:
         ValueError: Shapes that do not belong together.
@@ -49,34 +58,45 @@ class Record(Readable):
     """
 
     sensor: sensors.AbstractSensor
-    ts: Float[Array, "*throws n"]
-    values: Float[Array, "*throws n k"]
+    ts: Float[Array, "*trials n"]
+    values: Float[Array, "*trials n k"]
     sigma: Float[Array, "..."] | None
     covariance: Float[Array, "..."] | None
 
     def __init__(
-        self, sensor: sensors.AbstractSensor, ts: Times, values: Values, sigma: Noise = None, *,
+        self,
+        sensor: sensors.AbstractSensor,
+        ts: Times,
+        values: Values,
+        sigma: Noise = None,
+        *,
         covariance: Noise = None,
-    ):  # fmt: skip
+    ):
         """Values of a sensor with noise `sigma` or `covariance`."""
         check_type("sensor", sensor, sensors.AbstractSensor)
         of, width = f"of `{type(sensor).__name__}` must", sensor.width
         if values is None:  # a plan
-            demand(width is not None, f"Argument `values` {of} be given, but it is None.")
+            demand(
+                width is not None, f"Argument `values` {of} be given, but it is None."
+            )
             (ts,) = float_arrays(ts)
             values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
         ts, values = float_arrays(ts, values)
         demand(
-            ts.ndim in (1, 2) and values.ndim == ts.ndim + 1 and values.shape[:-1] == ts.shape,
+            ts.ndim in (1, 2)
+            and values.ndim == ts.ndim + 1
+            and values.shape[:-1] == ts.shape,
             f"Arguments `ts` and `values` {of} have shapes (n,) and (n, k), but they have shapes "
             f"{ts.shape} and {values.shape}.",
         )
         text = f"have {width} columns, but it has {values.shape[-1]}."
         demand(width in (None, values.shape[-1]), f"Argument `values` {of} {text}")
-        text = f"Arguments `sigma` and `covariance` {of} not both be given, but they are."
+        text = (
+            f"Arguments `sigma` and `covariance` {of} not both be given, but they are."
+        )
         demand(sigma is None or covariance is None, text)
         text = "not be given beside a sensor's `limit`, but it is: give `sigma`."
-        limited = sensor.largest() is not None
+        limited = sensor.saturation() is not None
         demand(covariance is None or not limited, f"Argument `covariance` {of} {text}")
         self.sensor, self.ts, self.values = sensor, ts, values
         k, n, self.sigma, self.covariance = self.degrees, ts.shape[-1], None, None
@@ -92,13 +112,19 @@ class Record(Readable):
             (covariance,) = float_arrays(covariance)
             text = f"shape ({k}, {k}) or ({n}, {k}, {k}), but it has shape {covariance.shape}."
             shapes = (k, k), (n, k, k), (*ts.shape, k, k)
-            demand(covariance.shape in shapes, f"Argument `covariance` {of} have {text}")
+            demand(
+                covariance.shape in shapes, f"Argument `covariance` {of} have {text}"
+            )
             self.covariance = _repeated(covariance, (*ts.shape, k, k))
 
     @property
     def degrees(self) -> int:
         """Numbers of a residual."""
-        return self.values.shape[-1] if self.sensor.degrees is None else self.sensor.degrees
+        return (
+            self.values.shape[-1]
+            if self.sensor.degrees is None
+            else self.sensor.degrees
+        )
 
     @property
     def states_noise(self) -> bool:
@@ -150,41 +176,62 @@ def Attitudes(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> R
 
 
 def Directions(
-    ts: Times, values: Values, sigma: Noise = None, *, of: VectorLike, seen_from: str = "body",
+    ts: Times,
+    values: Values,
+    sigma: Noise = None,
+    *,
+    of: VectorLike,
+    frame: str = "body",
     **noise: Any,
-) -> Record:  # fmt: skip
+) -> Record:
     """The record of a `DirectionSensor`: unit vectors, noise in radians across them.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> star = jnp.array([1.0, 0.0, 0.0])
     >>> seen = jr.identify.Directions(jnp.arange(5.0), jnp.tile(star, (5, 1)), 1e-3, of=star)
     """
-    sensor = sensors.DirectionSensor(float_arrays(of)[0], seen_from)
+    sensor = sensors.DirectionSensor(float_arrays(of)[0], frame)
     return Record(sensor, ts, values, sigma, **noise)
 
 
 def AngularMomenta(
-    ts: Times, values: Values, sigma: Noise = None, *, axes: str = "space", **noise: Any
+    ts: Times,
+    values: Values,
+    sigma: Noise = None,
+    *,
+    frame: str = "space",
+    **noise: Any,
 ) -> Record:
     """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> seen = jr.identify.AngularMomenta(jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, axes="body")
+    >>> seen = jr.identify.AngularMomenta(jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, frame="body")
     """
-    return Record(sensors.MomentumSensor(axes), ts, values, sigma, **noise)
+    return Record(sensors.MomentumSensor(frame), ts, values, sigma, **noise)
 
 
 def Observed(
-    function: Callable[[Any, Any, Any], Any], ts: Times, values: Values, sigma: Noise = None, *,
-    on_attitude: bool = True, **noise: Any,
-) -> Record:  # fmt: skip
+    function: Callable[[Any, Any, Any], Any],
+    ts: Times,
+    values: Values,
+    sigma: Noise = None,
+    *,
+    depends_on_attitude: bool = True,
+    **noise: Any,
+) -> Record:
     """The record of a `FunctionSensor`: any function `(t, state, system) -> (k,)`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> spin = jr.identify.Observed(
     ...     lambda t, state, system: state.omega[2:], jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
     """
-    return Record(sensors.FunctionSensor(function, on_attitude), ts, values, sigma, **noise)
+    return Record(
+        sensors.FunctionSensor(function, depends_on_attitude),
+        ts,
+        values,
+        sigma,
+        **noise,
+    )
 
 
 def one_after_another(sizes: Iterable[int]) -> list[slice]:
@@ -194,24 +241,27 @@ def one_after_another(sizes: Iterable[int]) -> list[slice]:
 
 
 def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Times of the first and last samples of each throw; zero for one without samples."""
+    """Times of the first and last samples of each trial; zero for one without samples."""
     xp = ts.__array_namespace__()
     first = xp.min(xp.where(there, ts, xp.inf), axis=1)
     last = xp.max(xp.where(there, ts, -xp.inf), axis=1)
-    return xp.where(xp.isfinite(first), first, 0.0), xp.where(xp.isfinite(last), last, 0.0)
+    return xp.where(xp.isfinite(first), first, 0.0), xp.where(
+        xp.isfinite(last), last, 0.0
+    )
 
 
 class Samples(NamedTuple):
     """All records as a fit reads them, side by side: finite, of weight zero where nothing is.
 
-    Residuals have as many numbers as the widest record's, D. `whitener` (throws, n, D, D) turns one
-    into units of its noise; `sign` (throws, n, D) is that of a saturated number, 0 elsewhere.
+    Residuals have as many numbers as the widest record's, D. `whitener` (trials, n, D,
+    D) turns one into units of its noise; `sign` (trials, n, D) is that of a saturated
+    number, 0 elsewhere.
     """
 
-    ts: AnyArray  # (throws, n)
+    ts: AnyArray  # (trials, n)
     values: tuple[AnyArray, ...]  # of each record
     whitener: AnyArray
-    weight: AnyArray  # (throws, n, D)
+    weight: AnyArray  # (trials, n, D)
     sign: AnyArray
 
     @property
@@ -228,7 +278,8 @@ class Samples(NamedTuple):
 def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
     """Records as a fit reads them; a noise that is not known is `guess`.
 
-    Of records with numpy arrays (`lengthened`, `on_host`) the samples are numpy arrays too.
+    Of records with numpy arrays (`lengthened`, `on_host`) the samples are numpy arrays
+    too.
     """
     width = max(x.degrees for x in records)
     values, *rest = zip(*(_normalised(x, guess, width) for x in records), strict=True)
@@ -257,7 +308,7 @@ def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, 
     else:
         sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
         whitener = eye / sigma[..., None].astype(dtype)
-    largest = sensor.largest()
+    largest = sensor.saturation()
     sign = xp.zeros(known.shape, dtype)
     if largest is not None:
         most = xp.broadcast_to(xp.asarray(largest, dtype) * (1 - 1e-6), values.shape)
@@ -270,7 +321,8 @@ def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, 
 def _inverse_factor(covariance: AnyArray) -> AnyArray:
     """L^-1 of covariances L L^T (..., k, k), L lower triangular; NaN where there is no L.
 
-    By Gram and Schmidt: its rows are orthonormal in the product that the covariance makes.
+    By Gram and Schmidt: its rows are orthonormal in the product that the covariance
+        makes.
     """
     xp = covariance.__array_namespace__()
     eye = xp.eye(covariance.shape[-1], dtype=covariance.dtype)
@@ -278,24 +330,31 @@ def _inverse_factor(covariance: AnyArray) -> AnyArray:
     for i, unit in enumerate(eye):
         row = xp.broadcast_to(unit, covariance.shape[:-1])
         for other in rows:
-            row = row - xp.sum(covariance[..., i, :] * other, axis=-1, keepdims=True) * other
+            row = (
+                row
+                - xp.sum(covariance[..., i, :] * other, axis=-1, keepdims=True) * other
+            )
         image = xp.sum(covariance * row[..., None, :], axis=-1)
         rows.append(row / xp.sqrt(xp.sum(row * image, axis=-1, keepdims=True)))
     return xp.stack(rows, axis=-2)
 
 
-def of_throws(observations: Any) -> tuple[Record, ...]:
-    """Records with an axis of throws in front: a list's, padded with NaN, or of length one."""
+def of_trials(observations: Any) -> tuple[Record, ...]:
+    """Records with an axis of trials in front: a list's, padded with NaN, or of length one."""
     if isinstance(observations, list):
-        throws = [_as_tuple(x) for x in observations]
-        demand(bool(throws), "Argument `observations` must not be empty, but it is.")
-        kinds = [[jtu.tree_structure(x.sensor) for x in throw] for throw in throws]
-        text = "hold records of the same sensors for each throw, but it does not."
-        demand(all(x == kinds[0] for x in kinds), f"Argument `observations` must {text}")
-        return tuple(map(_begun, map(_stacked, zip(*throws, strict=True))))
+        trials = [_as_tuple(x) for x in observations]
+        demand(bool(trials), "Argument `observations` must not be empty, but it is.")
+        kinds = [[jtu.tree_structure(x.sensor) for x in trial] for trial in trials]
+        text = "hold records of the same sensors for each trial, but it does not."
+        demand(
+            all(x == kinds[0] for x in kinds), f"Argument `observations` must {text}"
+        )
+        return tuple(map(_begun, map(_stacked, zip(*trials, strict=True))))
     single = _as_tuple(observations)
     shapes = {x.ts.shape[:-1] for x in single}
-    text = f"Arguments `observations` must have the same throws, but they have {shapes}."
+    text = (
+        f"Arguments `observations` must have the same trials, but they have {shapes}."
+    )
     demand(len(shapes) == 1, text)
     return tuple(_begun(_stacked([x]) if shapes == {()} else x) for x in single)
 
@@ -306,13 +365,14 @@ def _begun(record: Record) -> Record:
     xp = ts.__array_namespace__()
     first = xp.min(xp.where(xp.isfinite(ts), ts, xp.inf))
     first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), ts.dtype)
-    return eqx.tree_at(lambda x: x.sensor, record, record.sensor.begun(first))
+    return eqx.tree_at(lambda x: x.sensor, record, record.sensor.started_at(first))
 
 
 def rounded(count: int) -> int:
     """The number of samples to which a record is filled up: few programs serve all lengths.
 
-    16, 64, 256, where more samples cost little; above, a power of two or half as much again.
+    16, 64, 256, where more samples cost little; above, a power of two or half as much
+    again.
     """
     if count <= 256:
         return next(x for x in (16, 64, 256) if count <= x)
@@ -322,7 +382,9 @@ def rounded(count: int) -> int:
 
 def tells(record: Record, what: str) -> bool:
     """Whether its sensor has a method of its own for "rates" or "attitude"."""
-    return getattr(type(record.sensor), what) is not getattr(sensors.AbstractSensor, what)
+    return getattr(type(record.sensor), what) is not getattr(
+        sensors.AbstractSensor, what
+    )
 
 
 def lengthened(record: Record) -> Record:
@@ -345,7 +407,7 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
     demand(
         isinstance(observations, Sequence) and len(observations) > 0,
         "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, or a "
-        f"list with one entry for each throw, but it is {type(observations).__name__}.",
+        f"list with one entry for each trial, but it is {type(observations).__name__}.",
     )
     for x in observations:
         check_type("observations", x, Record)
@@ -353,25 +415,25 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
 
 
 def _stacked(parts: Sequence[Record]) -> Record:
-    """One record of all throws; shorter ones are filled up with NaN."""
-    text = "hold times of shape (n,) for each throw of a list, but it does not."
+    """One record of all trials; shorter ones are filled up with NaN."""
+    text = "hold times of shape (n,) for each trial of a list, but it does not."
     demand(all(x.ts.ndim == 1 for x in parts), f"Argument `observations` must {text}")
     demand(
         all(_same(x.sensor, parts[0].sensor) for x in parts),
-        "Argument `observations` must have the same sensor in every throw of a list, but it has "
-        "not: `jr.identify.each` seeks an error anew in each throw.",
+        "Argument `observations` must have the same sensor in every trial of a list, but it has "
+        "not: `jr.identify.each` seeks an error anew in each trial.",
     )
     arrays = lambda x: (x.ts, x.values, x.sigma, x.covariance)  # noqa: E731
-    text = "state the noise for all throws or for none, but it does for some."
+    text = "state the noise for all trials or for none, but it does for some."
     same = len({jtu.tree_structure(arrays(x)) for x in parts}) == 1
     demand(same, f"Argument `observations` must {text}")
     longest = max(x.ts.size for x in parts)
 
-    def stack(*throws: Array) -> Array:
-        known = all(map(is_concrete, throws))
-        xp, rows = jnp, list(throws)
+    def stack(*trials: Array) -> Array:
+        known = all(map(is_concrete, trials))
+        xp, rows = jnp, list(trials)
         if known:  # no compiled programs for each length
-            xp, rows = np, [np.asarray(x) for x in throws]
+            xp, rows = np, [np.asarray(x) for x in trials]
         missing = [[(0, longest - x.shape[0])] + [(0, 0)] * (x.ndim - 1) for x in rows]
         pairs = zip(rows, missing, strict=True)
         stacked = xp.stack([xp.pad(x, y, constant_values=np.nan) for x, y in pairs])
@@ -384,7 +446,9 @@ def _stacked(parts: Sequence[Record]) -> Record:
 def _same(a: Any, b: Any) -> bool:
     """Whether two sensors are equal, as far as that is known now."""
     pairs = zip(jtu.tree_leaves(a), jtu.tree_leaves(b), strict=True)
-    unlike = (not jnp.array_equal(x, y) for x, y in pairs if is_concrete(x) and is_concrete(y))
+    unlike = (
+        not jnp.array_equal(x, y) for x, y in pairs if is_concrete(x) and is_concrete(y)
+    )
     return a is b or not any(unlike)
 
 

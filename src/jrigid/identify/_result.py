@@ -50,7 +50,8 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "record asks for a tensor that no body has, or hardly tells it."
     )
     NOT_CONVERGED = (
-        "The fit has not converged in the steps allowed. With `throw=False` it can be looked at."
+        "The fit has not converged in the steps allowed. With `throw=False` it can be "
+        "looked at."
     )
     BAD_INPUT = "The observations, or another argument, are not usable."
 
@@ -79,45 +80,51 @@ def arrays_of(fields: dict[str, Any]) -> list[Any]:
     """The arrays of a result, in the order of its leaves."""
     inner = [fields[x.name] for x in dataclasses.fields(Diagnostics)]
     of_result = [x.name for x in dataclasses.fields(FitResult)]
-    return jtu.tree_leaves([inner if x == "diagnostics" else fields[x] for x in of_result])
+    return jtu.tree_leaves(
+        [inner if x == "diagnostics" else fields[x] for x in of_result]
+    )
 
 
 class FitResult(eqx.Module):
     """Inertia, state and nuisances with errors; by `fit_each` with an axis of fits in front.
 
-    `print` shows it in words. Errors are standard errors; if no noise was stated, or it does not
-    explain what is left, their level is that of the residuals.
+    `print` shows it in words. Errors are standard errors; if no noise was stated, or it
+    does not explain what is left, their level is that of the residuals.
 
     Attributes:
         status: A `jrigid.identify.Status`.
-        inertia: The tensor, body axes [kg m^2]; with `scale="trace"` of the trace of the system's.
+        inertia: The tensor, body axes [kg m^2]; with `scale="trace"` of the trace of
+            the system's.
         inertia_covariance: Of its elements, row by row.
         moments: Principal moments, ascending.
         axes: Principal axes, columns, body from principal.
         ratios: I2/I1 and I3/I1.
-        shares: Moments over their sum, each at most 1/2, where I1 is too small to divide by.
+        shares: Moments over their sum, each at most 1/2, where I1 is too small to
+            divide by.
         moments_covariance: Of the moments.
         ratios_covariance: Of the ratios.
         shares_covariance: Of the shares; singular, as their sum is 1.
         axes_errors: Errors of the turn about each principal axis [rad].
-        numbers: The numbers sought for all throws: see `names`.
-        own_numbers: Those sought in each throw (throws, own).
+        numbers: The numbers sought for all trials: see `names`.
+        own_numbers: Those sought in each trial (trials, own).
         numbers_covariance: Of `numbers`.
-        state: State at `t0`, not at time 0, with an axis of throws in front: see `start`.
-        t0: Time of each throw's state [s]: that of its first sample, in a fit.
-        chi_square: Sum of the squares of whitened residuals; if no noise was stated, in units of
-            2 % of the rms of what was observed.
+        state: State at `t0`, not at time 0, with an axis of trials in front: see
+            `start`.
+        t0: Time of each trial's state [s]: that of its first sample, in a fit.
+        chi_square: Sum of the squares of whitened residuals; if no noise was stated, in
+            units of 2 % of the rms of what was observed.
         degrees_of_freedom: Residuals less what was sought.
-        level: Of the unmodelled torque about each body axis [N m sqrt(s)]: the root of its spectral
-            density at low frequencies.
-        level_errors: Of the level, by the relative error that its logarithm has; of one that was
-            not sought, or not found, what the record could tell.
-        correlation_time: Of the unmodelled torque about each body axis [s]; 0 where it is white.
+        level: Of the unmodelled torque about each body axis [N m sqrt(s)]: the root of
+            its spectral density at low frequencies.
+        level_errors: Of the level, by the relative error that its logarithm has; of one
+            that was not sought, or not found, what the record could tell.
+        correlation_time: Of the unmodelled torque about each body axis [s]; 0 where it
+            is white.
         correlation_time_errors: Of that.
         level_by_trial: Of each trial, in units of `level`.
         kept: Which samples were, records side by side.
-        diagnostics: What was left of the record, what determined the numbers, and how the fit got
-            there.
+        diagnostics: What was left of the record, what determined the numbers, and how
+            the fit got there.
         problem: The record as it was fitted, and how.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -142,18 +149,18 @@ class FitResult(eqx.Module):
     shares_covariance: Matrix
     axes_errors: Vector
     numbers: Float[Array, " numbers"]
-    own_numbers: Float[Array, "throws own"]
+    own_numbers: Float[Array, "trials own"]
     numbers_covariance: Float[Array, "numbers numbers"]
     state: State
-    t0: Float[Array, " throws"]
+    t0: Float[Array, " trials"]
     chi_square: Scalar
     degrees_of_freedom: Int[Array, ""]
     level: Vector
     level_errors: Vector
     correlation_time: Vector
     correlation_time_errors: Vector
-    level_by_trial: Float[Array, " throws"]
-    kept: Bool[Array, "throws samples"]
+    level_by_trial: Float[Array, " trials"]
+    kept: Bool[Array, "trials samples"]
     diagnostics: Diagnostics
     problem: Problem
 
@@ -189,9 +196,11 @@ class FitResult(eqx.Module):
         return self.problem.unknowns
 
     @property
-    def spoilt(self) -> Bool[Array, "*fits throws"]:
-        """Throws that a robust fit gave up."""
-        return jnp.any(self.problem.samples.seen, axis=-1) & ~jnp.any(self.kept, axis=-1)
+    def rejected_trials(self) -> Bool[Array, "*fits trials"]:
+        """Trials that a robust fit gave up."""
+        return jnp.any(self.problem.samples.seen, axis=-1) & ~jnp.any(
+            self.kept, axis=-1
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -201,33 +210,37 @@ class FitResult(eqx.Module):
     def spread(self, function: Callable[[Array], Array]) -> Array:
         """Covariance of a function of the tensor, to a vector; of a single fit.
 
-        By its values one standard error away along each axis of the numbers' covariance, times the
-        root of their count: right where the function is linear, and where it has kinks, as sorted
-        moments have where two are equal, it follows them.
+        By its values one standard error away along each axis of the numbers'
+        covariance, times the root of their count: right where the function is linear,
+        and where it has kinks, as sorted moments have where two are equal, it follows
+        them.
 
         Args:
             function: Of the tensor.
         """
         return _spread(self.unknowns, self.numbers, self.numbers_covariance, function)
 
-    def interval(self, function: Callable[[Array], Array], level: float = 0.95) -> Array:
+    def interval(
+        self, function: Callable[[Array], Array], level: float = 0.95
+    ) -> Array:
         """Lower and upper limit of a scalar function of the tensor; of a single fit.
 
-        They hold where errors by derivatives do not: where sorted moments nearly coincide, whose
-        estimates repel each other, and at bounds, such as the 1 of ratios and a flat body, which
-        belong to the interval where the record does not tell from them; at a bound more than
-        `level` of the intervals hold the truth. They ask for small errors: within a few of them
-        the elements of the tensor follow the numbers linearly, their covariance is that at the
-        estimate, and the smallest moment is positive.
+        They hold where errors by derivatives do not: where sorted moments nearly
+        coincide, whose estimates repel each other, and at bounds, such as the 1 of
+        ratios and a flat body, which belong to the interval where the record does not
+        tell from them; at a bound more than `level` of the intervals hold the truth.
+        They ask for small errors: within a few of them the elements of the tensor
+        follow the numbers linearly, their covariance is that at the estimate, and the
+        smallest moment is positive.
 
         Args:
-            function: Of the tensor. Compiled once for each function, not for each lambda that is
-                made anew.
+            function: Of the tensor. Compiled once for each function, not for each
+                lambda that is made anew.
             level: Of confidence.
 
         Gradients: none.
-        Source: C.-S. Chuang, T. L. Lai, "Hybrid resampling methods for confidence intervals",
-        Statistica Sinica 10 (2000) 1.
+        Source: C.-S. Chuang, T. L. Lai, "Hybrid resampling methods for confidence
+        intervals", Statistica Sinica 10 (2000) 1.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
@@ -247,62 +260,68 @@ class FitResult(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
-        """Of `numbers`, then of each throw's state and own numbers."""
+        """Of `numbers`, then of each trial's state and own numbers."""
         numbers, known = self.numbers_covariance, self.diagnostics
-        *lanes, throws, local, size = known.follow.shape
-        follow = known.follow.reshape(*lanes, throws * local, size)
+        *lanes, trials, local, size = known.follow.shape
+        follow = known.follow.reshape(*lanes, trials * local, size)
         across = -product("...ag,...gh->...ah", follow, numbers)
-        eye = jnp.eye(throws, dtype=numbers.dtype)
+        eye = jnp.eye(trials, dtype=numbers.dtype)
         blocks = product("ts,...tlm->...tlsm", eye, known.local_covariance)
-        blocks = blocks.reshape(*lanes, throws * local, throws * local)
+        blocks = blocks.reshape(*lanes, trials * local, trials * local)
         blocks = blocks - product("...ah,...bh->...ab", across, follow)
         return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
 
     @property
     def system(self) -> RigidBody:
-        """The body that was found, that of the first throw."""
-        return self.parts()[0]
+        """The body that was found, that of the first trial."""
+        return self.fitted()[0]
 
-    def parts(self, index: Int[_ArrayLike, ""] = 0) -> tuple[Any, ...]:
-        """System and sensors of a throw, as they were found.
+    def fitted(self, index: Int[_ArrayLike, ""] = 0) -> tuple[Any, ...]:
+        """System and sensors of a trial, as they were found.
 
         Args:
-            index: Which throw.
+            index: Which trial.
         """
         leaves = self.unknowns.leaves_of(index)
         return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves)
 
-    def start(self, index: Int[_ArrayLike, ""] = 0) -> tuple[State, Float[Array, "*fits"]]:
-        """The state of a throw and its time [s], which whoever moves the state needs.
+    def initial_state(
+        self, index: Int[_ArrayLike, ""] = 0
+    ) -> tuple[State, Float[Array, "*fits"]]:
+        """The state of a trial and its time [s], which whoever moves the state needs.
 
         Args:
-            index: Which throw.
+            index: Which trial.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
         >>> readings = jr.identify.Rates(record.times + 50, record.omegas, record.sigma)
         >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-        >>> state0, t0 = found.start()
+        >>> state0, t0 = found.initial_state()
         >>> later = jr.simulate(found.system, state0, jnp.array([100.0]), t0=t0)
         >>> print(t0)
         50.0
         """
-        attitude, omega = self.state.attitude[..., index, :], self.state.omega[..., index, :]
+        attitude, omega = (
+            self.state.attitude[..., index, :],
+            self.state.omega[..., index, :],
+        )
         return State(attitude, omega), self.t0[..., index]
 
     def predict(
-        self, ts: Real[_ArrayLike, "*times"], record: int = 0, throw: int = 0
+        self, ts: Real[_ArrayLike, "*times"], record: int = 0, trial: int = 0
     ) -> Float[Array, "*times k"]:
-        """What a sensor would read in a throw, by the model that was found; of a single fit.
+        """What a sensor would read in a trial, by the model that was found; of a single fit.
 
-        The motion goes on from the throw's `state` at `t0`, with no torque that is not modelled;
-        the sensor has the errors that were found, its delay, its filter and its limit.
+        The motion goes on from the trial's `state` at `t0`, with no torque that is not
+        modelled; the sensor has the errors that were found, its delay, its filter and
+        its limit.
 
         Args:
-            ts: Times [s] on the clock of the record, of any shape; under a torque, whose motion is
-                followed forward only, not before `t0`.
+            ts: Times [s] on the clock of the record, of any shape; under a torque,
+                whose motion is followed forward only, not before `t0`.
             record: Which record's sensor.
-            throw: Which throw.
+            trial: Which trial.
 
         Raises:
             ValueError: No such record or throw, or times before `t0` under a torque.
@@ -316,18 +335,21 @@ class FitResult(eqx.Module):
         >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
         [ 1.6 -2.4  1.2]
         """
-        throws, records = self.t0.shape[0], len(self.problem.samples.values)
-        for name, value, count in (("record", record, records), ("throw", throw, throws)):
+        trials, records = self.t0.shape[0], len(self.problem.samples.values)
+        for name, value, count in (
+            ("record", record, records),
+            ("trial", trial, trials),
+        ):
             text = f"Argument `{name}` must be at least 0 and below {count}, but it is {value}."
             demand(0 <= value < count, text)
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
-        after, options = jnp.all(times >= self.t0[throw]), self.problem.options
+        after, options = jnp.all(times >= self.t0[trial]), self.problem.options
         backward = options.free_motion or options.motion is not None
         demand(
             backward or not is_concrete(after) or bool(after),
-            "Argument `ts` must not be before the throw's `t0` where there is a torque, but it is.",
+            "Argument `ts` must not be before the trial's `t0` where there is a torque, but it is.",
         )
-        found = _predicted(self, times.reshape(-1), record, jnp.asarray(throw))
+        found = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
         return found.reshape(*times.shape, -1)
 
     @property
@@ -337,8 +359,8 @@ class FitResult(eqx.Module):
         Raises:
             ValueError: The shape that was sought was another one.
         """
-        numbers = self.numbers[..., self.unknowns.slices["shape"]]
-        body = self.unknowns.shape.body(numbers)
+        numbers = self.numbers[..., self.unknowns.slices["inertia"]]
+        body = self.unknowns.inertia_model.body(numbers)
         if body is None:
             raise ValueError(
                 "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
@@ -346,19 +368,21 @@ class FitResult(eqx.Module):
             )
         return body
 
-    def rows(
-        self, record: int = 0, throw: int = 0
+    def linearization(
+        self, record: int = 0, trial: int = 0
     ) -> tuple[Float[Array, "n degrees unknowns"], Float[Array, "n degrees"]]:
-        """Derivatives and whitened residuals of a record in a throw, of a single fit.
+        """Derivatives and whitened residuals of a record in a trial, of a single fit.
 
         Args:
             record: Which record.
-            throw: Which throw.
+            trial: Which trial.
         """
         part = self.problem.samples.parts[record]
-        return self.diagnostics.jacobian[throw, part], self.diagnostics.residuals[throw, part]
+        return self.diagnostics.jacobian[trial, part], self.diagnostics.residuals[
+            trial, part
+        ]
 
-    def left(self, record: int = 0) -> Float[Array, "throws n degrees"]:
+    def residuals(self, record: int = 0) -> Float[Array, "trials n degrees"]:
         """What is left of a record: predicted less observed, in its own units; of a single fit.
 
         NaN where nothing was seen, and of samples that are saturated or were left out.
@@ -376,10 +400,10 @@ class FitResult(eqx.Module):
         return jnp.where(used[:, samples.parts[record]], left, jnp.nan)
 
     @property
-    def leaves(self) -> dict[str, tuple[Array, Array]]:
+    def estimates(self) -> dict[str, tuple[Array, Array]]:
         """Value and error of each array that `free` picked, of a single fit, by name.
 
-        Of one that is sought anew in each throw, of each throw.
+        Of one that is sought anew in each trial, of each trial.
         """
         found = {}
         for x in self.unknowns.sought:
@@ -389,7 +413,7 @@ class FitResult(eqx.Module):
         return found
 
     def _of_sought(self, x: AbstractSought) -> tuple[Array, Array]:
-        """Numbers of an array that is sought, and their covariance; of each throw if it is own."""
+        """Numbers of an array that is sought, and their covariance; of each trial if it is own."""
         numbers = self.numbers_covariance
         if not x.own:
             part = self.unknowns.slices[x.name]
@@ -400,15 +424,18 @@ class FitResult(eqx.Module):
         local = slice(first + part.start, first + part.stop)
         follow = known.follow[:, local]
         shared = product("tlg,gh,tmh->tlm", follow, numbers, follow)
-        return self.own_numbers[:, part], shared + known.local_covariance[:, local, local]
+        return self.own_numbers[:, part], shared + known.local_covariance[
+            :, local, local
+        ]
 
     @property
     def determined(self) -> dict[str, bool]:
         """Whether the record determines the inertia, and each array that `free` picked, by name.
 
-        An array is determined where its errors are below 0.3 of its size, or of its natural unit
-        if that is larger; one that is sought anew in each throw, where it is in every throw that
-        took part. The inertia, where `status` does not say otherwise. Of a single fit.
+        An array is determined where its errors are below 0.3 of its size, or of its
+        natural unit if that is larger; one that is sought anew in each trial, where it
+        is in every trial that took part. The inertia, where `status` does not say
+        otherwise. Of a single fit.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
@@ -421,7 +448,11 @@ class FitResult(eqx.Module):
         found = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
-            units = jax.vmap(x.natural_units)(numbers) if x.own else x.natural_units(numbers)
+            units = (
+                jax.vmap(x.natural_units)(numbers)
+                if x.own
+                else x.natural_units(numbers)
+            )
             errors = errors_of(covariance) / units
             took_part = jnp.any(self.kept, axis=-1)
             errors = errors[took_part] if x.own else errors
@@ -429,12 +460,12 @@ class FitResult(eqx.Module):
         return found
 
     @property
-    def mirror(self) -> Float[Array, "*fits 3"]:
+    def mirror_moments(self) -> Float[Array, "*fits 3"]:
         """Moments, about the same axes, of the body that fits the mirrored readings of a gyro.
 
-        With all axes of the gyro reversed, or one that is a principal axis, the rates obey Euler's
-        equations of another body, whose (I2 - I3)/I1 and cyclic ones have the opposite sign: a gyro
-        of unknown handedness cannot tell the two apart.
+        With all axes of the gyro reversed, or one that is a principal axis, the rates
+        obey Euler's equations of another body, whose (I2 - I3)/I1 and cyclic ones have
+        the opposite sign: a gyro of unknown handedness cannot tell the two apart.
         """
         first, second, third = jnp.moveaxis(self.moments, -1, 0)
         a, b = (second - third) / first, (third - first) / second
@@ -458,19 +489,27 @@ class FitResult(eqx.Module):
 
 
 @quick_jit
-def _predicted(result: FitResult, ts: Array, record: int, throw: Array) -> Array:
-    system, *sensors = result.parts(throw)
+def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array:
+    system, *sensors = result.fitted(trial)
     sensor, none = sensors[record], jnp.zeros((ts.size, 0), ts.dtype)
     samples, options = Samples(ts, (none,), none, none, none), result.problem.options
-    (shown,) = shown_by(options, system, [sensor], *result.start(throw), samples)
-    largest = sensor.largest()
-    return shown if largest is None else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
+    (shown,) = shown_by(
+        options, system, [sensor], *result.initial_state(trial), samples
+    )
+    largest = sensor.saturation()
+    return (
+        shown
+        if largest is None
+        else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
+    )
 
 
 def _of_moments(which: Any, tensor: Array) -> Array:
     """Of the moments, ratios and shares some."""
     moments = eigh(tensor)[0]
-    found = jnp.concatenate([moments, moments[1:] / moments[0], moments / jnp.sum(moments)])
+    found = jnp.concatenate(
+        [moments, moments[1:] / moments[0], moments / jnp.sum(moments)]
+    )
     return found[which]
 
 
@@ -480,10 +519,14 @@ def _spread(
     size = unknowns.of_inertia.stop
     values, axes = jnp.linalg.eigh(covariance[:size, :size])
     sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
-    near = jnp.minimum(sizes, _FAR)  # what is told worse is carried on as a straight line
+    near = jnp.minimum(
+        sizes, _FAR
+    )  # what is told worse is carried on as a straight line
     steps = jnp.pad(product("ij,j->ji", axes, near), ((0, 0), (0, numbers.size - size)))
     of_numbers = lambda x: function(unknowns.inertia(x))  # noqa: E731
     moves = jax.vmap(of_numbers)(numbers[None] + jnp.concatenate([steps, -steps]))
     moves = moves - of_numbers(numbers)[None]
-    moves = product("ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2))
+    moves = product(
+        "ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2)
+    )
     return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))

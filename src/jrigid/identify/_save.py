@@ -15,15 +15,17 @@ from jrigid.identify._result import FitResult
 def save(path: str | os.PathLike[str], result: FitResult) -> None:
     """Write a fit to a file, with the record that it was made from, for `load`.
 
-    The file is a pickle: functions and classes of one's own (a `FunctionSensor`'s function, a
-    torque, a shape) are in it by their names only, and must be importable where it is read.
+    The file is a pickle: functions and classes of one's own (a `FunctionSensor`'s
+    function, a torque, a shape) are in it by their names only, and must be importable
+    where it is read.
 
     Args:
         path: Of the file.
         result: A fit, or many by `fit_each`.
 
     Raises:
-        ValueError: A function that has no name to be found by: a lambda, or one within another.
+        ValueError: A function that has no name to be found by: a lambda, or one within
+            another.
         OSError: The file cannot be written.
 
     >>> import tempfile, jax.numpy as jnp, jrigid as jr
@@ -55,8 +57,8 @@ def load(path: str | os.PathLike[str]) -> FitResult:
         path: Of the file.
 
     Raises:
-        ValueError: No such fit, functions or classes that are not found here, or numbers in float64
-            where `jax_enable_x64` is off.
+        ValueError: No such fit, functions or classes that are not found here, or
+            numbers in float64 where `jax_enable_x64` is off.
         OSError: The file cannot be read.
     """
     data = Path(path).read_bytes()

@@ -1,7 +1,8 @@
 """The search for the minimum: stages, attempts from several bodies, probes of the weakest.
 
-The search is plain Python. Whatever it wants minimised it yields as a `Request`, and is sent the
-`Minimum`; so one driver serves a single record and many, whose requests share compiled calls.
+The search is plain Python. Whatever it wants minimised it yields as a `Request`, and is
+sent the `Minimum`; so one driver serves a single record and many, whose requests share
+compiled calls.
 """
 
 import dataclasses
@@ -42,15 +43,20 @@ from jrigid.identify._result import LARGEST_ERROR
 from jrigid.identify._smoother import Point
 from jrigid.identify._unknowns import Unknowns
 
-ACCURACY = 1e-6  # of the sum of squares a step would gain: a thousandth of the standard errors
+ACCURACY = (
+    1e-6  # of the sum of squares a step would gain: a thousandth of the standard errors
+)
 _ROUGH = 0.3  # ... where a stage only has to start the next one
-# Weights of the links, in units of the noise; and a slower way for fits that went wrong.
+# Weights of the links, in units of the noise; and a slower way for fits that went
+# wrong.
 _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
 LANES = 8  # records of one compiled call, where there are several
-_LEVELS = 12  # stages in which an unmodelled torque is sought, white and then of any form
+_LEVELS = (
+    12  # stages in which an unmodelled torque is sought, white and then of any form
+)
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
@@ -61,7 +67,9 @@ _HARD = 1e4  # weight of what a probe holds, in natural units
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
-_BENT = 2.0  # times what Fisher's information says: a valley that no covariance describes
+_BENT = (
+    2.0  # times what Fisher's information says: a valley that no covariance describes
+)
 _RIVAL = 25.0  # growth of chi-square beyond which another minimum does not matter
 
 
@@ -81,12 +89,12 @@ class Stage(NamedTuple):
     """One minimisation of an attempt.
 
     Attributes:
-        weight: Of the links, in units of the noise; of a torque that is known, how far its level
-            has come.
+        weight: Of the links, in units of the noise; of a torque that is known, how far
+            its level has come.
         steps: The largest number of steps.
         enough: A gain that is not worth a step.
         horizon: Fraction of the record that takes part.
-        whole: From one state a throw.
+        whole: From one state a trial.
         soft: With Cauchy's loss.
         reject: Samples too far off are left out from here on.
         last: The torque is no longer changed.
@@ -123,7 +131,7 @@ class Case:
 
     Attributes:
         problem: The record.
-        single: One segment a throw.
+        single: One segment a trial.
         cut: Many segments.
         point: States at their starts, as observed.
         starts: Numbers for each attempt (attempts, numbers).
@@ -172,7 +180,9 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
     end = Stage(largest, effort.max_steps, ACCURACY, whole=whole, last=True)
     if options.dense:
         if options.unmodelled == "known":
-            stages = [Stage(x, 8, 0.01) for x in np.linspace(0, 1, _LEVEL_STEPS).tolist()]
+            stages = [
+                Stage(x, 8, 0.01) for x in np.linspace(0, 1, _LEVEL_STEPS).tolist()
+            ]
         else:
             stages = [Stage(1.0, 8, 0.01) for _ in range(2 * _LEVELS)]
         end = end._replace(weight=1.0)
@@ -239,20 +249,21 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
 class _Torque:
     """The unmodelled torque on the way through the stages of an attempt.
 
-    It is white at first. Once its level has come to rest its other forms are tried; once these
-    have, trials of another body are looked for and left out.
+    It is white at first. Once its level has come to rest its other forms are tried;
+    once these have, trials of another body are looked for and left out.
     """
 
     def __init__(self, case: Case, problem: Problem):
         """Begin with a torque far too large: the fit then follows the record."""
         self._case, self._problem, self._dtype = case, problem, case.point.omega.dtype
-        self._kind, throws = problem.options.unmodelled, case.point.omega.shape[0]
+        self._kind, trials = problem.options.unmodelled, case.point.omega.shape[0]
         self._first = first_level(problem, case.cut, case.tensor)
         self._search = levels.Search(problem, case.cut, self._first)
-        # Beside a noise that is not known a level far too large is nearly as likely as another.
+        # Beside a noise that is not known a level far too large is nearly as likely as
+        # another.
         level = (10 if problem.options.noise_known else 1) * self._first
-        self._current = self._search.start(level, throws)
-        self.disturbance = no_disturbance(throws, self._dtype)
+        self._current = self._search.start(level, trials)
+        self.disturbance = no_disturbance(trials, self._dtype)
         self._may_have_other_forms = True
         self.at_rest = False
 
@@ -315,11 +326,11 @@ def _progress(stage: Stage, fit: Fit) -> str:
 def search(case: Case) -> Search:
     """Through all stages; if that ends wrong, again, more slowly, from other numbers.
 
-    Fisher's information at a minimum knows nothing of a valley that bends, nor of other minima.
-    So a fit whose weakest direction is poorly determined is probed: that direction is held a
-    natural unit, and a quarter of one, to either side, and all else is fitted anew. How little
-    chi-square grows tells the error. Of coarse records, which have aliases, several attempts are
-    compared.
+    Fisher's information at a minimum knows nothing of a valley that bends, nor of other
+    minima. So a fit whose weakest direction is poorly determined is probed: that
+    direction is held a natural unit, and a quarter of one, to either side, and all else
+    is fitted anew. How little chi-square grows tells the error. Of coarse records,
+    which have aliases, several attempts are compared.
     """
     problem = case.problem
     # Few samples of a coarse record follow any alias.
@@ -333,7 +344,9 @@ def search(case: Case) -> Search:
         off, seen = misfit(problem, end), weakest(problem, end)
         fall = (weak.square - seen.square) / seen.noise
         better = off < wrong or (off <= wrong and fall > 0)
-        apart = _are_apart(best, end, problem.unknowns.judged, max(weak.error, seen.error))
+        apart = _are_apart(
+            best, end, problem.unknowns.judged, max(weak.error, seen.error)
+        )
         rival = apart and abs(fall) < _RIVAL
         ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
         if better:
@@ -341,7 +354,8 @@ def search(case: Case) -> Search:
         index += 1
     best = best._replace(ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
-        # Squares beside levels of their own differ, so fits with a level are not probed.
+        # Squares beside levels of their own differ, so fits with a level are not
+        # probed.
         best = yield from _probed(case, best, weak)
     return best
 
@@ -373,7 +387,9 @@ def no_search(case: Case) -> Search:
     )
 
 
-def _attempts(case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool) -> int:
+def _attempts(
+    case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool
+) -> int:
     """How many attempts to make: two of a misfit that follows the record, all of other failures.
 
     A coarse record has many bodies that follow it, so its misfits are such failures.
@@ -416,13 +432,21 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
 
 def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
     """Whether two fits are different minima."""
-    apart = np.abs(one.minimum.point.numbers - other.minimum.point.numbers) / other.minimum.units
+    apart = (
+        np.abs(one.minimum.point.numbers - other.minimum.point.numbers)
+        / other.minimum.units
+    )
     far = np.max(apart[judged], initial=0.0)
     return bool(far > max(_APART, 6 * error))
 
 
 def _error_by_probe(
-    problem: Problem, best: Fit, end: Fit, direction: np.ndarray, step: float, growth: float
+    problem: Problem,
+    best: Fit,
+    end: Fit,
+    direction: np.ndarray,
+    step: float,
+    growth: float,
 ) -> float:
     """In natural units, by how far the tensor moved: numbers are logarithms."""
     before, after = best.minimum, end.minimum
@@ -471,7 +495,9 @@ def _alike(requests: dict[int, Request]) -> Iterable[Sequence[int]]:
 
 def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
     """Minimise side by side; unused lanes repeat the first one, without steps."""
-    idle = requests[0]._replace(settings=requests[0].settings._replace(steps=np.asarray(0)))
+    idle = requests[0]._replace(
+        settings=requests[0].settings._replace(steps=np.asarray(0))
+    )
     padded = [*requests, *[idle] * (lanes - len(requests))]
     stacked = jtu.tree_map(lambda *x: np.stack([np.asarray(y) for y in x]), *padded)
     found = jtu.tree_map(np.asarray, minimise(*stacked))

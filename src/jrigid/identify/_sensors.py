@@ -25,14 +25,19 @@ _FADING = (
 _EYE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
-def _array(name: str, unit: Any, default: Any = (0.0,) * 3, *shapes: Any, **metadata: Any) -> Any:
+def _array(
+    name: str, unit: Any, default: Any = (0.0,) * 3, *shapes: Any, **metadata: Any
+) -> Any:
     """A field that holds an array of one of these shapes, or None.
 
-    The unit of its errors is in powers of the rms of the rates [rad/s] and of that of the values.
+    The unit of its errors is in powers of the rms of the rates [rad/s] and of that of
+    the values.
     """
     shapes = shapes or ((3,),)
     convert = lambda x: None if x is None else array_of_shape(name, x, *shapes)  # noqa: E731
-    return eqx.field(default=default, converter=convert, metadata=metadata | {"unit": unit})
+    return eqx.field(
+        default=default, converter=convert, metadata=metadata | {"unit": unit}
+    )
 
 
 def _vector(name: str) -> Any:
@@ -42,14 +47,14 @@ def _vector(name: str) -> Any:
 class AbstractSensor(Readable):
     """What a sensor makes of time, state and body; its arrays are its errors, known or sought.
 
-    A subclass gives `predict`, and says more where the defaults do not hold. `fit(..., free=...)`
-    picks arrays of sensors as it does of the system.
+    A subclass gives `predict`, and says more where the defaults do not hold.
+    `fit(..., free=...)` picks arrays of sensors as it does of the system.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> class SpinMeter(jr.identify.AbstractSensor):
     ...     offset: float = 0.0
     ...     width = 1
-    ...     on_attitude = False
+    ...     depends_on_attitude = False
     ...
     ...     def predict(self, t, state, system):
     ...         return state.omega[2:] + self.offset
@@ -58,8 +63,10 @@ class AbstractSensor(Readable):
 
     width: ClassVar[int | None] = 3  # of a value; None: any
     degrees: ClassVar[int | None] = None  # of freedom of a value, its width if None
-    unit_length: ClassVar[bool] = False  # of values, to within a thousandth (attitudes) or a half
-    on_attitude: ClassVar[bool] = True
+    unit_length: ClassVar[bool] = (
+        False  # of values, to within a thousandth (attitudes) or a half
+    )
+    depends_on_attitude: ClassVar[bool] = True
 
     @abc.abstractmethod
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
@@ -69,7 +76,7 @@ class AbstractSensor(Readable):
         """Predicted less observed, one number for each degree of freedom."""
         return predicted - value
 
-    def begun(self, t: Array) -> "AbstractSensor":
+    def started_at(self, t: Array) -> "AbstractSensor":
         """The sensor of a record whose first sample is at a time."""
         return self
 
@@ -77,7 +84,7 @@ class AbstractSensor(Readable):
         """How long before a time the motion is shown at it [s], and with what weights."""
         return None
 
-    def largest(self) -> Array | None:
+    def saturation(self) -> Array | None:
         """Values of this size stand for it and anything beyond: the sensor is saturated."""
         return None
 
@@ -109,8 +116,8 @@ class AbstractSensor(Readable):
 class Gyro(AbstractSensor):
     """Angular velocity in the axes of the sensor, which are the body axes unless it is turned.
 
-    The reading is matrix scale R(misalignment)^-1 omega + bias + drift (t - since), late by `delay`
-    and a first-order filter, and ends at `limit`.
+    The reading is matrix scale R(misalignment)^-1 omega + bias + drift (t - since),
+    late by `delay` and a first-order filter, and ends at `limit`.
 
     Attributes:
         bias: [rad/s].
@@ -120,7 +127,8 @@ class Gyro(AbstractSensor):
         matrix: Whatever else is linear (3, 3); `diag(1, 1, -1)` is a left-handed gyro.
         delay: Of its clock behind that of the record [s]; None: none.
         time_constant: Of a first-order filter [s], a small part of a turn; None: none.
-        limit: Readings of this size are saturated and say "at least" [rad/s], () or (3,).
+        limit: Readings of this size are saturated and say "at least" [rad/s], () or
+            (3,).
         since: When the bias is `bias` [s]; None: at the first sample of the record.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -130,7 +138,7 @@ class Gyro(AbstractSensor):
     [0.1 0.  0. ]
     """
 
-    on_attitude: ClassVar[bool] = False
+    depends_on_attitude: ClassVar[bool] = False
     bias: Float[Array, "3"] = _array("bias", (1, 0))
     drift: Float[Array, "3"] = _array("drift", (2, 0))
     scale: Float[Array, "..."] = _array("scale", (0, 0), 1.0, (), (3,))
@@ -155,7 +163,7 @@ class Gyro(AbstractSensor):
         offset = self.bias.astype(dtype) + self.drift.astype(dtype) * since
         return product("ij,j->i", self._matrix(dtype), state.omega) + offset
 
-    def begun(self, t: Array) -> "Gyro":
+    def started_at(self, t: Array) -> "Gyro":
         """With its bias at that time, unless another was given."""
         return dataclasses.replace(self, since=t) if self.since is None else self
 
@@ -171,15 +179,20 @@ class Gyro(AbstractSensor):
             lags = lags.astype(self.delay.dtype) + self.delay
         return lags, weights.astype(lags.dtype)
 
-    def largest(self) -> Array | None:
+    def saturation(self) -> Array | None:
         """The limit."""
         return None if self.limit is None else jnp.broadcast_to(self.limit, (3,))
 
     def rates(self, value: Array) -> Array:
         """The reading, less what is known of the errors."""
         first, second, third = self._matrix(value.dtype)
-        # Columns of the inverse, but for the determinant: a third of the time that LU compiles.
-        columns = jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)
+        # Columns of the inverse, but for the determinant: a third of the time that LU
+        # compiles.
+        columns = (
+            jnp.cross(second, third),
+            jnp.cross(third, first),
+            jnp.cross(first, second),
+        )
         inverse = jnp.stack(columns, axis=1) / jnp.sum(first * columns[0])
         return product("ij,j->i", inverse, value - self.bias.astype(value.dtype))
 
@@ -200,7 +213,7 @@ class Accelerometer(AbstractSensor):
     [-10.   0.   0.]
     """
 
-    on_attitude: ClassVar[bool] = False
+    depends_on_attitude: ClassVar[bool] = False
     lever: Float[Array, "3"] = _array("lever", (-2, 1))
     bias: Float[Array, "3"] = _array("bias", (0, 1))
 
@@ -223,7 +236,9 @@ class Magnetometer(AbstractSensor):
     >>> north = jr.identify.Magnetometer(jnp.array([20.0, 0.0, -40.0]))
     """
 
-    field: Float[Array, "3"] = eqx.field(converter=_vector("field"), metadata={"unit": (0, 1)})
+    field: Float[Array, "3"] = eqx.field(
+        converter=_vector("field"), metadata={"unit": (0, 1)}
+    )
     bias: Float[Array, "3"] = _array("bias", (0, 1))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
@@ -236,11 +251,12 @@ class Magnetometer(AbstractSensor):
 class AttitudeSensor(AbstractSensor):
     """Attitudes, unit quaternions from body to space: a star tracker, or pictures.
 
-    The residual is the rotation vector from the observed to the predicted attitude, about the body
-    axes; q and -q are the same.
+    The residual is the rotation vector from the observed to the predicted attitude,
+    about the body axes; q and -q are the same.
 
     Attributes:
-        misalignment: Rotation vector, from the body's axes to those whose attitude is seen [rad].
+        misalignment: Rotation vector, from the body's axes to those whose attitude is
+            seen [rad].
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> tracker = jr.identify.AttitudeSensor(misalignment=jnp.array([0.0, 0.0, 0.1]))
@@ -273,12 +289,13 @@ class AttitudeSensor(AbstractSensor):
 class DirectionSensor(AbstractSensor):
     """Unit vectors: of something at rest in space seen from the body, or the other way round.
 
-    The residual is along two axes across the observed direction; its length is the chord.
+    The residual is along two axes across the observed direction; its length is the
+    chord.
 
     Attributes:
-        of: What is seen: a vector in space axes (a star, the Sun), or, with `seen_from="space"`, a
-            vector in body axes (a mark on the body).
-        seen_from: "body" or "space": the axes of the values.
+        of: What is seen: a vector in space axes (a star, the Sun), or, with
+            `frame="space"`, a vector in body axes (a mark on the body).
+        frame: "body" or "space": the axes of the values.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> sun = jr.identify.DirectionSensor(jnp.array([2.0, 0.0, 0.0]))
@@ -290,16 +307,16 @@ class DirectionSensor(AbstractSensor):
     degrees: ClassVar[int | None] = 2
     unit_length: ClassVar[bool] = True
     of: Float[Array, "3"] = eqx.field(converter=_vector("of"))
-    seen_from: str = eqx.field(static=True, default="body")
+    frame: str = eqx.field(static=True, default="body")
 
     def __check_init__(self) -> None:
         """Raise ValueError for axes that are none."""
-        check_option("seen_from", self.seen_from, ("body", "space"))
+        check_option("frame", self.frame, ("body", "space"))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The direction."""
         of = self.of.astype(state.omega.dtype)
-        turn = rotation.rotate_inverse if self.seen_from == "body" else rotation.rotate
+        turn = rotation.rotate_inverse if self.frame == "body" else rotation.rotate
         return turn(state.attitude, of / safe_norm(of))
 
     def difference(self, value: Array, predicted: Array) -> Array:
@@ -319,7 +336,7 @@ class MomentumSensor(AbstractSensor):
     """Angular momenta [kg m^2/s], internal parts included; they set the scale of the inertia.
 
     Attributes:
-        axes: "space" or "body": the axes of the values.
+        frame: "space" or "body": the axes of the values.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> start = jr.State(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0]))
@@ -328,26 +345,30 @@ class MomentumSensor(AbstractSensor):
     [-1.  -4.   7.5]
     """
 
-    axes: str = eqx.field(static=True, default="space")
+    frame: str = eqx.field(static=True, default="space")
 
     def __check_init__(self) -> None:
         """Raise ValueError for axes that are none."""
-        check_option("axes", self.axes, ("space", "body"))
+        check_option("frame", self.frame, ("space", "body"))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """The momentum."""
-        if self.axes == "space":
+        if self.frame == "space":
             return system.angular_momentum(t, state, None)
         inner = system.torque.internal_momentum(t, state, None)
-        return angular_momentum(system.inertia.astype(state.omega.dtype), state.omega) + inner
+        return (
+            angular_momentum(system.inertia.astype(state.omega.dtype), state.omega)
+            + inner
+        )
 
 
 class FunctionSensor(AbstractSensor):
     """Any function of time, state and system.
 
     Attributes:
-        function: `(t, state, system) -> (k,)`. Define it once: a new function is compiled anew.
-        looks_at_attitude: Whether the function looks at the attitude.
+        function: `(t, state, system) -> (k,)`. Define it once: a new function is
+            compiled anew.
+        depends_on_attitude: Whether the function looks at the attitude.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> rpm = jr.identify.FunctionSensor(lambda t, state, system: 9.549297 * state.omega[2:], False)
@@ -358,17 +379,21 @@ class FunctionSensor(AbstractSensor):
 
     width: ClassVar[int | None] = None
     function: Callable[[Any, Any, Any], Any]
-    looks_at_attitude: bool = eqx.field(static=True, default=True)
+    # Of an instance here, of the class elsewhere.
+    depends_on_attitude: bool = eqx.field(  # pyright: ignore
+        static=True
+    )
 
-    def __check_init__(self) -> None:
-        """Raise ValueError for what is no function."""
-        text = f"a callable (t, state, system) -> (k,), but it is {self.function!r}."
-        demand(callable(self.function), f"Argument `function` must be {text}")
-
-    @property
-    def on_attitude(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the function looks at the attitude."""
-        return self.looks_at_attitude
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        depends_on_attitude: bool = True,
+    ):
+        """Raise ValueError for what is not a function."""
+        text = f"a callable (t, state, system) -> (k,), but it is {function!r}."
+        demand(callable(function), f"Argument `function` must be {text}")
+        self.function = function
+        self.depends_on_attitude = depends_on_attitude
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
         """What the function gives."""

@@ -1,14 +1,16 @@
 """Least squares over a chain of states with links between: Levenberg-Marquardt, and a smoother.
 
-A wobble of n turns pins its rate so well that the sum of squares over the whole record has a
-valley only 0.3 / n wide. Multiple shooting gives each segment a state of its own and links that
-ask, more and more strongly, that the end of each be the start of the next. Links kept at a finite
-weight are a statement about physics: an unknown torque pushed the body between the nodes, and what
-is minimised is then the smoother of Rauch, Tung and Striebel with unknown parameters.
+A wobble of n turns pins its rate so well that the sum of squares over the whole record
+has a valley only 0.3 / n wide. Multiple shooting gives each segment a state of its own
+and links that ask, more and more strongly, that the end of each be the start of the
+next. Links kept at a finite weight are a statement about physics: an unknown torque
+pushed the body between the nodes, and what is minimised is then the smoother of Rauch,
+Tung and Striebel with unknown parameters.
 
-The normal equations are block-tridiagonal with a border (Bock 1983; Nocedal & Wright, Numerical
-Optimization, 2nd ed., section 10.3, for the damping), so that a step costs a time proportional to
-the record. The border of a throw holds its own numbers first, then those of all throws.
+The normal equations are block-tridiagonal with a border (Bock 1983; Nocedal & Wright,
+Numerical Optimization, 2nd ed., section 10.3, for the damping), so that a step costs a
+time proportional to the record. The border of a trial holds its own numbers first, then
+those of all trials.
 """
 
 from typing import NamedTuple
@@ -23,17 +25,18 @@ from jrigid.rotation import exp, multiply, normalize
 
 
 class Point(NamedTuple):
-    """Where a fit stands: numbers of all throws, of each, and the state at each node."""
+    """Where a fit stands: numbers of all trials, of each, and the state at each node."""
 
     numbers: AnyArray
-    own: AnyArray  # (throws, n)
-    attitude: AnyArray  # (throws, nodes, 4)
+    own: AnyArray  # (trials, n)
+    attitude: AnyArray  # (trials, nodes, 4)
     omega: AnyArray
-    torque: AnyArray  # (throws, nodes, 3) in units of its rms, or (throws, nodes, 0) without one
+    # (trials, nodes, 3) in units of its rms, or (trials, nodes, 0) without one
+    torque: AnyArray
 
 
 class Rows(NamedTuple):
-    """Whitened residuals (throws, n, D), and derivatives in the border and the state of a node."""
+    """Whitened residuals (trials, n, D), and derivatives in the border and the state of a node."""
 
     residual: AnyArray
     of_border: AnyArray
@@ -42,10 +45,10 @@ class Rows(NamedTuple):
 
 
 class Links(NamedTuple):
-    """End of a segment less the next one's start, (throws, nodes, local), and derivatives.
+    """End of a segment less the next one's start, (trials, nodes, local), and derivatives.
 
-    `torque` is the unmodelled torque at the first node, (throws, 3), whose size is known: it is 1
-    in units of its rms. Without such a torque it is (throws, 0).
+    `torque` is the unmodelled torque at the first node, (trials, 3), whose size is
+    known: it is 1 in units of its rms. Without such a torque it is (trials, 0).
     """
 
     gap: AnyArray
@@ -66,7 +69,7 @@ class Blocks(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """The equations of first states, throws' own numbers and numbers, (throws, l + m + g, ...)."""
+    """The equations of first states, trials' own numbers and numbers, (trials, l + m + g, ...)."""
 
     matrix: Array
     right: Array
@@ -80,12 +83,12 @@ def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Block
     Args:
         rows: Of the record.
         links: Between the segments; the next state enters with minus one.
-        weight: Of each sample (throws, n).
-        whitener: Of each link (throws, nodes, local, local), zero where there is none.
+        weight: Of each sample (trials, n).
+        whitener: Of each link (trials, nodes, local, local), zero where there is none.
     """
     nodes = links.gap.shape[1]
 
-    def throw(rows: Rows, w: Array) -> tuple[Array, ...]:
+    def trial(rows: Rows, w: Array) -> tuple[Array, ...]:
         r, jb, js, node = rows
         at_nodes = lambda x: jax.ops.segment_sum(x, node, nodes)  # noqa: E731
         ws, wb = (product("n,ndi->ndi", w, x) for x in (js, jb))
@@ -97,7 +100,7 @@ def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Block
             product("ndi,nd->i", wb, r),
         )
 
-    h, hb, bb, b, cb = jax.vmap(throw)(rows, weight)
+    h, hb, bb, b, cb = jax.vmap(trial)(rows, weight)
 
     def white(x: Array) -> Array:
         return product("tsij,tsjk->tsik", whitener, x)
@@ -106,11 +109,27 @@ def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Block
         """What the link before adds to a node."""
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
-    c, g, f = white(links.gap[..., None])[..., 0], white(links.of_border), white(links.of_state)
-    h = h + product("tsai,tsaj->tsij", f, f) + later(product("tsai,tsaj->tsij", whitener, whitener))
-    hb = hb + product("tsai,tsaj->tsij", f, g) - later(product("tsai,tsaj->tsij", whitener, g))
+    c, g, f = (
+        white(links.gap[..., None])[..., 0],
+        white(links.of_border),
+        white(links.of_state),
+    )
+    h = (
+        h
+        + product("tsai,tsaj->tsij", f, f)
+        + later(product("tsai,tsaj->tsij", whitener, whitener))
+    )
+    hb = (
+        hb
+        + product("tsai,tsaj->tsij", f, g)
+        - later(product("tsai,tsaj->tsij", whitener, g))
+    )
     bb = bb + product("tsai,tsaj->tij", g, g)
-    b = b + product("tsai,tsa->tsi", f, c) - later(product("tsai,tsa->tsi", whitener, c))
+    b = (
+        b
+        + product("tsai,tsa->tsi", f, c)
+        - later(product("tsai,tsa->tsi", whitener, c))
+    )
     cb = cb + product("tsai,tsa->ti", g, c)
     if links.torque.shape[-1]:
         last = slice(-links.torque.shape[-1], None)
@@ -152,7 +171,9 @@ def reduced(blocks: Blocks, damping: Array) -> Reduced:
         carry = down[:, :local], down[:, local:-1], down[:, -1]
         return carry, (solved, schur, log_determinant)
 
-    def throw(h: Array, u: Array, hb: Array, bb: Array, b: Array, cb: Array) -> tuple[Array, ...]:
+    def trial(
+        h: Array, u: Array, hb: Array, bb: Array, b: Array, cb: Array
+    ) -> tuple[Array, ...]:
         empty = jnp.zeros_like(h[0]), jnp.zeros_like(hb[0]), jnp.zeros_like(b[0])
         later = h[1:], u[:-1], hb[1:], b[1:]
         (less, border, right), (solved, schur, logs) = jax.lax.scan(
@@ -160,39 +181,52 @@ def reduced(blocks: Blocks, damping: Array) -> Reduced:
         )
         side, schur = hb[0] - border, jnp.sum(schur, axis=0)
         matrix = jnp.block([[h[0] - less, side], [side.T, bb - schur[:, :-1]]])
-        return matrix, jnp.concatenate([b[0] - right, cb - schur[:, -1]]), solved, jnp.sum(logs)
+        return (
+            matrix,
+            jnp.concatenate([b[0] - right, cb - schur[:, -1]]),
+            solved,
+            jnp.sum(logs),
+        )
 
-    matrix, right, solved, logs = jax.vmap(throw)(h, u, hb, bb, b, cb)
+    matrix, right, solved, logs = jax.vmap(trial)(h, u, hb, bb, b, cb)
     return Reduced(matrix, right, solved, jnp.sum(logs))
 
 
 class Eliminated(NamedTuple):
-    """What is left for the numbers, and how a throw's first state and own numbers follow them."""
+    """What is left for the numbers, and how a trial's first state and own numbers follow them."""
 
     numbers: Array  # (g, g), without damping
-    right: Array  # (throws, g): what each throw adds to the right side
-    follow: Array  # (throws, l + m, g)
-    still: Array  # (throws, l + m), where the numbers stay
+    right: Array  # (trials, g): what each trial adds to the right side
+    follow: Array  # (trials, l + m, g)
+    still: Array  # (trials, l + m), where the numbers stay
     log_determinant: Array
 
 
 def eliminated(left: Reduced, count: int) -> Eliminated:
-    """Eliminate the first states and throws' own numbers, `count` of them."""
+    """Eliminate the first states and trials' own numbers, `count` of them."""
 
-    def throw(matrix: Array, right: Array) -> tuple[Array, ...]:
+    def trial(matrix: Array, right: Array) -> tuple[Array, ...]:
         columns = jnp.concatenate([matrix[:count, count:], right[:count, None]], axis=1)
         solved, log_determinant = solve_positive(matrix[:count, :count], columns)
         schur = product("ij,ik->jk", matrix[:count, count:], solved)
         numbers = matrix[count:, count:] - schur[:, :-1]
-        return numbers, right[count:] - schur[:, -1], solved[:, :-1], solved[:, -1], log_determinant
+        return (
+            numbers,
+            right[count:] - schur[:, -1],
+            solved[:, :-1],
+            solved[:, -1],
+            log_determinant,
+        )
 
-    numbers, right, follow, still, logs = jax.vmap(throw)(left.matrix, left.right)
+    numbers, right, follow, still, logs = jax.vmap(trial)(left.matrix, left.right)
     logs = jnp.sum(logs) + left.log_determinant
     return Eliminated(jnp.sum(numbers, axis=0), right, follow, still, logs)
 
 
-def step_of(blocks: Blocks, own: int, damping: Array) -> tuple[tuple[Array, Array, Array], Array]:
-    """Move of the numbers, the throws' own, and the states; and what it gains, -gradient . move."""
+def step_of(
+    blocks: Blocks, own: int, damping: Array
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """Move of the numbers, the trials' own, and the states; and what it gains, -gradient . move."""
     local = blocks.state.shape[-1]
     damped = blocks._replace(border=_damped(blocks.border, damping))
     left = reduced(damped, damping)
@@ -215,7 +249,9 @@ def step_of(blocks: Blocks, own: int, damping: Array) -> tuple[tuple[Array, Arra
         return jnp.concatenate([first[None, :local], later])
 
     states, owns = jax.vmap(moves)(left.solved, firsts), firsts[:, local:]
-    gain = -jnp.sum(blocks.of_state * states) - jnp.sum(blocks.of_border[:, :own] * owns)
+    gain = -jnp.sum(blocks.of_state * states) - jnp.sum(
+        blocks.of_border[:, :own] * owns
+    )
     gain = gain - jnp.sum(jnp.sum(blocks.of_border[:, own:], axis=0) * numbers)
     return (numbers, owns, states), gain
 

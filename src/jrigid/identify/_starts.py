@@ -20,9 +20,9 @@ from jrigid._types import AnyArray, Matrix, Readable, Real, Vector
 from jrigid.dynamics import State
 from jrigid.identify import _host as host
 from jrigid.identify._compile import small_program
+from jrigid.identify._inertia_models import LogCholesky
 from jrigid.identify._layout import Told
 from jrigid.identify._records import first_and_last
-from jrigid.identify._shapes import LogCholesky
 
 _Times = Real[ArrayLike, " n"]
 _Vectors = Real[ArrayLike, "n 3"]
@@ -33,21 +33,22 @@ _EDGE = 1 - 1e-5  # of a window's half width
 _LARGEST_BLOCK = 2**17  # weights of samples in windows that are computed together
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
 _FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
-# A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without a trace.
+# A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without
+# a trace.
 _OF_SIX = np.eye(6)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 _TRACELESS = np.eye(6)[1:]
 _TRACELESS[:2, :3] = [[6**-0.5, 6**-0.5, -2 * 6**-0.5], [0.5**0.5, -(0.5**0.5), 0]]
 
 
-class LinearStart(Readable):
+class LinearEstimate(Readable):
     """Inertia from a linear regression, and how it went.
 
     Attributes:
-        inertia: Tensor; of trace 1 where only ratios can be known, [kg m^2] beside a known rotor.
-            It need not be positive definite where the samples say little.
-        singular_values: Of the regression's matrix, with columns of unit scale, descending. The
-            last is the misfit where ratios are sought; those nearly as small are directions that
-            the samples do not tell.
+        inertia: Tensor; of trace 1 where only ratios can be known, [kg m^2] beside a
+            known rotor. It need not be positive definite where the samples say little.
+        singular_values: Of the regression's matrix, with columns of unit scale,
+            descending. The last is the misfit where ratios are sought; those nearly as
+            small are directions that the samples do not tell.
         result: `jrigid.RESULTS.successful`, or what is wrong with the samples.
         momentum: That in space which belongs to the tensor, from `momentum`; else None.
         covariance: Of (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), from `gyrostat`; else None.
@@ -86,14 +87,16 @@ def _weak_rows(
     rotor: AnyArray,
     torque: AnyArray,
 ) -> AnyArray:
-    """Equations (3 windows, 7) of a throw, the right side last: smooth bumps, by parts.
+    """Equations (3 windows, 7) of a trial, the right side last: smooth bumps, by parts.
 
     Samples that are not known are zero, and repeat a time where theirs is not known.
     """
     xp = ts.__array_namespace__()
     span = ts[-1] - ts[0]
     least = _LEAST_SAMPLES * span / (ts.shape[0] - 1)
-    half = or_one(0.5 * xp.minimum(xp.maximum(radians / rms(omega, known), least), span))
+    half = or_one(
+        0.5 * xp.minimum(xp.maximum(radians / rms(omega, known), least), span)
+    )
     centers = xp.linspace(ts[0] + half, ts[-1] - half, windows)
     step = xp.pad(xp.diff(ts), 1)
     samples = ts, 0.5 * (step[1:] + step[:-1]), known, omega, rotor, torque
@@ -121,8 +124,8 @@ def _rows_of_windows(
     """Equations of windows with these centers and half this width [s], (3 windows, 7)."""
     xp = ts.__array_namespace__()
     s = (ts[None] - centers[:, None]) / half
-    # Samples at the very edge weigh nothing, but by rounding one that is not known, such as
-    # those that fill up a record, would count as a gap.
+    # Samples at the very edge weigh nothing, but by rounding one that is not known,
+    # such as those that fill up a record, would count as a gap.
     inside = xp.abs(s) < _EDGE
     s = xp.where(inside, s, 1.0)
     # A window with a gap says nothing.
@@ -139,8 +142,10 @@ def _rows_of_windows(
     return xp.concatenate([rows[..., :6], right[..., None]], axis=-1).reshape(-1, 7)
 
 
-def _samples(padded: bool, ts: Array, *columns: Array) -> tuple[Findings, Array, list[Array]]:
-    """Of throws (throws, n): what is wrong, which samples are known, and all, else zero."""
+def _samples(
+    padded: bool, ts: Array, *columns: Array
+) -> tuple[Findings, Array, list[Array]]:
+    """Of trials (trials, n): what is wrong, which samples are known, and all, else zero."""
     known = jnp.all(jnp.isfinite(jnp.concatenate(columns, axis=-1)), axis=-1)
     step, least, findings = jnp.diff(ts), jnp.min(jnp.sum(known, axis=1)), Findings()
     rising = (step > 0) & (step < jnp.inf) | padded & jnp.isnan(ts[:, 1:])
@@ -158,21 +163,33 @@ def _findings(padded: bool, *given: Array) -> Findings:
 
 
 @eqx.filter_jit
-def _solved(solve: Callable[..., Any], padded: bool, size: Any, *given: Array) -> LinearStart:
+def _solved(
+    solve: Callable[..., Any], padded: bool, size: Any, *given: Array
+) -> LinearEstimate:
     findings, known, samples = _samples(padded, *given)
     inertia, values, *others = solve(size, known, *samples)
-    return findings.guard(LinearStart(inertia, values, findings.result, *others), False)
+    return findings.guard(
+        LinearEstimate(inertia, values, findings.result, *others), False
+    )
 
 
 def _answer(
-    solve: Callable[..., Any], throw: bool, size: Any, ts: Any, padded: bool = False, **columns: Any
-) -> LinearStart:
-    """Of arguments checked and with an axis of throws in front."""
+    solve: Callable[..., Any],
+    throw: bool,
+    size: Any,
+    ts: Any,
+    padded: bool = False,
+    **columns: Any,
+) -> LinearEstimate:
+    """Of arguments checked and with an axis of trials in front."""
     shape, width = np.shape(ts), {"attitudes": 4}
     wanted = {name: (x, *shape, width.get(name, 3)) for name, x in columns.items()}
     ts, *arrays = shaped(ts=(ts, (None,), *[(None, None)] * padded), **wanted)
     count = ts.shape[-1]
-    demand(count >= 4, f"Argument `ts` must hold four times at least, but it holds {count}.")
+    demand(
+        count >= 4,
+        f"Argument `ts` must hold four times at least, but it holds {count}.",
+    )
     given = [ts, *arrays] if ts.ndim == 2 else [x[None] for x in (ts, *arrays)]
     found = _solved(solve, padded, size, *given)
     return settle(found, throw, _findings, padded, *given)
@@ -187,18 +204,23 @@ def _null_vector(rows: Array) -> tuple[Array, Array]:
 
 
 def weak_form(
-    ts: _Times, omegas: _Vectors, *, windows: int = _WINDOWS, radians: float = _RADIANS,
+    ts: _Times,
+    omegas: _Vectors,
+    *,
+    windows: int = _WINDOWS,
+    radians: float = _RADIANS,
     throw: bool = True,
-) -> LinearStart:  # fmt: skip
+) -> LinearEstimate:
     """Ratios of inertia from sampled rates of a free body, without derivatives of the samples.
 
-    Euler's equations I omega' + omega x I omega = 0 are multiplied by smooth bumps, (1 - s^2)^4 on
-    windows of some radians, and integrated by parts: linear equations for I.
+    Euler's equations I omega' + omega x I omega = 0 are multiplied by smooth bumps, (1
+    - s^2)^4 on windows of some radians, and integrated by parts: linear equations for
+    I.
 
     Args:
         ts: Times, increasing [s].
-        omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out, with the
-            windows they are in.
+        omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out,
+            with the windows they are in.
         windows: How many, spread over the record.
         radians: Length of a window, in radians turned; at least eight samples.
         throw: False: bad samples give NaN and a `result` instead of an error.
@@ -210,8 +232,8 @@ def weak_form(
         ValueError: Fewer than four samples.
 
     Gradients: those of the singular vector, where the last two singular values differ.
-    Source: the weak form of system identification, D. A. Messenger, D. M. Bortz, Multiscale
-    Modeling & Simulation 19 (2021) 1474.
+    Source: the weak form of system identification, D. A. Messenger, D. M. Bortz,
+    Multiscale Modeling & Simulation 19 (2021) 1474.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts = jnp.linspace(0.0, 40.0, 801)
@@ -233,8 +255,12 @@ def _weak_form(size: Any, known: Array, ts: Array, omegas: Array) -> tuple[Array
 
 
 def momentum(
-    ts: _Times, attitudes: Real[ArrayLike, "n 4"], omegas: _Vectors, *, throw: bool = True
-) -> LinearStart:
+    ts: _Times,
+    attitudes: Real[ArrayLike, "n 4"],
+    omegas: _Vectors,
+    *,
+    throw: bool = True,
+) -> LinearEstimate:
     """Ratios of inertia from attitudes and rates of a free body: its momentum stays in space.
 
     R I omega = L is linear in I and L.
@@ -246,7 +272,8 @@ def momentum(
         throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
-        The tensor of trace 1 in the body's axes, singular values, and the momentum in space.
+        The tensor of trace 1 in the body's axes, singular values, and the momentum in
+        space.
 
     Raises:
         ValueError: Fewer than four samples.
@@ -264,7 +291,9 @@ def momentum(
     return _answer(_momentum, throw, None, ts, attitudes=attitudes, omegas=omegas)
 
 
-def _momentum(_: Any, known: Array, ts: Array, attitudes: Array, omegas: Array) -> tuple:
+def _momentum(
+    _: Any, known: Array, ts: Array, attitudes: Array, omegas: Array
+) -> tuple:
     known, size = known[..., None], rms(omegas, jnp.isfinite(ts))
     unit = jnp.zeros_like(attitudes).at[..., 0].set(1)
     attitudes = jnp.where(known, attitudes, unit)
@@ -277,26 +306,31 @@ def _momentum(_: Any, known: Array, ts: Array, attitudes: Array, omegas: Array) 
 
 
 def gyrostat(
-    ts: Real[ArrayLike, "*throws n"], omegas: Real[ArrayLike, "*throws n 3"],
-    rotor: Real[ArrayLike, "*throws n 3"], *, windows: int = _WINDOWS, radians: float = _RADIANS,
+    ts: Real[ArrayLike, "*trials n"],
+    omegas: Real[ArrayLike, "*trials n 3"],
+    rotor: Real[ArrayLike, "*trials n 3"],
+    *,
+    windows: int = _WINDOWS,
+    radians: float = _RADIANS,
     throw: bool = True,
-) -> LinearStart:  # fmt: skip
+) -> LinearEstimate:
     """The whole inertia tensor, scale included, from rates beside a rotor of known momentum.
 
-    The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares over all
-    throws. Short windows do best where something smooth is not modelled.
+    The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares
+    over all trials. Short windows do best where something smooth is not modelled.
 
     Args:
-        ts: Times, increasing [s]; of throws, shorter ones end in NaN.
+        ts: Times, increasing [s]; of trials, shorter ones end in NaN.
         omegas: Angular velocities, sensor axes [rad/s]; samples with NaN are left out.
-        rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s]; likewise.
+        rotor: Momentum h of the rotor about its own axis, same axes [kg m^2/s];
+            likewise.
         windows: How many, spread over each record.
         radians: Length of a window, in radians turned; at least eight samples.
         throw: False: bad samples give NaN and a `result` instead of an error.
 
     Returns:
-        The tensor [kg m^2], singular values, and errors by how throws, or the parts of a single
-        one, scatter.
+        The tensor [kg m^2], singular values, and errors by how trials, or the parts of
+        a single one, scatter.
 
     Raises:
         ValueError: Fewer than four samples.
@@ -317,15 +351,18 @@ def gyrostat(
 
 
 def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -> tuple:
-    throws, zero = ts.shape[0], jnp.zeros_like(rotor)
-    rows = jax.vmap(partial(_weak_rows, *size))(ts, known, omegas, rotor, zero).reshape(-1, 7)
+    trials, zero = ts.shape[0], jnp.zeros_like(rotor)
+    rows = jax.vmap(partial(_weak_rows, *size))(ts, known, omegas, rotor, zero).reshape(
+        -1, 7
+    )
     rows = rows / or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows[:, :6]))))
     left, values, vt, told = _singular(rows[:, :6])
     half = vt.T * jnp.where(told, 1 / jnp.where(told, values, 1.0), 0.0)[None]
     six = product("jk,rk,r->j", half, left, rows[:, 6])
     misfit = rows[:, 6] - product("rj,j->r", rows[:, :6], six)
-    # Errors of neighbouring windows hang together: throws, or eight parts of one, are independent.
-    clusters = throws if throws > 1 else 8
+    # Errors of neighbouring windows hang together: trials, or eight parts of one, are
+    # independent.
+    clusters = trials if trials > 1 else 8
     whole = misfit.size // clusters * clusters
     parts = (left * misfit[:, None])[:whole].reshape(clusters, -1, 6).sum(axis=1)
     shift = product("jk,ck->jc", half, parts)
@@ -345,12 +382,14 @@ def linear_starts(
 ) -> np.ndarray:
     """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
-    From attitudes, if there are few, since R I omega is constant in each throw of a free body;
-    else from the weak form, with torques as they are at the samples.
+    From attitudes, if there are few, since R I omega is constant in each trial of a
+    free body; else from the weak form, with torques as they are at the samples.
     """
     dtype, free = unknowns.rate.dtype, options.free_motion
     known = unknowns.known_tensor.astype(dtype)
-    sought = unknowns.shape.names and not isinstance(unknowns.shape, LogCholesky)
+    sought = unknowns.inertia_model.names and not isinstance(
+        unknowns.inertia_model, LogCholesky
+    )
     if given is not None or told is None or not sought or options.motion is not None:
         first = known if given is None else given.astype(dtype)
         return np.stack([first, _rounder(first)])
@@ -363,10 +402,14 @@ def linear_starts(
         torques = zero if free else np.where(there, _torques_at(unknowns, told), zero)
         # Times that are not there repeat one.
         first = first_and_last(told.ts, told.there)[0]
-        ts = np.maximum.accumulate(np.where(told.there, told.ts, first[:, None]), axis=1)
-        throws = zip(ts, told.there, omegas, zero, torques, strict=True)
-        rows = np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in throws])
-    rows = np.where(np.isfinite(rows), rows, 0.0)  # a torque or a square may be out of range
+        ts = np.maximum.accumulate(
+            np.where(told.there, told.ts, first[:, None]), axis=1
+        )
+        trials = zip(ts, told.there, omegas, zero, torques, strict=True)
+        rows = np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in trials])
+    rows = np.where(
+        np.isfinite(rows), rows, 0.0
+    )  # a torque or a square may be out of range
     trace = None if unknowns.scaled and not free else np.trace(known)
     plain, leaning = _least_squares(rows, trace, np.trace(known))
     both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
@@ -374,7 +417,7 @@ def linear_starts(
 
 
 def _rows_of_attitudes(told: Told) -> np.ndarray:
-    """Equations (n, 7): the momentum in space at each sample is the mean one of its throw."""
+    """Equations (n, 7): the momentum in space at each sample is the mean one of its trial."""
     assert told.attitude is not None
     weight = told.there[..., None, None].astype(told.omega.dtype)
     turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))
@@ -412,12 +455,12 @@ def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
 def _torques(unknowns: Any, ts: Any, attitude: Any, omega: Any) -> Any:
     """As they are at the samples, by what is known of the system beforehand."""
 
-    def at(throw: Array, t: Array, q: Array, w: Array) -> Array:
-        system = unknowns.original(throw)[0]
+    def at(trial: Array, t: Array, q: Array, w: Array) -> Array:
+        system = unknowns.original(trial)[0]
         return jnp.asarray(system.torque_on(t, State(q, w), None), w.dtype)
 
-    of_throw = jax.vmap(at, (None, 0, 0, 0))
-    return jax.vmap(of_throw)(jnp.arange(len(ts)), ts, attitude, omega)
+    of_trial = jax.vmap(at, (None, 0, 0, 0))
+    return jax.vmap(of_trial)(jnp.arange(len(ts)), ts, attitude, omega)
 
 
 def _least_squares(
@@ -425,8 +468,8 @@ def _least_squares(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tensors of a given trace, or, None, of any, from equations (n, 7).
 
-    The first is the least-squares solution if that is a body; the second leans to a sphere where
-    the record says little.
+    The first is the least-squares solution if that is a body; the second leans to a
+    sphere where the record says little.
     """
     rows = rows / or_one(np.max(np.abs(rows[:, :6])))
     rows, right, dtype = rows[:, :6], rows[:, 6], rows.dtype

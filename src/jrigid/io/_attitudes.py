@@ -18,7 +18,10 @@ Pose = tuple[Float[Array, "*batch 4"], Float[Array, "*batch 3"]]
 
 def _one_of(kinds: str, rotation: Any, method: str) -> None:
     kind = type(rotation).__name__
-    demand(hasattr(rotation, method), f"Argument `rotation` must be {kinds}, but it is a {kind}.")
+    demand(
+        hasattr(rotation, method),
+        f"Argument `rotation` must be {kinds}, but it is a {kind}.",
+    )
 
 
 def _arrays(attitude: Attitudes, position: Positions | None) -> tuple[Array, ...]:
@@ -39,10 +42,12 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
         position: Of the body's origin, space components [m].
 
     Returns:
-        A `scipy.spatial.transform.Rotation`, or a `RigidTransform` (scipy 1.16), of as many.
+        A `scipy.spatial.transform.Rotation`, or a `RigidTransform` (scipy 1.16), of as
+        many.
 
     Raises:
-        ValueError: Other than four numbers in each attitude, or not three of a position for each.
+        ValueError: Other than four numbers in each attitude, or not three of a position
+            for each.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> turn = jr.io.to_scipy(jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2])))
@@ -61,7 +66,8 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     """Attitudes of scipy's rotations, or attitudes and positions of its rigid transforms.
 
     Args:
-        rotation: `Rotation` or `RigidTransform`, of one or many, taken as body to space.
+        rotation: `Rotation` or `RigidTransform`, of one or many, taken as body to
+            space.
 
     Returns:
         Unit quaternions, scalar first; of a `RigidTransform` (attitude, position).
@@ -79,7 +85,9 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     turn = rotation.rotation if hasattr(rotation, "translation") else rotation
     _one_of("a scipy.spatial.transform.Rotation or RigidTransform", turn, "as_quat")
     attitude = jnp.roll(jnp.asarray(turn.as_quat()), 1, axis=-1)
-    return attitude if turn is rotation else (attitude, jnp.asarray(rotation.translation))
+    return (
+        attitude if turn is rotation else (attitude, jnp.asarray(rotation.translation))
+    )
 
 
 def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
@@ -90,10 +98,12 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
         position: Of the body's origin, space components [m].
 
     Returns:
-        A `jaxlie.SO3` or `jaxlie.SE3`; `apply` takes body components to space components.
+        A `jaxlie.SO3` or `jaxlie.SE3`; `apply` takes body components to space
+        components.
 
     Raises:
-        ValueError: Other than four numbers in each attitude, or not three of a position for each.
+        ValueError: Other than four numbers in each attitude, or not three of a position
+            for each.
 
     Gradients: the identity.
 
@@ -136,9 +146,10 @@ def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
 def to_spice(attitude: QuaternionLike) -> Quaternion:
     """SPICE's quaternion of a C-matrix, as in C-kernels: `m2q(C)`, C from space to body.
 
-    SPICE is scalar first with Hamilton's product, as here, but its C-matrix takes components in
-    the reference frame to the instrument's: the conjugate. Its angular velocities are in
-    components of the reference frame: `jrigid.rotation.rotate(attitude, omega)`.
+    SPICE is scalar first with Hamilton's product, as here, but its C-matrix takes
+    components in the reference frame to the instrument's: the conjugate. Its angular
+    velocities are in components of the reference frame:
+        `jrigid.rotation.rotate(attitude, omega)`.
 
     Args:
         attitude: Unit quaternion, body to space.
@@ -160,7 +171,8 @@ def from_spice(quaternion: QuaternionLike) -> Quaternion:
     """Attitude of SPICE's quaternion of a C-matrix; see `to_spice`.
 
     Args:
-        quaternion: As `spiceypy.m2q(C)` gives it, C from the reference frame to the body's.
+        quaternion: As `spiceypy.m2q(C)` gives it, C from the reference frame to the
+            body's.
 
     Returns:
         Unit quaternion, scalar first, body to space.
@@ -181,13 +193,15 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
     The other set, of the turn the other way round, is `shadow_mrp` of it.
 
     Args:
-        attitude: Quaternion, body to space; its norm drops out, and q and -q give the same.
+        attitude: Quaternion, body to space; its norm drops out, and q and -q give the
+            same.
 
     Returns:
         Parameters, of length at most 1; NaN of the zero quaternion.
 
-    Gradients: finite everywhere. At a half turn (w = 0, length 1), where the value jumps to its
-        shadow, they are those of the set that is returned, that of the sign of the quaternion.
+    Gradients: finite everywhere. At a half turn (w = 0, length 1), where the value
+        jumps to its shadow, they are those of the set that is returned, that of the
+        sign of the quaternion.
     Source: H. Schaub and J. Junkins, J. Astronautical Sciences 44 (1996) 1-19.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -202,10 +216,12 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
 def shadow_mrp(mrp: VectorLike) -> Vector:
     """The other set of modified Rodrigues parameters of the same attitude, -mrp / |mrp|^2.
 
-    A record that goes through half a turn stays smooth in one set and jumps in the shorter one.
+    A record that goes through half a turn stays smooth in one set and jumps in the
+    shorter one.
 
     Args:
-        mrp: Parameters of either set; of none, the identity's, NaN: its shadow is infinite.
+        mrp: Parameters of either set; of none, the identity's, NaN: its shadow is
+            infinite.
 
     Returns:
         Parameters of the other set.

@@ -14,19 +14,43 @@ from jrigid._extra import extra
 from jrigid.io._physical import faults, nearest_physical, values_of
 from jrigid.mass import MassProperties
 
-_SIX = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
+_SIX = {
+    "ixx": (0, 0),
+    "iyy": (1, 1),
+    "izz": (2, 2),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyz": (1, 2),
+}
 _NEW = {  # a file and a link in it
     ".urdf": ("<robot name='bodies'>{}</robot>", "<link name={}/>"),
     ".xml": ("<mujoco><worldbody>{}</worldbody></mujoco>", "<body name={}/>"),
-    ".sdf": ("<sdf version='1.9'><model name='bodies'>{}</model></sdf>", "<link name={}/>"),
+    ".sdf": (
+        "<sdf version='1.9'><model name='bodies'>{}</model></sdf>",
+        "<link name={}/>",
+    ),
 }
-_RPY = {"angle": "radian", "eulerseq": "XYZ"}  # roll, pitch, yaw about fixed axes, in MJCF's words
+_RPY = {
+    "angle": "radian",
+    "eulerseq": "XYZ",
+}  # roll, pitch, yaw about fixed axes, in MJCF's words
 
-_POSES = {"euler_rpy": "0 0 0 0 0 0", "quat_xyzw": "0 0 0 0 0 0 1"}  # SDF's, where none is given
+_POSES = {
+    "euler_rpy": "0 0 0 0 0 0",
+    "quat_xyzw": "0 0 0 0 0 0 1",
+}  # SDF's, where none is given
 _SAVED = "save the compiled model by `mujoco.mj_saveLastXML`"
 _MADE = (  # links that a program makes: in which format, of what, what to do
-    ("sdf", ".//include", "`<include>` adds models: expand it first, `gz sdf -p a.sdf > b.sdf`."),
-    ("mujoco", ".//replicate//body", f"`<replicate>` makes bodies: {_SAVED} and read that."),
+    (
+        "sdf",
+        ".//include",
+        "`<include>` adds models: expand it first, `gz sdf -p a.sdf > b.sdf`.",
+    ),
+    (
+        "mujoco",
+        ".//replicate//body",
+        f"`<replicate>` makes bodies: {_SAVED} and read that.",
+    ),
     ("mujoco", ".//attach", f"`<attach>` adds bodies: {_SAVED} and read that."),
 )
 _MACROS = "Argument `path` must be expanded, but it has macros: `xacro a.xacro > a.urdf` first."
@@ -40,15 +64,22 @@ _Said = tuple[Mapping[str, str], Mapping[str, str]]
 def _urdf(inertial: ET.Element, _: ET.Element) -> _Said:
     known = {f"{x.tag} {k}": text for x in inertial for k, text in x.attrib.items()}
     mass, *six = _texts(known, "mass value", *(f"inertia {k}" for k in _SIX))
-    pose = {"pos": known.get("origin xyz", "0 0 0"), "euler": known.get("origin rpy", "0 0 0")}
+    pose = {
+        "pos": known.get("origin xyz", "0 0 0"),
+        "euler": known.get("origin rpy", "0 0 0"),
+    }
     return {"mass": mass, "fullinertia": " ".join(six), **pose}, _RPY
 
 
 def _sdf(inertial: ET.Element, _: ET.Element) -> _Said:
-    texts = {x.tag: [x.text, *(part.tail for part in x)] for x in inertial.iter()}  # past comments
+    texts = {
+        x.tag: [x.text, *(part.tail for part in x)] for x in inertial.iter()
+    }  # past comments
     known = {tag: " ".join(filter(None, parts)).strip() for tag, parts in texts.items()}
     about = getattr(inertial.find("pose"), "attrib", {})
-    demand(not _flag(inertial.attrib, "auto"), "`auto` is for the simulator to compute.")
+    demand(
+        not _flag(inertial.attrib, "auto"), "`auto` is for the simulator to compute."
+    )
     demand(not about.get("relative_to"), "Its pose must be relative to the link.")
     kind = about.get("rotation_format", "euler_rpy")
     check_option("rotation_format", kind, tuple(_POSES))
@@ -64,10 +95,17 @@ def _sdf(inertial: ET.Element, _: ET.Element) -> _Said:
 
 
 def _mjcf(inertial: ET.Element, root: ET.Element) -> _Said:
-    options = {k: x for compiler in root.iter("compiler") for k, x in compiler.attrib.items()}
-    demand(options.get("inertiafromgeom") != "true", "`inertiafromgeom` makes MuJoCo overlook it.")
+    options = {
+        k: x for compiler in root.iter("compiler") for k, x in compiler.attrib.items()
+    }
+    demand(
+        options.get("inertiafromgeom") != "true",
+        "`inertiafromgeom` makes MuJoCo overlook it.",
+    )
     for k in ("settotalmass", "boundmass", "boundinertia"):
-        message = f"`{k}` makes MuJoCo change it: {_SAVED}, delete `{k}` there and read that."
+        message = (
+            f"`{k}` makes MuJoCo change it: {_SAVED}, delete `{k}` there and read that."
+        )
         demand(float(options.get(k, 0)) <= 0, message)
     known, full = inertial.attrib, "fullinertia" in inertial.attrib
     rivals = (*_TURNS, "fullinertia", "diaginertia") if full else _TURNS
@@ -114,7 +152,9 @@ def _turn(said: Mapping[str, str], options: Mapping[str, str]) -> Any:
         z = np.cross(x, y)
         axes = [v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)]
         return turns.from_matrix(np.stack(axes, axis=1))
-    if text := said.get("zaxis"):  # the shortest turn there, of half a turn that about x
+    if text := said.get(
+        "zaxis"
+    ):  # the shortest turn there, of half a turn that about x
         x, y, z = _numbers(text, 3)
         half = [-y, x, 0.0, np.linalg.norm([x, y, z]) + z]
         return turns.from_quat(half if np.any(half) else [1.0, 0.0, 0.0, 0.0])
@@ -122,11 +162,15 @@ def _turn(said: Mapping[str, str], options: Mapping[str, str]) -> Any:
     angles = _numbers(said.get("euler") or "0 0 0", 3) * unit
     for axis, angle in zip(options.get("eulerseq", "xyz"), angles, strict=True):
         one = turns.from_euler(axis.lower(), angle)
-        turn = turn * one if axis.islower() else one * turn  # about moving or fixed axes
+        turn = (
+            turn * one if axis.islower() else one * turn
+        )  # about moving or fixed axes
     return turn
 
 
-def _read(inertial: ET.Element, root: ET.Element) -> tuple[float, np.ndarray, np.ndarray]:
+def _read(
+    inertial: ET.Element, root: ET.Element
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass, tensor about it in the axes of the link."""
     said, options = _FORMATS[root.tag](inertial, root)
     a, b, c, d, e, f = _numbers(said["fullinertia"], 6)
@@ -171,7 +215,10 @@ def _links(root: ET.Element) -> dict[str, ET.Element]:
         elements = model.iterfind(".//body" if root.tag == "mujoco" else "link")
         for i, element in enumerate(elements, 1):
             name = scope * (len(models) > 2) + element.get("name", f"body {i}")
-            demand(name not in links, f"Names of links must be unique, but {name!r} is not.")
+            demand(
+                name not in links,
+                f"Names of links must be unique, but {name!r} is not.",
+            )
             links[name] = element
     return links
 
@@ -181,30 +228,33 @@ def read_inertials(
 ) -> dict[str, MassProperties]:
     """Mass properties of the links of a URDF, MJCF or SDF file, by name, in the links' axes.
 
-    The format is that of the root: `<robot>`, `<mujoco>`, `<sdf>`. Links without an inertial are
-    left out, also those whose inertia MuJoCo would take from their shapes; the links of an SDF file
-    of several models are called `model::link`, of nested ones `outer::inner::link`.
+    The format is that of the root: `<robot>`, `<mujoco>`, `<sdf>`. Links without an
+    inertial are left out, also those whose inertia MuJoCo would take from their shapes;
+    the links of an SDF file of several models are called `model::link`, of nested ones
+    `outer::inner::link`.
 
     Args:
         path: The file, or its text.
-        unphysical: What to do with inertials that no body can have: "raise" says in one error what
-            is wrong with each (see `diagnose`); "nearest" takes the nearest tensors that a body
-            can have (see `nearest_physical`); "keep" takes them as they are, as
-            `MassProperties.unchecked` does.
-        thickness: Of "nearest": no body is thinner than a plate of this thickness [m]. MuJoCo,
-            which allows no rounding, may refuse flat ones.
+        unphysical: What to do with inertials that no body can have: "raise" says in one
+            error what is wrong with each (see `diagnose`); "nearest" takes the nearest
+            tensors that a body can have (see `nearest_physical`); "keep" takes them as
+            they are, as `MassProperties.unchecked` does.
+        thickness: Of "nearest": no body is thinner than a plate of this thickness [m].
+            MuJoCo, which allows no rounding, may refuse flat ones.
 
     Returns:
         The bodies; centres of mass from the origins of their links.
 
     Raises:
-        ValueError: A file of another kind, or whose links or numbers its program makes of others
-            (macros, SDF's includes, MJCF's `replicate`, `settotalmass`); numbers that are missing
-            or that are formulas; bodies that are none in the precision of jax (float32 but with
-            `jax_enable_x64`), by the names of the links.
+        ValueError: A file of another kind, or whose links or numbers its program makes
+            of others (macros, SDF's includes, MJCF's `replicate`, `settotalmass`);
+            numbers that are missing or that are formulas; bodies that are none in the
+            precision of jax (float32 but with `jax_enable_x64`), by the names of the
+            links.
 
-    Source: URDF, wiki.ros.org/urdf/XML/link; MuJoCo, XML reference, body/inertial; SDFormat 1.12,
-        inertial. All three mean tensors about the centre of mass with ixy = -sum m x y.
+    Source: URDF, wiki.ros.org/urdf/XML/link; MuJoCo, XML reference, body/inertial;
+        SDFormat 1.12, inertial. All three mean tensors about the centre of mass with
+        ixy = -sum m x y.
 
     >>> import jrigid as jr
     >>> text = "<inertial mass='2' pos='0 0 1' diaginertia='1 2 2.5' euler='0 0 90'/>"
@@ -224,7 +274,9 @@ def read_inertials(
         try:
             mass, center, tensor = _read(inertial, root)
         except ValueError as error:
-            raise ValueError(f"The inertial of {name!r} cannot be read: {error}") from error
+            raise ValueError(
+                f"The inertial of {name!r} cannot be read: {error}"
+            ) from error
         if unphysical == "nearest":
             tensor = np.asarray(nearest_physical(tensor, mass, thickness))
         bodies[name] = body = MassProperties.unchecked(mass, center, tensor)
@@ -238,7 +290,11 @@ def _written(kind: str, body: MassProperties) -> ET.Element:
     """An inertial in the axes of the link."""
     center, mass, *values = (
         " ".join(map(str, np.ravel(value)))
-        for value in (body.center_of_mass, body.mass, *(body.inertia[ij] for ij in _SIX.values()))
+        for value in (
+            body.center_of_mass,
+            body.mass,
+            *(body.inertia[ij] for ij in _SIX.values()),
+        )
     )
     if kind == "mujoco":
         text = f"pos='{center}' mass='{mass}' fullinertia='{' '.join(values)}'"
@@ -248,7 +304,9 @@ def _written(kind: str, body: MassProperties) -> ET.Element:
         text = f"<origin xyz='{center}' rpy='0 0 0'/><mass value='{mass}'/><inertia {text}/>"
     else:
         text = "".join(f"<{k}>{x}</{k}>" for k, x in zip(_SIX, values, strict=True))
-        text = f"<pose>{center} 0 0 0</pose><mass>{mass}</mass><inertia>{text}</inertia>"
+        text = (
+            f"<pose>{center} 0 0 0</pose><mass>{mass}</mass><inertia>{text}</inertia>"
+        )
     return ET.fromstring(f"<inertial>{text}</inertial>")
 
 
@@ -259,7 +317,10 @@ def _around(source: str | Path) -> tuple[str, str]:
     for event, x in ET.iterparse(_opened(source), events):
         depth += (event == "start") - (event == "end")
         before &= event != "start"
-        if event == "start-ns" and x[0].strip("0123456789") not in ("", "ns"):  # as ET takes
+        if event == "start-ns" and x[0].strip("0123456789") not in (
+            "",
+            "ns",
+        ):  # as ET takes
             ET.register_namespace(*x)
         elif event in ("comment", "pi") and not depth:
             around[not before] += ET.tostring(x, "unicode").strip() + "\n"
@@ -267,24 +328,29 @@ def _around(source: str | Path) -> tuple[str, str]:
 
 
 def write_inertials(
-    path: str | Path, bodies: Mapping[str, MassProperties], *, template: str | Path | None = None
+    path: str | Path,
+    bodies: Mapping[str, MassProperties],
+    *,
+    template: str | Path | None = None,
 ) -> None:
     """Write mass properties as the inertials of a URDF (.urdf), MJCF (.xml) or SDF (.sdf) file.
 
-    Tensors are written in the axes of the link, about the centre of mass, to the last digit of
-    their precision.
+    Tensors are written in the axes of the link, about the centre of mass, to the last
+    digit of their precision.
 
     Args:
         path: The file to write.
-        bodies: By the names of the links, in their axes, centres of mass from their origins [m].
-        template: A file, or its text, whose inertials are replaced (or added), and all other
-            elements and comments kept; white space, quotes and a DOCTYPE are not, and what an MJCF
-            includes is written into it. It may be `path` itself. None: a new file of these links
-            alone, without joints, which a URDF of several needs.
+        bodies: By the names of the links, in their axes, centres of mass from their
+            origins [m].
+        template: A file, or its text, whose inertials are replaced (or added), and all
+            other elements and comments kept; white space, quotes and a DOCTYPE are not,
+            and what an MJCF includes is written into it. It may be `path` itself. None:
+            a new file of these links alone, without joints, which a URDF of several
+            needs.
 
     Raises:
-        ValueError: A suffix of no format, a link that the template has not, a template with
-            macros.
+        ValueError: A suffix of no format, a link that the template has not, a template
+            with macros.
 
     >>> import jrigid as jr
     >>> from tempfile import TemporaryDirectory
@@ -312,4 +378,6 @@ def write_inertials(
     ET.indent(root)
     before, after = _around(template)
     text = f"{before}{ET.tostring(root, 'unicode')}\n{after}"
-    Path(path).write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{text}", encoding="utf-8")
+    Path(path).write_text(
+        f"<?xml version='1.0' encoding='utf-8'?>\n{text}", encoding="utf-8"
+    )

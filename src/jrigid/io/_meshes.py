@@ -19,11 +19,13 @@ _ADVICE = (
 )
 
 
-def mesh_arrays(mesh: Any) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+def mesh_arrays(
+    mesh: Any,
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
     """Vertices and faces of a trimesh, as `jrigid.from_mesh` takes them.
 
-    Corners at one place become one vertex, which STL files and meshes with textures or normals at
-    their corners do not have, and faces that this makes lines are left out.
+    Corners at one place become one vertex, which STL files and meshes with textures or
+    normals at their corners do not have, and faces that this makes lines are left out.
 
     Args:
         mesh: A `trimesh.Trimesh`.
@@ -37,7 +39,9 @@ def mesh_arrays(mesh: Any) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndar
     (8, 3) (12, 3) 6.0
     """
     message = f"Argument `mesh` must be a mesh or scene of trimesh, but it is {kind_of(mesh)}."
-    demand(hasattr(mesh, "merge_vertices"), f"{message} (`jrigid.from_mesh` takes arrays.)")
+    demand(
+        hasattr(mesh, "merge_vertices"), f"{message} (`jrigid.from_mesh` takes arrays.)"
+    )
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = np.asarray(merged.faces, np.int64)
@@ -52,7 +56,9 @@ def _parts(shape: Any) -> list[tuple[tuple[str, ...], Any]]:
     parts = []
     for node in shape.graph.nodes_geometry:
         transform, geometry = shape.graph[node]
-        if hasattr(shape.geometry[geometry], "faces"):  # else a path or a cloud of points
+        if hasattr(
+            shape.geometry[geometry], "faces"
+        ):  # else a path or a cloud of points
             mesh = shape.geometry[geometry].copy()
             mesh.apply_transform(transform)  # turns the faces over where it mirrors
             parts.append(((str(node), str(geometry)), mesh))
@@ -60,7 +66,9 @@ def _parts(shape: Any) -> list[tuple[tuple[str, ...], Any]]:
     return parts
 
 
-def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> MassProperties:
+def from_trimesh(
+    mesh: Any, density: Density = 1.0, *, scale: float = 1.0
+) -> MassProperties:
     """Mass properties of a trimesh, or of a scene of parts with their places, rigidly joined.
 
     Each part is a homogeneous body; where parts overlap their masses add.
@@ -74,8 +82,9 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
         The body, in the coordinates of the mesh or scene, in metres.
 
     Raises:
-        ValueError: A part has no density or a name none of the parts, a part is no closed
-            surface, or a value is wrong; the text says which part and what to do.
+        ValueError: A part has no density or a name none of the parts, a part is no
+            closed surface, or a value is wrong; the text says which part and what to
+            do.
 
     >>> import jrigid as jr, trimesh
     >>> scene = trimesh.Scene({"hull": trimesh.creation.box((1, 1, 1))})
@@ -94,24 +103,31 @@ def from_trimesh(mesh: Any, density: Density = 1.0, *, scale: float = 1.0) -> Ma
     demand(set(densities) <= set(known), message)
     for names, part in parts:
         own = [densities[x] for x in names if x in densities]
-        demand(bool(own), f"Argument `density` must have one of {names[0]!r}, but it has not.")
+        demand(
+            bool(own),
+            f"Argument `density` must have one of {names[0]!r}, but it has not.",
+        )
         vertices, faces = mesh_arrays(part)
         try:
             bodies.append(from_mesh(scale * vertices, faces, own[0]))
         except (RuntimeError, ValueError) as error:
             advice = f" {_ADVICE}" if "`faces`" in str(error) else ""
-            raise ValueError(f"Part {names[0]!r} of the mesh: {error}{advice}") from error
+            raise ValueError(
+                f"Part {names[0]!r} of the mesh: {error}{advice}"
+            ) from error
     return sum(bodies[1:], bodies[0])
 
 
-def read_mesh(path: str | Path, density: Density = 1.0, *, scale: float = 1.0) -> MassProperties:
+def read_mesh(
+    path: str | Path, density: Density = 1.0, *, scale: float = 1.0
+) -> MassProperties:
     """Mass properties of the parts in a file of meshes: STL, OBJ, PLY, glTF, all trimesh reads.
 
     Args:
         path: The file.
         density: Of all parts, or of each by its name in the file [kg/m^3].
-        scale: Metres in a unit of the file. STL, OBJ and PLY do not say their unit, CAD programs
-            mean millimetres (1e-3); glTF is in metres, its y axis up.
+        scale: Metres in a unit of the file. STL, OBJ and PLY do not say their unit, CAD
+            programs mean millimetres (1e-3); glTF is in metres, its y axis up.
 
     Returns:
         The body, in the coordinates of the file, in metres.

@@ -17,8 +17,9 @@ _ROUNDING = 1e-6  # of the tensor, in its symmetry
 _DIGITS = 1e-3  # of the trace: what three digits in a file round
 _SIZES = 1e-3, 10.0  # radii of gyration of machines and their parts [m]
 _FAR = 100.0  # radii of gyration
-# About the origin m c^T S^-1 c is at most 1 whatever the body, and about the centre of mass 3 for a
-# rod whose end is the origin, 5 for a ball that touches it: 3/4 and 5/6 where they are mistaken.
+# About the origin m c^T S^-1 c is at most 1 whatever the body, and about the centre of
+# mass 3 for a rod whose end is the origin, 5 for a ball that touches it: 3/4 and 5/6
+# where they are mistaken.
 _MISTAKEN = 0.7
 
 
@@ -30,7 +31,9 @@ def _is_real(tensor: np.ndarray) -> bool:
 
 
 def _shift(mass: float, center: np.ndarray) -> np.ndarray:
-    return mass * (center @ center * np.eye(3, dtype=center.dtype) - np.outer(center, center))
+    return mass * (
+        center @ center * np.eye(3, dtype=center.dtype) - np.outer(center, center)
+    )
 
 
 def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
@@ -46,7 +49,9 @@ def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
         "it was already about the centre of mass when m (|d|^2 1 - d d^T) was subtracted to bring "
         "it there (add it back)": tensor + _shift(mass, center),
     }
-    guesses = {k: x for k, x in guesses.items() if not np.allclose(x, tensor) and _is_real(x)}
+    guesses = {
+        k: x for k, x in guesses.items() if not np.allclose(x, tensor) and _is_real(x)
+    }
     return "".join(f" It is that of a body if {words}." for words in guesses)
 
 
@@ -55,18 +60,26 @@ def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
     if not all(np.all(np.isfinite(x)) for x in (mass, center, tensor)):
         return ("A number is not finite: write it, or delete the whole inertial.",)
     moments = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
-    shown, over = ", ".join(f"{x:.4g}" for x in moments), 2 * moments[2] - np.sum(moments)
+    shown, over = (
+        ", ".join(f"{x:.4g}" for x in moments),
+        2 * moments[2] - np.sum(moments),
+    )
     what = f"largest exceeds the sum of the others by {over:.4g}"
     what = "smallest is negative" if moments[0] < 0 else what
     why = _explanations(tensor, mass, center)
     if 0 < over < _DIGITS * np.sum(moments):
         why = " That is as little as rounding to few digits makes: write more digits."
     size = np.linalg.norm(tensor)
-    change = 100 * np.linalg.norm(np.asarray(nearest_physical(tensor)) - tensor) / (size or 1.0)
+    change = (
+        100
+        * np.linalg.norm(np.asarray(nearest_physical(tensor)) - tensor)
+        / (size or 1.0)
+    )
     words = {
         f"The mass is {mass:.4g} kg, which is not positive: give a mass to what moves, and to a "
         "mere frame no inertial at all.": mass <= 0,
-        "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T) > _ROUNDING * size,
+        "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T)
+        > _ROUNDING * size,
         f"The principal moments are {shown} kg m^2, of which the {what}: no body has them, as each "
         f"is a sum of m (y^2 + z^2).{why} Else take it from the mesh (`jrigid.io.read_mesh`), "
         "or the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
@@ -106,14 +119,15 @@ def values_of(body: MassProperties) -> tuple[float, np.ndarray, np.ndarray]:
 def diagnose(body: MassProperties | InertiaLike) -> tuple[str, ...]:
     """What is wrong, or looks wrong, with a body's mass properties, in words that say what to do.
 
-    First what no real body can have: a mass that is not positive, a tensor with a negative moment
-    or with I3 > I1 + I2, with the conventions, if any, in which it would be a body's (signs of the
-    products, order of the six numbers, a shift between points made twice). Of what a body can
-    have, what looks odd: about the link's origin instead of the centre of mass, in other units.
+    First what no real body can have: a mass that is not positive, a tensor with a
+    negative moment or with I3 > I1 + I2, with the conventions, if any, in which it
+    would be a body's (signs of the products, order of the six numbers, a shift between
+    points made twice). Of what a body can have, what looks odd: about the link's origin
+    instead of the centre of mass, in other units.
 
     Args:
-        body: As `jrigid.MassProperties.unchecked` makes it of any numbers, or moments or a tensor
-            about the centre of mass [kg m^2].
+        body: As `jrigid.MassProperties.unchecked` makes it of any numbers, or moments
+            or a tensor about the centre of mass [kg m^2].
 
     Returns:
         A text for each point; none, if nothing is wrong.
@@ -138,10 +152,11 @@ def nearest_physical(
 ) -> Matrix:
     r"""The tensor of a real body that is nearest to any tensor.
 
-    A tensor is a body's if its second moment $S = \sum m r r^T = (tr I / 2) 1 - I$ has no negative
-    principal moment. Of all such the one whose S is nearest in the Frobenius norm is taken: what is
-    below 0 in S becomes 0, and its axes stay. That body is flat. With a mass and a thickness no
-    direction is thinner than a plate of that thickness: no moment of S is below m h^2 / 12.
+    A tensor is a body's if its second moment $S = \sum m r r^T = (tr I / 2) 1 - I$ has
+    no negative principal moment. Of all such the one whose S is nearest in the
+    Frobenius norm is taken: what is below 0 in S becomes 0, and its axes stay. That
+    body is flat. With a mass and a thickness no direction is thinner than a plate of
+        that thickness: no moment of S is below m h^2 / 12.
 
     Args:
         inertia: Moments or tensor [kg m^2]; of a tensor the symmetric part counts.
@@ -152,8 +167,8 @@ def nearest_physical(
         The tensor [kg m^2], the same to the last bit if it was that of a body.
 
     Gradients: finite; right where no moment of S is at its least value.
-    Source: N. Higham, Linear Algebra Appl. 103 (1988) 103-118; P. Wensing, S. Kim and J.-J.
-    Slotine, IEEE Robotics and Automation Letters 3 (2018) 60-67.
+    Source: N. Higham, Linear Algebra Appl. 103 (1988) 103-118; P. Wensing, S. Kim and
+    J.-J. Slotine, IEEE Robotics and Automation Letters 3 (2018) 60-67.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jnp.diag(jr.io.nearest_physical(jnp.array([1.0, 1.0, 2.5]))))

@@ -21,7 +21,9 @@ _LABELS |= {"moment": ["I1", "I2", "I3"], "ratio": ["I2/I1", "I3/I1"]}
 
 def _dataset(variables: dict[str, Any], **attributes: Any) -> Any:
     """Of (dimensions, values, attributes), with the labels of the dimensions."""
-    used = {dimension for dimensions, *_ in variables.values() for dimension in dimensions}
+    used = {
+        dimension for dimensions, *_ in variables.values() for dimension in dimensions
+    }
     labels = {k: x for k, x in _LABELS.items() if k in used}
     return extra("io", "xarray").Dataset(variables, labels, attributes)
 
@@ -51,21 +53,38 @@ def _of_trajectory(motion: Trajectory) -> Any:
 def _with_errors(fit: FitResult) -> dict[str, tuple[tuple[str, ...], Any, Any]]:
     """Dimensions, values and standard errors of what a fit found."""
     single = np.ndim(fit.chi_square) == 0
-    demand(single, "Argument `x` must be a single fit, but it is many: take one by `jax.tree.map`.")
-    picked = fit.leaves.items()
+    demand(
+        single,
+        "Argument `x` must be a single fit, but it is many: take one by `jax.tree.map`.",
+    )
+    picked = fit.estimates.items()
     return {
-        "moments": (("moment",), fit.moments, np.sqrt(np.diagonal(fit.moments_covariance))),
+        "moments": (
+            ("moment",),
+            fit.moments,
+            np.sqrt(np.diagonal(fit.moments_covariance)),
+        ),
         "ratios": (("ratio",), fit.ratios, fit.ratios_errors),
         "shares": (("moment",), fit.shares, fit.shares_errors),
         "numbers": (("number",), fit.numbers, fit.errors),
-        **{k: (tuple(f"{k}_{i}" for i in range(np.ndim(x))), x, e) for k, (x, e) in picked},
+        **{
+            k: (tuple(f"{k}_{i}" for i in range(np.ndim(x))), x, e)
+            for k, (x, e) in picked
+        },
     }
 
 
 def _of_fit(fit: FitResult) -> Any:
     variables: dict[str, Any] = {
-        "inertia": (("axis", "other_axis"), np.asarray(fit.inertia), {"units": "kg m^2"}),
-        "numbers_covariance": (("number", "other_number"), np.asarray(fit.numbers_covariance)),
+        "inertia": (
+            ("axis", "other_axis"),
+            np.asarray(fit.inertia),
+            {"units": "kg m^2"},
+        ),
+        "numbers_covariance": (
+            ("number", "other_number"),
+            np.asarray(fit.numbers_covariance),
+        ),
     }
     for name, (dimensions, *pair) in _with_errors(fit).items():
         about = {"units": "kg m^2"} if name == "moments" else {}
@@ -79,12 +98,13 @@ def to_xarray(x: Trajectory | FitResult | SweepResult) -> Any:
     """A trajectory, fit or sweep as an `xarray.Dataset`, with units in the attributes.
 
     Args:
-        x: A trajectory, of many lanes too (dimensions `lane`, `time`; where their times differ
-            `lane`, `sample`); a single fit; a sweep.
+        x: A trajectory, of many lanes too (dimensions `lane`, `time`; where their times
+            differ `lane`, `sample`); a single fit; a sweep.
 
     Returns:
-        The data set: of a trajectory its states, of a fit its moments, ratios, shares, numbers and
-        what `free` picked, each with standard errors, of a sweep `x.to_xarray()`.
+        The data set: of a trajectory its states, of a fit its moments, ratios, shares,
+        numbers and what `free` picked, each with standard errors, of a sweep
+        `x.to_xarray()`.
 
     Raises:
         ImportError: Without the extra `jrigid[io]`.
@@ -110,9 +130,9 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
         x: A trajectory of one lane; a single fit; a sweep.
 
     Returns:
-        Of a trajectory a row for each time [s], columns `attitude_w`, ..., `omega_x`, ...; of a
-        fit a row for each moment, ratio, share and number, columns `value` and `error`; of a sweep
-        a row for each point.
+        Of a trajectory a row for each time [s], columns `attitude_w`, ..., `omega_x`,
+        ...; of a fit a row for each moment, ratio, share and number, columns `value`
+        and `error`; of a sweep a row for each point.
 
     Raises:
         ImportError: Without the extra `jrigid[io]`.
@@ -130,7 +150,10 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
         return dataset.to_dataframe()
     if isinstance(x, FitResult):
         names = [k for k in dataset if f"{k}_error" in dataset]
-        pair = [{k: v for n in names for k, v in _flat(dataset[n + x], n)} for x in ("", "_error")]
+        pair = [
+            {k: v for n in names for k, v in _flat(dataset[n + x], n)}
+            for x in ("", "_error")
+        ]
         return pandas.DataFrame(dict(zip(("value", "error"), pair, strict=True)))
     message = "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), but they have"
     demand(x.ts.ndim == 1, f"{message} shape {x.ts.shape}: use `to_xarray`.")
@@ -143,5 +166,7 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
 def _flat(variable: Any, name: str, keep: int = 0) -> Iterator[tuple[str, np.ndarray]]:
     """What a variable holds along its first dimensions, named by it and the labels of the rest."""
     columns = variable.values.reshape(*variable.shape[:keep], -1)
-    for i, labels in enumerate(product(*(variable[d].values for d in variable.dims[keep:]))):
+    for i, labels in enumerate(
+        product(*(variable[d].values for d in variable.dims[keep:]))
+    ):
         yield "_".join([name, *map(str, labels)]), columns.T[i]

@@ -1,9 +1,9 @@
 """Mass properties: point clouds, densities and meshes; parallel axis; principal axes; composition.
 
-Positions, centres of mass and tensors are components in one set of body axes [m, kg, kg m^2].
-`MassProperties` holds its tensor about the centre of mass. Where moments repeat, derivatives of
-their symmetric functions are right to first order through `principal_axes`, and to second order
-through `tensor_function`.
+Positions, centres of mass and tensors are components in one set of body axes [m, kg, kg
+m^2]. `MassProperties` holds its tensor about the centre of mass. Where moments repeat,
+derivatives of their symmetric functions are right to first order through
+`principal_axes`, and to second order through `tensor_function`.
 """
 
 from jrigid.mass._axes import inertia_of_second_moment as inertia_of_second_moment

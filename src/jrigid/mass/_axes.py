@@ -19,7 +19,15 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._spectral import eigh, spectral_function
-from jrigid._types import InertiaLike, Matrix, Readable, Scalar, ScalarLike, Vector, VectorLike
+from jrigid._types import (
+    InertiaLike,
+    Matrix,
+    Readable,
+    Scalar,
+    ScalarLike,
+    Vector,
+    VectorLike,
+)
 
 ULPS = 64  # rounding allowed in "not negative" and "I3 <= I1 + I2"
 
@@ -33,7 +41,8 @@ def as_tensor(inertia: Array) -> Matrix:
 def inertia_of_second_moment(second: Matrix) -> Matrix:
     """Inertia tensor of a second moment of the mass, tr(S) 1 - S.
 
-    Diagonal elements are sums of two, as differences of three would leave no digits to a needle.
+    Diagonal elements are sums of two, as differences of three would leave no digits to
+    a needle.
 
     Args:
         second: S, the integral of r r^T over the mass [kg m^2].
@@ -74,7 +83,8 @@ def steiner(displacement: Vector) -> Matrix:
 def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
     """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
 
-    Entries and scale are about 1: products of much larger or smaller ones leave the range.
+    Entries and scale are about 1: products of much larger or smaller ones leave the
+        range.
     """
     # A few ulps off at any moments, where the roots of the cubic lose half the digits.
     shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
@@ -84,7 +94,9 @@ def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
         k = jnp.argmax(jnp.where(left, jnp.diagonal(remainder), -jnp.inf))
         row, pivot = remainder[k], remainder[k, k]
         fine = fine & (pivot >= 0)
-        remainder = remainder - row[:, None] * row[None, :] / jnp.where(pivot > 0, pivot, 1.0)
+        remainder = remainder - row[:, None] * row[None, :] / jnp.where(
+            pivot > 0, pivot, 1.0
+        )
         left = left & (jnp.arange(3) != k)
     return fine
 
@@ -104,7 +116,9 @@ def body_arrays(
 ) -> tuple[Matrix, Scalar, Vector]:
     """Tensor, mass and a vector, given by its name, of one dtype, or ValueError."""
     ((name, value),) = vector.items()
-    inertia, mass, value = shaped(inertia=(inertia, *INERTIA), mass=(mass,), **{name: (value, 3)})
+    inertia, mass, value = shaped(
+        inertia=(inertia, *INERTIA), mass=(mass,), **{name: (value, 3)}
+    )
     return as_tensor(inertia), mass, value
 
 
@@ -123,10 +137,13 @@ def _displaced(arguments: tuple[Matrix, Scalar, Vector], *, to_center: bool) -> 
     return where_defined(ok, displaced, *arguments)
 
 
-def parallel_axis(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+def parallel_axis(
+    inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike
+) -> Matrix:
     r"""Inertia tensor about a point displaced from the centre of mass.
 
-    $I = I_{com} + m (|d|^2 1 - d d^T)$. NaN where the tensor is not symmetric or the mass negative.
+    $I = I_{com} + m (|d|^2 1 - d d^T)$. NaN where the tensor is not symmetric or the
+    mass negative.
 
     Args:
         inertia: Moments or tensor about the centre of mass [kg m^2].
@@ -144,15 +161,20 @@ def parallel_axis(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLi
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    return _displaced(body_arrays(inertia, mass, displacement=displacement), to_center=False)
+    return _displaced(
+        body_arrays(inertia, mass, displacement=displacement), to_center=False
+    )
 
 
-def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike) -> Matrix:
+def to_center_of_mass(
+    inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike
+) -> Matrix:
     r"""Inertia tensor about the centre of mass, from that about a displaced point.
 
-    The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$. NaN where the tensor is not
-    symmetric or the mass negative, and where a moment about the centre of mass comes out negative:
-    no body with `mass` at `displacement` has so small a tensor.
+    The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$. NaN where the
+    tensor is not symmetric or the mass negative, and where a moment about the centre of
+    mass comes out negative: no body with `mass` at `displacement` has so small a
+        tensor.
 
     Args:
         inertia: Moments or tensor about the point [kg m^2].
@@ -170,7 +192,9 @@ def to_center_of_mass(inertia: InertiaLike, mass: ScalarLike, displacement: Vect
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    return _displaced(body_arrays(inertia, mass, displacement=displacement), to_center=True)
+    return _displaced(
+        body_arrays(inertia, mass, displacement=displacement), to_center=True
+    )
 
 
 @final
@@ -179,7 +203,8 @@ class PrincipalAxes(Readable):
 
     Attributes:
         moments: Principal moments, ascending [kg m^2].
-        axes: Rotation whose columns are the principal axes: v_body = axes @ v_principal.
+        axes: Rotation whose columns are the principal axes: v_body = axes @
+            v_principal.
     """
 
     moments: Float[Array, "3"]
@@ -189,21 +214,24 @@ class PrincipalAxes(Readable):
 def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
     """Principal moments and axes of an inertia tensor; NaN where it is not symmetric.
 
-    Moments ascend; axes are the columns of a right-handed rotation. In axes 1 and 3 the first
-    component that has at least 0.9 of the largest magnitude is positive, so that the signs do not
-    hang on the last bit where two components tie; axis 2 completes the rotation.
+    Moments ascend; axes are the columns of a right-handed rotation. In axes 1 and 3 the
+    first component that has at least 0.9 of the largest magnitude is positive, so that
+    the signs do not hang on the last bit where two components tie; axis 2 completes the
+    rotation.
 
     Args:
         inertia: Moments or tensor [kg m^2]; any symmetric tensor will do.
 
     Returns:
-        Moments and axes, tensor = axes diag(moments) axes^T to a few ulps of the largest.
+        Moments and axes, tensor = axes diag(moments) axes^T to a few ulps of the
+        largest.
 
-    Gradients: d moments = diag(axes^T dI axes). First derivatives of symmetric functions of
-    the moments (`sum(1 / moments)`) are right everywhere, repeated moments included. The moments
-    one by one, and the axes, have no derivative where moments repeat: there d axes is finite and
-    leaves out the axes of equal moments, so functions composed of moments and axes by hand, and
-    second derivatives, cannot be right there. Use `tensor_function` for them.
+    Gradients: d moments = diag(axes^T dI axes). First derivatives of symmetric
+    functions of the moments (`sum(1 / moments)`) are right everywhere, repeated moments
+    included. The moments one by one, and the axes, have no derivative where moments
+    repeat: there d axes is finite and leaves out the axes of equal moments, so
+    functions composed of moments and axes by hand, and second derivatives, cannot be
+    right there. Use `tensor_function` for them.
     Source: Golub and Van Loan, Matrix Computations, 4th ed., 8.5 (Jacobi).
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -211,7 +239,9 @@ def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
     [1. 2. 3.]
     """
     tensor = as_tensor(float_arrays(inertia)[0])
-    return where_defined(is_symmetric(tensor), lambda x: PrincipalAxes(*eigh(x)), tensor)
+    return where_defined(
+        is_symmetric(tensor), lambda x: PrincipalAxes(*eigh(x)), tensor
+    )
 
 
 def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
@@ -220,9 +250,10 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
     NaN where the tensor is not symmetric, and where f is.
 
     Args:
-        f: Maps a scalar to a scalar, smooth on the range of the moments, by jax operations;
-            forward-differentiable. It may close over parameters that are differentiated. Across
-            gaps below a tenth of a moment its derivatives are integrated with eight nodes.
+        f: Maps a scalar to a scalar, smooth on the range of the moments, by jax
+            operations; forward-differentiable. It may close over parameters that are
+            differentiated. Across gaps below a tenth of a moment its derivatives are
+            integrated with eight nodes.
         inertia: Moments or tensor [kg m^2]; any symmetric tensor in the domain of f.
 
     Returns:
@@ -232,9 +263,10 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
         ValueError: f does not map scalars to scalars.
         NotImplementedError: A third derivative in the tensor.
 
-    Gradients: first and second, in every mode, in the tensor and in what f closes over, right at
-    repeated and nearly repeated moments (divided differences), where moments and axes composed by
-    hand give NaN or finite wrong numbers. So are those of its trace.
+    Gradients: first and second, in every mode, in the tensor and in what f closes over,
+    right at repeated and nearly repeated moments (divided differences), where moments
+    and axes composed by hand give NaN or finite wrong numbers. So are those of its
+    trace.
     Source: Higham, Functions of Matrices (2008), theorem 3.11 (Daleckii and Krein).
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
@@ -248,9 +280,13 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
     moment = jax.ShapeDtypeStruct((), tensor.dtype)
     shape = jax.eval_shape(f, moment)
     if getattr(shape, "shape", None) != () or shape.dtype != tensor.dtype:
-        raise ValueError(f"Argument `f` must map {moment} to the same, but it gives {shape}.")
+        raise ValueError(
+            f"Argument `f` must map {moment} to the same, but it gives {shape}."
+        )
     hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
     # Of a bad lane f is asked at 1, which is in the domain of most functions.
     return where_defined(
-        is_symmetric(tensor), lambda x: spectral_function(hoisted, x, *parameters), tensor
+        is_symmetric(tensor),
+        lambda x: spectral_function(hoisted, x, *parameters),
+        tensor,
     )

@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from jrigid._checks import RESULTS, Findings, all_finite, check_shape, float_arrays, where_defined
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    check_shape,
+    float_arrays,
+    where_defined,
+)
 from jrigid._numerics import product
 from jrigid._types import (
     InertiaLike,
@@ -39,9 +46,9 @@ _NOT_A_BODY = (
 class MassProperties(Readable):
     """Mass, centre of mass, and inertia tensor about the centre of mass, of a real body.
 
-    Thin bodies are bodies too: a plate may have I3 = I1 + I2, a rod one zero moment, a point
-    three. `a + b` is the two bodies rigidly joined (coordinates in common), and `sum` works. What
-    is done with a body of NaN gives NaN.
+    Thin bodies are bodies too: a plate may have I3 = I1 + I2, a rod one zero moment, a
+    point three. `a + b` is the two bodies rigidly joined (coordinates in common), and
+    `sum` works. What is done with a body of NaN gives NaN.
 
     Attributes:
         mass: Mass [kg].
@@ -74,20 +81,24 @@ class MassProperties(Readable):
         Args:
             mass: Mass [kg], positive.
             center_of_mass: Coordinates of the centre of mass [m].
-            inertia: Moments or tensor about the centre of mass [kg m^2], positive semi-definite,
-                with I3 <= I1 + I2, to rounding. It is stored symmetrised.
-            throw: False: a bad value makes the body of its lane NaN instead of an error.
+            inertia: Moments or tensor about the centre of mass [kg m^2], positive
+                semi-definite, with I3 <= I1 + I2, to rounding. It is stored
+                symmetrised.
+            throw: False: a bad value makes the body of its lane NaN instead of an
+                error.
 
         Raises:
-            RuntimeError: Mass not positive, a value not finite, a tensor that is not symmetric or
-                has a negative moment or violates I3 <= I1 + I2.
+            RuntimeError: Mass not positive, a value not finite, a tensor that is not
+                symmetric or has a negative moment or violates I3 <= I1 + I2.
 
         Gradients: the identity, on symmetric tensors.
         """
         values = body_arrays(inertia, mass, center_of_mass=center_of_mass)
         tensor, mass, center_of_mass = jax.lax.stop_gradient(values)
         findings = Findings()
-        findings.require((mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass, value=mass)
+        findings.require(
+            (mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass, value=mass
+        )
         message = "Argument `center_of_mass` must be finite, but it is not."
         findings.require(all_finite(center_of_mass), None, message, center_of_mass)
         positive, triangle = is_physical(tensor)
@@ -105,7 +116,8 @@ class MassProperties(Readable):
         Args:
             mass: Mass [kg].
             center_of_mass: Coordinates of the centre of mass [m].
-            inertia: Moments or tensor about the centre of mass [kg m^2], stored symmetrised.
+            inertia: Moments or tensor about the centre of mass [kg m^2], stored
+                symmetrised.
 
         Returns:
             The body; NaN stays NaN.
@@ -117,7 +129,9 @@ class MassProperties(Readable):
         1.0
         """
         body = object.__new__(cls)
-        tensor, mass, center_of_mass = body_arrays(inertia, mass, center_of_mass=center_of_mass)
+        tensor, mass, center_of_mass = body_arrays(
+            inertia, mass, center_of_mass=center_of_mass
+        )
         object.__setattr__(body, "mass", mass)
         object.__setattr__(body, "center_of_mass", center_of_mass)
         object.__setattr__(body, "inertia", _symmetrised(tensor))
@@ -162,13 +176,16 @@ class MassProperties(Readable):
         """
         body, shift = _in_one_dtype(self, displacement)
         check_shape("displacement", shift, (3,))
-        return MassProperties.unchecked(body.mass, body.center_of_mass + shift, body.inertia)
+        return MassProperties.unchecked(
+            body.mass, body.center_of_mass + shift, body.inertia
+        )
 
     def rotated(self, attitude: QuaternionLike) -> "MassProperties":
         """The body turned about the origin of the coordinates.
 
         Args:
-            attitude: Quaternion of the turn; its norm drops out. Of a zero quaternion: NaN.
+            attitude: Quaternion of the turn; its norm drops out. Of a zero quaternion:
+                NaN.
 
         Returns:
             The turned body: centre of mass R c, tensor R I R^T.

@@ -37,7 +37,8 @@ def is_closed(faces: Int[np.ndarray, "faces 3"], vertices: int) -> bool:
     low, high = np.minimum(start, end), np.maximum(start, end)
     edges = np.sort(2 * (low * vertices + high) + (start > end))
     forth, back = edges[::2], edges[1::2]
-    # Sorted, every edge once forth and once back leaves no room for a third run or a point.
+    # Sorted, every edge once forth and once back leaves no room for a third run or a
+    # point.
     return not (edges.size % 2 or np.any(forth % 2) or np.any(back != forth + 1))
 
 
@@ -46,7 +47,8 @@ def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
     least, most = faces.min(), faces.max()
     if least < 0 or most >= vertices:
         return (
-            f" (Indices count from 0 to {vertices - 1} here, but they go from {least} to {most}.)"
+            f" (Indices count from 0 to {vertices - 1} here, but they go from {least} "
+            f"to {most}.)"
         )
     if np.unique(faces).size == faces.size:
         return (
@@ -65,7 +67,11 @@ def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array,
         return jnp.asarray(False)
     start, end = faces.T.ravel(), jnp.roll(faces, -1, axis=1).T.ravel()
     # Keys stay apart: their product overflows int32.
-    keys = (jnp.minimum(start, end), jnp.maximum(start, end), (start > end).astype(start.dtype))
+    keys = (
+        jnp.minimum(start, end),
+        jnp.maximum(start, end),
+        (start > end).astype(start.dtype),
+    )
     low, high, back = jax.lax.sort(keys, num_keys=3)
     same = (low[::2] == low[1::2]) & (high[::2] == high[1::2])
     alternate = (back[::2] == 0) & (back[1::2] == 1)
@@ -83,29 +89,38 @@ def _index_array(faces: Any) -> Any:
             f"Argument `faces` must hold integers, but it holds {faces.dtype}: indices of vertices."
         )
     if faces.shape[0] == 0:
-        raise ValueError("Argument `faces` must hold at least one face, but it is empty.")
+        raise ValueError(
+            "Argument `faces` must hold at least one face, but it is empty."
+        )
     return faces.astype(np.int32) if isinstance(faces, np.ndarray) else faces
 
 
 @jax.jit
-def _mesh_integrals(vertices: Array, faces: Array) -> tuple[Scalar, Scalar, Vector, Matrix]:
+def _mesh_integrals(
+    vertices: Array, faces: Array
+) -> tuple[Scalar, Scalar, Vector, Matrix]:
     """Volume, sum of the absolute volumes of its tetrahedra, centre, tensor about it.
 
-    The divergence theorem, as tetrahedra between the faces and an origin amid the vertices: the
-    sums do not depend on it, so no derivative runs through it, and far bodies lose no digits.
-    Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
+    The divergence theorem, as tetrahedra between the faces and an origin amid the
+    vertices: the sums do not depend on it, so no derivative runs through it, and far
+        bodies lose no digits.
+    Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties
+        (2002).
     """
     sums = jnp.stack([lane_sum(vertices[:, i]) for i in range(3)])
     origin = jax.lax.stop_gradient(sums / vertices.shape[0])
     local = [vertices[:, i] - origin[i] for i in range(3)]
     a, b, c = ([x.at[faces[:, k]].get(mode="clip") for x in local] for k in range(3))
-    six_volumes: Any = sum(a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3))
+    six_volumes: Any = sum(
+        a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3)
+    )
     s = [a[i] + b[i] + c[i] for i in range(3)]
     volume = lane_sum(six_volumes) / 6
     magnitude = lane_sum(jnp.abs(jax.lax.stop_gradient(six_volumes))) / 6
     first = jnp.stack([lane_sum(six_volumes * s[i]) for i in range(3)]) / 24
     second = symmetric(
-        lane_sum(six_volumes * (a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j])) / 120
+        lane_sum(six_volumes * (a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j]))
+        / 120
         for i, j in PAIRS
     )
     center = first / jnp.where(volume == 0, 1.0, volume)
@@ -122,15 +137,17 @@ def from_mesh(
 ) -> MassProperties:
     """Mass properties of a homogeneous body bounded by a closed triangle mesh; exact.
 
-    Surfaces that close each for itself are taken at their word: a cavity is a surface turned
-    inward, and where surfaces overlap or one is inside out outside of the others (a part mirrored
-    by its program) their masses add or subtract. Programs that repair meshes join them.
+    Surfaces that close each for itself are taken at their word: a cavity is a surface
+    turned inward, and where surfaces overlap or one is inside out outside of the others
+    (a part mirrored by its program) their masses add or subtract. Programs that repair
+    meshes join them.
 
     Args:
-        vertices: Coordinates of the corners [m]. Corners at one place must be one vertex.
-        faces: Indices of the corners of each triangle, counter-clockwise seen from outside, in a
-            cavity seen from inside the cavity. Known values are checked once, at trace time;
-            traced ones by a sort at run time.
+        vertices: Coordinates of the corners [m]. Corners at one place must be one
+            vertex.
+        faces: Indices of the corners of each triangle, counter-clockwise seen from
+            outside, in a cavity seen from inside the cavity. Known values are checked
+            once, at trace time; traced ones by a sort at run time.
         density: Density [kg/m^3], positive.
         throw: False: a bad value makes the body of its lane NaN instead of an error.
 
@@ -139,14 +156,15 @@ def from_mesh(
 
     Raises:
         ValueError: No faces, or indices that are no integers.
-        RuntimeError: A vertex is not finite; an edge is not shared by exactly two faces that run
-            through it in opposite directions (an open mesh, a flipped, repeated or degenerate
-            face, an index out of range, three faces at an edge); the volume is not positive (inside
-            out or flat); the tensor is not that of a real body (the surface cuts itself); the
-            density is not positive and finite.
+        RuntimeError: A vertex is not finite; an edge is not shared by exactly two faces
+            that run through it in opposite directions (an open mesh, a flipped,
+            repeated or degenerate face, an index out of range, three faces at an edge);
+            the volume is not positive (inside out or flat); the tensor is not that of a
+            real body (the surface cuts itself); the density is not positive and finite.
 
     Gradients: exact in the vertices and the density.
-    Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties (2002).
+    Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties
+        (2002).
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> corners = jnp.array([[0.0, 0, 0], [6.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])

@@ -22,8 +22,9 @@ from jrigid._types import Matrix, Real, Scalar, Vector, VectorLike
 from jrigid.mass._axes import inertia_of_second_moment
 from jrigid.mass._body import MassProperties
 
-# Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU reductions
-# and products of tall thin matrices run below numpy's speed; lanes of partial sums mend both.
+# Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU
+# reductions and products of tall thin matrices run below numpy's speed; lanes of
+# partial sums mend both.
 _LANES = 1024
 
 
@@ -53,7 +54,10 @@ def _at_once(weights: Array, positions: Array, place: Vector) -> list[Array]:
 
 def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
     def add(i: Array, sums: list[Array]) -> list[Array]:
-        m, r = (jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES) for x in (weights, positions))
+        m, r = (
+            jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES)
+            for x in (weights, positions)
+        )
         return [s + x for s, x in zip(sums, _terms(m, r, place), strict=True)]
 
     blocks = weights.shape[0] // _LANES
@@ -66,11 +70,13 @@ def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
 def _moments(weights: Array, positions: Array, place: Vector) -> tuple[Vector, Matrix]:
     """Sums of m r and of m r r^T, r from a place, in one pass.
 
-    The rule spares reverse mode the memory of a scan, and NaN from bad values: to keep them from
-    the sum itself would cost as much as the sum.
+    The rule spares reverse mode the memory of a scan, and NaN from bad values: to keep
+    them from the sum itself would cost as much as the sum.
     """
     on_cpu = _in_lanes if len(weights) >= _LANES else _at_once
-    sums = jax.lax.platform_dependent(weights, positions, place, cpu=on_cpu, default=_at_once)
+    sums = jax.lax.platform_dependent(
+        weights, positions, place, cpu=on_cpu, default=_at_once
+    )
     return jnp.stack(sums[:3]), symmetric(sums[3:])
 
 
@@ -89,7 +95,9 @@ def _cloud(masses: Array, positions: Array) -> MassProperties:
     """The body, in one pass about the midst of some points, in two where the mass is elsewhere."""
     mass = lane_sum(masses)
     divisor = jnp.where(mass == 0, 1.0, mass)
-    place = jax.lax.stop_gradient(jnp.mean(positions[:: -(-len(positions) // 64)], axis=0))
+    place = jax.lax.stop_gradient(
+        jnp.mean(positions[:: -(-len(positions) // 64)], axis=0)
+    )
     sums = _moments(masses, positions, place)
     off = jax.lax.stop_gradient(sums[0]) / divisor
     far = 2 * mass * jnp.sum(off * off) > jnp.trace(sums[1])  # then digits are lost
@@ -97,7 +105,9 @@ def _cloud(masses: Array, positions: Array) -> MassProperties:
     again = lambda *_: _moments(masses, positions, place)  # noqa: E731
     first, second = jax.lax.cond(far, again, lambda *x: x, *sums)
     center = first / divisor
-    inertia = inertia_of_second_moment(second - mass * center[:, None] * center[None, :])
+    inertia = inertia_of_second_moment(
+        second - mass * center[:, None] * center[None, :]
+    )
     return MassProperties.unchecked(mass, place + center, inertia)
 
 
@@ -110,17 +120,24 @@ def _examined(masses: Array, positions: Array) -> list[tuple[Bool[Array, ""], Ar
 
     def first_bad(ok: Array, x: Array) -> Array:
         each = ok.reshape(len(x), -1)
-        return jax.lax.cond(jnp.all(ok), lambda: x[0], lambda: x[jnp.argmin(jnp.all(each, axis=1))])
+        return jax.lax.cond(
+            jnp.all(ok), lambda: x[0], lambda: x[jnp.argmin(jnp.all(each, axis=1))]
+        )
 
     fine, finite = jnp.isfinite(masses) & (masses >= 0), jnp.isfinite(positions)
-    return [(jnp.all(ok), first_bad(ok, x)) for ok, x in ((fine, masses), (finite, positions))]
+    return [
+        (jnp.all(ok), first_bad(ok, x))
+        for ok, x in ((fine, masses), (finite, positions))
+    ]
 
 
 def _cloud_arrays(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array]:
     masses, positions = shaped(masses=(masses, None), positions=(positions, None, 3))
     check_shape("positions", positions, (masses.shape[0], 3))
     if masses.shape[0] == 0:
-        raise ValueError("Argument `masses` must hold at least one point, but it is empty.")
+        raise ValueError(
+            "Argument `masses` must hold at least one point, but it is empty."
+        )
     return masses, positions
 
 
@@ -138,12 +155,12 @@ def from_points(
         throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:
-        The body, its tensor about the centre of mass. Accurate far from the origin too, and
-        where a light point is far from the others.
+        The body, its tensor about the centre of mass. Accurate far from the origin too,
+        and where a light point is far from the others.
 
     Raises:
-        RuntimeError: A mass is negative or not finite or all are zero, or a position is not
-            finite.
+        RuntimeError: A mass is negative or not finite or all are zero, or a position is
+            not finite.
 
     Gradients: finite everywhere.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 5.7-5.8.
@@ -159,11 +176,15 @@ def from_points(
     findings = Findings()
     message = "Argument `masses` must be finite and non-negative, but it is not."
     findings.require(fine, None, message, mass)
-    findings.require(finite, None, "Argument `positions` must be finite, but it is not.", position)
+    findings.require(
+        finite, None, "Argument `positions` must be finite, but it is not.", position
+    )
     if not throw:  # NaN in the sums would reach the gradients of the other lanes
         arrays = harmless(findings.ok, arrays)
     body = _cloud(*arrays)
-    findings.require(body.mass > 0, None, "Argument `masses` must not be all zero, but it is.")
+    findings.require(
+        body.mass > 0, None, "Argument `masses` must not be all zero, but it is."
+    )
     return findings.guard(body, throw)
 
 
@@ -172,7 +193,8 @@ def inertia_tensor(
 ) -> Matrix:
     r"""Inertia tensor of point masses about the origin of their coordinates.
 
-    $I_{ab} = \sum_i m_i (|r_i|^2 \delta_{ab} - r_{ia} r_{ib})$. NaN where a mass is negative.
+    $I_{ab} = \sum_i m_i (|r_i|^2 \delta_{ab} - r_{ia} r_{ib})$. NaN where a mass is
+    negative.
 
     Args:
         masses: Point masses [kg].
@@ -211,13 +233,14 @@ def from_density(
     """Mass properties of a density in a box, by tensor-product Gauss-Legendre quadrature.
 
     Args:
-        density: Maps coordinates [m] to a density [kg/m^3], non-negative. It may close over
-            parameters that are differentiated.
+        density: Maps coordinates [m] to a density [kg/m^3], non-negative. It may close
+            over parameters that are differentiated.
         lower: Least coordinates of the box [m].
         upper: Greatest coordinates of the box [m].
-        order: Nodes along each axis. Exact for densities that are polynomials of degree up to
-            2 order - 3 in each coordinate; a density that jumps inside the box, such as that of a
-            ball, converges slowly: split the box, or use `from_mesh` or `jrigid.solids`.
+        order: Nodes along each axis. Exact for densities that are polynomials of degree
+            up to 2 order - 3 in each coordinate; a density that jumps inside the box,
+            such as that of a ball, converges slowly: split the box, or use `from_mesh`
+                or `jrigid.solids`.
         throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:
@@ -225,8 +248,8 @@ def from_density(
 
     Raises:
         ValueError: A density that is no scalar.
-        RuntimeError: The density is negative or not finite at a node, its integral is zero, or
-            the box is empty.
+        RuntimeError: The density is negative or not finite at a node, its integral is
+            zero, or the box is empty.
 
     Gradients: finite wherever those of the density are.
 
@@ -243,7 +266,9 @@ def from_density(
             f"Argument `density` must map coordinates (3,) to a scalar, but it gives {shape}."
         )
     nodes, node_weights = np.polynomial.legendre.leggauss(order)
-    grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
     weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
     findings = Findings()
     box = jnp.stack([lower, upper])
@@ -251,12 +276,16 @@ def from_density(
     findings.require(all_finite(box) & jnp.all(lower < upper), None, message, box)
     lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)
-    positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(grid, half.dtype)
+    positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(
+        grid, half.dtype
+    )
     values = jax.vmap(density)(positions).astype(half.dtype)
     [(fine, value), _] = _examined(*jax.lax.stop_gradient((values, positions)))
     message = "Argument `density` must be finite and non-negative, but it is not."
     findings.require(fine, None, message, value)
     masses = harmless(fine, values) * jnp.prod(half) * jnp.asarray(weights, half.dtype)
     body = _cloud(masses, positions)
-    findings.require(body.mass > 0, None, "Argument `density` must not be zero, but it is.")
+    findings.require(
+        body.mass > 0, None, "Argument `density` must not be zero, but it is."
+    )
     return findings.guard(body, throw)

@@ -1,11 +1,12 @@
 """Pictures, drawn by matplotlib, which is imported when the first is drawn (`jrigid[plot]`).
 
-One convention: every function takes what the library returns, draws into the axes `ax` that it is
-given, or into a new figure, and returns the axes; what was drawn is in their `lines` and
-`collections`, the figure is `ax.figure`. Pictures of several panels (`fit`, `motion`) take and
-return a dict of axes by their names. What is on a sphere (`polhode`, `tip`, `body`) needs axes of
-three dimensions, `figure.add_subplot(projection="3d")`, which keep the view they have; what lies
-behind is faint. `animate` returns an `Animation`, to show in a notebook or to save.
+One convention: every function takes what the library returns, draws into the axes `ax`
+that it is given, or into a new figure, and returns the axes; what was drawn is in their
+`lines` and `collections`, the figure is `ax.figure`. Pictures of several panels (`fit`,
+`motion`) take and return a dict of axes by their names. What is on a sphere (`polhode`,
+`tip`, `body`) needs axes of three dimensions, `figure.add_subplot(projection="3d")`,
+which keep the view they have; what lies behind is faint. `animate` returns an
+`Animation`, to show in a notebook or to save.
 """
 
 from jrigid.plot._animate import Animation as Animation

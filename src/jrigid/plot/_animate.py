@@ -38,8 +38,13 @@ class Animation(NamedTuple):
     @property
     def html(self) -> str:
         """A page by itself, which asks for no server and no network: drag it to look around."""
-        arrays = self.surface._asdict() | {"attitudes": self.attitudes, "trace": self.trace}
-        data: dict[str, Any] = {name: x.round(_DIGITS).tolist() for name, x in arrays.items()}
+        arrays = self.surface._asdict() | {
+            "attitudes": self.attitudes,
+            "trace": self.trace,
+        }
+        data: dict[str, Any] = {
+            name: x.round(_DIGITS).tolist() for name, x in arrays.items()
+        }
         data |= {"fps": self.fps, "times": [float(x) for x in self.times[[0, -1]]]}
         data["colours"] = [colour for colour, _ in common.LOOKS]
         page = resources.files("jrigid.plot").joinpath("animation.html").read_text()
@@ -47,7 +52,9 @@ class Animation(NamedTuple):
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        frame = '<iframe width="480" height="540" style="border:0" srcdoc="{}"></iframe>'
+        frame = (
+            '<iframe width="480" height="540" style="border:0" srcdoc="{}"></iframe>'
+        )
         return frame.format(html.escape(self.html))
 
     def save(self, path: str | Path) -> Path:
@@ -74,7 +81,9 @@ class Animation(NamedTuple):
 
         writer: Any = film.PillowWriter if path.suffix == ".gif" else film.FFMpegWriter
         if not writer.isAvailable():
-            raise RuntimeError("A film needs ffmpeg, which is not found; a .gif or .html does not.")
+            raise RuntimeError(
+                "A film needs ffmpeg, which is not found; a .gif or .html does not."
+            )
         figure, recorder = plt.figure(figsize=(4.6, 4.6)), writer(fps=self.fps)
         ax = figure.add_axes((0, 0, 1, 1), projection="3d", elev=25, azim=35)
         ax, drawn = common.space_axes(ax, 1.1), []
@@ -82,7 +91,9 @@ class Animation(NamedTuple):
         lines = [ax.plot([], [], [], color="#D55E00", lw=1.5)[0] for _ in self.trace]
         trails = np.moveaxis(common.turned(self.attitudes, self.trace), 1, 0)
         with recorder.saving(figure, path, dpi=100):
-            for i, (time, attitude) in enumerate(zip(self.times, self.attitudes, strict=True)):
+            for i, (time, attitude) in enumerate(
+                zip(self.times, self.attitudes, strict=True)
+            ):
                 clock.set_text(f"t = {time:.3g} s")
                 for line, trail in zip(lines, trails, strict=True):
                     line.set_data_3d(*trail[: i + 1].T)
@@ -95,28 +106,37 @@ class Animation(NamedTuple):
 
 
 def animate(
-    body: Any, motion: Any, *, ts: Any = None, kind: str = "box", trace: Any = None,
-    seconds: float = 10.0, fps: float = 20.0,
-) -> Animation:  # fmt: skip
+    body: Any,
+    motion: Any,
+    *,
+    ts: Any = None,
+    kind: str = "box",
+    trace: Any = None,
+    seconds: float = 10.0,
+    fps: float = 20.0,
+) -> Animation:
     """A body along a motion.
 
     Args:
-        body: As for `body`: a mesh (vertices, faces), a `SymmetricTop`, or what has an inertia.
-        motion: What `simulate`, `free_rotation` or `top_motion` returned: no more than half a turn
-            from state to state.
+        body: As for `body`: a mesh (vertices, faces), a `SymmetricTop`, or what has an
+            inertia.
+        motion: What `simulate`, `free_rotation` or `top_motion` returned: no more than
+            half a turn from state to state.
         ts: Times of the states [s]; of a trajectory its own.
         kind: "box" or "ellipsoid".
-        trace: A point of the body, or several (n, 3), whose paths are drawn: body components, the
-            farthest corner at 1; by default the end of a top's axis, (0, 0, 1), and none of others.
+        trace: A point of the body, or several (n, 3), whose paths are drawn: body
+            components, the farthest corner at 1; by default the end of a top's axis,
+            (0, 0, 1), and none of others.
         seconds: How long it plays.
         fps: Frames a second.
 
     Returns:
-        An `Animation`: a notebook shows it, `.save("top.html")` (or .gif, .mp4) writes it.
+        An `Animation`: a notebook shows it, `.save("top.html")` (or .gif, .mp4) writes
+            it.
 
     Raises:
-        ValueError: Not one time for each state of one motion, in their order, or fewer than two
-            finite states.
+        ValueError: Not one time for each state of one motion, in their order, or fewer
+            than two finite states.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
@@ -129,13 +149,19 @@ def animate(
     attitudes = np.asarray(common.states_of(motion).attitude, float)
     ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=-1)
     ts, attitudes = ts[seen], attitudes[seen]
-    demand(len(ts) > 1, "Argument `motion` must hold two states at least, but it does not.")
-    demand(bool(np.all(np.diff(ts) >= 0)), "Argument `ts` must not decrease, but it does.")
+    demand(
+        len(ts) > 1, "Argument `motion` must hold two states at least, but it does not."
+    )
+    demand(
+        bool(np.all(np.diff(ts) >= 0)), "Argument `ts` must not decrease, but it does."
+    )
     demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
     times = np.linspace(ts[0], ts[-1], max(round(seconds * fps), 2))
     before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
     part = (times - ts[before]) / np.maximum(np.diff(ts)[before], np.finfo(float).tiny)
-    attitudes = np.asarray(jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part))
+    attitudes = np.asarray(
+        jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part)
+    )
     point = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
     trace = point if trace is None else np.reshape(np.asarray(trace, float), (-1, 3))
     return Animation(surface_of(body, kind), times, attitudes, trace, fps)

@@ -12,7 +12,9 @@ from jrigid.top import SymmetricTop
 _LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from
 _FLAT = 1e-6  # least square of a side, of the largest
 # Radius and height along a top's outline, from its tip, in units of its height.
-_TOP = np.array([[0.03, 0.4, 0.44, 0.36, 0.05, 0.04, 1e-3], [0, 0.45, 0.55, 0.64, 0.7, 0.98, 1]])
+_TOP = np.array(
+    [[0.03, 0.4, 0.44, 0.36, 0.05, 0.04, 1e-3], [0, 0.45, 0.55, 0.64, 0.7, 0.98, 1]]
+)
 _SIDES = 16
 _POLAR = np.linspace(np.pi - 1e-3, 1e-3, 13)  # along the outline of a ball
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -27,7 +29,8 @@ class Surface(NamedTuple):
         faces: The corners of each face (m, 3 or 4), counter-clockwise from outside.
         normals: Of the faces, outward (m, 3).
         kinds: Which colour each face has (m,).
-        lines: What of each principal axis sticks out, from its inner to its outer end (3, 2, 3).
+        lines: What of each principal axis sticks out, from its inner to its outer end
+            (3, 2, 3).
     """
 
     vertices: np.ndarray
@@ -41,18 +44,28 @@ class Surface(NamedTuple):
         from matplotlib.colors import to_rgb
 
         base = np.array([to_rgb(colour) for colour, _ in common.LOOKS])[self.kinds]
-        light = 0.5 + 0.5 * np.maximum(common.turned(attitude, self.normals) @ _LIGHT, 0)
+        light = 0.5 + 0.5 * np.maximum(
+            common.turned(attitude, self.normals) @ _LIGHT, 0
+        )
         return light[:, None] * (0.55 * base + 0.45)
 
 
-def _rings(radii: np.ndarray, heights: np.ndarray, sides: int) -> tuple[np.ndarray, np.ndarray]:
+def _rings(
+    radii: np.ndarray, heights: np.ndarray, sides: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Corners and faces, four corners each, of a body of revolution."""
     turn = 2 * np.pi * np.arange(sides) / sides
     ring = [np.outer(radii, np.cos(turn)), np.outer(radii, np.sin(turn))]
-    vertices = np.stack([*ring, np.outer(heights, np.ones(sides))], axis=-1).reshape(-1, 3)
-    row, k = np.meshgrid(np.arange(radii.size - 1) * sides, np.arange(sides), indexing="ij")
+    vertices = np.stack([*ring, np.outer(heights, np.ones(sides))], axis=-1).reshape(
+        -1, 3
+    )
+    row, k = np.meshgrid(
+        np.arange(radii.size - 1) * sides, np.arange(sides), indexing="ij"
+    )
     after = (k + 1) % sides
-    faces = np.stack([row + k, row + after, row + sides + after, row + sides + k], axis=-1)
+    faces = np.stack(
+        [row + k, row + after, row + sides + after, row + sides + k], axis=-1
+    )
     return vertices, faces.reshape(-1, 4)
 
 
@@ -80,19 +93,27 @@ def surface_of(body: Any, kind: str) -> Surface:
     size = np.max(np.linalg.norm(vertices, axis=1))
     first, second, third = np.moveaxis(vertices[faces[:, :3]], 1, 0)
     normals = np.cross(second - first, third - first)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    normals /= np.maximum(
+        np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny
+    )
     kinds = np.argmax(np.abs(normals @ axes), axis=1)
-    ends = np.stack([sides / size, sides / size + 0.25], axis=1)[..., None] * axes.T[:, None]
+    ends = (
+        np.stack([sides / size, sides / size + 0.25], axis=1)[..., None]
+        * axes.T[:, None]
+    )
     return Surface(vertices / size, faces, normals, kinds, center / size + ends)
 
 
-def body(body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str = "box") -> Any:
+def body(
+    body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str = "box"
+) -> Any:
     """A body with its principal axes.
 
     Args:
-        body: A mesh (vertices, faces) as for `from_mesh`, drawn about the origin of its vertices;
-            a `SymmetricTop`, drawn as one, standing on its tip; or whatever has an inertia, drawn
-            as the homogeneous box or ellipsoid that has it (as thin as a sheet where none has).
+        body: A mesh (vertices, faces) as for `from_mesh`, drawn about the origin of its
+            vertices; a `SymmetricTop`, drawn as one, standing on its tip; or whatever
+            has an inertia, drawn as the homogeneous box or ellipsoid that has it (as
+            thin as a sheet where none has).
         attitude: Quaternion, or a state.
         ax: Axes of three dimensions.
         kind: "box" or "ellipsoid".
@@ -116,8 +137,13 @@ def body(body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str
     demand(found.shape == (4,), wrong)
     surface, ax = surface_of(body, kind), common.space_axes(ax, 1.1)
     place(ax, surface, found)
-    mesh, top = isinstance(body, tuple) and len(body) == 2, isinstance(body, SymmetricTop)
-    title = "Mesh" if mesh else "Top" if top else f"{kind.capitalize()} of the same inertia"
+    mesh, top = (
+        isinstance(body, tuple) and len(body) == 2,
+        isinstance(body, SymmetricTop),
+    )
+    title = (
+        "Mesh" if mesh else "Top" if top else f"{kind.capitalize()} of the same inertia"
+    )
     if not mesh:
         moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]
         title += "\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
@@ -131,10 +157,14 @@ def place(ax: Any, surface: Surface, attitude: np.ndarray) -> list[Any]:
 
     corners = common.turned(attitude, surface.vertices)[surface.faces]
     colours = surface.colours(attitude)
-    faces = Poly3DCollection(corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4)
+    faces = Poly3DCollection(
+        corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4
+    )
     artists = [ax.add_collection3d(faces)]
     for name, line in zip("123", common.turned(attitude, surface.lines), strict=True):
-        front = common.FRONT * ((line[1] - line[0]) @ common.eye(ax) > 0)  # or behind all
+        front = common.FRONT * (
+            (line[1] - line[0]) @ common.eye(ax) > 0
+        )  # or behind all
         artists += ax.plot(*line.T, color="k", lw=1, zorder=front)
         artists.append(ax.text(*(1.2 * line[1] - 0.2 * line[0]), name, zorder=front))
     return artists

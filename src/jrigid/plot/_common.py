@@ -32,8 +32,12 @@ def space_axes(ax: Any, size: float, elevation: float = _VIEW[0]) -> Any:
     if ax is None:
         figure = pyplot().figure(figsize=(5.5, 5.5), layout="constrained")
         ax = figure.add_subplot(projection="3d", elev=elevation, azim=_VIEW[1])
-    demand(ax.name == "3d", "Argument `ax` must be 3-d (projection='3d'), but it is not.")
-    ax.set(proj_type="ortho", xlim=(-size, size), ylim=(-size, size), zlim=(-size, size))
+    demand(
+        ax.name == "3d", "Argument `ax` must be 3-d (projection='3d'), but it is not."
+    )
+    ax.set(
+        proj_type="ortho", xlim=(-size, size), ylim=(-size, size), zlim=(-size, size)
+    )
     ax.set_box_aspect((1, 1, 1), zoom=1.45)
     ax.set_axis_off()
     return ax
@@ -62,10 +66,14 @@ def principal(body: Any) -> tuple[np.ndarray, np.ndarray]:
 def states_of(motion: Any) -> Any:
     """The states of what `simulate`, `free_rotation` or `top_motion` returned, or a state."""
     states = getattr(motion, "states", motion)
-    wrong = f"Argument `motion` must be a motion or a State, but it is {kind_of(motion)}."
+    wrong = (
+        f"Argument `motion` must be a motion or a State, but it is {kind_of(motion)}."
+    )
     demand(hasattr(states, "attitude"), wrong)
     one = "Argument `motion` must be one motion, but it is several: take one by "
-    demand(np.ndim(states.attitude) <= 2, one + "`jax.tree.map(lambda x: x[i], motion)`.")
+    demand(
+        np.ndim(states.attitude) <= 2, one + "`jax.tree.map(lambda x: x[i], motion)`."
+    )
     return states
 
 
@@ -74,16 +82,30 @@ def start_of(motion: Any) -> State:
     states = states_of(motion)
     attitudes, omegas = states.attitude.reshape(-1, 4), states.omega.reshape(-1, 3)
     seen = np.isfinite(np.sum(attitudes, axis=1) + np.sum(omegas, axis=1))
-    demand(bool(np.any(seen)), "Argument `motion` must have a finite state, but it has none.")
+    demand(
+        bool(np.any(seen)),
+        "Argument `motion` must have a finite state, but it has none.",
+    )
     return State(attitudes[np.argmax(seen)], omegas[np.argmax(seen)])
 
 
 def times_of(motion: Any, ts: Any) -> np.ndarray:
     """The times given, or those of a trajectory [s]: one for each state."""
-    ts, shape = getattr(motion, "ts", None) if ts is None else ts, states_of(motion).omega.shape
-    demand(ts is not None, "Argument `ts` must be given for a motion without times, but it is not.")
-    demand(len(shape) == 2, "Argument `motion` must hold many states, but it is a single one.")
-    wrong = f"Argument `ts` must be a time for each of {shape[0]} states, but it has shape"
+    ts, shape = (
+        getattr(motion, "ts", None) if ts is None else ts,
+        states_of(motion).omega.shape,
+    )
+    demand(
+        ts is not None,
+        "Argument `ts` must be given for a motion without times, but it is not.",
+    )
+    demand(
+        len(shape) == 2,
+        "Argument `motion` must hold many states, but it is a single one.",
+    )
+    wrong = (
+        f"Argument `ts` must be a time for each of {shape[0]} states, but it has shape"
+    )
     demand(np.shape(ts) == shape[:1], f"{wrong} {np.shape(ts)}.")
     return np.asarray(ts, float)
 
@@ -98,7 +120,9 @@ def turned(attitudes: Any, vectors: Any) -> np.ndarray:
 def eye(ax: Any) -> np.ndarray:
     """Direction from which axes of three dimensions are seen."""
     up, round_ = np.radians([ax.elev, ax.azim])
-    return np.array([np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)])
+    return np.array(
+        [np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)]
+    )
 
 
 def circles(tilts: Any) -> np.ndarray:
@@ -111,7 +135,9 @@ def circles(tilts: Any) -> np.ndarray:
 def globe(ax: Any, semi_axes: Any, axes: Any) -> None:
     """An ellipsoid, as a pale surface."""
     x, y, z = np.moveaxis(circles(TURN[:181:4])[:, ::5] * semi_axes @ axes.T, -1, 0)
-    ax.plot_surface(x, y, z, color="0.92", alpha=0.4, lw=0, shade=False, rasterized=True)
+    ax.plot_surface(
+        x, y, z, color="0.92", alpha=0.4, lw=0, shade=False, rasterized=True
+    )
 
 
 def on_surface(ax: Any, points: np.ndarray, normals: np.ndarray, **style: Any) -> None:
@@ -139,4 +165,10 @@ def label(ax: Any, title: str, across: str, up: str) -> None:
     ax.set(xlabel=across, ylabel=up)
     if handles := ax.get_legend_handles_labels()[0]:
         place = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0}
-        ax.legend(ncols=len(handles), frameon=False, handlelength=1.4, columnspacing=1.0, **place)
+        ax.legend(
+            ncols=len(handles),
+            frameon=False,
+            handlelength=1.4,
+            columnspacing=1.0,
+            **place,
+        )

@@ -12,22 +12,28 @@ from jrigid.plot._common import label, looks, pyplot, states_of, times_of
 
 
 def motion(
-    motion: Any, axes: Mapping[str, Any] | None = None, *, system: Any = None, ts: Any = None,
+    motion: Any,
+    axes: Mapping[str, Any] | None = None,
+    *,
+    system: Any = None,
+    ts: Any = None,
     along: VectorLike | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The angular velocity of a motion, and the drift of its energy and angular momentum.
 
-    "omega": body components. "drift": changes since the first finite state, relative to the largest
-    value on the way: rounding and the errors of the integration where they are conserved, the work
-    of the torques where they are not.
+    "omega": body components. "drift": changes since the first finite state, relative to
+    the largest value on the way: rounding and the errors of the integration where they
+    are conserved, the work of the torques where they are not.
 
     Args:
-        motion: What `simulate` returned; or `free_rotation` or `top_motion`, with system and times.
-        axes: Matplotlib's axes by the names above, to draw only these; None: a new figure.
+        motion: What `simulate` returned; or `free_rotation` or `top_motion`, with
+            system and times.
+        axes: Matplotlib's axes by the names above, to draw only these; None: a new
+            figure.
         system: The `RigidBody` or `SymmetricTop`; of a trajectory its own.
         ts: The times [s]; of a trajectory its own.
-        along: Direction in space along which the momentum is compared, (0, 0, 1) for that about the
-            vertical; None: the vector.
+        along: Direction in space along which the momentum is compared, (0, 0, 1) for
+            that about the vertical; None: the vector.
 
     Returns:
         The axes by their names.
@@ -44,7 +50,10 @@ def motion(
     relative change
     """
     system = getattr(motion, "system", None) if system is None else system
-    demand(system is not None, "Argument `system` must be given for this motion, but it is not.")
+    demand(
+        system is not None,
+        "Argument `system` must be given for this motion, but it is not.",
+    )
     system = system.as_rigid_body() if hasattr(system, "as_rigid_body") else system
     ts, states = times_of(motion, ts), states_of(motion)
     if axes is None:
@@ -56,7 +65,10 @@ def motion(
             axes["omega"].plot(ts, column, style, color=colour, lw=1.2, label=name)
         label(axes["omega"], "Angular velocity", "time [s]", "in the body [rad/s]")
     if "drift" in axes:
-        args, times = getattr(motion, "args", None), jax.numpy.asarray(ts, states.omega.dtype)
+        args, times = (
+            getattr(motion, "args", None),
+            jax.numpy.asarray(ts, states.omega.dtype),
+        )
         kept = {"energy": system.energy, "angular momentum": system.angular_momentum}
         for (colour, marker), (name, of) in looks(kept.items()):
             each = jax.vmap(lambda t, state, of=of: of(t, state, args))
@@ -64,7 +76,9 @@ def motion(
             if along is not None and values.shape[1] > 1:
                 values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
             first = values[np.argmax(np.all(np.isfinite(values), axis=1))]
-            sizes, changes = (np.linalg.norm(x, axis=1) for x in (values, values - first))
+            sizes, changes = (
+                np.linalg.norm(x, axis=1) for x in (values, values - first)
+            )
             changes = np.where(changes > 0, changes, np.nan) / (np.nanmax(sizes) or 1.0)
             axes["drift"].plot(ts, changes, marker, color=colour, ms=3, label=name)
         eps = np.finfo(times.dtype).eps

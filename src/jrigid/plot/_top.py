@@ -54,24 +54,40 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
     vertical = np.array([[0, 0, 1.0], [0, 0, 1.2]])
     common.on_surface(ax, vertical, vertical, color="k", lw=1)
     ax.text(0, 0, 1.25, "up", ha="center", zorder=common.FRONT)
-    for (colour, marker), (motion, band) in common.looks(zip(motions, bounds, strict=True)):
+    for (colour, marker), (motion, band) in common.looks(
+        zip(motions, bounds, strict=True)
+    ):
         for circle in common.circles(band):
             common.on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
-        x, y, z = np.moveaxis(common.circles(np.linspace(band[0], band[1], _BAND)), -1, 0)
+        x, y, z = np.moveaxis(
+            common.circles(np.linspace(band[0], band[1], _BAND)), -1, 0
+        )
         ax.plot_surface(x, y, z, color=colour, alpha=0.15, lw=0, rasterized=True)
         attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
         path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
         common.on_surface(ax, path, path, color=colour, lw=1.5)
-        ax.lines[-2].set_label(_words(band))  # the part in front, also of tilts that are there
+        ax.lines[-2].set_label(
+            _words(band)
+        )  # the part in front, also of tilts that are there
         start = path[np.isfinite(path[:, 0])][:1]
         common.on_surface(ax, start, start, color=colour, marker=marker, ls="none")
     if more:
-        ax.legend(loc="lower center", ncols=4, frameon=False, handlelength=1.0, columnspacing=1.0)
-    ax.set_title("Tip of the top" if more else f"Tip of the top, tilts {_words(bounds[0])}")
+        ax.legend(
+            loc="lower center",
+            ncols=4,
+            frameon=False,
+            handlelength=1.0,
+            columnspacing=1.0,
+        )
+    ax.set_title(
+        "Tip of the top" if more else f"Tip of the top, tilts {_words(bounds[0])}"
+    )
     return ax
 
 
-def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
+def effective_potential(
+    top: SymmetricTop, motion: Any, *more: Any, ax: Any = None
+) -> Any:
     """The well in which the axis nods, and the energy's level between the turning points.
 
     Args:
@@ -95,9 +111,13 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
     bounds, starts = _bounds(top, motion, *more), map(common.start_of, (motion, *more))
     ax = common.flat_axes(ax)
     margin = max(0.6 * np.ptp(bounds), _LEAST)
-    ends = np.clip([np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3)
+    ends = np.clip(
+        [np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3
+    )
     tilts, heights = np.linspace(ends[0], ends[1], 400), []
-    for (colour, marker), (state, band) in common.looks(zip(starts, bounds, strict=True)):
+    for (colour, marker), (state, band) in common.looks(
+        zip(starts, bounds, strict=True)
+    ):
         p_phi, p_psi, energy = conserved(top, state)
         well = np.asarray(potential(top, tilts, p_phi, p_psi))
         level = float(energy - p_psi**2 / (2 * top.I3))
@@ -108,6 +128,10 @@ def effective_potential(top: SymmetricTop, motion: Any, *more: Any, ax: Any = No
         depth = max(level - low, 0.3 * (np.median(well) - low))
         heights += [low - 0.3 * depth, level + 1.5 * depth]
     ax.set(xlim=np.degrees(ends), ylim=(min(heights), max(heights)))
-    ax.set(xlabel="tilt [degrees]", ylabel="energy of the tilt [J]", title="Effective potential")
+    ax.set(
+        xlabel="tilt [degrees]",
+        ylabel="energy of the tilt [J]",
+        title="Effective potential",
+    )
     ax.legend(loc="lower right", frameon=False)
     return ax

@@ -7,8 +7,11 @@ from jaxtyping import Float, Int
 
 from jrigid._checks import check_option, check_shape
 
-_LATE = 20  # intervals that a row may come too late; a clock that goes back further was reset
-_COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])  # when micro- and milliseconds in 32 bits wrap [s]
+# Intervals that a row may come too late; a clock that goes back further was reset
+_LATE = 20
+_COUNTERS = 2.0**32 * np.array(
+    [1e-6, 1e-3]
+)  # when micro- and milliseconds in 32 bits wrap [s]
 _DIGITS = 10.0 ** -np.arange(5)  # [s] decimal digits that times may end with
 _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
@@ -44,19 +47,20 @@ def repair(
 ) -> Clock:
     """Times made increasing, and what was wrong with them in words.
 
-    Rows without a time are dropped. A counter of 32 bits that wrapped is unwrapped; a clock that
-    goes back by more than 20 intervals was reset, and what follows is put one interval later, after
-    a break. Rows that are a little late are sorted in, repeated ones dropped. A step of more than
-    `gap` intervals is a break; nothing is filled in. Times rounded to a coarse digit are put on the
-    line through them.
+    Rows without a time are dropped. A counter of 32 bits that wrapped is unwrapped; a
+    clock that goes back by more than 20 intervals was reset, and what follows is put
+    one interval later, after a break. Rows that are a little late are sorted in,
+    repeated ones dropped. A step of more than `gap` intervals is a break; nothing is
+    filled in. Times rounded to a coarse digit are put on the line through them.
 
     Args:
         times: As recorded [s].
-        values: What was read, to tell a row written twice from two readings in one tick.
-        clock: `"recorded"` leaves times as they are, rounded or not. `"uniform"` puts each piece on
-            a line, fitted robustly and with readings lost on the way; right where the sensor's
-            clock is even and only the stamps are late. None does so where the deviations are
-            those of rounding.
+        values: What was read, to tell a row written twice from two readings in one
+            tick.
+        clock: `"recorded"` leaves times as they are, rounded or not. `"uniform"` puts
+            each piece on a line, fitted robustly and with readings lost on the way;
+            right where the sensor's clock is even and only the stamps are late. None
+            does so where the deviations are those of rounding.
         gap: Steps longer than so many intervals are gaps.
 
     Raises:
@@ -100,7 +104,9 @@ def repair(
     if gaps.size:
         longest = gaps[np.argmax(steps[gaps - 1])]
         many = f"{gaps.size} gaps, the longest" if gaps.size > 1 else "1 gap,"
-        notes.append(f"{many} of {steps[longest - 1]:.3g} s after {t[longest - 1]:.6g} s")
+        notes.append(
+            f"{many} of {steps[longest - 1]:.3g} s after {t[longest - 1]:.6g} s"
+        )
     breaks = np.union1d(gaps, np.searchsorted(t, resets))
     if clock != "recorded":
         t = _evened(t, breaks, clock == "uniform", notes)
@@ -127,11 +133,15 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
         elif back > _LATE * interval:
             t[row:] += back + interval
             resets.append(float(t[row]))
-            notes.append(f"the clock went back by {back:.3g} s at row {row}: a break of any length")
+            notes.append(
+                f"the clock went back by {back:.3g} s at row {row}: a break of any length"
+            )
     return resets
 
 
-def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) -> np.ndarray:
+def _evened(
+    t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]
+) -> np.ndarray:
     """Each piece on the line through it, where that is asked for or all it does is to round."""
     ticks = (t - t[0])[:, None] / _DIGITS
     digit = _DIGITS[np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3].max(initial=0.0)
@@ -143,7 +153,9 @@ def _evened(t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]) ->
         line, interval = _line(piece, asked)
         jitter = np.abs(piece - line)
         uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
-        if asked or (uneven and digit > _COARSE * interval and jitter.max() < _ROUND * digit):
+        if asked or (
+            uneven and digit > _COARSE * interval and jitter.max() < _ROUND * digit
+        ):
             pieces[i] = line
             beside.append((interval, np.sqrt(np.mean(jitter**2))))
     if beside:
@@ -161,7 +173,8 @@ def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
         usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))
         ticks, phase = np.ones(t.size), t[0]
         for row in range(1, t.size):
-            # lost is a reading only where all of the next stamps are late, not this one alone
+            # lost is a reading only where all of the next stamps are late, not this one
+            # alone
             ahead = t[row : row + _NEXT] - phase
             late = (ahead - usual * np.arange(ahead.size)).min()
             ticks[row] = max(1, round(late / usual))

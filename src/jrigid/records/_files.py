@@ -18,13 +18,17 @@ from jrigid._extra import extra
 
 Source = str | os.PathLike[str] | io.TextIOBase
 _BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
-_MOST_ABOVE = 400  # lines that may stand above the header: blackbox logs have their settings there
+# Lines that may stand above the header: blackbox logs have their settings there
+_MOST_ABOVE = 400
 _NOTHING: Mapping[int, float] = types.MappingProxyType({})
-# Flight controllers run their gyros at 2000 deg/s, which 16 bits divide into 16.4 counts a deg/s.
+# Flight controllers run their gyros at 2000 deg/s, which 16 bits divide into 16.4
+# counts a deg/s.
 _FULL_SCALE = 2000.0  # [deg/s]
 _OVER = 1.05  # of the full scale: zero offsets and filters add a little
 _MOST_COUNTS = 1 << 15
-_PER_MICROSECOND = 1e-6  # smaller scales are in radians per microsecond, as Baseflight has them
+_PER_MICROSECOND = (
+    1e-6  # smaller scales are in radians per microsecond, as Baseflight has them
+)
 
 
 class Table(NamedTuple):
@@ -37,7 +41,8 @@ class Table(NamedTuple):
         about: What the file says about itself, by key.
         notes: In words.
         source: Who states the units in the headers.
-        scales: Factors from the file's numbers to the units in the headers, by column; 1 if absent.
+        scales: Factors from the file's numbers to the units in the headers, by column;
+            1 if absent.
         sources: Who states the unit of a column, where it is not `source`, by column.
     """
 
@@ -63,13 +68,17 @@ def tables_of(path: Source, log: int) -> list[Table]:
             files = {pathlib.PurePath(n).stem: archive.read(n) for n in names}
     else:
         files = {path.stem: path.read_bytes()}
-    texts = {name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()}
+    texts = {
+        name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()
+    }
     about = next(csv.DictReader(texts.get("Metadata", "").splitlines(), restval=""), {})
     tables = []
     for name, text in texts.items():
         try:
             is_log = text.startswith(_BLACKBOX)
-            tables.append(_blackbox(str(path), name, log) if is_log else _parse(text, name))
+            tables.append(
+                _blackbox(str(path), name, log) if is_log else _parse(text, name)
+            )
         except ValueError:
             if len(texts) == 1:
                 raise
@@ -79,7 +88,8 @@ def tables_of(path: Source, log: int) -> list[Table]:
 def _blackbox(path: str, name: str, log: int) -> Table:
     """A log of a flight controller, decoded by orangebox."""
     orangebox = extra("records", "orangebox")
-    try:  # a parser for each log: one that goes on to another keeps the headers of the last
+    # A parser for each log: one that goes on to another keeps the headers of the last
+    try:
         parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
     except RuntimeError as error:
         raise ValueError(
@@ -89,11 +99,15 @@ def _blackbox(path: str, name: str, log: int) -> Table:
     notes = [f"log {log} of {several}"] if several > 1 else []
     try:
         for frame in parser.frames():
-            frames.append([x if isinstance(x, int | float) else np.nan for x in frame.data])
+            frames.append(
+                [x if isinstance(x, int | float) else np.nan for x in frame.data]
+            )
     except (RuntimeError, ValueError, IndexError) as error:
         # Where a crash or the battery ended the log, orangebox raises one of these.
         notes.append(f"the log breaks off after {len(frames)} frames ({error})")
-    values = np.array([x for x in frames if len(x) == len(names)], float).reshape(-1, len(names))
+    values = np.array([x for x in frames if len(x) == len(names)], float).reshape(
+        -1, len(names)
+    )
     about = {key: str(value) for key, value in parser.headers.items()}
     return Table(name, names, values, about, notes)
 
@@ -102,7 +116,9 @@ def _parse(text: str, name: str) -> Table:
     """The table in a text, whatever its separator, decimal sign and lines above the header."""
     lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
     last = lines[-50:]
-    separator = next((d for d in "\t;," if sum(d in x for x in last) > len(last) / 2), ",")
+    separator = next(
+        (d for d in "\t;," if sum(d in x for x in last) > len(last) / 2), ","
+    )
     rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
     head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
@@ -111,7 +127,9 @@ def _parse(text: str, name: str) -> Table:
     headers, width = rows[head], len(rows[head])
     below = [row for row in rows[head + 1 :] if row != headers]
     whole = [row[:width] for row in below if len(row) >= width and not any(row[width:])]
-    values = np.array([[_number(x) for x in row] for row in whole], float).reshape(-1, width)
+    values = np.array([[_number(x) for x in row] for row in whole], float).reshape(
+        -1, width
+    )
     cut = len(rows[-1]) < width
     commas = any("," in x and not np.isnan(_number(x)) for row in whole for x in row)
     said = (
@@ -170,15 +188,18 @@ def _with_units_of_sensor_logger(table: Table) -> Table:
             table.headers[j] = new.format(name)
             table.values[:, j] *= factor
             if factor < 0:
-                table.notes.append("turned about: iOS gives accelerations the other sign")
+                table.notes.append(
+                    "turned about: iOS gives accelerations the other sign"
+                )
     return table._replace(source="so Sensor Logger writes it")
 
 
 def _with_units_of_blackbox(table: Table) -> Table:
     """Rates are in deg/s times a scale, or counts; accelerations in parts of `acc_1G`.
 
-    Firmware up to the end of 2016 logs counts, and later firmware deg/s. The settings say which by
-    `gyro_scale`; a CSV of `blackbox_decode` has no settings, so the range of the gyro decides.
+    Firmware up to the end of 2016 logs counts, and later firmware deg/s. The settings
+    say which by `gyro_scale`; a CSV of `blackbox_decode` has no settings, so the range
+    of the gyro decides.
     """
     scale, said = _gyro_scale(table.about)
     scales = {}
@@ -206,7 +227,9 @@ def _with_units_of_blackbox(table: Table) -> Table:
         scales[j] = scale
         if said:
             sources[j] = said
-    return table._replace(source="so Betaflight logs it", scales=scales, sources=sources)
+    return table._replace(
+        source="so Betaflight logs it", scales=scales, sources=sources
+    )
 
 
 def _columns(table: Table, stem: str) -> list[int]:
@@ -218,8 +241,8 @@ def _columns(table: Table, stem: str) -> list[int]:
 def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
     """Degrees per second of the number 1, by the settings, and a note unless they are usual.
 
-    Source: betaflight/blackbox-tools, `parser.c`; blackbox-log-viewer, `flightlog_parser.js` and
-    `flightlog_fields_presenter.js`.
+    Source: betaflight/blackbox-tools, `parser.c`; blackbox-log-viewer,
+    `flightlog_parser.js` and `flightlog_fields_presenter.js`.
     """
     text = about.get("gyro_scale", about.get("gyro.scale", "1"))
     scale = float(int(text, 0) if text.isalnum() else text)

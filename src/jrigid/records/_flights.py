@@ -13,11 +13,19 @@ from jrigid.records._reading import Reading, runs
 
 _WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
 _GUESSES = 300  # windows that are tried, at most
-_SOUND = 0.9  # of the rows of a window that its own guess must explain to be tried on the rest
+# Of the rows of a window that its own guess must explain to be tried on the rest
+_SOUND = 0.9
 _REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
-_USUAL = 0.2  # [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
-_FORCE = 3.0, 0.05  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
-_KEPT = 0.02, 6.0  # of a momentum that may come or go in that time, and of the gyro's noise
+# [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
+_USUAL = 0.2
+_FORCE = (
+    3.0,
+    0.05,
+)  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
+_KEPT = (
+    0.02,
+    6.0,
+)  # of a momentum that may come or go in that time, and of the gyro's noise
 _SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
 _LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
 # Delays of the accelerometer after the gyro [s]: both have filters, and their own.
@@ -25,35 +33,55 @@ _DELAYS = (0.0, 0.002, -0.002, 0.004, -0.004, 0.006, -0.006, 0.008, -0.008)
 _BETTER = 1.05  # times the rows that a delay must explain to be preferred to none
 _BIAS = 1.0  # [m/s^2] of an accelerometer; more is no bias but a hand
 _QUIET = 1.5  # [m/s^2] what a flight may differ from its own lever without any noise
-_NOISY = 3.5, 7.0  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
-_EDGE = 1.0, 2.0, 0.03  # [m/s^2], medians, and of the force: allowed at the ends of a flight
-_CLIPPED = 4  # readings equal to the largest: the accelerometer was at the end of its range,
+_NOISY = (
+    3.5,
+    7.0,
+)  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
+_EDGE = (
+    1.0,
+    2.0,
+    0.03,
+)  # [m/s^2], medians, and of the force: allowed at the ends of a flight
+_CLIPPED = (
+    4  # readings equal to the largest: the accelerometer was at the end of its range,
+)
 _LEAST_RANGE = 19.0  # [m/s^2] which is 2 g at least
-_JUMP = 8.0, 0.15  # medians of what slopes leave of a step, and parts of the rate: a blow
-_HOLE = 0.06  # [s] of a flight that may be unexplained, if by less than twice what is allowed
+_JUMP = (
+    8.0,
+    0.15,
+)  # medians of what slopes leave of a step, and parts of the rate: a blow
+# [s] of a flight that may be unexplained, if by less than twice what is allowed
+_HOLE = 0.06
 _ROUNDS = 3  # of fitting a lever to a flight and finding where the flight ends
 
 
 def flights(
-    reading: Reading, *, least: float = 0.2, margin: float = 0.01, by: str | None = None
+    reading: Reading,
+    *,
+    min_duration: float = 0.2,
+    margin: float = 0.01,
+    by: str | None = None,
 ) -> list[Reading]:
-    r"""Find the parts of a reading in which nothing touches the body: throws.
+    r"""Find the parts of a reading in which nothing touches the body: trials.
 
-    With an accelerometer: in free fall it shows $\dot\omega \times r + \omega \times (\omega \times
-    r)$, where $r$ is its lever from the mass centre, whatever that is; a hand adds gravity and
-    more. The lever that explains the longest part of the record gives the flights; then each
-    flight gets a lever and a bias of its own, and ends where these no longer explain the readings.
-    A delay of up to 8 ms between gyro and accelerometer is accounted for.
+    With an accelerometer: in free fall it shows
+    $\dot\omega \times r + \omega \times (\omega \times r)$, where $r$ is its lever from
+    the mass centre, whatever that is; a hand adds gravity and more. The lever that
+    explains the longest part of the record gives the flights; then each flight gets a
+    lever and a bias of its own, and ends where these no longer explain the readings. A
+    delay of up to 8 ms between gyro and accelerometer is accounted for.
 
-    Without an accelerometer: the momentum of one tensor stays the same in space but for a linear
-    drag, $I (\omega_b - \omega_a) + \int \omega \times I \omega\, dt + c \int \omega\, dt = 0$ from
-    any time to any other. This misses a fifth of the flights, and most of those in which a wheel
-    changes the momentum; a smooth slow turn in the hand, or a spin in a bearing, looks like a
-    flight.
+    Without an accelerometer: the momentum of one tensor stays the same in space but for
+    a linear drag,
+    $I (\omega_b - \omega_a) + \int \omega \times I \omega\, dt + c \int \omega\, dt =
+    0$ from any time to any other. This misses a fifth of the flights, and most of those
+    in which a wheel changes the momentum; a smooth slow turn in the hand, or a spin in
+    a bearing, looks like a flight.
 
     Args:
-        reading: With rates, and specific forces if there are any. No flight goes over a break.
-        least: Shorter parts are dropped [s].
+        reading: With rates, and specific forces if there are any. No flight goes over a
+            break.
+        min_duration: Shorter parts are dropped [s].
         margin: Readings closer than this to one with contact are cut off [s].
         by: `"forces"`, `"momentum"`, or None for forces where there are any.
 
@@ -73,7 +101,8 @@ def flights(
     >>> print(*flight.notes)
     flight 1 of 1, 0.51 s to 1.19 s: no contact by the specific forces
 
-    Source: the consensus of guesses is that of Fischler and Bolles, Comm. ACM 24, 381 (1981).
+    Source: the consensus of guesses is that of Fischler and Bolles, Comm. ACM 24, 381
+        (1981).
     """
     check_option("by", by, (None, "forces", "momentum"))
     rates, forces, t = reading.rates, reading.specific_forces, reading.times
@@ -85,13 +114,13 @@ def flights(
     if t.size <= size:
         return []
     if forces is None or by == "momentum":
-        spans = _by_momentum(reading, rates, size, least)
+        spans = _by_momentum(reading, rates, size, min_duration)
     else:
-        spans = _by_forces(reading, rates, forces, size, least)
+        spans = _by_forces(reading, rates, forces, size, min_duration)
     flown = []
     for first, last in spans:
         rows = _inside(reading, first, last, margin, by)
-        if rows.size and t[last - 1] - t[first] >= least:
+        if rows.size and t[last - 1] - t[first] >= min_duration:
             flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
     for i, x in enumerate(flown):
         note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
@@ -100,14 +129,16 @@ def flights(
     return flown
 
 
-def _inside(reading: Reading, first: int, last: int, margin: float, by: str) -> np.ndarray:
+def _inside(
+    reading: Reading, first: int, last: int, margin: float, by: str
+) -> np.ndarray:
     """Rows of a flight that are farther than the margin from readings with contact."""
     t = reading.times
     before = first
     after = last - 1
     if by == "forces":
-        # The readings outside have contact, but across a break nobody knows. By the momentum the
-        # edges themselves are uncertain, and the margin counts from there.
+        # The readings outside have contact, but across a break nobody knows. By the
+        # momentum the edges themselves are uncertain, and the margin counts from there.
         before -= first not in (0, *reading.breaks)
         after += last not in (t.size, *reading.breaks)
     rows = np.arange(first, last)
@@ -115,25 +146,31 @@ def _inside(reading: Reading, first: int, last: int, margin: float, by: str) -> 
 
 
 def _by_momentum(
-    reading: Reading, rates: np.ndarray, size: int, least: float
+    reading: Reading, rates: np.ndarray, size: int, min_duration: float
 ) -> list[tuple[int, int]]:
     """Spans of rows in which one tensor keeps its momentum."""
     reach = max(1, round(_REACH["momentum"] / reading.interval))
     law = _of_a_tensor(reading.times, rates, reach)
     _forget_breaks(law, reading, reach)
-    free = _consensus(*law, size, max(2, round(least / reading.interval)) - 2 * reach)
+    free = _consensus(
+        *law, size, max(2, round(min_duration / reading.interval)) - 2 * reach
+    )
     # An equation holds for all that it looks at, and hardly for its ends.
     free = np.convolve(free, np.ones(2 * (4 * reach // 5) + 1), mode="same") > 0.5
     return runs(free)
 
 
 def _by_forces(
-    reading: Reading, rates: np.ndarray, forces: np.ndarray, size: int, least: float
+    reading: Reading,
+    rates: np.ndarray,
+    forces: np.ndarray,
+    size: int,
+    min_duration: float,
 ) -> list[tuple[int, int]]:
     """Spans of rows in which a lever explains the specific forces."""
     t = reading.times
     reach = max(1, round(_REACH["forces"] / reading.interval))
-    shortest = max(2, round(least / 2 / reading.interval)) - 2 * reach
+    shortest = max(2, round(min_duration / 2 / reading.interval)) - 2 * reach
     best = np.zeros(t.size, bool)
     delay = 0.0
     for tried in _DELAYS[::2] if reach > 1 else _DELAYS:
@@ -190,10 +227,11 @@ class _Part(NamedTuple):
     Attributes:
         times: [s].
         forces: Specific forces at the times of the gyro [m/s^2].
-        models: What a lever of 1 m along each axis shows, (slopes, rows, 3, 3), for angular
-            accelerations from readings on both sides, before and after alone.
+        models: What a lever of 1 m along each axis shows, (slopes, rows, 3, 3), for
+            angular accelerations from readings on both sides, before and after alone.
         hole: Rows that a flight may lack within.
-        jumps: Rows before which the rates jump: the body hit something between two readings.
+        jumps: Rows before which the rates jump: the body hit something between two
+            readings.
     """
 
     times: Float[np.ndarray, " rows"]
@@ -203,7 +241,9 @@ class _Part(NamedTuple):
     jumps: Bool[np.ndarray, " rows"]
 
     @classmethod
-    def of(cls, reading: Reading, delay: float, free: Bool[np.ndarray, " rows"]) -> "_Part":
+    def of(
+        cls, reading: Reading, delay: float, free: Bool[np.ndarray, " rows"]
+    ) -> "_Part":
         """Prepare the equations of a part of a reading, of which some rows are known to be free."""
         rates, forces, t = reading.rates, reading.specific_forces, reading.times
         assert rates is not None
@@ -212,7 +252,9 @@ class _Part(NamedTuple):
         slopes = [_slope(t, rates, reach), *_one_sided(t, rates, reach)]
         models = np.array([_cross(x) + _cross(rates) @ _cross(rates) for x in slopes])
         hole = round(_HOLE / reading.interval) if t.size > 1 else 0
-        jumps = _jumps(t, rates, slopes[1:], free) if reach == 1 else np.zeros(t.size, bool)
+        jumps = (
+            _jumps(t, rates, slopes[1:], free) if reach == 1 else np.zeros(t.size, bool)
+        )
         return cls(t, _shifted(reading, forces, delay), models, hole, jumps)
 
     def parted(self, free: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
@@ -253,7 +295,9 @@ class _Part(NamedTuple):
 
     def fit(self, core: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, "6"]:
         """Lever [m] and bias [m/s^2] by least squares, twice without the rows that fit worst."""
-        model = np.concatenate([self.models[0], np.broadcast_to(np.eye(3), (core.size, 3, 3))], 2)
+        model = np.concatenate(
+            [self.models[0], np.broadcast_to(np.eye(3), (core.size, 3, 3))], 2
+        )
         known = core & np.isfinite(self.forces.sum(axis=1) + model.sum(axis=(1, 2)))
         noise = _FORCE[0]
         drawn = np.repeat([_USUAL, _BIAS / 2], 3) ** -2.0
@@ -269,7 +313,8 @@ class _Part(NamedTuple):
             b = (self.forces[use] * weights).ravel()
             fit = np.linalg.solve(a.T @ a + np.diag(drawn), a.T @ b)
             shown = model @ fit
-            # The end of the range bounds the force from below: it counts where less is shown.
+            # The end of the range bounds the force from below: it counts where less is
+            # shown.
             read = ~at_end | (np.sign(self.forces) * shown < np.abs(self.forces))
             beside = np.linalg.norm(self.clipped(shown) - self.forces, axis=1)
             use = known & (beside <= 3 * np.median(beside[use]))
@@ -277,7 +322,9 @@ class _Part(NamedTuple):
         fit[3:] *= min(1.0, _BIAS / size) if size > 0 else 1.0
         return fit
 
-    def residuals(self, fit: Float[np.ndarray, "6"]) -> Float[np.ndarray, "slopes rows"]:
+    def residuals(
+        self, fit: Float[np.ndarray, "6"]
+    ) -> Float[np.ndarray, "slopes rows"]:
         """What the lever and bias leave unexplained [m/s^2]; infinite where nothing is read."""
         shown = self.models @ fit[:3] + fit[3:]
         residuals = np.linalg.norm(self.clipped(shown) - self.forces, axis=2)
@@ -300,7 +347,9 @@ class _Part(NamedTuple):
         return filled
 
 
-def _trimmed(fits: Bool[np.ndarray, "slopes rows"], first: int, last: int) -> tuple[int, int]:
+def _trimmed(
+    fits: Bool[np.ndarray, "slopes rows"], first: int, last: int
+) -> tuple[int, int]:
     """A flight without the rows at its ends that do not fit by slopes from inside it."""
     central, before, after = fits[:, first:last]
     starts = np.argmax(central | after)
@@ -320,14 +369,19 @@ def _jumps(
     # The parabolas of the neighbours look across a jump, too: it is where most is left.
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 2), 5)
     largest = size == around.max(axis=1)
-    return largest & (size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1)))
+    return largest & (
+        size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1))
+    )
 
 
-# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over their errors.
+# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over
+# their errors.
 _Law = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray, slice], np.ndarray | float]]
 
 
-def _of_a_lever(t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int) -> _Law:
+def _of_a_lever(
+    t: np.ndarray, rates: np.ndarray, forces: np.ndarray, reach: int
+) -> _Law:
     """The specific force is that of a lever."""
     absolute, relative = _FORCE
     tolerance = absolute + relative * np.linalg.norm(forces, axis=1, keepdims=True)
@@ -370,7 +424,11 @@ def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]
         b = (t - t2) / ((t1 - t) * (t1 - t2))
         c = (t - t1) / ((t2 - t) * (t2 - t1))
         slope = a[:, None] * rates + b[:, None] * w1 + c[:, None] * w2
-        edge = slice(0, 2 * reach) if shift > 0 else slice(max(t.size - 2 * reach, 0), None)
+        edge = (
+            slice(0, 2 * reach)
+            if shift > 0
+            else slice(max(t.size - 2 * reach, 0), None)
+        )
         slope[edge] = np.nan  # rolled in from the other end
         slopes.append(slope)
     return slopes
@@ -379,22 +437,30 @@ def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]
 def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
     """The momentum of a tensor of trace 1 stays, but for a drag in proportion to the rates.
 
-    The unknowns are five numbers of the tensor and the drag [1/s]; errors are in parts of the
-    momentum.
+    The unknowns are five numbers of the tensor and the drag [1/s]; errors are in parts
+    of the momentum.
     """
-    # A sphere and five tensors without a trace, which make up all others; their angular momenta.
+    # A sphere and five tensors without a trace, which make up all others; their angular
+    # momenta.
     x, y, z = np.eye(3)
     off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
     tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
     momenta = np.einsum("kij,tj->tik", tensors, rates)
     turning = np.cross(rates[:, :, None], momenta, axis=1)
     dragged = _integral(t, rates)
-    whole = np.concatenate([momenta + _integral(t, turning), dragged[..., None]], axis=2)
+    whole = np.concatenate(
+        [momenta + _integral(t, turning), dragged[..., None]], axis=2
+    )
     spin = np.linalg.norm(rates, axis=1)
-    # Third differences of smooth rates are noise, of 20 times its variance; the median of 3 axes.
-    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(20 * 2.37)
+    # Third differences of smooth rates are noise, of 20 times its variance; the median
+    # of 3 axes.
+    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(
+        20 * 2.37
+    )
     relative, times_noise = _KEPT
-    tolerance = np.where(spin > _SPIN, (relative * spin + times_noise * noise) / 3, np.nan)
+    tolerance = np.where(
+        spin > _SPIN, (relative * spin + times_noise * noise) / 3, np.nan
+    )
     change = _across(whole, reach) / tolerance[:, None, None]
 
     def bound(x: np.ndarray, rows: slice) -> np.ndarray | float:
@@ -403,7 +469,11 @@ def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
         moments = np.linalg.eigvalsh(tensor)
         if moments[0] <= 0 or moments[2] > _LARGEST:
             return 0.0
-        return 3 * np.linalg.norm(rates[rows] @ tensor, axis=1) / np.maximum(spin[rows], _SPIN)
+        return (
+            3
+            * np.linalg.norm(rates[rows] @ tensor, axis=1)
+            / np.maximum(spin[rows], _SPIN)
+        )
 
     return change[..., 1:], -change[..., 0], bound
 
@@ -446,6 +516,9 @@ def _consensus(
     windows = range(0, len(known) - size, max(size // 2, len(known) // _GUESSES))
     windows = [slice(first, first + size) for first in windows]
     guesses = [np.zeros(len(drawn)), *map(solve, windows)]
-    sound = [explained(x, w).mean() >= _SOUND for x, w in zip(guesses[1:], windows, strict=True)]
+    sound = [
+        explained(x, w).mean() >= _SOUND
+        for x, w in zip(guesses[1:], windows, strict=True)
+    ]
     best = max(map(in_runs, itertools.compress(guesses, [True, *sound])), key=np.sum)
     return max(in_runs(solve(best)), best, key=np.sum)

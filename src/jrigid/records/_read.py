@@ -19,9 +19,18 @@ _UNITS: dict[str, dict[str, float]] = {
     | dict.fromkeys(("deg/s", "°/s", "dps", "deg_s", "degs", "degrees/s"), np.pi / 180)
     | {"mrad/s": 1e-3, "mdps": np.pi / 180e3, "rpm": np.pi / 30, "rev/s": 2 * np.pi}
     | {"counts": np.pi / 180 / 16.4},  # of 16 bits for 2000 deg/s
-    "specific_forces": dict.fromkeys(("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0)
+    "specific_forces": dict.fromkeys(
+        ("m/s^2", "m/s2", "m/s/s", "mps2", "ms^-2", "ms-2"), 1.0
+    )
     | {"g": 9.80665, "mg": 9.80665e-3},
-    "magnetic_fields": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "g": 1e-4, "gauss": 1e-4},
+    "magnetic_fields": {
+        "t": 1.0,
+        "mt": 1e-3,
+        "ut": 1e-6,
+        "nt": 1e-9,
+        "g": 1e-4,
+        "gauss": 1e-4,
+    },
 }
 Unit = str | float | int  # a name, or a factor to SI
 Columns = Mapping[str, str | Sequence[str]]
@@ -37,14 +46,22 @@ _KINDS = {
 }
 _AXIS = re.compile(r"^(.*?)[\s_.\-]*(\[[012]\]|[xyz])$", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
-_SUFFIX = re.compile(r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE)
+_SUFFIX = re.compile(
+    r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE
+)
 _EPOCH = 1e6  # [s] later times count from some epoch and are made to count from 0
-# No common gyro measures more: 4000 deg/s is the widest range of those in phones, loggers and
-# flight controllers. In rad/s, and in deg/s with a margin for what a filter or an offset adds.
+# No common gyro measures more: 4000 deg/s is the widest range of those in phones,
+# loggers and flight controllers. In rad/s, and in deg/s with a margin for what a filter
+# or an offset adds.
 _RANGE = 70.0, 4100.0
 # Medians of what each row says: steps of 8 Hz to 8 kHz, and sizes at hand.
 _USUAL = {
-    "times": {"s": (125e-6, 0.125), "ms": (0.125, 125), "us": (125, 125e3), "ns": (125e3, 125e6)},
+    "times": {
+        "s": (125e-6, 0.125),
+        "ms": (0.125, 125),
+        "us": (125, 125e3),
+        "ns": (125e3, 125e6),
+    },
     "specific_forces": {"g": (0.8, 1.25), "m/s^2": (7.8, 12.3)},
 }
 _TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
@@ -88,7 +105,9 @@ class _Units(NamedTuple):
                 return None
             other = f"but it does not, and the file's {unit!r} is not known."
             # How much a count is only the caller can tell, unless the format does.
-            known = unit in _UNITS[kind] and (unit != "counts" or column in table.sources)
+            known = unit in _UNITS[kind] and (
+                unit != "counts" or column in table.sources
+            )
             demand(known, f"Argument `unit` must say the unit of `{kind}`, {other}")
             factor, said = scale * _UNITS[kind][unit], f"taken as {unit}: {source}"
         if kind == "rates":
@@ -96,7 +115,9 @@ class _Units(NamedTuple):
         self.notes.append(f"{what} {said}")
         if turned and not 0.2 < factor / scale / _UNITS["rates"][turned] < 5:
             # Headers can be wrong.
-            self.notes.append(f"yet gravity turns in the body as if the rates were in {turned}")
+            self.notes.append(
+                f"yet gravity turns in the body as if the rates were in {turned}"
+            )
         return factor
 
     def _as_asked(
@@ -108,7 +129,8 @@ class _Units(NamedTuple):
             return float(asked), f"multiplied by {asked:g}: `unit` says so"
         differs = unit not in (None, asked) and not guessed
         heard = f", though the file says {unit}" if differs else ""
-        # Where the caller names another unit than the file, the numbers are meant as they are.
+        # Where the caller names another unit than the file, the numbers are meant as
+        # they are.
         factor = _UNITS[kind][asked] * (scale if unit == asked else 1.0)
         return factor, f"taken as {asked}: `unit` says so{heard}"
 
@@ -151,21 +173,26 @@ def read(
 ) -> Reading:
     r"""Read a file of sensors: phyphox, Sensor Logger, Betaflight, or anyone's columns by names.
 
-    A folder or a zip may hold a file for each sensor. Units are those that `unit` says, else those
-    that the file says (headers, or the format), else recognised where only one makes sense: times
-    by the interval, accelerations by gravity, rates by the range of gyros or by how fast gravity
-    turns in the body. All of it is in `notes`. The clock is the gyro's, put right by `repair`;
-    sensors with times of their own are brought to it by linear interpolation, which is said too.
+    A folder or a zip may hold a file for each sensor. Units are those that `unit` says,
+    else those that the file says (headers, or the format), else recognised where only
+    one makes sense: times by the interval, accelerations by gravity, rates by the range
+    of gyros or by how fast gravity turns in the body. All of it is in `notes`. The
+    clock is the gyro's, put right by `repair`; sensors with times of their own are
+    brought to it by linear interpolation, which is said too.
 
     Args:
-        path: A file (.csv, .txt, .zip, .bbl, .bfl), a folder, or a text open for reading.
-        unit: Of the rates (`"deg/s"`), or by what is measured: `{"times": "ms", "rates": "dps",
-            "specific_forces": "g", "magnetic_fields": "uT"}`. A number is a factor to SI: `unit=`
-            `np.pi / 1800` for tenths of deg/s. `"counts"` are those of a gyro with a range of 2000
-            deg/s in 16 bits, 16.4 to a deg/s. Rates above 70 rad/s need a unit from the caller.
-        columns: Which columns to take, by their headers with or without a unit: `{"times": "t",
-            "rates": ("gx", "gy", "gz"), "specific_forces": ...}`; any other key is the new name of
-            a column, as in `{"wheel": "speed (rpm)"}`. What is not named is recognised.
+        path: A file (.csv, .txt, .zip, .bbl, .bfl), a folder, or a text open for
+            reading.
+        unit: Of the rates (`"deg/s"`), or by what is measured:
+            `{"times": "ms", "rates": "dps", "specific_forces": "g", "magnetic_fields":
+            "uT"}`. A number is a factor to SI: `unit=` `np.pi /
+            1800` for tenths of deg/s. `"counts"` are those of a gyro with a range of
+            2000 deg/s in 16 bits, 16.4 to a deg/s. Rates above 70 rad/s need a unit
+            from the caller.
+        columns: Which columns to take, by their headers with or without a unit:
+            `{"times": "t", "rates": ("gx", "gy", "gz"), "specific_forces": ...}`; any
+            other key is the new name of a column, as in `{"wheel": "speed (rpm)"}`.
+            What is not named is recognised.
         clock: As in `repair`: `"recorded"`, `"uniform"` or None.
         log: Which log of a blackbox file with several, from 1.
 
@@ -173,8 +200,8 @@ def read(
         Times in s, rates in rad/s, specific forces in m/s^2, magnetic fields in T.
 
     Raises:
-        ValueError: No times, no sensor, no such column, a unit that is not known, or rates beyond
-            the range of gyros (70 rad/s) without `unit`.
+        ValueError: No times, no sensor, no such column, a unit that is not known, or
+            rates beyond the range of gyros (70 rad/s) without `unit`.
         ImportError: A blackbox log without the extra `jrigid[records]`.
 
     >>> import io
@@ -202,9 +229,16 @@ def read(
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
         needed = "Argument `path` must hold three columns of a sensor, but none is recognised: "
-        raise ValueError(f"{needed}name them by `columns`. There are {headers or 'no tables'}.")
-    apart = columns.keys() - _UNITS.keys() - set(main.table.headers) if columns else set()
-    demand(not apart, f"Argument `columns` must name columns of one file, but {apart} is apart.")
+        raise ValueError(
+            f"{needed}name them by `columns`. There are {headers or 'no tables'}."
+        )
+    apart = (
+        columns.keys() - _UNITS.keys() - set(main.table.headers) if columns else set()
+    )
+    demand(
+        not apart,
+        f"Argument `columns` must name columns of one file, but {apart} is apart.",
+    )
     own, raw = _on_one_clock(chosen, main, clock, units)
     found, used = {}, {main.columns[0]}
     for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
@@ -217,7 +251,9 @@ def read(
             if factor is not None:
                 found[kind] = factor * raw[kind]
                 used.update(sensor.columns if sensor.table is main.table else ())
-    rest = zip(main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True)
+    rest = zip(
+        main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True
+    )
     scales = main.table.scales
     rest = [
         (header, scales.get(j, 1.0) * x)
@@ -249,20 +285,28 @@ def _asked(unit: Unit | Mapping[str, Unit] | None) -> dict[str, Unit]:
 def _rename(tables: list[Table], columns: Columns) -> None:
     """Give columns the names that the caller has for them; where it is no sensor's, in SI."""
     factors: dict[str | None, float] = {None: 1.0}
-    factors |= {unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()}
+    factors |= {
+        unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()
+    }
     headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
         olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
         named = f"Argument `columns` must name three columns for `{new}`, but it names {old!r}."
         demand(len(olds) == 3 or not three, named)
         for i, one in enumerate(olds):
-            places = [(t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)]
-            places = [x for x in places if x[2] == one] or [x for x in places if x[3] == one]
+            places = [
+                (t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)
+            ]
+            places = [x for x in places if x[2] == one] or [
+                x for x in places if x[3] == one
+            ]
             there = f"Argument `columns` must name columns of the file, but {one!r} is none of "
             demand(len(places) > 0, there + headers)
             for table, j, _, _, unit in places:
                 name = f"{new}[{i}]" if three else new
-                table.headers[j] = f"{name} ({unit})" if unit and new in _UNITS else name
+                table.headers[j] = (
+                    f"{name} ({unit})" if unit and new in _UNITS else name
+                )
                 if new not in _UNITS:
                     table.values[:, j] *= factors.get(unit, 1.0)
 
@@ -281,9 +325,15 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
     sensors = []
     for stem, axes in triples.items():
         kind, three = _kind(stem or table.name), [axes[axis] for axis in sorted(axes)]
-        if len(three) < 3 or kind in (None, "times") or (kind in columns and kind != stem):
+        if (
+            len(three) < 3
+            or kind in (None, "times")
+            or (kind in columns and kind != stem)
+        ):
             continue
-        label = ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
+        label = (
+            ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
+        )
         needed = "Argument `columns` must name the column of the times, but it does not, and none "
         demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
         time = max((j for j in times if j < three[0]), default=times[0])
@@ -301,7 +351,10 @@ def _on_one_clock(
     chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
 ) -> tuple[Clock, dict[str, np.ndarray]]:
     """The clock of the main sensor put right, and what each sensor reads at its times."""
-    times, raw = {}, {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()}
+    times, raw = (
+        {},
+        {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()},
+    )
     for kind, sensor in chosen.items():
         t = raw[kind][:, 0]
         times[kind] = t * units.factor("times", sensor, t)
@@ -309,7 +362,9 @@ def _on_one_clock(
     if _EPOCH < origin < np.inf:
         units.notes.append(f"times count from {origin:.6f} s of the file's clock")
         times = {kind: t - origin for kind, t in times.items()}
-    clocks = {kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen}
+    clocks = {
+        kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen
+    }
     own = clocks[next(kind for kind, x in chosen.items() if x is main)]
     several = any(x.table is not main.table for x in chosen.values())
     for kind, (label, table, _, _, missed) in chosen.items():
@@ -354,7 +409,9 @@ def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None,
     if unit is None and kind == "times":
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
         doubt = f"Argument `unit` must say the unit of the times, but it does not, and {doubt}."
-        raise ValueError(f"{doubt} (`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)")
+        raise ValueError(
+            f"{doubt} (`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)"
+        )
     return unit, f"their median {'step ' * (kind == 'times')}is {size:.4g}"
 
 
@@ -372,7 +429,10 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     """The unit in which gravity turns as the rates say, df/dt = -omega x f; "" if unclear."""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
-    sums, size = np.cumsum(steps, axis=0) - steps / 2, np.linalg.norm(forces, axis=1)[lag:]
+    sums, size = (
+        np.cumsum(steps, axis=0) - steps / 2,
+        np.linalg.norm(forces, axis=1)[lag:],
+    )
     said, seen = sums[lag:] - sums[:-lag], forces[lag:] - forces[:-lag]
     least, most = _USUAL["specific_forces"]["m/s^2"]
     use = np.isfinite(seen).all(axis=1) & (size > least) & (size < most)
@@ -380,13 +440,18 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     product, square = np.sum(said * seen), np.sum(said**2)
     if product <= _LIKE * np.sqrt(square * np.sum(seen**2)):
         return ""
-    return min(("rad/s", "deg/s"), key=lambda u: abs(np.log(product / square / _UNITS["rates"][u])))
+    return min(
+        ("rad/s", "deg/s"),
+        key=lambda u: abs(np.log(product / square / _UNITS["rates"][u])),
+    )
 
 
 def _kind(name: str) -> str | None:
     """What the words of a name say that is measured: a key of `_KINDS`."""
     words = name.strip().lower()
-    return next((kind for kind, pattern in _KINDS.items() if re.search(pattern, words)), None)
+    return next(
+        (kind for kind, pattern in _KINDS.items() if re.search(pattern, words)), None
+    )
 
 
 def _split(header: str) -> tuple[str, str | None]:
@@ -399,5 +464,7 @@ def _split(header: str) -> tuple[str, str | None]:
 
 def _plain(unit: str) -> str:
     """A unit as in `_UNITS`; two signs for micro, and one lost in decoding, are u."""
-    unit = re.sub(r"\s|(?<=s)ec(onds?|s)?", "", re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower()))
+    unit = re.sub(
+        r"\s|(?<=s)ec(onds?|s)?", "", re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower())
+    )
     return unit.replace("²", "^2").replace("**", "^")

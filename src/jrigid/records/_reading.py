@@ -11,27 +11,39 @@ from jrigid._checks import check_shape, demand
 from jrigid._types import Readable
 
 _REST = 0.25  # [s] over which it is judged whether the body rests
-_STILL = 0.1, 0.2  # [rad/s] standard deviation, and mean, above which a body does not rest
-_FLOOR = 0.1, 3.0  # the quietest tenth of the windows, and how much noisier others at rest may be
+_STILL = (
+    0.1,
+    0.2,
+)  # [rad/s] standard deviation, and mean, above which a body does not rest
+_FLOOR = (
+    0.1,
+    3.0,
+)  # the quietest tenth of the windows, and how much noisier others at rest may be
 _PER_OCTAVE = 4  # averaging times in a factor of two
-_FLICKER = 0.664  # Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi)
+_FLICKER = (
+    0.664  # Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi)
+)
 
 
 class Reading(Readable):
     """Readings of the sensors in one box, in SI units and body axes, on one clock.
 
-    `print(reading)` is a report in words; `reading[first:last]` are some of its rows. It holds
-    NumPy arrays in float64 whatever JAX's precision is set to.
+    `print(reading)` is a report in words; `reading[first:last]` are some of its rows.
+    It holds NumPy arrays in float64 whatever JAX's precision is set to.
 
     Attributes:
         times: When it was read [s], increasing.
         rates: Angular velocity, body components [rad/s]; None where there is no gyro.
-        specific_forces: What an accelerometer shows [m/s^2]: acceleration minus gravity, so 9.8
-            upward at rest and zero in free fall. NaN where it was silent; None without one.
-        magnetic_fields: Magnetic field, body components [T]; NaN where silent; None without.
-        columns: What else is in the file, by its header there and in the file's units; columns that
-            were asked for by a name, in SI where their header states a unit.
-        breaks: Rows before which time is missing (a gap) or of unknown length (a reset clock).
+        specific_forces: What an accelerometer shows [m/s^2]: acceleration minus
+            gravity, so 9.8 upward at rest and zero in free fall. NaN where it was
+            silent; None without one.
+        magnetic_fields: Magnetic field, body components [T]; NaN where silent; None
+            without.
+        columns: What else is in the file, by its header there and in the file's units;
+            columns that were asked for by a name, in SI where their header states a
+            unit.
+        breaks: Rows before which time is missing (a gap) or of unknown length (a reset
+            clock).
         notes: In words what was recognised, converted and repaired.
     """
 
@@ -46,12 +58,18 @@ class Reading(Readable):
     @property
     def interval(self) -> float:
         """Median time from a row to the next [s]; NaN for less than two rows."""
-        return float(np.median(np.diff(self.times))) if self.times.size > 1 else float("nan")
+        return (
+            float(np.median(np.diff(self.times)))
+            if self.times.size > 1
+            else float("nan")
+        )
 
     def __getitem__(self, rows: slice) -> "Reading":
         """Consecutive rows, with the notes of the whole."""
         first, last, step = rows.indices(self.times.size)
-        demand(step == 1, f"Argument `rows` must be consecutive, but their step is {step}.")
+        demand(
+            step == 1, f"Argument `rows` must be consecutive, but their step is {step}."
+        )
         arrays = (self.rates, self.specific_forces, self.magnetic_fields)
         rates, forces, fields = (None if x is None else x[first:last] for x in arrays)
         columns = {name: column[first:last] for name, column in self.columns.items()}
@@ -69,13 +87,17 @@ class Reading(Readable):
         size = self.times.size
         lines = [f"{size} readings"]
         if size > 1:
-            lines[0] += f" over {np.ptp(self.times):.4g} s, one in {1e3 * self.interval:.4g} ms"
+            lines[0] += (
+                f" over {np.ptp(self.times):.4g} s, one in {1e3 * self.interval:.4g} ms"
+            )
         units = {"rates": "rad/s", "specific_forces": "m/s^2", "magnetic_fields": "T"}
         for what, unit in units.items():
             array = getattr(self, what)
             if array is not None and np.isfinite(array).any():
                 largest = np.nanmax(np.linalg.norm(array, axis=1))
-                lines.append(f"  {what.replace('_', ' ')}: {largest:.4g} {unit} at most")
+                lines.append(
+                    f"  {what.replace('_', ' ')}: {largest:.4g} {unit} at most"
+                )
         if self.columns:
             lines.append(f"  other columns: {', '.join(self.columns)}")
         if self.breaks:
@@ -110,10 +132,11 @@ class Noise(Readable):
         interval: Between readings [s].
         bias: Mean at rest [rad/s].
         sigma: White noise of one reading [rad/s]: Allan deviation over one interval.
-        density: White noise [rad/s/sqrt(Hz)], from where the Allan deviation falls as it should for
-            white noise. In a gyro that filters its output it exceeds `sigma` sqrt(interval).
-        instability: Bias instability [rad/s]: the least Allan deviation over 0.664; an upper bound
-            where `instability_times` is the longest that was looked at.
+        density: White noise [rad/s/sqrt(Hz)], from where the Allan deviation falls as
+            it should for white noise. In a gyro that filters its output it exceeds
+            `sigma` sqrt(interval).
+        instability: Bias instability [rad/s]: the least Allan deviation over 0.664; an
+            upper bound where `instability_times` is the longest that was looked at.
         instability_times: Averaging times of the least deviation [s].
         allan: The Allan deviations that it is taken from.
         notes: In words.
@@ -129,13 +152,16 @@ class Noise(Readable):
     notes: tuple[str, ...]
 
 
-def allan(values: Float[np.ndarray, "rows columns"] | list[np.ndarray], interval: float) -> Allan:
+def allan(
+    values: Float[np.ndarray, "rows columns"] | list[np.ndarray], interval: float
+) -> Allan:
     r"""Overlapping Allan deviations of even readings.
 
-    $\sigma^2(m \tau) = \langle (\theta_{k+2m} - 2 \theta_{k+m} + \theta_k)^2 \rangle / (2 m^2
-    \tau^2)$ with $\theta$ the integral of the values, for averages over up to a third of the
-    readings. White noise of standard deviation s gives s / sqrt(m), a bias that wanders as a random
-    walk rises as sqrt(m), and 1/f noise of instability B lies level at 0.664 B.
+    $\sigma^2(m \tau) = \langle (\theta_{k+2m} - 2 \theta_{k+m} + \theta_k)^2 \rangle /
+    (2 m^2 \tau^2)$ with $\theta$ the integral of the values, for averages over up to a
+    third of the readings. White noise of standard deviation s gives s / sqrt(m), a bias
+    that wanders as a random walk rises as sqrt(m), and 1/f noise of instability B lies
+    level at 0.664 B.
 
     Args:
         values: Readings, or a list of stretches of them, whose squares are pooled.
@@ -152,14 +178,21 @@ def allan(values: Float[np.ndarray, "rows columns"] | list[np.ndarray], interval
 
     Source: IEEE Std 952-1997, annex C; Riley, NIST SP 1065 (2008), section 5.2.
     """
-    pieces = [np.asarray(x, float) for x in (values if isinstance(values, list) else [values])]
+    pieces = [
+        np.asarray(x, float) for x in (values if isinstance(values, list) else [values])
+    ]
     for piece in pieces:
         check_shape("values", piece, (None, None))
     longest = max(map(len, pieces), default=0)
-    demand(longest > 2, f"Argument `values` must have 3 readings, but it has {longest}.")
+    demand(
+        longest > 2, f"Argument `values` must have 3 readings, but it has {longest}."
+    )
     octaves = np.arange(0, np.log2(longest / 3) + 1e-9, 1 / _PER_OCTAVE)
     averaged = np.unique(np.round(2**octaves).astype(int))
-    squares, counts = np.zeros((averaged.size, pieces[0].shape[1])), np.zeros(averaged.size)
+    squares, counts = (
+        np.zeros((averaged.size, pieces[0].shape[1])),
+        np.zeros(averaged.size),
+    )
     for piece in pieces:
         # the mean changes nothing but the rounding of the sums
         sums = np.cumsum(piece - piece.mean(axis=0), axis=0)
@@ -172,12 +205,12 @@ def allan(values: Float[np.ndarray, "rows columns"] | list[np.ndarray], interval
     return Allan(averaged * interval, deviations, counts)
 
 
-def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
+def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
     """The parts of a reading in which the body rests: as quiet as its quietest, and not turning.
 
     Args:
         reading: With rates.
-        least: Shorter parts are dropped [s].
+        min_duration: Shorter parts are dropped [s].
 
     Raises:
         ValueError: No rates.
@@ -204,17 +237,23 @@ def rests(reading: Reading, *, least: float = 1.0) -> list[Reading]:
     quiet = spreads <= min(spread, factor * np.quantile(spreads, quantile))
     quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < mean
     still = np.isin(np.arange(times.size), windows[quiet])
-    parts = [part for first, last in runs(still) for part in reading[first:last].pieces()]
-    return [part for part in parts if np.ptp(part.times) >= least - reading.interval]
+    parts = [
+        part for first, last in runs(still) for part in reading[first:last].pieces()
+    ]
+    return [
+        part for part in parts if np.ptp(part.times) >= min_duration - reading.interval
+    ]
 
 
-def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noise:
+def noise(
+    reading: Reading, *, at_rest: bool = False, min_duration: float = 1.0
+) -> Noise:
     """Noise of the gyro from the rest in a reading: white noise, bias, bias instability.
 
     Args:
         reading: With rates.
         at_rest: All of the reading is rest; else `rests` looks for it.
-        least: Shorter rests are not used [s].
+        min_duration: Shorter rests are not used [s].
 
     Raises:
         ValueError: No rates, or no rest.
@@ -226,15 +265,17 @@ def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noi
     >>> print(gyro.bias.round(3), gyro.sigma.round(3), gyro.density.round(4))
     [0.02 0.02 0.02] [0.01 0.01 0.01] [0.001 0.001 0.001]
     """
-    pieces = reading.pieces() if at_rest else rests(reading, least=least)
+    pieces = reading.pieces() if at_rest else rests(reading, min_duration=min_duration)
     parts = [x.rates for x in pieces if x.rates is not None and x.times.size > 2]
-    needed = f"rates at rest for {least:g} s"
+    needed = f"rates at rest for {min_duration:g} s"
     demand(len(parts) > 0, f"Argument `reading` must have {needed}, but it has none.")
     curve = allan(parts, reading.interval)
     times, deviations = curve.times[:, None], curve.deviations
     lowest = np.argmin(deviations, axis=0)
     logs = np.log(np.maximum(deviations, np.finfo(float).tiny))
-    slopes = np.diff(logs, axis=0, append=np.nan) / np.diff(np.log(times), axis=0, append=np.nan)
+    slopes = np.diff(logs, axis=0, append=np.nan) / np.diff(
+        np.log(times), axis=0, append=np.nan
+    )
     early = np.arange(len(times))[:, None] < np.maximum(lowest, 1)
     white = early & (np.abs(slopes + 0.5) < 0.1)
     white = np.where(white.any(axis=0), white, early)
@@ -246,7 +287,9 @@ def noise(reading: Reading, *, at_rest: bool = False, least: float = 1.0) -> Noi
         reading.interval,
         bias=np.concatenate(parts).mean(axis=0),
         sigma=deviations[0],
-        density=np.nanmedian(np.where(white, deviations * np.sqrt(times), np.nan), axis=0),
+        density=np.nanmedian(
+            np.where(white, deviations * np.sqrt(times), np.nan), axis=0
+        ),
         instability=deviations.min(axis=0) / _FLICKER,
         instability_times=curve.times[lowest],
         allan=curve,

@@ -8,7 +8,14 @@ from jaxtyping import Array
 
 from jrigid._checks import array_of_shape
 from jrigid._numerics import safe_arctan2, safe_norm
-from jrigid._types import Matrix, MatrixLike, Quaternion, QuaternionLike, Vector, VectorLike
+from jrigid._types import (
+    Matrix,
+    MatrixLike,
+    Quaternion,
+    QuaternionLike,
+    Vector,
+    VectorLike,
+)
 from jrigid.rotation._quaternion import multiply, normalize, rescaled, rotate
 
 
@@ -30,7 +37,9 @@ def hat(vector: VectorLike) -> Matrix:
     """
     x, y, z = array_of_shape("vector", vector, 3)
     zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    return jnp.stack(
+        [jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])]
+    )
 
 
 def vee(matrix: MatrixLike) -> Vector:
@@ -77,13 +86,17 @@ def from_matrix(matrix: MatrixLike) -> Quaternion:
     """Unit quaternion, w >= 0, of a rotation matrix.
 
     Args:
-        matrix: Rotation matrix, body to space. It is not checked; the result is normalised.
+        matrix: Rotation matrix, body to space. It is not checked; the result is
+            normalised.
 
     Returns:
-        Unit quaternion. Where w = 0 (half turns) the sign makes the largest component positive.
+        Unit quaternion. Where w = 0 (half turns) the sign makes the largest component
+        positive.
 
-    Gradients: those of a smooth extension off the rotation group; exact along it, everywhere.
-    Source: S. W. Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978) 223.
+    Gradients: those of a smooth extension off the rotation group; exact along it,
+        everywhere.
+    Source: S. W. Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1
+        (1978) 223.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.rotation.from_matrix(jnp.diag(jnp.array([1.0, -1.0, -1.0]))))
@@ -133,7 +146,8 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
     """Attitude of one of scipy's rotations, or scalar-first order from scipy's scalar-last one.
 
     Args:
-        rotation: A single `scipy.spatial.transform.Rotation`, or a quaternion (x, y, z, w).
+        rotation: A single `scipy.spatial.transform.Rotation`, or a quaternion (x, y, z,
+            w).
 
     Returns:
         The same quaternion, scalar first.
@@ -180,14 +194,16 @@ def from_euler(angles: VectorLike) -> Quaternion:
     phi, theta, psi = 0.5 * array_of_shape("angles", angles, 3)
     c, s = jnp.cos(theta), jnp.sin(theta)
     plus, minus = phi + psi, phi - psi
-    return jnp.stack([c * jnp.cos(plus), s * jnp.cos(minus), s * jnp.sin(minus), c * jnp.sin(plus)])
+    return jnp.stack(
+        [c * jnp.cos(plus), s * jnp.cos(minus), s * jnp.sin(minus), c * jnp.sin(plus)]
+    )
 
 
 def to_euler(attitude: QuaternionLike) -> Vector:
     """z-x-z Euler angles of an attitude.
 
-    At theta = 0 only phi + psi is defined, at theta = pi only phi - psi: there psi = 0 is chosen
-    and phi carries the whole rotation about the vertical.
+    At theta = 0 only phi + psi is defined, at theta = pi only phi - psi: there psi = 0
+    is chosen and phi carries the whole rotation about the vertical.
 
     Args:
         attitude: Unit quaternion, body to space; its norm drops out.
@@ -195,8 +211,8 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     Returns:
         (phi, theta, psi) [rad], theta in [0, pi], phi and psi in [-pi, pi].
 
-    Gradients: exact for 0 < theta < pi. At the two poles theta has a cone (gradient 0) and phi
-    and psi the derivatives along the choice psi = 0: finite always.
+    Gradients: exact for 0 < theta < pi. At the two poles theta has a cone (gradient 0)
+    and phi and psi the derivatives along the choice psi = 0: finite always.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> angles = jnp.array([0.3, 0.8, -1.2])
@@ -220,9 +236,9 @@ def _wrap(angle: Array) -> Array:
 def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     """Attitude of roll, pitch and yaw: `R = Rz(yaw) Ry(pitch) Rx(roll)`, body to space.
 
-    The aerospace sequence z-y'-x'': from the space axes the body is turned by yaw about z, then by
-    pitch about its new y axis, then by roll about its newest x axis, each right-handed. It is
-    scipy's `Rotation.from_euler("ZYX", (yaw, pitch, roll))`.
+    The aerospace sequence z-y'-x'': from the space axes the body is turned by yaw about
+    z, then by pitch about its new y axis, then by roll about its newest x axis, each
+    right-handed. It is scipy's `Rotation.from_euler("ZYX", (yaw, pitch, roll))`.
 
     Args:
         angles: (roll, pitch, yaw) [rad].
@@ -240,25 +256,30 @@ def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     half = 0.5 * array_of_shape("angles", angles, 3)
     (a, b, c), (p, q, r) = jnp.cos(half), jnp.sin(half)
     return jnp.stack(
-        [a * b * c + p * q * r, p * b * c - a * q * r, a * q * c + p * b * r, a * b * r - p * q * c]
+        [
+            a * b * c + p * q * r,
+            p * b * c - a * q * r,
+            a * q * c + p * b * r,
+            a * b * r - p * q * c,
+        ]
     )
 
 
 def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     """Roll, pitch and yaw of an attitude, as `from_roll_pitch_yaw` takes them.
 
-    At pitch = +-pi/2, to rounding, only roll -+ yaw is defined: there roll = 0 is chosen and yaw
-    carries the whole rotation about the vertical.
+    At pitch = +-pi/2, to rounding, only roll -+ yaw is defined: there roll = 0 is
+    chosen and yaw carries the whole rotation about the vertical.
 
     Args:
         attitude: Unit quaternion, body to space; its norm drops out.
 
     Returns:
-        (roll, pitch, yaw) [rad], to rounding of the attitude; pitch in [-pi/2, pi/2], roll and yaw
-        in [-pi, pi].
+        (roll, pitch, yaw) [rad], to rounding of the attitude; pitch in [-pi/2, pi/2],
+        roll and yaw in [-pi, pi].
 
-    Gradients: exact for |pitch| < pi/2. At the two poles pitch has a cone (gradient 0) and yaw and
-        roll the derivatives along the choice roll = 0: finite always.
+    Gradients: exact for |pitch| < pi/2. At the two poles pitch has a cone (gradient 0)
+        and yaw and roll the derivatives along the choice roll = 0: finite always.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> angles = jnp.array([0.3, -0.8, 1.2])
@@ -267,10 +288,14 @@ def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     [ 0.3 -0.8  1.2]
     """
     q = rescaled(array_of_shape("attitude", attitude, 4))
-    # Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; four halves are C^-1.
+    # Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; four
+    # halves are C^-1.
     q = multiply(q, jnp.full(4, 0.5, q.dtype))
-    # No float is a pole exactly: a pair of components is zero where it is so to rounding.
+    # No float is a pole exactly: a pair of components is zero where it is so to
+    # rounding.
     w, x, y, z = jnp.abs(q) / (4 * jnp.finfo(q.dtype).eps)
     upper, lower = w + z < 1, x + y < 1
-    yaw, pitch, roll = to_euler(jnp.where(jnp.stack([upper, lower, lower, upper]), 0.0, q))
+    yaw, pitch, roll = to_euler(
+        jnp.where(jnp.stack([upper, lower, lower, upper]), 0.0, q)
+    )
     return jnp.stack([roll, pitch - jnp.pi / 2, _wrap(yaw - jnp.pi / 2)])

@@ -15,7 +15,14 @@ from jrigid._numerics import (
     sinc_sqrt,
     sum_of_squares,
 )
-from jrigid._types import Quaternion, QuaternionLike, Scalar, ScalarLike, Vector, VectorLike
+from jrigid._types import (
+    Quaternion,
+    QuaternionLike,
+    Scalar,
+    ScalarLike,
+    Vector,
+    VectorLike,
+)
 
 
 def _scale(vector: Array) -> Array:
@@ -25,8 +32,8 @@ def _scale(vector: Array) -> Array:
 def rescaled(vector: Array) -> Array:
     """Vector times the power of two that brings the sum of its magnitudes to [1, 2).
 
-    No rounding, and no squares that leave the range of numbers, in values or in derivatives; zero
-    stays zero.
+    No rounding, and no squares that leave the range of numbers, in values or in
+    derivatives; zero stays zero.
     """
     return vector * _scale(vector)
 
@@ -44,8 +51,8 @@ def identity(dtype: DTypeLike | None = None) -> Quaternion:
     """The unit quaternion (1, 0, 0, 0): body and space axes coincide.
 
     Args:
-        dtype: Of floating point numbers; JAX's default by default (float32 unless x64 is on).
-            Beside arrays of another precision pass theirs.
+        dtype: Of floating point numbers; JAX's default by default (float32 unless x64
+            is on). Beside arrays of another precision pass theirs.
 
     Returns:
         The quaternion of no rotation.
@@ -61,7 +68,8 @@ def random(key: PRNGKeyArray, dtype: DTypeLike | None = None) -> Quaternion:
     """A random attitude: uniform on the sphere of unit quaternions, so in every turned frame.
 
     Args:
-        key: Of `jax.random`; for many attitudes `jax.vmap` over `jax.random.split(key, count)`.
+        key: Of `jax.random`; for many attitudes `jax.vmap` over
+            `jax.random.split(key, count)`.
         dtype: Of floating point numbers; JAX's default by default.
 
     Returns:
@@ -84,8 +92,8 @@ def normalize(quaternion: QuaternionLike) -> Quaternion:
     Returns:
         The unit quaternion.
 
-    Gradients: projected on the tangent of the unit sphere, over the norm, whatever that is; zero
-    at the zero quaternion.
+    Gradients: projected on the tangent of the unit sphere, over the norm, whatever that
+    is; zero at the zero quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.rotation.normalize(jnp.array([0.0, 3.0, 0.0, 4.0])))
@@ -99,7 +107,9 @@ def _direction(vector: Array) -> Array:
     vector = rescaled(vector)
     square = sum_of_squares(vector)
     zero = square == 0
-    return jnp.where(zero, jnp.zeros_like(vector), vector / jnp.sqrt(jnp.where(zero, 1.0, square)))
+    return jnp.where(
+        zero, jnp.zeros_like(vector), vector / jnp.sqrt(jnp.where(zero, 1.0, square))
+    )
 
 
 def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
@@ -186,7 +196,8 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
         vector: Body components [any unit].
 
     Returns:
-        Space components, same unit. Exact for any non-zero quaternion: its norm drops out.
+        Space components, same unit. Exact for any non-zero quaternion: its norm drops
+            out.
 
     Gradients: finite for any non-zero quaternion, of order 1 / norm in the attitude.
 
@@ -275,8 +286,8 @@ def log(attitude: QuaternionLike) -> Vector:
     Returns:
         Axis times angle [rad]; zero for the zero quaternion.
 
-    Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion; across a
-    half turn the value itself jumps from +pi to -pi along the axis.
+    Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion;
+    across a half turn the value itself jumps from +pi to -pi along the axis.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> v = jnp.array([0.1, -0.2, 0.3])
@@ -306,7 +317,8 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     Returns:
         Angle in [0, pi] [rad], accurate also for tiny angles; 0 if p or q is zero.
 
-    Gradients: at p = q the angle has a cone; the gradient there is 0, as at a zero quaternion.
+    Gradients: at p = q the angle has a cone; the gradient there is 0, as at a zero
+        quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> q = jr.rotation.exp(jnp.array([0.0, 1e-3, 0.0]))
@@ -322,16 +334,18 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
 
     Args:
         p: Attitude at s = 0: unit quaternion; its norm drops out.
-        q: Attitude at s = 1: unit quaternion; its norm drops out, and -q gives the same.
-        s: Fraction of the way; outside of [0, 1] the rotation goes on. NaN where p or q is zero or
-            not finite.
+        q: Attitude at s = 1: unit quaternion; its norm drops out, and -q gives the
+            same.
+        s: Fraction of the way; outside of [0, 1] the rotation goes on. NaN where p or q
+            is zero or not finite.
 
     Returns:
         Unit quaternion p exp(s log(p^-1 q)), of the sign of p at s = 0.
 
-    Gradients: analytic also at p = q, to any order. Attitudes half a turn apart have two shortest
-        arcs: where conj(p) q has no scalar part the one about its vector part is taken, and
-        the value jumps from one to the other across; derivatives are those on the side taken.
+    Gradients: analytic also at p = q, to any order. Attitudes half a turn apart have
+        two shortest arcs: where conj(p) q has no scalar part the one about its vector
+        part is taken, and the value jumps from one to the other across; derivatives are
+        those on the side taken.
     Source: K. Shoemake, Animating rotation with quaternion curves, SIGGRAPH (1985) 245.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -356,7 +370,8 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
         angle: Angle [rad], right-handed about the axis.
 
     Returns:
-        Unit quaternion; the identity, with gradient zero in `axis`, if the axis is zero.
+        Unit quaternion; the identity, with gradient zero in `axis`, if the axis is
+        zero.
 
     Gradients: finite everywhere.
 
@@ -365,4 +380,6 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
     [0. 0. 0. 1.]
     """
     v, a = shaped(axis=(axis, 3), angle=(angle,))
-    return normalize(jnp.concatenate([jnp.cos(0.5 * a)[None], jnp.sin(0.5 * a) * _direction(v)]))
+    return normalize(
+        jnp.concatenate([jnp.cos(0.5 * a)[None], jnp.sin(0.5 * a) * _direction(v)])
+    )

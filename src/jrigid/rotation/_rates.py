@@ -7,7 +7,14 @@ from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import all_finite, is_unit, shaped, where_defined
-from jrigid._types import MatrixLike, Quaternion, QuaternionLike, Real, Vector, VectorLike
+from jrigid._types import (
+    MatrixLike,
+    Quaternion,
+    QuaternionLike,
+    Real,
+    Vector,
+    VectorLike,
+)
 from jrigid.rotation._forms import vee
 from jrigid.rotation._quaternion import exp, multiply, normalize
 
@@ -30,8 +37,8 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     [-2.4 -1.   2.   1.8]
     """
     (w, x, y, z), (a, b, c) = shaped(attitude=(attitude, 4), omega=(omega, 3))
-    # No two sums are built alike: LLVM merges such sums into one whose operands are chosen
-    # lane by lane, and then does not vectorise it.
+    # No two sums are built alike: LLVM merges such sums into one whose operands are
+    # chosen lane by lane, and then does not vectorise it.
     return 0.5 * jnp.stack(
         [
             -x * a - y * b - z * c,
@@ -88,14 +95,17 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     """
     (_, theta, psi), (dphi, dtheta, dpsi) = shaped(angles=(angles, 3), rates=(rates, 3))
     s, c, tilt = jnp.sin(psi), jnp.cos(psi), dphi * jnp.sin(theta)
-    return jnp.stack([tilt * s + dtheta * c, tilt * c - dtheta * s, dpsi + dphi * jnp.cos(theta)])
+    return jnp.stack(
+        [tilt * s + dtheta * c, tilt * c - dtheta * s, dpsi + dphi * jnp.cos(theta)]
+    )
 
 
 def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """Rates of the z-x-z Euler angles from the angular velocity in body components.
 
-    Where sin theta = 0 exactly, psi' = 0 is chosen, as `to_euler` chooses psi = 0; phi' carries
-    the turning about the vertical, and the part of omega that no rates can express is dropped.
+    Where sin theta = 0 exactly, psi' = 0 is chosen, as `to_euler` chooses psi = 0; phi'
+    carries the turning about the vertical, and the part of omega that no rates can
+    express is dropped.
 
     Args:
         angles: (phi, theta, psi) [rad].
@@ -114,7 +124,8 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """
     (_, theta, psi), (a, b, c) = shaped(angles=(angles, 3), omega=(omega, 3))
     sine = jnp.sin(theta)
-    # sin(pi) is 1.2e-16 in floating point: the pole is where theta is its closest float.
+    # sin(pi) is 1.2e-16 in floating point: the pole is where theta is its closest
+    # float.
     pole = jnp.abs(sine) <= 0.5 * jnp.finfo(sine.dtype).eps * jnp.abs(theta)
     horizontal = a * jnp.sin(psi) + b * jnp.cos(psi)
     dphi = jnp.where(pole, c * jnp.cos(theta), horizontal / jnp.where(pole, 1.0, sine))
@@ -130,10 +141,10 @@ def integrate_rate(
 ) -> Float[Array, "samples 4"]:
     r"""Dead-reckon an attitude from sampled gyro rates, coning-corrected, to fourth order.
 
-    The rotation is the time-ordered exponential of omega, new increments on the right. Between
-    two samples omega is the cubic through the four nearest ones, and the increment is the
-    fourth-order Magnus expansion with the rates a, b at the two Gauss points,
-    $q \to q \exp(h (a + b) / 2 + \sqrt{3} h^2 (a \times b) / 12)$.
+    The rotation is the time-ordered exponential of omega, new increments on the right.
+    Between two samples omega is the cubic through the four nearest ones, and the
+    increment is the fourth-order Magnus expansion with the rates a, b at the two Gauss
+    points, $q \to q \exp(h (a + b) / 2 + \sqrt{3} h^2 (a \times b) / 12)$.
 
     Args:
         ts: Times of two or more samples [s], increasing, not necessarily uniform.
@@ -141,12 +152,13 @@ def integrate_rate(
         attitude0: Unit quaternion at the first sample; the identity by default.
 
     Returns:
-        Attitude at each sample, with samples h apart to an error of O(h^4) over a fixed span; all
-        NaN unless `ts` is finite and increasing, `omegas` finite and `attitude0` of norm 1.
+        Attitude at each sample, with samples h apart to an error of O(h^4) over a fixed
+        span; all NaN unless `ts` is finite and increasing, `omegas` finite and
+        `attitude0` of norm 1.
 
     Gradients: finite everywhere; zero in a record of NaN.
-    Source: A. Iserles et al., Lie-group methods, Acta Numerica 9 (2000) 215, section 5 (for
-    R' = hat(omega) R; the sign of the commutator is the opposite for body rates).
+    Source: A. Iserles et al., Lie-group methods, Acta Numerica 9 (2000) 215, section 5
+    (for R' = hat(omega) R; the sign of the commutator is the opposite for body rates).
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts = jnp.linspace(0.0, 1.0, 11)
@@ -163,7 +175,9 @@ def integrate_rate(
             f"Argument `ts` must hold at least two samples, but it has shape {ts.shape}."
         )
     step = ts[1:] - ts[:-1]
-    increasing = jnp.all((step > 0) & jnp.isfinite(step))  # no time is infinite or NaN then
+    increasing = jnp.all(
+        (step > 0) & jnp.isfinite(step)
+    )  # no time is infinite or NaN then
     ok = increasing & all_finite(omegas) & is_unit(start)
     return where_defined(ok, _dead_reckon, ts, omegas, start)
 
@@ -175,8 +189,8 @@ def _dead_reckon(ts: Array, omegas: Array, start: Quaternion) -> Array:
     first = jnp.clip(jnp.arange(count - 1) - (width - 2) // 2, 0, count - width)
     window = first[:, None] + jnp.arange(width)[None, :]
     step = ts[1:] - ts[:-1]
-    # From the middle of the step, in its units; differences of times come first, so that an epoch
-    # far from zero costs nothing.
+    # From the middle of the step, in its units; differences of times come first, so
+    # that an epoch far from zero costs nothing.
     nodes = (ts[window] - ts[:-1, None]) / step[:, None] - 0.5
 
     def interpolate(place: float) -> Array:
@@ -187,13 +201,17 @@ def _dead_reckon(ts: Array, omegas: Array, start: Quaternion) -> Array:
     gauss = 3**-0.5 / 2
     a, b = interpolate(-gauss), interpolate(gauss)
     h = step[:, None]
-    increments = jax.vmap(exp)(0.5 * h * (a + b) + (3**0.5 / 12) * h * h * jnp.cross(a, b))
+    increments = jax.vmap(exp)(
+        0.5 * h * (a + b) + (3**0.5 / 12) * h * h * jnp.cross(a, b)
+    )
     quaternions = jnp.concatenate([start[None], increments])
     product = jax.lax.associative_scan(jax.vmap(multiply), quaternions)
     return jax.vmap(normalize)(product)
 
 
-def _lagrange_weights(nodes: Float[Array, " nodes"], place: float) -> Float[Array, " nodes"]:
+def _lagrange_weights(
+    nodes: Float[Array, " nodes"], place: float
+) -> Float[Array, " nodes"]:
     count = nodes.shape[0]
     others = ~jnp.eye(count, dtype=bool)
     numerator = jnp.where(others, place - nodes[None, :], 1.0)

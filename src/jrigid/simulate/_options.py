@@ -18,7 +18,11 @@ _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
 SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
 _DEFAULT_MAX_STEPS_DIRECT = 4096
-_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)
+_ADJOINTS = (
+    diffrax.RecursiveCheckpointAdjoint,
+    diffrax.ForwardMode,
+    diffrax.DirectAdjoint,
+)
 
 
 class Inputs(NamedTuple):
@@ -69,9 +73,9 @@ class Options(NamedTuple):
     def is_worth_foreseeing(self) -> bool:
         """Whether a motion that needs too many steps is to fail before its first one.
 
-        It runs for minutes before it has used up the default number. A smaller one bounds
-        the work: such a run hands out what it reached. Where an event ends a motion,
-        nothing is known beforehand, and the closed form takes no steps.
+        It runs for minutes before it has used up the default number. A smaller one
+        bounds the work: such a run hands out what it reached. Where an event ends a
+        motion, nothing is known beforehand, and the closed form takes no steps.
         """
         if self.event is not None or isinstance(self.solver, ExactFree):
             return False

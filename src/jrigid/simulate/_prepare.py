@@ -48,8 +48,8 @@ class Prepared(NamedTuple):
     Attributes:
         findings: What is wrong with the arguments.
         inputs: The arguments, harmless where they are wrong.
-        motion: In numbers, its parameters and times as they were given: what lanes share
-            stays shared. Where an argument is wrong its fastest rate is zero.
+        motion: In numbers, its parameters and times as they were given: what lanes
+            share stays shared. Where an argument is wrong its fastest rate is zero.
         field: Vector field of (parameters, t, y).
         parameters: Those of the field, harmless where an argument is wrong.
         times: The output times, all zero where an argument is wrong.
@@ -74,7 +74,9 @@ class Prepared(NamedTuple):
     def harmless_motion(self) -> Motion:
         """The motion with parameters and times of each lane, harmless where one is wrong."""
         limits = self.motion.limits._replace(end=jax.lax.stop_gradient(self.times[-1]))
-        return self.motion._replace(parameters=self.parameters, times=self.times, limits=limits)
+        return self.motion._replace(
+            parameters=self.parameters, times=self.times, limits=limits
+        )
 
 
 def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
@@ -118,11 +120,15 @@ def _can_be_enough(limits: Limits, options: Options) -> Array:
 
     No step is longer than the longest at the start, even where the rate falls.
     """
-    longest = options.max_step if isinstance(options.solver, Splitting) else limits.longest
+    longest = (
+        options.max_step if isinstance(options.solver, Splitting) else limits.longest
+    )
     return ~((1 - _SAVED) * limits.end > options.max_steps * longest)
 
 
-def opened(function: Callable[..., Array], *example: Array) -> tuple[Callable, list[Array]]:
+def opened(
+    function: Callable[..., Array], *example: Array
+) -> tuple[Callable, list[Array]]:
     """A function with the arrays that it closes over as a first argument, and these."""
     closed = jax.make_jaxpr(function)(*example)
 
@@ -158,7 +164,9 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         jumps=jumps,
         beside=jnp.full_like(jumps, beside),
         scales=scales,
-        limits=limits._replace(start_rate=jnp.where(findings.ok, limits.start_rate, 0.0)),
+        limits=limits._replace(
+            start_rate=jnp.where(findings.ok, limits.start_rate, 0.0)
+        ),
     )
     return Prepared(
         findings=findings,

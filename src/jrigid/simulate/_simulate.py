@@ -74,72 +74,81 @@ def simulate(
 ) -> Trajectory:
     r"""Integrate the motion of a body and return its states at the times `ts`.
 
-    The variables are measured in their own scales, so the answer does not depend on the unit of
-    time, and the error control is set for the promises below. One thing it cannot know: a pulse
-    of torque that is shorter than a step is missed, unless `jumps` or `max_step` tell of it.
+    The variables are measured in their own scales, so the answer does not depend on the
+    unit of time, and the error control is set for the promises below. One thing it
+    cannot know: a pulse of torque that is shorter than a step is missed, unless `jumps`
+        or `max_step` tell of it.
 
     Args:
-        system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or what has a method
-            `as_rigid_body`, as a `SymmetricTop`. A torque that is a function is compiled anew for
-            each new function object, which takes seconds, and memory that only
-            `jax.clear_caches()` frees: define it once, and hand on what changes through `args`.
-        state0: Its state at `t0`. Where a damper or a rotor needs an internal state and none is
-            given, it starts at rest relative to the body.
-        ts: Times [s], non-decreasing in the order of their memory, none before `t0`; any shape.
-            Their dtype may have more digits than the state's, and needs them where `t0` is far
-            from 0, as the seconds of 1970 are.
+        system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or what has a
+            method `as_rigid_body`, as a `SymmetricTop`. A torque that is a function is
+            compiled anew for each new function object, which takes seconds, and memory
+            that only `jax.clear_caches()` frees: define it once, and hand on what
+            changes through `args`.
+        state0: Its state at `t0`. Where a damper or a rotor needs an internal state and
+            none is given, it starts at rest relative to the body.
+        ts: Times [s], non-decreasing in the order of their memory, none before `t0`;
+            any shape. Their dtype may have more digits than the state's, and needs them
+            where `t0` is far from 0, as the seconds of 1970 are.
         args: Passed to torques and forces.
         t0: Time of `state0` [s].
-        solver: A diffrax solver with an error estimate; `jrigid.solvers.Verner9()` by default. An
-            implicit one (`diffrax.Kvaerno5()`) steps over what drag or a damper kills within a
-            radian of its own rate. For a `RigidBody` without torque `jrigid.solvers.ExactFree()`
-            gives the closed form, for one in a potential `jrigid.solvers.Splitting()` symplectic
-            steps of the length `max_step`.
-        rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an angle of turn
-            phi [rad] the relative error of energy and space angular momentum stays below
-            rtol (1 + phi), that of the state of a regular motion below 10 rtol (1 + phi), with a
-            floor of 100 eps (1 + phi). One step is held to half of rtol for that, and to less
-            in long runs or by a method of lower order. Where derivatives are taken steps are
-            shorter, and the value is closer for it. What counts is the fastest part of the motion:
-            for a body in flight that turns slowly, or not at all, phi is the angle of its orbit,
-            and errors of position and velocity are relative to their initial magnitudes (to those
-            they reach in the run, or in a radian, where they start at zero).
-        atol: The same for components near zero, as a fraction of the scale of their variable (the
-            initial rate of turning, say); `rtol` by default.
-        adjoint: How derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`,
-            `jax.jacrev`) works; `diffrax.ForwardMode()` gives `jax.jvp`, `jax.jacfwd` and forward
-            over forward; `diffrax.DirectAdjoint()` every mode and order.
-        max_steps: Largest number of steps; by default 2e7, enough for some 5e5 turns, but 4096
-            for `DirectAdjoint`, whose cost grows with it. A motion that certainly needs more
-            than the default fails before its first step; with a smaller number it goes as far
-            as that leads. For a free body `jrigid.free_rotation` has no such bound.
-        max_step: Longest step [s]. Steps follow the fastest rate of the motion, which is
-            evaluated where each begins and ends. A pulse of torque much shorter than a radian
-            of turning, or than the run if the body is at rest, can fall between two
-            evaluations and is then missed: bound the step by the length of the pulse, or name
-            its start and end as `jumps`.
-        jumps: Times [s] at which a torque or a force is not smooth: where it is switched, or
-            the knots of a table that it is interpolated in. Steps end exactly there. A torque
-            that has a property `jumps`, as those of `jrigid.torques`, declares its own; a
-            plain function cannot. A switch or a knot that is not named is found and costs
-            more steps; a pulse shorter than a step is missed.
-        event: A `diffrax.Event` that ends the motion; its condition functions are called with
-            (t, state, args), in SI units. The time at which a number changes its sign, or a
-            boolean becomes true, is found by bisection, unless the event brings a root finder.
-            (With an implicit solver a boolean ends the motion at the end of a step.)
-        throw: If True, bad input and a failed integration raise an error; if False, they set the
-            lane's result code, and NaN where there is no state.
+        solver: A diffrax solver with an error estimate; `jrigid.solvers.Verner9()` by
+            default. An implicit one (`diffrax.Kvaerno5()`) steps over what drag or a
+            damper kills within a radian of its own rate. For a `RigidBody` without
+            torque `jrigid.solvers.ExactFree()` gives the closed form, for one in a
+            potential `jrigid.solvers.Splitting()` symplectic steps of the length
+            `max_step`.
+        rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an
+            angle of turn phi [rad] the relative error of energy and space angular
+            momentum stays below rtol (1 + phi), that of the state of a regular motion
+            below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). One step is held
+            to half of rtol for that, and to less in long runs or by a method of lower
+            order. Where derivatives are taken steps are shorter, and the value is
+            closer for it. What counts is the fastest part of the motion: for a body in
+            flight that turns slowly, or not at all, phi is the angle of its orbit, and
+            errors of position and velocity are relative to their initial magnitudes (to
+            those they reach in the run, or in a radian, where they start at zero).
+        atol: The same for components near zero, as a fraction of the scale of their
+            variable (the initial rate of turning, say); `rtol` by default.
+        adjoint: How derivatives are taken. By default reverse mode (`jax.grad`,
+            `jax.vjp`, `jax.jacrev`) works; `diffrax.ForwardMode()` gives `jax.jvp`,
+            `jax.jacfwd` and forward over forward; `diffrax.DirectAdjoint()` every mode
+            and order.
+        max_steps: Largest number of steps; by default 2e7, enough for some 5e5 turns,
+            but 4096 for `DirectAdjoint`, whose cost grows with it. A motion that
+            certainly needs more than the default fails before its first step; with a
+            smaller number it goes as far as that leads. For a free body
+            `jrigid.free_rotation` has no such bound.
+        max_step: Longest step [s]. Steps follow the fastest rate of the motion, which
+            is evaluated where each begins and ends. A pulse of torque much shorter than
+            a radian of turning, or than the run if the body is at rest, can fall
+            between two evaluations and is then missed: bound the step by the length of
+            the pulse, or name its start and end as `jumps`.
+        jumps: Times [s] at which a torque or a force is not smooth: where it is
+            switched, or the knots of a table that it is interpolated in. Steps end
+            exactly there. A torque that has a property `jumps`, as those of
+            `jrigid.torques`, declares its own; a plain function cannot. A switch or a
+            knot that is not named is found and costs more steps; a pulse shorter than a
+            step is missed.
+        event: A `diffrax.Event` that ends the motion; its condition functions are
+            called with (t, state, args), in SI units. The time at which a number
+            changes its sign, or a boolean becomes true, is found by bisection, unless
+            the event brings a root finder. (With an implicit solver a boolean ends the
+            motion at the end of a step.)
+        throw: If True, bad input and a failed integration raise an error; if False,
+            they set the lane's result code, and NaN where there is no state.
         progress: True prints a progress meter, or give one of diffrax's.
 
     Returns:
         The trajectory. With `throw=False` look at its `result` before its states.
 
-    Gradients: those of the motion, in the state, the system's parameters, `args`, `t0` and `ts`,
-    also at pure spin and the sleeping top. Their error, relative to the norm of the Jacobian, is
-    at most 1000 rtol up to 1e4 radians; from there on it grows as radians^2. A mode that the
-    adjoint cannot serve raises an error that names one that can. A lane that fails, from its
-    input or on the way, has no part in the gradients of what lanes share once its states are
-    masked by `result`, unless the vector field itself has no finite derivative where it starts.
+    Gradients: those of the motion, in the state, the system's parameters, `args`, `t0`
+    and `ts`, also at pure spin and the sleeping top. Their error, relative to the norm
+    of the Jacobian, is at most 1000 rtol up to 1e4 radians; from there on it grows as
+    radians^2. A mode that the adjoint cannot serve raises an error that names one that
+    can. A lane that fails, from its input or on the way, has no part in the gradients
+    of what lanes share once its states are masked by `result`, unless the vector field
+    itself has no finite derivative where it starts.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -168,7 +177,9 @@ def simulate(
     return settle(trajectory, throw, _findings, inputs, options, *final)
 
 
-def _findings(inputs: Inputs, options: Options, result: Any, final_time: Array) -> Findings:
+def _findings(
+    inputs: Inputs, options: Options, result: Any, final_time: Array
+) -> Findings:
     """What is wrong with the arguments, and where a torque became NaN."""
     findings, limits, _ = judged(inputs, options)
     enough = result != RESULTS.max_steps_reached
@@ -263,10 +274,14 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
             [lambda t, y, _, f=f, **__: f(t, y, given.inputs.args) for f in each]
         )
         event = dataclasses.replace(event, cond_fn=conditions)
-    ys, t, y, result, stats = solve_by_diffrax(given.field, motion, given.omega, options, event)
+    ys, t, y, result, stats = solve_by_diffrax(
+        given.field, motion, given.omega, options, event
+    )
     result = RESULTS.promote(result)
     fixed = jax.lax.stop_gradient(motion.times)
-    ys = jax.vmap(partial(moved_by, given.field, given.parameters))(fixed, ys, motion.times - fixed)
+    ys = jax.vmap(partial(moved_by, given.field, given.parameters))(
+        fixed, ys, motion.times - fixed
+    )
     if event is None:
         whole = result == RESULTS.successful
         t = jnp.where(whole, motion.times[-1], t)
@@ -277,7 +292,9 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
     return _Solved(ys, reached, t, y, result, tried, accepted)
 
 
-def _integrated(engine: Engine, motion: Motion, given: Prepared, options: Options) -> _Solved:
+def _integrated(
+    engine: Engine, motion: Motion, given: Prepared, options: Options
+) -> _Solved:
     """The motion by our own loop."""
     conditions, observed = _conditions(given, options)
     engine = engine._replace(conditions=conditions)
@@ -287,7 +304,9 @@ def _integrated(engine: Engine, motion: Motion, given: Prepared, options: Option
         solve = solve_forward
     if isinstance(options.adjoint, diffrax.DirectAdjoint):
         solve = solve_direct
-        motion = motion._replace(parameters=harmless(given.findings.ok, motion.parameters))
+        motion = motion._replace(
+            parameters=harmless(given.findings.ok, motion.parameters)
+        )
     ends = solve(engine, motion)
     state, tried, accepted = ends.counts[0], ends.counts[1], ends.counts[2]
     fixed = jax.lax.stop_gradient(given.times)
@@ -336,7 +355,9 @@ def _each_condition(given: Prepared, options: Options) -> tuple[list[Callable], 
     return each, (given.motion.times[-1], given.motion.y0)
 
 
-def _conditions(given: Prepared, options: Options) -> tuple[Conditions | None, list[Array]]:
+def _conditions(
+    given: Prepared, options: Options
+) -> tuple[Conditions | None, list[Array]]:
     """The conditions of the event, if there is one, and the arrays that they depend on."""
     if options.event is None:
         return None, []
@@ -377,4 +398,6 @@ def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
         "num_rejected_steps": tried - accepted,
     }
     moved = eqx.partition((usable.system, usable.args), eqx.is_array)
-    return Trajectory(inputs.ts, states, result, counts, final_time, final_state, *moved)
+    return Trajectory(
+        inputs.ts, states, result, counts, final_time, final_state, *moved
+    )

@@ -54,7 +54,9 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step; its length, the fastest rate, a direction."""
         del terms, t1, dt0, args, func, error_order
-        longest = jnp.minimum(self.limits.radians / self.limits.start_rate, self.limits.longest)
+        longest = jnp.minimum(
+            self.limits.radians / self.limits.start_rate, self.limits.longest
+        )
         first = _FIRST_STEP * longest
         return t0 + first, (first, self.limits.start_rate, first_direction(y0))
 
@@ -70,7 +72,9 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
             fastest, along = undamped_rate(rates), direction
         else:
             base = self.field(t, y)
-            fastest, along = rate_along(lambda y: self.field(t, y), y, base, direction, self.scales)
+            fastest, along = rate_along(
+                lambda y: self.field(t, y), y, base, direction, self.scales
+            )
         size = in_tolerances(limits, self.scales, before, y, error)
         rate1 = fastest_rate(self.scales, self.omega, y, fastest)
         verdict = judge(limits, error_order, step, h, size, rate0, rate1)
@@ -126,7 +130,9 @@ def solve_by_diffrax(
         None,
         motion.y0,
         motion.parameters,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=fixed.times), diffrax.SubSaveAt(t1=True)]),
+        saveat=diffrax.SaveAt(
+            subs=[diffrax.SubSaveAt(ts=fixed.times), diffrax.SubSaveAt(t1=True)]
+        ),
         stepsize_controller=controller,
         adjoint=options.adjoint,
         max_steps=options.max_steps,
@@ -144,12 +150,14 @@ def _exactness(limits: Limits) -> float:
     return 16 * float(jnp.finfo(limits.end.dtype).eps)
 
 
-def _guarded(y0: Array, field: Callable, t: Array, y: Array, parameters: list[Array]) -> Array:
+def _guarded(
+    y0: Array, field: Callable, t: Array, y: Array, parameters: list[Array]
+) -> Array:
     """The vector field, with a large number for NaN and infinities.
 
     A step into a place where the field is not finite is rejected. In reverse mode a
-    cotangent of zero times NaN would be NaN, in everything that lanes share: derivatives
-    there are taken at the start instead, where the field is finite.
+    cotangent of zero times NaN would be NaN, in everything that lanes share:
+    derivatives there are taken at the start instead, where the field is finite.
     """
     rates = jax.lax.stop_gradient(field(parameters, t, y))
     finite = all_finite(rates)

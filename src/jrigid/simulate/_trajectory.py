@@ -19,15 +19,15 @@ class Trajectory(Readable):
 
     Attributes:
         ts: Times [s], in the shape they were given.
-        states: State at each time; the leading axes of its leaves are those of `ts`. NaN where
-            the integration did not get to; attitudes are normalised.
-        result: Result code, `jrigid.RESULTS.successful` if all went well; one for each lane under
-            vmap. After an event it is `event_occurred`. Test it by
-            `trajectory.result == jrigid.RESULTS.successful`, an array of booleans under vmap;
-            `jrigid.RESULTS[trajectory.result]` is the message of a single one.
+        states: State at each time; the leading axes of its leaves are those of `ts`.
+            NaN where the integration did not get to; attitudes are normalised.
+        result: Result code, `jrigid.RESULTS.successful` if all went well; one for each
+            lane under vmap. After an event it is `event_occurred`. Test it by
+            `trajectory.result == jrigid.RESULTS.successful`, an array of booleans under
+            vmap; `jrigid.RESULTS[trajectory.result]` is the message of a single one.
         stats: Counts of steps: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-        final_time: Where the integration ended [s]: the last of `ts`, the event, or where it
-            failed.
+        final_time: Where the integration ended [s]: the last of `ts`, the event, or
+            where it failed.
         final_state: The state there; NaN if it failed.
     """
 
@@ -59,7 +59,9 @@ class Trajectory(Readable):
     @property
     def angular_momentum(self) -> Float[Array, "... 3"]:
         """Total angular momentum at each time [kg m^2/s], space components."""
-        return self._each(lambda system, t, state, args: system.angular_momentum(t, state, args))
+        return self._each(
+            lambda system, t, state, args: system.angular_momentum(t, state, args)
+        )
 
     def _each(self, fn: Callable[..., Array]) -> Array:
         lanes = jnp.ndim(code_of(self.result))

@@ -1,12 +1,13 @@
 """Mass properties of homogeneous solids and shells, in closed form.
 
-Every body has its centre of mass at the origin of the coordinates, except where a function says
-otherwise, its axis of symmetry along z and its principal axes along x, y, z. Move it with
-`.translated` and `.rotated`, join bodies with `+`. A body is NaN where its mass or a length is not
-positive and finite, or where its lengths do not fit together.
+Every body has its centre of mass at the origin of the coordinates, except where a
+function says otherwise, its axis of symmetry along z and its principal axes along x, y,
+z. Move it with `.translated` and `.rotated`, join bodies with `+`. A body is NaN where
+its mass or a length is not positive and finite, or where its lengths do not fit
+together.
 
-Source: Beer, Johnston, Mazurek and Cornwell, Vector Mechanics for Engineers: Dynamics, 10th ed.,
-9.11-9.17 and inside cover; torus and capsule by integration.
+Source: Beer, Johnston, Mazurek and Cornwell, Vector Mechanics for Engineers: Dynamics,
+10th ed., 9.11-9.17 and inside cover; torus and capsule by integration.
 """
 
 from jrigid.solids._round import capsule as capsule

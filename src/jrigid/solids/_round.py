@@ -34,13 +34,16 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     return solid(lambda r: (r * r / 5,) * 3, mass, radius=radius)
 
 
-def shell(mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike) -> MassProperties:
+def shell(
+    mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike
+) -> MassProperties:
     """Spherical shell: a ball with a concentric spherical cavity.
 
     Args:
         mass: Mass [kg].
         inner_radius: Radius of the cavity [m].
-        outer_radius: Outer radius [m], not below the inner; equal radii are a thin shell.
+        outer_radius: Outer radius [m], not below the inner; equal radii are a thin
+            shell.
 
     Returns:
         The body, centre at the origin.
@@ -53,7 +56,8 @@ def shell(mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike) 
     """
 
     def mean_squares(inner: Scalar, outer: Scalar) -> MeanSquares:
-        # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in the limit.
+        # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in
+        # the limit.
         q = inner / outer
         ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
         square = outer * outer / 5 * ratio
@@ -82,7 +86,9 @@ def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
     return solid(lambda axes: axes * axes / 5, mass, shape=(3,), semi_axes=semi_axes)
 
 
-def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
+def cylinder(
+    mass: ScalarLike, radius: ScalarLike, height: ScalarLike
+) -> MassProperties:
     """Homogeneous circular cylinder along z.
 
     Args:
@@ -91,8 +97,8 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
         height: Full height [m].
 
     Returns:
-        The body, centre at the origin. The transverse moment is M h^2 / 12 + M r^2 / 4 (a source
-        in circulation prints M h^2 / 2).
+        The body, centre at the origin. The transverse moment is M h^2 / 12 + M r^2 / 4
+        (a source in circulation prints M h^2 / 2).
 
     Gradients: polynomial, finite everywhere.
 
@@ -100,18 +106,24 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
     >>> print(jnp.diag(jr.solids.cylinder(12.0, 2.0, 1.0).inertia))
     [13. 13. 24.]
     """
-    return solid(lambda r, h: _round(r * r / 4, h * h / 12), mass, radius=radius, height=height)
+    return solid(
+        lambda r, h: _round(r * r / 4, h * h / 12), mass, radius=radius, height=height
+    )
 
 
 def tube(
-    mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike, height: ScalarLike
+    mass: ScalarLike,
+    inner_radius: ScalarLike,
+    outer_radius: ScalarLike,
+    height: ScalarLike,
 ) -> MassProperties:
     """Homogeneous circular tube along z.
 
     Args:
         mass: Mass [kg].
         inner_radius: Radius of the bore [m].
-        outer_radius: Outer radius [m], not below the inner; equal radii are a thin wall.
+        outer_radius: Outer radius [m], not below the inner; equal radii are a thin
+            wall.
         height: Full height [m].
 
     Returns:
@@ -140,8 +152,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
         height: From base to apex [m].
 
     Returns:
-        The body, centre of mass at the origin: the apex is at z = 3 height / 4, the base at
-        z = -height / 4.
+        The body, centre of mass at the origin: the apex is at z = 3 height / 4, the
+        base at z = -height / 4.
 
     Gradients: polynomial, finite everywhere.
 
@@ -150,7 +162,10 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     [96. 96. 96.]
     """
     return solid(
-        lambda r, h: _round(3 * r * r / 20, 3 * h * h / 80), mass, radius=radius, height=height
+        lambda r, h: _round(3 * r * r / 20, 3 * h * h / 80),
+        mass,
+        radius=radius,
+        height=height,
     )
 
 
@@ -192,7 +207,9 @@ def hoop(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     return solid(lambda r: _round(r * r / 2, 0.0), mass, radius=radius)
 
 
-def torus(mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike) -> MassProperties:
+def torus(
+    mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike
+) -> MassProperties:
     """Homogeneous solid torus around z.
 
     Args:
@@ -239,7 +256,8 @@ def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPro
         # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
         whole = h + 4 * r / 3
         middle, ends = h / whole, 4 * r / (3 * whole)
-        # A half ball has its centre of mass 3 r / 8 above its base, and r^2 / 5 about the base.
+        # A half ball has its centre of mass 3 r / 8 above its base, and r^2 / 5 about
+        # the base.
         along = middle * h * h / 12 + ends * (r * r / 5 + h * h / 4 + 3 * r * h / 8)
         return _round(middle * r * r / 4 + ends * r * r / 5, along)
 

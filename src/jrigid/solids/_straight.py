@@ -63,7 +63,9 @@ def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
     >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
     [4. 1. 5.]
     """
-    return solid(lambda edges: (*(edges * edges / 12), 0.0), mass, shape=(2,), lengths=lengths)
+    return solid(
+        lambda edges: (*(edges * edges / 12), 0.0), mass, shape=(2,), lengths=lengths
+    )
 
 
 def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassProperties:
@@ -91,10 +93,13 @@ def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassPrope
     def body(mass: Array, vertices: Array) -> MassProperties:
         origin = vertices[0]
         center = origin + jnp.sum(vertices - origin[None, :], axis=0) / 4
-        # Its tensor is that of a twentieth of the mass at each corner, the others at the centre.
+        # Its tensor is that of a twentieth of the mass at each corner, the others at
+        # the centre.
         corners = jnp.broadcast_to(mass / 20, (4,))
         return MassProperties.unchecked(
             mass, center, inertia_tensor(corners, vertices - center[None, :])
         )
 
-    return where_defined(all_positive(mass) & all_finite(vertices), body, mass, vertices)
+    return where_defined(
+        all_positive(mass) & all_finite(vertices), body, mass, vertices
+    )

@@ -18,4 +18,8 @@ class Dense(diffrax.AbstractLocalInterpolation):
         """The state at t0, or its change from t0 to t1."""
         del left
         start = self.at(t0)
-        return start if t1 is None else jtu.tree_map(lambda a, b: b - a, start, self.at(t1))
+        return (
+            start
+            if t1 is None
+            else jtu.tree_map(lambda a, b: b - a, start, self.at(t1))
+        )

@@ -20,7 +20,8 @@ from jrigid.solvers._dense import Dense
 class FreeRotation(diffrax.AbstractTerm):
     """The equations of a free body, for any diffrax solver, and for `ExactFree` to solve exactly.
 
-    The state is a `State`, or any dataclass with `attitude` and `omega`, whose other fields rest.
+    The state is a `State`, or any dataclass with `attitude` and `omega`, whose other
+    fields rest.
 
     Attributes:
         inertia: Principal moments or tensor [kg m^2]; not checked.
@@ -43,7 +44,9 @@ class FreeRotation(diffrax.AbstractTerm):
         del t, args
         rest = jtu.tree_map(lambda x: 0 * x, y)
         omega = euler_equations(self.inertia.astype(y.omega.dtype), y.omega)
-        return dataclasses.replace(rest, attitude=attitude_rate(y.attitude, y.omega), omega=omega)
+        return dataclasses.replace(
+            rest, attitude=attitude_rate(y.attitude, y.omega), omega=omega
+        )
 
     def contr(self, t0: Any, t1: Any, **_: Any) -> Any:
         """The step of time."""
@@ -79,14 +82,15 @@ class _ExactInterpolation(Dense):
 class ExactFree(diffrax.AbstractSolver):
     """The exact flow of the free body as a diffrax solver: one step goes any distance.
 
-    `simulate(RigidBody(inertia), ..., solver=ExactFree())` evaluates the closed form at the times
-    asked for. In `diffrax.diffeqsolve` it solves the term `FreeRotation(inertia)`, its dense output
-    exact too; a splitting scheme can call its `step`, or `FreeRotation.after`, as a stage.
-    Attitudes keep the norm they start with.
+    `simulate(RigidBody(inertia), ..., solver=ExactFree())` evaluates the closed form at
+    the times asked for. In `diffrax.diffeqsolve` it solves the term
+    `FreeRotation(inertia)`, its dense output exact too; a splitting scheme can call its
+    `step`, or `FreeRotation.after`, as a stage. Attitudes keep the norm they start
+    with.
 
     Gradients: those of the motion, see `jrigid.free_rotation`.
-    Source: docs/free_rotation.md; as a stage: A. Dullweber, B. Leimkuhler, R. McLachlan, J. Chem.
-    Phys. 107 (1997) 5840.
+    Source: docs/free_rotation.md; as a stage: A. Dullweber, B. Leimkuhler, R.
+    McLachlan, J. Chem. Phys. 107 (1997) 5840.
 
     >>> import diffrax, jax.numpy as jnp, jrigid as jr
     >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
@@ -98,7 +102,9 @@ class ExactFree(diffrax.AbstractSolver):
     """
 
     term_structure: ClassVar = FreeRotation
-    interpolation_cls: ClassVar[Callable[..., _ExactInterpolation]] = _ExactInterpolation
+    interpolation_cls: ClassVar[Callable[..., _ExactInterpolation]] = (
+        _ExactInterpolation
+    )
 
     def order(self, terms: Any) -> None:
         """None: there is no error to speak of."""
@@ -109,11 +115,19 @@ class ExactFree(diffrax.AbstractSolver):
         del terms, t0, t1, y0, args
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: Any,
     ) -> tuple[Any, None, dict[str, Any], None, Any]:
         """The state at t1, with no error estimate."""
         del args, solver_state, made_jump
-        # diffeqsolve lets time grow, and wraps the term in one that knows its direction.
+        # diffeqsolve lets time grow, and wraps the term in one that knows its
+        # direction.
         term = getattr(terms, "term", terms)
         direction = jnp.asarray(getattr(terms, "direction", 1), y0.omega.dtype)
         info = {"y0": y0, "inertia": term.inertia, "direction": direction}

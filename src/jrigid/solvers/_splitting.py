@@ -18,15 +18,21 @@ from jrigid.solvers._dense import Dense
 from jrigid.solvers._exact import FreeRotation
 from jrigid.systems import RigidBody
 
-# Steps of order 2 that make one of a higher order, the first half of them and the middle one:
-# M. Suzuki, Phys. Lett. A 146 (1990) 319; W. Kahan, R.-C. Li, Math. Comp. 66 (1997) 1089.
+# Steps of order 2 that make one of a higher order, the first half of them and the
+# middle one: M. Suzuki, Phys. Lett. A 146 (1990) 319; W. Kahan, R.-C. Li, Math. Comp.
+# 66 (1997) 1089.
 _SUZUKI = 1 / (4 - 4 ** (1 / 3))
 _HALVES = {
     2: [1.0],
     4: [_SUZUKI, _SUZUKI, 1 - 4 * _SUZUKI],
-    6: [0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981,
-        0.082213596293550800230, 0.79854399093482996340],
-}  # fmt: skip
+    6: [
+        0.39216144400731413928,
+        0.33259913678935943860,
+        -0.70624617255763935981,
+        0.082213596293550800230,
+        0.79854399093482996340,
+    ],
+}
 
 
 class _Rest(eqx.Module):
@@ -61,13 +67,16 @@ def _kick(body: RigidBody, t: Any, y: Any, args: Any) -> Any:
 def _unbiased(inertia: Any, before: Any, after: Any) -> Any:
     """A free motion whose rounding does not add up over millions of steps.
 
-    Size of the momentum, energy and norm of the attitude are what they were, to a rounding that is
-    as often up as down.
+    Size of the momentum, energy and norm of the attitude are what they were, to a
+    rounding that is as often up as down.
     """
     old, new = jax.lax.stop_gradient((before.omega, after.omega))
     inertia = jax.lax.stop_gradient(inertia).astype(new.dtype)
     inertia = inertia / jnp.max(jnp.abs(inertia))  # whose unit drops out
-    step, mean = angular_momentum(inertia, new - old), angular_momentum(inertia, new + old)
+    step, mean = (
+        angular_momentum(inertia, new - old),
+        angular_momentum(inertia, new + old),
+    )
     momentum = angular_momentum(inertia, new)
     square = jnp.sum(momentum**2)
     excess, energy = 0.5 * jnp.sum(step * mean), 0.5 * jnp.sum((new - old) * mean)
@@ -75,7 +84,9 @@ def _unbiased(inertia: Any, before: Any, after: Any) -> Any:
     energy = energy - excess / safe * jnp.sum(new * momentum)
     across = new - jnp.sum(new * momentum) / safe * momentum
     width = jnp.sum(across**2) + 1e-20 * jnp.sum(new**2)
-    change = excess / safe * momentum + energy / jnp.where(width > 0, width, 1.0) * across
+    change = (
+        excess / safe * momentum + energy / jnp.where(width > 0, width, 1.0) * across
+    )
     omega = after.omega - euler_equations(inertia, 0 * new, change)
     return dataclasses.replace(after, attitude=normalize(after.attitude), omega=omega)
 
@@ -83,22 +94,24 @@ def _unbiased(inertia: Any, before: Any, after: Any) -> Any:
 class Splitting(diffrax.AbstractSolver):
     r"""Symplectic steps for a body in a potential: kicks by the torque between exact free motions.
 
-    Steps are of one length. They preserve the symplectic form and are their own inverse backward in
-    time, so the energy does not drift: its error stays of the order of step^order, whatever the
-    time, until rounding adds up, nearly as a random walk. A momentum about an axis of symmetry of
-    the potential and |q| = 1 are kept to rounding. An adaptive method of the same price is ahead
-    for longer the stronger the torque (docs/simulate.md). `simulate(body, ..., solver=Splitting(),
-    max_step=h)` divides the time from each output to the next into equal steps no longer than h; of
-    `rtol` it knows nothing. A torque may depend on attitude and time alone: any other is an error
-    there.
+    Steps are of one length. They preserve the symplectic form and are their own inverse
+    backward in time, so the energy does not drift: its error stays of the order of
+    step^order, whatever the time, until rounding adds up, nearly as a random walk. A
+    momentum about an axis of symmetry of the potential and |q| = 1 are kept to
+    rounding. An adaptive method of the same price is ahead for longer the stronger the
+    torque (docs/simulate.md). `simulate(body, ..., solver=Splitting(), max_step=h)`
+    divides the time from each output to the next into equal steps no longer than h; of
+    `rtol` it knows nothing. A torque may depend on attitude and time alone: any other
+    is an error there.
 
-    In `diffrax.diffeqsolve` it solves the pair of terms `Splitting.terms(body)` by constant steps;
-    its dense output is a shorter step, which costs as much as one.
+    In `diffrax.diffeqsolve` it solves the pair of terms `Splitting.terms(body)` by
+    constant steps; its dense output is a shorter step, which costs as much as one.
 
-    Gradients: those of the method. A torque that turns NaN on the way makes NaN of the gradients of
-    what lanes share, too.
-    Source: A. Dullweber, B. Leimkuhler, R. McLachlan, J. Chem. Phys. 107 (1997) 5840, with the free
-    motion in closed form; composed after Suzuki (order 4) and Kahan and Li (order 6).
+    Gradients: those of the method. A torque that turns NaN on the way makes NaN of the
+    gradients of what lanes share, too.
+    Source: A. Dullweber, B. Leimkuhler, R. McLachlan, J. Chem. Phys. 107 (1997) 5840,
+    with the free motion in closed form; composed after Suzuki (order 4) and Kahan and
+    Li (order 6).
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> weight = jr.torques.UniformGravity(1.0, jnp.array([0.3, 0.1, 0.5]), jnp.array([0, 0, -1.0]))
@@ -111,7 +124,9 @@ class Splitting(diffrax.AbstractSolver):
     """
 
     _order: int = eqx.field(static=True)
-    term_structure: ClassVar = diffrax.MultiTerm[tuple[FreeRotation, diffrax.AbstractTerm]]
+    term_structure: ClassVar = diffrax.MultiTerm[
+        tuple[FreeRotation, diffrax.AbstractTerm]
+    ]
     interpolation_cls: ClassVar[Callable[..., _ShorterStep]] = _ShorterStep
 
     def __init__(self, order: int = 4):
@@ -124,7 +139,9 @@ class Splitting(diffrax.AbstractSolver):
             ValueError: Another order.
         """
         if order not in _HALVES:
-            raise ValueError(f"Argument `order` must be 2, 4 or 6, but it is {order!r}.")
+            raise ValueError(
+                f"Argument `order` must be 2, 4 or 6, but it is {order!r}."
+            )
         self._order = order
 
     def order(self, terms: Any) -> int:
@@ -148,17 +165,31 @@ class Splitting(diffrax.AbstractSolver):
         return jtu.tree_map(jnp.add, *terms.vf(t0, y0, args))
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: Any,
     ) -> tuple[Any, None, dict[str, Any], None, Any]:
         """The state at t1, with no error estimate."""
         del solver_state, made_jump
         arrays, rest = eqx.partition((self, terms, args), eqx.is_array)
         info = {"y0": y0, "arrays": arrays, "rest": _Rest(rest)}
-        return self._moved(terms, t0, t1, y0, args), None, info, None, diffrax.RESULTS.successful
+        return (
+            self._moved(terms, t0, t1, y0, args),
+            None,
+            info,
+            None,
+            diffrax.RESULTS.successful,
+        )
 
     def _moved(self, terms: Any, t0: Any, t1: Any, y: Any, args: Any) -> Any:
         """The state at t1: kicks, with free motions between them."""
-        # diffeqsolve lets time grow, and wraps the terms in ones that know its direction.
+        # diffeqsolve lets time grow, and wraps the terms in ones that know its
+        # direction.
         direction = getattr(terms.terms[0], "direction", 1)
         free, push = (getattr(term, "term", term) for term in terms.terms)
         start, h = direction * t0, direction * (t1 - t0)

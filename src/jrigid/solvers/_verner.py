@@ -70,7 +70,8 @@ _ERROR = (8, [
         -0.028672962914094935, 2.624999655215792, -0.2825509643291537, 0.13643174034822156,
         0.030570139830827976, -0.048342313738239585,
 ])
-# Dense output of order 6: the weights of stages 1, 8 to 15 and 17 in Chebyshev polynomials.
+# Dense output of order 6: the weights of stages 1, 8 to 15 and 17 in Chebyshev
+# polynomials.
 _DENSE = [
     [
         0.014875428560454304, 0.0007655025021676208, 0.0012315376022196023, 0.0011406891502607078,
@@ -160,12 +161,14 @@ class _Interpolation(Dense):
 class Verner9(diffrax.AbstractERK):
     """Verner's method of order 9, error estimate of order 8.
 
-    16 evaluations a step, since the last stage is the first of the next step: the default of
-    `jrigid.simulate`. Its dense output, of order 6 with a continuous slope, takes none more.
+    16 evaluations a step, since the last stage is the first of the next step: the
+    default of `jrigid.simulate`. Its dense output, of order 6 with a continuous slope,
+    takes none more.
 
     Gradients: those of the method.
-    Source: J. H. Verner, Numer. Algorithms 53 (2010) 383, the "most efficient" pair of orders 9
-    and 8; the dense output is the one of its stages whose terms of order 7 are least.
+    Source: J. H. Verner, Numer. Algorithms 53 (2010) 383, the "most efficient" pair of
+    orders 9 and 8; the dense output is the one of its stages whose terms of order 7 are
+    least.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))

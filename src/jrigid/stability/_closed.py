@@ -23,7 +23,8 @@ from jrigid._types import Real, Scalar, ScalarLike, VectorLike
 from jrigid.top import SymmetricTop, steady_precession
 
 Answer = TypeVar("Answer")
-# Moments of a flat body, of which one is the sum of the others, pass with this many eps.
+# Moments of a flat body, of which one is the sum of the others, pass with this many
+# eps.
 _FLAT = 8
 
 
@@ -32,11 +33,12 @@ class Modes(NamedTuple):
 
     Attributes:
         rates: Growing or turning, and its opposite [1/s].
-        shapes: For each the two small components of the angular velocity, those of the axes that
-            follow the spin axis in cyclic order; of unit length. Both the same, at rates of 0,
-            where the motion drifts; zero where nothing couples the two.
-        amplitude_ratio: |second component / first|; infinite or NaN, and its slopes, where a
-            coupling is zero.
+        shapes: For each the two small components of the angular velocity, those of the
+            axes that follow the spin axis in cyclic order; of unit length. Both the
+            same, at rates of 0, where the motion drifts; zero where nothing couples the
+            two.
+        amplitude_ratio: |second component / first|; infinite or NaN, and its slopes,
+            where a coupling is zero.
     """
 
     rates: Complex[Array, "2"]
@@ -78,22 +80,25 @@ def growth_rate_squared(
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
         spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
+        rotor: Angular momentum of a rotor along the axis, relative to the body [kg
+            m^2/s].
 
     Returns:
-        Square of the growth rate [1/s^2]; where negative, minus the square of the frequency. NaN
-        outside positive, finite moments and finite rates.
+        Square of the growth rate [1/s^2]; where negative, minus the square of the
+        frequency. NaN outside positive, finite moments and finite rates.
 
     Gradients: polynomial over moments, finite everywhere.
-    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; with a rotor, Hughes, Spacecraft
-    Attitude Dynamics (1986), section 6.3.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; with a rotor, Hughes,
+    Spacecraft Attitude Dynamics (1986), section 6.3.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> moments = jnp.array([1.0, 2.0, 3.0])
     >>> print([jr.stability.growth_rate_squared(moments, n, 1.0).item() for n in range(3)])
     [-0.3333333333333333, 0.3333333333333333, -1.0]
     """
-    return _of_couplings(lambda towards, back: towards * back, moments, axis, spin, rotor)
+    return _of_couplings(
+        lambda towards, back: towards * back, moments, axis, spin, rotor
+    )
 
 
 def growth_rate(
@@ -105,14 +110,15 @@ def growth_rate(
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
         spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
+        rotor: Angular momentum of a rotor along the axis, relative to the body [kg
+            m^2/s].
 
     Returns:
-        Growth rate [1/s]. Where it is 0 the wobble turns: see `frequency`. NaN outside positive,
-        finite moments and finite rates.
+        Growth rate [1/s]. Where it is 0 the wobble turns: see `frequency`. NaN outside
+        positive, finite moments and finite rates.
 
-    Gradients: exact where it is positive; at the threshold itself, where they are infinite, 0. Use
-    `growth_rate_squared`, which is smooth there, to find thresholds.
+    Gradients: exact where it is positive; at the threshold itself, where they are
+    infinite, 0. Use `growth_rate_squared`, which is smooth there, to find thresholds.
     Source: as `growth_rate_squared`.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -120,21 +126,29 @@ def growth_rate(
     1.154701
     """
     return _of_couplings(
-        lambda towards, back: root_of_positive(towards * back), moments, axis, spin, rotor
+        lambda towards, back: root_of_positive(towards * back),
+        moments,
+        axis,
+        spin,
+        rotor,
     )
 
 
-def frequency(moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0) -> Scalar:
+def frequency(
+    moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
+) -> Scalar:
     """Angular frequency of a small wobble about a principal axis; 0 where it grows.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
         spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
+        rotor: Angular momentum of a rotor along the axis, relative to the body [kg
+            m^2/s].
 
     Returns:
-        Angular frequency [rad/s]; NaN outside positive, finite moments and finite rates.
+        Angular frequency [rad/s]; NaN outside positive, finite moments and finite
+        rates.
 
     Gradients: as `growth_rate`.
     Source: as `growth_rate_squared`.
@@ -144,22 +158,29 @@ def frequency(moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLik
     2.0
     """
     return _of_couplings(
-        lambda towards, back: root_of_positive(-towards * back), moments, axis, spin, rotor
+        lambda towards, back: root_of_positive(-towards * back),
+        moments,
+        axis,
+        spin,
+        rotor,
     )
 
 
-def modes(moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0) -> Modes:
+def modes(
+    moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
+) -> Modes:
     """The two small motions about spin on a principal axis.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
         spin: Rate of the rotation about it [rad/s].
-        rotor: Angular momentum of a rotor along the axis, relative to the body [kg m^2/s].
+        rotor: Angular momentum of a rotor along the axis, relative to the body [kg
+            m^2/s].
 
     Returns:
-        Rates, shapes, and the ratio of the amplitudes; `linearized` is the solution. NaN outside
-        positive, finite moments and finite rates.
+        Rates, shapes, and the ratio of the amplitudes; `linearized` is the solution.
+        NaN outside positive, finite moments and finite rates.
 
     Gradients: exact where the two rates differ.
     Source: as `growth_rate_squared`.
@@ -197,8 +218,9 @@ def linearized(
         ts: Times [s] of any shape.
 
     Returns:
-        Body components [rad/s]; the error is of the order of the wobble squared, while it is small.
-        NaN outside positive, finite moments, and at a time that is not finite.
+        Body components [rad/s]; the error is of the order of the wobble squared, while
+        it is small. NaN outside positive, finite moments, and at a time that is not
+        finite.
 
     Gradients: finite everywhere, equal moments included.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
@@ -217,9 +239,13 @@ def linearized(
         square = towards * back * t * t
         even, odd = cosh_sqrt(square), t * sinhc_sqrt(square)
         turned = first * even + towards * odd * second
-        return jnp.roll(jnp.stack([spin, turned, second * even + back * odd * first]), axis)
+        return jnp.roll(
+            jnp.stack([spin, turned, second * even + back * odd * first]), axis
+        )
 
-    each = jax.vmap(lambda t: _of_couplings(wave, moments, axis, omega0[axis], 0.0, omega0, t))
+    each = jax.vmap(
+        lambda t: _of_couplings(wave, moments, axis, omega0[axis], 0.0, omega0, t)
+    )
     return each(ts.reshape(-1)).reshape(*ts.shape, 3)
 
 
@@ -237,12 +263,12 @@ class TopStability(NamedTuple):
     """A vertical top.
 
     Attributes:
-        growth_rate_squared: Smooth through 0: where positive, the square of the rate at which the
-            tilt grows; where negative, minus the square of half the difference of `frequencies`
-            [1/s^2].
+        growth_rate_squared: Smooth through 0: where positive, the square of the rate at
+            which the tilt grows; where negative, minus the square of half the
+            difference of `frequencies` [1/s^2].
         growth_rate: Its root, or 0 [1/s].
-        frequencies: At which the tilt goes round the vertical, the nutation and the slow
-            precession; both the same where it grows [rad/s].
+        frequencies: At which the tilt goes round the vertical, the nutation and the
+            slow precession; both the same where it grows [rad/s].
     """
 
     growth_rate_squared: Scalar
@@ -260,14 +286,16 @@ def _of_top(formula: Callable[..., Answer], top: Any, **numbers: Any) -> Answer:
 def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
     """Stability of a vertical top: sleeping (mgl > 0), or hanging (mgl < 0).
 
-    The tilt, as a complex number in the plane, obeys I1 z'' - i I3 omega3 z' - mgl z = 0.
+    The tilt, as a complex number in the plane, obeys I1 z'' - i I3 omega3 z' - mgl z =
+    0.
 
     Args:
         top: The top.
         omega3: Its spin [rad/s].
 
     Returns:
-        Growth rate or frequencies; NaN outside positive, finite moments, finite mgl and spin.
+        Growth rate or frequencies; NaN outside positive, finite moments, finite mgl and
+        spin.
 
     Gradients: of the square exact everywhere; of its root as `growth_rate`.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -293,7 +321,8 @@ class PrecessionStability(NamedTuple):
 
     Attributes:
         precession: Rates [rad/s]; the fast one is infinite for a level top.
-        growth_rate_squared: Minus the squares of the frequencies of a small nutation [1/s^2].
+        growth_rate_squared: Minus the squares of the frequencies of a small nutation
+            [1/s^2].
         exists: Whether the spin is fast enough for any; NaN where not.
     """
 
@@ -313,8 +342,9 @@ def precession_stability(
         omega3: Third component of the angular velocity [rad/s].
 
     Returns:
-        For the slow and the fast precession p the square -(p^2 sin^2 theta + (I3 omega3 / I1 -
-        2 p cos theta)^2); NaN outside positive, finite moments, finite mgl, tilt and spin.
+        For the slow and the fast precession p the square -(p^2 sin^2 theta + (I3 omega3
+        / I1 - 2 p cos theta)^2); NaN outside positive, finite moments, finite mgl, tilt
+        and spin.
 
     Gradients: as those of `top.steady_precession`.
     Source: from the second derivative of `top.effective_potential`; docs/stability.md.
@@ -325,11 +355,15 @@ def precession_stability(
     [ -7.0941 -30.9059]
     """
 
-    def formula(i1: Array, i3: Array, mgl: Array, tilt: Array, spin: Array) -> tuple[Array, Array]:
+    def formula(
+        i1: Array, i3: Array, mgl: Array, tilt: Array, spin: Array
+    ) -> tuple[Array, Array]:
         steady = steady_precession(SymmetricTop(i1, i3, mgl), tilt, spin)
         rates = jnp.stack([steady.slow, steady.fast])
         sine, cosine = jnp.sin(tilt), jnp.cos(tilt)
-        return rates, -((rates * sine) ** 2) - (i3 * spin / i1 - 2 * rates * cosine) ** 2
+        return rates, -((rates * sine) ** 2) - (
+            i3 * spin / i1 - 2 * rates * cosine
+        ) ** 2
 
     rates, squares = _of_top(formula, top, theta=theta, omega3=omega3)
     return PrecessionStability(rates, squares, ~jnp.isnan(rates[0]))
@@ -340,14 +374,15 @@ class SatelliteStability(NamedTuple):
 
     Attributes:
         pitch_squared: Square of the growth rate of pitch, smooth through 0 [1/s^2].
-        roll_yaw_squared: Squares of the two growth rates of roll and yaw, complex where they form
-            two growing and two falling spirals [1/s^2].
+        roll_yaw_squared: Squares of the two growth rates of roll and yaw, complex where
+            they form two growing and two falling spirals [1/s^2].
         growth_rate: The largest [1/s].
-        margins: Four numbers that are all positive where it is stable, each smooth through 0, of
-            the moments (A, B, C) with k_R = (C - A)/B, k_Y = (C - B)/A: (B - A)/C (pitch), k_R k_Y,
-            1 + 3 k_R + k_R k_Y, and its square less 16 k_R k_Y.
-        region: One of `REGIONS`; "marginal" where nothing grows but a margin is not positive,
-            "undefined" for moments of no real body.
+        margins: Four numbers that are all positive where it is stable, each smooth
+            through 0, of the moments (A, B, C) with k_R = (C - A)/B, k_Y = (C - B)/A:
+            (B - A)/C (pitch), k_R k_Y, 1 + 3 k_R + k_R k_Y, and its square less 16 k_R
+            k_Y.
+        region: One of `REGIONS`; "marginal" where nothing grows but a margin is not
+            positive, "undefined" for moments of no real body.
     """
 
     pitch_squared: Scalar
@@ -357,24 +392,28 @@ class SatelliteStability(NamedTuple):
     region: REGIONS
 
 
-def satellite_stability(moments: VectorLike, orbital_rate: ScalarLike = 1.0) -> SatelliteStability:
+def satellite_stability(
+    moments: VectorLike, orbital_rate: ScalarLike = 1.0
+) -> SatelliteStability:
     """Stability of a satellite held by the gravity gradient on a circular orbit.
 
     Args:
-        moments: Principal moments about the axes that point along the radius (yaw), along the
-            flight (roll) and along the normal of the orbit (pitch) [kg m^2].
+        moments: Principal moments about the axes that point along the radius (yaw),
+            along the flight (roll) and along the normal of the orbit (pitch) [kg m^2].
         orbital_rate: n [rad/s].
 
     Returns:
-        Growth rates, margins, and the region: Lagrange's (largest moment along the normal, smallest
-        along the radius), DeBra and Delp's, stable in the linear sense only, or unstable. NaN
-        outside positive, finite moments and a finite rate. A region is of a real body: it is
-        "undefined" where one moment exceeds the sum of the others, which the equations allow.
+        Growth rates, margins, and the region: Lagrange's (largest moment along the
+        normal, smallest along the radius), DeBra and Delp's, stable in the linear sense
+        only, or unstable. NaN outside positive, finite moments and a finite rate. A
+        region is of a real body: it is "undefined" where one moment exceeds the sum of
+            the others, which the equations allow.
 
-    Gradients: of squares and margins exact where roll and yaw have different rates; of the growth
-    rate as `growth_rate`.
-    Source: Hughes, Spacecraft Attitude Dynamics (1986), section 9.2; D. B. DeBra, R. H. Delp,
-    Journal of the Astronautical Sciences 8 (1961) 14; derived in docs/stability.md.
+    Gradients: of squares and margins exact where roll and yaw have different rates; of
+    the growth rate as `growth_rate`.
+    Source: Hughes, Spacecraft Attitude Dynamics (1986), section 9.2; D. B. DeBra, R. H.
+    Delp, Journal of the Astronautical Sciences 8 (1961) 14; derived in
+    docs/stability.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> satellite = jr.stability.satellite_stability(jnp.array([1.0, 2.0, 2.5]))
@@ -383,7 +422,9 @@ def satellite_stability(moments: VectorLike, orbital_rate: ScalarLike = 1.0) -> 
     """
     moments, n = shaped(moments=(moments, 3), orbital_rate=(orbital_rate,))
     ok = all_positive(moments) & jnp.isfinite(n)
-    real = 2 * jnp.max(moments) <= jnp.sum(moments) * (1 + _FLAT * jnp.finfo(moments.dtype).eps)
+    real = 2 * jnp.max(moments) <= jnp.sum(moments) * (
+        1 + _FLAT * jnp.finfo(moments.dtype).eps
+    )
     answer = where_defined(ok, _satellite, moments, n)
     region = REGIONS.where(ok & real, answer.region, REGIONS.undefined)
     return answer._replace(region=region)
@@ -398,12 +439,16 @@ def _satellite(moments: Array, n: Array) -> SatelliteStability:
     # s^4 + middle s^2 + 4 both = 0, for s^2, in units of n
     root = root_of_positive(inside)
     first = -0.5 * (middle + jnp.where(middle < 0, -root, root))
-    second = jnp.where(first != 0, 4 * both / jnp.where(first != 0, first, 1.0), -middle - first)
+    second = jnp.where(
+        first != 0, 4 * both / jnp.where(first != 0, first, 1.0), -middle - first
+    )
     apart, spiral = inside < 0, 0.5 * root_of_positive(-inside)
     squares = jax.lax.complex(
-        jnp.where(apart, -0.5 * middle, jnp.stack([first, second])), jnp.stack([spiral, -spiral])
+        jnp.where(apart, -0.5 * middle, jnp.stack([first, second])),
+        jnp.stack([spiral, -spiral]),
     )
-    # Re sqrt(z) = sqrt((|z| + Re z) / 2), and |z| is 2 sqrt(both) for both of a complex pair.
+    # Re sqrt(z) = sqrt((|z| + Re z) / 2), and |z| is 2 sqrt(both) for both of a complex
+    # pair.
     of_spiral = root_of_positive(root_of_positive(both) - 0.25 * middle)
     of_real = root_of_positive(jnp.maximum(first, second))
     growth = jnp.maximum(root_of_positive(pitch), jnp.where(apart, of_spiral, of_real))
@@ -412,4 +457,6 @@ def _satellite(moments: Array, n: Array) -> SatelliteStability:
     others = REGIONS.where(growth > 0, REGIONS.unstable, REGIONS.marginal)
     region = REGIONS.where(jnp.all(margins > 0), stable, others)
     squares = (n * n).astype(squares.dtype) * squares
-    return SatelliteStability(n * n * pitch, squares, jnp.abs(n) * growth, margins, region)
+    return SatelliteStability(
+        n * n * pitch, squares, jnp.abs(n) * growth, margins, region
+    )

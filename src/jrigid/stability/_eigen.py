@@ -23,14 +23,16 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
         matrix: Any square matrix, whose entries are of comparable size.
 
     Returns:
-        Its eigenvalues; real parts closer than 1e-5 of the matrix's norm count as equal, and there
-        the larger imaginary part comes first. NaN of a matrix that is not finite.
+        Its eigenvalues; real parts closer than 1e-5 of the matrix's norm count as
+        equal, and there the larger imaginary part comes first. NaN of a matrix that is
+        not finite.
 
-    Gradients: exact where an eigenvalue is by itself. Eigenvalues that are nearer than 8 sqrt(eps)
-    of the matrix's norm (1e-7 in float64) count as one, and each gets the derivative of their mean,
-    which is smooth where they meet; its own may be infinite there. Never NaN, in all orders.
-    Source: T. Kato, Perturbation Theory for Linear Operators, section II.2: derivatives by the
-    projector (1 / 2 pi i) times the contour integral of the resolvent.
+    Gradients: exact where an eigenvalue is by itself. Eigenvalues that are nearer than
+    8 sqrt(eps) of the matrix's norm (1e-7 in float64) count as one, and each gets the
+    derivative of their mean, which is smooth where they meet; its own may be infinite
+    there. Never NaN, in all orders.
+    Source: T. Kato, Perturbation Theory for Linear Operators, section II.2: derivatives
+    by the projector (1 / 2 pi i) times the contour integral of the resolvent.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> def pair(mu):  # eigenvalues +-sqrt(mu), which meet at mu = 0
@@ -83,9 +85,14 @@ def _slopes(matrix: Array, values: Array, change: Array) -> Array:
     outer = jnp.min(away, axis=1, initial=4 * size, where=~near)  # none is so far
     radius = jnp.where(inner < 0.25 * outer, 0.5 * outer, jnp.sqrt(inner * outer))
     angles = 2 * jnp.pi * (jnp.arange(_POINTS).astype(real) + 0.5) / _POINTS
-    spokes = radius[:, None] * jax.lax.complex(jnp.cos(angles), jnp.sin(angles))[None, :]
-    points = (centre[:, None] + spokes)[:, :, None, None] * jnp.eye(n, dtype=real)[None, None]
-    # The sum of the eigenvalues inside changes by the trace of the projector times the change.
+    spokes = (
+        radius[:, None] * jax.lax.complex(jnp.cos(angles), jnp.sin(angles))[None, :]
+    )
+    points = (centre[:, None] + spokes)[:, :, None, None] * jnp.eye(n, dtype=real)[
+        None, None
+    ]
+    # The sum of the eigenvalues inside changes by the trace of the projector times the
+    # change.
     resolvents = jnp.linalg.inv(points - matrix[None, None])
     spread = product("ipjk,kj->ip", resolvents, change.astype(values.dtype))
     return jnp.sum(spokes * spread, axis=1) / (_POINTS * count)
@@ -112,19 +119,25 @@ def null_directions(vectors: Array, operator: Array, tiny: Array) -> Array:
     return jnp.stack(rows)
 
 
-def _without_symmetries(matrix: Array, neutral: Array, conserved: Array, tiny: Array) -> Array:
+def _without_symmetries(
+    matrix: Array, neutral: Array, conserved: Array, tiny: Array
+) -> Array:
     """The matrix, what comes with every motion moved from the axis to -1.
 
-    Moved are the eigenvalues of directions that the matrix takes to zero, of rows that it does,
-    and, where the torque does not look at the attitude, the turn of the body, which all follows. An
-    eigenvalue of a known vector v is moved by adding a multiple of v v^T, which leaves the others
-    where they are, for each value of a parameter and so for derivatives.
+    Moved are the eigenvalues of directions that the matrix takes to zero, of rows that
+    it does, and, where the torque does not look at the attitude, the turn of the body,
+    which all follows. An eigenvalue of a known vector v is moved by adding a multiple
+    of v v^T, which leaves the others where they are, for each value of a parameter and
+    so for derivatives.
     """
     blind = jnp.all(matrix[3:, :3] == 0)
     away = -jnp.eye(3, len(matrix), dtype=matrix.dtype)
     matrix = matrix.at[:3].set(jnp.where(blind, away, matrix[:3]))
     conserved = conserved.at[:, :3].set(jnp.where(blind, 0.0, conserved[:, :3]))
-    directions = null_directions(neutral, matrix.T, tiny), null_directions(conserved, matrix, tiny)
+    directions = (
+        null_directions(neutral, matrix.T, tiny),
+        null_directions(conserved, matrix, tiny),
+    )
     rows = jnp.concatenate(directions)
     return matrix - product("ki,kj->ij", rows, rows)
 
@@ -132,10 +145,11 @@ def _without_symmetries(matrix: Array, neutral: Array, conserved: Array, tiny: A
 def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> Scalar:
     """The margin of a matrix, in its units.
 
-    Without damping the eigenvalues lie in mirror images about the imaginary axis. Two that meet
-    there, at zero or in a collision of Krein's kind, leave it: ((s - s') / 2)^2 of the two goes
-    smoothly from minus the square of half their distance to the square of the growth rate. It is a
-    double eigenvalue of the square of the matrix less their mean, simple in kind where they meet.
+    Without damping the eigenvalues lie in mirror images about the imaginary axis. Two
+    that meet there, at zero or in a collision of Krein's kind, leave it: ((s - s') /
+    2)^2 of the two goes smoothly from minus the square of half their distance to the
+    square of the growth rate. It is a double eigenvalue of the square of the matrix
+    less their mean, simple in kind where they meet.
     """
     # Over the size all eigenvalues but those that are moved are within 1/4 of zero.
     size = 4 * (1 + jnp.sqrt(jnp.sum(jax.lax.stop_gradient(matrix) ** 2)))
@@ -156,15 +170,22 @@ def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> 
     return jnp.where(undamped, -squares[place].real * size, damped) * size
 
 
-def _nearest(values: Array, vectors: Array, free: Array, tiny: Array) -> tuple[Array, Array]:
+def _nearest(
+    values: Array, vectors: Array, free: Array, tiny: Array
+) -> tuple[Array, Array]:
     """The two eigenvalues of an undamped motion that are nearest to growth, or grow most.
 
-    Two of one rate that have directions of their own do not count, nor does one with a zero that
-    stays where it is.
+    Two of one rate that have directions of their own do not count, nor does one with a
+    zero that stays where it is.
     """
     gaps, alike = pairs(values, vectors)
     zero = jnp.abs(values) <= tiny
-    counts = jnp.isfinite(gaps) & free[:, None] & free[None, :] & (zero[:, None] == zero[None, :])
+    counts = (
+        jnp.isfinite(gaps)
+        & free[:, None]
+        & free[None, :]
+        & (zero[:, None] == zero[None, :])
+    )
     counts = counts & ((gaps > tiny) | alike)
     squares = (0.25 * (values[:, None] - values[None, :]) ** 2).real
     best = jnp.argmax(jnp.where(counts, squares, -jnp.inf))

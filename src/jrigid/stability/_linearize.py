@@ -52,26 +52,28 @@ class STABILITY(Enumeration):
 class Linearization(Readable):
     """Small motions about an equilibrium: x' = matrix x.
 
-    The components of x are a small turn of the attitude about the body axes (q = q0 exp(x)) [rad],
-    the change of the angular velocity, body components [rad/s], and that of the internal state, all
-    as seen in a frame that turns with the motion.
+    The components of x are a small turn of the attitude about the body axes (q = q0
+    exp(x)) [rad], the change of the angular velocity, body components [rad/s], and that
+    of the internal state, all as seen in a frame that turns with the motion.
 
     Attributes:
         matrix: Its matrix.
         eigenvalues: Rates [1/s], the one of largest real part first.
         eigenvectors: Columns, in the order of the eigenvalues; without derivatives.
-        stability: One of `STABILITY`: "unstable" where a part grows exponentially; "stable" where
-            none does and none drifts; "marginal" between: two eigenvalues that share an
-            eigenvector, beside those that come with every motion of a symmetric system (it may turn
-            a little further, at a slightly other rate). Rates below 1e-6 of that of the motion (in
-            float64; 2e-2 in float32) count as 0.
-        margin: Positive where stable, negative where unstable, smooth where it changes its sign,
-            which is where `boundary` looks [1/s^2]. Without damping, minus the square of the
-            largest growth rate where something grows, else the square of half the smallest
-            difference of two frequencies (of one and its own negative: of the frequency), which
-            also touches zero where two pass through each other. With damping, minus the largest
-            real part times the rate of the motion. What every motion of a symmetric system does
-            counts for neither, nor does the turning of the momentum of a free body in space.
+        stability: One of `STABILITY`: "unstable" where a part grows exponentially;
+            "stable" where none does and none drifts; "marginal" between: two
+            eigenvalues that share an eigenvector, beside those that come with every
+            motion of a symmetric system (it may turn a little further, at a slightly
+            other rate). Rates below 1e-6 of that of the motion (in float64; 2e-2 in
+            float32) count as 0.
+        margin: Positive where stable, negative where unstable, smooth where it changes
+            its sign, which is where `boundary` looks [1/s^2]. Without damping, minus
+            the square of the largest growth rate where something grows, else the square
+            of half the smallest difference of two frequencies (of one and its own
+            negative: of the frequency), which also touches zero where two pass through
+            each other. With damping, minus the largest real part times the rate of the
+            motion. What every motion of a symmetric system does counts for neither, nor
+            does the turning of the momentum of a free body in space.
         result: `jrigid.RESULTS` of the input.
     """
 
@@ -100,20 +102,21 @@ def linearize(
 ) -> Linearization:
     """Linearise a system about an equilibrium, or about a motion that is one in a turning frame.
 
-    Without `body_rate` the frame turns with the body: right for rest, for the spin of a free body
-    or of a gyrostat, for a sleeping or hanging top, for a satellite that keeps its face to the
-    Earth on a circular orbit. A top in steady precession also turns about its own axis, as seen by
-    one who precesses with it: `body_rate` is that turning.
+    Without `body_rate` the frame turns with the body: right for rest, for the spin of a
+    free body or of a gyrostat, for a sleeping or hanging top, for a satellite that
+    keeps its face to the Earth on a circular orbit. A top in steady precession also
+    turns about its own axis, as seen by one who precesses with it: `body_rate` is that
+        turning.
 
     Args:
         system: The body and its torque.
         state0: Its state, an equilibrium in the frame.
         args: Passed to the torque.
         t0: Time of the state [s].
-        body_rate: Turning of the body seen from the frame, body components [rad/s]; about an axis
-            of symmetry of the body and its torque.
-        space_axis: A direction in space about which the system is symmetric, where it is at rest:
-            up, for what hangs still. A motion that turns has its own.
+        body_rate: Turning of the body seen from the frame, body components [rad/s];
+            about an axis of symmetry of the body and its torque.
+        space_axis: A direction in space about which the system is symmetric, where it
+            is at rest: up, for what hangs still. A motion that turns has its own.
         throw: False: bad input is a result code and NaN.
 
     Returns:
@@ -121,13 +124,14 @@ def linearize(
 
     Raises:
         ValueError: `body_rate` with internal parts.
-        RuntimeError: Bad value; a state that is no equilibrium; a system that changes in the frame,
-            such as a body on an eccentric orbit.
+        RuntimeError: Bad value; a state that is no equilibrium; a system that changes
+            in the frame, such as a body on an eccentric orbit.
 
-    Gradients: of matrix, eigenvalues and margin, in all parameters of the system and in the state;
-    where eigenvalues meet see `eigenvalues`. None of the eigenvectors.
-    Source: J. E. Marsden, T. S. Ratiu, Introduction to Mechanics and Symmetry, 2nd ed. (1999), for
-    relative equilibria; docs/stability.md. Eigenvalues on a GPU need a jaxlib that has them there.
+    Gradients: of matrix, eigenvalues and margin, in all parameters of the system and in
+    the state; where eigenvalues meet see `eigenvalues`. None of the eigenvectors.
+    Source: J. E. Marsden, T. S. Ratiu, Introduction to Mechanics and Symmetry, 2nd ed.
+    (1999), for relative equilibria; docs/stability.md. Eigenvalues on a GPU need a
+    jaxlib that has them there.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -194,13 +198,18 @@ class _Frame(NamedTuple):
     def symmetries(self, rate: Scalar) -> tuple[Array, Array]:
         """Where every motion of a symmetric system may go, and slopes of what it keeps.
 
-        It may turn about an axis in space, and about one in the body; it keeps its momentum along.
+        It may turn about an axis in space, and about one in the body; it keeps its
+        momentum along.
         """
         system, state, args, t0, *_ = self.motion
         own, none = self.own, jnp.zeros(self.motion.dimension, rate.dtype)
-        along = jnp.where(safe_norm(self.up) > 0, self.up, self.across)  # the system's own axis
+        along = jnp.where(
+            safe_norm(self.up) > 0, self.up, self.across
+        )  # the system's own axis
         turned = none.at[:3].set(rotate_inverse(state.attitude, along))
-        slewed = none.at[:6].set(jnp.concatenate([own, jnp.cross(state.omega, own) / rate]))
+        slewed = none.at[:6].set(
+            jnp.concatenate([own, jnp.cross(state.omega, own) / rate])
+        )
 
         def momenta(x: Array) -> Array:
             state = self.state(x, jnp.zeros_like(t0))
@@ -222,7 +231,9 @@ class _Frame(NamedTuple):
     def units(self, rate: Scalar) -> Array:
         """Size of each component of x for an angle of 1."""
         system, state, *_ = self.motion
-        return spread(system, state, rate)[1:]  # a turn has a component less than a quaternion
+        return spread(system, state, rate)[
+            1:
+        ]  # a turn has a component less than a quaternion
 
 
 def _accuracy(dtype: Any) -> Scalar:
@@ -271,10 +282,14 @@ def _linearize(frame: _Frame) -> Linearization:
     plain = jnp.where(ok, matrix * units[None, :] / units[:, None] / rate, eye)
     values, vectors = eigensystem(plain)
     neutral, conserved = frame.symmetries(rate)
-    stability = _classify(known(plain), known(values), vectors, known(neutral), accuracy)
+    stability = _classify(
+        known(plain), known(values), vectors, known(neutral), accuracy
+    )
     left = margin(plain, neutral, conserved * units[None, :], accuracy) * rate * rate
     shapes = units.astype(vectors.dtype)[:, None] * vectors
-    shapes = shapes / jnp.linalg.norm(shapes, axis=0, keepdims=True).astype(shapes.dtype)
+    shapes = shapes / jnp.linalg.norm(shapes, axis=0, keepdims=True).astype(
+        shapes.dtype
+    )
     stability = STABILITY.where(ok, stability, STABILITY.undefined)
     values = rate.astype(values.dtype) * values
     answer = Linearization(matrix, values, shapes, stability, left, findings.result)
@@ -287,7 +302,8 @@ def _classify(
     # Rounding of the largest entries splits a double zero by the root of it.
     largest = jnp.maximum(jnp.max(jnp.abs(values)), 1.0)
     tiny = jnp.maximum(accuracy, 4 * jnp.sqrt(jnp.finfo(matrix.dtype).eps * largest))
-    # Directions along which the motion only turns further, at a rate that a neighbour may change.
+    # Directions along which the motion only turns further, at a rate that a neighbour
+    # may change.
     turning = jnp.sum(jnp.any(null_directions(neutral, matrix.T, tiny) != 0, axis=1))
     # A zero with an eigenvector of its own stays where it is; the others drift.
     zero = jnp.abs(values) <= tiny

@@ -8,15 +8,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
-from jrigid._checks import RESULTS, Enumeration, Findings, array_of_shape, settle, whole_number
+from jrigid._checks import (
+    RESULTS,
+    Enumeration,
+    Findings,
+    array_of_shape,
+    settle,
+    whole_number,
+)
 from jrigid._core.lanes import in_blocks
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.stability._steps import Motion, Walk, findings_of, motion_of, orthonormal, verdict, walk
+from jrigid.stability._steps import (
+    Motion,
+    Walk,
+    findings_of,
+    motion_of,
+    orthonormal,
+    verdict,
+    walk,
+)
 from jrigid.systems import RigidBody
 
 _REGULAR, _CHAOTIC = 3.0, 5.0  # between them MEGNO has not decided
-_INDEPENDENT = 1e3  # eps that must be left of a small motion once those before it are taken off
+_INDEPENDENT = (
+    1e3  # eps that must be left of a small motion once those before it are taken off
+)
 
 
 class ORDER(Enumeration):
@@ -52,11 +69,13 @@ class Megno(NamedTuple):
     """Mean exponential growth of nearby orbits.
 
     Attributes:
-        megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one near a
-            periodic orbit), and to half the exponent times the time for a chaotic one.
+        megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one
+            near a periodic orbit), and to half the exponent times the time for a
+            chaotic one.
         exponent: 2 / time of it: an estimate of the largest exponent [1/s].
-        order: One of `ORDER`: "regular" below 3, "chaotic" above 5, between "undecided". It starts
-            at "regular" and needs some ten e-folding times to leave it.
+        order: One of `ORDER`: "regular" below 3, "chaotic" above 5, between
+            "undecided". It starts at "regular" and needs some ten e-folding times to
+            leave it.
         ts: Times since the start [s].
         history: `megno` up to each of these times.
         final_state: Where the motion ended.
@@ -92,9 +111,13 @@ def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
 
 def _findings(motion: Motion, rows: Array) -> Findings:
     findings = findings_of(motion)
-    least = _INDEPENDENT * jnp.finfo(rows.dtype).eps * jnp.sqrt(jnp.sum(rows**2, axis=1))
+    least = (
+        _INDEPENDENT * jnp.finfo(rows.dtype).eps * jnp.sqrt(jnp.sum(rows**2, axis=1))
+    )
     message = "Arguments `vector(s)` must be finite and linearly independent, but they are not."
-    findings.require(jnp.all(orthonormal(rows)[1] > least), RESULTS.invalid_state, message)
+    findings.require(
+        jnp.all(orthonormal(rows)[1] > least), RESULTS.invalid_state, message
+    )
     return findings
 
 
@@ -128,7 +151,9 @@ def _followed(path: Walk, y: Array, plan: tuple[int, int, int]) -> tuple[Array, 
         return carry, carry[1]
 
     begin = (y, (jnp.zeros(len(path.tangents(y)), y.dtype), none, none), none)
-    (y, _, error), (totals, _, indicator) = jax.lax.scan(sample, begin, each * jnp.arange(samples))
+    (y, _, error), (totals, _, indicator) = jax.lax.scan(
+        sample, begin, each * jnp.arange(samples)
+    )
     return y, totals, indicator, error
 
 
@@ -139,7 +164,9 @@ def _growth(
     findings, (samples, each, every) = _findings(motion, rows), plan
     path = walk(motion, samples * each * every, findings.ok)
     y = path.with_tangents(path.start, orthonormal(rows)[0])
-    y, totals, indicator, error = in_blocks(lambda path, y: _followed(path, y, plan), path, y)
+    y, totals, indicator, error = in_blocks(
+        lambda path, y: _followed(path, y, plan), path, y
+    )
     counts = (each * (1 + jnp.arange(samples))).astype(rows.dtype)
     ts = path.step * every * counts
     answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
@@ -169,36 +196,39 @@ def lyapunov_spectrum(
 ) -> LyapunovSpectrum:
     """Lyapunov exponents of a motion, by small motions beside it that are kept orthogonal.
 
-    The small motions live where they belong, a turn of the attitude and a change of the angular
-    velocity (and of internal parts): six exponents for a plain body, none of the quaternion's norm.
-    The steps are equal and their number is given, so that every lane of a map costs the same.
+    The small motions live where they belong, a turn of the attitude and a change of the
+    angular velocity (and of internal parts): six exponents for a plain body, none of
+    the quaternion's norm. The steps are equal and their number is given, so that every
+    lane of a map costs the same.
 
     Args:
         system: The body and its torque.
         state0: Where the motion starts.
-        duration: How long it is followed [s]: an exponent is uncertain by a few over the duration.
-        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step too coarse
-            is an error, not a wrong number.
+        duration: How long it is followed [s]: an exponent is uncertain by a few over
+            the duration.
+        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step
+            too coarse is an error, not a wrong number.
         args: Passed to the torque.
         t0: Time at the start [s].
         count: How many exponents, from the largest; all by default.
-        vectors: Small motions to start from, rows of (turn about the body axes, change of the rate
-            over the initial one, ...); they stay in any set that the motion keeps invariant, such
-            as that of a planar motion. Gives `count`.
+        vectors: Small motions to start from, rows of (turn about the body axes, change
+            of the rate over the initial one, ...); they stay in any set that the motion
+            keeps invariant, such as that of a planar motion. Gives `count`.
         every: Steps between two orthogonalisations.
         samples: How many times of `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
         throw: False: a bad or an inaccurate lane is a result code and NaN.
 
     Returns:
-        The exponents, and their means up to each of the times. (`steps` is rounded up to fill
-        all intervals.)
+        The exponents, and their means up to each of the times. (`steps` is rounded up
+        to fill all intervals.)
 
     Raises:
         RuntimeError: Bad value, steps too coarse.
 
     Gradients: none to be relied on: those of a chaotic motion grow as fast as it does.
-    Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980) 9.
+    Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980)
+        9.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))  # integrable: none grows
@@ -228,16 +258,16 @@ def megno(
 ) -> Megno:
     """Mean exponential growth of nearby orbits: tells order from chaos long before an exponent.
 
-    One small motion beside the motion is enough, and 2 is what it tends to for order of any kind,
-    without a constant of the system's own: that is why this one of the fast indicators is here. It
-    also gives the exponent of what is chaotic, in the same pass.
+    One small motion beside the motion is enough, and 2 is what it tends to for order of
+    any kind, without a constant of the system's own: that is why this one of the fast
+    indicators is here. It also gives the exponent of what is chaotic, in the same pass.
 
     Args:
         system: The body and its torque.
         state0: Where the motion starts.
         duration: How long it is followed [s].
-        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step too coarse
-            is an error, not a wrong number.
+        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step
+            too coarse is an error, not a wrong number.
         args: Passed to the torque.
         t0: Time at the start [s].
         vector: The small motion to start from, as for `lyapunov_spectrum`.
@@ -247,15 +277,15 @@ def megno(
         throw: False: a bad or an inaccurate lane is a result code and NaN.
 
     Returns:
-        The mean, the exponent it stands for, and the verdict. (`steps` is rounded up to fill all
-        intervals.)
+        The mean, the exponent it stands for, and the verdict. (`steps` is rounded up to
+        fill all intervals.)
 
     Raises:
         RuntimeError: Bad value, steps too coarse.
 
     Gradients: none to be relied on.
-    Source: P. M. Cincotta, C. Simo, Astronomy & Astrophysics Supplement 147 (2000) 205; in steps,
-    P. M. Cincotta, C. M. Giordano, C. Simo, Physica D 182 (2003) 151.
+    Source: P. M. Cincotta, C. Simo, Astronomy & Astrophysics Supplement 147 (2000) 205;
+    in steps, P. M. Cincotta, C. M. Giordano, C. Simo, Physica D 182 (2003) 151.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))

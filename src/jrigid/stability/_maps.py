@@ -15,7 +15,8 @@ from jrigid._checks import Findings, all_finite, array_of_shape, shaped
 from jrigid._types import Scalar, ScalarLike
 from jrigid.sweep import SweepResult, sweep
 
-# Part of the larger end value that a function may have left at a root; at a pole it has more.
+# Part of the larger end value that a function may have left at a root; at a pole it has
+# more.
 _ROOT = 1e-3
 
 
@@ -28,16 +29,17 @@ def stability_map(
 ) -> SweepResult:
     """Evaluate a function of some parameters on the grid they span.
 
-    This is `jrigid.sweep` in memory and on this machine, which also keeps what it has done, or
-    sends it elsewhere. The compiled call is kept for the next map of the same function with blocks
-    of the same shape.
+    This is `jrigid.sweep` in memory and on this machine, which also keeps what it has
+    done, or sends it elsewhere. The compiled call is kept for the next map of the same
+    function with blocks of the same shape.
 
     Args:
-        function: A pure function (as for `jax.jit`: what it closes over must not change) of one
-            number for each axis, given by name, for a single point: a growth rate, an indicator of
-            chaos, a region, a tree of several. With `throw=False` inside where it takes it, so
-            that points that fail are NaN.
-        axes: Name and points of each axis, two or more as a rule; the last one runs fastest.
+        function: A pure function (as for `jax.jit`: what it closes over must not
+            change) of one number for each axis, given by name, for a single point: a
+            growth rate, an indicator of chaos, a region, a tree of several. With
+            `throw=False` inside where it takes it, so that points that fail are NaN.
+        axes: Name and points of each axis, two or more as a rule; the last one runs
+            fastest.
         block_size: Points of a block, 65,536 at most by default.
         progress: Show how many points are done.
 
@@ -45,9 +47,9 @@ def stability_map(
         Values on the grid, and where they are valid.
 
     Raises:
-        ValueError: An axis that is not one array of numbers, or a function that returns integers or
-            booleans only, which cannot say that they are undefined: return floats, NaN where they
-            are.
+        ValueError: An axis that is not one array of numbers, or a function that returns
+            integers or booleans only, which cannot say that they are undefined: return
+            floats, NaN where they are.
 
     Gradients: none; differentiate the function, or a `boundary`.
 
@@ -67,18 +69,23 @@ def place_of_root(
 ) -> Scalar:
     """Place between 0 and 1 at which `rising(x, args)` goes from negative to positive.
 
-    So many halvings as the place asks for, and no look at the size of the values. A function that
-    is known to rise (`flip=False`) needs no check of its ends, which would raise in a lane of vmap
-    that looks for no root.
+    So many halvings as the place asks for, and no look at the size of the values. A
+    function that is known to rise (`flip=False`) needs no check of its ends, which
+    would raise in a lane of vmap that looks for no root.
 
     Gradients: by the implicit function theorem in `args`.
     """
     bisection = optx.Bisection(rtol=0.0, atol=tolerance, flip=False)
     zero = jnp.zeros((), dtype)
     return optx.root_find(
-        rising, bisection, zero + 0.5, args, options={"lower": zero, "upper": zero + 1},
-        max_steps=1 - math.floor(math.log2(tolerance)), throw=False,
-    ).value  # fmt: skip
+        rising,
+        bisection,
+        zero + 0.5,
+        args,
+        options={"lower": zero, "upper": zero + 1},
+        max_steps=1 - math.floor(math.log2(tolerance)),
+        throw=False,
+    ).value
 
 
 def boundary(
@@ -92,8 +99,9 @@ def boundary(
     """Where a function of one parameter changes its sign: the edge of a region of stability.
 
     Args:
-        function: `function(parameter, *args)`, a number that is positive on one side and negative
-            on the other, smooth between: a `growth_rate_squared`, one of the margins.
+        function: `function(parameter, *args)`, a number that is positive on one side
+            and negative on the other, smooth between: a `growth_rate_squared`, one of
+                the margins.
         lower: An end of the interval to look in, where the function has one sign.
         upper: The other end, where it has the other.
         *args: Passed to the function: what the boundary depends on.
@@ -104,11 +112,11 @@ def boundary(
         The parameter at the boundary.
 
     Raises:
-        RuntimeError: The function has the same sign at both ends, is not finite there, or jumps
-            where its sign changes, as at a pole.
+        RuntimeError: The function has the same sign at both ends, is not finite there,
+            or jumps where its sign changes, as at a pole.
 
-    Gradients: by the implicit function theorem in `args`, not in what the function closes over.
-    Infinite where the slope of the function is 0.
+    Gradients: by the implicit function theorem in `args`, not in what the function
+    closes over. Infinite where the slope of the function is 0.
     Source: bisection (`optimistix.Bisection`).
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
@@ -121,7 +129,9 @@ def boundary(
     2.0
     """
     lower, upper = shaped(lower=(lower,), upper=(upper,))
-    fixed = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, args)
+    fixed = jtu.tree_map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, args
+    )
     ends = jax.lax.stop_gradient(jnp.stack([lower, upper]))
     values = [array_of_shape("function", function(x, *fixed)) for x in ends]
     known = jax.lax.stop_gradient(jnp.stack(values).astype(lower.dtype))
@@ -141,11 +151,15 @@ def boundary(
         "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
         "which must be continuous there, but they are not."
     )
-    findings.require(ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends)
+    findings.require(
+        ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends
+    )
     return findings.guard(lower + (upper - lower) * place, throw)
 
 
-def _rising(function: Callable[..., Any], x: Array, arguments: tuple[Any, Any]) -> Array:
+def _rising(
+    function: Callable[..., Any], x: Array, arguments: tuple[Any, Any]
+) -> Array:
     """The function at a place in the interval, its sign such that it rises.
 
     Where the interval holds no change of sign it is some function that has a root.

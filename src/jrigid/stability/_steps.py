@@ -40,10 +40,17 @@ class Motion(NamedTuple):
 
 
 def motion_of(
-    system: Any, state0: Any, args: Any, t0: Any, duration: Any = 1.0, solver: Any = None
+    system: Any,
+    state0: Any,
+    args: Any,
+    t0: Any,
+    duration: Any = 1.0,
+    solver: Any = None,
 ) -> Motion:
     """A motion with shapes checked and internal parts, its times in the precision of the state."""
-    system, state0, times = motion_arguments(system, state0, RigidBody, t0=t0, duration=duration)
+    system, state0, times = motion_arguments(
+        system, state0, RigidBody, t0=t0, duration=duration
+    )
     t0, duration = (x.astype(state0.omega.dtype) for x in times)
     solver = solver_of(solver, diffrax.Dopri8())
     return Motion(system, state0, args, t0, duration, solver)
@@ -55,7 +62,9 @@ def findings_of(motion: Motion) -> Findings:
     findings = Findings()
     message = "Argument `t0` must be finite, but it is not."
     findings.require(jnp.isfinite(t0), RESULTS.invalid_times, message, t0)
-    message = "Argument `duration` (or `step`) must be positive and finite, but it is not."
+    message = (
+        "Argument `duration` (or `step`) must be positive and finite, but it is not."
+    )
     findings.require(all_positive(duration), RESULTS.invalid_times, message, duration)
     check_motion(findings, system, state0, t0, args)
     return findings
@@ -64,8 +73,9 @@ def findings_of(motion: Motion) -> Findings:
 class Walk(NamedTuple):
     """A motion in equal steps.
 
-    Its state is one array. Tangents may follow in the same array, each (turn about the body axes,
-    change of the rate, change of the internal state), the changes in the scales of what changes.
+    Its state is one array. Tangents may follow in the same array, each (turn about the
+    body axes, change of the rate, change of the internal state), the changes in the
+    scales of what changes.
     """
 
     motion: Motion
@@ -127,19 +137,29 @@ class Walk(NamedTuple):
         memory = solver.init(term, t, end, y, None)
         return solver.step(term, t, end, y, None, memory, made_jump=False)[:3]
 
-    def _step(self, t: Array, y: Array, in_lanes: bool = False) -> tuple[Array, Array, Any]:
+    def _step(
+        self, t: Array, y: Array, in_lanes: bool = False
+    ) -> tuple[Array, Array, Any]:
         """One step: its end, its error, and what interpolates it."""
         if not isinstance(self.motion.solver, diffrax.AbstractERK):
             return self._by_solver(t, y)
         method = method_of(self.motion.solver)
         rates, after = stages(method, self._together, t, self.step, y, in_lanes)
         known = self.step * rates[: method.own]
-        return after, error_of(method, rates, self.step), {"y0": y, "y1": after, "k": known}
+        return (
+            after,
+            error_of(method, rates, self.step),
+            {"y0": y, "y1": after, "k": known},
+        )
 
-    def advance(self, t: Array, y: Array, in_lanes: bool = False) -> tuple[Array, Array]:
+    def advance(
+        self, t: Array, y: Array, in_lanes: bool = False
+    ) -> tuple[Array, Array]:
         """One step, and the local error of the state."""
         after, error, _ = self._step(t, y, in_lanes)
-        return self.on_sphere(after), jnp.max(jnp.abs(error[: self.scales.size]) / self.scales)
+        return self.on_sphere(after), jnp.max(
+            jnp.abs(error[: self.scales.size]) / self.scales
+        )
 
     def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
         """States within one step, by the fraction of it that has passed."""

@@ -90,12 +90,14 @@ def poincare_section(
         state0: Where the motion starts.
         condition: `(t, state) -> ()`, zero on the surface and smooth beside it.
         crossings: How many are wanted.
-        step: Length of a step [s], the same throughout: some 20 to 60 for each turn of the fastest
-            part. Two crossings within one step are missed.
+        step: Length of a step [s], the same throughout: some 20 to 60 for each turn of
+            the fastest part. Two crossings within one step are missed.
         args: Passed to the torque.
         t0: Time at the start [s].
-        direction: True: crossings at which the condition grows; False: falls; None: both.
-        steps: Most steps from one crossing to the next: the bound on the cost of a lane.
+        direction: True: crossings at which the condition grows; False: falls; None:
+            both.
+        steps: Most steps from one crossing to the next: the bound on the cost of a
+            lane.
         solver: A diffrax solver; `diffrax.Dopri8()` by default.
         throw: False: bad input is a result code and NaN.
 
@@ -103,12 +105,12 @@ def poincare_section(
         States and times of the crossings; a start on the surface itself is none.
 
     Raises:
-        RuntimeError: Bad value, a step too coarse. Fewer crossings than asked for are no error: see
-            `valid`.
+        RuntimeError: Bad value, a step too coarse. Fewer crossings than asked for are
+            no error: see `valid`.
 
     Gradients: none to be relied on.
-    Source: M. Henon, Physica D 5 (1982) 412; a crossing is located by bisection of the solver's
-    own interpolation.
+    Source: M. Henon, Physica D 5 (1982) 412; a crossing is located by bisection of the
+    solver's own interpolation.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -119,7 +121,10 @@ def poincare_section(
     [1. 1.]
     """
     check_option("direction", direction, (True, False, None))
-    crossings, steps = whole_number("crossings", crossings), whole_number("steps", steps)
+    crossings, steps = (
+        whole_number("crossings", crossings),
+        whole_number("steps", steps),
+    )
     motion = motion_of(system, state0, args, t0, step, solver)
     section = _section(motion, condition, crossings, direction, steps)
     return settle(section, throw, _section_findings, motion, condition)
@@ -147,7 +152,11 @@ class _Place(NamedTuple):
 
 @eqx.filter_jit
 def _section(
-    motion: Motion, condition: Callable, crossings: int, direction: bool | None, steps: int
+    motion: Motion,
+    condition: Callable,
+    crossings: int,
+    direction: bool | None,
+    steps: int,
 ) -> Section:
     findings = _section_findings(motion, condition)
     path = walk(motion, 1, findings.ok)
@@ -172,7 +181,9 @@ def _section(
             return ~search[0].crosses & (search[1] < steps)
 
         begin = start._replace(crosses=jnp.zeros_like(start.crosses))
-        return jax.lax.while_loop(goes_on, step, (begin, jnp.where(start.crosses, 0, steps)))[0]
+        return jax.lax.while_loop(
+            goes_on, step, (begin, jnp.where(start.crosses, 0, steps))
+        )[0]
 
     def crossing(place: _Place, _: None) -> tuple[_Place, tuple]:
         t, y, above, crosses, error = before_crossing(place)
@@ -188,39 +199,44 @@ def _section(
         return _Place(t, y, ~above, crosses, error), crossed
 
     t, y = path.motion.t0, path.start
-    # A start on the surface itself is no crossing: the motion is where it goes from there.
+    # A start on the surface itself is no crossing: the motion is where it goes from
+    # there.
     now, small = value(t, y), 1e-3 * path.step
     ahead = value(t + small, y + small * path.rates(t, y))
     above = jnp.where(now == 0, ahead > now, now > 0)
     begin = _Place(t, y, above, findings.ok, jnp.zeros_like(t))
-    place, (ts, states, valid, left) = jax.lax.scan(crossing, begin, None, length=crossings)
+    place, (ts, states, valid, left) = jax.lax.scan(
+        crossing, begin, None, length=crossings
+    )
     ts, states = verdict(findings, place.error, (ts, states))
     valid = valid & findings.ok
     ts, states = jax.vmap(nan_where)(~valid, (ts, states))
-    return Section(states, ts, valid, jnp.max(jnp.where(valid, left, 0)), findings.result)
+    return Section(
+        states, ts, valid, jnp.max(jnp.where(valid, left, 0)), findings.result
+    )
 
 
 def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time between two flips of a free body about its intermediate axis: the tennis racket's.
 
-    A body flips if, on its polhode, it now and then turns faster about the intermediate axis than
-    about each of the others. That component of the angular velocity then changes its sign twice in
-    a period of the polhode, and the body's intermediate axis turns over against the angular
-    momentum. A body that always turns mainly about the axis of its largest or smallest moment only
-    wobbles, and never flips.
+    A body flips if, on its polhode, it now and then turns faster about the intermediate
+    axis than about each of the others. That component of the angular velocity then
+    changes its sign twice in a period of the polhode, and the body's intermediate axis
+    turns over against the angular momentum. A body that always turns mainly about the
+    axis of its largest or smallest moment only wobbles, and never flips.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
         omega: Angular velocity at any time, body components [rad/s].
 
     Returns:
-        Half of the period of the polhode [s]; infinite where the body never flips: such a wobble,
-        any steady rotation, the separatrix, rest, a body of two equal moments. NaN outside finite,
-        positive definite inertia and finite rates.
+        Half of the period of the polhode [s]; infinite where the body never flips: such
+        a wobble, any steady rotation, the separatrix, rest, a body of two equal
+        moments. NaN outside finite, positive definite inertia and finite rates.
 
     Gradients: those of `jrigid.free.polhode_period`; 0 where it is infinite.
-    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; near the separatrix it grows like
-    twice the logarithm of one over the offset, over `growth_rate`.
+    Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; near the separatrix it
+    grows like twice the logarithm of one over the offset, over `growth_rate`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> racket = jnp.array([1.0, 2.0, 3.0])
@@ -233,24 +249,31 @@ def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
 
     def formula(inertia: Array, omega: Array) -> Scalar:
         known, rates = jax.lax.stop_gradient((inertia, omega))
-        i1, i2, i3 = jnp.sort(known) if known.ndim == 1 else principal_axes(known).moments
+        i1, i2, i3 = (
+            jnp.sort(known) if known.ndim == 1 else principal_axes(known).moments
+        )
         square = jnp.sum(angular_momentum(known, rates) ** 2)
         twice = 2 * kinetic_energy(known, rates)
-        # Where w2 is largest one of the others is 0, and w2^2 exceeds the square of the third.
+        # Where w2 is largest one of the others is 0, and w2^2 exceeds the square of the
+        # third.
         outer = jnp.where(square > twice * i2, i3, i1)
-        faster = jnp.abs(twice * outer - square) * outer > jnp.abs(square - twice * i2) * i2
+        faster = (
+            jnp.abs(twice * outer - square) * outer > jnp.abs(square - twice * i2) * i2
+        )
         flips = faster & (i1 < i2) & (i2 < i3)
         return jnp.where(flips, 0.5 * polhode_period(inertia, omega), jnp.inf)
 
-    return where_defined(is_inertia(inertia) & all_finite(omega), formula, inertia, omega)
+    return where_defined(
+        is_inertia(inertia) & all_finite(omega), formula, inertia, omega
+    )
 
 
 class FinalSpin(NamedTuple):
     """On which side a tumbling body came to spin.
 
     Attributes:
-        side: One of `SIDES`: whether it turns along the axis of largest moment, against it, or
-            is not within 5 degrees of either.
+        side: One of `SIDES`: whether it turns along the axis of largest moment, against
+            it, or is not within 5 degrees of either.
         alignment: Cosine of the angle between the angular velocity and that axis.
         state: At the end.
         error: Largest local error of a step, in the scales of the variables.
@@ -277,17 +300,19 @@ def final_spin(
 ) -> FinalSpin:
     """The side on which a body that loses energy ends: the major-axis rule, and its coin.
 
-    What is lost inside, such as by a `torques.InternalDamper`, takes energy but no angular momentum
-    from a body, until it spins about the axis of largest moment. Whether along it or against it is
-    decided where the motion crosses the separatrix, and looks like chance. The axis and its sign
-    are those of `principal_axes` (of moments, the body axis itself): two equal largest moments
-    leave no axis to settle about.
+    What is lost inside, such as by a `torques.InternalDamper`, takes energy but no
+    angular momentum from a body, until it spins about the axis of largest moment.
+    Whether along it or against it is decided where the motion crosses the separatrix,
+    and looks like chance. The axis and its sign are those of `principal_axes` (of
+    moments, the body axis itself): two equal largest moments leave no axis to settle
+    about.
 
     Args:
         system: The body and what damps it.
         state0: Where the motion starts.
         duration: How long it is followed [s].
-        steps: Number of steps, equal ones; some 20 to 60 for each turn of the fastest part.
+        steps: Number of steps, equal ones; some 20 to 60 for each turn of the fastest
+            part.
         args: Passed to the torque.
         t0: Time at the start [s].
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.

@@ -34,12 +34,16 @@ class Grid(NamedTuple):
     @property
     def axes(self) -> dict[str, np.ndarray]:
         """Coordinates along each axis; of a list `point`, numbers from 0."""
-        return {"point": np.arange(self.shape[0])} if self.names is None else self.points
+        return (
+            {"point": np.arange(self.shape[0])} if self.names is None else self.points
+        )
 
     @property
     def blocks(self) -> tuple[int, ...]:
         """How many blocks there are along each axis."""
-        return tuple(-(-n // width) for n, width in zip(self.shape, self.block, strict=True))
+        return tuple(
+            -(-n // width) for n, width in zip(self.shape, self.block, strict=True)
+        )
 
     def corner(self, number: int) -> tuple[int, ...]:
         """Where a block begins; the last axis runs fastest."""
@@ -60,7 +64,11 @@ class Grid(NamedTuple):
         region = self.region(number)
 
         def cut(x: np.ndarray, places: slice, width: int) -> np.ndarray:
-            return x[np.minimum(np.arange(places.start, places.start + width), places.stop - 1)]
+            return x[
+                np.minimum(
+                    np.arange(places.start, places.start + width), places.stop - 1
+                )
+            ]
 
         if self.names is None:
             return jtu.tree_map(lambda x: cut(x, region[0], self.block[0]), self.points)
@@ -90,14 +98,18 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
     arrays = {name: np.asarray(x) for name, x in axes.items()}
     for name, x in arrays.items():
         if not name.isidentifier() or name == VALID.name:
-            raise ValueError(f"Argument `axes` must name arguments, but {name!r} can be none.")
+            raise ValueError(
+                f"Argument `axes` must name arguments, but {name!r} can be none."
+            )
         if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
             raise ValueError(
                 f"Argument `axes` must hold arrays of numbers of shape (n,), but {name!r} has "
                 f"shape {x.shape} and type {x.dtype}."
             )
     if not arrays:
-        raise ValueError("Argument `axes` must name at least one axis, but it is empty.")
+        raise ValueError(
+            "Argument `axes` must name at least one axis, but it is empty."
+        )
     shape = tuple(x.size for x in arrays.values())
     # One dtype, that of all axes taken together.
     values = map(np.asarray, float_arrays(*arrays.values()))
@@ -166,7 +178,8 @@ class Leaf(eqx.Module):
     """One array of what a function returns: its name, its own shape, what its numbers mean.
 
     Attributes:
-        name: The path in the tree, joined by underscores; `value` where there is nothing but it.
+        name: The path in the tree, joined by underscores; `value` where there is
+            nothing but it.
         shape: Without the axes of the grid.
         dtype: Its numpy dtype.
         fill: Where nothing is known: NaN; of codes `undefined`, of integers the least.
@@ -202,7 +215,9 @@ def leaves_of(values: Any, axes: Iterable[str]) -> list[Leaf]:
     found: list[Leaf] = []
     names = {*axes, VALID.name}
     beyond = len(names) - 1
-    paths, _ = jtu.tree_flatten_with_path(values, is_leaf=lambda x: isinstance(x, EnumerationItem))
+    paths, _ = jtu.tree_flatten_with_path(
+        values, is_leaf=lambda x: isinstance(x, EnumerationItem)
+    )
     for path, value in paths:
         codes: tuple[str, ...] = ()
         if isinstance(value, EnumerationItem):
@@ -217,7 +232,9 @@ def leaves_of(values: Any, axes: Iterable[str]) -> list[Leaf]:
             fill = False
         else:
             fill = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
-        name = re.sub(r"\W", "_", jtu.keystr(path, simple=True, separator="_")) or "value"
+        name = (
+            re.sub(r"\W", "_", jtu.keystr(path, simple=True, separator="_")) or "value"
+        )
         leaf = Leaf(name, value.shape[beyond:], dtype, fill, codes)
         while names & {leaf.name, *leaf.dimensions(())}:
             leaf = dataclasses.replace(leaf, name=leaf.name + "_")

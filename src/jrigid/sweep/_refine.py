@@ -21,7 +21,9 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
     return lattice
 
 
-def _classes(classify: Callable[[Any], Any], values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _classes(
+    classify: Callable[[Any], Any], values: Any, shape: tuple[int, ...]
+) -> np.ndarray:
     """Classes of values with axes of this shape in front."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
     found = jtu.tree_leaves(classify(flat))
@@ -55,15 +57,20 @@ def refined(
     """Compute all blocks that hold a change of class.
 
     Returns:
-        The blocks that failed; classes of all points, in blocks that were not computed, or failed,
-        that of the first corner.
+        The blocks that failed; classes of all points, in blocks that were not computed,
+        or failed, that of the first corner.
     """
     classify = jax.jit(jax.vmap(classify))
     lattice = _classes(classify, corners.values, tuple(n + 1 for n in grid.blocks))
-    place = [np.arange(n) // width for n, width in zip(grid.shape, grid.block, strict=True)]
+    place = [
+        np.arange(n) // width for n, width in zip(grid.shape, grid.block, strict=True)
+    ]
     classes = lattice[np.ix_(*place)]
     numbers = np.arange(math.prod(grid.blocks)).reshape(grid.blocks)
-    todo = {*numbers[_changes(corners, lattice)].tolist(), *filter(kept.has, range(numbers.size))}
+    todo = {
+        *numbers[_changes(corners, lattice)].tolist(),
+        *filter(kept.has, range(numbers.size)),
+    }
     for number in range(numbers.size):
         kept.leave(number)
 

@@ -27,11 +27,12 @@ class SweepResult(NamedTuple):
     """Values of a function at many points.
 
     Attributes:
-        values: As the function returned them, with the axes of the grid in front: numpy arrays, or
-            of a store zarr arrays, which are read where they are indexed.
-        valid: Where all numbers are finite and no code is `undefined`: a mask of the shape of the
-            grid.
-        axes: Names and points of the axes, in their order; of a list `point`, its numbers.
+        values: As the function returned them, with the axes of the grid in front: numpy
+            arrays, or of a store zarr arrays, which are read where they are indexed.
+        valid: Where all numbers are finite and no code is `undefined`: a mask of the
+            shape of the grid.
+        axes: Names and points of the axes, in their order; of a list `point`, its
+            numbers.
         failures: The blocks that failed thrice, whose points are not valid.
         attributes: What was said about axes and values (units, names), by their names.
         store: Where it is kept, if anywhere.
@@ -59,7 +60,9 @@ class SweepResult(NamedTuple):
             ValueError: The map is over more or fewer axes.
         """
         if len(self.axes) != 2:
-            raise ValueError(f"Property `extent` is for two axes, but there are {len(self.axes)}.")
+            raise ValueError(
+                f"Property `extent` is for two axes, but there are {len(self.axes)}."
+            )
         ends: list[float] = []
         for x in self.axes.values():
             half = 0.5 * (x[-1] - x[0]) / max(x.size - 1, 1)
@@ -78,10 +81,14 @@ class SweepResult(NamedTuple):
         if self.store is not None:
             dataset = xarray.open_zarr(self.store)
         else:
-            coordinates = {k: (k, x, self.attributes.get(k)) for k, x in self.axes.items()}
+            coordinates = {
+                k: (k, x, self.attributes.get(k)) for k, x in self.axes.items()
+            }
             dataset = xarray.Dataset(coords=coordinates)
             arrays = [*jtu.tree_leaves(self.values), self.valid]
-            for leaf, array in zip(leaves_of(self.values, self.labels), arrays, strict=True):
+            for leaf, array in zip(
+                leaves_of(self.values, self.labels), arrays, strict=True
+            ):
                 about = leaf.flags | self.attributes.get(leaf.name, {})
                 dataset[leaf.name] = leaf.dimensions(self.labels), array, about
         if self.classes is not None:

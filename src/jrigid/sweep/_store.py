@@ -86,7 +86,9 @@ def identity(grid: Grid, leaves: list[Leaf]) -> dict[str, Any]:
         "points": {name: _digest(*jtu.tree_leaves(x)) for name, x in points.items()},
         "shape": list(grid.shape),
         "block": list(grid.block),
-        "values": [[x.name, list(x.shape), str(x.dtype), list(x.codes)] for x in leaves],
+        "values": [
+            [x.name, list(x.shape), str(x.dtype), list(x.codes)] for x in leaves
+        ],
     }
 
 
@@ -116,7 +118,9 @@ class Memory:
     def __init__(self, grid: Grid, leaves: list[Leaf]):
         """Nothing is touched before it is written."""
         self.grid, self.fills = grid, [x.fill for x in leaves]
-        self.arrays = {x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves}
+        self.arrays = {
+            x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves
+        }
 
     @contextlib.contextmanager
     def opened(self, *_: Any) -> Iterator[None]:
@@ -183,24 +187,42 @@ class Store:
         for x in self.leaves:
             shape, block = (*grid.shape, *x.shape), (*grid.block, *x.shape)
             parts.append(
-                (x.name, shape, block, x.dtype, x.fill, x.dimensions(tuple(grid.axes)), x.flags)
+                (
+                    x.name,
+                    shape,
+                    block,
+                    x.dtype,
+                    x.fill,
+                    x.dimensions(tuple(grid.axes)),
+                    x.flags,
+                )
             )
         try:
             group = zarr.create_group(partial, attributes=_CONVENTIONS | {_KEY: about})
             for name, shape, block, dtype, fill, dimensions, flags in parts:
                 group.create_array(
-                    name, shape=shape, chunks=block, dtype=dtype, fill_value=fill,
-                    dimension_names=dimensions, attributes=flags | attributes.get(name, {}),
+                    name,
+                    shape=shape,
+                    chunks=block,
+                    dtype=dtype,
+                    fill_value=fill,
+                    dimension_names=dimensions,
+                    attributes=flags | attributes.get(name, {}),
                     compressors=[extra("sweep", "zarr.codecs").Crc32cCodec()],
-                )  # fmt: skip
+                )
             with warnings.catch_warnings():
-                # So that xarray opens it in one look; the format's next version will have it.
+                # So that xarray opens it in one look; the format's next version will
+                # have it.
                 warnings.simplefilter("ignore")
                 zarr.consolidate_metadata(partial)
             os.rename(partial, self.path)
         except OSError as error:
-            if not (self.path / "zarr.json").exists():  # of another process, a moment ago
-                raise OSError(f"The store {self.path} cannot be written: {error}.") from error
+            if not (
+                self.path / "zarr.json"
+            ).exists():  # of another process, a moment ago
+                raise OSError(
+                    f"The store {self.path} cannot be written: {error}."
+                ) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
@@ -237,11 +259,14 @@ class Store:
     def write(self, number: int, values: list[np.ndarray]) -> None:
         """Keep a block, its mask last.
 
-        As zarr would, but without a copy: the numbers, little end first, and their checksum.
+        As zarr would, but without a copy: the numbers, little end first, and their
+            checksum.
         """
         for leaf, value in zip(self.leaves, values, strict=True):
             numbers = (
-                np.ascontiguousarray(value, leaf.dtype.newbyteorder("<")).reshape(-1).view(np.uint8)
+                np.ascontiguousarray(value, leaf.dtype.newbyteorder("<"))
+                .reshape(-1)
+                .view(np.uint8)
             )
             chunk = self._chunk(leaf, number)
             partial = chunk.with_name(f"{chunk.name}.{uuid.uuid4().hex}.partial")
@@ -256,7 +281,9 @@ class Store:
                 raise
 
     @contextlib.contextmanager
-    def opened(self, about: dict[str, Any], attributes: dict[str, dict]) -> Iterator[None]:
+    def opened(
+        self, about: dict[str, Any], attributes: dict[str, dict]
+    ) -> Iterator[None]:
         """New or gone on with, if it is of the same sweep."""
         if _is_new(self.path):
             self._create(about, attributes)

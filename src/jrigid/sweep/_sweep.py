@@ -33,7 +33,8 @@ from jrigid.sweep._work import (
 
 # Blocks that an executor has at a time.
 _AHEAD = 1024
-# A sweep is cut into so many blocks or more, unless they got smaller, or larger, than these.
+# A sweep is cut into so many blocks or more, unless they got smaller, or larger, than
+# these.
 _BLOCKS, _LEAST, _MOST = 64, 256, 2**18
 _BYTES = 2**24  # of what a block returns
 _TILE = 1024
@@ -53,45 +54,48 @@ def sweep(
 ) -> SweepResult:
     """Evaluate a function of some parameters on the grid they span, or at each of many points.
 
-    The points are cut into blocks of one shape, each of which is one call of one compiled and
-    vmapped function, so that what comes out does not depend on where a block was computed, when, or
-    beside which. Memory is that of some blocks, and of the result where there is no store.
+    The points are cut into blocks of one shape, each of which is one call of one
+    compiled and vmapped function, so that what comes out does not depend on where a
+    block was computed, when, or beside which. Memory is that of some blocks, and of the
+    result where there is no store.
 
     Args:
-        function: A pure function (as for `jax.jit`: what it closes over must not change) of one
-            number for each axis, given by name, or of one of the points; it returns an array, a
-            code, or a tree of them. With `throw=False` inside where it takes it, so that points
-            that fail are NaN.
+        function: A pure function (as for `jax.jit`: what it closes over must not
+            change) of one number for each axis, given by name, or of one of the points;
+            it returns an array, a code, or a tree of them. With `throw=False` inside
+            where it takes it, so that points that fail are NaN.
         axes: Name and points of each axis; the last one runs fastest.
         points: In place of axes: any tree of arrays that have the points in front.
-        store: A directory that keeps what is done (zarr, version 3; extra `jrigid[sweep]`), and
-            that the same call goes on from, whatever ended it. `xarray.open_zarr` opens it at any
-            time, NaN where nothing is yet.
-        executor: What computes the blocks, in place of the devices of this process: anything with
-            the interface of `concurrent.futures.Executor`, such as `Client.get_executor()` of
-            `dask.distributed`, or a `ProcessPoolExecutor` that spawns. Workers need jrigid and, if
-            there is a store, the directory.
-        block_size: About how many points a block has: axes are cut whole, and evenly. By default a
-            64th of all, within 256 and 2^18 and 16 MB of what comes out; that of a store if it has
-            one.
-        attributes: By name of an axis or value what is to be said of it, as `{"units": "rad/s"}`.
-        refine: `values -> class` of one point, an integer, boolean or code: only blocks that hold a
-            change of class are computed, found from the corners of all and followed from block to
-            block. The blocks are tiles, of 1,024 points by default. What lies within one tile and
-            shows at no corner is missed.
+        store: A directory that keeps what is done (zarr, version 3; extra
+            `jrigid[sweep]`), and that the same call goes on from, whatever ended it.
+            `xarray.open_zarr` opens it at any time, NaN where nothing is yet.
+        executor: What computes the blocks, in place of the devices of this process:
+            anything with the interface of `concurrent.futures.Executor`, such as
+            `Client.get_executor()` of `dask.distributed`, or a `ProcessPoolExecutor`
+            that spawns. Workers need jrigid and, if there is a store, the directory.
+        block_size: About how many points a block has: axes are cut whole, and evenly.
+            By default a 64th of all, within 256 and 2^18 and 16 MB of what comes out;
+            that of a store if it has one.
+        attributes: By name of an axis or value what is to be said of it, as
+            `{"units": "rad/s"}`.
+        refine: `values -> class` of one point, an integer, boolean or code: only blocks
+            that hold a change of class are computed, found from the corners of all and
+            followed from block to block. The blocks are tiles, of 1,024 points by
+            default. What lies within one tile and shows at no corner is missed.
         progress: Show how many points are done.
 
     Returns:
-        Values, where they are valid, and which blocks failed three times; refined, also the class
-        of every point, and values where a class changes.
+        Values, where they are valid, and which blocks failed three times; refined, also
+        the class of every point, and values where a class changes.
 
     Raises:
-        ValueError: Axes that are not arrays of numbers, a function that returns integers or
-            booleans only, which cannot say that they are undefined (return floats, NaN where they
-            are), one that cannot be sent to a worker, a store of another sweep.
+        ValueError: Axes that are not arrays of numbers, a function that returns
+            integers or booleans only, which cannot say that they are undefined (return
+            floats, NaN where they are), one that cannot be sent to a worker, a store of
+            another sweep.
         OSError: The store cannot be written.
-        RuntimeError: Another process writes to the store, or a worker died and took the executor
-            along.
+        RuntimeError: Another process writes to the store, or a worker died and took the
+            executor along.
         ImportError: The extra is missing, or jrigid on a worker.
 
     Gradients: none; differentiate the function.
@@ -107,7 +111,9 @@ def sweep(
     """
     grid = grid_of(axes, points)
     if refine is not None and grid.names is None:
-        raise ValueError("Argument `refine` is for a grid of `axes`, not for a list of points.")
+        raise ValueError(
+            "Argument `refine` is for a grid of `axes`, not for a list of points."
+        )
     path = None if store is None else Path(store).absolute()
     values, about = traced(function, grid.names, grid.cut(1).part(0))
     leaves = leaves_of(values, grid.axes)
@@ -134,7 +140,9 @@ def sweep(
         else:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                corners = sweep(function, corners_of(grid), executor=executor, progress=False)
+                corners = sweep(
+                    function, corners_of(grid), executor=executor, progress=False
+                )
             failures, classes = refined(grid, kept, structure, refine, corners, done)
             valid += int(np.sum(corners.valid))
         kept.tell(failures)
@@ -152,15 +160,21 @@ def sweep(
         )
     *arrays, valid = kept.arrays.values()
     filled = jtu.tree_unflatten(structure, arrays)
-    return SweepResult(filled, valid, grid.axes, failures, said, path and str(path), classes)
+    return SweepResult(
+        filled, valid, grid.axes, failures, said, path and str(path), classes
+    )
 
 
-def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]) -> Grid:
+def _cut(
+    grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]
+) -> Grid:
     """The points in blocks, those of a store if there is one and nothing else was asked for."""
     if size is None:
         block = path and known_block(path)
         if block and len(block) == len(grid.shape):
-            tiles = all(x == min(max(block), n) for x, n in zip(block, grid.shape, strict=True))
+            tiles = all(
+                x == min(max(block), n) for x, n in zip(block, grid.shape, strict=True)
+            )
             if refine is not None and not tiles:
                 raise ValueError(
                     f"Argument `refine` needs a store in tiles, but the blocks of {path} are "
@@ -177,7 +191,11 @@ def _cut(grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: l
 
 
 def _compute(
-    work: Work, kept: Any, numbers: Iterable[int], executor: Executor | None, progress: bool
+    work: Work,
+    kept: Any,
+    numbers: Iterable[int],
+    executor: Executor | None,
+    progress: bool,
 ) -> tuple[tuple[Failure, ...], int]:
     """Compute the blocks that are not kept yet; say which failed, and how many points are valid."""
     grid, failures = work.grid, []
@@ -204,7 +222,9 @@ def _compute(
 
 
 @contextmanager
-def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tuple[Callable, int]]:
+def _submitting(
+    work: Work, kept: Any, executor: Executor | None
+) -> Iterator[tuple[Callable, int]]:
     """How to have a block computed, and how many may wait for it."""
     if executor is None:
         worker = Worker(work, kept)
@@ -224,7 +244,10 @@ def _submitting(work: Work, kept: Any, executor: Executor | None) -> Iterator[tu
         pool._initializer = end_with_driver
     share = getattr(executor, "_max_workers", None)  # of a pool on this machine
     cores = share and max(1, (os.cpu_count() or 1) // share)
-    surroundings, payload = Surroundings(os.getpid(), cores, work.settings), packed(work)
+    surroundings, payload = (
+        Surroundings(os.getpid(), cores, work.settings),
+        packed(work),
+    )
 
     def submit(number: int) -> Future:
         call = Call(surroundings, payload, number, work.grid.part(number))

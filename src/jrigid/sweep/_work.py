@@ -23,7 +23,8 @@ from jrigid.sweep._store import Memory, Store, fingerprint
 evaluated = eqx.filter_jit(on_block)
 
 
-# What decides besides a function what is traced, and is known to one thread of one process.
+# What decides besides a function what is traced, and is known to one thread of one
+# process.
 _SETTINGS = {
     "jax_enable_x64": jax.enable_x64,
     "jax_default_matmul_precision": jax.default_matmul_precision,
@@ -64,7 +65,8 @@ class Outcome(NamedTuple):
         number: Which block.
         count: How many points are valid.
         values: Of the block, its mask last; None where they are kept already.
-        error: What went wrong, in words: an exception need not survive the way between processes.
+        error: What went wrong, in words: an exception need not survive the way between
+            processes.
         final: What to raise, if no other trial or block can do better.
     """
 
@@ -81,8 +83,8 @@ class Worker:
     def __init__(self, work: Work, kept: Store | Memory | None):
         """Without a place to keep blocks they are returned."""
         self.work, self.kept, self.devices = work, kept, jax.local_devices()
-        # Two at a time on a device would compile twice, and on a CPU can wait for each other for
-        # ever: both run in the same few threads of XLA.
+        # Two at a time on a device would compile twice, and on a CPU can wait for each
+        # other for ever: both run in the same few threads of XLA.
         self.free = {device: threading.Lock() for device in self.devices}
 
     def __call__(self, number: int, part: Any) -> Outcome:
@@ -98,7 +100,9 @@ class Worker:
             self.kept.write(number, values)
         except OSError as error:
             text = f"The store cannot be written: {error}. What is finished is kept, and the same "
-            return Outcome(number, error=text + "call goes on from there.", final=OSError)
+            return Outcome(
+                number, error=text + "call goes on from there.", final=OSError
+            )
         return Outcome(number, count)
 
     def _computed(self, number: int, part: Any) -> list[np.ndarray]:
@@ -109,7 +113,9 @@ class Worker:
         return [np.asarray(x) for x in jtu.tree_leaves(found)]
 
 
-def traced(function: Callable[..., Any], names: Any, part: Any) -> tuple[Any, dict[str, Any]]:
+def traced(
+    function: Callable[..., Any], names: Any, part: Any
+) -> tuple[Any, dict[str, Any]]:
     """What a function returns for the first of some points, as shapes, and its fingerprint."""
     one = jtu.tree_map(lambda x: x[:1], part)
     jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, names, one)
@@ -119,7 +125,9 @@ def traced(function: Callable[..., Any], names: Any, part: Any) -> tuple[Any, di
 def in_words(error: BaseException) -> str:
     """What kind of error it was and what it says, without stacks and hints."""
     text = str(error)
-    text = (text.partition("EquinoxRuntimeError: ")[2] or text).partition("\n\n-----")[0]
+    text = (text.partition("EquinoxRuntimeError: ")[2] or text).partition("\n\n-----")[
+        0
+    ]
     return f"{type(error).__name__}: {text.strip()}"
 
 
@@ -193,7 +201,9 @@ _one_at_a_time = threading.Lock()
 def _unpacked(work: bytes) -> Worker:
     known: Work = pickle.loads(work)
     store = known.store
-    return Worker(known, None if store is None else Store(store, known.grid, known.leaves))
+    return Worker(
+        known, None if store is None else Store(store, known.grid, known.leaves)
+    )
 
 
 _seen: dict[bytes, dict[str, Any]] = {}
@@ -214,7 +224,9 @@ def _settle_in(cores: int | None) -> None:
     end_with_driver()
     _take_cores(cores or _threads_of_dask())
     if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update("jax_compilation_cache_dir", str(_own_directory() / "compiled"))
+        jax.config.update(
+            "jax_compilation_cache_dir", str(_own_directory() / "compiled")
+        )
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

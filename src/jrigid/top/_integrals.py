@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from jrigid._checks import all_finite, check_option, check_type, is_inertia, is_unit, where_defined
+from jrigid._checks import (
+    all_finite,
+    check_option,
+    check_type,
+    is_inertia,
+    is_unit,
+    where_defined,
+)
 from jrigid._motion import plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
@@ -26,11 +33,13 @@ class Integrals(NamedTuple):
     """What a heavy body with a fixed point keeps.
 
     Attributes:
-        energy: Kinetic and potential, the latter zero with the centre of mass level [J].
-        vertical_momentum: Angular momentum along the vertical, against gravity [kg m^2/s].
+        energy: Kinetic and potential, the latter zero with the centre of mass level
+            [J].
+        vertical_momentum: Angular momentum along the vertical, against gravity [kg
+            m^2/s].
         extra: The third integral of the case asked for, None without one: Euler's |L|^2
-            [kg^2 m^4/s^2], Lagrange's I3 omega3 [kg m^2/s], Kovalevskaya's [1/s^4], that of
-            Goryachev and Chaplygin [1/s^3].
+            [kg^2 m^4/s^2], Lagrange's I3 omega3 [kg m^2/s], Kovalevskaya's [1/s^4],
+            that of Goryachev and Chaplygin [1/s^3].
     """
 
     energy: Scalar
@@ -41,28 +50,29 @@ class Integrals(NamedTuple):
 def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integrals:
     """Energy, vertical angular momentum and the extra integral of a heavy body.
 
-    With w = omega1 + i omega2, c = lever1 + i lever2, G = gamma1 + i gamma2 (gamma the vertical in
-    the body) and k = mass |gravity| / I3 Kovalevskaya's integral is |w^2 - k c G|^2, and that of
-    Goryachev and Chaplygin omega3 |w|^2 - k gamma3 Re(c* w).
+    With w = omega1 + i omega2, c = lever1 + i lever2, G = gamma1 + i gamma2 (gamma the
+    vertical in the body) and k = mass |gravity| / I3 Kovalevskaya's integral is |w^2 -
+    k c G|^2, and that of Goryachev and Chaplygin omega3 |w|^2 - k gamma3 Re(c* w).
 
     Args:
-        body: A body under `torques.UniformGravity` alone; moments, not a tensor, where a case is
-            asked for.
+        body: A body under `torques.UniformGravity` alone; moments, not a tensor, where
+            a case is asked for.
         state: Any state of the motion.
-        case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3), "kovalevskaya" (I1 =
-            I2 = 2 I3, lever across axis 3), "goryachev-chaplygin" (I1 = I2 = 4 I3, lever across
-            axis 3, no vertical angular momentum), or None.
+        case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3),
+            "kovalevskaya" (I1 = I2 = 2 I3, lever across axis 3), "goryachev-chaplygin"
+            (I1 = I2 = 4 I3, lever across axis 3, no vertical angular momentum), or
+            None.
 
     Returns:
-        What the motion keeps. NaN of a body that is not of the case to 1e-8 (float32: 3e-4), nor a
-        body at all, or of a state that is none.
+        What the motion keeps. NaN of a body that is not of the case to 1e-8 (float32:
+        3e-4), nor a body at all, or of a state that is none.
 
     Raises:
         ValueError: Another torque, another case, a tensor with a case.
 
     Gradients: analytic; without gravity those of the vertical momentum are zero.
-    Source: V. V. Golubev, Lectures on the Integration of the Equations of Motion of a Rigid Body
-    about a Fixed Point (1960); signs from Euler's and Poisson's equations.
+    Source: V. V. Golubev, Lectures on the Integration of the Equations of Motion of a
+    Rigid Body about a Fixed Point (1960); signs from Euler's and Poisson's equations.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> gravity = jr.torques.UniformGravity(
@@ -93,7 +103,9 @@ def _integrals(
 ) -> Integrals:
     strength = safe_norm(gravity.gravity)
     pulls = strength > 0
-    down = rotate_inverse(state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0))
+    down = rotate_inverse(
+        state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0)
+    )
     up = jnp.where(pulls, -down, 0.0)
     momentum = angular_momentum(inertia, state.omega)
     energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
@@ -111,7 +123,9 @@ def _integrals(
     return Integrals(energy, product("i,i->", momentum, up), extra)
 
 
-def _is_of_case(case: Case | None, inertia: Array, gravity: UniformGravity, state: State) -> Array:
+def _is_of_case(
+    case: Case | None, inertia: Array, gravity: UniformGravity, state: State
+) -> Array:
     def vanishes(x: Array, beside: Array) -> Array:
         tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
         return jnp.max(jnp.abs(x)) <= tolerance * jnp.max(jnp.abs(beside))
@@ -119,7 +133,9 @@ def _is_of_case(case: Case | None, inertia: Array, gravity: UniformGravity, stat
     i1, i2, i3 = inertia
     of_case = gravity.mass >= 0
     if case == "euler":
-        of_case &= gravity.mass * safe_norm(gravity.gravity) * safe_norm(gravity.lever) == 0
+        of_case &= (
+            gravity.mass * safe_norm(gravity.gravity) * safe_norm(gravity.lever) == 0
+        )
     elif case is not None:
         off = gravity.lever[:2] if case == "lagrange" else gravity.lever[2]
         of_case &= vanishes(i1 - i2, i1) & vanishes(off, gravity.lever)

@@ -22,27 +22,28 @@ def top_motion(
 ) -> ExactStates:
     r"""Exact state of Lagrange's top at any times, at a cost that does not depend on the time.
 
-    One formula serves every motion: waves, cusps and loops, steady and sleeping tops, pendulums,
-    passages through the vertical, no gravity; without Euler angles.
+    One formula serves every motion: waves, cusps and loops, steady and sleeping tops,
+    pendulums, passages through the vertical, no gravity; without Euler angles.
 
     Args:
         top: Moments about the fixed point and mgl of any sign.
         state0: State at `t0`, without internal parts; gravity pulls along -z in space.
         ts: Times [s], in any order, before or after `t0`, of any shape.
         t0: Time of `state0` [s].
-        throw: False: a bad value gives NaN and its code in `result` instead of an error, in its
-            lane alone.
+        throw: False: a bad value gives NaN and its code in `result` instead of an
+            error, in its lane alone.
 
     Returns:
-        Attitude and angular velocity (`.states`, or `.attitude` and `.omega`), with the shape of
-        `ts` in front, and `result`. The error is below 1e-13 (1 + radians turned) in float64, plus
-        what the last bits of the arguments do.
+        Attitude and angular velocity (`.states`, or `.attitude` and `.omega`), with the
+        shape of `ts` in front, and `result`. The error is below 1e-13 (1 + radians
+        turned) in float64, plus what the last bits of the arguments do.
 
     Raises:
         RuntimeError: Bad value, or angles turned that overflow.
 
-    Gradients: of any order and in every mode those of the motion, also for a sleeping, steady,
-    weightless or hanging top and through the vertical; reverse mode costs a few values.
+    Gradients: of any order and in every mode those of the motion, also for a sleeping,
+    steady, weightless or hanging top and through the vertical; reverse mode costs a few
+    values.
     Source: Lagrange's solution in the form derived in docs/top.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -59,7 +60,9 @@ def top_motion(
 
 
 def _check(findings: Findings, top: SymmetricTop) -> None:
-    findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(jtu.tree_leaves(top)))
+    findings.require(
+        top.is_valid, RESULTS.invalid_top, value=jnp.stack(jtu.tree_leaves(top))
+    )
 
 
 def _flow(top: SymmetricTop, state0: State, t: Scalar) -> tuple[Quaternion, Vector]:

@@ -52,9 +52,9 @@ def _of_invariants(
 def _bounds(motion: Invariants) -> tuple[Array, Array, Array]:
     """At the least and at the largest tilt |beta|^2 = (1 - cos tilt) / 2 and |alpha|^2; the spread.
 
-    For mgl < 0 of the motion upside down. From the smaller of the two squares, x, which keeps its
-    relative accuracy: (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of the
-    exact flow.
+    For mgl < 0 of the motion upside down. From the smaller of the two squares, x, which
+    keeps its relative accuracy: (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0),
+    with the root X of the exact flow.
     """
     alpha, d_alpha, beta, d_beta = motion.start
     mu, a, *_ = motion.kept
@@ -78,10 +78,12 @@ def _bounds(motion: Invariants) -> tuple[Array, Array, Array]:
     low = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
     high = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
     low, high = jnp.stack([low, 1 - high]), jnp.stack([high, 1 - low])
-    low, high = (jnp.where(hanging, y[::-1], y) for y in (low, high))  # of beta and of alpha
-    # Where the lower bound is far below the upper one, with its relative accuracy: at x = 0 the
-    # slope's square is -J^2, of the constant momentum J. Roots of a smaller size carry rounding of
-    # the larger numbers they come from.
+    low, high = (
+        jnp.where(hanging, y[::-1], y) for y in (low, high)
+    )  # of beta and of alpha
+    # Where the lower bound is far below the upper one, with its relative accuracy: at x
+    # = 0 the slope's square is -J^2, of the constant momentum J. Roots of a smaller
+    # size carry rounding of the larger numbers they come from.
     front, momenta = jnp.stack([root, root + mu]), jnp.stack(motion.momenta[::-1])
     sound = motion.nutates & (front > 0.01 * mu) & (front > 0) & (low < 0.25 * high)
     of_root = momenta * (momenta / jnp.where(sound, front, 1.0))
@@ -97,10 +99,11 @@ def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
         state: Any state of the motion.
 
     Returns:
-        Least and largest angle between the axis and the vertical; equal in steady precession.
+        Least and largest angle between the axis and the vertical; equal in steady
+        precession.
 
-    Gradients: right where the two differ and neither is vertical; finite everywhere: without the
-    infinite part where they meet, zero at the vertical.
+    Gradients: right where the two differ and neither is vertical; finite everywhere:
+    without the infinite part where they meet, zero at the vertical.
     Source: the roots of `cubic`, from the state rather than from its coefficients.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -126,8 +129,9 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
         state: Any state of the motion.
 
     Returns:
-        The period [s]; in steady precession that of small nutations; of a pendulum half a swing,
-        or a whole turn; infinite on the separatrix and for a top without weight at rest.
+        The period [s]; in steady precession that of small nutations; of a pendulum half
+        a swing, or a whole turn; infinite on the separatrix and for a top without
+        weight at rest.
 
     Gradients: analytic, also in steady precession; zero where the period is infinite.
     Source: docs/top.md, an arithmetic-geometric mean.
@@ -138,7 +142,9 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     >>> print(jr.top.nutation_period(top, state).round(5))
     3.51772
     """
-    return _of_invariants(lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state)
+    return _of_invariants(
+        lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state
+    )
 
 
 def _advance(motion: Invariants) -> Advance:
@@ -146,7 +152,9 @@ def _advance(motion: Invariants) -> Advance:
     of_alpha = motion.advance_alpha + jnp.pi * jnp.sign(plus)
     of_beta = motion.advance_beta + motion.half_turn * jnp.sign(less)
     phi = jnp.where(motion.hangs, -1.0, 1.0) * (of_alpha + of_beta)
-    psi = of_alpha - of_beta + (motion.omega3 - motion.spin) / motion.unit * motion.period
+    psi = (
+        of_alpha - of_beta + (motion.omega3 - motion.spin) / motion.unit * motion.period
+    )
     return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in (phi, psi)))
 
 
@@ -158,8 +166,9 @@ def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
         state: Any state of the motion.
 
     Returns:
-        Growth of phi and psi [rad]. In a motion through the vertical, where phi jumps by half a
-        turn to either side, the mean of the two. Zero where the period is infinite.
+        Growth of phi and psi [rad]. In a motion through the vertical, where phi jumps
+        by half a turn to either side, the mean of the two. Zero where the period is
+        infinite.
 
     Gradients: those of the branch, also in steady precession and through the vertical.
     Source: docs/top.md.
@@ -181,10 +190,12 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
         state: Any state of the motion.
 
     Returns:
-        The rate [rad/s]; in steady precession the rate of that; where the period is infinite that
-        with which the axis comes upright, I3 omega3 / (2 I1) (mgl < 0: upside down, the opposite).
+        The rate [rad/s]; in steady precession the rate of that; where the period is
+        infinite that with which the axis comes upright, I3 omega3 / (2 I1) (mgl < 0:
+        upside down, the opposite).
 
-    Gradients: analytic, also in steady precession; it jumps where the axis passes the vertical.
+    Gradients: analytic, also in steady precession; it jumps where the axis passes the
+        vertical.
     Source: docs/top.md.
 
     >>> import jrigid as jr
@@ -204,18 +215,19 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
 def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     """What kind of motion it is, a member of `CLASSES`.
 
-    The path of the axis on the sphere is a wave where it precesses one way throughout, a loop
-    where it turns back in each nutation, and has cusps between the two. Steady: at a constant
-    tilt. Sleeping: at the vertical, upright or hanging. Pendulum: in a plane through the vertical,
-    without spin. Through the vertical: spinning, and upright or hanging at times.
+    The path of the axis on the sphere is a wave where it precesses one way throughout,
+    a loop where it turns back in each nutation, and has cusps between the two. Steady:
+    at a constant tilt. Sleeping: at the vertical, upright or hanging. Pendulum: in a
+    plane through the vertical, without spin. Through the vertical: spinning, and
+        upright or hanging at times.
 
     Args:
         top: The top.
         state: Any state of the motion.
 
     Returns:
-        The kind; `CLASSES.undefined` where the top or the state is not valid. Two sides are told
-        apart to some 1e-12 (float32: 5e-4) of their size.
+        The kind; `CLASSES.undefined` where the top or the state is not valid. Two sides
+        are told apart to some 1e-12 (float32: 5e-4) of their size.
 
     Gradients: none, it is an integer.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 35, problem 1.
@@ -241,7 +253,9 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     turning = plus * of_beta + less * of_alpha
     rounding = tolerance * (jnp.abs(plus * of_beta) + jnp.abs(less * of_alpha))
     turns = jnp.prod(jnp.where(jnp.abs(turning) <= rounding, 0.0, jnp.sign(turning)))
-    vertical = (of_beta[0] <= tolerance * of_beta[1]) | (of_alpha[1] <= tolerance * of_alpha[0])
+    vertical = (of_beta[0] <= tolerance * of_beta[1]) | (
+        of_alpha[1] <= tolerance * of_alpha[0]
+    )
     widest = of_beta[1] * of_alpha[0]
     momentum = jnp.maximum(jnp.abs(plus), jnp.abs(less))
     kind = CLASSES.wave

@@ -86,7 +86,9 @@ def conserved(top: SymmetricTop, state: State) -> Conserved:
     """
 
     def constants(top: SymmetricTop, state: State) -> Conserved:
-        up = rotate_inverse(state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype))
+        up = rotate_inverse(
+            state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype)
+        )
         momentum = jnp.stack([top.I1, top.I1, top.I3]) * state.omega
         energy = 0.5 * product("i,i->", momentum, state.omega) + top.mgl * up[2]
         return Conserved(product("i,i->", momentum, up), momentum[2], energy)
@@ -121,13 +123,14 @@ def angle_rates(
         p_psi: Angular momentum about the axis [kg m^2/s].
 
     Returns:
-        phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi' cos theta
-        [rad/s]. Infinite at the vertical, unless the momenta let the axis pass: then the mean of
-        the two sides. At theta = pi, which no floating point number is, large in place of
-        infinite. NaN where the top is not valid or a number not finite.
+        phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi'
+        cos theta [rad/s]. Infinite at the vertical, unless the momenta let the axis
+        pass: then the mean of the two sides. At theta = pi, which no floating point
+        number is, large in place of infinite. NaN where the top is not valid or a
+        number not finite.
 
-    Gradients: right inside 0 < theta < pi; in the momenta at the vertical without the singular
-    part.
+    Gradients: right inside 0 < theta < pi; in the momenta at the vertical without the
+    singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -139,7 +142,10 @@ def angle_rates(
 
 
 def effective_potential(
-    top: SymmetricTop, theta: Real[ArrayLike, "..."], p_phi: ScalarLike, p_psi: ScalarLike
+    top: SymmetricTop,
+    theta: Real[ArrayLike, "..."],
+    p_phi: ScalarLike,
+    p_psi: ScalarLike,
 ) -> Float[Array, "..."]:
     """Potential of the tilt alone: I1 theta'^2 / 2 + V(theta) = E - p_psi^2 / (2 I3).
 
@@ -150,11 +156,12 @@ def effective_potential(
         p_psi: Angular momentum about the axis [kg m^2/s].
 
     Returns:
-        V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J]; infinite at the
-        vertical unless the momenta let the axis pass; NaN where the top is not valid or a number
-        not finite.
+        V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J];
+        infinite at the vertical unless the momenta let the axis pass; NaN where the top
+        is not valid or a number not finite.
 
-    Gradients: right where V is finite; in the momenta at the vertical without the singular part.
+    Gradients: right where V is finite; in the momenta at the vertical without the
+        singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -171,7 +178,9 @@ def effective_potential(
         return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
 
     momenta = {"p_phi": p_phi, "p_psi": p_psi}
-    return jnp.vectorize(lambda theta: where_valid(potential, top, theta=theta, **momenta))(theta)
+    return jnp.vectorize(
+        lambda theta: where_valid(potential, top, theta=theta, **momenta)
+    )(theta)
 
 
 def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
@@ -182,9 +191,9 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
         conserved: Its momenta and energy.
 
     Returns:
-        Coefficients of f [1/s^2], the highest power first, as `jnp.polyval` takes them: f = (1 -
-        u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2. NaN where the top is
-        not valid or a constant not finite.
+        Coefficients of f [1/s^2], the highest power first, as `jnp.polyval` takes them:
+        f = (1 - u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2.
+        NaN where the top is not valid or a constant not finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -214,9 +223,10 @@ def reduced_vector_field(
         conserved: Its momenta; the energy is not used.
 
     Returns:
-        The rates `(t, y, args) -> y'` of y = (phi, theta, psi, theta') [rad, rad/s]: theta'' =
-        -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the vertical; an axis that
-        may pass there (p_phi = +-p_psi) does pass, theta changing its sign (or beyond pi).
+        The rates `(t, y, args) -> y'` of y = (phi, theta, psi, theta') [rad, rad/s]:
+        theta'' = -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the
+        vertical; an axis that may pass there (p_phi = +-p_psi) does pass, theta
+        changing its sign (or beyond pi).
 
     Gradients: analytic inside 0 < theta < pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -234,7 +244,11 @@ def reduced_vector_field(
         del t, args
         _, theta, _, theta_dot = y
         phi_dot, psi_dot = _angle_rates(i1, i3, mgl, theta, p_phi, p_psi)
-        pull = (mgl + phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi)) * jnp.sin(theta) / i1
+        pull = (
+            (mgl + phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi))
+            * jnp.sin(theta)
+            / i1
+        )
         return jnp.stack([phi_dot, theta_dot, psi_dot, pull])
 
     return rates

@@ -39,8 +39,8 @@ class SteadyPrecession(NamedTuple):
 
     Attributes:
         slow: The one of smaller magnitude [rad/s], mgl / (I3 omega3) for fast spin.
-        fast: The other [rad/s], I3 omega3 / (I1 cos theta) for fast spin; infinite with the axis
-            level, where there is one rate only.
+        fast: The other [rad/s], I3 omega3 / (I1 cos theta) for fast spin; infinite with
+            the axis level, where there is one rate only.
         exists: Whether the spin is fast enough; the rates are NaN where not.
     """
 
@@ -55,8 +55,8 @@ class Gyroscopic(NamedTuple):
     Attributes:
         precession: Mean rate of precession mgl / (I3 omega3) [rad/s].
         nutation: Angular frequency of nutation I3 omega3 / I1 [rad/s].
-        amplitude: By how much a top released from rest falls before it rises again [rad],
-            2 mgl I1 sin theta / (I3 omega3)^2.
+        amplitude: By how much a top released from rest falls before it rises again
+            [rad], 2 mgl I1 sin theta / (I3 omega3)^2.
     """
 
     precession: Scalar
@@ -97,24 +97,27 @@ def steady_precession(
 ) -> SteadyPrecession:
     """The rates at which a top may precess at a constant tilt.
 
-    They solve I1 cos(theta) p^2 - I3 omega3 p + mgl = 0, which has solutions if (I3 omega3)^2 >=
-    4 I1 mgl cos theta: above the horizontal a top needs spin, below it none.
+    They solve I1 cos(theta) p^2 - I3 omega3 p + mgl = 0, which has solutions if (I3
+    omega3)^2 >= 4 I1 mgl cos theta: above the horizontal a top needs spin, below it
+    none.
 
     Args:
         top: The top.
         theta: Tilt of the axis from the vertical [rad].
-        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s]; or
-        psi_dot: spin about the axis, as seen by one who precesses with it [rad/s]; one of the two.
-            Then I1 - I3 takes the place of I1.
+        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s];
+            or
+        psi_dot: spin about the axis, as seen by one who precesses with it [rad/s]; one
+            of the two. Then I1 - I3 takes the place of I1.
 
     Returns:
-        Both rates, and whether there are any: not with too little spin, nor where the top is not
-        valid or a number not finite.
+        Both rates, and whether there are any: not with too little spin, nor where the
+        top is not valid or a number not finite.
 
     Raises:
         ValueError: omega3 and psi_dot both given, or neither.
 
-    Gradients: right where the two rates differ; where they meet, without the infinite part.
+    Gradients: right where the two rates differ; where they meet, without the infinite
+        part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -123,9 +126,13 @@ def steady_precession(
     0.354249 5.645751 True
     """
     if (omega3 is None) == (psi_dot is None):
-        raise ValueError("One of the arguments `omega3` and `psi_dot` must be given, and one only.")
+        raise ValueError(
+            "One of the arguments `omega3` and `psi_dot` must be given, and one only."
+        )
     spin = {"psi_dot": psi_dot} if omega3 is None else {"omega3": omega3}
-    slow, fast = where_valid(partial(_steady, of_psi=omega3 is None), top, theta=theta, **spin)
+    slow, fast = where_valid(
+        partial(_steady, of_psi=omega3 is None), top, theta=theta, **spin
+    )
     return SteadyPrecession(slow, fast, ~jnp.isnan(slow))
 
 
@@ -164,9 +171,9 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
         omega3: Third component of the angular velocity, not zero [rad/s].
 
     Returns:
-        Precession, nutation and the amplitude of nutation, with relative errors of the order of
-        mgl I1 / (I3 omega3)^2. NaN without spin, and where the top is not valid or a number not
-        finite.
+        Precession, nutation and the amplitude of nutation, with relative errors of the
+        order of mgl I1 / (I3 omega3)^2. NaN without spin, and where the top is not
+        valid or a number not finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -177,7 +184,9 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
     0.02 50.0 0.0004
     """
 
-    def fast(i1: Array, i3: Array, mgl: Array, theta: Array, omega3: Array) -> Gyroscopic:
+    def fast(
+        i1: Array, i3: Array, mgl: Array, theta: Array, omega3: Array
+    ) -> Gyroscopic:
         momentum = i3 * omega3
         fall = 2 * mgl * i1 * jnp.sin(theta) / (momentum * momentum)
         return Gyroscopic(mgl / momentum, momentum / i1, fall)
@@ -207,10 +216,10 @@ def initial_state(
         top: The top.
         theta: Tilt of the axis from the vertical, from 0 to pi [rad].
         psi_dot: Spin about the axis, as seen by one who precesses with it [rad/s]; or
-        omega3: third component of the angular velocity, psi' + phi' cos theta [rad/s]; one of the
-            two, or neither for no spin (omega3 = 0).
-        phi_dot: Precession [rad/s], or "slow" or "fast" for that of steady precession with the
-            given spin (see `steady_precession`).
+        omega3: third component of the angular velocity, psi' + phi' cos theta [rad/s];
+            one of the two, or neither for no spin (omega3 = 0).
+        phi_dot: Precession [rad/s], or "slow" or "fast" for that of steady precession
+            with the given spin (see `steady_precession`).
         theta_dot: Rate of the tilt [rad/s].
         phi: Azimuth of the axis, from -y towards +x [rad].
         psi: Angle about the axis [rad].
@@ -221,8 +230,9 @@ def initial_state(
 
     Raises:
         ValueError: psi_dot and omega3 both given.
-        RuntimeError: A tilt outside of its range, a value that is not finite, too little spin for
-            steady precession, or the fast one of a level axis, which is infinite.
+        RuntimeError: A tilt outside of its range, a value that is not finite, too
+            little spin for steady precession, or the fast one of a level axis, which is
+            infinite.
 
     Gradients: analytic; of a steady precession those of its rate.
 
@@ -234,7 +244,9 @@ def initial_state(
     """
     check_type("top", top, SymmetricTop)
     if psi_dot is not None and omega3 is not None:
-        raise ValueError("Argument `psi_dot` must be None where `omega3` is given, but it is not.")
+        raise ValueError(
+            "Argument `psi_dot` must be None where `omega3` is given, but it is not."
+        )
     spin_name, spin = ("omega3", omega3) if psi_dot is None else ("psi_dot", psi_dot)
     spin = 0.0 if spin is None else spin
     steady = isinstance(phi_dot, str)
@@ -244,15 +256,24 @@ def initial_state(
     findings = Findings()
     findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(numbers[:3]))
     for name, value in zip(given, numbers[3:], strict=True):
-        good, message = jnp.isfinite(value), f"Argument `{name}` must be finite, but it is not."
+        good, message = (
+            jnp.isfinite(value),
+            f"Argument `{name}` must be finite, but it is not.",
+        )
         if name == "theta":
-            good, message = (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING), _BAD_TILT
+            good, message = (
+                (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING),
+                _BAD_TILT,
+            )
         findings.require(good, RESULTS.invalid_state, message, value)
     i1, i3, mgl, theta, spin, rate, theta_dot, phi, psi = harmless(findings.ok, numbers)
     if steady:
         check_option("phi_dot", phi_dot, ("slow", "fast"))
         slow, fast = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
-        rate, too_slow = slow if phi_dot == "slow" else fast, _TOO_SLOW.format(spin_name)
+        rate, too_slow = (
+            slow if phi_dot == "slow" else fast,
+            _TOO_SLOW.format(spin_name),
+        )
         findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
         findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
         rate = harmless(findings.ok, rate)

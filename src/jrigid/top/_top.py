@@ -96,7 +96,10 @@ class SymmetricTop(Readable):
         if gravity is None:
             gravity = jnp.array([0.0, 0.0, -_STANDARD_GRAVITY], body.mass.dtype)
         mass, inertia, lever, gravity = shaped(
-            mass=(body.mass,), inertia=(body.inertia, 3, 3), lever=(lever, 3), gravity=(gravity, 3)
+            mass=(body.mass,),
+            inertia=(body.inertia, 3, 3),
+            lever=(lever, 3),
+            gravity=(gravity, 3),
         )
         (a, d, e), (_, b, f), (_, _, c) = inertia
         tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
@@ -132,13 +135,19 @@ class SymmetricTop(Readable):
 
 
 def _scalar(name: str, value: Any) -> Any:
-    return None if value is None else array_of_shape(name, value)  # None: an axis of vmap
+    return (
+        None if value is None else array_of_shape(name, value)
+    )  # None: an axis of vmap
 
 
-def where_valid(formula: Callable[..., Answer], top: SymmetricTop, **scalars: Any) -> Answer:
+def where_valid(
+    formula: Callable[..., Answer], top: SymmetricTop, **scalars: Any
+) -> Answer:
     """A formula of I1, I3, mgl and scalars, in one dtype; NaN where any is outside its domain."""
     check_type("top", top, SymmetricTop)
-    numbers = shaped(**{name: (value,) for name, value in (vars(top) | scalars).items()})
+    numbers = shaped(
+        **{name: (value,) for name, value in (vars(top) | scalars).items()}
+    )
     return where_defined(top.is_valid & all_finite(numbers), formula, *numbers)
 
 

@@ -1,7 +1,7 @@
 """What a torque is, and how torques add."""
+# ruff: noqa: ARG002
 
 # A torque takes t, state and args, whatever it looks at.
-# ruff: noqa: ARG002
 
 import abc
 import dataclasses
@@ -31,22 +31,29 @@ from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
 TorqueFunction = Callable[[Any, Any, Any], Any]
 
 
-# What a parameter must be, in words and as a test: the metadata of its field. `positive` asks a
-# search to keep to one side of zero.
+# What a parameter must be, in words and as a test: the metadata of its field.
+# `positive` asks a search to keep to one side of zero.
 FINITE = {"rule": ("finite", all_finite)}
 POSITIVE = {"rule": ("positive and finite", all_positive), "positive": True}
 NOT_NEGATIVE = {
     "rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0)),
     "positive": True,
 }
-NOT_ZERO = {"rule": ("finite and not zero", lambda x: all_finite(x) & jnp.all(jnp.any(x, axis=-1)))}
+NOT_ZERO = {
+    "rule": (
+        "finite and not zero",
+        lambda x: all_finite(x) & jnp.all(jnp.any(x, axis=-1)),
+    )
+}
 
 
 def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
     """Note each parameter that breaks the rule of its field."""
     for field in dataclasses.fields(torque):
         value = getattr(torque, field.name)
-        if "rule" in field.metadata and eqx.is_array(value):  # not a function of time, nor None
+        if "rule" in field.metadata and eqx.is_array(
+            value
+        ):  # not a function of time, nor None
             words, holds = field.metadata["rule"]
             name = f"Argument `{field.name}` of `{type(torque).__name__}`"
             message = f"{name} must be {words}, but it is not."
@@ -103,9 +110,9 @@ def zero_like(state: Any) -> Scalar:
 class AbstractTorque(Readable):
     """A torque, its potential energy, and the internal parts that exert it.
 
-    Subclasses give `__call__`; the rest defaults to a torque without potential or internal parts.
-    A torque with internal parts sees in `state.internal` a tuple with an entry for each of its own,
-    alone and in a sum, and answers with such tuples.
+    Subclasses give `__call__`; the rest defaults to a torque without potential or
+    internal parts. A torque with internal parts sees in `state.internal` a tuple with
+    an entry for each of its own, alone and in a sum, and answers with such tuples.
 
     Gradients: those of the subclass's own functions.
 
@@ -138,8 +145,8 @@ class AbstractTorque(Readable):
     def jumps(self) -> Float[Array, " jumps"]:
         """Times at which the torque is not smooth [s]; steps of `simulate` end there.
 
-        By default they are those that its parts declare: torques in a sum, a `Sampled` in
-        a field. A subclass that switches at known times returns these:
+        By default they are those that its parts declare: torques in a sum, a `Sampled`
+        in a field. A subclass that switches at known times returns these:
 
         >>> import equinox as eqx, jax, jax.numpy as jnp, jrigid as jr
         >>> class Pulse(jr.torques.AbstractTorque):
@@ -199,7 +206,8 @@ class AbstractTorque(Readable):
     def __radd__(self, other: Any) -> "AbstractTorque":
         """Both torques together; `0 + torque` is the torque, so that `sum()` works.
 
-        A plain function may not come first in `sum`, since Python adds it to 0 without asking any
+        A plain function may not come first in `sum`, since Python adds it to 0 without
+        asking any
         torque: `Sum([function, torque])` takes them in any order.
         """
         return self if other == 0 else Sum((other, self))
@@ -248,8 +256,9 @@ def _takes_three(function: Callable[..., Any]) -> bool:
 class Sum(AbstractTorque):
     """Torques acting together; what `+` makes.
 
-    The internal state is a tuple with an entry for each torque that carries parts, in their order.
-    Such a torque sees its own entries as `state.internal`; the others see all of it.
+    The internal state is a tuple with an entry for each torque that carries parts, in
+    their order. Such a torque sees its own entries as `state.internal`; the others see
+    all of it.
 
     Attributes:
         terms: The torques, those of sums within the sum among them.
@@ -287,7 +296,10 @@ class Sum(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Sum of the torques [N m], body components."""
-        return sum((x(t, own, args) for x, own in self._views(state)), jnp.zeros_like(state.omega))
+        return sum(
+            (x(t, own, args) for x, own in self._views(state)),
+            jnp.zeros_like(state.omega),
+        )
 
     def of_body(self, inertia: InertiaLike) -> "Sum":
         """The torques on a body of this inertia."""
@@ -295,7 +307,10 @@ class Sum(AbstractTorque):
 
     def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
         """Sum of the potential energies [J]."""
-        return sum((x.potential(t, own, args) for x, own in self._views(state)), zero_like(state))
+        return sum(
+            (x.potential(t, own, args) for x, own in self._views(state)),
+            zero_like(state),
+        )
 
     def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
         """Internal states of the terms that have one."""
@@ -351,7 +366,8 @@ class Torque(AbstractTorque):
 
         Args:
             fn: `(t, state, args) -> (3,)` body components [N m].
-            potential: `(t, state, args) -> ()` potential energy [J], for the energy balance.
+            potential: `(t, state, args) -> ()` potential energy [J], for the energy
+                balance.
         """
         self.fn = fn
         self.potential_fn = potential

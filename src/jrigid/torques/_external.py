@@ -1,7 +1,7 @@
 """Torques from outside: gravity and its gradient, magnetism, sunlight, drag and friction."""
+# ruff: noqa: ARG002
 
 # A torque takes t, state and args, whatever it looks at.
-# ruff: noqa: ARG002
 
 from collections.abc import Callable
 from typing import Any
@@ -37,7 +37,9 @@ from jrigid.torques._base import (
     vector_or_function,
 )
 
-_PRESSURE_AT_EARTH = 1361 / 299_792_458  # total irradiance [W/m^2] over the speed of light [m/s]
+_PRESSURE_AT_EARTH = (
+    1361 / 299_792_458
+)  # total irradiance [W/m^2] over the speed of light [m/s]
 
 
 class UniformGravity(AbstractTorque):
@@ -60,7 +62,9 @@ class UniformGravity(AbstractTorque):
 
     mass: Float[Array, ""] = eqx.field(converter=array("mass"), metadata=NOT_NEGATIVE)
     lever: Float[Array, "3"] = eqx.field(converter=array("lever", 3), metadata=FINITE)
-    gravity: Float[Array, "3"] = eqx.field(converter=array("gravity", 3), metadata=FINITE)
+    gravity: Float[Array, "3"] = eqx.field(
+        converter=array("gravity", 3), metadata=FINITE
+    )
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
@@ -76,17 +80,20 @@ class UniformGravity(AbstractTorque):
 class GravityGradient(AbstractTorque):
     """Gravity-gradient torque of a distant attractor: 3 mu / r^3 (n x I n).
 
-    First order in body size over distance; n is the direction of the attractor in the body, I the
-    inertia about the centre of mass, which the body on which the torque acts hands over: nothing
-    else need name it. `GravityGradient(mu, position).of_body(inertia)` acts without a body.
+    First order in body size over distance; n is the direction of the attractor in the
+    body, I the inertia about the centre of mass, which the body on which the torque
+    acts hands over: nothing else need name it.
+        `GravityGradient(mu, position).of_body(inertia)` acts without a body.
 
     Attributes:
         mu: Gravitational parameter of the attractor [m^3/s^2].
-        position: `position(t) -> (3,)`, from the attractor to the body, space components [m]; None
-            for the body's own position, that of a `FloatingState` with the attractor at the origin.
+        position: `position(t) -> (3,)`, from the attractor to the body, space
+            components [m]; None for the body's own position, that of a `FloatingState`
+            with the attractor at the origin.
         inertia: Set by `of_body` [kg m^2]; None before.
 
-    Gradients: finite except where the attractor is at the body (r = 0), where all is NaN.
+    Gradients: finite except where the attractor is at the body (r = 0), where all is
+        NaN.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), section 8.1.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -140,7 +147,8 @@ class MagneticDipole(AbstractTorque):
 
     Attributes:
         moment: Dipole moment m, body components [A m^2].
-        field: Flux density B, space components [T]: an array, or `field(t, state) -> (3,)`.
+        field: Flux density B, space components [T]: an array, or
+            `field(t, state) -> (3,)`.
 
     Gradients: analytic in the attitude, linear in m and B.
     Source: Wertz, Spacecraft Attitude Determination and Control (1978), section 17.2.4.
@@ -173,29 +181,33 @@ class MagneticDipole(AbstractTorque):
 
 
 def _fraction(name: str) -> Any:
-    return eqx.field(default=0.0, converter=array(name, (), (None,)), metadata=NOT_NEGATIVE)
+    return eqx.field(
+        default=0.0, converter=array(name, (), (None,)), metadata=NOT_NEGATIVE
+    )
 
 
 class SolarPressure(AbstractTorque):
     r"""Torque of sunlight on flat plates: the sum of r x F over those that face the Sun.
 
-    With n the normal of a plate's bright side, s the direction of the Sun and c = n . s > 0,
-    $F = -P A c [(1 - \rho_s) s + 2 (\rho_s c + \rho_d / 3) n]$: a fraction rho_s of the light is
-    reflected as by a mirror, rho_d as by paper, the rest absorbed. A plate feels nothing from
+    With n the normal of a plate's bright side, s the direction of the Sun and c = n . s
+    > 0, $F = -P A c [(1 - \rho_s) s + 2 (\rho_s c + \rho_d / 3) n]$: a fraction rho_s
+    of the light is reflected as by a mirror, rho_d as by paper, the rest absorbed. A
+    plate feels nothing from
     behind: one with two sides is two plates. None throws a shadow on another.
 
     Attributes:
         areas: A [m^2], one for each plate.
         normals: n, body components, of any length but zero.
-        centers: r, from the centre of mass to the centre of each plate, body components [m].
+        centers: r, from the centre of mass to the centre of each plate, body components
+            [m].
         sun: From the body to the Sun, space components, of any length; an array, or
             `sun(t) -> (3,)`. Where it is zero there is no light, as in an eclipse.
         specular: rho_s, a number or one for each plate.
         diffuse: rho_d, a number or one for each plate; rho_s + rho_d is at most 1.
         pressure: P [N/m^2]; at the Earth by default.
 
-    Gradients: finite everywhere. The torque has a kink where a plate is seen edge on; derivatives
-    are there those of its dark side, zero.
+    Gradients: finite everywhere. The torque has a kink where a plate is seen edge on;
+    derivatives are there those of its dark side, zero.
     Source: Wertz, Spacecraft Attitude Determination and Control (1978), section 17.2.2.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -206,9 +218,13 @@ class SolarPressure(AbstractTorque):
     [ 0.     0.    45.398]
     """
 
-    areas: Float[Array, " n"] = eqx.field(converter=array("areas", None), metadata=NOT_NEGATIVE)
+    areas: Float[Array, " n"] = eqx.field(
+        converter=array("areas", None), metadata=NOT_NEGATIVE
+    )
     normals: Float[Array, "n 3"] = eqx.field(**direction("normals", None, 3))
-    centers: Float[Array, "n 3"] = eqx.field(converter=array("centers", None, 3), metadata=FINITE)
+    centers: Float[Array, "n 3"] = eqx.field(
+        converter=array("centers", None, 3), metadata=FINITE
+    )
     sun: Any = eqx.field(**vector_or_function("sun"))
     specular: Float[Array, "..."] = _fraction("specular")
     diffuse: Float[Array, "..."] = _fraction("diffuse")
@@ -218,7 +234,12 @@ class SolarPressure(AbstractTorque):
 
     def __check_init__(self):
         """As many of everything as there are areas."""
-        for name, row in (("normals", (3,)), ("centers", (3,)), ("specular", ()), ("diffuse", ())):
+        for name, row in (
+            ("normals", (3,)),
+            ("centers", (3,)),
+            ("specular", ()),
+            ("diffuse", ()),
+        ):
             value = getattr(self, name)
             if value.ndim:  # not one number for all
                 check_shape(name, value, (self.areas.size, *row))
@@ -227,13 +248,18 @@ class SolarPressure(AbstractTorque):
         """Force on each plate [N], body components."""
         sun = value_of("sun", self.sun, state, t)
         distance = safe_norm(sun)
-        s = rotate_inverse(state.attitude, sun / jnp.where(distance > 0, distance, 1.0))[None]
+        s = rotate_inverse(
+            state.attitude, sun / jnp.where(distance > 0, distance, 1.0)
+        )[None]
         n, areas, pressure = in_dtype_of(state, self.normals, self.areas, self.pressure)
         specular, diffuse = in_dtype_of(state, self.specular, self.diffuse)
         cosine = jnp.sum(n * s, axis=-1)
         cosine = jnp.where(cosine > 0, cosine, 0.0)
         pushed = -pressure * areas * cosine
-        along, across = pushed * (1 - specular), 2 * pushed * (specular * cosine + diffuse / 3)
+        along, across = (
+            pushed * (1 - specular),
+            2 * pushed * (specular * cosine + diffuse / 3),
+        )
         return along[:, None] * s + across[:, None] * n
 
     def force(self, t: ScalarLike, state: Any, args: Any) -> Vector:
@@ -259,7 +285,9 @@ def _takes_energy(coefficient: Array) -> Array:
     if coefficient.ndim < 2:
         return jnp.all((coefficient >= 0) & (coefficient < jnp.inf))
     (unit,) = scaled_together(coefficient)
-    return is_inertia(unit + 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype))
+    return is_inertia(
+        unit + 64 * jnp.finfo(unit.dtype).eps * jnp.eye(3, dtype=unit.dtype)
+    )
 
 
 _WORDS = "finite and not negative (a tensor symmetric and positive semi-definite)"
@@ -273,8 +301,8 @@ class LinearDrag(AbstractTorque):
     """Drag proportional to the angular velocity: -c omega.
 
     Attributes:
-        coefficient: c [N m s]: a number or one for each body axis, not negative, or a tensor,
-            symmetric and positive semi-definite.
+        coefficient: c [N m s]: a number or one for each body axis, not negative, or a
+            tensor, symmetric and positive semi-definite.
 
     Gradients: linear in the coefficient and in omega.
 
@@ -297,8 +325,8 @@ class QuadraticDrag(AbstractTorque):
     """Drag quadratic in the angular velocity: -|omega| c omega; at rest zero, its gradient too.
 
     Attributes:
-        coefficient: c [N m s^2]: a number or one for each body axis, not negative, or a tensor,
-            symmetric and positive semi-definite.
+        coefficient: c [N m s^2]: a number or one for each body axis, not negative, or a
+            tensor, symmetric and positive semi-definite.
 
     Gradients: finite everywhere; in omega zero at rest.
 
@@ -319,18 +347,19 @@ class QuadraticDrag(AbstractTorque):
 class CoulombFriction(AbstractTorque):
     """Dry friction, of one size at any speed: -c omega / sqrt(|omega|^2 + width^2).
 
-    Coulomb's law jumps where the motion turns round, and no integrator steps over that. Here the
-    jump is spread over a width: far above it the torque is c, at it 0.71 c, below it that of a
-    linear drag c / width, in which a body comes to rest with the time constant I width / c. A body
-    that c could hold under a load does not stand still but creeps at about the width. At rest
-    `simulate` takes some three steps in each such time constant: with a width of a thousandth of
-    the speed 3000 in the time it took to stop. An event at |omega| = width saves them.
+    Coulomb's law jumps where the motion turns round, and no integrator steps over that.
+    Here the jump is spread over a width: far above it the torque is c, at it 0.71 c,
+    below it that of a linear drag c / width, in which a body comes to rest with the
+    time constant I width / c. A body that c could hold under a load does not stand
+    still but creeps at about the width. At rest `simulate` takes some three steps in
+    each such time constant: with a width of a thousandth of the speed 3000 in the time
+        it took to stop. An event at |omega| = width saves them.
 
     Attributes:
         magnitude: c [N m], not negative.
         width: Speed at which the law is rounded off [rad/s], positive.
-        axis: Of a bearing, body components, of any length: only the turning about it is braked.
-            None for a ball joint, which brakes all.
+        axis: Of a bearing, body components, of any length: only the turning about it is
+            braked. None for a ball joint, which brakes all.
 
     Gradients: finite everywhere; the torque is analytic.
 
@@ -341,9 +370,13 @@ class CoulombFriction(AbstractTorque):
     [-0.  -0.  -0.1]
     """
 
-    magnitude: Float[Array, ""] = eqx.field(converter=array("magnitude"), metadata=NOT_NEGATIVE)
+    magnitude: Float[Array, ""] = eqx.field(
+        converter=array("magnitude"), metadata=NOT_NEGATIVE
+    )
     width: Float[Array, ""] = eqx.field(converter=array("width"), metadata=POSITIVE)
-    axis: Float[Array, "3"] | None = eqx.field(default=None, **direction("axis", 3, optional=True))
+    axis: Float[Array, "3"] | None = eqx.field(
+        default=None, **direction("axis", 3, optional=True)
+    )
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""

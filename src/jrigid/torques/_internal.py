@@ -1,7 +1,7 @@
 """Torques of internal parts with a momentum of their own: a damper, a rotor."""
+# ruff: noqa: ARG002
 
 # A torque takes t, state and args, whatever it looks at.
-# ruff: noqa: ARG002
 
 from typing import Any
 
@@ -28,12 +28,13 @@ from jrigid.torques._base import (
 class InternalDamper(AbstractTorque):
     """A sphere inside the body, coupled to it by a viscous layer.
 
-    The sphere has an angular velocity of its own; the layer exerts c (omega_sphere - omega) on
-    the body and the opposite on the sphere. The total angular momentum in space is constant, the
-    energy falls at the rate c |omega_sphere - omega|^2. Its entry in `State.internal` is
-    omega_sphere, the absolute angular velocity of the sphere in the components of the body's axes
-    [rad/s]; by default the sphere starts at rest relative to the body. The inertia of the body does
-    not include the sphere's own.
+    The sphere has an angular velocity of its own; the layer exerts c (omega_sphere -
+    omega) on the body and the opposite on the sphere. The total angular momentum in
+    space is constant, the energy falls at the rate c |omega_sphere - omega|^2. Its
+    entry in `State.internal` is omega_sphere, the absolute angular velocity of the
+    sphere in the components of the body's axes [rad/s]; by default the sphere starts at
+    rest relative to the body. The inertia of the body does not include the sphere's
+    own.
 
     Attributes:
         inertia: Moment of inertia of the sphere [kg m^2], positive.
@@ -50,11 +51,15 @@ class InternalDamper(AbstractTorque):
     """
 
     inertia: Float[Array, ""] = eqx.field(converter=array("inertia"), metadata=POSITIVE)
-    coupling: Float[Array, ""] = eqx.field(converter=array("coupling"), metadata=NOT_NEGATIVE)
+    coupling: Float[Array, ""] = eqx.field(
+        converter=array("coupling"), metadata=NOT_NEGATIVE
+    )
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""
-        return self.coupling.astype(state.omega.dtype) * (state.internal[0] - state.omega)
+        return self.coupling.astype(state.omega.dtype) * (
+            state.internal[0] - state.omega
+        )
 
     def internal_at_rest(self, state: Any) -> tuple[Vector]:
         """The sphere turning with the body."""
@@ -81,11 +86,12 @@ class InternalDamper(AbstractTorque):
 class Rotor(AbstractTorque):
     """A rotor inside the body with a prescribed momentum h (a gyrostat): -h' - omega x h.
 
-    The body's inertia includes the locked rotor. For a wheel that turns as its motor makes it see
-    `SpinningMass`.
+    The body's inertia includes the locked rotor. For a wheel that turns as its motor
+    makes it see `SpinningMass`.
 
     Attributes:
-        momentum: h, relative to the body, body components [kg m^2/s]: an array, or `h(t) -> (3,)`.
+        momentum: h, relative to the body, body components [kg m^2/s]: an array, or
+            `h(t) -> (3,)`.
 
     Gradients: finite everywhere; a function of time must be differentiable.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
@@ -114,15 +120,15 @@ class Rotor(AbstractTorque):
 class SpinningMass(AbstractTorque):
     """A wheel with a spin of its own: -(motor torque) a - omega x (J s a).
 
-    The wheel's absolute spin s about its axis a is its entry in `State.internal` [rad/s]; by
-    default it starts at rest relative to the body. J s' = motor torque. The body's inertia includes
-    the wheel except for its axial moment J about a.
+    The wheel's absolute spin s about its axis a is its entry in `State.internal`
+    [rad/s]; by default it starts at rest relative to the body. J s' = motor torque. The
+    body's inertia includes the wheel except for its axial moment J about a.
 
     Attributes:
         inertia: J [kg m^2], positive.
         axis: a, body components, of any length but zero.
-        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m], or None: the
-            wheel turns freely on its axis.
+        motor_torque: `(t, state, args) -> ()` torque of the motor on the wheel [N m],
+            or None: the wheel turns freely on its axis.
 
     Gradients: finite for any axis but zero.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
@@ -141,7 +147,9 @@ class SpinningMass(AbstractTorque):
     def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
         if self.motor_torque is None:
             return zero_like(state)
-        return value_of("motor_torque", self.motor_torque, state, t, state, args, shape=())
+        return value_of(
+            "motor_torque", self.motor_torque, state, t, state, args, shape=()
+        )
 
     def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
         """Torque on the body [N m], body components."""

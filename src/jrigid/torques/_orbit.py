@@ -12,8 +12,8 @@ from jrigid.torques._base import array
 class KeplerOrbit(eqx.Module):
     """Position on an ellipse, as a function of time, for `GravityGradient`.
 
-    At time 0 the body is at the pericentre, on the x axis of space; it moves towards y, and z is
-    the normal of the orbit.
+    At time 0 the body is at the pericentre, on the x axis of space; it moves towards y,
+    and z is the normal of the orbit.
 
     Attributes:
         mu: Gravitational parameter of the attractor [m^3/s^2].
@@ -22,12 +22,12 @@ class KeplerOrbit(eqx.Module):
 
     NaN for the numbers of no ellipse.
 
-    Digits: all up to an eccentricity of 0.99; of more extreme ones some are lost near the
-    pericentre.
+    Digits: all up to an eccentricity of 0.99; of more extreme ones some are lost near
+    the pericentre.
 
     Gradients: finite for eccentricities below 1.
-    Source: S. Mikkola, Celestial Mechanics 40 (1987) 329, for the start; J. M. A. Danby,
-    Fundamentals of Celestial Mechanics, 2nd ed. (1988), section 6.6.
+    Source: S. Mikkola, Celestial Mechanics 40 (1987) 329, for the start; J. M. A.
+    Danby, Fundamentals of Celestial Mechanics, 2nd ed. (1988), section 6.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> orbit = jr.torques.KeplerOrbit(1.0, 1.0, 0.1)
@@ -62,9 +62,13 @@ class KeplerOrbit(eqx.Module):
             f, slope = anomaly - sine - known, 1 - cosine
             first = -f / slope
             second = -f / (slope + 0.5 * first * sine)
-            anomaly = anomaly - f / (slope + 0.5 * second * sine + second**2 * cosine / 6)
+            anomaly = anomaly - f / (
+                slope + 0.5 * second * sine + second**2 * cosine / 6
+            )
         for _ in range(2):  # Newton's steps, which carry the derivatives
-            anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (1 - e * jnp.cos(anomaly))
+            anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (
+                1 - e * jnp.cos(anomaly)
+            )
         x = a * (jnp.cos(anomaly) - e)
         y = a * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
         ellipse = (fixed >= 0) & (fixed < 1)

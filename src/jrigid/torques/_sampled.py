@@ -12,17 +12,18 @@ from jrigid.torques._base import FINITE, POSITIVE, array
 class Sampled(Readable):
     """A function of time from samples: scale values(t - delay), smooth between them.
 
-    Cubic between neighbouring samples, with the slope of the parabola through each and its
-    neighbours; held before the first and after the last. Give it where a torque takes a function of
-    time, `Rotor(Sampled(ts, momenta))`; `jrigid.identify.fit` can seek its scale, its delay and its
-    values.
+    Cubic between neighbouring samples, with the slope of the parabola through each and
+    its neighbours; held before the first and after the last. Give it where a torque
+    takes a function of time, `Rotor(Sampled(ts, momenta))`; `jrigid.identify.fit` can
+    seek its scale, its delay and its values.
 
     Attributes:
         ts: Times [s] (n,), increasing; repeated ones at the end pad.
         values: One row for each time (n, ...).
         scale: Factor of the values, positive.
-        delay: By which the function is later than the samples [s], as a torque that follows its
-            command; of samples that lag behind what they measure it is negative.
+        delay: By which the function is later than the samples [s], as a torque that
+            follows its command; of samples that lag behind what they measure it is
+            negative.
 
     Gradients: those of the cubics, in everything; the second derivative in time jumps.
 
@@ -34,8 +35,12 @@ class Sampled(Readable):
 
     ts: Float[Array, " n"] = eqx.field(converter=array("ts", None))
     values: Float[Array, "n ..."] = eqx.field(converter=lambda x: float_arrays(x)[0])
-    scale: Float[Array, ""] = eqx.field(default=1.0, converter=array("scale"), metadata=POSITIVE)
-    delay: Float[Array, ""] = eqx.field(default=0.0, converter=array("delay"), metadata=FINITE)
+    scale: Float[Array, ""] = eqx.field(
+        default=1.0, converter=array("scale"), metadata=POSITIVE
+    )
+    delay: Float[Array, ""] = eqx.field(
+        default=0.0, converter=array("delay"), metadata=FINITE
+    )
 
     def __check_init__(self) -> None:
         """Raise ValueError for shapes that do not belong together."""
@@ -49,7 +54,9 @@ class Sampled(Readable):
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
         ts, values = self.ts, self.values
-        t = jnp.clip(jnp.asarray(t, ts.dtype) - self.delay.astype(ts.dtype), ts[0], ts[-1])
+        t = jnp.clip(
+            jnp.asarray(t, ts.dtype) - self.delay.astype(ts.dtype), ts[0], ts[-1]
+        )
         last = ts.size - 1
         i = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, last - 1)
 
@@ -61,7 +68,8 @@ class Sampled(Readable):
             return (values[j + 1] - values[j]) / jnp.where(span > 0, span, 1.0), span
 
         (before, a), (within, b), (after, c) = (steepness(i + k) for k in (-1, 0, 1))
-        # Parabolas through three samples; at an end that of the last three, of two a chord.
+        # Parabolas through three samples; at an end that of the last three, of two a
+        # chord.
         ab, bc = (jnp.where(x > 0, x + b, 1.0) for x in (a, c))
         bend_before = jnp.where(a > 0, (within - before) / ab, 0.0)
         bend_after = jnp.where(c > 0, (after - within) / bc, 0.0)

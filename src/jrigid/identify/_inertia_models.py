@@ -1,4 +1,4 @@
-"""What is known of a tensor beforehand: shapes of inertia, each with the numbers that are left."""
+"""What is known of a tensor beforehand: inertia models, each with its unknown numbers."""
 # ruff: noqa: ARG002 (all take what one of them needs)
 
 import abc
@@ -31,12 +31,14 @@ def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:
     """The nearest shape of a body with extent in three directions: second moments of trace 1."""
     xp = tensor.__array_namespace__()
     # Second moments are tr(I) / 2 - I, of half the trace of I.
-    values, axes = principal_axes(xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor))
+    values, axes = principal_axes(
+        xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor)
+    )
     values = xp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / xp.sum(values), axes)
 
 
-class AbstractShape(Readable):
+class AbstractInertiaModel(Readable):
     """What is known of a tensor: a few numbers without bounds, and the tensor that they make.
 
     A subclass says how many numbers there are, where to start and what tensor they make. With
@@ -44,7 +46,7 @@ class AbstractShape(Readable):
     sets it.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> class Ballast(jr.identify.AbstractShape):  # an unknown mass at a known place
+    >>> class Ballast(jr.identify.AbstractInertiaModel):  # an unknown mass at a known place
     ...     empty: jnp.ndarray
     ...     place: jnp.ndarray
     ...     absolute = True
@@ -67,7 +69,7 @@ class AbstractShape(Readable):
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple[Any, AnyArray]:
-        """The shape, in a frame chosen for a tensor, and its numbers there.
+        """The model, in a frame chosen for a tensor, and its numbers there.
 
         Args:
             tensor: Where to start: of numpy in a fit, of JAX in a plan. `tensor.
@@ -85,15 +87,19 @@ class AbstractShape(Readable):
         return jnp.ones(len(self.names))
 
     def body(self, numbers: Array) -> MassProperties | None:
-        """The body about its fixed point, of a shape that tells the mass and where it is."""
+        """The body about its fixed point, of a model that determines the mass and where it is."""
         return None
 
 
 def _names(count: int) -> tuple[str, ...]:
-    return tuple(f"shape[{i}]" for i in range(count)) if count > 1 else ("shape",) * count
+    return (
+        tuple(f"inertia[{i}]" for i in range(count))
+        if count > 1
+        else ("inertia",) * count
+    )
 
 
-class Tensor(AbstractShape):
+class Tensor(AbstractInertiaModel):
     """Nothing is known: any real body, by five numbers.
 
     The second moments of the mass are L L^T with L11 = 1: log L22, log L33, L21, L31, L32.
@@ -114,7 +120,9 @@ class Tensor(AbstractShape):
         xp = tensor.__array_namespace__()
         sigma = real_body(tensor, flattest)
         lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
-        return self, xp.concatenate([xp.log(xp.diagonal(lower)[1:]), lower[_parameters.SIDES]])
+        return self, xp.concatenate(
+            [xp.log(xp.diagonal(lower)[1:]), lower[_parameters.SIDES]]
+        )
 
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
@@ -123,8 +131,8 @@ class Tensor(AbstractShape):
         )
 
 
-class _InFrame(AbstractShape):
-    """A shape in axes of its own."""
+class _InFrame(AbstractInertiaModel):
+    """A model in axes of its own."""
 
     frame: AnyMatrix | None = None
 
@@ -135,7 +143,9 @@ class _InFrame(AbstractShape):
     def inertia(self, numbers: Array) -> Array:
         """The tensor, of whatever trace."""
         frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
-        return inertia_of_second_moment(product("ik,kl,jl->ij", frame, self.sigma(numbers), frame))
+        return inertia_of_second_moment(
+            product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
+        )
 
 
 class Moments(_InFrame):
@@ -160,8 +170,8 @@ class Symmetric(_InFrame):
     The logarithm of the odd second moment over the others, and where axis 3 of the frame turns to.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> shape = jr.identify.Symmetric(jnp.eye(3))
-    >>> print(jnp.linalg.eigvalsh(shape.inertia(jnp.array([jnp.log(2.0), 0.1, -0.2]))).round(6))
+    >>> model = jr.identify.Symmetric(jnp.eye(3))
+    >>> print(jnp.linalg.eigvalsh(model.inertia(jnp.array([jnp.log(2.0), 0.1, -0.2]))).round(6))
     [2. 3. 3.]
     """
 
@@ -223,7 +233,9 @@ class Flat(_InFrame):
         """The largest second moment first, the thickness last."""
         xp = tensor.__array_namespace__()
         values, frame = principal_axes(real_body(tensor, flattest))
-        return Flat(frame[:, ::-1]), xp.pad(0.5 * xp.log(values[1:2] / values[2:]), (0, 3))
+        return Flat(frame[:, ::-1]), xp.pad(
+            0.5 * xp.log(values[1:2] / values[2:]), (0, 3)
+        )
 
     def sigma(self, numbers: Array) -> Array:
         """L L^T, the third column of L zero."""
@@ -231,7 +243,7 @@ class Flat(_InFrame):
         return _parameters.squared(jnp.pad(sizes, (0, 1)), numbers[1:])
 
 
-class Fixed(AbstractShape):
+class Fixed(AbstractInertiaModel):
     """All of the tensor is known, the system's; nothing of it is sought.
 
     Attributes:
@@ -258,7 +270,7 @@ class Fixed(AbstractShape):
         return self.known.astype(numbers.dtype)
 
 
-class LogCholesky(AbstractShape):
+class LogCholesky(AbstractInertiaModel):
     """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
 
     The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
@@ -307,7 +319,9 @@ class LogCholesky(AbstractShape):
     def units(self) -> Array:
         """1, or, of numbers in metres, the size of the body."""
         body = _parameters.body_from_log_cholesky(self.parameters)
-        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(body.center_of_mass**2)
+        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(
+            body.center_of_mass**2
+        )
         of_length = np.array([name[0] in "st" for name in self.names])
         return jnp.where(of_length, jnp.sqrt(square), 1.0)
 

@@ -1,18 +1,19 @@
-"""A hundred throws of a racquet with drag and a lash, read by a gyro with a lag: is `fit` honest?
+"""A hundred trials of a racquet with drag and a lash, read by a gyro with a lag: is `fit` honest?
 
-The throws come from an independent integrator (tests/worlds.py): a flat body of moments 0.07, 0.93
-and 1 (their unit plays no role), 0.5 to 1 s at 100 Hz, 5 to 20 rad/s, about any axis or nearly
-about a principal one; quadratic drag takes 0.3 % of the spin in a radian; the gyro's noise is
-0.05 % of the spin (0.0025 to 0.01 rad/s), its low-pass has 3 ms. The lash is white torque, its
-root spectral density s over the mean moment [rad / s^1.5], or a ball of so many parts of the
-smallest moment on a spring. `fit` is told the drag's form, and that there may be a torque
-(`unmodelled="estimate"`).
+The trials come from an independent integrator (tests/worlds.py): a flat body of moments
+0.07, 0.93 and 1 (their unit plays no role), 0.5 to 1 s at 100 Hz, 5 to 20 rad/s, about
+any axis or nearly about a principal one; quadratic drag takes 0.3 % of the spin in a
+radian; the gyro's noise is 0.05 % of the spin (0.0025 to 0.01 rad/s), its low-pass has
+3 ms. The lash is white torque, its root spectral density s over the mean moment [rad /
+s^1.5], or a ball of so many parts of the smallest moment on a spring. `fit` is told the
+drag's form, and that there may be a torque (`unmodelled="estimate"`).
 
-Told: the error stated is below a tenth of the ratio. Scatter: rms of the errors of I2/I1, of I3/I1
-and of the drag over what was stated, of the throws that are told. Explained: the fit does not end
-MISFIT, WRONG_BASIN or NOT_CONVERGED. Errors: those stated over the part of the sensor. Halves: two
-fits of half the throws each; the difference of both ratios over its error, and each half's I3/I1
-less the truth over its error.
+Told: the error stated is below a tenth of the ratio. Scatter: rms of the errors of
+I2/I1, of I3/I1 and of the drag over what was stated, of the trials that are told.
+Explained: the fit does not end MISFIT, WRONG_BASIN or NOT_CONVERGED. Errors: those
+stated over the part of the sensor. Halves: two fits of half the trials each; the
+difference of both ratios over its error, and each half's I3/I1 less the truth over its
+error.
 """
 
 import pathlib
@@ -59,13 +60,13 @@ FAILED = (Status.MISFIT, Status.WRONG_BASIN, Status.NOT_CONVERGED)
 NAMES = [x for x in dir(Status) if isinstance(getattr(Status, x), Status)]
 
 
-def throws_of(lash, count, seed):
-    """Throws of the world with this lash, each a `worlds.Record`."""
-    return worlds.throws(np.random.default_rng(seed), count, **SCENE | LASHES[lash])
+def trials_of(lash, count, seed):
+    """Trials of the world with this lash, each a `worlds.Record`."""
+    return worlds.trials(np.random.default_rng(seed), count, **SCENE | LASHES[lash])
 
 
 def fitter(shape, lag, unmodelled):
-    """A function that fits each of several sets of throws, given as `fit` takes them."""
+    """A function that fits each of several sets of trials, given as `fit` takes them."""
     body = jr.RigidBody(np.full(3, MEAN), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
     gyro = identify.Gyro(time_constant=None if lag == "ignored" else jnp.asarray(LAG))
 
@@ -75,10 +76,11 @@ def fitter(shape, lag, unmodelled):
 
     def fit_sets(sets):
         records = [
-            [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in throws] for throws in sets
+            [identify.Record(gyro, x.ts, x.readings, x.sigma) for x in trials]
+            for trials in sets
         ]
         return identify.fit_each(
-            body, records, free=free, shape=SHAPES[shape], unmodelled=unmodelled
+            body, records, free=free, inertia_model=SHAPES[shape], unmodelled=unmodelled
         )
 
     return fit_sets
@@ -91,7 +93,7 @@ def is_one_of(status, states):
 
 def drags_of(found):
     """The drag's coefficient in each fit, and its error."""
-    values, errors = jax.vmap(lambda x: x.leaves["torque.coefficient"])(found)
+    values, errors = jax.vmap(lambda x: x.estimates["torque.coefficient"])(found)
     return np.asarray(values), np.asarray(errors)
 
 
@@ -103,11 +105,15 @@ def of_singles(found):
     boundary = is_one_of(found.status, [Status.AT_BOUNDARY])
     told = (errors[:, 1] < 0.1 * RATIOS[1]) & ~failed
     drag, drag_error = drags_of(found)
-    pulls = np.column_stack([(ratios - RATIOS) / errors, (drag - DRAG * MEAN) / drag_error])
+    pulls = np.column_stack(
+        [(ratios - RATIOS) / errors, (drag - DRAG * MEAN) / drag_error]
+    )
     scatter = np.sqrt(np.mean(pulls[told] ** 2, axis=0))
     size = 100 * np.median(errors[told, 1] / RATIOS[1])
     whole = np.diagonal(np.asarray(found.numbers_covariance), axis1=1, axis2=2)[told]
-    own = np.diagonal(np.asarray(found.diagnostics.sensor_covariance), axis1=1, axis2=2)[told]
+    own = np.diagonal(
+        np.asarray(found.diagnostics.sensor_covariance), axis1=1, axis2=2
+    )[told]
     return [
         f"{100 * np.mean(~failed):.0f}",
         f"{100 * np.mean(boundary):.0f}",
@@ -143,9 +149,11 @@ def name_of(unmodelled):
 
 def main():
     parser = common.arguments(__doc__)
-    parser.add_argument("--count", type=int, default=100, help="throws")
+    parser.add_argument("--count", type=int, default=100, help="trials")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--any", action="store_true", help="also as a body of any shape")
+    parser.add_argument(
+        "--any", action="store_true", help="also as a body of any shape"
+    )
     given = parser.parse_args()
     cases = [("flat", "known", "estimate", lash) for lash in LASHES]
     cases += [("flat", lag, "estimate", WHITE) for lag in ("sought", "ignored")]
@@ -154,12 +162,14 @@ def main():
         cases += [("any", "known", "estimate", lash) for lash in LASHES]
     fits, rows = {}, []
     for shape, lag, unmodelled, lash in cases:
-        fit_sets = fits.setdefault((shape, lag, unmodelled), fitter(shape, lag, unmodelled))
-        throws = throws_of(lash, given.count, given.seed)
+        fit_sets = fits.setdefault(
+            (shape, lag, unmodelled), fitter(shape, lag, unmodelled)
+        )
+        trials = trials_of(lash, given.count, given.seed)
         half = given.count // 2
         start = time.perf_counter()
-        singles = of_singles(fit_sets([[x] for x in throws]))
-        halves = of_halves(fit_sets([throws[:half], throws[half:]]))
+        singles = of_singles(fit_sets([[x] for x in trials]))
+        halves = of_halves(fit_sets([trials[:half], trials[half:]]))
         rows.append([lash, shape, lag, name_of(unmodelled), *singles, *halves])
         print(*rows[-1], f"{time.perf_counter() - start:.0f} s", sep=" | ", flush=True)
     header = [
@@ -183,7 +193,9 @@ def main():
     explained = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:3]]
     text = "\n\n".join([*explained, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
-    common.report("throws", "A hundred throws with what no model has", text, packages, given.write)
+    common.report(
+        "trials", "A hundred trials with what no model has", text, packages, given.write
+    )
 
 
 if __name__ == "__main__":
