@@ -1,4 +1,4 @@
-"""The main job: inertia from an observed wobble, synthetic and real.
+"""Demonstration: inertia from an observed wobble, synthetic and real.
 
 Run it: `python demo.py [picture.png]`, or `make demo`.
 """
@@ -13,7 +13,7 @@ import symmetric_top
 
 
 def main() -> None:
-    """A body with a known answer first, then the Earth."""
+    """Fit a body whose inertia is known, then the Earth."""
     begin = time.perf_counter()
     jax.config.update("jax_enable_x64", True)
     symmetric_top.main()

@@ -1,10 +1,10 @@
 """What the Earth's wobble says about its inertia.
 
-The Earth does not spin about its axis of figure: the pole of rotation wanders on the
-ground in loops of about ten metres. A rigid Earth, left alone, would wobble once in 305
-days. Here the Earth is a rotating body that obeys Euler's equations, pushed by the
-seasons; the record of its pole since 1962 is fitted by gradients through the
-integration, and (I3 - I1)/I1 comes out.
+The Earth does not spin about its axis of figure. The pole of rotation moves on the
+ground in loops of about ten metres. A rigid Earth without torques would wobble once in
+305 days. Here the Earth is a rotating body that obeys Euler's equations under seasonal
+torques. Gradients through the integration fit the record of its pole since 1962, and
+give (I3 - I1)/I1.
 
 Run it: `python earth_wobble.py [picture.png]`.
 """
@@ -43,8 +43,8 @@ PICTURE = Path(__file__).parents[1] / "outputs" / "earth_wobble.png"
 class Wobble(eqx.Module):
     """Parameters of the Earth's motion, all of order one.
 
-    Pairs of reals stand for complex numbers: x toward Greenwich plus i times y toward
-        90 deg east.
+    A pair of real numbers is a complex number: x toward Greenwich plus i times y toward
+    90 deg east.
 
     Attributes:
         ellipticity: (I3 - I1)/I1, in units of that of a rigid Earth, 1/305 sidereal
@@ -53,7 +53,7 @@ class Wobble(eqx.Module):
             [SCALE].
         seasons: Torques at the four frequencies SEASONS [SCALE * ANNUAL * I1 *
             Omega^2].
-        drift: Wander of the axis of figure: Legendre coefficients, degree 0 to 3
+        drift: Drift of the axis of figure, as Legendre coefficients of degree 0 to 3
             [SCALE].
     """
 
@@ -64,7 +64,7 @@ class Wobble(eqx.Module):
 
 
 def ellipticity_of_period(days: Any) -> Any:
-    """(I3 - I1)/I1 of a body that wobbles once in so many (mean solar) days."""
+    """(I3 - I1)/I1 of a body whose wobble takes this many (mean solar) days."""
     return 1.0 / (days * TURNS_PER_DAY)
 
 
@@ -91,11 +91,11 @@ class Pole(eqx.Module):
 
 
 def rotation_pole(record: jr.datasets.EarthPole, days: int = DAYS_PER_SAMPLE) -> Pole:
-    """The pole of rotation out of the published pole.
+    """The pole of rotation, computed from the published pole.
 
-    The published pole p = x - i y is that of the celestial intermediate pole, y being
-    positive toward the west. The pole of rotation is m = p - (i / Omega) dp/dt (Gross,
-    J. Geophys. Res. 97, 6979 (1992)); for the wobble the two differ by 0.2 %.
+    The published pole p = x - i y is the celestial intermediate pole, and y is positive
+    toward the west. The pole of rotation is m = p - (i / Omega) dp/dt (Gross,
+    J. Geophys. Res. 97, 6979 (1992)). For the wobble the two differ by 0.2 %.
     """
     p = (record.x - 1j * record.y) / SCALE
     m = p - 1j / SPIN_PER_DAY * np.gradient(p, record.mjd)
@@ -113,7 +113,7 @@ def drift_basis(tau: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4"
 
 
 def seasonal_torque(seasons: Float[Array, "4 2"], tau: Any) -> Float[Array, " 3"]:
-    """Real + i imaginary, times exp(i season tau), in the equator's plane [I1 Omega^2]."""
+    """Seasonal torque, (real + i imaginary) exp(i season tau), equatorial [I1 Omega^2]."""
     real, imaginary = seasons.T * (SCALE * ANNUAL)
     of_cosine = jnp.stack([real, imaginary, jnp.zeros(4)])
     of_sine = jnp.stack([-imaginary, real, jnp.zeros(4)])
@@ -121,7 +121,7 @@ def seasonal_torque(seasons: Float[Array, "4 2"], tau: Any) -> Float[Array, " 3"
 
 
 class Ground(jr.torques.AbstractTorque):
-    """The seasons' torque, and how the axis of figure wanders under whoever watches the pole.
+    """The seasonal torque, and the drift of the axis of figure on the ground.
 
     Attributes:
         seasons: As in `Wobble`.
@@ -140,7 +140,7 @@ class Ground(jr.torques.AbstractTorque):
 
 
 def moments_of(ellipticity: Any) -> Float[Array, " 3"]:
-    """In units of I1."""
+    """The moments of inertia in units of I1."""
     return jnp.array([1.0, 1.0, 1.0]).at[2].add(ellipticity)
 
 
@@ -148,9 +148,9 @@ def motion(system: Any, state: jr.State, tau: Array, start: Any) -> jr.State:
     """Euler's equations, integrated from sample to sample.
 
     In units of Omega and of I1 the moments are (1, 1, 1 + e), the spin is (m1, m2, 1)
-    and tau is the angle the Earth has turned. One wobble takes 1/e turns of the Earth,
-    so a step can span many
-    turns: only omega is integrated, and fixed steps keep its derivatives right.
+    and tau is the angle that the Earth has turned. One wobble takes 1/e turns of the
+    Earth, so a step can span many turns. Only omega is integrated, and fixed steps keep
+    its derivatives right.
     """
     del start  # the first sample
 
@@ -174,7 +174,7 @@ def motion(system: Any, state: jr.State, tau: Array, start: Any) -> jr.State:
 
 
 def start_of(wobble: Wobble) -> jr.State:
-    """The spin at the start of the record; the attitude plays no role."""
+    """The spin at the beginning of the record. The attitude has no effect."""
     return jr.State(jnp.array([1.0, 0, 0, 0]), jnp.append(wobble.start * SCALE, 1.0))
 
 
@@ -188,7 +188,7 @@ def pole_of_body(
 
 
 def seen(tau: Any, state: jr.State, system: Any) -> Float[Array, " 3"]:
-    """What is observed: the pole from where the ground is [SCALE], and the spin [Omega]."""
+    """Observed values: the pole as seen from the ground [SCALE], and the spin [Omega]."""
     x = 2 * tau / system.torque.span - 1
     legendre = jnp.stack(
         [jnp.ones_like(x), x, 1.5 * x * x - 0.5, (2.5 * x * x - 1.5) * x]
@@ -198,7 +198,7 @@ def seen(tau: Any, state: jr.State, system: Any) -> Float[Array, " 3"]:
 
 
 class WobbleFit(eqx.Module):
-    """What a fit of the pole found.
+    """Result of a fit of the pole.
 
     Attributes:
         params: Best parameters.
@@ -217,14 +217,14 @@ class WobbleFit(eqx.Module):
 
 
 def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
-    """Fit the Earth's motion by gradients, blind but for the sign of the wobble.
+    """Fit the Earth's motion by gradients. Only the sign of the wobble is given.
 
-    The noise of the pole is that of its residuals; that of the spin, which is known by
-    clocks, is next to nothing, and one value of it is enough.
+    The noise of the pole is that of its residuals. The spin is known from clocks, with
+    almost no noise, and one value of it is enough.
 
     Args:
         pole: The observed pole.
-        period: Wobble period to start from [days]: that of a rigid Earth.
+        period: Initial value of the wobble period [days], by default of a rigid Earth.
 
     Returns:
         The fit.
@@ -249,7 +249,7 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
         free=lambda body: (body.torque.seasons, body.torque.drift),
         start=start_of(guess),
         motion=motion,
-        doublings=5,  # from two years on
+        doublings=5,  # begin with two years of the record
         absolute_sigma=False,
         throw=False,
     )
@@ -262,8 +262,7 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
         ground.seasons,
         ground.drift,
     )
-    # The number sought is log((1 - e) / (1 + e)); the spin and the attitude are not
-    # ours to know.
+    # The unknown is log((1 - e) / (1 + e)). The spin and the attitude are not reported.
     of_ellipticity = -2 * unit / (1 - ellipticity**2)
     columns = found.numbers.size + 2
     jacobian = found.diagnostics.jacobian[0]
@@ -271,8 +270,8 @@ def fit_wobble(pole: Pole, period: float = RIGID_PERIOD) -> WobbleFit:
     jacobian = jacobian.at[..., 0].multiply(of_ellipticity).reshape(-1, columns)
     rows = found.diagnostics.residuals[0].reshape(-1, 3)[:, :2].reshape(-1)
     steps = int(np.sum(np.isfinite(found.diagnostics.history)))
-    # The Earth's own kicks are left over: what is no white noise is a misfit, and ours
-    # to judge.
+    # The residuals contain the excitation of the wobble, which is not white, so the
+    # status is MISFIT. `kicked_covariance` accounts for it.
     status = jr.identify.Status
     converged = bool((found.status == status.OK) | (found.status == status.MISFIT))
     return WobbleFit(params, rows, jacobian, steps, converged)
@@ -284,11 +283,11 @@ def period_of_fit(fit: WobbleFit) -> float:
 
 
 def linear_misfit(pole: Pole) -> Callable[[Any], Any]:
-    """The same model without an integration: misfit against rate, the rest by linear least squares.
+    """Misfit of the same model as a function of the rate, by linear least squares.
 
-    A symmetric body's small wobble is an exponential, and its answer to seasonal
-    torques another four. At a given rate everything is linear; what does not depend on
-    the rate is projected out.
+    The small wobble of a symmetric body is an exponential, and its response to seasonal
+    torques four others. At a given rate everything else is linear. Parts that do not
+    depend on the rate are projected out.
 
     Returns:
         A function from (I3 - I1)/I1, of either sign, one or many, to the residuals'
@@ -305,7 +304,7 @@ def linear_misfit(pole: Pole) -> Callable[[Any], Any]:
     def misfit(ellipticity):
         wobble = np.exp(1j * np.multiply.outer(ellipticity, tau))
         norm = len(tau) - np.sum(np.abs(wobble.conj() @ others) ** 2, axis=-1)
-        norm = np.maximum(norm, 1e-9 * len(tau))  # what hardly turns is drift already
+        norm = np.maximum(norm, 1e-9 * len(tau))  # slow ones are drift
         explained = np.abs(wobble.conj() @ rest) ** 2 / norm
         return np.sqrt((np.vdot(rest, rest).real - explained) / len(tau)) * SCALE / MAS
 
@@ -313,9 +312,9 @@ def linear_misfit(pole: Pole) -> Callable[[Any], Any]:
 
 
 def linear_fit(pole: Pole) -> float:
-    """Wobble period [days] by linear least squares, the rate scanned over all beyond 200 days.
+    """Wobble period [days] by linear least squares, scanned above 200 days.
 
-    Negative for a wobble against the spin, that is, of a prolate body.
+    The period is negative for a wobble against the spin, which a prolate body has.
     """
     misfit = linear_misfit(pole)
     step = 0.1 * 2 * math.pi / pole.tau[-1]
@@ -334,13 +333,13 @@ def linear_fit(pole: Pole) -> float:
 def kick_level(
     pole: Pole, residual: Complex[np.ndarray, " times"], period: float
 ) -> float:
-    """How hard the wobble is kicked: power density of the excitation near the wobble's frequency.
+    """Power density of the excitation near the frequency of the wobble.
 
-    Air and water shake the Earth all the time, and it keeps wobbling after each kick:
-    what the fit leaves over is the sum of all kicks, each turning on with the wobble.
-    Undoing the turning from sample to sample leaves the kicks themselves; their
-    spectrum is read from -0.3 to 0.1 cycles a year off the wobble, where the kicks
-    outweigh everything else and the annual line is left out.
+    Air and water excite the Earth all the time, and it keeps wobbling after each kick.
+    The residuals of the fit are the sum of all kicks, each rotating with the wobble.
+    Undoing this rotation from sample to sample leaves the kicks themselves. Their
+    spectrum is evaluated from -0.3 to 0.1 cycles a year off the wobble. The kicks
+    dominate there, and the annual line is outside.
 
     Returns:
         Variance of the (complex) kicks in a sidereal radian [SCALE^2].
@@ -355,7 +354,7 @@ def kick_level(
 
 
 def kicked_covariance(pole: Pole, fit: WobbleFit) -> Float[Array, "params params"]:
-    """Covariance of the parameters of `fit` when random kicks re-excite the wobble all the time."""
+    """Covariance of the parameters of `fit` if random kicks excite the wobble."""
     x, y = np.asarray(fit.residuals).reshape(-1, 2).T
     period = period_of_fit(fit)
     variance = kick_level(pole, x + 1j * y, period) * (pole.tau[1] - pole.tau[0])
@@ -365,7 +364,7 @@ def kicked_covariance(pole: Pole, fit: WobbleFit) -> Float[Array, "params params
 
 @jax.jit
 def _kicked_covariance(jacobian, turning, variance):
-    def colour(rows):  # each kick is seen, turned, in every later row
+    def colour(rows):  # each kick appears, rotated, in every later row
         rows = jax.lax.complex(*rows.reshape(-1, 2).T) / turning
         kicks = jnp.cumsum(rows[::-1])[::-1] * turning
         return jnp.concatenate([kicks.real, kicks.imag]) * jnp.sqrt(variance / 2)
@@ -374,15 +373,15 @@ def _kicked_covariance(jacobian, turning, variance):
 
 
 class Result(eqx.Module):
-    """What the record says.
+    """Result of the study.
 
     Attributes:
         pole: The observed pole.
         modelled: The fitted pole [SCALE].
         period: Wobble period [days].
-        period_error: Its standard error, for a wobble that is kicked all the time
+        period_error: Its standard error, for a wobble that is excited all the time
             [days].
-        bootstrap_error: What a bootstrap over blocks of four years makes of it [days].
+        bootstrap_error: Its error by a bootstrap over blocks of four years [days].
         ellipticity: Effective (I3 - I1)/I1.
         ellipticity_error: Its standard error.
         rms: Root mean square of the residuals [mas].
@@ -390,7 +389,7 @@ class Result(eqx.Module):
         linear_period: Period by linear least squares [days].
         windows: Period by linear least squares in parts of the record: (from, to,
             days).
-        drift: Fitted wander of the axis of figure, Legendre coefficients of x and y
+        drift: Fitted drift of the axis of figure, Legendre coefficients of x and y
             [SCALE].
         steps: Evaluations of the integration and its derivatives.
     """
@@ -411,7 +410,7 @@ class Result(eqx.Module):
 
 
 def analyse(pole: Pole) -> Result:
-    """Fit the pole and say how well the fit is known."""
+    """Fit the pole and estimate the errors of the fit."""
     fit = fit_wobble(pole)
     if not bool(fit.converged):
         raise RuntimeError("The fit of the Earth's wobble did not converge.")
@@ -545,7 +544,7 @@ def picture(result: Result) -> Any:
         color=ink,
     )
 
-    # The coil: time runs to the right, the pole's plane is seen at a slant.
+    # The coil: time runs to the right, and the plane of the pole is tilted.
     middle = (years[0] + years[-1]) / 2
     for row, (begin, end) in enumerate(((years[0], middle), (middle, years[-1]))):
         axes = figure.add_subplot(grid[row, :])

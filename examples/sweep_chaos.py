@@ -1,13 +1,14 @@
-"""Where is a heavy top chaotic that is let go at a tilt, with a spin?
+"""Where is a heavy top chaotic that is released at a tilt, with a spin?
 
-The top has three different moments and a centre of mass off its axes, so that nothing
-but energy and one momentum is kept. MEGNO tells order from chaos after 200 s, and only
-tiles of the map that hold a coast between the two are computed. They go to a store: a
-run that was stopped, by whatever, goes on where it ended.
+The top has three different moments and a centre of mass off its axes. Only energy and
+the angular momentum about the vertical are conserved. MEGNO, the mean exponential
+growth of nearby orbits, separates regular motion from chaos after 200 s. Only tiles of
+the map that contain a boundary between the two are computed. They are stored, so a run
+that was stopped resumes.
 
 Run it: `python sweep_chaos.py [--size 1000] [--store outputs/chaos.zarr]`. 1000 x 1000
-points, 16 % of them computed, took 95 s on two cores of an AMD EPYC, half of which
-other work had.
+points, 16 % of them computed, took 95 s on two cores of an AMD EPYC, which other work
+shared.
 """
 
 import argparse
@@ -44,12 +45,12 @@ def chaos(tilt: Array, spin: Array) -> dict[str, Any]:
 
 
 def is_chaotic(values: dict[str, Any]) -> Array:
-    """The class of a point; what is undecided after 200 s counts as chaos."""
+    """The class of a point. An undecided motion counts as chaos after 200 s."""
     return values["order"] != ORDER.regular
 
 
 def draw(found: jr.SweepResult) -> None:
-    """Order and chaos at every point, and MEGNO in the tiles that were computed."""
+    """Regular motion and chaos at every point, and MEGNO in the computed tiles."""
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(12.0, 5.2), constrained_layout=True, sharey=True
     )
@@ -78,7 +79,7 @@ def draw(found: jr.SweepResult) -> None:
 
 
 def main() -> None:
-    """Sweep, or go on, and draw."""
+    """Start or resume the sweep, and draw it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=1000, help="points along each side")
     parser.add_argument("--store", type=Path, default=OUTPUTS / "chaos.zarr")

@@ -1,10 +1,10 @@
-"""Do the error bars of a fit cover the truth as often as they say?
+"""Do the error bars of a fit contain the truth as often as they state?
 
-A body with three different moments tumbles freely for three turns, and a gyro reads its
-rates 60 times with a noise of a twelfth of them. Each trial draws the noise anew, fits
-the two ratios of moments and keeps the estimates, their stated errors and how the fit
-ended. Workers of a dask cluster share the trials, a hundred at a time; the seed alone
-decides the noise of a trial, so that it comes out the same anywhere.
+A body with three different moments tumbles freely for three turns. A gyroscope measures
+its rates 60 times, with a noise of a twelfth of the rates. Each trial has new noise and
+a fit of the two ratios of moments. The estimates, their stated errors and the status
+are kept. Workers of a dask cluster share the trials, a hundred at a time. The seed
+alone determines the noise of a trial, so the result is the same anywhere.
 
 Run it: `python sweep_coverage.py [--size 4000]`.
 """
@@ -31,7 +31,7 @@ INTERVALS = {"68.3 %": (1.0, 0.6827), "95 %": (1.96, 0.95)}
 
 
 def trials(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ratios of moments, their errors, and whether the fit is OK, from noisy records."""
+    """Ratios of moments, their errors, and whether the fit is OK."""
     jax.config.update("jax_enable_x64", True)  # in each worker
     state0 = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array(OMEGA))
     rates = np.asarray(jr.free_rotation(np.array(MOMENTS), state0, TIMES).omega)
@@ -48,7 +48,7 @@ def trials(seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def draw(normalised: np.ndarray) -> None:
-    """Errors over stated errors, beside the unit normal."""
+    """Actual errors over stated errors, beside the unit normal distribution."""
     figure, panels = plt.subplots(
         1, 2, figsize=(9.0, 3.8), constrained_layout=True, sharey=True
     )
@@ -71,7 +71,7 @@ def draw(normalised: np.ndarray) -> None:
 
 
 def main() -> None:
-    """Start a cluster of two processes, sweep over the seeds, count."""
+    """Start a cluster of two processes, sweep over the seeds, and count."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=4000, help="number of trials")
     seeds = np.arange(parser.parse_args().size)

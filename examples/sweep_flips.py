@@ -1,14 +1,14 @@
-"""How long does a thrown box stay as it was thrown, whatever its shape?
+"""How many turns does a thrown box make between two flips?
 
-A box thrown with a spin about its middle axis flips over, turns on, and flips back. The
-map shows how often it turns between two flips, for every ratio of its sides, if the
-spin misses the axis by one degree, half way between the other two axes. Towards two
-edges of the map two moments become equal, and no box there ever flips. Nor does one on
-the diagonal: if the middle side is the geometric mean of the others, this spin lies on
-the separatrix itself.
+A box that is thrown with a spin about its intermediate axis flips over and later flips
+back. The map shows the number of turns between two flips, for every ratio of its sides.
+The spin misses the axis by one degree, half way between the other two axes. At two
+edges of the map two moments become equal, and no box there ever flips. A box on the
+diagonal does not flip either. Its middle side is the geometric mean of the others, and
+this spin lies on the separatrix itself.
 
 Run it: `python sweep_flips.py [--size 2000]`. 4,000,000 boxes took 12 s, and the
-picture as much, on two cores of an AMD EPYC, half of which other work had.
+picture as much, on two cores of an AMD EPYC, which other work shared.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from matplotlib.colors import LogNorm
 import jrigid as jr
 
 PICTURE = Path(__file__).parents[1] / "outputs" / "sweep_flips.png"
-OFFSET = math.radians(1.0)  # from the middle axis, half way between the other two
+OFFSET = math.radians(1.0)  # from the intermediate axis, half way between the other two
 THINGS = {  # length, width, thickness [mm]
     "bank card": (85.6, 54.0, 0.76),
     "book": (240.0, 170.0, 30.0),
@@ -37,7 +37,7 @@ THINGS = {  # length, width, thickness [mm]
 
 
 def turns_between_flips(width: Array, thickness: Array) -> Array:
-    """Of a box of length 1 m, and of a thickness that is told as a part of its width."""
+    """Turns between flips of a box of length 1 m; `thickness` is over its width."""
     sides = jnp.stack([jnp.ones_like(width), width, thickness * width])
     inertia = jr.solids.box(1.0, sides).inertia
     aside = math.sin(OFFSET) / math.sqrt(2.0)
@@ -48,7 +48,7 @@ def turns_between_flips(width: Array, thickness: Array) -> Array:
 
 
 def draw(found: jr.SweepResult) -> None:
-    """The map, with lines of equal number and some things from a drawer."""
+    """The map, with contour lines and some everyday objects."""
     figure, axes = plt.subplots(figsize=(7.2, 6.0), constrained_layout=True)
     width, thickness = found.axes.values()
     image = axes.imshow(
@@ -58,7 +58,7 @@ def draw(found: jr.SweepResult) -> None:
         cmap="viridis",
         norm=LogNorm(2, 30),
     )
-    ridge = np.abs(thickness[:, None] - width) < 0.012  # which all lines run along
+    ridge = np.abs(thickness[:, None] - width) < 0.012  # all contour lines run along it
     smooth = np.where(ridge, np.nan, found.values.T)
     lines = axes.contour(
         width, thickness, smooth, [2.5, 3, 4, 6, 10], colors="white", linewidths=0.7
@@ -89,7 +89,7 @@ def draw(found: jr.SweepResult) -> None:
 
 
 def main() -> None:
-    """Sweep, say what came out, draw."""
+    """Sweep, print the result, and draw it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=2000, help="points along each side")
     size = parser.parse_args().size

@@ -1,14 +1,15 @@
 """Which rotations of Hyperion are chaotic?
 
-Planar rotation of a moon on a fixed ellipse: the angle of its longest axis from Saturn
-and its rate, both at a pericentre. Numbers are those of J. Wisdom, S. Peale, F.
-Mignard, Icarus 58 (1984) 137: e = 0.1, omega_0 = sqrt(3 (B - A) / C) = 0.89 mean
-motions. MEGNO follows a neighbour in the plane too, so what is shown is planar chaos;
-out of the plane islands may still be unstable. Angles from 0 to 90 degrees are
-computed, the others are their mirror image with time run backwards.
+A moon rotates in the plane of its orbit, a fixed ellipse. The map is over the angle of
+its longest axis from Saturn and its rate, both at a pericentre. The numbers are from J.
+Wisdom, S. Peale, F. Mignard, Icarus 58 (1984) 137: e = 0.1 and omega_0 =
+sqrt(3 (B - A) / C) = 0.89 mean motions. MEGNO, the mean exponential growth of nearby
+orbits, uses a neighbour in the plane. Therefore the map shows planar chaos, and islands
+may still be unstable out of the plane. Angles from 0 to 90 degrees are computed. The
+others are their mirror image with time reversed.
 
 Run it: `python sweep_hyperion.py [--size 300]`. 45,000 motions of 60 orbits took four
-and a half minutes on two cores of an AMD EPYC, half of which other work had.
+and a half minutes on two cores of an AMD EPYC, which other work shared.
 """
 
 import argparse
@@ -33,20 +34,20 @@ RESONANCES = [Fraction(x) for x in ("1/2", "1", "3/2", "2", "9/4", "5/2")]
 
 
 def hyperion() -> jr.RigidBody:
-    """Moments of C = 1; in the plane only (B - A)/C matters. Time is in mean motions."""
+    """The body, with C = 1. Only (B - A)/C matters. The mean motion is 1."""
     moments = jnp.array([0.7, 0.7 + OMEGA_0**2 / 3, 1.0])
     orbit = jr.torques.KeplerOrbit(1.0, 1.0, ECCENTRICITY)
     return jr.RigidBody(moments, jr.torques.GravityGradient(1.0, orbit))
 
 
 def at_pericentre(angle: Array, rate: Array) -> jr.State:
-    """Turning about the normal of the orbit."""
+    """State of a rotation about the normal of the orbit."""
     normal = jnp.array([0.0, 0.0, 1.0])
     return jr.State(jr.rotation.exp(angle * normal), rate * normal)
 
 
 def chaos(angle: Array, rate: Array) -> Array:
-    """MEGNO of a neighbour in the plane: a turn and a change of rate about the normal."""
+    """MEGNO with a deviation in the plane, of angle and rate about the normal."""
     return jr.stability.megno(
         hyperion(),
         at_pericentre(angle, rate),
@@ -66,7 +67,7 @@ def mean_rate(angle: Array, rate: Array) -> Array:
 
 
 def islands() -> list[tuple[Fraction, float, float]]:
-    """Resonance, angle and rate of the middle of each island that lies at an angle of 0 or 90."""
+    """Resonance, angle and rate at the centre of each island at an angle of 0 or 90."""
     axes = {"angle": np.array([0.0, np.pi / 2]), "rate": np.linspace(0.01, 3.0, 240)}
     calm = jr.sweep(chaos, axes, progress=False).values < 3
     means = jr.sweep(mean_rate, axes, progress=False).values
@@ -80,7 +81,7 @@ def islands() -> list[tuple[Fraction, float, float]]:
 
 
 def draw(found: jr.SweepResult, centres: list) -> None:
-    """Half of the map and its mirror image, with the islands named by their spin rate."""
+    """Half of the map and its mirror image. The spin rate names each island."""
     figure, axes = plt.subplots(figsize=(7.2, 6.4), constrained_layout=True)
     half = np.maximum(found.values, 1)
     both = np.roll(np.concatenate([half, half[::-1]]), 2 * len(half) // 3, axis=0)
@@ -95,7 +96,7 @@ def draw(found: jr.SweepResult, centres: list) -> None:
     for resonance, angle, rate in centres:
         colour, aside = (
             ("black", 8) if resonance == RESONANCES[0] else ("white", 0)
-        )  # a small one
+        )  # a small island
         axes.text(
             angle + aside, rate, str(resonance), color=colour, ha="center", va="center"
         )
@@ -114,7 +115,7 @@ def draw(found: jr.SweepResult, centres: list) -> None:
 
 
 def main() -> None:
-    """Sweep, say what came out, draw."""
+    """Sweep, print the result, and draw it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--size", type=int, default=300, help="points along a side, 6 n"

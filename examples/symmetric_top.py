@@ -1,9 +1,8 @@
-"""The inertia of a symmetric top from its body rates: a synthetic check with a known answer.
+"""The inertia of a symmetric top from its rates, a synthetic check with a known answer.
 
-A body with I1 = I2 tumbles freely and a gyro reads its rates with 2 % noise. From
-nothing but the readings, and starting from a sphere, I1/I3 comes back with an error bar
-that can be trusted: over many records, (estimate - truth) / error is a unit normal
-variable.
+A body with I1 = I2 tumbles freely, and a gyroscope measures its rates with 2 % noise.
+The fit uses only the readings and starts from a sphere. It estimates I1/I3 with a valid
+error. Over many records, (estimate - truth) / error is a unit normal variable.
 
 Run it: `python symmetric_top.py`.
 """
@@ -35,7 +34,7 @@ def read_gyro(key: PRNGKeyArray) -> Float[Array, "times 3"]:
 
 
 def recover(readings: Float[Array, "times 3"]) -> tuple[Array, Array, Array]:
-    """I1/I3 from body rates alone, blind but for the axis of symmetry; the noise is not told.
+    """I1/I3 from rates alone. Only the axis of symmetry is given, and the noise is not.
 
     Returns:
         Estimate, its standard error, and whether the fit converged.
@@ -57,7 +56,7 @@ def recover(readings: Float[Array, "times 3"]) -> tuple[Array, Array, Array]:
 
 
 def report(ratio: float, error: float) -> str:
-    """One line."""
+    """The result in one line."""
     off = (ratio - TRUE_RATIO) / error
     return (
         f"A synthetic top, 2 % noise, started from a sphere: I1/I3 = {ratio:.5f} +- {error:.5f}, "
