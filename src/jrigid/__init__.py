@@ -10,6 +10,7 @@ from jrigid import identify as identify
 from jrigid import io as io
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
+from jrigid import photometry as photometry
 from jrigid import plot as plot
 from jrigid import records as records
 from jrigid import rotation as rotation
