@@ -35,7 +35,7 @@ class Ellipsoid(Readable):
             rows: Between pole and pole; there are 2 `rows`^2 triangles.
         """
         vertices, faces = _sphere(whole_number("rows", rows, least=4))
-        corners = jnp.asarray(vertices, self.semi_axes.dtype) * self.semi_axes
+        corners = jnp.asarray(vertices, self.semi_axes.dtype) * self.semi_axes[None]
         return facets_from_mesh(corners, faces)
 
     def brightness(

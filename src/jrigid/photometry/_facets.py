@@ -121,7 +121,7 @@ def facets_from_mesh(
         f"{faces.shape} and type {faces.dtype}.",
     )
     demand(
-        bool(faces.size) and faces.min() >= 0 and faces.max() < len(vertices),
+        bool(faces.size and faces.min() >= 0 and faces.max() < len(vertices)),
         f"Argument `faces` must hold indices from 0 to {len(vertices) - 1}, but it does "
         "not.",
     )

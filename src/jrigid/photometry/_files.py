@@ -89,7 +89,7 @@ class _Lines:
 def read_light_curves(
     path: str | pathlib.Path, epoch: float | None = None
 ) -> list[LightCurve]:
-    """Read a file of light curves in the format of DAMIT and convexinv.
+    r"""Read a file of light curves in the format of DAMIT and convexinv.
 
     The first line is the number of curves. Each curve begins with its number of points
     and a 1 for absolute or a 0 for relative brightness. Each point is a Julian date,
@@ -107,7 +107,7 @@ def read_light_curves(
         ValueError: A line that does not hold what it should; the text names the line.
 
     >>> import pathlib, tempfile, jrigid as jr
-    >>> text = "1\\n2 0\\n2450000.5 1.0 1 0 0 1 0 0\\n2450000.6 1.1 1 0 0 1 0 0\\n"
+    >>> text = "1\n2 0\n2450000.5 1.0 1 0 0 1 0 0\n2450000.6 1.1 1 0 0 1 0 0\n"
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "curves.txt"
     >>> _ = path.write_text(text)
     >>> print(jr.photometry.read_light_curves(path)[0].ts)
@@ -169,7 +169,7 @@ def _curve(rows: list[list[Decimal]], epoch: Decimal, is_relative: bool) -> Ligh
 
 
 def read_shape(path: str | pathlib.Path, *, hull: bool = False) -> Facets:
-    """Read a shape file of DAMIT: vertices and triangles that count from 1.
+    r"""Read a shape file of DAMIT: vertices and triangles that count from 1.
 
     Args:
         path: The file: numbers of vertices and triangles, then the vertices, then the
@@ -184,7 +184,7 @@ def read_shape(path: str | pathlib.Path, *, hull: bool = False) -> Facets:
             convex.
 
     >>> import pathlib, tempfile, jrigid as jr
-    >>> text = "4 4\\n0 0 0\\n1 0 0\\n0 1 0\\n0 0 1\\n1 3 2\\n1 2 4\\n1 4 3\\n2 3 4\\n"
+    >>> text = "4 4\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 3 2\n1 2 4\n1 4 3\n2 3 4\n"
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "shape.txt"
     >>> _ = path.write_text(text)
     >>> print(jr.photometry.read_shape(path).areas.round(3))

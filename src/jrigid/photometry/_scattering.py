@@ -1,6 +1,7 @@
 """Scattering laws: how much light a small piece of surface sends to the observer."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jrigid._checks import array_of_shape
 from jrigid._types import Readable, Scalar
 
 
-def _number(name: str, default: float) -> Float[Array, ""]:
+def _number(name: str, default: float) -> Any:  # to a type checker, its value
     """A field that holds one number."""
     return eqx.field(
         default=default, converter=lambda value: array_of_shape(name, value, ())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jrigid._checks import (
     INERTIA,
@@ -96,7 +96,9 @@ def tumbling(inertia: InertiaLike, omega: VectorLike) -> Tumbling:
     )
 
 
-def _tilts_and_energy(inertia: Array, omega: Vector) -> tuple[Vector, Scalar]:
+def _tilts_and_energy(
+    inertia: Array, omega: Vector
+) -> tuple[Float[Array, "2"], Scalar]:
     """Least and largest tilt, and E/E0, from the direction of the angular momentum.
 
     With n a unit vector along it, 2 E / L^2 is the sum of n_i^2 / I_i. Excesses over the
@@ -225,7 +227,7 @@ def _root(
     high = jnp.full_like(like, _HIGHEST)
     found = (function(low) <= 0) & (function(high) >= 0)
 
-    def halve(_: int, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+    def halve(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends
         middle = (low + high) / 2
         below = function(middle) < 0
