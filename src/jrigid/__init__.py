@@ -10,6 +10,7 @@ from jrigid import identify as identify
 from jrigid import io as io
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
+from jrigid import photometry as photometry
 from jrigid import plot as plot
 from jrigid import records as records
 from jrigid import rotation as rotation
@@ -52,18 +53,22 @@ from jrigid.top import top_motion as top_motion
 __version__ = _version("jrigid")
 
 _list_public_names(
-    *(
-        datasets,
-        dynamics,
-        elliptic,
-        free,
-        identify,
-        io,
-        lagrangian,
-        mass,
-        plot,
-        records,
-        rotation,
-    ),
-    *(solids, solvers, stability, systems, top, torques),
+    datasets,
+    dynamics,
+    elliptic,
+    free,
+    identify,
+    io,
+    lagrangian,
+    mass,
+    photometry,
+    plot,
+    records,
+    rotation,
+    solids,
+    solvers,
+    stability,
+    systems,
+    top,
+    torques,
 )

@@ -1,0 +1,114 @@
+"""A triaxial ellipsoid: its facets, and its brightness in closed form."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import array_of_shape, demand, whole_number
+from jrigid._numerics import safe_norm
+from jrigid._types import Readable, Scalar, Vector
+from jrigid.photometry._facets import Facets, facets_from_mesh
+from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
+
+
+class Ellipsoid(Readable):
+    """A triaxial ellipsoid with its axes along the body axes.
+
+    Attributes:
+        semi_axes: Half lengths along the body axes [m], positive.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> cigar = jr.photometry.Ellipsoid(jnp.array([3.0, 1.0, 1.0]))
+    >>> print(cigar.facets(8).areas.shape)
+    (128,)
+    """
+
+    semi_axes: Float[Array, "3"] = eqx.field(
+        converter=lambda value: array_of_shape("semi_axes", value, (3,))
+    )
+
+    def facets(self, rows: int = 64) -> Facets:
+        """Triangles with their corners on the ellipsoid.
+
+        Args:
+            rows: Between pole and pole; there are 2 `rows`^2 triangles.
+        """
+        vertices, faces = _sphere(whole_number("rows", rows, least=4))
+        corners = jnp.asarray(vertices, self.semi_axes.dtype) * self.semi_axes[None]
+        return facets_from_mesh(corners, faces)
+
+    def brightness(
+        self, scattering: AbstractScattering, to_sun: Vector, to_observer: Vector
+    ) -> Scalar:
+        """Brightness by Lommel-Seeliger's law, without the phase function.
+
+        Args:
+            scattering: The law, which must be `LommelSeeliger`.
+            to_sun: Unit vector to the Sun, body axes.
+            to_observer: Unit vector to the observer, body axes.
+
+        Source: K. Muinonen and K. Lumme, Astron. Astrophys. 584 (2015) A23, eq. 13;
+        derived again from the integral over the unit sphere.
+        """
+        demand(
+            isinstance(scattering, LommelSeeliger),
+            "Argument `scattering` must be `LommelSeeliger()` for an ellipsoid, whose "
+            f"brightness is known by that law alone, but it is {scattering!r}: take "
+            "`shape.facets()`.",
+        )
+        return _brightness(self.semi_axes, to_sun, to_observer)
+
+
+def _sphere(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners on the unit sphere and triangles: `rows` of them from pole to pole."""
+    columns = 2 * rows
+    polar = np.pi * np.arange(1, rows) / rows
+    around = 2 * np.pi * np.arange(columns) / columns
+    polar, around = np.meshgrid(polar, around, indexing="ij")
+    rings = [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around)]
+    rings = np.stack([*rings, np.cos(polar)], axis=-1).reshape(-1, 3)
+    vertices = np.concatenate([rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    north = len(rings)
+    index = np.arange(len(rings)).reshape(rows - 1, columns)
+    right = np.roll(index, -1, axis=1)
+    upper, lower = index[:-1], index[1:]
+    upper_right, lower_right = right[:-1], right[1:]
+    faces = [
+        np.stack([np.full(columns, north), index[0], right[0]], axis=-1),
+        np.stack([upper, lower, upper_right], axis=-1).reshape(-1, 3),
+        np.stack([upper_right, lower, lower_right], axis=-1).reshape(-1, 3),
+        np.stack([np.full(columns, north + 1), right[-1], index[-1]], axis=-1),
+    ]
+    return vertices, np.concatenate(faces)
+
+
+def _brightness(semi_axes: Vector, to_sun: Vector, to_observer: Vector) -> Scalar:
+    """Integral of mu0 mu / (mu0 + mu) over the lit and visible surface.
+
+    A point of the ellipsoid is A n, with n on the unit sphere and A the diagonal matrix
+    of the semi-axes; an element of the surface with its normal is |A| A^-1 n dn. With
+    unit vectors u0 and u along A^-1 e0 and A^-1 e, of lengths s0 and s, the integrand is
+    |A| s0 s (u0 n) (u n) / (s0 u0 n + s u n): a lune of the sphere between two great
+    circles, over which the integral is elementary.
+    """
+    sun = to_sun / semi_axes
+    observer = to_observer / semi_axes
+    s0 = safe_norm(sun)
+    s = safe_norm(observer)
+    cosine = jnp.sum(sun * observer) / (s0 * s)
+    sum_ = safe_norm(sun + observer)
+    # Cosines of the angles from s0 u0 + s u to u0 and to u.
+    from_sun = (s0 + s * cosine) / sum_
+    from_observer = (s + s0 * cosine) / sum_
+    # The square of the sine of the angle between u0 and u, without a difference.
+    sine = jnp.cross(sun, observer) / (s0 * s)
+    square = jnp.sum(sine * sine)
+    # Product of the sines of the two angles.
+    sines = square * s0 * s / sum_**2
+    lit = square > 0
+    cotangents = (1 + from_sun) * (1 + from_observer) / jnp.where(lit, sines, 1.0)
+    bent = jnp.where(lit, sines * jnp.log(cotangents), 0.0)
+    lune = from_sun + from_observer - bent
+    volume = jnp.prod(semi_axes)
+    return jnp.pi / 2 * volume * s0 * s / sum_ * lune

@@ -1,0 +1,348 @@
+"""Light curves: closed forms, published numbers, another program, another integrator."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import jrigid as jr
+from jrigid import photometry as ph
+
+HOUR, DAY, AU = 3600.0, 86400.0, 149597870700.0
+SEMI_AXES = np.array([3.0, 2.0, 1.2])
+LAWS = {
+    "lambert": ph.Lambert(),
+    "lommel_seeliger": ph.LommelSeeliger(),
+    "geometric": ph.Geometric(),
+    "mixture": ph.Mixture(0.2, amplitude=0.5, width=0.1, slope=-0.3),
+}
+
+
+def egg():
+    """Corners of a convex body without symmetry, as they are written to a file."""
+    rows, around = np.arange(1, 12) * np.pi / 12, np.arange(16) * np.pi / 8
+    theta, phi = np.meshgrid(rows, around, indexing="ij")
+    n = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    n = np.stack(n, axis=-1).reshape(-1, 3)
+    n = np.concatenate([n, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    corners = n * [34.0, 26.0, 21.0]
+    corners[:, 0] += 5.0 * n[:, 0] ** 2 + 2.0 * n[:, 2] ** 2
+    return corners.round(3)
+
+
+# Brightness of the egg by `lcgenerator` of DAMIT's light-curve inversion package 0.2.1
+# (CC-BY-4.0, M. Kaasalainen and J. Durech), at epochs of its test asteroid: pole 210.3,
+# -32.7 degrees, period 5.76198 h, angle 37 degrees at JD 2438882.2, phase function .5,
+# .1, -.5, Lambert coefficient .1.
+POINTS = """1
+9 1
+2438882.319985  555.5720  1.466729 1.310028  .08236771  .7141551  .6395958  .08231011
+2441543.477618  387.0470 -1.731287  .8765158 -.1087737 -.9367699  .2481637 -.1088044
+2445167.689432  1.007140 -1.963816  .4163673 -.1207416 -1.541748 -.5082327 -.1207748
+2445829.672690  1.126260  2.134992 -1.044011  .1342643  1.471909 -1.805445  .1342327
+2445213.698375  .9700990 -2.090452 -.1383338 -.1256040 -1.150336 -.5052291 -.1256139
+2446818.447285  .9786510  .7257654 -2.465920  .05632194  .1960257 -1.636432  .05634442
+2446833.746687  1.013830  .8666943 -2.415556  .06457978  .1326092 -1.756971  .06459386
+2447852.709786  1.004540 -.8141091 -2.371461 -.03712506 -.3205179 -1.515999 -.03710149
+2438882.233275  559.9660  1.467574  1.309298  .08242228  .7140329  .6399864  .08236481
+"""
+BY_LCGENERATOR = [
+    *(1887.177629, 1241.605799, 868.297887, 909.094352, 1163.724944),
+    *(1175.913738, 963.065657, 1304.919451, 1900.090410),
+]
+
+
+def test_brightness_is_that_of_damits_generator(tmp_path):
+    (tmp_path / "curves").write_text(POINTS)
+    (curve,) = ph.read_light_curves(tmp_path / "curves", epoch=2438882.2)
+    facets = ph.facets_from_mesh(egg(), np.zeros((1, 3), int), hull=True)
+    pole = np.deg2rad([210.3, -32.7])
+    state = ph.state_of_pole(*pole, 5.76198 * HOUR, np.deg2rad(37.0))
+    law = ph.Mixture(0.1, amplitude=0.5, width=0.1, slope=-0.5)
+    body = np.array([1.0, 1.5, 2.0])  # any: it rotates about a principal axis
+    found = ph.light_curve(
+        body,
+        state,
+        curve.ts,
+        curve.to_sun,
+        curve.to_observer,
+        facets,
+        law,
+        light_time=False,
+    )
+    np.testing.assert_allclose(found, BY_LCGENERATOR, rtol=2e-8)
+
+
+def directions(rng, count):
+    return rng.normal(size=(2, count, 3))
+
+
+def test_facets_converge_to_the_ellipsoid_in_closed_form(rng):
+    shape = ph.Ellipsoid(SEMI_AXES)
+    brightness = jax.jit(jax.vmap(ph.brightness, in_axes=(None, 0, 0)))
+    pairs = directions(rng, 6)
+    exact = brightness(shape, *pairs)
+    errors = [
+        np.max(np.abs(brightness(shape.facets(rows), *pairs) / exact - 1))
+        for rows in (25, 50, 100)
+    ]
+    assert errors[2] < 2e-3  # of 2 * 10^4 facets
+    assert errors[0] / errors[1] > 3  # quadratic in the size of a facet
+    assert errors[1] / errors[2] > 3
+
+
+def test_a_sphere_is_as_bright_from_all_sides_and_by_its_phase_curve(rng):
+    ball = ph.Ellipsoid(np.full(3, 2.0))
+    alpha = np.array([0.0, 1e-9, 0.3, 1.0, 2.5])
+    turns = Rotation.random(5, random_state=0)
+    sun = turns.apply([1.0, 0.0, 0.0])
+    seen = np.stack([np.cos(alpha), np.sin(alpha), 0 * alpha], axis=-1)
+    observer = np.array([r.apply(x) for r, x in zip(turns, seen, strict=True)])
+    found = jax.vmap(ph.brightness, in_axes=(None, 0, 0))(ball, sun, observer)
+    # H. von Seeliger's phase curve of a sphere by this law.
+    half = alpha / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bent = np.sin(half) * np.tan(half) * np.log(np.tan(alpha / 4))
+    expected = 4 * np.pi / 2 * (1 + np.where(alpha > 0, bent, 0.0))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["lommel_seeliger", "lambert", "mixture"])
+def test_gradients_are_those_of_central_differences(law, rng):
+    shape = ph.Ellipsoid(SEMI_AXES).facets(8)
+    sun, observer = directions(rng, 1)[:, 0]
+    x = jnp.concatenate([jnp.asarray(sun), jnp.asarray(observer)])
+
+    @jax.jit
+    def brightness(x):
+        return ph.brightness(shape, x[:3], x[3:], LAWS[law])
+
+    h = 6e-6
+    step = h * np.eye(6)
+    difference = jax.vmap(lambda e: brightness(x + e) - brightness(x - e))(step) / (
+        2 * h
+    )
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(brightness)(x), difference, atol=1e-8)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_facets_edge_on_and_in_the_dark_have_finite_derivatives(law):
+    normals = np.concatenate([np.eye(3), -np.eye(3)])  # a cube, seen from the front
+    cube = ph.Facets(np.ones(6), normals)
+    x, y, _ = jnp.eye(3)
+
+    def brightness(sun, observer):
+        return ph.brightness(cube, sun, observer, LAWS[law])
+
+    for sun, observer in ((x, x), (x, y), (x, -x), (x + y, x)):
+        for derivative in (jax.jacfwd, jax.jacrev):
+            for slope in derivative(brightness, argnums=(0, 1))(sun, observer):
+                assert np.all(np.isfinite(slope))
+
+
+def test_the_ellipsoid_has_derivatives_at_opposition():
+    shape = ph.Ellipsoid(SEMI_AXES)
+    x = jnp.array([0.3, -0.4, 0.8])
+    same = jax.grad(lambda y: ph.brightness(shape, x, y))(x)
+    near = jax.grad(lambda y: ph.brightness(shape, x, y))(x * (1 + 1e-9))
+    assert np.all(np.isfinite(same))
+    np.testing.assert_allclose(same, near, atol=1e-6)
+
+
+def tumbler():
+    """Moments, a state, epochs, directions and facets of a body that tumbles."""
+    moments = np.array([1.0, 2.1, 2.6])
+    state = jr.State(np.array([0.5, 0.5, -0.5, 0.5]), np.array([1.1, 0.3, 0.7]))
+    ts = np.sort(np.random.default_rng(3).uniform(0.0, 60.0, 12))
+    sun = AU * np.stack([np.cos(ts / 99), np.sin(ts / 99), 0.1 + 0 * ts], axis=-1)
+    observer = AU * np.stack([0.3 + 0 * ts, 0.2 * np.cos(ts / 50), -0.1 + 0 * ts], -1)
+    return moments, state, ts, sun, observer
+
+
+def test_a_tumbler_is_that_of_another_integrator():
+    moments, state, ts, sun, observer = tumbler()
+    facets = ph.Ellipsoid(SEMI_AXES).facets(6)
+    emitted = ts - np.linalg.norm(observer, axis=1) / 299792458.0
+
+    def rates(t, y):
+        q, w = y[:4], y[4:]
+        turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+        return np.concatenate([turn, np.cross(moments * w, w) / moments])
+
+    start = np.concatenate([state.attitude, state.omega])
+    parts = []
+    for t in emitted:  # some before the epoch of the state
+        end = solve_ivp(rates, (0.0, t), start, method="DOP853", rtol=1e-12, atol=1e-12)
+        parts.append(end.y[:4, -1])
+    turns = Rotation.from_quat(np.array(parts)[:, [1, 2, 3, 0]]).inv()
+    areas, normals = np.asarray(facets.areas), np.asarray(facets.normals)
+    expected = []
+    for turn, *lines in zip(turns, sun, observer, strict=True):
+        mu0, mu = (normals @ turn.apply(x / np.linalg.norm(x)) for x in lines)
+        counted = (mu0 > 0) & (mu > 0)
+        mu0, mu = mu0[counted], mu[counted]
+        expected.append(np.sum(areas[counted] * mu0 * mu / (mu0 + mu)))
+    found = ph.light_curve(moments, state, ts, sun, observer, facets)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_light_curve_has_derivatives_in_all_that_a_fit_seeks():
+    moments, state, ts, sun, observer = tumbler()
+
+    @jax.jit
+    def curve(x):
+        body, semi_axes, attitude, omega = x
+        start = jr.State(attitude / jnp.linalg.norm(attitude), omega)
+        shape = ph.Ellipsoid(semi_axes)
+        return ph.light_curve(
+            body, start, ts, sun, observer, shape, light_time=False, throw=False
+        )
+
+    x = tuple(map(jnp.asarray, (moments, SEMI_AXES, state.attitude, state.omega)))
+    directions = tuple(
+        jnp.asarray(np.random.default_rng(i).normal(size=y.shape))
+        for i, y in enumerate(x)
+    )
+    _, slope = jax.jvp(curve, (x,), (directions,))
+    h = 1e-6
+    moved = [
+        jax.tree.map(lambda y, e, s=s: y + s * h * e, x, directions) for s in (1, -1)
+    ]
+    difference = (curve(moved[0]) - curve(moved[1])) / (2 * h)
+    np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=1e-6)
+    (back,) = jax.vjp(curve, x)[1](jnp.ones(ts.size))
+    inner = sum(np.sum(a * b) for a, b in zip(back, directions, strict=True))
+    np.testing.assert_allclose(inner, np.sum(slope), rtol=1e-10)
+
+
+APOPHIS = np.array([0.61, 0.965, 1.0])  # P. Pravec et al., Icarus 233 (2014) 48
+
+
+def test_apophis_has_its_published_energy():
+    omega = ph.omega_from_periods(APOPHIS, 27.38 * HOUR, 263 * HOUR)
+    terms = ph.tumbling(APOPHIS, omega)
+    assert terms.regime == jr.free.REGIMES.about_largest
+    np.testing.assert_allclose(terms.energy_ratio, 1.0236, atol=1e-4)
+    # Ratios that are rounded to two digits move it by about 1 %.
+    rounded = ph.tumbling(
+        APOPHIS.round(2),
+        ph.omega_from_periods(np.array([0.61, 0.96, 1.0]), 27.38 * HOUR, 263 * HOUR),
+    )
+    assert abs(rounded.energy_ratio - terms.energy_ratio) < 0.02
+
+
+def test_toutatis_has_its_published_periods():
+    body = jr.datasets.toutatis_1992()
+    terms = ph.tumbling(body.moments, body.epoch_omega)
+    assert terms.regime == jr.free.REGIMES.about_smallest
+    # R. S. Hudson and S. J. Ostro, Science 270 (1995) 84: 7.35 and 5.41 days, from
+    # moments that differ by .5 % from those of the data set.
+    np.testing.assert_allclose(terms.precession_period / DAY, 7.35, rtol=0.01)
+    np.testing.assert_allclose(terms.rotation_period / DAY, 5.41, rtol=0.01)
+
+
+@pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
+def test_periods_and_angular_velocity_are_inverses(mode, rng):
+    """From small wobbles to the separatrix, for moments and for a tensor."""
+    turn = Rotation.random(random_state=1).as_matrix()
+    tensor = turn @ np.diag(APOPHIS) @ turn.T
+
+    @jax.jit
+    @jax.vmap
+    def there_and_back(ratio):
+        omega = ph.omega_from_periods(tensor, 3.0, 3.0 * ratio, mode)
+        terms = ph.tumbling(tensor, omega)
+        return terms.precession_period, terms.rotation_period / 3.0, terms.tilt_max
+
+    least = {"short-axis": 7.5669281, "long-axis": 1.6400806}[mode]
+    ratios = np.array([*least * np.array([1.00001, 1.01, 1.3, 2.0]), 40.0])
+    precession, found, tilt = there_and_back(ratios)
+    np.testing.assert_allclose(precession, 3.0, rtol=1e-9)
+    np.testing.assert_allclose(found, ratios, rtol=1e-8)
+    assert np.all(np.diff(tilt) > 0)
+    assert np.isnan(there_and_back(np.array([0.99 * least]))[0][0])
+
+
+def test_inverse_has_derivatives_of_two_orders():
+    @jax.jit
+    def omega(x):
+        return ph.omega_from_periods(APOPHIS * jnp.array([1.0, x[0], 1.0]), x[1], x[2])
+
+    x, h = jnp.array([1.0, 27.38, 263.0]), 1e-5
+    step = np.array([1.0, 27.38, 263.0]) * h * np.eye(3)
+    for function, tolerance in ((omega, 1e-6), (jax.jit(jax.jacfwd(omega)), 1e-5)):
+        slope = jax.jacfwd(function)(x)
+        differences = [function(x + e) - function(x - e) for e in step]
+        difference = np.stack(differences, axis=-1) / (2 * np.diagonal(step))
+        scale = np.max(np.abs(difference), axis=tuple(range(difference.ndim - 1)))
+        assert np.max(np.abs(slope - difference) / scale) < tolerance
+
+
+def test_steady_rotation_has_no_tilt_and_no_excess():
+    terms = ph.tumbling(APOPHIS, np.array([0.0, 0.0, 2.0]))
+    np.testing.assert_allclose([terms.tilt_min, terms.tilt_max], 0.0, atol=1e-12)
+    np.testing.assert_allclose(terms.energy_ratio, 1.0, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "ends where the number of light curves should be"),
+        ("x\n", "line 1: the number of light curves must be numbers"),
+        ("1\n2 0\n2450000.5 1 1 0 0 1 0 0\n", "ends where a point of light curve 1"),
+        ("1\n1 2\n", "line 2: a light curve must have at least 1 point and the kind"),
+        (
+            "1\n1 0\n2450000.5 1 1 0 0 1 0\n",
+            "line 3: .* must be 8 numbers, but there are 7",
+        ),
+        ("1\n1 0\n2450000.5 -1 1 0 0 1 0 0\n", "line 3: brightness must be positive"),
+        ("1\n1 0\n2450000.5 1 0 0 0 1 0 0\n", "line 3: the vector to the Sun must not"),
+        (
+            "1\n1 0\n2450000.5 18.2 1 0 0 1 0 0\n",
+            r"line 3: .*take 10\^\(-0.4 m\) of mag",
+        ),
+        ("1\n1 0\n2450000.5 nan 1 0 0 1 0 0\n", "line 3: .* must be finite"),
+        ("0\n1 0\n", "line 2: the end of the file"),
+    ],
+)
+def test_a_malformed_file_of_light_curves_is_named_by_line(text, message, tmp_path):
+    (tmp_path / "curves").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        ph.read_light_curves(tmp_path / "curves")
+
+
+def test_a_body_that_is_not_convex_is_refused_or_wrapped():
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    signs = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    faces = np.arange(3) + 3 * signs
+    mirrored = np.sum(signs, axis=1) % 2 == 1
+    faces[mirrored] = faces[mirrored][:, ::-1]
+    octahedron = ph.facets_from_mesh(corners, faces)
+    np.testing.assert_allclose(octahedron.areas, np.sqrt(3) / 2)
+    dented = corners.copy()
+    dented[2] *= -0.3
+    with pytest.raises(
+        ValueError, match="must be those of a convex body, but a corner"
+    ):
+        ph.facets_from_mesh(dented, faces)
+    wrapped = ph.facets_from_mesh(dented, faces, hull=True)
+    # Half of the octahedron, and the square that closes it.
+    np.testing.assert_allclose(np.sum(wrapped.areas), 2 * np.sqrt(3) + 2)
+    # The areas of a closed surface, as vectors, have the sum 0.
+    closed = np.asarray(wrapped.areas) @ np.asarray(wrapped.normals)
+    np.testing.assert_allclose(closed, 0.0, atol=1e-12)
+
+
+def test_mistakes_say_what_to_pass_instead(untyped):
+    ball = ph.Ellipsoid(np.ones(3))
+    x = np.array([1.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"take `shape.facets\(\)`"):
+        ph.brightness(ball, x, x, ph.Lambert())
+    with pytest.raises(ValueError, match="must have one entry for each facet"):
+        ph.Facets(np.ones(2), np.eye(3))
+    state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), x)
+    with pytest.raises(ValueError, match="must have one entry for each epoch"):
+        ph.light_curve(np.ones(3), state, np.zeros(2), x[None], x[None], ball)
