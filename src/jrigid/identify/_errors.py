@@ -138,6 +138,7 @@ class Independent(NamedTuple):
     log_determinant: float
 
 
+@quality.once_for_each_fit
 def independent_rows(problem: Problem, fit: Fit) -> Independent:
     """The rows of a fit by which it is judged, those of what is known beforehand last."""
     minimum = fit.minimum
@@ -176,6 +177,7 @@ class Weakest(NamedTuple):
     direction: np.ndarray
 
 
+@quality.once_for_each_fit
 def precision(problem: Problem, fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
     own, units = fit.minimum.point.own.shape[-1], fit.minimum.units
@@ -348,7 +350,7 @@ def conclude(
     minimum, options = fit.minimum, problem.options
     point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
     independent = independent_rows(problem, fit)
-    known = precision_of_rows(independent.rows, independent.weight, own, units)
+    known = precision(problem, fit)
     rows, sensor = independent.rows, known
     if options.dense:
         rows = condensed(minimum.rows, minimum.links)
@@ -432,8 +434,10 @@ def _resized(
     resized = []
     for part, n in zip(parts, lengths, strict=True):
         own = x[:, part][:, :n]
-        missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
-        resized.append(np.pad(own, missing, mode))  # type: ignore[call-overload]
+        if own.shape[1] < n:
+            missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
+            own = np.pad(own, missing, mode)  # type: ignore[call-overload]
+        resized.append(own)
     return np.concatenate(resized, axis=1)
 
 

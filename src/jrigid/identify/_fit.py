@@ -51,7 +51,7 @@ from jrigid.identify._records import (
     tells,
 )
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
-from jrigid.identify._search import Case, Effort, Line, no_search, run, search
+from jrigid.identify._search import Case, Effort, Line, Starts, no_search, run, search
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
@@ -63,8 +63,6 @@ _LENGTHS = {
 }  # radians of a segment, of free motion and of forced
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
-_FLAT = 1e-3  # least second moment of a body to start from
-_ROUND = 0.1  # ... where the first start led nowhere
 
 
 def fit(
@@ -433,7 +431,7 @@ class _Begun(NamedTuple):
     """Numbers of each attempt, the segments, and the states at their starts."""
 
     unknowns: Unknowns
-    numbers: np.ndarray
+    starts: Starts
     single: Layout
     cut: Layout
     point: Point
@@ -452,10 +450,8 @@ def _begun(
     told, samples = observed.told, observed.samples
     trials, dtype = samples.ts.shape[0], samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
-    unknowns, numbers = unknowns.starts(
-        tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1)
-    )
-    unknowns = on_host(unknowns)
+    starts = Starts(unknowns, tensors)
+    unknowns = on_host(starts.unknowns)
     single = cut = whole(samples, options.nodes)
     attitude = np.zeros((trials, options.nodes, 4), dtype)
     attitude[..., 0] = 1
@@ -473,8 +469,8 @@ def _begun(
         )
     torque = np.zeros_like(omega if options.dense else omega[..., :0])
     own = unknowns.own_start(trials, dtype)
-    point = Point(numbers[0], own, attitude, omega, torque)
-    return _Begun(unknowns, numbers, single, cut, point, tensors[0])
+    point = Point(starts[0], own, attitude, omega, torque)
+    return _Begun(unknowns, starts, single, cut, point, tensors[0])
 
 
 @np.errstate(all="ignore")  # values that are bad or out of range
@@ -514,13 +510,13 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     unknowns = begun.unknowns.holding(line)
     tensor = begun.tensor
     if options.dense:  # a level is sought, in proportion to it
-        tensor = np.asarray(tensors_at(unknowns, begun.numbers[:2]))[0]
+        tensor = np.asarray(tensors_at(unknowns, np.stack([begun.starts[0]] * 2)))[0]
     case = Case(
         problem=Problem(options, unknowns, observed.samples, observed.noise),
         single=begun.single,
         cut=begun.cut,
         point=begun.point,
-        starts=begun.numbers,
+        starts=begun.starts,
         tensor=tensor,
         torque=asked.torque,
         coarse=observed.coarse,

@@ -60,6 +60,8 @@ _LEVELS = (
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
+_FLAT = 1e-3  # least second moment of the body that the first attempt starts from
+_ROUND = 0.1  # ... that others start from, since the first led nowhere
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
 _PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
@@ -125,6 +127,38 @@ class Effort:
     report: Callable[[str], None] | None = None
 
 
+class Starts:
+    """Numbers from which attempts start, by one tensor for each attempt.
+
+    They are computed when they are needed: only a fit that went wrong needs more than
+    the first ones.
+
+    Attributes:
+        unknowns: With the frame of the inertia model chosen for the first tensor.
+    """
+
+    def __init__(self, unknowns: Unknowns, tensors: np.ndarray):
+        """Choose the frame, and compute the numbers of the first attempt.
+
+        Args:
+            unknowns: With the inertia model as it was given.
+            tensors: Where to start (attempts, 3, 3).
+        """
+        self._given = unknowns
+        self._tensors = tensors
+        self.unknowns, self._first = unknowns.start(tensors[0], _FLAT)
+
+    def __len__(self) -> int:
+        """How many attempts there may be."""
+        return len(self._tensors)
+
+    def __getitem__(self, attempt: int) -> np.ndarray:
+        """The numbers of an attempt."""
+        if attempt == 0:
+            return self._first
+        return self._given.start(self._tensors[attempt], _ROUND)[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A record and where its search begins.
@@ -134,7 +168,7 @@ class Case:
         single: One segment a trial.
         cut: Many segments.
         point: States at their starts, as observed.
-        starts: Numbers for each attempt (attempts, numbers).
+        starts: Numbers of each attempt.
         tensor: The inertia of the first start.
         torque: Unmodelled, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
@@ -146,7 +180,7 @@ class Case:
     single: Layout
     cut: Layout
     point: Point
-    starts: np.ndarray
+    starts: Starts
     tensor: np.ndarray
     torque: GaussMarkov
     coarse: bool
@@ -352,7 +386,7 @@ def search(case: Case) -> Search:
         if better:
             best, wrong, weak = end, off, seen
         index += 1
-    best = best._replace(ambiguous=ambiguous)
+    best = dataclasses.replace(best, ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
         # Squares beside levels of their own differ, so fits with a level are not
         # probed.
@@ -424,10 +458,10 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         if growth < _SURE:
             largest = max(largest, error)
         if largest > _BENT * at.error:
-            return best._replace(ambiguous=True, probed_error=largest)
+            return dataclasses.replace(best, ambiguous=True, probed_error=largest)
         if largest >= LARGEST_ERROR:
             break
-    return best._replace(probed_error=largest)
+    return dataclasses.replace(best, probed_error=largest)
 
 
 def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
