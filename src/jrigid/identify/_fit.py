@@ -4,12 +4,14 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from jrigid._checks import check_option, check_type, demand, is_good
 from jrigid._types import AnyArray
@@ -24,6 +26,7 @@ from jrigid.identify._inputs import (
     judge,
     noise_of,
     refuse,
+    result_of_start,
     sizes_of,
     start_of,
     systems_of,
@@ -57,10 +60,8 @@ from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
-_LENGTHS = {
-    True: 3.0,
-    False: 0.75,
-}  # radians of a segment, of free motion and of forced
+# Radians of a segment, of free motion and of forced.
+_LENGTHS = {True: 3.0, False: 0.75}
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
 
@@ -155,20 +156,12 @@ def fit(
     >>> print(found.null_directions)
     ('overall scale',)
     """
-    request = _asked(
-        system,
-        observations,
-        free,
-        scale,
-        inertia_model,
-        start,
-        unmodelled,
-        loss,
-        absolute_sigma,
-        motion,
+    question = _Question(
+        free, scale, inertia_model, unmodelled, loss, absolute_sigma, motion
     )
+    task = _task(question, _Bodies(system), observations, start)
     with _reporter(progress) as report:
-        (fields,) = _fits([request], Effort(max_steps, doublings, report), throw)
+        (fields,) = _fits([task], Effort(max_steps, doublings, report), throw)
     return result_of(fields)
 
 
@@ -239,28 +232,24 @@ def fit_each(
         "Arguments `system` and `start` must have an entry for each of "
         f"{count} fits, but they have {len(systems)} and {len(starts)}.",
     )
-    requests = [
-        _asked(
-            x,
-            y,
-            free,
-            scale,
-            inertia_model,
-            z,
-            unmodelled,
-            loss,
-            absolute_sigma,
-            motion,
-        )
-        for x, y, z in zip(systems, observations, starts, strict=True)
+    question = _Question(
+        free, scale, inertia_model, unmodelled, loss, absolute_sigma, motion
+    )
+    # Fits of the same body share what is computed of it alone.
+    bodies = {id(x): _Bodies(x) for x in systems}
+    tasks = [
+        _task(question, bodies[id(body)], observed, first)
+        for body, observed, first in zip(systems, observations, starts, strict=True)
     ]
-    found = _fits(requests, Effort(max_steps, doublings), throw)
-    return _side_by_side(found)
+    return _side_by_side(_fits(tasks, Effort(max_steps, doublings), throw))
 
 
 @contextlib.contextmanager
 def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
-    """What is called with a line after each stage: a bar on a terminal where there is tqdm."""
+    """Yield what is called with a line of text after each stage, or None.
+
+    It is a bar on a terminal where tqdm is installed.
+    """
     if progress is not None or not sys.stderr.isatty():
         yield print if progress else None
         return
@@ -279,6 +268,7 @@ def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
 
 
 def _late_lines() -> Callable[[str], None]:
+    """Return a function that prints a line once some seconds have passed."""
     start = time.perf_counter()
 
     def show(line: str) -> None:
@@ -288,64 +278,128 @@ def _late_lines() -> Callable[[str], None]:
     return show
 
 
-class _Asked(NamedTuple):
-    """What is asked of a record, after its arguments were checked at trace time."""
+class _Question(NamedTuple):
+    """What is asked of every record: the keyword arguments of `fit`."""
 
+    free: Callable[..., Any] | None
+    scale: str
+    inertia_model: AbstractInertiaModel | None
+    unmodelled: Any
+    loss: str
+    absolute_sigma: bool
+    motion: Callable[..., State] | None
+
+
+class _Bodies:
+    """The argument `system` of a fit, and what follows from it alone."""
+
+    def __init__(self, system: RigidBody | Sequence[RigidBody]):
+        """Take a body, or one for each trial."""
+        self._system = system
+        self._systems: dict[int, tuple[RigidBody, ...]] = {}
+
+    def of_trials(self, trials: int) -> tuple[RigidBody, ...]:
+        """One body, or one for each trial; ValueError if there are others."""
+        if trials not in self._systems:
+            self._systems[trials] = systems_of(self._system, trials)
+        return self._systems[trials]
+
+    @cached_property
+    def _any(self) -> tuple[RigidBody, ...]:
+        """The bodies, however many trials there are."""
+        return next(iter(self._systems.values()))
+
+    @cached_property
+    def on_host(self) -> tuple[RigidBody, ...]:
+        """The bodies with numpy arrays."""
+        return on_host(self._any)
+
+    @cached_property
+    def need_attitude(self) -> bool:
+        """Whether the torque looks at the attitude."""
+        return needs_attitude(self._any[0])
+
+    @cached_property
+    def carry_parts(self) -> bool:
+        """Whether parts move inside the body."""
+        still = State(jnp.zeros(4), jnp.zeros(3))
+        return self._any[0].with_parts(still).internal is not None
+
+    @cached_property
+    def result(self) -> Any:
+        """The result code of the values of the bodies."""
+        return result_of_start(self._any, None, None)
+
+
+class _Task(NamedTuple):
+    """A record to be fitted, after the arguments were checked at trace time.
+
+    Attributes:
+        bodies: Those of the fit.
+        systems: One, or one for each trial.
+        records: With an axis of trials in front.
+        options: What is fixed when the fit is compiled.
+        tensor: Where to start, if that is given.
+        state: Where each trial starts, if that is given.
+        torque: Unmodelled, if it is known.
+        inertia_model: What is known of the inertia.
+        question: What is asked.
+    """
+
+    bodies: _Bodies
     systems: tuple[RigidBody, ...]
     records: tuple[Record, ...]
     options: Options
-    tensor: Any
+    tensor: Array | None
     state: State | None
     torque: GaussMarkov
-    free: Callable[..., Any] | None
-    scale: str
     inertia_model: AbstractInertiaModel
+    question: _Question
 
 
-def _asked(
-    system: Any,
-    observations: Any,
-    free: Callable[..., Any] | None,
-    scale: str,
-    inertia_model: AbstractInertiaModel | None,
-    start: Any,
-    unmodelled: Any,
-    loss: str,
-    absolute_sigma: bool,
-    motion: Callable[..., State] | None,
-) -> _Asked:
-    """Check options and shapes of arguments; ValueError for what no record could answer."""
+def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -> _Task:
+    """Check options and shapes; ValueError for what no record could answer."""
     records = of_trials(observations)
     trials = records[0].ts.shape[0]
+    inertia_model = question.inertia_model
     inertia_model = Tensor() if inertia_model is None else inertia_model
-    systems = systems_of(system, trials)
+    systems = bodies.of_trials(trials)
     check_type("inertia_model", inertia_model, AbstractInertiaModel)
-    check_option("loss", loss, ("squares", "robust"))
-    refuse(systems[0], records, scale, inertia_model)
+    check_option("loss", question.loss, ("squares", "robust"))
+    refuse(systems[0], records, question.scale, inertia_model)
     tensor, state = start_of(start, trials)
     stated = all(x.states_noise for x in records)
-    kind, torque = _torque(unmodelled, absolute_sigma and stated)
+    noise_known = question.absolute_sigma and stated
+    kind, torque = _torque(question.unmodelled, noise_known)
     demand(
         stated or len(records) == 1,
-        "Argument `observations` must state the noise of each kind where there are several, but "
-        "one has neither `sigma` nor `covariance`: they cannot be weighed.",
+        "Argument `observations` must state the noise of each kind where there are "
+        "several, but one has neither `sigma` nor `covariance`: they cannot be weighed.",
     )
+    of_sensors = any(x.sensor.depends_on_attitude for x in records)
     options = Options(
-        free_motion=systems[0].is_free and motion is None,
-        depends_on_attitude=any(x.sensor.depends_on_attitude for x in records)
-        or needs_attitude(systems[0]),
+        free_motion=systems[0].is_free and question.motion is None,
+        depends_on_attitude=of_sensors or bodies.need_attitude,
         unmodelled=kind,
-        robust=loss == "robust",
-        noise_known=absolute_sigma and stated,
-        motion=motion,
+        robust=question.loss == "robust",
+        noise_known=noise_known,
+        motion=question.motion,
     )
-    options = options._replace(shooting=_shoots(options, systems[0], records, state))
-    return _Asked(
-        systems, records, options, tensor, state, torque, free, scale, inertia_model
+    options = options._replace(shooting=_shoots(options, bodies, records, state))
+    return _Task(
+        bodies=bodies,
+        systems=systems,
+        records=records,
+        options=options,
+        tensor=tensor,
+        state=state,
+        torque=torque,
+        inertia_model=inertia_model,
+        question=question,
     )
 
 
-def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
+def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
     """What is to be done about the unmodelled torque, and the torque if it is known."""
     if isinstance(unmodelled, str):
         check_option("unmodelled", unmodelled, ("estimate",))
@@ -358,40 +412,44 @@ def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
     if not isinstance(torque, GaussMarkov):
         demand(np.shape(unmodelled) in ((), (3,)), text)
         torque = GaussMarkov(unmodelled)
-    level, time = np.asarray(torque.level), np.asarray(torque.time)
+    level = np.asarray(torque.level)
+    time = np.asarray(torque.time)
     good = np.all(level == 0) or np.all(level > 0)
     demand(bool(good and np.all(np.isfinite(level)) and np.all(time >= 0)), text)
     known = bool(np.any(level > 0))
-    text = "Argument `unmodelled` must be 0 or estimated where the noise is not known, but it is "
-    demand(stated or not known, text + "given.")
+    demand(
+        noise_known or not known,
+        "Argument `unmodelled` must be 0 or estimated where the noise is not known, "
+        "but it is given.",
+    )
     return "known" if known else "none", torque
 
 
 def _shoots(
     options: Options,
-    system: RigidBody,
+    bodies: _Bodies,
     records: tuple[Record, ...],
     state: State | None,
 ) -> bool:
-    """Whether each segment has a state of its own; ValueError for a fit that cannot be begun."""
+    """Whether each segment has a state of its own; ValueError if no fit can begin."""
     by_attitude = any(tells(x, "attitude") for x in records)
     demand(
         not options.depends_on_attitude or state is not None or by_attitude,
-        "Argument `start` must hold a State whose attitude the fit can start from, since the "
-        "motion or an observation depends on the attitude and none was observed, but it does not.",
+        "Argument `start` must hold a State whose attitude the fit can start from, since "
+        "the motion or an observation depends on the attitude and none was observed, "
+        "but it does not.",
     )
-    internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     observed = by_attitude or any(tells(x, "rates") for x in records)
-    shooting = observed and options.motion is None and not internal
+    shooting = observed and options.motion is None and not bodies.carry_parts
     demand(
         shooting or state is not None,
-        "Argument `start` must hold a State to start from, since neither rates nor attitudes were "
-        "observed, or they do not tell the whole state, but it does not.",
+        "Argument `start` must hold a State to start from, since neither rates nor "
+        "attitudes were observed, or they do not tell the whole state, but it does not.",
     )
     demand(
         shooting or not options.dense,
-        "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, a part "
-        "moves inside the body or `motion` is given, but it is not.",
+        "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, "
+        "a part moves inside the body or `motion` is given, but it is not.",
     )
     return shooting
 
@@ -427,8 +485,17 @@ def _observed(
     )
 
 
-class _Begun(NamedTuple):
-    """Numbers of each attempt, the segments, and the states at their starts."""
+class _Opening(NamedTuple):
+    """Where the search begins.
+
+    Attributes:
+        unknowns: What is sought, with the frame of the inertia model chosen.
+        starts: Numbers of each attempt.
+        single: One segment a trial.
+        cut: Many segments.
+        point: Numbers of the first attempt, and states as observed.
+        tensor: Of the first attempt.
+    """
 
     unknowns: Unknowns
     starts: Starts
@@ -438,27 +505,29 @@ class _Begun(NamedTuple):
     tensor: np.ndarray
 
 
-def _begun(
+def _opening(
     unknowns: Unknowns,
     observed: _Observed,
     tensor: np.ndarray | None,
     state: State | None,
     options: Options,
     length: float,
-) -> _Begun:
-    """Where the search begins."""
-    told, samples = observed.told, observed.samples
-    trials, dtype = samples.ts.shape[0], samples.ts.dtype
+) -> _Opening:
+    """Choose where the search begins, by segments of some length [rad]."""
+    told = observed.told
+    samples = observed.samples
+    trials = samples.ts.shape[0]
+    dtype = samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
     starts = Starts(unknowns, tensors)
     unknowns = on_host(starts.unknowns)
     single = cut = whole(samples, options.nodes)
-    attitude = np.zeros((trials, options.nodes, 4), dtype)
-    attitude[..., 0] = 1
     if options.shooting and told is not None:
-        cut, opening = segments(samples, told, options.nodes, length)
-        omega, seen = node_states(told, opening, cut.start)
-        attitude = attitude if seen is None else seen
+        cut, first_samples = segments(samples, told, options.nodes, length)
+        omega, attitude = node_states(told, first_samples, cut.start)
+        if attitude is None:
+            attitude = np.zeros((trials, options.nodes, 4), dtype)
+            attitude[..., 0] = 1
     else:
         assert state is not None
         omega, attitude = (
@@ -470,14 +539,14 @@ def _begun(
     torque = np.zeros_like(omega if options.dense else omega[..., :0])
     own = unknowns.own_start(trials, dtype)
     point = Point(starts[0], own, attitude, omega, torque)
-    return _Begun(unknowns, starts, single, cut, point, tensors[0])
+    return _Opening(unknowns, starts, single, cut, point, tensors[0])
 
 
 @np.errstate(all="ignore")  # values that are bad or out of range
-def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
+def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     """Where the search of a record begins, and the result code of the input."""
-    options = asked.options
-    records, state, tensor = on_host((asked.records, asked.state, asked.tensor))
+    options = task.options
+    records, state, tensor = on_host((task.records, task.state, task.tensor))
     if options.motion is None:  # which may ask for times that increase
         records = tuple(lengthened(x) for x in records)
     dtype = records[0].values.dtype
@@ -485,61 +554,86 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     if state is not None and options.depends_on_attitude:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
-    result = judge(asked.systems, records, tensor, state, observed.told, throw)
+    input_result = _judged(task, records, observed, throw)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and observed.told is not None:
         count = observed.told.ts.shape[1]
         options = options._replace(nodes=segments_needed(observed.angle, count, length))
-    unknowns = unknowns_of(
-        on_host(asked.systems),
-        tuple(x.sensor for x in records),
-        observed.sizes,
-        asked.free,
-        on_host(asked.inertia_model),
-        asked.scale != "trace" and not asked.inertia_model.absolute,
-        observed.rate,
-        records[0].ts.shape[0],
-    )
-    demand(
-        options.noise_known or all(x.sigma is None for x in unknowns.sought),
-        "Argument `free` must not state what is known beforehand where the noise of the record is "
-        "not stated or only relative, but it does: the two cannot be weighed.",
-    )
-    begun = _begun(unknowns, observed, tensor, state, options, length)
-    line = Line(np.zeros_like(begun.point.numbers), np.zeros((), dtype))
-    unknowns = begun.unknowns.holding(line)
-    tensor = begun.tensor
-    if options.dense:  # a level is sought, in proportion to it
-        tensor = np.asarray(tensors_at(unknowns, np.stack([begun.starts[0]] * 2)))[0]
+    unknowns = _unknowns(task, records, observed)
+    opening = _opening(unknowns, observed, tensor, state, options, length)
+    # A probe holds a direction; here none is held, by a line of the same structure.
+    line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
+    unknowns = opening.unknowns.holding(line)
+    tensor = opening.tensor
+    if options.dense:
+        # A level is sought, in proportion to the tensor.
+        numbers = np.stack([opening.starts[0]] * 2)
+        tensor = np.asarray(tensors_at(unknowns, numbers))[0]
     case = Case(
         problem=Problem(options, unknowns, observed.samples, observed.noise),
-        single=begun.single,
-        cut=begun.cut,
-        point=begun.point,
-        starts=begun.starts,
+        single=opening.single,
+        cut=opening.cut,
+        point=opening.point,
+        starts=opening.starts,
         tensor=tensor,
-        torque=asked.torque,
+        torque=task.torque,
         coarse=observed.coarse,
         long=observed.angle > _LONG,
         effort=effort,
     )
-    return case, result
+    return case, input_result
 
 
-def _fits(
-    requests: Sequence[_Asked], effort: Effort, throw: bool
-) -> list[dict[str, Any]]:
+def _judged(
+    task: _Task, records: tuple[Record, ...], observed: _Observed, throw: bool
+) -> Any:
+    """The result code of the input; RuntimeError for bad input if `throw`."""
+    from_bodies = task.tensor is None and task.state is None
+    return judge(
+        task.systems,
+        records,
+        task.tensor,
+        task.state,
+        observed.told,
+        throw,
+        of_start=task.bodies.result if from_bodies else None,
+    )
+
+
+def _unknowns(
+    task: _Task, records: tuple[Record, ...], observed: _Observed
+) -> Unknowns:
+    """What is sought, around the bodies and sensors as they were given."""
+    question = task.question
+    unknowns = unknowns_of(
+        task.bodies.on_host,
+        tuple(x.sensor for x in records),
+        observed.sizes,
+        question.free,
+        on_host(task.inertia_model),
+        question.scale != "trace" and not task.inertia_model.absolute,
+        observed.rate,
+        records[0].ts.shape[0],
+    )
+    demand(
+        task.options.noise_known or all(x.sigma is None for x in unknowns.sought),
+        "Argument `free` must not state what is known beforehand where the noise of the "
+        "record is not stated or only relative, but it does: the two cannot be weighed.",
+    )
+    return unknowns
+
+
+def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str, Any]]:
     """Fit records side by side: the fields of each result."""
-    cases = [_case(x, effort, throw) for x in requests]
+    cases = [_case(x, effort, throw) for x in tasks]
     searches = [
         search(case) if is_good(result) else no_search(case) for case, result in cases
     ]
-    lengths = [
-        max(x) for x in zip(*(_lengths(y.records) for y in requests), strict=True)
-    ]
+    columns = zip(*(_lengths(x.records) for x in tasks), strict=True)
+    lengths = [max(x) for x in columns]
     results = []
-    for (case, input_result), found in zip(cases, run(searches), strict=True):
-        fields = conclude(case.problem, found, lengths, input_result)
+    for (case, input_result), best in zip(cases, run(searches), strict=True):
+        fields = conclude(case.problem, best, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
                 raise RuntimeError(Status[status])

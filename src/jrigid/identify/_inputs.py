@@ -46,9 +46,8 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
         f"Argument `system` must hold one body for each of {trials} trials, but it holds "
         f"{len(systems)}.",
     )
-    return (
-        _padded(systems) if len(set(map(jtu.tree_structure, systems))) == 1 else systems
-    )
+    alike = len(set(map(jtu.tree_structure, systems))) == 1
+    return _padded(systems) if alike and len(systems) > 1 else systems
 
 
 def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
@@ -205,9 +204,21 @@ def judge(
     state: State | None,
     told: Told | None,
     throw: bool,
+    of_start: Any = None,
 ) -> Any:
-    """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`."""
-    result = result_of_start(systems, tensor, state)
+    """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`.
+
+    Args:
+        systems: One, or one for each trial.
+        records: With numpy arrays.
+        tensor: Where to start, or None.
+        state: Where each trial starts, or None.
+        told: What the records tell of the motion.
+        throw: Whether to raise an error.
+        of_start: `result_of_start` of these arguments, if it is known.
+    """
+    known = of_start is not None
+    result = of_start if known else result_of_start(systems, tensor, state)
     if not is_good(result):
         settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
         return result
