@@ -32,8 +32,8 @@ class Diagnostics(eqx.Module):
         local_covariance: Of each trial's state at `t0` (rate, then, if it matters, a
             small turn of the attitude about the body axes) and own numbers, beside
             given numbers.
-        follow: How these follow the numbers, with the sign turned (trials, local,
-            numbers).
+        sensitivity: Derivative of the state and own numbers of each trial in the
+            numbers.
         scores: What each trial adds to the gradient of half the squares, zero in sum.
         inflation: Of covariances, beyond what the noise stated makes.
         torque_numbers: How many numbers of the unmodelled torque were sought.
@@ -66,7 +66,7 @@ class Diagnostics(eqx.Module):
     state_singular_values: Float[Array, "trials local"]
     sensor_covariance: Float[Array, "numbers numbers"]
     local_covariance: Float[Array, "trials local local"]
-    follow: Float[Array, "trials local numbers"]
+    sensitivity: Float[Array, "trials local numbers"]
     scores: Float[Array, "trials numbers"]
     inflation: Scalar
     torque_numbers: Int[Array, ""]

@@ -374,7 +374,8 @@ def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -
     demand(
         stated or len(records) == 1,
         "Argument `observations` must state the noise of each kind where there are "
-        "several, but one has neither `sigma` nor `covariance`: they cannot be weighed.",
+        "several, but one has neither `sigma` nor `covariance`: they cannot be "
+        "weighed.",
     )
     of_sensors = any(x.sensor.depends_on_attitude for x in records)
     options = Options(
@@ -435,21 +436,22 @@ def _shoots(
     by_attitude = any(tells(x, "attitude") for x in records)
     demand(
         not options.depends_on_attitude or state is not None or by_attitude,
-        "Argument `start` must hold a State whose attitude the fit can start from, since "
-        "the motion or an observation depends on the attitude and none was observed, "
-        "but it does not.",
+        "Argument `start` must hold a State whose attitude the fit can start from, "
+        "since the motion or an observation depends on the attitude and none was "
+        "observed, but it does not.",
     )
     observed = by_attitude or any(tells(x, "rates") for x in records)
     shooting = observed and options.motion is None and not bodies.carry_parts
     demand(
         shooting or state is not None,
         "Argument `start` must hold a State to start from, since neither rates nor "
-        "attitudes were observed, or they do not tell the whole state, but it does not.",
+        "attitudes were observed, or they do not tell the whole state, but it does "
+        "not.",
     )
     demand(
         shooting or not options.dense,
-        "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, "
-        "a part moves inside the body or `motion` is given, but it is not.",
+        "Argument `unmodelled` must be 0 where neither rates nor attitudes were "
+        "observed, a part moves inside the body or `motion` is given, but it is not.",
     )
     return shooting
 
@@ -617,8 +619,9 @@ def _unknowns(
     )
     demand(
         task.options.noise_known or all(x.sigma is None for x in unknowns.sought),
-        "Argument `free` must not state what is known beforehand where the noise of the "
-        "record is not stated or only relative, but it does: the two cannot be weighed.",
+        "Argument `free` must not state what is known beforehand where the noise of "
+        "the record is not stated or only relative, but it does: the two cannot be "
+        "weighed.",
     )
     return unknowns
 

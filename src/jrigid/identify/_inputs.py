@@ -43,8 +43,8 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
         demand(isinstance(x, RigidBody), text)
     demand(
         len(systems) in (1, trials),
-        f"Argument `system` must hold one body for each of {trials} trials, but it holds "
-        f"{len(systems)}.",
+        f"Argument `system` must hold one body for each of {trials} trials, but it "
+        f"holds {len(systems)}.",
     )
     alike = len(set(map(jtu.tree_structure, systems))) == 1
     return _padded(systems) if alike and len(systems) > 1 else systems
@@ -82,8 +82,8 @@ def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
     inertia = inertia.inertia if isinstance(inertia, RigidBody) else inertia
     demand(
         state is None or isinstance(state, State),
-        "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
-        f"None), but it is {start!r}.",
+        "Argument `start` must be a State, or a tuple of an inertia and a State "
+        f"(either may be None), but it is {start!r}.",
     )
     if isinstance(state, State):
         attitude = jnp.broadcast_to(state.attitude, (trials, 4))
@@ -102,25 +102,27 @@ def refuse(
     demand(
         not (inertia_model.absolute and inertia_model.names and scale == "trace"),
         "Argument `scale` must be 'known' or 'rotor' where `inertia_model` is a "
-        f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is 'trace'.",
+        f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is "
+        "'trace'.",
     )
     terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
     has_rotor = any(isinstance(x, Rotor | SpinningMass) for x in terms)
     demand(
         scale != "trace" or not has_rotor or inertia_model.absolute,
-        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose momentum sets "
-        "the scale of the tensor, but it is 'trace', which would keep the trace of `system`.",
+        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose "
+        "momentum sets the scale of the tensor, but it is 'trace', which would keep "
+        "the trace of `system`.",
     )
     demand(
         scale != "rotor" or has_rotor,
-        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it is: "
-        "nothing sets the scale of the tensor.",
+        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, "
+        "but it is: nothing sets the scale of the tensor.",
     )
     momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
     demand(
         scale != "known" or not system.is_free or momenta or inertia_model.absolute,
-        "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
-        "motion tells ratios of the moments, never their scale.",
+        "Argument `scale` must be 'trace' for a body without torque, but it is "
+        "'known': free motion tells ratios of the moments, never their scale.",
     )
 
 

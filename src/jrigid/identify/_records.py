@@ -74,48 +74,23 @@ class Record(Readable):
     ):
         """Values of a sensor with noise `sigma` or `covariance`."""
         check_type("sensor", sensor, sensors.AbstractSensor)
-        of, width = f"of `{type(sensor).__name__}` must", sensor.width
-        if values is None:  # a plan
-            demand(
-                width is not None, f"Argument `values` {of} be given, but it is None."
-            )
-            (ts,) = float_arrays(ts)
-            values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
-        ts, values = float_arrays(ts, values)
+        of = f"of `{type(sensor).__name__}` must"
+        self.sensor = sensor
+        self.ts, self.values = _times_and_values(sensor, ts, values, of)
         demand(
-            ts.ndim in (1, 2)
-            and values.ndim == ts.ndim + 1
-            and values.shape[:-1] == ts.shape,
-            f"Arguments `ts` and `values` {of} have shapes (n,) and (n, k), but they have shapes "
-            f"{ts.shape} and {values.shape}.",
+            sigma is None or covariance is None,
+            f"Arguments `sigma` and `covariance` {of} not both be given, but they are.",
         )
-        text = f"have {width} columns, but it has {values.shape[-1]}."
-        demand(width in (None, values.shape[-1]), f"Argument `values` {of} {text}")
-        text = (
-            f"Arguments `sigma` and `covariance` {of} not both be given, but they are."
+        demand(
+            covariance is None or sensor.saturation() is None,
+            f"Argument `covariance` {of} not be given beside a sensor's `limit`, but "
+            "it is: give `sigma`.",
         )
-        demand(sigma is None or covariance is None, text)
-        text = "not be given beside a sensor's `limit`, but it is: give `sigma`."
-        limited = sensor.saturation() is not None
-        demand(covariance is None or not limited, f"Argument `covariance` {of} {text}")
-        self.sensor, self.ts, self.values = sensor, ts, values
-        k, n, self.sigma, self.covariance = self.degrees, ts.shape[-1], None, None
-        if sigma is not None:
-            (sigma,) = float_arrays(sigma)
-            text = f"have shape (), ({k},), ({n},) or ({n}, {k}), but it has shape {sigma.shape}."
-            shapes = (), (k,), (n,), ts.shape, (n, k), (*ts.shape, k)
-            demand(sigma.shape in shapes, f"Argument `sigma` {of} {text}")
-            of_samples = sigma.shape in ((n,), ts.shape) and sigma.shape != (k,)
-            sigma = sigma[..., None] if of_samples else sigma
-            self.sigma = _repeated(sigma, (*ts.shape, k))
+        shape = (*self.ts.shape, self.degrees)
+        self.sigma = None if sigma is None else _sigma(sigma, shape, of)
+        self.covariance = None
         if covariance is not None:
-            (covariance,) = float_arrays(covariance)
-            text = f"shape ({k}, {k}) or ({n}, {k}, {k}), but it has shape {covariance.shape}."
-            shapes = (k, k), (n, k, k), (*ts.shape, k, k)
-            demand(
-                covariance.shape in shapes, f"Argument `covariance` {of} have {text}"
-            )
-            self.covariance = _repeated(covariance, (*ts.shape, k, k))
+            self.covariance = _covariance(covariance, shape, of)
 
     @property
     def degrees(self) -> int:
@@ -144,6 +119,67 @@ class Record(Readable):
         """With other values, where there are times."""
         values = jnp.where(jnp.isfinite(self.ts)[..., None], values, jnp.nan)
         return eqx.tree_at(lambda x: x.values, self, values)
+
+
+def _times_and_values(
+    sensor: sensors.AbstractSensor, ts: Times, values: Values, of: str
+) -> tuple[Array, Array]:
+    """Times (..., n) and values (..., n, k) as arrays of one dtype.
+
+    Args:
+        sensor: What showed the values.
+        ts: Times [s].
+        values: None in a plan.
+        of: Words for errors, after the name of an argument.
+    """
+    width = sensor.width
+    if values is None:
+        demand(width is not None, f"Argument `values` {of} be given, but it is None.")
+        (ts,) = float_arrays(ts)
+        # Of unit length, for sensors whose values are.
+        values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
+    ts, values = float_arrays(ts, values)
+    demand(
+        ts.ndim in (1, 2)
+        and values.ndim == ts.ndim + 1
+        and values.shape[:-1] == ts.shape,
+        f"Arguments `ts` and `values` {of} have shapes (n,) and (n, k), but they have "
+        f"shapes {ts.shape} and {values.shape}.",
+    )
+    demand(
+        width in (None, values.shape[-1]),
+        f"Argument `values` {of} have {width} columns, but it has {values.shape[-1]}.",
+    )
+    return ts, values
+
+
+def _sigma(sigma: Any, shape: tuple[int, ...], of: str) -> Array:
+    """Standard deviations of each component of each sample, (..., n, k)."""
+    (sigma,) = float_arrays(sigma)
+    *of_ts, k = shape
+    n = of_ts[-1]
+    of_components = ((), (k,), (n, k), shape)
+    of_samples = ((n,), tuple(of_ts))
+    demand(
+        sigma.shape in of_components + of_samples,
+        f"Argument `sigma` {of} have shape (), ({k},), ({n},) or ({n}, {k}), but it "
+        f"has shape {sigma.shape}.",
+    )
+    if sigma.shape in of_samples and sigma.shape != (k,):
+        sigma = sigma[..., None]
+    return _repeated(sigma, shape)
+
+
+def _covariance(covariance: Any, shape: tuple[int, ...], of: str) -> Array:
+    """Covariances of the components of each sample, (..., n, k, k)."""
+    (covariance,) = float_arrays(covariance)
+    *_, n, k = shape
+    demand(
+        covariance.shape in ((k, k), (n, k, k), (*shape, k)),
+        f"Argument `covariance` {of} have shape ({k}, {k}) or ({n}, {k}, {k}), but it "
+        f"has shape {covariance.shape}.",
+    )
+    return _repeated(covariance, (*shape, k))
 
 
 def _repeated(x: Array, shape: tuple[int, ...]) -> Array:
@@ -313,9 +349,13 @@ def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, 
     if largest is not None:
         most = xp.broadcast_to(xp.asarray(largest, dtype) * (1 - 1e-6), values.shape)
         sign = xp.where(known & (xp.abs(values) >= most), xp.sign(values), 0.0)
-    pad = [(0, 0), (0, 0), (0, width - size)]
-    columns = (xp.pad(x, pad) for x in (known.astype(dtype), sign))
-    return values, record.ts, xp.pad(whitener, [*pad, pad[-1]]), *columns
+    weight = known.astype(dtype)
+    if size < width:
+        pad = [(0, 0), (0, 0), (0, width - size)]
+        weight = xp.pad(weight, pad)
+        sign = xp.pad(sign, pad)
+        whitener = xp.pad(whitener, [*pad, pad[-1]])
+    return values, record.ts, whitener, weight, sign
 
 
 def _inverse_factor(covariance: AnyArray) -> AnyArray:
@@ -340,32 +380,50 @@ def _inverse_factor(covariance: AnyArray) -> AnyArray:
 
 
 def of_trials(observations: Any) -> tuple[Record, ...]:
-    """Records with an axis of trials in front: a list's, padded with NaN, or of length one."""
+    """Records with an axis of trials in front, and sensors that know when they begin.
+
+    Trials of a list are filled up with NaN to one length; a single trial makes an axis of
+    length one.
+    """
     if isinstance(observations, list):
         trials = [_as_tuple(x) for x in observations]
         demand(bool(trials), "Argument `observations` must not be empty, but it is.")
         kinds = [[jtu.tree_structure(x.sensor) for x in trial] for trial in trials]
-        text = "hold records of the same sensors for each trial, but it does not."
         demand(
-            all(x == kinds[0] for x in kinds), f"Argument `observations` must {text}"
+            all(x == kinds[0] for x in kinds),
+            "Argument `observations` must hold records of the same sensors for each "
+            "trial, but it does not.",
         )
-        return tuple(map(_begun, map(_stacked, zip(*trials, strict=True))))
+        return tuple(_stacked(x) for x in zip(*trials, strict=True))
     single = _as_tuple(observations)
     shapes = {x.ts.shape[:-1] for x in single}
-    text = (
-        f"Arguments `observations` must have the same trials, but they have {shapes}."
+    demand(
+        len(shapes) == 1,
+        f"Arguments `observations` must have the same trials, but they have {shapes}.",
     )
-    demand(len(shapes) == 1, text)
-    return tuple(_begun(_stacked([x]) if shapes == {()} else x) for x in single)
+    if shapes == {()}:
+        return tuple(_stacked([x]) for x in single)
+    return tuple(_with_arrays(x, _arrays(x)) for x in single)
 
 
-def _begun(record: Record) -> Record:
-    """With a sensor that knows when the record begins."""
-    ts = np.asarray(record.ts) if is_concrete(record.ts) else record.ts
-    xp = ts.__array_namespace__()
-    first = xp.min(xp.where(xp.isfinite(ts), ts, xp.inf))
-    first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), ts.dtype)
-    return eqx.tree_at(lambda x: x.sensor, record, record.sensor.started_at(first))
+def _arrays(record: Record) -> list[Any]:
+    """Times, values, sigma and covariance; the last two may be None."""
+    return [record.ts, record.values, record.sigma, record.covariance]
+
+
+def _with_arrays(record: Record, arrays: list[Any]) -> Record:
+    """With other arrays, and a sensor that knows when the record begins."""
+    ts = arrays[0]
+    times = np.asarray(ts) if is_concrete(ts) else ts
+    xp = times.__array_namespace__()
+    first = xp.min(xp.where(xp.isfinite(times), times, xp.inf))
+    first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), times.dtype)
+    return eqx.tree_at(
+        lambda x: [x.sensor, *_arrays(x)],
+        record,
+        [record.sensor.started_at(first), *arrays],
+        is_leaf=lambda x: x is None,
+    )
 
 
 def rounded(count: int) -> int:
@@ -393,12 +451,12 @@ def lengthened(record: Record) -> Record:
 
     def filled(x: Any, axis: int) -> Any:
         x = np.asarray(x)
-        widths = [(0, more if i == axis else 0) for i in range(x.ndim)]
-        return np.pad(x, widths, constant_values=np.nan)
+        shape = list(x.shape)
+        shape[axis] = more
+        return np.concatenate([x, np.full(shape, np.nan, x.dtype)], axis)
 
-    arrays = lambda x: [x.ts, x.values, x.sigma, x.covariance]  # noqa: E731
-    wanted = [None if x is None else filled(x, 1) for x in arrays(record)]
-    return eqx.tree_at(arrays, record, wanted, is_leaf=lambda x: x is None)
+    arrays = [None if x is None else filled(x, 1) for x in _arrays(record)]
+    return eqx.tree_at(_arrays, record, arrays, is_leaf=lambda x: x is None)
 
 
 def _as_tuple(observations: Any) -> tuple[Record, ...]:
@@ -406,8 +464,9 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
         return (observations,)
     demand(
         isinstance(observations, Sequence) and len(observations) > 0,
-        "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, or a "
-        f"list with one entry for each trial, but it is {type(observations).__name__}.",
+        "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of "
+        "them, or a list with one entry for each trial, but it is "
+        f"{type(observations).__name__}.",
     )
     for x in observations:
         check_type("observations", x, Record)
@@ -416,31 +475,42 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
 
 def _stacked(parts: Sequence[Record]) -> Record:
     """One record of all trials; shorter ones are filled up with NaN."""
-    text = "hold times of shape (n,) for each trial of a list, but it does not."
-    demand(all(x.ts.ndim == 1 for x in parts), f"Argument `observations` must {text}")
+    demand(
+        all(x.ts.ndim == 1 for x in parts),
+        "Argument `observations` must hold times of shape (n,) for each trial of a "
+        "list, but it does not.",
+    )
     demand(
         all(_same(x.sensor, parts[0].sensor) for x in parts),
-        "Argument `observations` must have the same sensor in every trial of a list, but it has "
-        "not: `jr.identify.each` seeks an error anew in each trial.",
+        "Argument `observations` must have the same sensor in every trial of a list, "
+        "but it has not: `jr.identify.each` seeks an error anew in each trial.",
     )
-    arrays = lambda x: (x.ts, x.values, x.sigma, x.covariance)  # noqa: E731
-    text = "state the noise for all trials or for none, but it does for some."
-    same = len({jtu.tree_structure(arrays(x)) for x in parts}) == 1
-    demand(same, f"Argument `observations` must {text}")
+    demand(
+        len({jtu.tree_structure(_arrays(x)) for x in parts}) == 1,
+        "Argument `observations` must state the noise for all trials or for none, but "
+        "it does for some.",
+    )
     longest = max(x.ts.size for x in parts)
 
-    def stack(*trials: Array) -> Array:
-        known = all(map(is_concrete, trials))
-        xp, rows = jnp, list(trials)
-        if known:  # no compiled programs for each length
-            xp, rows = np, [np.asarray(x) for x in trials]
-        missing = [[(0, longest - x.shape[0])] + [(0, 0)] * (x.ndim - 1) for x in rows]
-        pairs = zip(rows, missing, strict=True)
-        stacked = xp.stack([xp.pad(x, y, constant_values=np.nan) for x, y in pairs])
-        return jnp.asarray(stacked)
+    columns = zip(*map(_arrays, parts), strict=True)
+    arrays = [None if x[0] is None else _stack(x, longest) for x in columns]
+    return _with_arrays(parts[0], arrays)
 
-    stacked = jtu.tree_map(stack, *map(arrays, parts))
-    return eqx.tree_at(arrays, parts[0], stacked, is_leaf=lambda x: x is None)
+
+def _stack(trials: Sequence[Array], longest: int) -> Array:
+    """Stack arrays of trials, shorter ones filled up with NaN."""
+    xp = jnp
+    rows = list(trials)
+    if all(map(is_concrete, trials)):
+        # NumPy needs no compiled program for each length.
+        xp = np
+        rows = [np.asarray(x) for x in trials]
+    filled = []
+    for row in rows:
+        missing = [(0, longest - row.shape[0])] + [(0, 0)] * (row.ndim - 1)
+        short = missing[0][1] > 0
+        filled.append(xp.pad(row, missing, constant_values=np.nan) if short else row)
+    return jnp.asarray(xp.stack(filled))
 
 
 def _same(a: Any, b: Any) -> bool:

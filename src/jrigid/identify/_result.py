@@ -15,7 +15,7 @@ from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
 from jrigid._core.third_party import with_codes
 from jrigid._numerics import product
 from jrigid._spectral import eigh
-from jrigid._types import Matrix, Real, Scalar, Vector
+from jrigid._types import AnyArray, Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._diagnostics import Diagnostics
@@ -33,21 +33,21 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
 
     OK = "The fit describes the record, and the record determines the inertia."
     UNIDENTIFIABLE = (
-        "The fit describes the record, but the record does not determine the inertia: see "
-        "`null_directions`."
+        "The fit describes the record, but the record does not determine the inertia: "
+        "see `null_directions`."
     )
     MISFIT = (
-        "The fit follows the record, but what is left is no noise of the size stated: a torque "
-        "that the model has not, or a sensor's error (see `unmodelled`, `free`), or the noise is "
-        "not as stated. The errors are those of what is left."
+        "The fit follows the record, but what is left is no noise of the size stated: "
+        "a torque that the model has not, or a sensor's error (see `unmodelled`, "
+        "`free`), or the noise is not as stated. The errors are those of what is left."
     )
     WRONG_BASIN = (
-        "The fit does not describe the record: it ended in a wrong minimum, or the model is wrong. "
-        "With `throw=False` it can be looked at."
+        "The fit does not describe the record: it ended in a wrong minimum, or the "
+        "model is wrong. With `throw=False` it can be looked at."
     )
     AT_BOUNDARY = (
-        "The fit has run into the boundary of real bodies: all mass in a plane or on a line. The "
-        "record asks for a tensor that no body has, or hardly tells it."
+        "The fit has run into the boundary of real bodies: all mass in a plane or on a "
+        "line. The record asks for a tensor that no body has, or hardly tells it."
     )
     NOT_CONVERGED = (
         "The fit has not converged in the steps allowed. With `throw=False` it can be "
@@ -261,14 +261,15 @@ class FitResult(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
         """Of `numbers`, then of each trial's state and own numbers."""
-        numbers, known = self.numbers_covariance, self.diagnostics
-        *lanes, trials, local, size = known.follow.shape
-        follow = known.follow.reshape(*lanes, trials * local, size)
-        across = -product("...ag,...gh->...ah", follow, numbers)
+        numbers = self.numbers_covariance
+        diagnostics = self.diagnostics
+        *lanes, trials, local, size = diagnostics.sensitivity.shape
+        sensitivity = diagnostics.sensitivity.reshape(*lanes, trials * local, size)
+        across = product("...ag,...gh->...ah", sensitivity, numbers)
         eye = jnp.eye(trials, dtype=numbers.dtype)
-        blocks = product("ts,...tlm->...tlsm", eye, known.local_covariance)
+        blocks = product("ts,...tlm->...tlsm", eye, diagnostics.local_covariance)
         blocks = blocks.reshape(*lanes, trials * local, trials * local)
-        blocks = blocks - product("...ah,...bh->...ab", across, follow)
+        blocks = blocks + product("...ah,...bh->...ab", across, sensitivity)
         return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
 
     @property
@@ -347,7 +348,8 @@ class FitResult(eqx.Module):
         backward = options.free_motion or options.motion is not None
         demand(
             backward or not is_concrete(after) or bool(after),
-            "Argument `ts` must not be before the trial's `t0` where there is a torque, but it is.",
+            "Argument `ts` must not be before the trial's `t0` where there is a "
+            "torque, but it is.",
         )
         found = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
         return found.reshape(*times.shape, -1)
@@ -363,8 +365,8 @@ class FitResult(eqx.Module):
         body = self.unknowns.inertia_model.body(numbers)
         if body is None:
             raise ValueError(
-                "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
-                "to follow, but it was not."
+                "Argument `shape` of the fit must be a LogCholesky for a mass and a "
+                "centre of mass to follow, but it was not."
             )
         return body
 
@@ -419,14 +421,13 @@ class FitResult(eqx.Module):
             part = self.unknowns.slices[x.name]
             return self.numbers[part], numbers[part, part]
         part = next(s for y, s in self.unknowns.own_slices if y is x)
-        known = self.diagnostics
-        first = known.follow.shape[1] - self.own_numbers.shape[1]
+        # Own numbers come after the numbers of a state.
+        first = self.diagnostics.sensitivity.shape[1] - self.own_numbers.shape[1]
         local = slice(first + part.start, first + part.stop)
-        follow = known.follow[:, local]
-        shared = product("tlg,gh,tmh->tlm", follow, numbers, follow)
-        return self.own_numbers[:, part], shared + known.local_covariance[
-            :, local, local
-        ]
+        sensitivity = self.diagnostics.sensitivity[:, local]
+        shared = product("tlg,gh,tmh->tlm", sensitivity, numbers, sensitivity)
+        alone = self.diagnostics.local_covariance[:, local, local]
+        return self.own_numbers[:, part], shared + alone
 
     @property
     def determined(self) -> dict[str, bool]:
@@ -516,17 +517,45 @@ def _of_moments(which: Any, tensor: Array) -> Array:
 def _spread(
     unknowns: Unknowns, numbers: Array, covariance: Array, function: Callable[..., Any]
 ) -> Array:
-    size = unknowns.of_inertia.stop
-    values, axes = jnp.linalg.eigh(covariance[:size, :size])
-    sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
-    near = jnp.minimum(
-        sizes, _FAR
-    )  # what is told worse is carried on as a straight line
-    steps = jnp.pad(product("ij,j->ji", axes, near), ((0, 0), (0, numbers.size - size)))
-    of_numbers = lambda x: function(unknowns.inertia(x))  # noqa: E731
-    moves = jax.vmap(of_numbers)(numbers[None] + jnp.concatenate([steps, -steps]))
-    moves = moves - of_numbers(numbers)[None]
-    moves = product(
-        "ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2)
-    )
-    return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
+    """Covariance of a function of the tensor: see `FitResult.spread`."""
+
+    def of_numbers(x: Array) -> Array:
+        return function(unknowns.inertia(x))
+
+    points, scales = sigma_points(numbers, covariance, unknowns.of_inertia.stop)
+    return spread_of(jax.vmap(of_numbers)(points), scales)
+
+
+def sigma_points(
+    numbers: AnyArray, covariance: AnyArray, size: int
+) -> tuple[AnyArray, AnyArray]:
+    """Points one standard error away along each axis of a covariance, the estimate last.
+
+    Errors are multiplied by the root of the count of axes: then the mean square over the
+    points is the variance.
+
+    Args:
+        numbers: The estimate.
+        covariance: Of the numbers.
+        size: How many of them, the first ones, are moved.
+
+    Returns:
+        Points (2 size + 1, numbers), and factors by which moves of a function between
+        them are too small, as no point is moved by more than `_FAR`.
+    """
+    xp = numbers.__array_namespace__()
+    values, axes = xp.linalg.eigh(covariance[:size, :size])
+    errors = xp.sqrt(xp.maximum(values, 0.0) * size)
+    # What is determined worse is continued as a straight line.
+    near = xp.minimum(errors, _FAR)
+    steps = xp.pad(axes * near[None], ((0, numbers.size - size), (0, 0))).T
+    still = xp.zeros_like(numbers)[None]
+    points = numbers[None] + xp.concatenate([steps, -steps, still])
+    scales = xp.tile(errors / xp.where(near > 0, near, 1.0), 2)
+    return points.astype(numbers.dtype), scales
+
+
+def spread_of(values: AnyArray, scales: AnyArray) -> AnyArray:
+    """Covariance of a function, from its values at `sigma_points` (points, k)."""
+    moves = (values[:-1] - values[-1:]) * scales[:, None]
+    return product("ki,kj->ij", moves, moves) / max(len(scales), 2)

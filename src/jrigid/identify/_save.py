@@ -42,8 +42,9 @@ def save(path: str | os.PathLike[str], result: FitResult) -> None:
         data = pickle.dumps(jtu.tree_map(np.asarray, result))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
-            "Argument `result` must hold functions and classes that can be imported by their "
-            f"names, no lambda and none within a function, but one cannot: {error}."
+            "Argument `result` must hold functions and classes that can be imported by "
+            "their names, no lambda and none within a function, but one cannot: "
+            f"{error}."
         ) from error
     Path(path).write_bytes(data)
 
@@ -66,15 +67,15 @@ def load(path: str | os.PathLike[str]) -> FitResult:
         result = pickle.loads(data)
     except Exception as error:
         raise ValueError(
-            "Argument `path` must be a file that `save` wrote, whose functions and classes can be "
-            f"imported, but it cannot be read: {error}."
+            "Argument `path` must be a file that `save` wrote, whose functions and "
+            f"classes can be imported, but it cannot be read: {error}."
         ) from error
     check_type("path", result, FitResult)
     arrays = jtu.tree_map(jnp.asarray, result)
     same = jtu.tree_map(lambda x, y: x.dtype == y.dtype, result, arrays)
     demand(
         jtu.tree_all(same),
-        "Argument `path` must be read with `jax_enable_x64` on, since it holds numbers of 64 bits, "
-        "but it is off.",
+        "Argument `path` must be read with `jax_enable_x64` on, since it holds numbers "
+        "of 64 bits, but it is off.",
     )
     return arrays

@@ -30,7 +30,9 @@ _LEAST_SAMPLES = 8  # to a window
 _FEW_ATTITUDES = 40  # fewer than these do without the weak form
 _WINDOWS, _RADIANS = 128, 3.0
 _EDGE = 1 - 1e-5  # of a window's half width
-_LARGEST_BLOCK = 2**17  # weights of samples in windows that are computed together
+# Weights of samples in windows that are computed together. Products of more would run in
+# several threads of BLAS, which wait for each other for longer than they compute.
+_LARGEST_BLOCK = 2**13
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
 _FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
 # A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without

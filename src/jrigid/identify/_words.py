@@ -178,8 +178,8 @@ def remarks(result: FitResult) -> tuple[str, ...]:
         notes += [
             (
                 by_rates and free_motion and real,
-                "with one axis of the gyro reversed the same record is that of a body with "
-                f"I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}",
+                "with one axis of the gyro reversed the same record is that of a body "
+                f"with I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}",
             ),
         ]
     return tuple(text for holds, text in notes if holds)
@@ -248,8 +248,8 @@ def _of_torque(result: FitResult) -> list[str]:
     shares = own / _diagonal(result.numbers_covariance)
     part = 100 * np.sqrt(np.median(shares)) if own.size else 100
     lines = [
-        f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would make "
-        f"{part:.0f} % of the errors"
+        f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would "
+        f"make {part:.0f} % of the errors"
     ]
     by_trial = np.asarray(result.level_by_trial)
     if np.any(by_trial != by_trial[0]):
