@@ -215,8 +215,9 @@ def fit_each(
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> noise = record.sigma * jax.random.normal(jax.random.key(0), (4, 200, 3))
-    >>> records = [jr.identify.Rates(record.times, record.omegas + x, 1.4 * record.sigma)
-    ...            for x in noise]
+    >>> records = [
+    ...     jr.identify.Rates(record.times, record.omegas + x, 1.4 * record.sigma)
+    ...     for x in noise]
     >>> found = jr.identify.fit_each(jr.RigidBody(jnp.ones(3)), records)
     >>> print(found.ratios.shape, found)
     (4, 2) 4 fits: 4 OK
@@ -457,7 +458,7 @@ def _shoots(
 
 
 class _Observed(NamedTuple):
-    """What the records say of the state on the way, and of the size of rates and values."""
+    """What the records tell of the motion, and of the sizes of rates and values."""
 
     samples: Samples
     told: Told | None
@@ -478,7 +479,8 @@ def _observed(
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     told = told_by(records, samples, attitude0)
     rate = typical_rate(told, state, samples.ts.dtype)
-    angle, coarse = 0.0, False
+    angle = 0.0
+    coarse = False
     if told is not None:
         angle = float(np.max(angle_turned(told)[:, -1]))
         coarse = longest_turn(told) > np.pi

@@ -1,4 +1,4 @@
-"""What a fit does with its arguments: options at trace time, values at run time."""
+"""Input validation of a fit: options at trace time, values at run time."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from jrigid._checks import (
     RESULTS,
@@ -38,9 +39,11 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
     """One body, or one for each trial."""
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
-        of_flight = " (of a body in flight, rotation about its centre of mass)"
-        text = f"Argument `system` must be a RigidBody{of_flight}, but it is {type(x).__name__}."
-        demand(isinstance(x, RigidBody), text)
+        demand(
+            isinstance(x, RigidBody),
+            "Argument `system` must be a RigidBody (of a body in flight, rotation about its "
+            f"centre of mass), but it is {type(x).__name__}.",
+        )
     demand(
         len(systems) in (1, trials),
         f"Argument `system` must hold one body for each of {trials} trials, but it "
@@ -52,7 +55,10 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
 
 def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
     """With samples of one length where those of trials differ."""
-    is_sampled = lambda x: isinstance(x, Sampled)  # noqa: E731
+
+    def is_sampled(x: object) -> bool:
+        return isinstance(x, Sampled)
+
     leaves, trees = zip(
         *(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True
     )
@@ -68,10 +74,14 @@ def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
 
 
 def _longer(function: Any, count: int) -> Any:
-    """With the last sample repeated so many times: the same function."""
-    longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], count, axis=0)])  # noqa: E731
-    arrays = lambda x: (x.ts, x.values)  # noqa: E731
-    return eqx.tree_at(arrays, function, replace_fn=longer) if count else function
+    """The same function, its last sample repeated so many times; or what is no function."""
+    if not count:
+        return function
+
+    def longer(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.repeat(x[-1:], count, axis=0)])
+
+    return eqx.tree_at(lambda x: (x.ts, x.values), function, replace_fn=longer)
 
 
 def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
@@ -97,7 +107,7 @@ def refuse(
     scale: str,
     inertia_model: AbstractInertiaModel,
 ) -> None:
-    """ValueError for a scale that nothing tells, and numbers that hold it without one."""
+    """Raise ValueError for a scale that nothing sets, or that is set twice."""
     check_option("scale", scale, ("trace", "known", "rotor"))
     demand(
         not (inertia_model.absolute and inertia_model.names and scale == "trace"),
@@ -175,7 +185,7 @@ def result_of_start(
 def findings_of_start(
     systems: tuple[RigidBody, ...], tensor: Any, state: State | None
 ) -> Findings:
-    """What is wrong with the values of the systems and the start."""
+    """What is wrong with the values of the systems and of `start`."""
     findings = Findings()
     for system in systems:
         system.check(findings)

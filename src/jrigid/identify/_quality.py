@@ -1,4 +1,7 @@
-"""How well a fit describes its record: scales, outliers, misfits, boundaries. Plain numpy."""
+"""How well a fit describes its record: scales, outliers, misfits and boundaries.
+
+Plain numpy, on the host.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,9 +21,8 @@ from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
-_REJECTED = (
-    16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
-)
+# Whitened square of a sample, above its degrees of freedom, that is no noise.
+_REJECTED = 16.0
 _SPOILT = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
@@ -85,21 +87,31 @@ def once_for_each_fit(
 
 def linearised(fit: Fit) -> Linearised:
     """A record where a fit ended."""
-    minimum, count = fit.minimum, fit.kept.shape[1]
-    rows = Rows(*(x[:, :count] for x in minimum.rows))
-    weight, own = minimum.weight[:, :count], minimum.point.own
-    return Linearised(fit.layout, minimum.tensor, rows, minimum.links, weight, own)
+    minimum = fit.minimum
+    count = fit.kept.shape[1]
+    return Linearised(
+        fit.layout,
+        minimum.tensor,
+        Rows(*(x[:, :count] for x in minimum.rows)),
+        minimum.links,
+        minimum.weight[:, :count],
+        minimum.point.own,
+    )
 
 
 def columns_of_prior(fit: Fit) -> np.ndarray:
-    """What is known beforehand, as columns of innovations, (trials, known, degrees, columns)."""
-    minimum, count = fit.minimum, fit.kept.shape[1]
+    """What is known beforehand, as columns of innovations.
+
+    Returns:
+        Columns (trials, known, degrees, columns): residual, state, border.
+    """
+    minimum = fit.minimum
+    count = fit.kept.shape[1]
+    local = minimum.links.gap.shape[-1]
     root = np.sqrt(minimum.weight[:, count:, None, None])
     residual = minimum.rows.residual[:, count:, :, None]
-    still = np.zeros(
-        (*residual.shape[:-1], minimum.links.gap.shape[-1]), residual.dtype
-    )
-    columns = [residual, still, minimum.rows.of_border[:, count:]]
+    of_state = np.zeros((*residual.shape[:-1], local), residual.dtype)
+    columns = [residual, of_state, minimum.rows.of_border[:, count:]]
     return root * np.concatenate(columns, axis=-1)
 
 
@@ -194,11 +206,15 @@ def misfit(problem: Problem, fit: Fit) -> float:
 
 
 def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
-    """What there is to explain, in units of the noise: a radian, or the variation of values."""
+    """What is to be explained, in units of the noise.
+
+    It is a radian for attitudes, and the variation of values for others.
+    """
     white = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
     signals = []
     for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
-        w, unit = weight[:, part], white[:, part]
+        w = weight[:, part]
+        unit = white[:, part]
         if values.shape[-1] > w.shape[-1]:  # quaternions
             signals.append(unit)
             continue
@@ -223,7 +239,7 @@ def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
 
 @once_for_each_fit
 def is_at_boundary(problem: Problem, fit: Fit) -> bool:
-    """Whether a body that need not be is flat: its mass lies in a plane or on a line."""
+    """Whether all mass lies in a plane or on a line, of a body that need not be flat."""
     if isinstance(problem.unknowns.inertia_model, Fixed | Flat):
         return False
     tensor = np.asarray(fit.minimum.tensor, float)

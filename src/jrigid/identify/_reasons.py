@@ -1,4 +1,4 @@
-"""Why a fit does not describe its record, as far as the record shows it, and what to pass.
+"""Why a fit does not describe its record, and what to pass instead.
 
 One sentence for the first line of a report: a unit, a noise, an error of the sensor
 that is not sought, or something that swings.

@@ -1,4 +1,4 @@
-"""What was seen of a rotating body: a sensor, times, values and their noise, one trial or many."""
+"""Records of a rotating body: a sensor, times, values and their noise."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
@@ -53,7 +53,8 @@ class Record(Readable):
 
     >>> import jrigid as jr
     >>> seen = jr.datasets.gyro_example()
-    >>> print(jr.identify.Record(jr.identify.Gyro(), seen.times, seen.omegas, 0.01).values.shape)
+    >>> record = jr.identify.Record(jr.identify.Gyro(), seen.times, seen.omegas, 0.01)
+    >>> print(record.values.shape)
     (200, 3)
     """
 
@@ -108,12 +109,13 @@ class Record(Readable):
 
     @property
     def known(self) -> AnyArray:
-        """Which numbers of the residual are there."""
+        """Which numbers of the residual were seen."""
         xp = self.values.__array_namespace__()
-        there = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
+        is_finite = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
         if self.sensor.degrees is None and self.covariance is None:
-            return there
-        return xp.repeat(xp.all(there, axis=-1, keepdims=True), self.degrees, axis=-1)
+            return is_finite
+        whole = xp.all(is_finite, axis=-1, keepdims=True)
+        return xp.repeat(whole, self.degrees, axis=-1)
 
     def with_values(self, values: Array) -> "Record":
         """With other values, where there are times."""
@@ -201,7 +203,9 @@ def Rates(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Recor
 
 
 def Attitudes(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
-    """The record of an `AttitudeSensor`: unit quaternions, noise in radians about body axes.
+    """The record of an `AttitudeSensor`: unit quaternions.
+
+    The noise is in radians about the body axes.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.toutatis_1992()
@@ -224,7 +228,8 @@ def Directions(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> star = jnp.array([1.0, 0.0, 0.0])
-    >>> seen = jr.identify.Directions(jnp.arange(5.0), jnp.tile(star, (5, 1)), 1e-3, of=star)
+    >>> values = jnp.tile(star, (5, 1))
+    >>> record = jr.identify.Directions(jnp.arange(5.0), values, 1e-3, of=star)
     """
     sensor = sensors.DirectionSensor(float_arrays(of)[0], frame)
     return Record(sensor, ts, values, sigma, **noise)
@@ -238,10 +243,13 @@ def AngularMomenta(
     frame: str = "space",
     **noise: Any,
 ) -> Record:
-    """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`.
+    """The record of a `MomentumSensor` [kg m^2/s].
+
+    It sets the scale of the inertia: `fit(..., scale="known")`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> seen = jr.identify.AngularMomenta(jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, frame="body")
+    >>> record = jr.identify.AngularMomenta(
+    ...     jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, frame="body")
     """
     return Record(sensors.MomentumSensor(frame), ts, values, sigma, **noise)
 
@@ -258,8 +266,9 @@ def Observed(
     """The record of a `FunctionSensor`: any function `(t, state, system) -> (k,)`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> spin = jr.identify.Observed(
-    ...     lambda t, state, system: state.omega[2:], jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
+    >>> def spin(t, state, system):
+    ...     return state.omega[2:]
+    >>> record = jr.identify.Observed(spin, jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
     """
     return Record(
         sensors.FunctionSensor(function, depends_on_attitude),
@@ -277,7 +286,7 @@ def one_after_another(sizes: Iterable[int]) -> list[slice]:
 
 
 def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Times of the first and last samples of each trial; zero for one without samples."""
+    """Times of the first and last samples of each trial; zero if there are none."""
     xp = ts.__array_namespace__()
     first = xp.min(xp.where(there, ts, xp.inf), axis=1)
     last = xp.max(xp.where(there, ts, -xp.inf), axis=1)
@@ -287,8 +296,9 @@ def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
 
 
 class Samples(NamedTuple):
-    """All records as a fit reads them, side by side: finite, of weight zero where nothing is.
+    """All records as a fit reads them, side by side.
 
+    Arrays are finite, and of weight zero where nothing was seen.
     Residuals have as many numbers as the widest record's, D. `whitener` (trials, n, D,
     D) turns one into units of its noise; `sign` (trials, n, D) is that of a saturated
     number, 0 elsewhere.
@@ -327,7 +337,10 @@ def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
 
 
 def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, ...]:
-    """Values, times, whitener, weight and sign of a record, the latter as wide as the widest's."""
+    """Values, times, whitener, weight and sign of a record.
+
+    The last three are as wide as those of the widest record.
+    """
     known = record.known
     values = record.values
     sensor = record.sensor
@@ -359,8 +372,9 @@ def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, 
 
 
 def _inverse_factor(covariance: AnyArray) -> AnyArray:
-    """L^-1 of covariances L L^T (..., k, k), L lower triangular; NaN where there is no L.
+    """L^-1 of covariances L L^T (..., k, k), with L lower triangular.
 
+    It is NaN where there is no L.
     By Gram and Schmidt: its rows are orthonormal in the product that the covariance
         makes.
     """
@@ -427,9 +441,9 @@ def _with_arrays(record: Record, arrays: list[Any]) -> Record:
 
 
 def rounded(count: int) -> int:
-    """The number of samples to which a record is filled up: few programs serve all lengths.
+    """The number of samples to which a record is filled up.
 
-    16, 64, 256, where more samples cost little; above, a power of two or half as much
+    Few compiled programs then serve all lengths. 16, 64, 256, where more samples cost little; above, a power of two or half as much
     again.
     """
     if count <= 256:
@@ -526,32 +540,46 @@ def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
     """Note what is wrong with values, times and noise of records with numpy arrays."""
     code = RESULTS.invalid_state
     for x in records:
-        of, known = f"of `{type(x.sensor).__name__}` must", x.known
-        seen = np.any(known, axis=-1)
+        of = f"of `{type(x.sensor).__name__}` must"
+        known = x.known
+        is_seen = np.any(known, axis=-1)
         text = f"Argument `values` {of} hold values, but all are NaN."
         findings.require(np.any(known), code, text)
-        times = np.maximum.accumulate(np.where(seen, x.ts, -np.inf), axis=1)
-        ordered = np.all(~seen[:, 1:] | (x.ts[:, 1:] > times[:, :-1]))
-        padded = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
-        text = "be finite where there are values, and increasing, each time once, but it is not."
-        ordered = ordered & ~np.any(padded)
-        findings.require(ordered, RESULTS.invalid_times, f"Argument `ts` {of} {text}")
+        text = (
+            f"Argument `ts` {of} be finite where there are values, and increasing, each "
+            "time once, but it is not."
+        )
+        findings.require(_is_ordered(x, is_seen), RESULTS.invalid_times, text)
         text = f"Arguments `sigma` and `covariance` {of} be positive, but one is not."
         findings.require(_is_noise(x, known), code, text)
         if x.sensor.unit_length:
-            square = np.sum(np.where(seen[..., None], x.values, 0.0) ** 2, axis=-1)
-            near = 1e-3 if x.values.shape[-1] == 4 else 0.5
             text = f"Argument `values` {of} be of unit length, but one is not."
-            findings.require(np.all(~seen | (np.abs(square - 1) < near)), code, text)
+            findings.require(_is_unit(x, is_seen), code, text)
     enough = np.bool_(sum(np.sum(x.known) for x in records) >= 12)
     text = "hold more numbers than a body and its state have, but it holds too few."
     findings.require(enough, code, f"Argument `observations` must {text}")
 
 
+def _is_ordered(x: Record, is_seen: np.ndarray) -> np.bool_:
+    """Whether times of samples increase, and are there where values are."""
+    before = np.maximum.accumulate(np.where(is_seen, x.ts, -np.inf), axis=1)
+    increasing = np.all(~is_seen[:, 1:] | (x.ts[:, 1:] > before[:, :-1]))
+    without_time = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
+    return increasing & ~np.any(without_time)
+
+
+def _is_unit(x: Record, is_seen: np.ndarray) -> np.bool_:
+    """Whether values are nearly of unit length: quaternions closely, directions roughly."""
+    square = np.sum(np.where(is_seen[..., None], x.values, 0.0) ** 2, axis=-1)
+    near = 1e-3 if x.values.shape[-1] == 4 else 0.5
+    return np.all(~is_seen | (np.abs(square - 1) < near))
+
+
 def _is_noise(x: Record, known: AnyArray) -> np.bool_:
+    """Whether `sigma` is positive, or `covariance` positive definite, where seen."""
     if x.covariance is not None:
-        seen = np.any(known, axis=-1)[..., None, None]
-        noise = np.where(seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
+        is_seen = np.any(known, axis=-1)[..., None, None]
+        noise = np.where(is_seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
         even = np.abs(noise - np.swapaxes(noise, -1, -2)) <= 1e-6 * np.abs(noise)
         return np.all(even) & np.all(np.isfinite(_inverse_factor(noise)))
     if x.sigma is None:

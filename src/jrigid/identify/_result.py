@@ -1,4 +1,4 @@
-"""FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
+"""FitResult: the estimates of a fit, their errors, and what the record leaves open."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,7 +29,7 @@ from jrigid.systems import RigidBody
 
 @with_codes
 class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
-    """What became of a fit; `int` gives the code of one, `numpy.asarray` the codes of many."""
+    """How a fit ended; `int` gives the code of one, `numpy.asarray` those of many."""
 
     OK = "The fit describes the record, and the record determines the inertia."
     UNIDENTIFIABLE = (
@@ -57,7 +57,7 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 _FAR = 1.0  # a change of a number beyond which the tensor is another one
-# An error above this, in natural units, and a direction is not told.
+# In natural units: a direction with a larger error is not determined.
 LARGEST_ERROR = 0.3
 
 
@@ -86,10 +86,11 @@ def arrays_of(fields: dict[str, Any]) -> list[Any]:
 
 
 class FitResult(eqx.Module):
-    """Inertia, state and nuisances with errors; by `fit_each` with an axis of fits in front.
+    """Inertia, state and what else was sought, with errors.
 
-    `print` shows it in words. Errors are standard errors; if no noise was stated, or it
-    does not explain what is left, their level is that of the residuals.
+    `fit_each` returns one with an axis of fits in front. `print` shows it in words.
+    Errors are standard errors. If no noise was stated, or it does not explain the
+    residuals, their level is that of the residuals.
 
     Attributes:
         status: A `jrigid.identify.Status`.
@@ -122,9 +123,8 @@ class FitResult(eqx.Module):
             is white.
         correlation_time_errors: Of that.
         level_by_trial: Of each trial, in units of `level`.
-        kept: Which samples were, records side by side.
-        diagnostics: What was left of the record, what determined the numbers, and how
-            the fit got there.
+        kept: Which samples took part, records side by side.
+        diagnostics: Residuals, what determined the numbers, and how the fit got there.
         problem: The record as it was fitted, and how.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -254,7 +254,7 @@ class FitResult(eqx.Module):
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
-        """Lower and upper limits of I2/I1 and I3/I1 at 95 %, in columns; of a single fit."""
+        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first; of a single fit."""
         ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
         return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
@@ -303,19 +303,17 @@ class FitResult(eqx.Module):
         >>> print(t0)
         50.0
         """
-        attitude, omega = (
-            self.state.attitude[..., index, :],
-            self.state.omega[..., index, :],
-        )
+        attitude = self.state.attitude[..., index, :]
+        omega = self.state.omega[..., index, :]
         return State(attitude, omega), self.t0[..., index]
 
     def predict(
         self, ts: Real[_ArrayLike, "*times"], record: int = 0, trial: int = 0
     ) -> Float[Array, "*times k"]:
-        """What a sensor would read in a trial, by the model that was found; of a single fit.
+        """Predict the readings of a sensor in a trial, of a single fit.
 
-        The motion goes on from the trial's `state` at `t0`, with no torque that is not
-        modelled; the sensor has the errors that were found, its delay, its filter and
+        The motion goes on from the trial's `state` at `t0`, without an unmodelled
+        torque. The sensor has the errors that were estimated, its delay, its filter and
         its limit.
 
         Args:
@@ -325,7 +323,7 @@ class FitResult(eqx.Module):
             trial: Which trial.
 
         Raises:
-            ValueError: No such record or throw, or times before `t0` under a torque.
+            ValueError: No such record or trial, or times before `t0` under a torque.
 
         Gradients: in forward mode.
 
@@ -336,23 +334,19 @@ class FitResult(eqx.Module):
         >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
         [ 1.6 -2.4  1.2]
         """
-        trials, records = self.t0.shape[0], len(self.problem.samples.values)
-        for name, value, count in (
-            ("record", record, records),
-            ("trial", trial, trials),
-        ):
-            text = f"Argument `{name}` must be at least 0 and below {count}, but it is {value}."
-            demand(0 <= value < count, text)
+        _check_index("record", record, len(self.problem.samples.values))
+        _check_index("trial", trial, self.t0.shape[0])
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
-        after, options = jnp.all(times >= self.t0[trial]), self.problem.options
+        after = jnp.all(times >= self.t0[trial])
+        options = self.problem.options
         backward = options.free_motion or options.motion is not None
         demand(
             backward or not is_concrete(after) or bool(after),
             "Argument `ts` must not be before the trial's `t0` where there is a "
             "torque, but it is.",
         )
-        found = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
-        return found.reshape(*times.shape, -1)
+        readings = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
+        return readings.reshape(*times.shape, -1)
 
     @property
     def body(self) -> MassProperties:
@@ -380,12 +374,11 @@ class FitResult(eqx.Module):
             trial: Which trial.
         """
         part = self.problem.samples.parts[record]
-        return self.diagnostics.jacobian[trial, part], self.diagnostics.residuals[
-            trial, part
-        ]
+        jacobian = self.diagnostics.jacobian[trial, part]
+        return jacobian, self.diagnostics.residuals[trial, part]
 
     def residuals(self, record: int = 0) -> Float[Array, "trials n degrees"]:
-        """What is left of a record: predicted less observed, in its own units; of a single fit.
+        """Residuals of a record, predicted less observed, in its units; of a single fit.
 
         NaN where nothing was seen, and of samples that are saturated or were left out.
 
@@ -398,24 +391,24 @@ class FitResult(eqx.Module):
         eye = jnp.eye(white.shape[-1], dtype=white.dtype)
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
         rows = self.diagnostics.residuals[:, samples.parts[record], :, None]
-        left = jnp.linalg.solve(white, rows)[..., 0]
-        return jnp.where(used[:, samples.parts[record]], left, jnp.nan)
+        residuals = jnp.linalg.solve(white, rows)[..., 0]
+        return jnp.where(used[:, samples.parts[record]], residuals, jnp.nan)
 
     @property
     def estimates(self) -> dict[str, tuple[Array, Array]]:
-        """Value and error of each array that `free` picked, of a single fit, by name.
+        """Value and error of each array that `free` picked, by name; of a single fit.
 
-        Of one that is sought anew in each trial, of each trial.
+        An array that is sought anew in each trial has an axis of trials in front.
         """
-        found = {}
+        estimates = {}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
             function = jax.vmap(x.with_errors) if x.own else x.with_errors
-            found[x.name] = function(numbers, covariance)
-        return found
+            estimates[x.name] = function(numbers, covariance)
+        return estimates
 
     def _of_sought(self, x: AbstractSought) -> tuple[Array, Array]:
-        """Numbers of an array that is sought, and their covariance; of each trial if it is own."""
+        """Numbers of an array that is sought, of each trial if it is own; covariance."""
         numbers = self.numbers_covariance
         if not x.own:
             part = self.unknowns.slices[x.name]
@@ -431,7 +424,7 @@ class FitResult(eqx.Module):
 
     @property
     def determined(self) -> dict[str, bool]:
-        """Whether the record determines the inertia, and each array that `free` picked, by name.
+        """Whether the record determines the inertia and each array of `free`, by name.
 
         An array is determined where its errors are below 0.3 of its size, or of its
         natural unit if that is larger; one that is sought anew in each trial, where it
@@ -446,34 +439,33 @@ class FitResult(eqx.Module):
         >>> print(found.determined)
         {'inertia': True, 'gyro.bias': True}
         """
-        found = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
+        verdicts = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
-            units = (
-                jax.vmap(x.natural_units)(numbers)
-                if x.own
-                else x.natural_units(numbers)
-            )
-            errors = errors_of(covariance) / units
-            took_part = jnp.any(self.kept, axis=-1)
-            errors = errors[took_part] if x.own else errors
-            found[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
-        return found
+            units_of = jax.vmap(x.natural_units) if x.own else x.natural_units
+            errors = errors_of(covariance) / units_of(numbers)
+            if x.own:
+                took_part = jnp.any(self.kept, axis=-1)
+                errors = errors[took_part]
+            verdicts[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
+        return verdicts
 
     @property
     def mirror_moments(self) -> Float[Array, "*fits 3"]:
-        """Moments, about the same axes, of the body that fits the mirrored readings of a gyro.
+        """Moments of the body that fits the mirrored readings of a gyro.
 
+        They are about the same axes, in the same order.
         With all axes of the gyro reversed, or one that is a principal axis, the rates
         obey Euler's equations of another body, whose (I2 - I3)/I1 and cyclic ones have
         the opposite sign: a gyro of unknown handedness cannot tell the two apart.
         """
         first, second, third = jnp.moveaxis(self.moments, -1, 0)
-        a, b = (second - third) / first, (third - first) / second
+        a = (second - third) / first
+        b = (third - first) / second
         other = (1 - a) / (1 + b)
-        found = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
-        total = jnp.sum(found, axis=-1, keepdims=True)
-        return found * jnp.sum(self.moments, axis=-1, keepdims=True) / total
+        mirrored = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
+        total = jnp.sum(mirrored, axis=-1, keepdims=True)
+        return mirrored * jnp.sum(self.moments, axis=-1, keepdims=True) / total
 
     @property
     def null_directions(self) -> tuple[str, ...]:
@@ -489,29 +481,35 @@ class FitResult(eqx.Module):
         return report(self)
 
 
+def _check_index(name: str, value: int, count: int) -> None:
+    """Raise ValueError unless there is such a record or trial."""
+    demand(
+        0 <= value < count,
+        f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
+    )
+
+
 @quick_jit
 def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array:
+    """Readings of a sensor in a trial (n, k), with its limit."""
     system, *sensors = result.fitted(trial)
-    sensor, none = sensors[record], jnp.zeros((ts.size, 0), ts.dtype)
-    samples, options = Samples(ts, (none,), none, none, none), result.problem.options
-    (shown,) = shown_by(
-        options, system, [sensor], *result.initial_state(trial), samples
-    )
+    sensor = sensors[record]
+    none = jnp.zeros((ts.size, 0), ts.dtype)
+    samples = Samples(ts, (none,), none, none, none)
+    state0, t0 = result.initial_state(trial)
+    options = result.problem.options
+    (shown,) = shown_by(options, system, [sensor], state0, t0, samples)
     largest = sensor.saturation()
-    return (
-        shown
-        if largest is None
-        else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
-    )
+    if largest is None:
+        return shown
+    return jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
 
 
 def _of_moments(which: Any, tensor: Array) -> Array:
-    """Of the moments, ratios and shares some."""
+    """Some of the moments, ratios and shares of a tensor."""
     moments = eigh(tensor)[0]
-    found = jnp.concatenate(
-        [moments, moments[1:] / moments[0], moments / jnp.sum(moments)]
-    )
-    return found[which]
+    ratios = moments[1:] / moments[0]
+    return jnp.concatenate([moments, ratios, moments / jnp.sum(moments)])[which]
 
 
 def _spread(
@@ -529,10 +527,10 @@ def _spread(
 def sigma_points(
     numbers: AnyArray, covariance: AnyArray, size: int
 ) -> tuple[AnyArray, AnyArray]:
-    """Points one standard error away along each axis of a covariance, the estimate last.
+    """Points one standard error from the estimate along each axis of a covariance.
 
-    Errors are multiplied by the root of the count of axes: then the mean square over the
-    points is the variance.
+    Errors are multiplied by the root of the count of axes, so that the mean square over
+    the points is the variance.
 
     Args:
         numbers: The estimate.
@@ -540,8 +538,8 @@ def sigma_points(
         size: How many of them, the first ones, are moved.
 
     Returns:
-        Points (2 size + 1, numbers), and factors by which moves of a function between
-        them are too small, as no point is moved by more than `_FAR`.
+        Points (2 size + 1, numbers), the estimate last. Factors by which moves of a
+        function between them are too small, as no point is moved by more than `_FAR`.
     """
     xp = numbers.__array_namespace__()
     values, axes = xp.linalg.eigh(covariance[:size, :size])

@@ -1,4 +1,4 @@
-"""Fits kept in files."""
+"""Save fits to files and load them."""
 
 import os
 import pickle
@@ -50,9 +50,10 @@ def save(path: str | os.PathLike[str], result: FitResult) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> FitResult:
-    """Read a fit that `save` wrote with this version of jrigid; all it can do it still can.
+    """Read a fit that `save` wrote with this version of jrigid.
 
-    A pickle can run any code: load only files whose origin you trust.
+    The result can do all that the original could. A pickle can run any code: load only
+    files whose origin you trust.
 
     Args:
         path: Of the file.
