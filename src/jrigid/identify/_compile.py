@@ -16,9 +16,9 @@ _ON_CPU = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 2,
 }
-# LLVM's second level of optimisation takes a fifth longer to compile and makes a fit 3 %
-# faster. A program that runs once in a fit compiles in a third of the time without any
-# optimisation, and then runs half as fast.
+# LLVM's second level of optimisation takes a fifth of the time to compile, and makes a
+# fit 3 % faster. Programs that run once in a fit are not optimised: they compile in a
+# third of the time and run half as fast.
 _LEVEL = 1
 _LEVEL_ONCE = 0
 

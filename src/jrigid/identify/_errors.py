@@ -41,7 +41,7 @@ _TRIED = 0.03
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
-    """Rows in the first state of each trial: along the links, as if nothing came between."""
+    """Rows in the first state of each trial, as if nothing acted between segments."""
     if not np.any(rows.node):
         return rows
     trials, nodes, local = links.gap.shape
@@ -125,7 +125,7 @@ def precision_of_rows(
 
 
 class _States(NamedTuple):
-    """Singular value decomposition of derivatives in each trial's state and own numbers.
+    """Singular value decomposition of derivatives in the state and own numbers.
 
     Attributes:
         basis: Columns of what the record shows of them (trials, rows, local).
@@ -141,7 +141,10 @@ class _States(NamedTuple):
 
 
 def _decomposed(local: np.ndarray) -> _States:
-    """Decompose derivatives (trials, rows, local); what is not shown gets large errors."""
+    """Decompose derivatives (trials, rows, local).
+
+    What the record does not show has large errors.
+    """
     scale = quality.or_one(np.linalg.norm(local, axis=1))
     basis, values, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
     shown = values > SHOWN * values[:, :1]
@@ -158,7 +161,7 @@ def _decomposed(local: np.ndarray) -> _States:
 def _of_numbers(
     rest: np.ndarray, units: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Singular values, directions and covariance of the numbers, from their derivatives.
+    """Singular values, directions and covariance of the numbers.
 
     Args:
         rest: Derivatives in natural units, without what states can do (trials, rows,
@@ -198,7 +201,7 @@ def _condensed_rows(problem: Problem, fit: Fit) -> Rows:
 
 @quality.once_for_each_fit
 def independent_rows(problem: Problem, fit: Fit) -> Independent:
-    """The rows of a fit by which it is judged, those of what is known beforehand last."""
+    """The rows by which a fit is judged, those of what is known beforehand last."""
     minimum = fit.minimum
     if not problem.options.dense:
         return Independent(_condensed_rows(problem, fit), minimum.weight, 0.0)
@@ -219,7 +222,7 @@ def independent_rows(problem: Problem, fit: Fit) -> Independent:
 
 
 class Weakest(NamedTuple):
-    """Chi-square of a fit, its unit, and what the record determines least of the inertia.
+    """Chi-square, its unit, and what the record determines least of the inertia.
 
     Attributes:
         square: Chi-square.
@@ -360,8 +363,8 @@ def _errors_of_axes(
 ) -> np.ndarray:
     """Errors of the turn about each principal axis [rad], huge where moments coincide.
 
-    A change dI of the tensor turns two axes j and k about the third by j . dI k / (I_k -
-    I_j).
+    A change dI of the tensor turns two axes j and k about the third by
+    j . dI k / (I_k - I_j).
     """
     gaps = np.roll(moments, -1) - np.roll(moments, 1)
     floor = np.finfo(gaps.dtype).eps * moments[2]
@@ -441,7 +444,7 @@ def _status(
     derived: dict[str, np.ndarray],
     of_torque: dict[str, np.ndarray],
 ) -> str:
-    """The name of the status, once the input, the ratios and the torque are looked at."""
+    """The name of the status, after a look at the input, the ratios and the torque."""
     errors = errors_of(derived["ratios_covariance"])
     loose = np.any(errors > LARGEST_ERROR * derived["ratios"])
     levels_known = np.isfinite([of_torque["level"], of_torque["level_errors"]])
@@ -478,7 +481,7 @@ def _fields_of_precision(
 def _fields_of_record(
     problem: Problem, fit: Fit, lengths: Sequence[int]
 ) -> dict[str, Any]:
-    """Fields that hold the estimates and the record, without the samples that fill it up."""
+    """Fields that hold the estimates, the residuals and the record as it was given."""
     minimum = fit.minimum
     point = minimum.point
     parts = problem.samples.parts
@@ -507,7 +510,7 @@ def _fields_of_record(
 
 
 def _weighted(fit: Fit, rows: Rows, own: int) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the samples, and their derivatives in the numbers and the first state."""
+    """Residuals of the samples, with derivatives in the numbers and the first state."""
     count = fit.kept.shape[1]
     root = np.sqrt(fit.minimum.weight)[:, :count, None]
     jacobian = np.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
@@ -532,7 +535,14 @@ def _resized(
     lengths: Sequence[int],
     mode: str = "constant",
 ) -> np.ndarray:
-    """The samples of each record (trials, samples, ...), so many: cut, or filled with zeros."""
+    """Samples of each record, cut to these lengths, or filled with zeros.
+
+    Args:
+        x: Records side by side (trials, samples, ...).
+        parts: Where each record's samples are.
+        lengths: How many samples of each record to return.
+        mode: Of `numpy.pad`.
+    """
     resized = []
     for part, n in zip(parts, lengths, strict=True):
         own = x[:, part][:, :n]
@@ -562,7 +572,10 @@ def _of_lengths(samples: Samples, lengths: Sequence[int]) -> Samples:
 def _with_error(
     part: slice, covariance: np.ndarray, units: np.ndarray, error: float
 ) -> np.ndarray:
-    """With an error of the inertia's weakest direction, in natural units, of at least this size."""
+    """The covariance with an error of the weakest direction of at least this size.
+
+    The error is in natural units.
+    """
     before, _, direction = weakest_of(part, covariance, units)
     return covariance + max(error**2 - before**2, 0.0) * np.outer(direction, direction)
 
@@ -579,7 +592,10 @@ def _with_larger_errors(
 def _scatter_of_trials(
     known: Precision, alive: np.ndarray, units: np.ndarray
 ) -> np.ndarray:
-    """Errors by the scatter of trials over those stated, along each direction; 1 of few trials."""
+    """Errors by the scatter of trials over those stated, along each direction.
+
+    Ones where there are few trials.
+    """
     trials = np.sum(alive)
     if trials < _FEWEST or not np.all(np.isfinite(known.scores)):
         return np.ones(units.size)
@@ -743,7 +759,7 @@ def _inflated(
     scatter: np.ndarray,
     inflation: float,
 ) -> np.ndarray:
-    """The covariance of the numbers, with errors as large as the fit shows them to be."""
+    """The covariance of the numbers, with errors as large as the fit shows them."""
     units = fit.minimum.units
     factors = np.maximum(scatter, 1.0)
     covariance = inflation * _with_larger_errors(known, factors, units)

@@ -41,8 +41,8 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
     for x in systems:
         demand(
             isinstance(x, RigidBody),
-            "Argument `system` must be a RigidBody (of a body in flight, rotation about its "
-            f"centre of mass), but it is {type(x).__name__}.",
+            "Argument `system` must be a RigidBody (of a body in flight, rotation "
+            f"about its centre of mass), but it is {type(x).__name__}.",
         )
     demand(
         len(systems) in (1, trials),
@@ -74,7 +74,7 @@ def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
 
 
 def _longer(function: Any, count: int) -> Any:
-    """The same function, its last sample repeated so many times; or what is no function."""
+    """The same function, with its last sample repeated so many times."""
     if not count:
         return function
 

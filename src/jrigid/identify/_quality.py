@@ -239,7 +239,7 @@ def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
 
 @once_for_each_fit
 def is_at_boundary(problem: Problem, fit: Fit) -> bool:
-    """Whether all mass lies in a plane or on a line, of a body that need not be flat."""
+    """Whether all mass lies in a plane or on a line, though it need not."""
     if isinstance(problem.unknowns.inertia_model, Fixed | Flat):
         return False
     tensor = np.asarray(fit.minimum.tensor, float)

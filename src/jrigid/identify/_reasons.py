@@ -79,7 +79,10 @@ def _of_parameters(result: FitResult) -> str:
 
 
 def _swing(result: FitResult) -> float:
-    """Rate of the largest swing of the readings over their rms: of a free body at most about 1."""
+    """Rate of the largest swing of the readings over their rms.
+
+    Of a free body it is at most about 1.
+    """
     if not (result.problem.options.free_motion and _by_gyro(result)):
         return 0.0
     samples = result.problem.samples
@@ -125,7 +128,7 @@ def _bias(result: FitResult) -> np.ndarray | None:
 def _slopes_in_bias(
     result: FitResult, record: int, residuals: np.ndarray
 ) -> np.ndarray:
-    """Derivatives of whitened residuals in the bias of a gyro (trials, n, degrees, 3)."""
+    """Derivatives of residuals in the bias of a gyro (trials, n, degrees, 3)."""
     part = result.problem.samples.parts[record]
     whitener = np.asarray(result.problem.samples.whitener)[:, part, :, :3]
     slopes = np.zeros((*residuals.shape, 3))
@@ -184,7 +187,10 @@ def _of_noise(result: FitResult) -> str:
             "and `free`."
         )
     if size < 1.1:
-        return "Trials differ by more than their errors say: they may be of different bodies."
+        return (
+            "Trials differ by more than their errors say: they may be of different "
+            "bodies."
+        )
     return (
         f"{residuals}, and white: `sigma` is too small. Pass the noise of the sensor, "
         "or `absolute_sigma=False`."

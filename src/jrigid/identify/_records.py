@@ -396,8 +396,8 @@ def _inverse_factor(covariance: AnyArray) -> AnyArray:
 def of_trials(observations: Any) -> tuple[Record, ...]:
     """Records with an axis of trials in front, and sensors that know when they begin.
 
-    Trials of a list are filled up with NaN to one length; a single trial makes an axis of
-    length one.
+    Trials of a list are filled up with NaN to one length. A single trial makes an axis
+    of length one.
     """
     if isinstance(observations, list):
         trials = [_as_tuple(x) for x in observations]
@@ -443,8 +443,8 @@ def _with_arrays(record: Record, arrays: list[Any]) -> Record:
 def rounded(count: int) -> int:
     """The number of samples to which a record is filled up.
 
-    Few compiled programs then serve all lengths. 16, 64, 256, where more samples cost little; above, a power of two or half as much
-    again.
+    Few compiled programs then serve all lengths. Where more samples cost little it is
+    16, 64 or 256; above, a power of two or half as much again.
     """
     if count <= 256:
         return next(x for x in (16, 64, 256) if count <= x)
@@ -546,8 +546,8 @@ def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
         text = f"Argument `values` {of} hold values, but all are NaN."
         findings.require(np.any(known), code, text)
         text = (
-            f"Argument `ts` {of} be finite where there are values, and increasing, each "
-            "time once, but it is not."
+            f"Argument `ts` {of} be finite where there are values, and increasing, "
+            "each time once, but it is not."
         )
         findings.require(_is_ordered(x, is_seen), RESULTS.invalid_times, text)
         text = f"Arguments `sigma` and `covariance` {of} be positive, but one is not."
@@ -569,7 +569,7 @@ def _is_ordered(x: Record, is_seen: np.ndarray) -> np.bool_:
 
 
 def _is_unit(x: Record, is_seen: np.ndarray) -> np.bool_:
-    """Whether values are nearly of unit length: quaternions closely, directions roughly."""
+    """Whether values are of unit length: quaternions closely, directions roughly."""
     square = np.sum(np.where(is_seen[..., None], x.values, 0.0) ** 2, axis=-1)
     near = 1e-3 if x.values.shape[-1] == 4 else 0.5
     return np.all(~is_seen | (np.abs(square - 1) < near))

@@ -246,7 +246,8 @@ class FitResult(eqx.Module):
         >>> record = jr.datasets.gyro_example()
         >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
         >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-        >>> print(found.interval(lambda tensor: tensor[2, 2] / jnp.trace(tensor)).round(2))
+        >>> share = lambda tensor: tensor[2, 2] / jnp.trace(tensor)
+        >>> print(found.interval(share).round(2))
         [0.44 0.44]
         """
         level_ = jnp.asarray(level, self.numbers.dtype)
@@ -254,7 +255,7 @@ class FitResult(eqx.Module):
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
-        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first; of a single fit."""
+        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first."""
         ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
         return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
@@ -378,7 +379,7 @@ class FitResult(eqx.Module):
         return jacobian, self.diagnostics.residuals[trial, part]
 
     def residuals(self, record: int = 0) -> Float[Array, "trials n degrees"]:
-        """Residuals of a record, predicted less observed, in its units; of a single fit.
+        """Residuals of a record, predicted less observed, in its own units.
 
         NaN where nothing was seen, and of samples that are saturated or were left out.
 
@@ -408,7 +409,7 @@ class FitResult(eqx.Module):
         return estimates
 
     def _of_sought(self, x: AbstractSought) -> tuple[Array, Array]:
-        """Numbers of an array that is sought, of each trial if it is own; covariance."""
+        """Numbers and covariance of an array that is sought, of each trial if own."""
         numbers = self.numbers_covariance
         if not x.own:
             part = self.unknowns.slices[x.name]

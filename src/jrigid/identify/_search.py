@@ -1,8 +1,8 @@
 """The search for the minimum: stages, attempts from several bodies, and probes.
 
 The search is plain Python: a generator that yields what is to be minimised as a
-`Request` and is sent the `Minimum`. So one driver serves a single record and many, whose
-requests share compiled calls.
+`Request` and is sent the `Minimum`. So one driver serves a single record and many,
+whose requests share compiled calls.
 """
 
 import dataclasses
@@ -350,7 +350,11 @@ class _Torque:
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
-    """Minimise in calls of `STEPS` steps: the minimum, and the sum of squares at each step."""
+    """Minimise in calls of `STEPS` steps.
+
+    Returns:
+        The minimum, and the sum of squares after each step.
+    """
     settings = request.settings
     allowed = int(settings.steps)
     histories = []

@@ -232,8 +232,8 @@ def weak_form(
     """Ratios of inertia from sampled rates of a free body.
 
     No derivatives of the samples are needed. Euler's equations I omega' + omega x I
-    omega = 0 are multiplied by smooth bumps, (1 - s^2)^4 on windows of some radians, and
-    integrated by parts. This gives linear equations for I.
+    omega = 0 are multiplied by smooth bumps, (1 - s^2)^4 on windows of some radians,
+    and integrated by parts. This gives linear equations for I.
 
     Args:
         ts: Times, increasing [s].
@@ -447,7 +447,7 @@ def _rows_of_rates(told: Told, torques: np.ndarray | None) -> np.ndarray:
 
 
 def _rows_of_attitudes(told: Told) -> np.ndarray:
-    """Equations (n, 7): the momentum in space at a sample is the mean one of its trial."""
+    """Equations (n, 7): the momentum in space at a sample is the trial's mean one."""
     assert told.attitude is not None
     weight = told.there[..., None, None].astype(told.omega.dtype)
     turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))

@@ -206,8 +206,8 @@ def _of_ratios(result: FitResult) -> list[tuple[Any, str]]:
         (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
         error = math.sqrt(max(first + second - 2 * across, 0.0))
         text = (
-            f"I{i + 1} and I{i + 2} are equal within their errors: which is the larger, "
-            "and the axes of each, are not determined"
+            f"I{i + 1} and I{i + 2} are equal within their errors: which is the "
+            "larger, and the axes of each, are not determined"
         )
         notes.append((moments[i + 1] - moments[i] < 2 * error, text))
     return notes
