@@ -196,7 +196,9 @@ def _is_matrix_product(subscripts: str) -> bool:
     """Whether the last index of one array is summed with the first one of another."""
     inputs, _, output = subscripts.partition("->")
     left, *rest = inputs.split(",")
-    if len(rest) != 1 or "." in subscripts or not left or left[-1:] != rest[0][:1]:
+    if len(rest) != 1 or "." in subscripts or not output:
+        return False
+    if left[-1:] != rest[0][:1]:
         return False
     # An index that repeats is no axis of its own.
     return output == left[:-1] + rest[0][1:] and len(set(inputs)) == len(inputs) - 1

@@ -458,7 +458,17 @@ def _shoots(
 
 
 class _Observed(NamedTuple):
-    """What the records tell of the motion, and of the sizes of rates and values."""
+    """What the records tell of the motion, and of the sizes of rates and values.
+
+    Attributes:
+        samples: Of all records.
+        told: Rates and attitudes along the way, where a sensor tells them.
+        rate: Rms of the rates [rad/s].
+        sizes: Rms of the values of each record.
+        angle: Most radians that a trial turns.
+        coarse: Whether the body turns by more than half a turn between samples.
+        noise: Of rates [rad/s] and turns [rad] (6,).
+    """
 
     samples: Samples
     told: Told | None
@@ -484,9 +494,8 @@ def _observed(
     if told is not None:
         angle = float(np.max(angle_turned(told)[:, -1]))
         coarse = longest_turn(told) > np.pi
-    return _Observed(
-        samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate)
-    )
+    noise = noise_of(records, samples, rate)
+    return _Observed(samples, told, rate, sizes, angle, coarse, noise)
 
 
 class _Opening(NamedTuple):

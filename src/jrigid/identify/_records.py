@@ -331,8 +331,8 @@ def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
     values, *rest = zip(*(_normalised(x, guess, width) for x in records), strict=True)
     xp = records[0].values.__array_namespace__()
     ts, whitener, weight, sign = (xp.concatenate(x, axis=1) for x in rest)
-    there = xp.any(weight > 0, axis=-1)
-    ts = xp.where(there, ts, first_and_last(ts, there)[0][:, None])
+    is_seen = xp.any(weight > 0, axis=-1)
+    ts = xp.where(is_seen, ts, first_and_last(ts, is_seen)[0][:, None])
     return Samples(ts, values, whitener, weight, sign)
 
 
@@ -343,32 +343,47 @@ def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, 
     """
     known = record.known
     values = record.values
-    sensor = record.sensor
     xp = values.__array_namespace__()
-    dtype, size = values.dtype, record.degrees
-    seen = xp.any(known, axis=-1, keepdims=True)
+    is_seen = xp.any(known, axis=-1, keepdims=True)
     # A value that was not seen is zero, or the first unit vector.
-    first = xp.arange(values.shape[-1]) == 0
-    harmless = xp.where(first & sensor.unit_length, xp.ones((), dtype), 0.0)
-    values = xp.where(seen & xp.isfinite(values), values, harmless)
-    eye = xp.broadcast_to(xp.eye(size, dtype=dtype), (*known.shape, size))
-    if record.covariance is not None:
-        whitener = _inverse_factor(xp.where(seen[..., None], record.covariance, eye))
-    else:
-        sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
-        whitener = eye / sigma[..., None].astype(dtype)
-    largest = sensor.saturation()
-    sign = xp.zeros(known.shape, dtype)
-    if largest is not None:
-        most = xp.broadcast_to(xp.asarray(largest, dtype) * (1 - 1e-6), values.shape)
-        sign = xp.where(known & (xp.abs(values) >= most), xp.sign(values), 0.0)
-    weight = known.astype(dtype)
-    if size < width:
-        pad = [(0, 0), (0, 0), (0, width - size)]
+    is_first = xp.arange(values.shape[-1]) == 0
+    one = xp.ones((), values.dtype)
+    harmless = xp.where(is_first & record.sensor.unit_length, one, 0.0)
+    values = xp.where(is_seen & xp.isfinite(values), values, harmless)
+    whitener = _whitener(record, known, guess)
+    weight = known.astype(values.dtype)
+    sign = _saturation_sign(record, known, values)
+    if record.degrees < width:
+        pad = [(0, 0), (0, 0), (0, width - record.degrees)]
         weight = xp.pad(weight, pad)
         sign = xp.pad(sign, pad)
         whitener = xp.pad(whitener, [*pad, pad[-1]])
     return values, record.ts, whitener, weight, sign
+
+
+def _whitener(record: Record, known: AnyArray, guess: AnyArray) -> AnyArray:
+    """Matrices that turn a residual into units of its noise (trials, n, k, k)."""
+    xp = record.values.__array_namespace__()
+    dtype = record.values.dtype
+    eye = xp.eye(record.degrees, dtype=dtype)
+    eye = xp.broadcast_to(eye, (*known.shape, record.degrees))
+    if record.covariance is not None:
+        is_seen = xp.any(known, axis=-1)[..., None, None]
+        return _inverse_factor(xp.where(is_seen, record.covariance, eye))
+    sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
+    return eye / sigma[..., None].astype(dtype)
+
+
+def _saturation_sign(record: Record, known: AnyArray, values: AnyArray) -> AnyArray:
+    """The sign of each number that is saturated, 0 elsewhere."""
+    xp = values.__array_namespace__()
+    largest = record.sensor.saturation()
+    if largest is None:
+        return xp.zeros(known.shape, values.dtype)
+    # The limit itself may have been rounded.
+    least = xp.asarray(largest, values.dtype) * (1 - 1e-6)
+    least = xp.broadcast_to(least, values.shape)
+    return xp.where(known & (xp.abs(values) >= least), xp.sign(values), 0.0)
 
 
 def _inverse_factor(covariance: AnyArray) -> AnyArray:
