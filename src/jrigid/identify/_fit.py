@@ -1,4 +1,4 @@
-"""fit(): inertia, and what else is asked for, from what was observed."""
+"""fit(): estimates of inertia and other parameters from observations."""
 
 import contextlib
 import sys
@@ -83,50 +83,51 @@ def fit(
     progress: bool | None = None,
     throw: bool = True,
 ) -> FitResult:
-    r"""Inertia, and what else is asked for, from what was observed of a rotating body.
+    r"""Estimate the inertia of a rotating body and other parameters from observations.
 
-    No start and no knobs are needed where rates or attitudes were observed: linear
-    equations in the tensor give a start, multiple shooting brings it into the basin of
-    the answer, and Levenberg-Marquardt ends there, with the exact flow where the motion
-    is free.
+    No initial values are needed where rates or attitudes were observed. Linear
+    equations in the tensor give them, multiple shooting brings them into the basin of
+    the minimum, and Levenberg-Marquardt ends there. Free motion is evaluated by the
+    exact flow.
 
     Args:
-        system: The body: its torque, and what is known beforehand of the tensor (see
-            `scale` and `inertia_model`); the tensor itself is only a start, and none is
-            needed for a free body. A sequence has one for each trial, of the same kind:
-                its own record of a wheel, say.
+        system: The body, with its torque. What is known of its tensor is said by
+            `scale` and `inertia_model`; the tensor itself is an initial value, which a
+            free body does not need. A sequence has one body for each trial, of the same
+            kind, with its own record of a wheel, say.
         observations: A `Record` (`Rates`, `Attitudes`, ...); a tuple of several of one
             motion; or a list with one entry (a tuple, or a single one) for each trial.
-            Records with an axis of trials in front of their times do as well as a list.
-        free: What is sought beside the inertia: a function of the system and the
+            Records with an axis of trials in front of their times may replace a list.
+        free: What is sought beside the inertia. It is a function of the system and the
             sensors that picks arrays of theirs,
-            `lambda body, gyro: (body.torque.coefficient, gyro.bias)`; of those
-            `prior(array, sigma)` is known beforehand, `each(array)` sought anew in each
-            trial. Drags and what else cannot be negative are kept positive.
-        scale: What sets the scale of the tensor. "trace": nothing does, it keeps the
-            trace of the system's; "known": a torque or a momentum whose size is known;
+            `lambda body, gyro: (body.torque.coefficient, gyro.bias)`. Of those,
+            `prior(array, sigma)` is known beforehand, and `each(array)` is sought anew
+            in each trial. Drags, and what else cannot be negative, are kept positive.
+        scale: What sets the scale of the tensor. "trace": nothing, it keeps the trace
+            of the system's tensor; "known": a torque or a momentum whose size is known;
             "rotor": the known momentum of a `torques.Rotor`.
-        inertia_model: What is known of the tensor: `Tensor()`, nothing, any real body;
+        inertia_model: What is known of the tensor. `Tensor()`: nothing, any real body;
             `Moments()`, `Symmetric()`, `Top()`, `Flat()`, `Fixed()`, a `LogCholesky` of
-            ten numbers about a fixed point, or one's own.
-        start: Where to start: a `State` at each trial's first sample (`t0` of what is
-            returned), of one trial or with an axis of trials in front; or (inertia or
-            None, State or None). Needed where the attitude matters and was not
-            observed: an attitude nearer than about half a turn will do.
-        unmodelled: A torque that no model has: the level [N m sqrt(s)] of a white one
-            (its spectral density is the level squared), for all body axes or for each;
-            a `GaussMarkov`, which has a memory; or "estimate": of white torques and
-            those with a memory, with levels and times for all axes or for each, and
-            levels in proportion to the spin of a trial or of its own, the one whose
-            likelihood asks for it.
-        loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard
-            deviations are left out, trials with more than a quarter of such samples
-            altogether, and the rest is fitted by squares.
-        absolute_sigma: False: the noise stated is relative, its level is that of the
-            residuals.
+            ten numbers about a fixed point, or a model of one's own.
+        start: Initial values: a `State` at each trial's first sample (`t0` of the
+            result), of one trial or with an axis of trials in front; or a tuple
+            (inertia or None, State or None). A state is needed where the attitude
+            matters and was not observed; an error below about half a turn is small
+            enough.
+        unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
+            torque, for all body axes or for each (its spectral density is the level
+            squared); a `GaussMarkov`, which has a correlation time; or "estimate".
+            Then the likelihood selects one of white torques and those with a
+            correlation time, with levels and times for all axes or for each, and with
+            levels in proportion to the spin of a trial or of its own.
+        loss: "squares" or "robust". A robust fit begins with Cauchy's loss. Then
+            samples beyond four standard deviations are left out, and trials with more
+            than a quarter of such samples altogether. The rest is fitted by squares.
+        absolute_sigma: False: the stated noise is relative, and its level is that of
+            the residuals.
         motion: `(system, state, ts, t0) -> State` in place of the exact flow or
             `simulate`; it must allow forward mode.
-        doublings: Where no start can be made from the observations, the first
+        doublings: Where the observations give no initial values, the first
             2^-doublings of the record is fitted first, then twice as much, and so on.
         max_steps: Steps of the last stage.
         progress: Print each stage as it ends. None: where the standard error is a
@@ -135,9 +136,9 @@ def fit(
             errors. False: they are results with that status (bad input: of NaN).
 
     Returns:
-        What was found, with errors, and what the record does not tell; `print` it. Its
-        `state` is at its `t0`, the first sample of each trial:
-        `state0, t0 = found.initial_state()` hands out both.
+        The estimates with their errors, and what the record does not determine; `print`
+        shows them. The `state` is at `t0`, the first sample of each trial, and
+        `state0, t0 = found.initial_state()` returns both.
 
     Raises:
         ValueError: A request that no record could answer.
@@ -181,10 +182,10 @@ def fit_each(
     max_steps: int = 400,
     throw: bool = False,
 ) -> FitResult:
-    """Fit each of many records, which share compiled programs and run side by side.
+    """Fit each of many records side by side, with shared compiled programs.
 
-    It is `fit` in a loop, with the same results, in a fraction of the time: for studies
-    of coverage, or a catalogue of bodies. Records may differ in length.
+    The results are those of `fit` in a loop, in a fraction of the time. Use it for
+    studies of coverage, or for a catalogue of bodies. Records may differ in length.
 
     Args:
         system: The body for all fits; or a sequence of what `fit` takes, once for each

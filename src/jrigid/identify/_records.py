@@ -28,24 +28,23 @@ Noise = Real[_ArrayLike, "..."] | None
 
 
 class Record(Readable):
-    """What a sensor showed at some times, and how well.
+    """Times, values and noise of one sensor, in one trial or in several.
 
-    NaN stands for "not seen": in a component of `values` (that number is left out; the
-    whole sample where the components hang together, in attitudes, directions and beside
-    a `covariance`), in a whole row, or in `ts` and its row (padding, which brings
-    trials to one length). What was not seen weighs nothing, and its `sigma` may be NaN;
-    it costs what any sample costs.
+    NaN stands for "not seen". It may stand in a component of `values`, in a whole row,
+    or in `ts` and its row (padding, which brings trials to one length). Then that
+    number is left out, or the whole sample where its components belong together: in
+    attitudes, in directions and beside a `covariance`. What was not seen weighs nothing,
+    and its `sigma` may be NaN. It costs as much time as any sample.
 
     Attributes:
         sensor: What showed the values.
         ts: Times [s] (n,), increasing among the samples seen, their origin that of `t0`
             elsewhere; with an axis of trials in front, (trials, n).
-        values: One row for each time (n, k); a plan, whose values play no role, takes
-            None.
+        values: One row for each time (n, k). A plan needs none and takes None.
         sigma: Standard deviation of the noise, in units of the residual: one number for
-            all, (k,) for each component, (n,) for each sample, or (n, k); kept as (n,
-            k). None where it is not known: `fit` takes it from the residuals.
-        covariance: Of the components of a sample, (k, k) or (n, k, k), kept as the
+            all, (k,) for each component, (n,) for each sample, or (n, k), which is how
+            it is stored. None where it is not known: `fit` takes it from the residuals.
+        covariance: Of the components of a sample, (k, k) or (n, k, k), stored as the
             latter; then no `sigma`.
 
     Raises:

@@ -13,11 +13,11 @@ from jrigid.identify._result import FitResult
 
 
 def save(path: str | os.PathLike[str], result: FitResult) -> None:
-    """Write a fit to a file, with the record that it was made from, for `load`.
+    """Write a fit, with the record that it was made from, to a file for `load`.
 
-    The file is a pickle: functions and classes of one's own (a `FunctionSensor`'s
-    function, a torque, a shape) are in it by their names only, and must be importable
-    where it is read.
+    The file is a pickle. It holds functions and classes of one's own (the function of a
+    `FunctionSensor`, a torque, an inertia model) by their names only, and they must be
+    importable where it is read.
 
     Args:
         path: Of the file.
