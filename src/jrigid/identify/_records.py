@@ -33,8 +33,8 @@ class Record(Readable):
     NaN stands for "not seen". It may stand in a component of `values`, in a whole row,
     or in `ts` and its row (padding, which brings trials to one length). Then that
     number is left out, or the whole sample where its components belong together: in
-    attitudes, in directions and beside a `covariance`. What was not seen weighs nothing,
-    and its `sigma` may be NaN. It costs as much time as any sample.
+    attitudes, in directions and beside a `covariance`. What was not seen weighs
+    nothing, and its `sigma` may be NaN. It costs as much time as any sample.
 
     Attributes:
         sensor: What showed the values.
