@@ -997,7 +997,7 @@ def test_too_few_samples_and_wrong_options(untyped):
         identify.fit(BLIND, identify.Rates(ts, values, 0.01))
     readings = identify.Rates(TS, np.ones((200, 3)), 0.01)
     for options, message in (
-        ({"shape": "cube"}, "shape"),
+        ({"inertia_model": "cube"}, "inertia_model"),
         ({"scale": "mass"}, "scale"),
         ({"unmodelled": "some"}, "unmodelled"),
         ({"unmodelled": -1.0}, "unmodelled"),

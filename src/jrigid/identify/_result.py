@@ -354,14 +354,14 @@ class FitResult(eqx.Module):
         """The body that was found, about its fixed point, by a `LogCholesky`.
 
         Raises:
-            ValueError: The shape that was sought was another one.
+            ValueError: The inertia model of the fit was another one.
         """
         numbers = self.numbers[..., self.unknowns.slices["inertia"]]
         body = self.unknowns.inertia_model.body(numbers)
         if body is None:
             raise ValueError(
-                "Argument `shape` of the fit must be a LogCholesky for a mass and a "
-                "centre of mass to follow, but it was not."
+                "Argument `inertia_model` of the fit must be a LogCholesky for a mass "
+                "and a centre of mass to follow, but it was not."
             )
         return body
 
