@@ -1,4 +1,4 @@
-"""fit(): bodies found again from noisy records, honest errors, and what no record tells."""
+"""fit(): bodies estimated from noisy records, errors, and what no record tells."""
 
 import functools
 import re
@@ -151,7 +151,7 @@ def one_fit():
 
 
 def test_minimum_and_covariance_are_those_of_scipy_in_other_parameters(one_fit):
-    """Moments and a rotation vector, Euler's equations integrated, finite differences."""
+    """Moments and a rotation vector, Euler's equations, finite differences."""
     _, readings, found = one_fit
     moments, axes = np.linalg.eigh(np.asarray(found.inertia))
     axes = axes * np.sign(np.linalg.det(axes))
@@ -221,7 +221,7 @@ def test_what_is_printed(one_fit):
 
 @quick_jit
 def rows_and_slope(inertia, state, t0, ts, values):
-    """Residuals with an axis of trials in what is given, and the slope of half their squares."""
+    """Residuals with an axis of trials in what is given; slope of half their squares."""
 
     def loss(omega):
         start, readings = (
@@ -287,7 +287,7 @@ def told_and_information(tensor, omega, ts, sigma, t0):
 
 
 def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
-    """Whoever takes the state of a fit takes its time too; without it all is 50 s off."""
+    """Who takes the state of a fit takes its time too; without it all is 50 s off."""
     _, readings, early = one_fit
     ts = TS + 50
     found = fit_of_rates(ts, readings.values, 0.02)
@@ -459,7 +459,7 @@ def test_one_scale_factor_of_the_gyro():
 
 @pytest.mark.slow  # two programs of their own
 def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
-    """Three factors along the principal axes change (I2 - I3)/I1 and cyclic ones at will."""
+    """Three factors along principal axes change (I2 - I3)/I1 and cyclic ones at will."""
     words = told(ASYMMETRIC, "scale", factors=3, axes=np.eye(3)).null_directions
     assert len(words) > 1
     assert all("gyro scale" in text for text in words[1:])
@@ -469,7 +469,7 @@ def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
 
 
 def test_bias_and_scale_inflate_the_bound_as_measured_before():
-    """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5), by order."""
+    """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5)."""
     for body, least in ((ASYMMETRIC, 1.2), (BODIES["nearly symmetric"], 10.0)):
         plain, bias, factor = (
             float(told(body, n).ratios_errors[1]) for n in (None, "bias", "scale")
@@ -542,7 +542,9 @@ def test_gaps_missing_samples_and_single_components(rng):
 
 
 def test_attitudes_rates_directions_and_momenta_together(rng):
-    """All kinds at once, times of their own, one with a covariance; the momentum sets the scale.
+    """All kinds at once, with times of their own, one with a covariance.
+
+    The momentum sets the scale.
 
     No attitude is seen in two turns of the six: dead reckoning carries them over the
         gap.
@@ -674,7 +676,7 @@ def test_toutatis():
 
 
 def steps_of_one_s_own(system, state, ts, t0):
-    """Runge and Kutta's steps, two from sample to sample: a `motion` that is soon compiled."""
+    """Runge and Kutta's steps, two from sample to sample: a `motion` quickly compiled."""
 
     def rate(t, y):
         slope = system.vector_field(t, jr.State(*y), None)
@@ -774,7 +776,10 @@ def test_heavy_top_from_its_gyro_alone(rng):
 
 
 def test_ten_numbers_of_a_body_about_its_pivot_of_which_two_are_known(rng):
-    """A gyro on a swinging body tells inertia over weight; mass and one length must be known."""
+    """A gyro on a swinging body tells inertia over weight.
+
+    Mass and one length must be known.
+    """
     turn = jr.rotation.exp(np.array([0.3, -0.2, 0.5]))
     box = jr.solids.box(2.0, np.array([0.2, 0.3, 0.5])).rotated(turn)
     arm = box.translated(np.array([0.05, -0.02, 0.4]))
@@ -845,7 +850,7 @@ def test_ten_numbers_are_two_too_many():
 
 
 def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
-    """Where it is seen so often that it seems to turn little between samples all the same."""
+    """Where it is seen so often that it seems to turn little between samples."""
     degrees = 180 / np.pi
     _, omegas, _ = rates(ASYMMETRIC, SHORT)
     values = omegas + 1e-4 * rng.normal(size=omegas.shape)
@@ -926,7 +931,7 @@ def test_117_trials_of_a_phone(rng):
 
 @pytest.mark.slow  # a program of its own
 def test_motion_of_one_s_own_and_a_function_of_the_state(rng):
-    """A damped pointer seen through one angle: doubling horizons from a start that is off."""
+    """A damped pointer seen through one angle: doubling horizons from a bad start."""
     ts = np.linspace(0.0, 12.0, 120)
     body = jr.RigidBody(np.array([1.0, 1.0, 1.5]), jr.torques.LinearDrag(0.1))
     start = jr.State(UNTURNED, np.array([0.3, 0.0, 2.0]))
@@ -992,7 +997,7 @@ def test_too_few_samples_and_wrong_options(untyped):
         identify.fit(BLIND, identify.Rates(ts, values, 0.01))
     readings = identify.Rates(TS, np.ones((200, 3)), 0.01)
     for options, message in (
-        ({"shape": "cube"}, "shape"),
+        ({"inertia_model": "cube"}, "inertia_model"),
         ({"scale": "mass"}, "scale"),
         ({"unmodelled": "some"}, "unmodelled"),
         ({"unmodelled": -1.0}, "unmodelled"),

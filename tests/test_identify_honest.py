@@ -1,4 +1,7 @@
-"""fit() on records that mislead: it is right, or says what is wrong. The records are of worlds."""
+"""fit() on records that mislead: it is right, or says what is wrong.
+
+The records are simulated in `worlds.py`.
+"""
 
 import functools
 
@@ -60,7 +63,7 @@ def words(found):
 
 
 def covers(found, tensor, absolute=False, far=30.0, ratio=5.0):
-    """The tensor is within the errors stated: chi-square of five numbers, 1e-5; of six."""
+    """The tensor is within its errors: chi-square of five numbers, 1e-5; of six."""
     pairs = SIX if absolute else FIVE
 
     def numbers(tensor):
@@ -164,7 +167,7 @@ def test_records_that_tell_all_are_fitted(seed):
 
 
 def off_by(found, tensor):
-    """Squares of the tensor's five numbers, and ratios, in units of their errors, of many fits."""
+    """Squares of the tensor's five numbers, and ratios, in units of their errors."""
     places = [3 * i + j for i, j in FIVE]
     spread = np.asarray(found.inertia_covariance)[:, places][:, :, places]
     error = (np.asarray(found.inertia) - tensor).reshape(-1, 9)[:, places]
@@ -178,7 +181,7 @@ def off_by(found, tensor):
 
 
 def test_500_random_records_are_never_ok_and_wrong():
-    """Beyond six of their own errors: chi-square of five numbers 53, and each ratio six."""
+    """Beyond six of their errors: chi-square of five numbers 53, and each ratio six."""
     draws = (np.random.default_rng([1, seed]) for seed in range(500))
     records = [worlds.random_record(rng, largest=60) for rng in draws]
     tensors = np.stack([3 * x.tensor / np.trace(x.tensor) for x in records])
@@ -619,7 +622,10 @@ SEVERAL = 4
 
 
 def trials_of(rng, tensors, **errors):
-    """A record of each body, three turns, and the gyro's errors, each trial's own if a list."""
+    """A record of each body, three turns, with errors of the gyro.
+
+    The errors are each trial's own if they are a list.
+    """
     records = []
     grid = grid_for(SHORT)
     for i, tensor in enumerate(tensors):

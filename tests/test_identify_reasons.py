@@ -1,4 +1,4 @@
-"""What is wrong with a request is named in the first line of its report, with what to pass."""
+"""The first line of a report names what is wrong with a request, and what to pass."""
 
 import re
 
@@ -54,7 +54,7 @@ def test_degrees_for_radians_are_named(readings):
 
 
 def test_degrees_for_radians_are_named_where_samples_are_dense(rng):
-    """A body whose rates change 57 times as slowly as they should is nearly a sphere."""
+    """A body whose rates change 57 times too slowly is nearly a sphere."""
     ts = np.linspace(0, 2, 1000)
     values = motion(ts) + NOISE * rng.normal(size=(ts.size, 3))
     readings = identify.Rates(ts, DEGREES * values, DEGREES * NOISE)

@@ -22,7 +22,7 @@ def by_session(_, gyro):
 
 
 def trials(rng, turns):
-    """Records of trials whose sensor axes are turned from the body's by rotation vectors."""
+    """Records of trials whose sensors are turned from the body by rotation vectors."""
     spins = 6.0 * rng.normal(size=(len(SESSIONS), 3))
     motion = worlds.tumble(TENSOR, spins, TS)
     values = motion.omega + NOISE * rng.normal(size=motion.omega.shape)

@@ -183,10 +183,25 @@ _WORTH_A_PLAN = 1000  # numbers of an array, where numpy's plan for a product pa
 
 def product(subscripts: str, *operands: AnyArray) -> AnyArray:
     """`einsum` in the full precision of the dtype on every device; numpy's of arrays of numpy."""
-    if all(isinstance(x, np.ndarray) for x in operands):
-        large = max(x.size for x in operands) > _WORTH_A_PLAN
-        return np.einsum(subscripts, *operands, optimize=large)
-    return jnp.einsum(subscripts, *operands, precision=_EXACT)
+    if not all(isinstance(x, np.ndarray) for x in operands):
+        return jnp.einsum(subscripts, *operands, precision=_EXACT)
+    if _is_matrix_product(subscripts):
+        return np.tensordot(*operands, axes=1)
+    large = max(x.size for x in operands) > _WORTH_A_PLAN
+    return np.einsum(subscripts, *operands, optimize=large)
+
+
+@functools.cache
+def _is_matrix_product(subscripts: str) -> bool:
+    """Whether the last index of one array is summed with the first one of another."""
+    inputs, _, output = subscripts.partition("->")
+    left, *rest = inputs.split(",")
+    if len(rest) != 1 or "." in subscripts or not output:
+        return False
+    if left[-1:] != rest[0][:1]:
+        return False
+    # An index that repeats is no axis of its own.
+    return output == left[:-1] + rest[0][1:] and len(set(inputs)) == len(inputs) - 1
 
 
 def with_columns(function: Callable[..., Components]) -> Callable[..., Components]:

@@ -16,9 +16,11 @@ _ON_CPU = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 2,
 }
-# LLVM's second level of optimisation takes a fifth and makes a fit 3 % faster; of what
-# runs once in a fit, no optimisation takes a third of the time for code half as fast.
-_LEVEL, _LEVEL_ONCE = 1, 0
+# LLVM's second level of optimisation takes a fifth of the time to compile, and makes a
+# fit 3 % faster. Programs that run once in a fit are not optimised: they compile in a
+# third of the time and run half as fast.
+_LEVEL = 1
+_LEVEL_ONCE = 0
 
 
 @cache
@@ -40,10 +42,10 @@ def _options(level: int) -> dict[str, Any] | None:
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`equinox.filter_jit`, with options for the CPU's compiler where it is called by itself.
+    """`equinox.filter_jit` with options for the CPU's compiler.
 
-    Within another jit, vmap or derivative it is the plain one: options are for whole
-        programs.
+    Within another jit, vmap or derivative it is the plain one, since options are for
+    whole programs.
     """
     plain = eqx.filter_jit(function)
 

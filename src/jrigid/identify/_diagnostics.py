@@ -1,4 +1,4 @@
-"""Diagnostics: what a fit left of its record, and how it got there."""
+"""Diagnostics: residuals of a fit, what determined its numbers, and its history."""
 
 from typing import Any
 
@@ -9,19 +9,20 @@ from jrigid._types import Scalar
 
 
 class Diagnostics(eqx.Module):
-    """What a fit left of its record, what determined its numbers, and how it got there.
+    """Residuals of a fit, what determined its numbers, and how it got there.
 
     Attributes:
         residuals: Whitened, records side by side; zero where nothing was seen.
         jacobian: Their derivatives in the numbers and in the state of the trial.
         chi_square_by_trial: Mean square of the residuals of each trial.
         whiteness: Correlation of neighbouring residuals, and how many standard
-            deviations that is from 0. Near 0 for noise; what a model leaves out changes
-            slowly and brings it near 1.
-        loudest_band: Power of what is left in the band of frequencies that stands out
-            most, over the mean, and how many standard deviations that is from what
-            noise has.
-        unexplained: Of the square of what was observed, beyond the noise.
+            deviations that is from 0. It is near 0 for noise. What a model leaves out
+            changes slowly and brings it near 1.
+        loudest_band: Power of the residuals in the band of frequencies that stands out
+            most, over the mean power, and how many standard deviations that is from the
+            power of noise.
+        unexplained: Fraction of the square of what was observed that the fit does not
+            explain, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed,
             descending.
         directions: In the numbers, columns for the singular values.
@@ -30,19 +31,19 @@ class Diagnostics(eqx.Module):
         sensor_covariance: The part of the numbers' covariance that the sensors' noise
             makes.
         local_covariance: Of each trial's state at `t0` (rate, then, if it matters, a
-            small turn of the attitude about the body axes) and own numbers, beside
-            given numbers.
-        follow: How these follow the numbers, with the sign turned (trials, local,
-            numbers).
+            small turn of the attitude about the body axes) and own numbers, for given
+            numbers.
+        sensitivity: Derivative of the state and own numbers of each trial in the
+            numbers.
         scores: What each trial adds to the gradient of half the squares, zero in sum.
-        inflation: Of covariances, beyond what the noise stated makes.
+        inflation: Factor of covariances beyond what the stated noise makes.
         torque_numbers: How many numbers of the unmodelled torque were sought.
-        log_determinant: Of the covariance of the record that it makes, in units of the
-            noise: with `chi_square` it is -2 log likelihood, but for a constant; 0
-                without such a torque.
+        log_determinant: Of the covariance of the record that this torque makes, in
+            units of the noise. Its sum with `chi_square` is -2 log likelihood, but for
+            a constant. It is 0 without such a torque.
         scales: Of each record's residuals, in units of the noise, in the median of a
             robust fit.
-        history: Sum of squares of the record after each step, NaN beyond the last.
+        history: Sum of squares of residuals after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
         input_result: `jrigid.RESULTS` of the input.
@@ -66,7 +67,7 @@ class Diagnostics(eqx.Module):
     state_singular_values: Float[Array, "trials local"]
     sensor_covariance: Float[Array, "numbers numbers"]
     local_covariance: Float[Array, "trials local local"]
-    follow: Float[Array, "trials local numbers"]
+    sensitivity: Float[Array, "trials local numbers"]
     scores: Float[Array, "trials numbers"]
     inflation: Scalar
     torque_numbers: Int[Array, ""]

@@ -21,29 +21,32 @@ from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples
-from jrigid.identify._result import LARGEST_ERROR, Status, errors_of
+from jrigid.identify._result import (
+    LARGEST_ERROR,
+    Status,
+    errors_of,
+    sigma_points,
+    spread_of,
+)
 from jrigid.identify._smoother import Links, Rows
 
-SHOWN = (
-    1e-9  # of the largest singular value: a change of the state that the record shows
-)
-_FAR = 1.0  # a change of a number beyond which the tensor is another one
+# Of the largest singular value: a change of the state that the record shows.
+SHOWN = 1e-9
 HISTORY = 512  # steps whose sums of squares are returned
 _FEWEST = 8  # trials whose scatter says how large errors are
-_DISAGREEING = (
-    3.0  # times the errors stated: the scatter of trials of which something is missing
-)
-_TRIED = (
-    0.03  # of the level that moves a rate by its noise: where one of zero is judged
-)
+# Scatter of trials over the errors stated, above which something is missing.
+_DISAGREEING = 3.0
+# Of the level that moves a rate by its noise: where one of zero is judged.
+_TRIED = 0.03
 
 
 def condensed(rows: Rows, links: Links) -> Rows:
-    """Rows in the first state of each trial: along the links, as if nothing came between."""
+    """Rows in the first state of each trial, as if nothing acted between segments."""
     if not np.any(rows.node):
         return rows
     trials, nodes, local = links.gap.shape
     border = rows.of_border.shape[-1]
+    # Derivatives of the state at a node in the border and in the first state.
     state = np.zeros((trials, local, border + local), links.gap.dtype)
     state[:, :, border:] = np.eye(local)
     states = np.zeros((trials, nodes, local, border + local), links.gap.dtype)
@@ -51,12 +54,13 @@ def condensed(rows: Rows, links: Links) -> Rows:
         states[:, node] = state
         state = links.of_state[:, node] @ state
         state[:, :, :border] += links.of_border[:, node]
-    through = rows.of_state @ np.take_along_axis(
-        states, rows.node[:, :, None, None], axis=1
-    )
-    of_border = rows.of_border + through[..., :border]
+    of_nodes = np.take_along_axis(states, rows.node[:, :, None, None], axis=1)
+    through = rows.of_state @ of_nodes
     return Rows(
-        rows.residual, of_border, through[..., border:], np.zeros_like(rows.node)
+        residual=rows.residual,
+        of_border=rows.of_border + through[..., :border],
+        of_state=through[..., border:],
+        node=np.zeros_like(rows.node),
     )
 
 
@@ -69,7 +73,7 @@ class Precision(NamedTuple):
         directions: In the numbers, columns for the values.
         covariance: Of the numbers.
         local: Of a trial's first state and own numbers beside given numbers.
-        follow: How these follow the numbers, with the sign turned.
+        sensitivity: Derivative of these in the numbers (trials, local, numbers).
         of_state: Singular values of each trial's state, of unit columns, descending.
         scores: What each trial adds to the gradient of half the squares in the numbers.
     """
@@ -78,7 +82,7 @@ class Precision(NamedTuple):
     directions: np.ndarray
     covariance: np.ndarray
     local: np.ndarray
-    follow: np.ndarray
+    sensitivity: np.ndarray
     of_state: np.ndarray
     scores: np.ndarray
 
@@ -86,41 +90,91 @@ class Precision(NamedTuple):
 def precision_of_rows(
     rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
 ) -> Precision:
-    """By a QR decomposition of weighted rows in first states: their squares would lose digits."""
+    """Decompose weighted rows in first states by QR: their squares would lose digits.
+
+    Args:
+        rows: In the first state of each trial, own numbers and numbers.
+        weight: Of each row.
+        own: How many own numbers a trial has.
+        units: Natural units of the numbers.
+    """
     root = np.sqrt(weight)[..., None]
     trials, count, width = rows.residual.shape
-    residual = (root * rows.residual).reshape(trials, count * width)
+    flat = (trials, count * width)
+    residual = (root * rows.residual).reshape(flat)
     local = np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    local = (root[..., None] * local).reshape(trials, count * width, local.shape[-1])
+    local = (root[..., None] * local).reshape(*flat, local.shape[-1])
     shared = root[..., None] * rows.of_border[..., own:]
-    shared = shared.reshape(trials, count * width, units.size)
-    shared = np.nan_to_num(shared * units)
-    local = np.nan_to_num(local)
-    eps, size = np.finfo(units.dtype).eps, units.size
-    scale = quality.or_one(np.linalg.norm(local, axis=1))
-    u, s, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
-    shown = s > SHOWN * s[:, :1]
-    u = np.where(shown[:, None], u, 0.0)
-    inverse = 1 / np.where(shown, s, eps * np.maximum(s[:, :1], 1.0))
-    half = np.swapaxes(vt, 1, 2) * inverse[:, None] / scale[:, :, None]
-    along = np.swapaxes(u, 1, 2) @ shared
-    follow = np.where(shown[:, None], half, 0.0) @ along
-    rest = shared - u @ along
+    shared = np.nan_to_num(shared.reshape(*flat, units.size) * units)
+    states = _decomposed(np.nan_to_num(local))
+    along = np.swapaxes(states.basis, 1, 2) @ shared
+    # What no state can do is left for the numbers.
+    rest = shared - states.basis @ along
     scores = (residual[:, None] @ rest)[:, 0] / units
-    r = np.linalg.qr(rest.reshape(trials * count * width, size), mode="r")
-    sound = np.all(np.isfinite(r))
-    _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
-    floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
-    root = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
+    values, directions, covariance = _of_numbers(rest, units)
+    half = states.half
     return Precision(
         values=values,
-        directions=vt.T,
-        covariance=root.T @ root,
+        directions=directions,
+        covariance=covariance,
         local=half @ np.swapaxes(half, 1, 2),
-        follow=follow / units,
-        of_state=s,
+        sensitivity=-(np.where(states.shown[:, None], half, 0.0) @ along) / units,
+        of_state=states.values,
         scores=scores,
     )
+
+
+class _States(NamedTuple):
+    """Singular value decomposition of derivatives in the state and own numbers.
+
+    Attributes:
+        basis: Columns of what the record shows of them (trials, rows, local).
+        values: Singular values of unit columns, descending.
+        shown: Which of them the record shows.
+        half: Of the covariance, which is its product with its transpose.
+    """
+
+    basis: np.ndarray
+    values: np.ndarray
+    shown: np.ndarray
+    half: np.ndarray
+
+
+def _decomposed(local: np.ndarray) -> _States:
+    """Decompose derivatives (trials, rows, local).
+
+    What the record does not show has large errors.
+    """
+    scale = quality.or_one(np.linalg.norm(local, axis=1))
+    basis, values, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
+    shown = values > SHOWN * values[:, :1]
+    eps = np.finfo(local.dtype).eps
+    inverse = 1 / np.where(shown, values, eps * np.maximum(values[:, :1], 1.0))
+    return _States(
+        basis=np.where(shown[:, None], basis, 0.0),
+        values=values,
+        shown=shown,
+        half=np.swapaxes(vt, 1, 2) * inverse[:, None] / scale[:, :, None],
+    )
+
+
+def _of_numbers(
+    rest: np.ndarray, units: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Singular values, directions and covariance of the numbers.
+
+    Args:
+        rest: Derivatives in natural units, without what states can do (trials, rows,
+            numbers).
+        units: Natural units of the numbers.
+    """
+    r = np.linalg.qr(rest.reshape(-1, units.size), mode="r")
+    sound = np.all(np.isfinite(r))
+    _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
+    eps = np.finfo(units.dtype).eps
+    floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
+    half = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
+    return values, vt.T, half.T @ half
 
 
 class Independent(NamedTuple):
@@ -138,26 +192,37 @@ class Independent(NamedTuple):
     log_determinant: float
 
 
+@quality.once_for_each_fit
+def _condensed_rows(problem: Problem, fit: Fit) -> Rows:
+    """Rows of a minimum in the first state of each trial."""
+    del problem
+    return condensed(fit.minimum.rows, fit.minimum.links)
+
+
+@quality.once_for_each_fit
 def independent_rows(problem: Problem, fit: Fit) -> Independent:
-    """The rows of a fit by which it is judged, those of what is known beforehand last."""
+    """The rows by which a fit is judged, those of what is known beforehand last."""
     minimum = fit.minimum
     if not problem.options.dense:
-        return Independent(condensed(minimum.rows, minimum.links), minimum.weight, 0.0)
-    found = innovations(quality.linearised(fit), fit.disturbance)
+        return Independent(_condensed_rows(problem, fit), minimum.weight, 0.0)
+    filtered = innovations(quality.linearised(fit), fit.disturbance)
     columns = np.concatenate(
-        [np.asarray(found.rows), quality.columns_of_prior(fit)], axis=1
+        [np.asarray(filtered.rows), quality.columns_of_prior(fit)], axis=1
     )
     border = 1 + minimum.links.gap.shape[-1]
-    of_border, of_state = columns[..., border:], columns[..., 1:border]
-    rows = Rows(columns[..., 0], of_border, of_state, np.zeros_like(minimum.rows.node))
-    # They have their weights already.
-    return Independent(
-        rows, np.ones_like(minimum.weight), float(np.sum(found.log_determinant))
+    rows = Rows(
+        residual=columns[..., 0],
+        of_border=columns[..., border:],
+        of_state=columns[..., 1:border],
+        node=np.zeros_like(minimum.rows.node),
     )
+    # They have their weights already.
+    weight = np.ones_like(minimum.weight)
+    return Independent(rows, weight, float(np.sum(filtered.log_determinant)))
 
 
 class Weakest(NamedTuple):
-    """Chi-square of a fit, its unit, and what the record determines least of the inertia.
+    """Chi-square, its unit, and what the record determines least of the inertia.
 
     Attributes:
         square: Chi-square.
@@ -176,21 +241,24 @@ class Weakest(NamedTuple):
     direction: np.ndarray
 
 
+@quality.once_for_each_fit
 def precision(problem: Problem, fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
-    own, units = fit.minimum.point.own.shape[-1], fit.minimum.units
+    own = fit.minimum.point.own.shape[-1]
     rows, weight, _ = independent_rows(problem, fit)
-    return precision_of_rows(rows, weight, own, units)
+    return precision_of_rows(rows, weight, own, fit.minimum.units)
 
 
 def weakest(problem: Problem, fit: Fit) -> Weakest:
     """The direction in the numbers that the record determines least."""
-    minimum, units = fit.minimum, fit.minimum.units
-    square, noise = float(minimum.square + minimum.kicks), 1.0
+    minimum = fit.minimum
+    units = minimum.units
+    square = float(minimum.square + minimum.kicks)
+    noise = 1.0
     if not problem.options.noise_known:
-        trials, local = minimum.links.gap.shape[0], minimum.links.gap.shape[-1]
-        counted = np.sum(quality.weights_of(problem, fit.kept))
-        noise = square / max(float(counted) - units.size - local * trials, 1.0)
+        trials, _, local = minimum.links.gap.shape
+        count = quality.sums_of(problem, fit).count
+        noise = square / max(count - units.size - local * trials, 1.0)
     covariance = precision(problem, fit).covariance
     error, normal, direction = weakest_of(problem.unknowns.judged, covariance, units)
     return Weakest(square, noise, np.sqrt(noise) * error, normal, direction)
@@ -206,15 +274,16 @@ def weakest_of(
         covariance: Of all numbers.
         units: Natural units of the numbers.
     """
-    normal, direction = np.zeros_like(units), np.zeros_like(units)
+    normal = np.zeros_like(units)
+    direction = np.zeros_like(units)
     inside = covariance[part, part] / (units[part, None] * units[part])
     if not units.size or not np.all(np.isfinite(inside)):
         return 0.0 if not units.size else np.inf, normal, direction
     values, axes = np.linalg.eigh(inside)
     normal[part] = axes[:, -1] / units[part]
     # Others follow as far as they are known to, and no farther than a start need be.
-    follow = covariance @ normal / max(values[-1], 1e-300)
-    direction = np.clip(follow, -units, units)
+    change = covariance @ normal / max(values[-1], 1e-300)
+    direction = np.clip(change, -units, units)
     direction[part] = axes[:, -1] * units[part]
     return float(np.sqrt(max(values[-1], 0.0))), normal, direction
 
@@ -227,44 +296,42 @@ def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
     return float(problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0))
 
 
-def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
+def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.ndarray]:
     """Level and correlation time of the unmodelled torque, with errors."""
-    trials, none = fit.kept.shape[0], np.zeros(3)
+    none = np.zeros(3)
     fields = {
         "level": none,
         "level_errors": none,
         "correlation_time": none,
         "correlation_time_errors": none,
-        "level_by_trial": np.ones(trials),
+        "level_by_trial": np.ones(fit.kept.shape[0]),
     }
     if not problem.options.dense:
         return fields
-    # A level was relative to a noise that was not known.
-    size = 1.0 if problem.options.noise_known else np.sqrt(inflation)
     first = first_level(problem, fit.layout, fit.minimum.tensor)
     search = levels.Search(problem, fit.layout, first)
     torque = fit.torque
     if torque is None:
-        given = fit.disturbance
-        torque = levels.known(
-            np.asarray(given.level[0], float), np.asarray(given.time, float)
-        )
+        level = np.asarray(fit.disturbance.level[0], float)
+        torque = levels.known(level, np.asarray(fit.disturbance.time, float))
     faint = search.are_faint(torque)
     tried = torque.with_levels(np.where(faint, _TRIED * first, torque.levels))
-    typical, errors = tried.typical, search.errors(tried, fit)
+    typical = tried.typical
+    errors = search.errors(tried, fit)
     of_levels, of_times = np.split(errors, [torque.form.levels])
     # Near none the likelihood is quadratic in the level squared: the least to be seen.
     of_levels = np.where(faint, np.sqrt(2 * of_levels), of_levels)
+    # A level was relative to a noise that was not known.
+    size = 1.0 if problem.options.noise_known else np.sqrt(inflation)
     level = size * typical.level
     if fit.torque is not None:
         level = np.where(search.are_unbounded(tried, of_levels), np.inf, level)
-    fields |= {"level": np.where(faint, 0.0, level), "level_errors": level * of_levels}
+    fields["level"] = np.where(faint, 0.0, level)
+    fields["level_errors"] = level * of_levels
     if np.all(faint):
         return fields
-    fields |= {
-        "correlation_time": typical.time,
-        "level_by_trial": np.exp(torque.trials),
-    }
+    fields["correlation_time"] = typical.time
+    fields["level_by_trial"] = np.exp(torque.trials)
     if torque.form.times:
         fields["correlation_time_errors"] = typical.time * of_times
     return fields
@@ -272,16 +339,10 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, Any]:
 
 def derive(
     problem: Problem, numbers: np.ndarray, covariance: np.ndarray
-) -> dict[str, Any]:
+) -> dict[str, np.ndarray]:
     """Moments, axes and ratios, with errors, from the numbers and their covariance."""
-    found = jtu.tree_map(np.asarray, spectrum(problem.unknowns, numbers))
-    tensor, moments, axes, slopes = found
+    tensor, moments, axes, slopes = map(np.asarray, spectrum(problem.unknowns, numbers))
     elements = slopes.reshape(9, numbers.size)
-    gaps = np.roll(moments, -1) - np.roll(moments, 1)
-    floor = np.finfo(gaps.dtype).eps * moments[2]
-    gaps = np.where(np.abs(gaps) > floor, gaps, floor)
-    sides = np.roll(axes, -1, axis=1), np.roll(axes, 1, axis=1)
-    turns = np.einsum("ki,kln,li->in", sides[0], slopes, sides[1]) / gaps[:, None]
     spread = _spread_of_moments(problem, numbers, covariance)
     return {
         "inertia": tensor,
@@ -293,10 +354,26 @@ def derive(
         "moments_covariance": spread[:3, :3],
         "ratios_covariance": spread[3:5, 3:5],
         "shares_covariance": spread[5:, 5:],
-        "axes_errors": np.sqrt(
-            np.maximum(np.sum((turns @ covariance) * turns, axis=1), 0.0)
-        ),
+        "axes_errors": _errors_of_axes(moments, axes, slopes, covariance),
     }
+
+
+def _errors_of_axes(
+    moments: np.ndarray, axes: np.ndarray, slopes: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Errors of the turn about each principal axis [rad], huge where moments coincide.
+
+    A change dI of the tensor turns two axes j and k about the third by
+    j . dI k / (I_k - I_j).
+    """
+    gaps = np.roll(moments, -1) - np.roll(moments, 1)
+    floor = np.finfo(gaps.dtype).eps * moments[2]
+    gaps = np.where(np.abs(gaps) > floor, gaps, floor)
+    following = np.roll(axes, -1, axis=1)
+    preceding = np.roll(axes, 1, axis=1)
+    turns = np.einsum("ki,kln,li->in", following, slopes, preceding) / gaps[:, None]
+    square = np.sum((turns @ covariance) * turns, axis=1)
+    return np.sqrt(np.maximum(square, 0.0))
 
 
 def _of_moments(moments: np.ndarray) -> np.ndarray:
@@ -311,23 +388,16 @@ def _spread_of_moments(
 ) -> np.ndarray:
     """Covariance of moments, ratios and shares: as `FitResult.spread`."""
     size = problem.unknowns.of_inertia.stop
-    inside = covariance[:size, :size]
-    if not size or not np.all(np.isfinite(inside)):
-        return np.full((8, 8), 0.0 if not size else np.nan, numbers.dtype)
-    values, axes = np.linalg.eigh(inside)
-    sizes = np.sqrt(np.maximum(values, 0.0) * size)
-    near = np.minimum(
-        sizes, _FAR
-    )  # what is known worse is continued as a straight line
-    steps = np.pad((axes * near).T, ((0, 0), (0, numbers.size - size)))
-    points = numbers + np.concatenate([steps, -steps, np.zeros((1, numbers.size))])
-    tensors = np.asarray(tensors_at(problem.unknowns, points.astype(numbers.dtype)))
+    unknown = np.full((8, 8), np.nan, numbers.dtype)
+    if not size:
+        return np.zeros_like(unknown)
+    if not np.all(np.isfinite(covariance[:size, :size])):
+        return unknown
+    points, scales = sigma_points(numbers, covariance, size)
+    tensors = np.asarray(tensors_at(problem.unknowns, points))
     if not np.all(np.isfinite(tensors)):
-        return np.full((8, 8), np.nan, numbers.dtype)
-    values = _of_moments(np.linalg.eigvalsh(tensors))
-    moves = values[:-1] - values[-1]
-    moves = moves * np.tile(sizes / np.where(near > 0, near, 1.0), 2)[:, None]
-    return moves.T @ moves / (2 * max(size, 1))
+        return unknown
+    return spread_of(_of_moments(np.linalg.eigvalsh(tensors)), scales)
 
 
 @np.errstate(all="ignore")  # what is not finite is judged below
@@ -345,65 +415,102 @@ def conclude(
         lengths: How many samples of each record to return.
         input_result: What is wrong with the input.
     """
-    minimum, options = fit.minimum, problem.options
-    point, units, own = minimum.point, minimum.units, minimum.point.own.shape[-1]
     independent = independent_rows(problem, fit)
-    known = precision_of_rows(independent.rows, independent.weight, own, units)
-    rows, sensor = independent.rows, known
-    if options.dense:
-        rows = condensed(minimum.rows, minimum.links)
-        sensor = precision_of_rows(rows, minimum.weight, own, units)
-    residuals, jacobian = _weighted(fit, rows, own)
-    parts, count = problem.samples.parts, fit.kept.shape[1]
+    known = precision(problem, fit)
+    judgement = _judgement(problem, fit, known, _white(fit, independent))
+    derived = derive(problem, fit.minimum.point.numbers, judgement.covariance)
+    of_torque = _of_torque(problem, fit, judgement.remainder.inflation)
+    fields = derived | of_torque
+    fields |= _fields_of_judgement(judgement)
+    fields |= _fields_of_precision(problem, fit, known, judgement)
+    fields |= _fields_of_record(problem, fit, lengths)
+    fields["log_determinant"] = np.asarray(independent.log_determinant)
+    good = is_good(input_result)
+    fields = _of_dtype(fields, good, fit.minimum.units.dtype)
+    status = _status(judgement.status, good, derived, of_torque)
+    return fields | {"status": getattr(Status, status), "input_result": input_result}
+
+
+def _white(fit: Fit, independent: Independent) -> np.ndarray:
+    """Whitened residuals or innovations of the samples (trials, samples, degrees)."""
     # Weights of innovations are ones.
-    judged_by = (np.sqrt(independent.weight)[..., None] * independent.rows.residual)[
-        :, :count
-    ]
-    judged = _judged(problem, fit, known, judged_by)
-    inflation, covariance = judged["inflation"], judged["numbers_covariance"]
-    derived = derive(problem, point.numbers, covariance)
-    loose = np.any(
-        errors_of(derived["ratios_covariance"]) > LARGEST_ERROR * derived["ratios"]
-    )
-    if not is_good(input_result):
-        judged["status"] = "BAD_INPUT"
-    elif loose and judged["status"] == "OK":
-        judged["status"] = "UNIDENTIFIABLE"
-    of_torque = _of_torque(problem, fit, float(inflation))
-    if not np.all(np.isfinite([of_torque["level"], of_torque["level_errors"]])):
-        judged["status"] = "NOT_CONVERGED"
-    fields = judged | derived | of_torque
-    fields |= {
+    white = np.sqrt(independent.weight)[..., None] * independent.rows.residual
+    return white[:, : fit.kept.shape[1]]
+
+
+def _status(
+    status: str,
+    good_input: bool,
+    derived: dict[str, np.ndarray],
+    of_torque: dict[str, np.ndarray],
+) -> str:
+    """The name of the status, after a look at the input, the ratios and the torque."""
+    errors = errors_of(derived["ratios_covariance"])
+    loose = np.any(errors > LARGEST_ERROR * derived["ratios"])
+    levels_known = np.isfinite([of_torque["level"], of_torque["level_errors"]])
+    if not np.all(levels_known):
+        return "NOT_CONVERGED"
+    if not good_input:
+        return "BAD_INPUT"
+    return "UNIDENTIFIABLE" if loose and status == "OK" else status
+
+
+def _fields_of_precision(
+    problem: Problem, fit: Fit, known: Precision, judgement: "_Judgement"
+) -> dict[str, np.ndarray]:
+    """Fields that say what determines the numbers and the states."""
+    minimum = fit.minimum
+    sensors = known
+    if problem.options.dense:
+        # What the sensors alone would determine, without an unmodelled torque.
+        rows = _condensed_rows(problem, fit)
+        own = minimum.point.own.shape[-1]
+        sensors = precision_of_rows(rows, minimum.weight, own, minimum.units)
+    inflation = judgement.remainder.inflation
+    return {
+        "singular_values": known.values,
+        "directions": known.directions,
+        "scores": known.scores,
+        "sensitivity": known.sensitivity,
+        "local_covariance": inflation * known.local,
+        "sensor_covariance": inflation * sensors.covariance,
+        "state_singular_values": sensors.of_state,
+    }
+
+
+def _fields_of_record(
+    problem: Problem, fit: Fit, lengths: Sequence[int]
+) -> dict[str, Any]:
+    """Fields that hold the estimates, the residuals and the record as it was given."""
+    minimum = fit.minimum
+    point = minimum.point
+    parts = problem.samples.parts
+    rows = _condensed_rows(problem, fit)
+    residuals, jacobian = _weighted(fit, rows, point.own.shape[-1])
+    history = np.full(HISTORY, np.nan)
+    history[: fit.history.size] = fit.history[:HISTORY]
+    return {
         "numbers": point.numbers,
         "own_numbers": point.own,
-        "sensor_covariance": inflation * sensor.covariance,
-        "local_covariance": inflation * known.local,
-        "follow": known.follow,
-        "scores": known.scores,
         "state": State(point.attitude[:, 0], point.omega[:, 0]),
         "t0": fit.layout.start[:, 0],
         "residuals": _resized(residuals, parts, lengths),
         "jacobian": _resized(jacobian, parts, lengths),
-        "state_singular_values": sensor.of_state,
         "scales": fit.scales,
         "kept": _resized(fit.kept, parts, lengths) > 0,
-        "history": np.pad(fit.history, (0, HISTORY), constant_values=np.nan)[:HISTORY],
+        "history": history,
         "ambiguous": np.asarray(fit.ambiguous),
-        "log_determinant": np.asarray(independent.log_determinant),
         "torque_numbers": np.asarray(0 if fit.torque is None else fit.torque.size),
         "problem": dataclasses.replace(
             problem,
-            options=options._replace(nodes=1),
+            options=problem.options._replace(nodes=1),
             samples=_of_lengths(problem.samples, lengths),
         ),
     }
-    status = getattr(Status, fields.pop("status"))
-    fields = _of_dtype(fields, is_good(input_result), units.dtype)
-    return fields | {"status": status, "input_result": input_result}
 
 
 def _weighted(fit: Fit, rows: Rows, own: int) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the samples, and their derivatives in the numbers and the first state."""
+    """Residuals of the samples, with derivatives in the numbers and the first state."""
     count = fit.kept.shape[1]
     root = np.sqrt(fit.minimum.weight)[:, :count, None]
     jacobian = np.concatenate([rows.of_border[..., own:], rows.of_state], axis=-1)
@@ -428,12 +535,21 @@ def _resized(
     lengths: Sequence[int],
     mode: str = "constant",
 ) -> np.ndarray:
-    """The samples of each record (trials, samples, ...), so many: cut, or filled with zeros."""
+    """Samples of each record, cut to these lengths, or filled with zeros.
+
+    Args:
+        x: Records side by side (trials, samples, ...).
+        parts: Where each record's samples are.
+        lengths: How many samples of each record to return.
+        mode: Of `numpy.pad`.
+    """
     resized = []
     for part, n in zip(parts, lengths, strict=True):
         own = x[:, part][:, :n]
-        missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
-        resized.append(np.pad(own, missing, mode))  # type: ignore[call-overload]
+        if own.shape[1] < n:
+            missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
+            own = np.pad(own, missing, mode)  # type: ignore[call-overload]
+        resized.append(own)
     return np.concatenate(resized, axis=1)
 
 
@@ -456,7 +572,10 @@ def _of_lengths(samples: Samples, lengths: Sequence[int]) -> Samples:
 def _with_error(
     part: slice, covariance: np.ndarray, units: np.ndarray, error: float
 ) -> np.ndarray:
-    """With an error of the inertia's weakest direction, in natural units, of at least this size."""
+    """The covariance with an error of the weakest direction of at least this size.
+
+    The error is in natural units.
+    """
     before, _, direction = weakest_of(part, covariance, units)
     return covariance + max(error**2 - before**2, 0.0) * np.outer(direction, direction)
 
@@ -473,7 +592,10 @@ def _with_larger_errors(
 def _scatter_of_trials(
     known: Precision, alive: np.ndarray, units: np.ndarray
 ) -> np.ndarray:
-    """Errors by the scatter of trials over those stated, along each direction; 1 of few trials."""
+    """Errors by the scatter of trials over those stated, along each direction.
+
+    Ones where there are few trials.
+    """
     trials = np.sum(alive)
     if trials < _FEWEST or not np.all(np.isfinite(known.scores)):
         return np.ones(units.size)
@@ -500,8 +622,8 @@ def _kicks(problem: Problem, fit: Fit) -> float:
     return float(fit.minimum.kicks) if problem.options.dense else 0.0
 
 
-class _Left(NamedTuple):
-    """What a fit leaves of its record.
+class _Remainder(NamedTuple):
+    """What a fit does not explain of its record.
 
     Attributes:
         chi_square: Sum of squares, of what is known beforehand and of an unmodelled
@@ -523,91 +645,171 @@ class _Left(NamedTuple):
     inflation: float
 
 
-def _what_is_left(
-    problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray
-) -> _Left:
-    count = fit.kept.shape[1]
-    weight = quality.weights_of(problem, fit.kept)
-    alive = np.any(fit.kept > 0, axis=1)[:, None]
-    shown = np.sum((known.of_state > SHOWN * known.of_state[:, :1]) & alive)
-    rows = fit.minimum.rows.residual
-    prior = rows[:, count : rows.shape[1] - problem.held]
-    freedom = np.sum(weight) + np.sum(prior != 0) - fit.minimum.units.size - shown
-    chi_square = np.sum(weight * fit.residual**2) + np.sum(prior**2)
-    chi_square = chi_square + _kicks(problem, fit)
+def _remainder(
+    problem: Problem, fit: Fit, known: Precision, white: np.ndarray
+) -> _Remainder:
+    """Compare chi-square, and the loudest band, with those of noise."""
+    chi_square, freedom = _chi_square(problem, fit, known)
     noise = chi_square / max(freedom, 1.0)
-    band, sure = colour.loudest_band(residuals, problem.samples.parts)
-    coloured = colour.stands_out(band, sure)
+    band = _band(problem, fit, white)
+    coloured = colour.stands_out(*band)
     more = less = False
     if problem.options.noise_known:
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
         more = noise > 1 + gate or np.max(fit.scales) > 2
         less = 0 < noise < 1 - gate  # a plan has no residuals
-    inflation = (
-        noise if not problem.options.noise_known else max(noise, 1.0) if more else 1.0
-    )
-    # A band that stands out may be the one that tells the numbers.
-    inflation = inflation * band if coloured else inflation
-    misfit = bool(more or coloured)
-    return _Left(
-        chi_square, freedom, noise, (band, sure), misfit, bool(less), inflation
+    inflation = 1.0
+    if not problem.options.noise_known:
+        inflation = noise
+    elif more:
+        inflation = max(noise, 1.0)
+    if coloured:
+        # A band that stands out may be the one that tells the numbers.
+        inflation = inflation * band[0]
+    return _Remainder(
+        chi_square=chi_square,
+        freedom=freedom,
+        noise=noise,
+        band=band,
+        misfit=bool(more or coloured),
+        overstated=bool(less),
+        inflation=inflation,
     )
 
 
-def _judged(
-    problem: Problem, fit: Fit, known: Precision, residuals: np.ndarray
-) -> dict[str, Any]:
-    """How well a fit describes the record, by residuals or innovations, and its name."""
-    units, settled, unknowns = (
-        fit.minimum.units,
-        bool(fit.minimum.settled),
-        problem.unknowns,
-    )
-    left = _what_is_left(problem, fit, known, residuals)
-    apart = _scatter_of_trials(known, np.any(fit.kept > 0, axis=1), units)
-    apart = apart / np.sqrt(left.inflation)
-    misfit = left.misfit or np.any(apart > _DISAGREEING)
-    covariance = left.inflation * _with_larger_errors(
-        known, np.maximum(apart, 1.0), units
-    )
-    if fit.probed_error > 0:
-        covariance = _with_error(unknowns.judged, covariance, units, fit.probed_error)
-    pure = quality.is_pure(problem, fit, left.inflation)
+def _chi_square(problem: Problem, fit: Fit, known: Precision) -> tuple[float, float]:
+    """Chi-square and its degrees of freedom."""
+    sums = quality.sums_of(problem, fit)
+    rows = fit.minimum.rows.residual
+    # The last rows only hold a fit near its start.
+    prior = rows[:, fit.kept.shape[1] : rows.shape[1] - problem.held]
+    takes_part = np.any(fit.kept > 0, axis=1)[:, None]
+    is_shown = known.of_state > SHOWN * known.of_state[:, :1]
+    sought = fit.minimum.units.size + np.sum(is_shown & takes_part)
+    freedom = sums.count + np.sum(prior != 0) - sought
+    chi_square = sums.residual + np.sum(prior**2) + _kicks(problem, fit)
+    return chi_square, freedom
+
+
+def _band(problem: Problem, fit: Fit, white: np.ndarray) -> tuple[float, float]:
+    """Power in the band that stands out most, and its standard deviations."""
+    if problem.options.dense or np.any(problem.samples.sign):
+        return colour.loudest_band(white, problem.samples.parts)
+    # The search has computed it from the same residuals.
+    return quality.loudest_band_of(problem, fit)
+
+
+class _Judgement(NamedTuple):
+    """How well a fit describes its record.
+
+    Attributes:
+        status: Name of the status, as far as it does not depend on the ratios.
+        remainder: What it does not explain.
+        covariance: Of the numbers.
+        pure: Whether constant rates describe a gyro's record as well.
+        unexplained: Of the square of what was observed, beyond the noise.
+        whiteness: Correlation of neighbours, and its standard deviations from 0.
+        by_trial: Mean square of the residuals of each trial.
+    """
+
+    status: str
+    remainder: _Remainder
+    covariance: np.ndarray
+    pure: bool
+    unexplained: float
+    whiteness: tuple[float, float]
+    by_trial: np.ndarray
+
+
+def _judgement(
+    problem: Problem, fit: Fit, known: Precision, white: np.ndarray
+) -> _Judgement:
+    """Judge a fit by its whitened residuals, or innovations."""
+    remainder = _remainder(problem, fit, known, white)
+    takes_part = np.any(fit.kept > 0, axis=1)
+    scatter = _scatter_of_trials(known, takes_part, fit.minimum.units)
+    scatter = scatter / np.sqrt(remainder.inflation)
+    covariance = _inflated(problem, fit, known, scatter, remainder.inflation)
+    pure = quality.is_pure(problem, fit, remainder.inflation)
     unexplained = quality.unexplained(problem, fit, _kicks(problem, fit))
-    flat = quality.is_at_boundary(problem, fit)
-    largest = weakest_of(unknowns.judged, covariance, units)[0]
-    sound = np.all(np.isfinite(covariance)) and left.freedom > 0
-    if not (sound and np.isfinite(left.chi_square)):
-        status = "NOT_CONVERGED"
-    elif misfit:
-        follows = unexplained <= quality.FOLLOWED and not flat
-        status = (
-            "MISFIT" if follows else ("WRONG_BASIN" if settled else "NOT_CONVERGED")
-        )
-    elif pure or fit.ambiguous:
-        status = "UNIDENTIFIABLE"
-    elif flat:
-        status = "AT_BOUNDARY"
-    elif (
-        largest > LARGEST_ERROR
-    ):  # a fit that creeps along what is not determined is good
-        status = "UNIDENTIFIABLE"
-    elif not settled:
-        status = "NOT_CONVERGED"
+    misfit = remainder.misfit or bool(np.any(scatter > _DISAGREEING))
+    seen = np.maximum(np.sum(white != 0, axis=(1, 2)), 1)
+    if misfit:
+        status = _status_of_misfit(problem, fit, unexplained)
     else:
-        status = "MISFIT" if left.overstated else "OK"
-    seen = np.maximum(np.sum(residuals != 0, axis=(1, 2)), 1)
+        status = _status_of_match(problem, fit, remainder, covariance, pure)
+    sound = np.all(np.isfinite(covariance)) and remainder.freedom > 0
+    if not (sound and np.isfinite(remainder.chi_square)):
+        status = "NOT_CONVERGED"
+    return _Judgement(
+        status=status,
+        remainder=remainder,
+        covariance=covariance,
+        pure=pure,
+        unexplained=unexplained,
+        whiteness=_whiteness(white, problem.samples.parts),
+        by_trial=np.sum(white**2, axis=(1, 2)) / seen,
+    )
+
+
+def _inflated(
+    problem: Problem,
+    fit: Fit,
+    known: Precision,
+    scatter: np.ndarray,
+    inflation: float,
+) -> np.ndarray:
+    """The covariance of the numbers, with errors as large as the fit shows them."""
+    units = fit.minimum.units
+    factors = np.maximum(scatter, 1.0)
+    covariance = inflation * _with_larger_errors(known, factors, units)
+    if fit.probed_error > 0:
+        judged = problem.unknowns.judged
+        covariance = _with_error(judged, covariance, units, fit.probed_error)
+    return covariance
+
+
+def _status_of_misfit(problem: Problem, fit: Fit, unexplained: float) -> str:
+    """The status of a fit whose residuals are more than noise."""
+    follows = unexplained <= quality.FOLLOWED
+    if follows and not quality.is_at_boundary(problem, fit):
+        return "MISFIT"
+    return "WRONG_BASIN" if fit.minimum.settled else "NOT_CONVERGED"
+
+
+def _status_of_match(
+    problem: Problem,
+    fit: Fit,
+    remainder: _Remainder,
+    covariance: np.ndarray,
+    pure: bool,
+) -> str:
+    """The status of a fit whose residuals are no more than noise."""
+    if pure or fit.ambiguous:
+        return "UNIDENTIFIABLE"
+    if quality.is_at_boundary(problem, fit):
+        return "AT_BOUNDARY"
+    judged = problem.unknowns.judged
+    largest, _, _ = weakest_of(judged, covariance, fit.minimum.units)
+    # A fit that creeps along what is not determined is good.
+    if largest > LARGEST_ERROR:
+        return "UNIDENTIFIABLE"
+    if not fit.minimum.settled:
+        return "NOT_CONVERGED"
+    return "MISFIT" if remainder.overstated else "OK"
+
+
+def _fields_of_judgement(judgement: _Judgement) -> dict[str, Any]:
+    """Fields that say how well the fit describes the record."""
+    remainder = judgement.remainder
     return {
-        "status": status,
-        "chi_square": left.chi_square,
-        "degrees_of_freedom": np.asarray(int(left.freedom)),
-        "whiteness": _whiteness(residuals, problem.samples.parts),
-        "loudest_band": left.band,
-        "chi_square_by_trial": np.sum(residuals**2, axis=(1, 2)) / seen,
-        "inflation": np.asarray(left.inflation),
-        "unexplained": np.asarray(unexplained),
-        "pure_spin": np.asarray(pure),
-        "singular_values": known.values,
-        "directions": known.directions,
-        "numbers_covariance": covariance,
+        "chi_square": remainder.chi_square,
+        "degrees_of_freedom": np.asarray(int(remainder.freedom)),
+        "numbers_covariance": judgement.covariance,
+        "whiteness": judgement.whiteness,
+        "loudest_band": remainder.band,
+        "chi_square_by_trial": judgement.by_trial,
+        "inflation": np.asarray(remainder.inflation),
+        "unexplained": np.asarray(judgement.unexplained),
+        "pure_spin": np.asarray(judgement.pure),
     }

@@ -1,15 +1,17 @@
-"""fit(): inertia, and what else is asked for, from what was observed."""
+"""fit(): estimates of inertia and other parameters from observations."""
 
 import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from jrigid._checks import check_option, check_type, demand, is_good
 from jrigid._types import AnyArray
@@ -24,6 +26,7 @@ from jrigid.identify._inputs import (
     judge,
     noise_of,
     refuse,
+    result_of_start,
     sizes_of,
     start_of,
     systems_of,
@@ -51,20 +54,16 @@ from jrigid.identify._records import (
     tells,
 )
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
-from jrigid.identify._search import Case, Effort, Line, no_search, run, search
+from jrigid.identify._search import Case, Effort, Line, Starts, no_search, run, search
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
-_LENGTHS = {
-    True: 3.0,
-    False: 0.75,
-}  # radians of a segment, of free motion and of forced
+# Radians of a segment, of free motion and of forced.
+_LENGTHS = {True: 3.0, False: 0.75}
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
-_FLAT = 1e-3  # least second moment of a body to start from
-_ROUND = 0.1  # ... where the first start led nowhere
 
 
 def fit(
@@ -84,50 +83,51 @@ def fit(
     progress: bool | None = None,
     throw: bool = True,
 ) -> FitResult:
-    r"""Inertia, and what else is asked for, from what was observed of a rotating body.
+    r"""Estimate the inertia of a rotating body and other parameters from observations.
 
-    No start and no knobs are needed where rates or attitudes were observed: linear
-    equations in the tensor give a start, multiple shooting brings it into the basin of
-    the answer, and Levenberg-Marquardt ends there, with the exact flow where the motion
-    is free.
+    No initial values are needed where rates or attitudes were observed. Linear
+    equations in the tensor give them, multiple shooting brings them into the basin of
+    the minimum, and Levenberg-Marquardt ends there. Free motion is evaluated by the
+    exact flow.
 
     Args:
-        system: The body: its torque, and what is known beforehand of the tensor (see
-            `scale` and `inertia_model`); the tensor itself is only a start, and none is
-            needed for a free body. A sequence has one for each trial, of the same kind:
-                its own record of a wheel, say.
+        system: The body, with its torque. What is known of its tensor is said by
+            `scale` and `inertia_model`; the tensor itself is an initial value, which a
+            free body does not need. A sequence has one body for each trial, of the same
+            kind, with its own record of a wheel, say.
         observations: A `Record` (`Rates`, `Attitudes`, ...); a tuple of several of one
             motion; or a list with one entry (a tuple, or a single one) for each trial.
-            Records with an axis of trials in front of their times do as well as a list.
-        free: What is sought beside the inertia: a function of the system and the
+            Records with an axis of trials in front of their times may replace a list.
+        free: What is sought beside the inertia. It is a function of the system and the
             sensors that picks arrays of theirs,
-            `lambda body, gyro: (body.torque.coefficient, gyro.bias)`; of those
-            `prior(array, sigma)` is known beforehand, `each(array)` sought anew in each
-            trial. Drags and what else cannot be negative are kept positive.
-        scale: What sets the scale of the tensor. "trace": nothing does, it keeps the
-            trace of the system's; "known": a torque or a momentum whose size is known;
+            `lambda body, gyro: (body.torque.coefficient, gyro.bias)`. Of those,
+            `prior(array, sigma)` is known beforehand, and `each(array)` is sought anew
+            in each trial. Drags, and what else cannot be negative, are kept positive.
+        scale: What sets the scale of the tensor. "trace": nothing, it keeps the trace
+            of the system's tensor; "known": a torque or a momentum whose size is known;
             "rotor": the known momentum of a `torques.Rotor`.
-        inertia_model: What is known of the tensor: `Tensor()`, nothing, any real body;
+        inertia_model: What is known of the tensor. `Tensor()`: nothing, any real body;
             `Moments()`, `Symmetric()`, `Top()`, `Flat()`, `Fixed()`, a `LogCholesky` of
-            ten numbers about a fixed point, or one's own.
-        start: Where to start: a `State` at each trial's first sample (`t0` of what is
-            returned), of one trial or with an axis of trials in front; or (inertia or
-            None, State or None). Needed where the attitude matters and was not
-            observed: an attitude nearer than about half a turn will do.
-        unmodelled: A torque that no model has: the level [N m sqrt(s)] of a white one
-            (its spectral density is the level squared), for all body axes or for each;
-            a `GaussMarkov`, which has a memory; or "estimate": of white torques and
-            those with a memory, with levels and times for all axes or for each, and
-            levels in proportion to the spin of a trial or of its own, the one whose
-            likelihood asks for it.
-        loss: "squares", or "robust": Cauchy's loss, then samples beyond four standard
-            deviations are left out, trials with more than a quarter of such samples
-            altogether, and the rest is fitted by squares.
-        absolute_sigma: False: the noise stated is relative, its level is that of the
-            residuals.
+            ten numbers about a fixed point, or a model of one's own.
+        start: Initial values: a `State` at each trial's first sample (`t0` of the
+            result), of one trial or with an axis of trials in front; or a tuple
+            (inertia or None, State or None). A state is needed where the attitude
+            matters and was not observed; an error below about half a turn is small
+            enough.
+        unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
+            torque, for all body axes or for each (its spectral density is the level
+            squared); a `GaussMarkov`, which has a correlation time; or "estimate".
+            Then the likelihood selects one of white torques and those with a
+            correlation time, with levels and times for all axes or for each, and with
+            levels in proportion to the spin of a trial or of its own.
+        loss: "squares" or "robust". A robust fit begins with Cauchy's loss. Then
+            samples beyond four standard deviations are left out, and trials with more
+            than a quarter of such samples altogether. The rest is fitted by squares.
+        absolute_sigma: False: the stated noise is relative, and its level is that of
+            the residuals.
         motion: `(system, state, ts, t0) -> State` in place of the exact flow or
             `simulate`; it must allow forward mode.
-        doublings: Where no start can be made from the observations, the first
+        doublings: Where the observations give no initial values, the first
             2^-doublings of the record is fitted first, then twice as much, and so on.
         max_steps: Steps of the last stage.
         progress: Print each stage as it ends. None: where the standard error is a
@@ -136,9 +136,9 @@ def fit(
             errors. False: they are results with that status (bad input: of NaN).
 
     Returns:
-        What was found, with errors, and what the record does not tell; `print` it. Its
-        `state` is at its `t0`, the first sample of each trial:
-        `state0, t0 = found.initial_state()` hands out both.
+        The estimates with their errors, and what the record does not determine; `print`
+        shows them. The `state` is at `t0`, the first sample of each trial, and
+        `state0, t0 = found.initial_state()` returns both.
 
     Raises:
         ValueError: A request that no record could answer.
@@ -157,20 +157,12 @@ def fit(
     >>> print(found.null_directions)
     ('overall scale',)
     """
-    request = _asked(
-        system,
-        observations,
-        free,
-        scale,
-        inertia_model,
-        start,
-        unmodelled,
-        loss,
-        absolute_sigma,
-        motion,
+    question = _Question(
+        free, scale, inertia_model, unmodelled, loss, absolute_sigma, motion
     )
+    task = _task(question, _Bodies(system), observations, start)
     with _reporter(progress) as report:
-        (fields,) = _fits([request], Effort(max_steps, doublings, report), throw)
+        (fields,) = _fits([task], Effort(max_steps, doublings, report), throw)
     return result_of(fields)
 
 
@@ -190,10 +182,10 @@ def fit_each(
     max_steps: int = 400,
     throw: bool = False,
 ) -> FitResult:
-    """Fit each of many records, which share compiled programs and run side by side.
+    """Fit each of many records side by side, with shared compiled programs.
 
-    It is `fit` in a loop, with the same results, in a fraction of the time: for studies
-    of coverage, or a catalogue of bodies. Records may differ in length.
+    The results are those of `fit` in a loop, in a fraction of the time. Use it for
+    studies of coverage, or for a catalogue of bodies. Records may differ in length.
 
     Args:
         system: The body for all fits; or a sequence of what `fit` takes, once for each
@@ -224,8 +216,9 @@ def fit_each(
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> noise = record.sigma * jax.random.normal(jax.random.key(0), (4, 200, 3))
-    >>> records = [jr.identify.Rates(record.times, record.omegas + x, 1.4 * record.sigma)
-    ...            for x in noise]
+    >>> records = [
+    ...     jr.identify.Rates(record.times, record.omegas + x, 1.4 * record.sigma)
+    ...     for x in noise]
     >>> found = jr.identify.fit_each(jr.RigidBody(jnp.ones(3)), records)
     >>> print(found.ratios.shape, found)
     (4, 2) 4 fits: 4 OK
@@ -241,28 +234,24 @@ def fit_each(
         "Arguments `system` and `start` must have an entry for each of "
         f"{count} fits, but they have {len(systems)} and {len(starts)}.",
     )
-    requests = [
-        _asked(
-            x,
-            y,
-            free,
-            scale,
-            inertia_model,
-            z,
-            unmodelled,
-            loss,
-            absolute_sigma,
-            motion,
-        )
-        for x, y, z in zip(systems, observations, starts, strict=True)
+    question = _Question(
+        free, scale, inertia_model, unmodelled, loss, absolute_sigma, motion
+    )
+    # Fits of the same body share what is computed of it alone.
+    bodies = {id(x): _Bodies(x) for x in systems}
+    tasks = [
+        _task(question, bodies[id(body)], observed, first)
+        for body, observed, first in zip(systems, observations, starts, strict=True)
     ]
-    found = _fits(requests, Effort(max_steps, doublings), throw)
-    return _side_by_side(found)
+    return _side_by_side(_fits(tasks, Effort(max_steps, doublings), throw))
 
 
 @contextlib.contextmanager
 def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
-    """What is called with a line after each stage: a bar on a terminal where there is tqdm."""
+    """Yield what is called with a line of text after each stage, or None.
+
+    It is a bar on a terminal where tqdm is installed.
+    """
     if progress is not None or not sys.stderr.isatty():
         yield print if progress else None
         return
@@ -281,6 +270,7 @@ def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
 
 
 def _late_lines() -> Callable[[str], None]:
+    """Return a function that prints a line once some seconds have passed."""
     start = time.perf_counter()
 
     def show(line: str) -> None:
@@ -290,64 +280,129 @@ def _late_lines() -> Callable[[str], None]:
     return show
 
 
-class _Asked(NamedTuple):
-    """What is asked of a record, after its arguments were checked at trace time."""
+class _Question(NamedTuple):
+    """What is asked of every record: the keyword arguments of `fit`."""
 
+    free: Callable[..., Any] | None
+    scale: str
+    inertia_model: AbstractInertiaModel | None
+    unmodelled: Any
+    loss: str
+    absolute_sigma: bool
+    motion: Callable[..., State] | None
+
+
+class _Bodies:
+    """The argument `system` of a fit, and what follows from it alone."""
+
+    def __init__(self, system: RigidBody | Sequence[RigidBody]):
+        """Take a body, or one for each trial."""
+        self._system = system
+        self._systems: dict[int, tuple[RigidBody, ...]] = {}
+
+    def of_trials(self, trials: int) -> tuple[RigidBody, ...]:
+        """One body, or one for each trial; ValueError if there are others."""
+        if trials not in self._systems:
+            self._systems[trials] = systems_of(self._system, trials)
+        return self._systems[trials]
+
+    @cached_property
+    def _any(self) -> tuple[RigidBody, ...]:
+        """The bodies, however many trials there are."""
+        return next(iter(self._systems.values()))
+
+    @cached_property
+    def on_host(self) -> tuple[RigidBody, ...]:
+        """The bodies with numpy arrays."""
+        return on_host(self._any)
+
+    @cached_property
+    def need_attitude(self) -> bool:
+        """Whether the torque looks at the attitude."""
+        return needs_attitude(self._any[0])
+
+    @cached_property
+    def carry_parts(self) -> bool:
+        """Whether parts move inside the body."""
+        still = State(jnp.zeros(4), jnp.zeros(3))
+        return self._any[0].with_parts(still).internal is not None
+
+    @cached_property
+    def result(self) -> Any:
+        """The result code of the values of the bodies."""
+        return result_of_start(self._any, None, None)
+
+
+class _Task(NamedTuple):
+    """A record to be fitted, after the arguments were checked at trace time.
+
+    Attributes:
+        bodies: Those of the fit.
+        systems: One, or one for each trial.
+        records: With an axis of trials in front.
+        options: What is fixed when the fit is compiled.
+        tensor: Where to start, if that is given.
+        state: Where each trial starts, if that is given.
+        torque: Unmodelled, if it is known.
+        inertia_model: What is known of the inertia.
+        question: What is asked.
+    """
+
+    bodies: _Bodies
     systems: tuple[RigidBody, ...]
     records: tuple[Record, ...]
     options: Options
-    tensor: Any
+    tensor: Array | None
     state: State | None
     torque: GaussMarkov
-    free: Callable[..., Any] | None
-    scale: str
     inertia_model: AbstractInertiaModel
+    question: _Question
 
 
-def _asked(
-    system: Any,
-    observations: Any,
-    free: Callable[..., Any] | None,
-    scale: str,
-    inertia_model: AbstractInertiaModel | None,
-    start: Any,
-    unmodelled: Any,
-    loss: str,
-    absolute_sigma: bool,
-    motion: Callable[..., State] | None,
-) -> _Asked:
-    """Check options and shapes of arguments; ValueError for what no record could answer."""
+def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -> _Task:
+    """Check options and shapes; ValueError for what no record could answer."""
     records = of_trials(observations)
     trials = records[0].ts.shape[0]
+    inertia_model = question.inertia_model
     inertia_model = Tensor() if inertia_model is None else inertia_model
-    systems = systems_of(system, trials)
+    systems = bodies.of_trials(trials)
     check_type("inertia_model", inertia_model, AbstractInertiaModel)
-    check_option("loss", loss, ("squares", "robust"))
-    refuse(systems[0], records, scale, inertia_model)
+    check_option("loss", question.loss, ("squares", "robust"))
+    refuse(systems[0], records, question.scale, inertia_model)
     tensor, state = start_of(start, trials)
     stated = all(x.states_noise for x in records)
-    kind, torque = _torque(unmodelled, absolute_sigma and stated)
+    noise_known = question.absolute_sigma and stated
+    kind, torque = _torque(question.unmodelled, noise_known)
     demand(
         stated or len(records) == 1,
-        "Argument `observations` must state the noise of each kind where there are several, but "
-        "one has neither `sigma` nor `covariance`: they cannot be weighed.",
+        "Argument `observations` must state the noise of each kind where there are "
+        "several, but one has neither `sigma` nor `covariance`: they cannot be "
+        "weighed.",
     )
+    of_sensors = any(x.sensor.depends_on_attitude for x in records)
     options = Options(
-        free_motion=systems[0].is_free and motion is None,
-        depends_on_attitude=any(x.sensor.depends_on_attitude for x in records)
-        or needs_attitude(systems[0]),
+        free_motion=systems[0].is_free and question.motion is None,
+        depends_on_attitude=of_sensors or bodies.need_attitude,
         unmodelled=kind,
-        robust=loss == "robust",
-        noise_known=absolute_sigma and stated,
-        motion=motion,
+        robust=question.loss == "robust",
+        noise_known=noise_known,
+        motion=question.motion,
     )
-    options = options._replace(shooting=_shoots(options, systems[0], records, state))
-    return _Asked(
-        systems, records, options, tensor, state, torque, free, scale, inertia_model
+    options = options._replace(shooting=_shoots(options, bodies, records, state))
+    return _Task(
+        bodies=bodies,
+        systems=systems,
+        records=records,
+        options=options,
+        tensor=tensor,
+        state=state,
+        torque=torque,
+        inertia_model=inertia_model,
+        question=question,
     )
 
 
-def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
+def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
     """What is to be done about the unmodelled torque, and the torque if it is known."""
     if isinstance(unmodelled, str):
         check_option("unmodelled", unmodelled, ("estimate",))
@@ -360,46 +415,61 @@ def _torque(unmodelled: Any, stated: bool) -> tuple[str, GaussMarkov]:
     if not isinstance(torque, GaussMarkov):
         demand(np.shape(unmodelled) in ((), (3,)), text)
         torque = GaussMarkov(unmodelled)
-    level, time = np.asarray(torque.level), np.asarray(torque.time)
+    level = np.asarray(torque.level)
+    time = np.asarray(torque.time)
     good = np.all(level == 0) or np.all(level > 0)
     demand(bool(good and np.all(np.isfinite(level)) and np.all(time >= 0)), text)
     known = bool(np.any(level > 0))
-    text = "Argument `unmodelled` must be 0 or estimated where the noise is not known, but it is "
-    demand(stated or not known, text + "given.")
+    demand(
+        noise_known or not known,
+        "Argument `unmodelled` must be 0 or estimated where the noise is not known, "
+        "but it is given.",
+    )
     return "known" if known else "none", torque
 
 
 def _shoots(
     options: Options,
-    system: RigidBody,
+    bodies: _Bodies,
     records: tuple[Record, ...],
     state: State | None,
 ) -> bool:
-    """Whether each segment has a state of its own; ValueError for a fit that cannot be begun."""
+    """Whether each segment has a state of its own; ValueError if no fit can begin."""
     by_attitude = any(tells(x, "attitude") for x in records)
     demand(
         not options.depends_on_attitude or state is not None or by_attitude,
-        "Argument `start` must hold a State whose attitude the fit can start from, since the "
-        "motion or an observation depends on the attitude and none was observed, but it does not.",
+        "Argument `start` must hold a State whose attitude the fit can start from, "
+        "since the motion or an observation depends on the attitude and none was "
+        "observed, but it does not.",
     )
-    internal = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
     observed = by_attitude or any(tells(x, "rates") for x in records)
-    shooting = observed and options.motion is None and not internal
+    shooting = observed and options.motion is None and not bodies.carry_parts
     demand(
         shooting or state is not None,
-        "Argument `start` must hold a State to start from, since neither rates nor attitudes were "
-        "observed, or they do not tell the whole state, but it does not.",
+        "Argument `start` must hold a State to start from, since neither rates nor "
+        "attitudes were observed, or they do not tell the whole state, but it does "
+        "not.",
     )
     demand(
         shooting or not options.dense,
-        "Argument `unmodelled` must be 0 where neither rates nor attitudes were observed, a part "
-        "moves inside the body or `motion` is given, but it is not.",
+        "Argument `unmodelled` must be 0 where neither rates nor attitudes were "
+        "observed, a part moves inside the body or `motion` is given, but it is not.",
     )
     return shooting
 
 
 class _Observed(NamedTuple):
-    """What the records say of the state on the way, and of the size of rates and values."""
+    """What the records tell of the motion, and of the sizes of rates and values.
+
+    Attributes:
+        samples: Of all records.
+        told: Rates and attitudes along the way, where a sensor tells them.
+        rate: Rms of the rates [rad/s].
+        sizes: Rms of the values of each record.
+        angle: Most radians that a trial turns.
+        coarse: Whether the body turns by more than half a turn between samples.
+        noise: Of rates [rad/s] and turns [rad] (6,).
+    """
 
     samples: Samples
     told: Told | None
@@ -420,49 +490,58 @@ def _observed(
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     told = told_by(records, samples, attitude0)
     rate = typical_rate(told, state, samples.ts.dtype)
-    angle, coarse = 0.0, False
+    angle = 0.0
+    coarse = False
     if told is not None:
         angle = float(np.max(angle_turned(told)[:, -1]))
         coarse = longest_turn(told) > np.pi
-    return _Observed(
-        samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate)
-    )
+    noise = noise_of(records, samples, rate)
+    return _Observed(samples, told, rate, sizes, angle, coarse, noise)
 
 
-class _Begun(NamedTuple):
-    """Numbers of each attempt, the segments, and the states at their starts."""
+class _Opening(NamedTuple):
+    """Where the search begins.
+
+    Attributes:
+        unknowns: What is sought, with the frame of the inertia model chosen.
+        starts: Numbers of each attempt.
+        single: One segment a trial.
+        cut: Many segments.
+        point: Numbers of the first attempt, and states as observed.
+        tensor: Of the first attempt.
+    """
 
     unknowns: Unknowns
-    numbers: np.ndarray
+    starts: Starts
     single: Layout
     cut: Layout
     point: Point
     tensor: np.ndarray
 
 
-def _begun(
+def _opening(
     unknowns: Unknowns,
     observed: _Observed,
     tensor: np.ndarray | None,
     state: State | None,
     options: Options,
     length: float,
-) -> _Begun:
-    """Where the search begins."""
-    told, samples = observed.told, observed.samples
-    trials, dtype = samples.ts.shape[0], samples.ts.dtype
+) -> _Opening:
+    """Choose where the search begins, by segments of some length [rad]."""
+    told = observed.told
+    samples = observed.samples
+    trials = samples.ts.shape[0]
+    dtype = samples.ts.dtype
     tensors = linear_starts(options, unknowns, told, tensor)
-    unknowns, numbers = unknowns.starts(
-        tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1)
-    )
-    unknowns = on_host(unknowns)
+    starts = Starts(unknowns, tensors)
+    unknowns = on_host(starts.unknowns)
     single = cut = whole(samples, options.nodes)
-    attitude = np.zeros((trials, options.nodes, 4), dtype)
-    attitude[..., 0] = 1
     if options.shooting and told is not None:
-        cut, opening = segments(samples, told, options.nodes, length)
-        omega, seen = node_states(told, opening, cut.start)
-        attitude = attitude if seen is None else seen
+        cut, first_samples = segments(samples, told, options.nodes, length)
+        omega, attitude = node_states(told, first_samples, cut.start)
+        if attitude is None:
+            attitude = np.zeros((trials, options.nodes, 4), dtype)
+            attitude[..., 0] = 1
     else:
         assert state is not None
         omega, attitude = (
@@ -473,15 +552,15 @@ def _begun(
         )
     torque = np.zeros_like(omega if options.dense else omega[..., :0])
     own = unknowns.own_start(trials, dtype)
-    point = Point(numbers[0], own, attitude, omega, torque)
-    return _Begun(unknowns, numbers, single, cut, point, tensors[0])
+    point = Point(starts[0], own, attitude, omega, torque)
+    return _Opening(unknowns, starts, single, cut, point, tensors[0])
 
 
 @np.errstate(all="ignore")  # values that are bad or out of range
-def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
+def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     """Where the search of a record begins, and the result code of the input."""
-    options = asked.options
-    records, state, tensor = on_host((asked.records, asked.state, asked.tensor))
+    options = task.options
+    records, state, tensor = on_host((task.records, task.state, task.tensor))
     if options.motion is None:  # which may ask for times that increase
         records = tuple(lengthened(x) for x in records)
     dtype = records[0].values.dtype
@@ -489,61 +568,87 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     if state is not None and options.depends_on_attitude:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
-    result = judge(asked.systems, records, tensor, state, observed.told, throw)
+    input_result = _judged(task, records, observed, throw)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and observed.told is not None:
         count = observed.told.ts.shape[1]
         options = options._replace(nodes=segments_needed(observed.angle, count, length))
-    unknowns = unknowns_of(
-        on_host(asked.systems),
-        tuple(x.sensor for x in records),
-        observed.sizes,
-        asked.free,
-        on_host(asked.inertia_model),
-        asked.scale != "trace" and not asked.inertia_model.absolute,
-        observed.rate,
-        records[0].ts.shape[0],
-    )
-    demand(
-        options.noise_known or all(x.sigma is None for x in unknowns.sought),
-        "Argument `free` must not state what is known beforehand where the noise of the record is "
-        "not stated or only relative, but it does: the two cannot be weighed.",
-    )
-    begun = _begun(unknowns, observed, tensor, state, options, length)
-    line = Line(np.zeros_like(begun.point.numbers), np.zeros((), dtype))
-    unknowns = begun.unknowns.holding(line)
-    tensor = begun.tensor
-    if options.dense:  # a level is sought, in proportion to it
-        tensor = np.asarray(tensors_at(unknowns, begun.numbers[:2]))[0]
+    unknowns = _unknowns(task, records, observed)
+    opening = _opening(unknowns, observed, tensor, state, options, length)
+    # A probe holds a direction; here none is held, by a line of the same structure.
+    line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
+    unknowns = opening.unknowns.holding(line)
+    tensor = opening.tensor
+    if options.dense:
+        # A level is sought, in proportion to the tensor.
+        numbers = np.stack([opening.starts[0]] * 2)
+        tensor = np.asarray(tensors_at(unknowns, numbers))[0]
     case = Case(
         problem=Problem(options, unknowns, observed.samples, observed.noise),
-        single=begun.single,
-        cut=begun.cut,
-        point=begun.point,
-        starts=begun.numbers,
+        single=opening.single,
+        cut=opening.cut,
+        point=opening.point,
+        starts=opening.starts,
         tensor=tensor,
-        torque=asked.torque,
+        torque=task.torque,
         coarse=observed.coarse,
         long=observed.angle > _LONG,
         effort=effort,
     )
-    return case, result
+    return case, input_result
 
 
-def _fits(
-    requests: Sequence[_Asked], effort: Effort, throw: bool
-) -> list[dict[str, Any]]:
+def _judged(
+    task: _Task, records: tuple[Record, ...], observed: _Observed, throw: bool
+) -> Any:
+    """The result code of the input; RuntimeError for bad input if `throw`."""
+    from_bodies = task.tensor is None and task.state is None
+    return judge(
+        task.systems,
+        records,
+        task.tensor,
+        task.state,
+        observed.told,
+        throw,
+        of_start=task.bodies.result if from_bodies else None,
+    )
+
+
+def _unknowns(
+    task: _Task, records: tuple[Record, ...], observed: _Observed
+) -> Unknowns:
+    """What is sought, around the bodies and sensors as they were given."""
+    question = task.question
+    unknowns = unknowns_of(
+        task.bodies.on_host,
+        tuple(x.sensor for x in records),
+        observed.sizes,
+        question.free,
+        on_host(task.inertia_model),
+        question.scale != "trace" and not task.inertia_model.absolute,
+        observed.rate,
+        records[0].ts.shape[0],
+    )
+    demand(
+        task.options.noise_known or all(x.sigma is None for x in unknowns.sought),
+        "Argument `free` must not state what is known beforehand where the noise of "
+        "the record is not stated or only relative, but it does: the two cannot be "
+        "weighed.",
+    )
+    return unknowns
+
+
+def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str, Any]]:
     """Fit records side by side: the fields of each result."""
-    cases = [_case(x, effort, throw) for x in requests]
+    cases = [_case(x, effort, throw) for x in tasks]
     searches = [
         search(case) if is_good(result) else no_search(case) for case, result in cases
     ]
-    lengths = [
-        max(x) for x in zip(*(_lengths(y.records) for y in requests), strict=True)
-    ]
+    columns = zip(*(_lengths(x.records) for x in tasks), strict=True)
+    lengths = [max(x) for x in columns]
     results = []
-    for (case, input_result), found in zip(cases, run(searches), strict=True):
-        fields = conclude(case.problem, found, lengths, input_result)
+    for (case, input_result), best in zip(cases, run(searches), strict=True):
+        fields = conclude(case.problem, best, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
                 raise RuntimeError(Status[status])

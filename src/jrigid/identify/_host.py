@@ -91,7 +91,7 @@ def to_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def principal_axes(tensor: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Moments, ascending, and axes of a tensor, with the signs of `jrigid._spectral.eigh`."""
+    """Moments, ascending, and axes, with the signs of `jrigid._spectral.eigh`."""
     if not isinstance(tensor, np.ndarray):
         return eigh(tensor)
     if not np.all(np.isfinite(tensor)):

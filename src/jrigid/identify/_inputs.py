@@ -1,4 +1,4 @@
-"""What a fit does with its arguments: options at trace time, values at run time."""
+"""Input validation of a fit: options at trace time, values at run time."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from jrigid._checks import (
     RESULTS,
@@ -38,22 +39,26 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
     """One body, or one for each trial."""
     systems = tuple(system) if isinstance(system, Sequence) else (system,)
     for x in systems:
-        of_flight = " (of a body in flight, rotation about its centre of mass)"
-        text = f"Argument `system` must be a RigidBody{of_flight}, but it is {type(x).__name__}."
-        demand(isinstance(x, RigidBody), text)
+        demand(
+            isinstance(x, RigidBody),
+            "Argument `system` must be a RigidBody (of a body in flight, rotation "
+            f"about its centre of mass), but it is {type(x).__name__}.",
+        )
     demand(
         len(systems) in (1, trials),
-        f"Argument `system` must hold one body for each of {trials} trials, but it holds "
-        f"{len(systems)}.",
+        f"Argument `system` must hold one body for each of {trials} trials, but it "
+        f"holds {len(systems)}.",
     )
-    return (
-        _padded(systems) if len(set(map(jtu.tree_structure, systems))) == 1 else systems
-    )
+    alike = len(set(map(jtu.tree_structure, systems))) == 1
+    return _padded(systems) if alike and len(systems) > 1 else systems
 
 
 def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
     """With samples of one length where those of trials differ."""
-    is_sampled = lambda x: isinstance(x, Sampled)  # noqa: E731
+
+    def is_sampled(x: object) -> bool:
+        return isinstance(x, Sampled)
+
     leaves, trees = zip(
         *(jtu.tree_flatten(x, is_leaf=is_sampled) for x in systems), strict=True
     )
@@ -69,10 +74,14 @@ def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
 
 
 def _longer(function: Any, count: int) -> Any:
-    """With the last sample repeated so many times: the same function."""
-    longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], count, axis=0)])  # noqa: E731
-    arrays = lambda x: (x.ts, x.values)  # noqa: E731
-    return eqx.tree_at(arrays, function, replace_fn=longer) if count else function
+    """The same function, with its last sample repeated so many times."""
+    if not count:
+        return function
+
+    def longer(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.repeat(x[-1:], count, axis=0)])
+
+    return eqx.tree_at(lambda x: (x.ts, x.values), function, replace_fn=longer)
 
 
 def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
@@ -83,8 +92,8 @@ def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
     inertia = inertia.inertia if isinstance(inertia, RigidBody) else inertia
     demand(
         state is None or isinstance(state, State),
-        "Argument `start` must be a State, or a tuple of an inertia and a State (either may be "
-        f"None), but it is {start!r}.",
+        "Argument `start` must be a State, or a tuple of an inertia and a State "
+        f"(either may be None), but it is {start!r}.",
     )
     if isinstance(state, State):
         attitude = jnp.broadcast_to(state.attitude, (trials, 4))
@@ -98,30 +107,32 @@ def refuse(
     scale: str,
     inertia_model: AbstractInertiaModel,
 ) -> None:
-    """ValueError for a scale that nothing tells, and numbers that hold it without one."""
+    """Raise ValueError for a scale that nothing sets, or that is set twice."""
     check_option("scale", scale, ("trace", "known", "rotor"))
     demand(
         not (inertia_model.absolute and inertia_model.names and scale == "trace"),
         "Argument `scale` must be 'known' or 'rotor' where `inertia_model` is a "
-        f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is 'trace'.",
+        f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is "
+        "'trace'.",
     )
     terms = system.torque.terms if isinstance(system.torque, Sum) else (system.torque,)
     has_rotor = any(isinstance(x, Rotor | SpinningMass) for x in terms)
     demand(
         scale != "trace" or not has_rotor or inertia_model.absolute,
-        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose momentum sets "
-        "the scale of the tensor, but it is 'trace', which would keep the trace of `system`.",
+        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose "
+        "momentum sets the scale of the tensor, but it is 'trace', which would keep "
+        "the trace of `system`.",
     )
     demand(
         scale != "rotor" or has_rotor,
-        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, but it is: "
-        "nothing sets the scale of the tensor.",
+        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, "
+        "but it is: nothing sets the scale of the tensor.",
     )
     momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
     demand(
         scale != "known" or not system.is_free or momenta or inertia_model.absolute,
-        "Argument `scale` must be 'trace' for a body without torque, but it is 'known': free "
-        "motion tells ratios of the moments, never their scale.",
+        "Argument `scale` must be 'trace' for a body without torque, but it is "
+        "'known': free motion tells ratios of the moments, never their scale.",
     )
 
 
@@ -174,7 +185,7 @@ def result_of_start(
 def findings_of_start(
     systems: tuple[RigidBody, ...], tensor: Any, state: State | None
 ) -> Findings:
-    """What is wrong with the values of the systems and the start."""
+    """What is wrong with the values of the systems and of `start`."""
     findings = Findings()
     for system in systems:
         system.check(findings)
@@ -205,9 +216,21 @@ def judge(
     state: State | None,
     told: Told | None,
     throw: bool,
+    of_start: Any = None,
 ) -> Any:
-    """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`."""
-    result = result_of_start(systems, tensor, state)
+    """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`.
+
+    Args:
+        systems: One, or one for each trial.
+        records: With numpy arrays.
+        tensor: Where to start, or None.
+        state: Where each trial starts, or None.
+        told: What the records tell of the motion.
+        throw: Whether to raise an error.
+        of_start: `result_of_start` of these arguments, if it is known.
+    """
+    known = of_start is not None
+    result = of_start if known else result_of_start(systems, tensor, state)
     if not is_good(result):
         settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
         return result

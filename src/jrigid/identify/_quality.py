@@ -1,6 +1,12 @@
-"""How well a fit describes its record: scales, outliers, misfits, boundaries. Plain numpy."""
+"""How well a fit describes its record: scales, outliers, misfits and boundaries.
 
-from typing import Any, NamedTuple
+Plain numpy, on the host.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,15 +21,15 @@ from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
-_REJECTED = (
-    16.0  # whitened square of a sample, above its degrees of freedom, that is no noise
-)
+# Whitened square of a sample, above its degrees of freedom, that is no noise.
+_REJECTED = 16.0
 _SPOILT = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
 
 
-class Fit(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Fit:
     """A minimum and what was decided on the way to it.
 
     Attributes:
@@ -36,6 +42,7 @@ class Fit(NamedTuple):
         history: Sums of squares after each step of all stages.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
         probed_error: Error of the weakest direction, by probes, in natural units.
+        computed: Values of functions marked `once_for_each_fit`, by function.
     """
 
     minimum: Minimum
@@ -47,6 +54,7 @@ class Fit(NamedTuple):
     history: np.ndarray
     ambiguous: bool = False
     probed_error: float = 0.0
+    computed: dict[Any, tuple[Problem, Any]] = dataclasses.field(default_factory=dict)
 
     @property
     def residual(self) -> np.ndarray:
@@ -54,23 +62,56 @@ class Fit(NamedTuple):
         return self.minimum.rows.residual[:, : self.kept.shape[1]]
 
 
+_Value = TypeVar("_Value")
+
+
+def once_for_each_fit(
+    function: Callable[[Problem, Fit], _Value],
+) -> Callable[[Problem, Fit], _Value]:
+    """Keep the value of a function of the minimum with the fit.
+
+    The search and the conclusion ask the same questions. The function must not depend
+    on `ambiguous` and `probed_error`, which change after the value was computed.
+    """
+
+    @wraps(function)
+    def call(problem: Problem, fit: Fit) -> _Value:
+        known, value = fit.computed.get(function, (None, None))
+        if known is not problem:
+            value = function(problem, fit)
+            fit.computed[function] = problem, value
+        return value  # type: ignore[return-value]
+
+    return call
+
+
 def linearised(fit: Fit) -> Linearised:
     """A record where a fit ended."""
-    minimum, count = fit.minimum, fit.kept.shape[1]
-    rows = Rows(*(x[:, :count] for x in minimum.rows))
-    weight, own = minimum.weight[:, :count], minimum.point.own
-    return Linearised(fit.layout, minimum.tensor, rows, minimum.links, weight, own)
+    minimum = fit.minimum
+    count = fit.kept.shape[1]
+    return Linearised(
+        fit.layout,
+        minimum.tensor,
+        Rows(*(x[:, :count] for x in minimum.rows)),
+        minimum.links,
+        minimum.weight[:, :count],
+        minimum.point.own,
+    )
 
 
 def columns_of_prior(fit: Fit) -> np.ndarray:
-    """What is known beforehand, as columns of innovations, (trials, known, degrees, columns)."""
-    minimum, count = fit.minimum, fit.kept.shape[1]
+    """What is known beforehand, as columns of innovations.
+
+    Returns:
+        Columns (trials, known, degrees, columns): residual, state, border.
+    """
+    minimum = fit.minimum
+    count = fit.kept.shape[1]
+    local = minimum.links.gap.shape[-1]
     root = np.sqrt(minimum.weight[:, count:, None, None])
     residual = minimum.rows.residual[:, count:, :, None]
-    still = np.zeros(
-        (*residual.shape[:-1], minimum.links.gap.shape[-1]), residual.dtype
-    )
-    columns = [residual, still, minimum.rows.of_border[:, count:]]
+    of_state = np.zeros((*residual.shape[:-1], local), residual.dtype)
+    columns = [residual, of_state, minimum.rows.of_border[:, count:]]
     return root * np.concatenate(columns, axis=-1)
 
 
@@ -116,30 +157,64 @@ def weights_of(problem: Problem, kept: np.ndarray) -> np.ndarray:
     return np.where(samples.sign == 0, samples.weight, 0.0) * kept[..., None]
 
 
+class Sums(NamedTuple):
+    """Sums over the numbers that are seen, kept and not saturated.
+
+    Attributes:
+        count: How many there are.
+        residual: Of the squares of their residuals.
+        signal: Of the squares of `signal_of`.
+    """
+
+    count: float
+    residual: float
+    signal: float
+
+
+@once_for_each_fit
+def sums_of(problem: Problem, fit: Fit) -> Sums:
+    """Sums over the samples that a fit is judged by."""
+    weight = weights_of(problem, fit.kept)
+    return Sums(
+        count=float(np.sum(weight)),
+        residual=float(np.sum(weight * fit.residual**2)),
+        signal=float(np.sum(weight * signal_of(problem, weight) ** 2)),
+    )
+
+
+@once_for_each_fit
+def loudest_band_of(problem: Problem, fit: Fit) -> tuple[float, float]:
+    """`loudest_band` of the residuals, without those of saturated numbers."""
+    white = np.sqrt(weights_of(problem, fit.kept)) * fit.residual
+    return loudest_band(white, problem.samples.parts)
+
+
 def misfit(problem: Problem, fit: Fit) -> float:
     """0 for a fit that may be kept; else how wrong it is."""
-    weight = weights_of(problem, fit.kept)
-    square = np.sum(weight * fit.residual**2)
+    sums = sums_of(problem, fit)
     numbers = fit.minimum.point.numbers.size
-    freedom = max(np.sum(weight) - numbers - 3.0 * fit.kept.shape[0], 1.0)
-    ratio = float(square / freedom)
+    freedom = max(sums.count - numbers - 3.0 * fit.kept.shape[0], 1.0)
+    ratio = sums.residual / freedom
     good = bool(fit.minimum.settled) and np.isfinite(ratio)
     if problem.options.noise_known and not problem.options.robust:
         good = good and ratio < 1 + GATE * np.sqrt(2 / freedom)
         if good and not problem.options.dense:
-            white = np.sqrt(weight) * fit.residual
-            good = not stands_out(*loudest_band(white, problem.samples.parts))
+            good = not stands_out(*loudest_band_of(problem, fit))
     if good:
         return _AT_BOUNDARY if is_at_boundary(problem, fit) else 0.0
     return ratio if np.isfinite(ratio) else np.finfo(float).max
 
 
 def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
-    """What there is to explain, in units of the noise: a radian, or the variation of values."""
+    """What is to be explained, in units of the noise.
+
+    It is a radian for attitudes, and the variation of values for others.
+    """
     white = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
     signals = []
     for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
-        w, unit = weight[:, part], white[:, part]
+        w = weight[:, part]
+        unit = white[:, part]
         if values.shape[-1] > w.shape[-1]:  # quaternions
             signals.append(unit)
             continue
@@ -151,17 +226,20 @@ def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
 
 
 def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
-    """Fraction of the square of the record that is left, beyond the noise if that is known."""
-    weight = weights_of(problem, fit.kept)
-    left = np.sum(weight * fit.residual**2) + kicks
+    """Fraction of the square of the record that the fit does not explain.
+
+    It counts what is beyond the noise if that is known.
+    """
+    sums = sums_of(problem, fit)
+    excess = sums.residual + kicks
     if problem.options.noise_known:
-        left = left - np.sum(weight)
-    signal = float(np.sum(weight * signal_of(problem, weight) ** 2))
-    return float(left) / (signal if signal > 0 else 1.0)
+        excess = excess - sums.count
+    return excess / (sums.signal if sums.signal > 0 else 1.0)
 
 
+@once_for_each_fit
 def is_at_boundary(problem: Problem, fit: Fit) -> bool:
-    """Whether a body that need not be is flat: its mass lies in a plane or on a line."""
+    """Whether all mass lies in a plane or on a line, though it need not."""
     if isinstance(problem.unknowns.inertia_model, Fixed | Flat):
         return False
     tensor = np.asarray(fit.minimum.tensor, float)
@@ -178,15 +256,19 @@ def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
     motion fitted to the noise seems to determine what the true one does not. The best
     of many wobbles gains something from any noise, the more the longer the record.
     """
-    sensors = problem.unknowns.original(0)[1:]
-    if not problem.unknowns.inertia_model.names or any(
-        x.depends_on_attitude or x.width != 3 for x in sensors
-    ):
+    if not _may_be_pure(problem, fit):
         return False
-    weight = weights_of(problem, fit.kept)
-    constant = np.sum(weight * signal_of(problem, weight) ** 2)
-    fitted = np.sum(weight * fit.residual**2)
-    chance = (
-        5 + GATE * 10**0.5 + 4 * np.log(max(np.sum(weight), 1.0))
-    )  # of five numbers
-    return bool(constant - fitted < noise * chance)
+    sums = sums_of(problem, fit)
+    # Five numbers gain this from noise.
+    chance = 5 + GATE * 10**0.5 + 4 * np.log(max(sums.count, 1.0))
+    return bool(sums.signal - sums.residual < noise * chance)
+
+
+@once_for_each_fit
+def _may_be_pure(problem: Problem, fit: Fit) -> bool:
+    """Whether the inertia is sought from sensors whose values are rates."""
+    del fit
+    sensors = problem.unknowns.original(0)[1:]
+    return bool(problem.unknowns.inertia_model.names) and not any(
+        x.depends_on_attitude or x.width != 3 for x in sensors
+    )

@@ -1,4 +1,4 @@
-"""Why a fit does not describe its record, as far as the record shows it, and what to pass.
+"""Why a fit does not describe its record, and what to pass instead.
 
 One sentence for the first line of a report: a unit, a noise, an error of the sensor
 that is not sought, or something that swings.
@@ -14,14 +14,13 @@ from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments,
 from jrigid.identify._result import FitResult, Status
 from jrigid.identify._sensors import Gyro
 
-_NEARLY_A_SPHERE = (
-    1.03  # I3/I1: degrees for radians shrink the gaps of the moments by 57
-)
-_TOO_FAST = (
-    3.0  # radians of a swing while the body turns by one: no free body does that
-)
-_EXPLAINED = 0.5  # of what is left, for a bias to be named
-_WHITE, _WHITE_SURE = 0.1, 5.0  # correlation of neighbours, and its standard deviations
+# I3/I1: degrees for radians shrink the gaps of the moments by a factor of 57.
+_NEARLY_A_SPHERE = 1.03
+# Radians of a swing while the body turns by one: no free body does that.
+_TOO_FAST = 3.0
+_EXPLAINED = 0.5  # part of what the fit does not explain, for a bias to be named
+_WHITE = 0.1  # correlation of neighbours
+_WHITE_SURE = 5.0  # standard deviations of that
 _FEWEST = 16  # samples whose spectrum says something
 
 
@@ -31,29 +30,29 @@ def reason(result: FitResult) -> str:
         return RESULTS[result.diagnostics.input_result]
     if _is_nearly_a_sphere(result):
         return (
-            "Nearly a sphere: so looks any body whose rates are in degrees a second, or whose "
-            "times are not in seconds. Multiply rates in deg/s by pi / 180."
+            "Nearly a sphere: so looks any body whose rates are in degrees a second, "
+            "or whose times are not in seconds. Multiply rates in deg/s by pi / 180."
         )
     if result.status == Status.OK:
         return _of_parameters(result)
     if not np.all(np.isfinite(np.asarray([result.level, result.level_errors]))):
         return (
-            "The level of the unmodelled torque has no bound or no error: the record does not tell "
-            "it from noise. Pass `sigma`, or the torque (`unmodelled`)."
+            "The level of the unmodelled torque has no bound or no error: the record "
+            "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
     swing = _swing(result)
     if swing > _TOO_FAST:
         return (
-            f"The rates swing {swing:.2g} times as fast as the body turns, which no body does: "
-            "they are too small. Pass them in rad/s (were they converted twice, or times not in "
-            "seconds?)."
+            f"The rates swing {swing:.2g} times as fast as the body turns, which no "
+            "body does: they are too small. Pass them in rad/s (were they converted "
+            "twice, or times not in seconds?)."
         )
     bias = _bias(result)
     if bias is not None:
         numbers = ", ".join(f"{x:.2g}" for x in bias)
         return (
-            f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what is left: seek "
-            "it (`free`), by `free=lambda body, gyro: gyro.bias`."
+            f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what "
+            "is left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
         )
     return _of_noise(result)
 
@@ -74,20 +73,24 @@ def _is_nearly_a_sphere(result: FitResult) -> bool:
 
 def _of_parameters(result: FitResult) -> str:
     """Which arrays beside the inertia are not determined."""
-    names = [name for name, known in result.determined.items() if not known]
+    verdicts = result.determined.items()
+    names = [name for name, is_determined in verdicts if not is_determined]
     return f"It does not determine {', '.join(names)}." if names else ""
 
 
 def _swing(result: FitResult) -> float:
-    """Rate of the largest swing of the readings over their rms: of a free body at most about 1."""
+    """Rate of the largest swing of the readings over their rms.
+
+    Of a free body it is at most about 1.
+    """
     if not (result.problem.options.free_motion and _by_gyro(result)):
         return 0.0
     samples = result.problem.samples
     part = samples.parts[0]
-    seen = np.asarray(samples.seen)[:, part]
-    trial = int(np.argmax(np.sum(seen, axis=1)))
-    ts = np.asarray(samples.ts)[trial, part][seen[trial]]
-    rates = np.asarray(samples.values[0])[trial][seen[trial]]
+    is_seen = np.asarray(samples.seen)[:, part]
+    trial = int(np.argmax(np.sum(is_seen, axis=1)))
+    ts = np.asarray(samples.ts)[trial, part][is_seen[trial]]
+    rates = np.asarray(samples.values[0])[trial][is_seen[trial]]
     if ts.size < _FEWEST:
         return 0.0
     power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
@@ -99,43 +102,61 @@ def _swing(result: FitResult) -> float:
 
 
 def _bias(result: FitResult) -> np.ndarray | None:
-    """A bias that explains most of what the fit leaves, where none was sought."""
+    """A bias that explains most of what the fit does not, where none was sought."""
     options = result.problem.options
     gyros = [i for i, x in enumerate(result.fitted()[1:]) if isinstance(x, Gyro)]
     sought = any(x.name.endswith("bias") for x in result.unknowns.sought)
     if not gyros or sought or options.dense or not options.noise_known:
         return None
-    part = result.problem.samples.parts[gyros[0]]
     residuals = np.asarray(result.diagnostics.residuals)
     jacobian = np.asarray(result.diagnostics.jacobian)
-    # Residuals are those of what is predicted, to which a bias is added.
-    of_bias = np.zeros((*residuals.shape, 3))
-    used = (residuals != 0)[:, part, :, None]
-    of_bias[:, part] = (
-        used * np.asarray(result.problem.samples.whitener)[:, part, :, :3]
-    )
     before = np.sum(residuals**2)
     excess = before - int(result.degrees_of_freedom)
     if not excess > 0 or not np.all(np.isfinite(jacobian)):
         return None
-    numbers = result.numbers.size
-    rows = []
-    for i, left in enumerate(residuals):
-        derivatives = jacobian[i].reshape(-1, jacobian.shape[-1])
-        state = derivatives[:, numbers:]
-        others = [
-            derivatives[:, :numbers],
-            of_bias[i].reshape(-1, 3),
-            left.reshape(-1, 1),
-        ]
-        columns = np.concatenate(others, axis=1)
-        # What a state of the trial's own can do is taken out.
-        rows.append(columns - state @ np.linalg.lstsq(state, columns, rcond=1e-12)[0])
-    columns = np.concatenate(rows)
-    slopes, size = columns[:, :-1], columns[:, -1]
-    found = np.linalg.lstsq(slopes, -size, rcond=1e-12)[0]
-    after = np.sum((size + slopes @ found) ** 2)
-    return found[-3:] if before - after > _EXPLAINED * excess else None
+    of_bias = _slopes_in_bias(result, gyros[0], residuals)
+    count = result.numbers.size
+    trials = zip(residuals, jacobian, of_bias, strict=True)
+    columns = np.concatenate([_without_state(count, *x) for x in trials])
+    slopes = columns[:, :-1]
+    residual = columns[:, -1]
+    solution = np.linalg.lstsq(slopes, -residual, rcond=1e-12)[0]
+    after = np.sum((residual + slopes @ solution) ** 2)
+    return solution[-3:] if before - after > _EXPLAINED * excess else None
+
+
+def _slopes_in_bias(
+    result: FitResult, record: int, residuals: np.ndarray
+) -> np.ndarray:
+    """Derivatives of residuals in the bias of a gyro (trials, n, degrees, 3)."""
+    part = result.problem.samples.parts[record]
+    whitener = np.asarray(result.problem.samples.whitener)[:, part, :, :3]
+    slopes = np.zeros((*residuals.shape, 3))
+    # Residuals are those of what is predicted, to which a bias is added.
+    slopes[:, part] = (residuals != 0)[:, part, :, None] * whitener
+    return slopes
+
+
+def _without_state(
+    count: int, residuals: np.ndarray, jacobian: np.ndarray, of_bias: np.ndarray
+) -> np.ndarray:
+    """Columns of a trial, without what a change of its own state can do.
+
+    Args:
+        count: How many numbers are sought for all trials.
+        residuals: Whitened (n, degrees).
+        jacobian: Their derivatives in the numbers and the state.
+        of_bias: Their derivatives in the bias.
+
+    Returns:
+        Columns of the numbers, of the bias and of the residuals.
+    """
+    derivatives = jacobian.reshape(-1, jacobian.shape[-1])
+    numbers = derivatives[:, :count]
+    state = derivatives[:, count:]
+    others = [numbers, of_bias.reshape(-1, 3), residuals.reshape(-1, 1)]
+    columns = np.concatenate(others, axis=1)
+    return columns - state @ np.linalg.lstsq(state, columns, rcond=1e-12)[0]
 
 
 def _of_noise(result: FitResult) -> str:
@@ -143,26 +164,34 @@ def _of_noise(result: FitResult) -> str:
     if not (result.status == Status.MISFIT and result.problem.options.noise_known):
         return ""
     size = math.sqrt(result.reduced_chi_square)
-    found = f"The residuals are {size:.2g} times the stated noise"
+    residuals = f"The residuals are {size:.2g} times the stated noise"
     if size < 1:
-        degrees = (
-            " (it is 57 times too large if it is in deg/s)"
-            if 0.01 < size < 0.03
-            else ""
+        degrees = ""
+        if 0.01 < size < 0.03:
+            degrees = " (it is 57 times too large if it is in deg/s)"
+        return (
+            f"{residuals}: `sigma` is too large{degrees}. Pass the noise of the sensor "
+            "in rad/s."
         )
-        return f"{found}: `sigma` is too large{degrees}. Pass the noise of the sensor in rad/s."
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
     if stands_out(band, sure):
         return (
-            f"What is left has {band:.2g} times its mean power in one band of frequencies: "
-            "something that changes slowly, or swings, is missing. See `unmodelled` and `free`."
+            f"What is left has {band:.2g} times its mean power in one band of "
+            "frequencies: something that changes slowly, or swings, is missing. See "
+            "`unmodelled` and `free`."
         )
     like, deviations = result.diagnostics.whiteness
     if like > _WHITE and deviations > _WHITE_SURE:
-        return f"{found}, and neighbours correlate by {like:.2f}: see `unmodelled` and `free`."
+        return (
+            f"{residuals}, and neighbours correlate by {like:.2f}: see `unmodelled` "
+            "and `free`."
+        )
     if size < 1.1:
-        return "Trials differ by more than their errors say: they may be of different bodies."
+        return (
+            "Trials differ by more than their errors say: they may be of different "
+            "bodies."
+        )
     return (
-        f"{found}, and white: `sigma` is too small. Pass the noise of the sensor, or "
-        "`absolute_sigma=False`."
+        f"{residuals}, and white: `sigma` is too small. Pass the noise of the sensor, "
+        "or `absolute_sigma=False`."
     )

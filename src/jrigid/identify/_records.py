@@ -1,4 +1,4 @@
-"""What was seen of a rotating body: a sensor, times, values and their noise, one trial or many."""
+"""Records of a rotating body: a sensor, times, values and their noise."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
@@ -28,24 +28,23 @@ Noise = Real[_ArrayLike, "..."] | None
 
 
 class Record(Readable):
-    """What a sensor showed at some times, and how well.
+    """Times, values and noise of one sensor, in one trial or in several.
 
-    NaN stands for "not seen": in a component of `values` (that number is left out; the
-    whole sample where the components hang together, in attitudes, directions and beside
-    a `covariance`), in a whole row, or in `ts` and its row (padding, which brings
-    trials to one length). What was not seen weighs nothing, and its `sigma` may be NaN;
-    it costs what any sample costs.
+    NaN stands for "not seen". It may stand in a component of `values`, in a whole row,
+    or in `ts` and its row (padding, which brings trials to one length). Then that
+    number is left out, or the whole sample where its components belong together: in
+    attitudes, in directions and beside a `covariance`. What was not seen weighs
+    nothing, and its `sigma` may be NaN. It costs as much time as any sample.
 
     Attributes:
         sensor: What showed the values.
         ts: Times [s] (n,), increasing among the samples seen, their origin that of `t0`
             elsewhere; with an axis of trials in front, (trials, n).
-        values: One row for each time (n, k); a plan, whose values play no role, takes
-            None.
+        values: One row for each time (n, k). A plan needs none and takes None.
         sigma: Standard deviation of the noise, in units of the residual: one number for
-            all, (k,) for each component, (n,) for each sample, or (n, k); kept as (n,
-            k). None where it is not known: `fit` takes it from the residuals.
-        covariance: Of the components of a sample, (k, k) or (n, k, k), kept as the
+            all, (k,) for each component, (n,) for each sample, or (n, k), which is how
+            it is stored. None where it is not known: `fit` takes it from the residuals.
+        covariance: Of the components of a sample, (k, k) or (n, k, k), stored as the
             latter; then no `sigma`.
 
     Raises:
@@ -53,7 +52,8 @@ class Record(Readable):
 
     >>> import jrigid as jr
     >>> seen = jr.datasets.gyro_example()
-    >>> print(jr.identify.Record(jr.identify.Gyro(), seen.times, seen.omegas, 0.01).values.shape)
+    >>> record = jr.identify.Record(jr.identify.Gyro(), seen.times, seen.omegas, 0.01)
+    >>> print(record.values.shape)
     (200, 3)
     """
 
@@ -74,48 +74,23 @@ class Record(Readable):
     ):
         """Values of a sensor with noise `sigma` or `covariance`."""
         check_type("sensor", sensor, sensors.AbstractSensor)
-        of, width = f"of `{type(sensor).__name__}` must", sensor.width
-        if values is None:  # a plan
-            demand(
-                width is not None, f"Argument `values` {of} be given, but it is None."
-            )
-            (ts,) = float_arrays(ts)
-            values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
-        ts, values = float_arrays(ts, values)
+        of = f"of `{type(sensor).__name__}` must"
+        self.sensor = sensor
+        self.ts, self.values = _times_and_values(sensor, ts, values, of)
         demand(
-            ts.ndim in (1, 2)
-            and values.ndim == ts.ndim + 1
-            and values.shape[:-1] == ts.shape,
-            f"Arguments `ts` and `values` {of} have shapes (n,) and (n, k), but they have shapes "
-            f"{ts.shape} and {values.shape}.",
+            sigma is None or covariance is None,
+            f"Arguments `sigma` and `covariance` {of} not both be given, but they are.",
         )
-        text = f"have {width} columns, but it has {values.shape[-1]}."
-        demand(width in (None, values.shape[-1]), f"Argument `values` {of} {text}")
-        text = (
-            f"Arguments `sigma` and `covariance` {of} not both be given, but they are."
+        demand(
+            covariance is None or sensor.saturation() is None,
+            f"Argument `covariance` {of} not be given beside a sensor's `limit`, but "
+            "it is: give `sigma`.",
         )
-        demand(sigma is None or covariance is None, text)
-        text = "not be given beside a sensor's `limit`, but it is: give `sigma`."
-        limited = sensor.saturation() is not None
-        demand(covariance is None or not limited, f"Argument `covariance` {of} {text}")
-        self.sensor, self.ts, self.values = sensor, ts, values
-        k, n, self.sigma, self.covariance = self.degrees, ts.shape[-1], None, None
-        if sigma is not None:
-            (sigma,) = float_arrays(sigma)
-            text = f"have shape (), ({k},), ({n},) or ({n}, {k}), but it has shape {sigma.shape}."
-            shapes = (), (k,), (n,), ts.shape, (n, k), (*ts.shape, k)
-            demand(sigma.shape in shapes, f"Argument `sigma` {of} {text}")
-            of_samples = sigma.shape in ((n,), ts.shape) and sigma.shape != (k,)
-            sigma = sigma[..., None] if of_samples else sigma
-            self.sigma = _repeated(sigma, (*ts.shape, k))
+        shape = (*self.ts.shape, self.degrees)
+        self.sigma = None if sigma is None else _sigma(sigma, shape, of)
+        self.covariance = None
         if covariance is not None:
-            (covariance,) = float_arrays(covariance)
-            text = f"shape ({k}, {k}) or ({n}, {k}, {k}), but it has shape {covariance.shape}."
-            shapes = (k, k), (n, k, k), (*ts.shape, k, k)
-            demand(
-                covariance.shape in shapes, f"Argument `covariance` {of} have {text}"
-            )
-            self.covariance = _repeated(covariance, (*ts.shape, k, k))
+            self.covariance = _covariance(covariance, shape, of)
 
     @property
     def degrees(self) -> int:
@@ -133,17 +108,79 @@ class Record(Readable):
 
     @property
     def known(self) -> AnyArray:
-        """Which numbers of the residual are there."""
+        """Which numbers of the residual were seen."""
         xp = self.values.__array_namespace__()
-        there = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
+        is_finite = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
         if self.sensor.degrees is None and self.covariance is None:
-            return there
-        return xp.repeat(xp.all(there, axis=-1, keepdims=True), self.degrees, axis=-1)
+            return is_finite
+        whole = xp.all(is_finite, axis=-1, keepdims=True)
+        return xp.repeat(whole, self.degrees, axis=-1)
 
     def with_values(self, values: Array) -> "Record":
         """With other values, where there are times."""
         values = jnp.where(jnp.isfinite(self.ts)[..., None], values, jnp.nan)
         return eqx.tree_at(lambda x: x.values, self, values)
+
+
+def _times_and_values(
+    sensor: sensors.AbstractSensor, ts: Times, values: Values, of: str
+) -> tuple[Array, Array]:
+    """Times (..., n) and values (..., n, k) as arrays of one dtype.
+
+    Args:
+        sensor: What showed the values.
+        ts: Times [s].
+        values: None in a plan.
+        of: Words for errors, after the name of an argument.
+    """
+    width = sensor.width
+    if values is None:
+        demand(width is not None, f"Argument `values` {of} be given, but it is None.")
+        (ts,) = float_arrays(ts)
+        # Of unit length, for sensors whose values are.
+        values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
+    ts, values = float_arrays(ts, values)
+    demand(
+        ts.ndim in (1, 2)
+        and values.ndim == ts.ndim + 1
+        and values.shape[:-1] == ts.shape,
+        f"Arguments `ts` and `values` {of} have shapes (n,) and (n, k), but they have "
+        f"shapes {ts.shape} and {values.shape}.",
+    )
+    demand(
+        width in (None, values.shape[-1]),
+        f"Argument `values` {of} have {width} columns, but it has {values.shape[-1]}.",
+    )
+    return ts, values
+
+
+def _sigma(sigma: Any, shape: tuple[int, ...], of: str) -> Array:
+    """Standard deviations of each component of each sample, (..., n, k)."""
+    (sigma,) = float_arrays(sigma)
+    *of_ts, k = shape
+    n = of_ts[-1]
+    of_components = ((), (k,), (n, k), shape)
+    of_samples = ((n,), tuple(of_ts))
+    demand(
+        sigma.shape in of_components + of_samples,
+        f"Argument `sigma` {of} have shape (), ({k},), ({n},) or ({n}, {k}), but it "
+        f"has shape {sigma.shape}.",
+    )
+    if sigma.shape in of_samples and sigma.shape != (k,):
+        sigma = sigma[..., None]
+    return _repeated(sigma, shape)
+
+
+def _covariance(covariance: Any, shape: tuple[int, ...], of: str) -> Array:
+    """Covariances of the components of each sample, (..., n, k, k)."""
+    (covariance,) = float_arrays(covariance)
+    *_, n, k = shape
+    demand(
+        covariance.shape in ((k, k), (n, k, k), (*shape, k)),
+        f"Argument `covariance` {of} have shape ({k}, {k}) or ({n}, {k}, {k}), but it "
+        f"has shape {covariance.shape}.",
+    )
+    return _repeated(covariance, (*shape, k))
 
 
 def _repeated(x: Array, shape: tuple[int, ...]) -> Array:
@@ -165,7 +202,9 @@ def Rates(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Recor
 
 
 def Attitudes(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
-    """The record of an `AttitudeSensor`: unit quaternions, noise in radians about body axes.
+    """The record of an `AttitudeSensor`: unit quaternions.
+
+    The noise is in radians about the body axes.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.toutatis_1992()
@@ -188,7 +227,8 @@ def Directions(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> star = jnp.array([1.0, 0.0, 0.0])
-    >>> seen = jr.identify.Directions(jnp.arange(5.0), jnp.tile(star, (5, 1)), 1e-3, of=star)
+    >>> values = jnp.tile(star, (5, 1))
+    >>> record = jr.identify.Directions(jnp.arange(5.0), values, 1e-3, of=star)
     """
     sensor = sensors.DirectionSensor(float_arrays(of)[0], frame)
     return Record(sensor, ts, values, sigma, **noise)
@@ -202,10 +242,13 @@ def AngularMomenta(
     frame: str = "space",
     **noise: Any,
 ) -> Record:
-    """The record of a `MomentumSensor` [kg m^2/s]; it sets the scale: `fit(..., scale="known")`.
+    """The record of a `MomentumSensor` [kg m^2/s].
+
+    It sets the scale of the inertia: `fit(..., scale="known")`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> seen = jr.identify.AngularMomenta(jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, frame="body")
+    >>> record = jr.identify.AngularMomenta(
+    ...     jnp.arange(4.0), jnp.ones((4, 3)), 1e-3, frame="body")
     """
     return Record(sensors.MomentumSensor(frame), ts, values, sigma, **noise)
 
@@ -222,8 +265,9 @@ def Observed(
     """The record of a `FunctionSensor`: any function `(t, state, system) -> (k,)`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> spin = jr.identify.Observed(
-    ...     lambda t, state, system: state.omega[2:], jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
+    >>> def spin(t, state, system):
+    ...     return state.omega[2:]
+    >>> record = jr.identify.Observed(spin, jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
     """
     return Record(
         sensors.FunctionSensor(function, depends_on_attitude),
@@ -241,7 +285,7 @@ def one_after_another(sizes: Iterable[int]) -> list[slice]:
 
 
 def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Times of the first and last samples of each trial; zero for one without samples."""
+    """Times of the first and last samples of each trial; zero if there are none."""
     xp = ts.__array_namespace__()
     first = xp.min(xp.where(there, ts, xp.inf), axis=1)
     last = xp.max(xp.where(there, ts, -xp.inf), axis=1)
@@ -251,8 +295,9 @@ def first_and_last(ts: AnyArray, there: AnyArray) -> tuple[AnyArray, AnyArray]:
 
 
 class Samples(NamedTuple):
-    """All records as a fit reads them, side by side: finite, of weight zero where nothing is.
+    """All records as a fit reads them, side by side.
 
+    Arrays are finite, and of weight zero where nothing was seen.
     Residuals have as many numbers as the widest record's, D. `whitener` (trials, n, D,
     D) turns one into units of its noise; `sign` (trials, n, D) is that of a saturated
     number, 0 elsewhere.
@@ -285,42 +330,65 @@ def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
     values, *rest = zip(*(_normalised(x, guess, width) for x in records), strict=True)
     xp = records[0].values.__array_namespace__()
     ts, whitener, weight, sign = (xp.concatenate(x, axis=1) for x in rest)
-    there = xp.any(weight > 0, axis=-1)
-    ts = xp.where(there, ts, first_and_last(ts, there)[0][:, None])
+    is_seen = xp.any(weight > 0, axis=-1)
+    ts = xp.where(is_seen, ts, first_and_last(ts, is_seen)[0][:, None])
     return Samples(ts, values, whitener, weight, sign)
 
 
 def _normalised(record: Record, guess: AnyArray, width: int) -> tuple[AnyArray, ...]:
-    """Values, times, whitener, weight and sign of a record, the latter as wide as the widest's."""
+    """Values, times, whitener, weight and sign of a record.
+
+    The last three are as wide as those of the widest record.
+    """
     known = record.known
     values = record.values
-    sensor = record.sensor
     xp = values.__array_namespace__()
-    dtype, size = values.dtype, record.degrees
-    seen = xp.any(known, axis=-1, keepdims=True)
+    is_seen = xp.any(known, axis=-1, keepdims=True)
     # A value that was not seen is zero, or the first unit vector.
-    first = xp.arange(values.shape[-1]) == 0
-    harmless = xp.where(first & sensor.unit_length, xp.ones((), dtype), 0.0)
-    values = xp.where(seen & xp.isfinite(values), values, harmless)
-    eye = xp.broadcast_to(xp.eye(size, dtype=dtype), (*known.shape, size))
+    is_first = xp.arange(values.shape[-1]) == 0
+    one = xp.ones((), values.dtype)
+    harmless = xp.where(is_first & record.sensor.unit_length, one, 0.0)
+    values = xp.where(is_seen & xp.isfinite(values), values, harmless)
+    whitener = _whitener(record, known, guess)
+    weight = known.astype(values.dtype)
+    sign = _saturation_sign(record, known, values)
+    if record.degrees < width:
+        pad = [(0, 0), (0, 0), (0, width - record.degrees)]
+        weight = xp.pad(weight, pad)
+        sign = xp.pad(sign, pad)
+        whitener = xp.pad(whitener, [*pad, pad[-1]])
+    return values, record.ts, whitener, weight, sign
+
+
+def _whitener(record: Record, known: AnyArray, guess: AnyArray) -> AnyArray:
+    """Matrices that turn a residual into units of its noise (trials, n, k, k)."""
+    xp = record.values.__array_namespace__()
+    dtype = record.values.dtype
+    eye = xp.eye(record.degrees, dtype=dtype)
+    eye = xp.broadcast_to(eye, (*known.shape, record.degrees))
     if record.covariance is not None:
-        whitener = _inverse_factor(xp.where(seen[..., None], record.covariance, eye))
-    else:
-        sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
-        whitener = eye / sigma[..., None].astype(dtype)
-    largest = sensor.saturation()
-    sign = xp.zeros(known.shape, dtype)
-    if largest is not None:
-        most = xp.broadcast_to(xp.asarray(largest, dtype) * (1 - 1e-6), values.shape)
-        sign = xp.where(known & (xp.abs(values) >= most), xp.sign(values), 0.0)
-    pad = [(0, 0), (0, 0), (0, width - size)]
-    columns = (xp.pad(x, pad) for x in (known.astype(dtype), sign))
-    return values, record.ts, xp.pad(whitener, [*pad, pad[-1]]), *columns
+        is_seen = xp.any(known, axis=-1)[..., None, None]
+        return _inverse_factor(xp.where(is_seen, record.covariance, eye))
+    sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
+    return eye / sigma[..., None].astype(dtype)
+
+
+def _saturation_sign(record: Record, known: AnyArray, values: AnyArray) -> AnyArray:
+    """The sign of each number that is saturated, 0 elsewhere."""
+    xp = values.__array_namespace__()
+    largest = record.sensor.saturation()
+    if largest is None:
+        return xp.zeros(known.shape, values.dtype)
+    # The limit itself may have been rounded.
+    least = xp.asarray(largest, values.dtype) * (1 - 1e-6)
+    least = xp.broadcast_to(least, values.shape)
+    return xp.where(known & (xp.abs(values) >= least), xp.sign(values), 0.0)
 
 
 def _inverse_factor(covariance: AnyArray) -> AnyArray:
-    """L^-1 of covariances L L^T (..., k, k), L lower triangular; NaN where there is no L.
+    """L^-1 of covariances L L^T (..., k, k), with L lower triangular.
 
+    It is NaN where there is no L.
     By Gram and Schmidt: its rows are orthonormal in the product that the covariance
         makes.
     """
@@ -340,39 +408,57 @@ def _inverse_factor(covariance: AnyArray) -> AnyArray:
 
 
 def of_trials(observations: Any) -> tuple[Record, ...]:
-    """Records with an axis of trials in front: a list's, padded with NaN, or of length one."""
+    """Records with an axis of trials in front, and sensors that know when they begin.
+
+    Trials of a list are filled up with NaN to one length. A single trial makes an axis
+    of length one.
+    """
     if isinstance(observations, list):
         trials = [_as_tuple(x) for x in observations]
         demand(bool(trials), "Argument `observations` must not be empty, but it is.")
         kinds = [[jtu.tree_structure(x.sensor) for x in trial] for trial in trials]
-        text = "hold records of the same sensors for each trial, but it does not."
         demand(
-            all(x == kinds[0] for x in kinds), f"Argument `observations` must {text}"
+            all(x == kinds[0] for x in kinds),
+            "Argument `observations` must hold records of the same sensors for each "
+            "trial, but it does not.",
         )
-        return tuple(map(_begun, map(_stacked, zip(*trials, strict=True))))
+        return tuple(_stacked(x) for x in zip(*trials, strict=True))
     single = _as_tuple(observations)
     shapes = {x.ts.shape[:-1] for x in single}
-    text = (
-        f"Arguments `observations` must have the same trials, but they have {shapes}."
+    demand(
+        len(shapes) == 1,
+        f"Arguments `observations` must have the same trials, but they have {shapes}.",
     )
-    demand(len(shapes) == 1, text)
-    return tuple(_begun(_stacked([x]) if shapes == {()} else x) for x in single)
+    if shapes == {()}:
+        return tuple(_stacked([x]) for x in single)
+    return tuple(_with_arrays(x, _arrays(x)) for x in single)
 
 
-def _begun(record: Record) -> Record:
-    """With a sensor that knows when the record begins."""
-    ts = np.asarray(record.ts) if is_concrete(record.ts) else record.ts
-    xp = ts.__array_namespace__()
-    first = xp.min(xp.where(xp.isfinite(ts), ts, xp.inf))
-    first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), ts.dtype)
-    return eqx.tree_at(lambda x: x.sensor, record, record.sensor.started_at(first))
+def _arrays(record: Record) -> list[Any]:
+    """Times, values, sigma and covariance; the last two may be None."""
+    return [record.ts, record.values, record.sigma, record.covariance]
+
+
+def _with_arrays(record: Record, arrays: list[Any]) -> Record:
+    """With other arrays, and a sensor that knows when the record begins."""
+    ts = arrays[0]
+    times = np.asarray(ts) if is_concrete(ts) else ts
+    xp = times.__array_namespace__()
+    first = xp.min(xp.where(xp.isfinite(times), times, xp.inf))
+    first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), times.dtype)
+    return eqx.tree_at(
+        lambda x: [x.sensor, *_arrays(x)],
+        record,
+        [record.sensor.started_at(first), *arrays],
+        is_leaf=lambda x: x is None,
+    )
 
 
 def rounded(count: int) -> int:
-    """The number of samples to which a record is filled up: few programs serve all lengths.
+    """The number of samples to which a record is filled up.
 
-    16, 64, 256, where more samples cost little; above, a power of two or half as much
-    again.
+    Few compiled programs then serve all lengths. Where more samples cost little it is
+    16, 64 or 256; above, a power of two or half as much again.
     """
     if count <= 256:
         return next(x for x in (16, 64, 256) if count <= x)
@@ -393,12 +479,12 @@ def lengthened(record: Record) -> Record:
 
     def filled(x: Any, axis: int) -> Any:
         x = np.asarray(x)
-        widths = [(0, more if i == axis else 0) for i in range(x.ndim)]
-        return np.pad(x, widths, constant_values=np.nan)
+        shape = list(x.shape)
+        shape[axis] = more
+        return np.concatenate([x, np.full(shape, np.nan, x.dtype)], axis)
 
-    arrays = lambda x: [x.ts, x.values, x.sigma, x.covariance]  # noqa: E731
-    wanted = [None if x is None else filled(x, 1) for x in arrays(record)]
-    return eqx.tree_at(arrays, record, wanted, is_leaf=lambda x: x is None)
+    arrays = [None if x is None else filled(x, 1) for x in _arrays(record)]
+    return eqx.tree_at(_arrays, record, arrays, is_leaf=lambda x: x is None)
 
 
 def _as_tuple(observations: Any) -> tuple[Record, ...]:
@@ -406,8 +492,9 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
         return (observations,)
     demand(
         isinstance(observations, Sequence) and len(observations) > 0,
-        "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of them, or a "
-        f"list with one entry for each trial, but it is {type(observations).__name__}.",
+        "Argument `observations` must be a record (jr.identify.Rates, ...), a tuple of "
+        "them, or a list with one entry for each trial, but it is "
+        f"{type(observations).__name__}.",
     )
     for x in observations:
         check_type("observations", x, Record)
@@ -416,31 +503,42 @@ def _as_tuple(observations: Any) -> tuple[Record, ...]:
 
 def _stacked(parts: Sequence[Record]) -> Record:
     """One record of all trials; shorter ones are filled up with NaN."""
-    text = "hold times of shape (n,) for each trial of a list, but it does not."
-    demand(all(x.ts.ndim == 1 for x in parts), f"Argument `observations` must {text}")
+    demand(
+        all(x.ts.ndim == 1 for x in parts),
+        "Argument `observations` must hold times of shape (n,) for each trial of a "
+        "list, but it does not.",
+    )
     demand(
         all(_same(x.sensor, parts[0].sensor) for x in parts),
-        "Argument `observations` must have the same sensor in every trial of a list, but it has "
-        "not: `jr.identify.each` seeks an error anew in each trial.",
+        "Argument `observations` must have the same sensor in every trial of a list, "
+        "but it has not: `jr.identify.each` seeks an error anew in each trial.",
     )
-    arrays = lambda x: (x.ts, x.values, x.sigma, x.covariance)  # noqa: E731
-    text = "state the noise for all trials or for none, but it does for some."
-    same = len({jtu.tree_structure(arrays(x)) for x in parts}) == 1
-    demand(same, f"Argument `observations` must {text}")
+    demand(
+        len({jtu.tree_structure(_arrays(x)) for x in parts}) == 1,
+        "Argument `observations` must state the noise for all trials or for none, but "
+        "it does for some.",
+    )
     longest = max(x.ts.size for x in parts)
 
-    def stack(*trials: Array) -> Array:
-        known = all(map(is_concrete, trials))
-        xp, rows = jnp, list(trials)
-        if known:  # no compiled programs for each length
-            xp, rows = np, [np.asarray(x) for x in trials]
-        missing = [[(0, longest - x.shape[0])] + [(0, 0)] * (x.ndim - 1) for x in rows]
-        pairs = zip(rows, missing, strict=True)
-        stacked = xp.stack([xp.pad(x, y, constant_values=np.nan) for x, y in pairs])
-        return jnp.asarray(stacked)
+    columns = zip(*map(_arrays, parts), strict=True)
+    arrays = [None if x[0] is None else _stack(x, longest) for x in columns]
+    return _with_arrays(parts[0], arrays)
 
-    stacked = jtu.tree_map(stack, *map(arrays, parts))
-    return eqx.tree_at(arrays, parts[0], stacked, is_leaf=lambda x: x is None)
+
+def _stack(trials: Sequence[Array], longest: int) -> Array:
+    """Stack arrays of trials, shorter ones filled up with NaN."""
+    xp = jnp
+    rows = list(trials)
+    if all(map(is_concrete, trials)):
+        # NumPy needs no compiled program for each length.
+        xp = np
+        rows = [np.asarray(x) for x in trials]
+    filled = []
+    for row in rows:
+        missing = [(0, longest - row.shape[0])] + [(0, 0)] * (row.ndim - 1)
+        short = missing[0][1] > 0
+        filled.append(xp.pad(row, missing, constant_values=np.nan) if short else row)
+    return jnp.asarray(xp.stack(filled))
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -456,32 +554,46 @@ def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
     """Note what is wrong with values, times and noise of records with numpy arrays."""
     code = RESULTS.invalid_state
     for x in records:
-        of, known = f"of `{type(x.sensor).__name__}` must", x.known
-        seen = np.any(known, axis=-1)
+        of = f"of `{type(x.sensor).__name__}` must"
+        known = x.known
+        is_seen = np.any(known, axis=-1)
         text = f"Argument `values` {of} hold values, but all are NaN."
         findings.require(np.any(known), code, text)
-        times = np.maximum.accumulate(np.where(seen, x.ts, -np.inf), axis=1)
-        ordered = np.all(~seen[:, 1:] | (x.ts[:, 1:] > times[:, :-1]))
-        padded = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
-        text = "be finite where there are values, and increasing, each time once, but it is not."
-        ordered = ordered & ~np.any(padded)
-        findings.require(ordered, RESULTS.invalid_times, f"Argument `ts` {of} {text}")
+        text = (
+            f"Argument `ts` {of} be finite where there are values, and increasing, "
+            "each time once, but it is not."
+        )
+        findings.require(_is_ordered(x, is_seen), RESULTS.invalid_times, text)
         text = f"Arguments `sigma` and `covariance` {of} be positive, but one is not."
         findings.require(_is_noise(x, known), code, text)
         if x.sensor.unit_length:
-            square = np.sum(np.where(seen[..., None], x.values, 0.0) ** 2, axis=-1)
-            near = 1e-3 if x.values.shape[-1] == 4 else 0.5
             text = f"Argument `values` {of} be of unit length, but one is not."
-            findings.require(np.all(~seen | (np.abs(square - 1) < near)), code, text)
+            findings.require(_is_unit(x, is_seen), code, text)
     enough = np.bool_(sum(np.sum(x.known) for x in records) >= 12)
     text = "hold more numbers than a body and its state have, but it holds too few."
     findings.require(enough, code, f"Argument `observations` must {text}")
 
 
+def _is_ordered(x: Record, is_seen: np.ndarray) -> np.bool_:
+    """Whether times of samples increase, and are there where values are."""
+    before = np.maximum.accumulate(np.where(is_seen, x.ts, -np.inf), axis=1)
+    increasing = np.all(~is_seen[:, 1:] | (x.ts[:, 1:] > before[:, :-1]))
+    without_time = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
+    return increasing & ~np.any(without_time)
+
+
+def _is_unit(x: Record, is_seen: np.ndarray) -> np.bool_:
+    """Whether values are of unit length: quaternions closely, directions roughly."""
+    square = np.sum(np.where(is_seen[..., None], x.values, 0.0) ** 2, axis=-1)
+    near = 1e-3 if x.values.shape[-1] == 4 else 0.5
+    return np.all(~is_seen | (np.abs(square - 1) < near))
+
+
 def _is_noise(x: Record, known: AnyArray) -> np.bool_:
+    """Whether `sigma` is positive, or `covariance` positive definite, where seen."""
     if x.covariance is not None:
-        seen = np.any(known, axis=-1)[..., None, None]
-        noise = np.where(seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
+        is_seen = np.any(known, axis=-1)[..., None, None]
+        noise = np.where(is_seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
         even = np.abs(noise - np.swapaxes(noise, -1, -2)) <= 1e-6 * np.abs(noise)
         return np.all(even) & np.all(np.isfinite(_inverse_factor(noise)))
     if x.sigma is None:

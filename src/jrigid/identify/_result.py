@@ -1,4 +1,4 @@
-"""FitResult: what a fit found, how well it is known, and what the record cannot tell, in words."""
+"""FitResult: the estimates of a fit, their errors, and what the record leaves open."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
 from jrigid._core.third_party import with_codes
 from jrigid._numerics import product
 from jrigid._spectral import eigh
-from jrigid._types import Matrix, Real, Scalar, Vector
+from jrigid._types import AnyArray, Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._diagnostics import Diagnostics
@@ -29,25 +29,25 @@ from jrigid.systems import RigidBody
 
 @with_codes
 class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
-    """What became of a fit; `int` gives the code of one, `numpy.asarray` the codes of many."""
+    """How a fit ended; `int` gives the code of one, `numpy.asarray` those of many."""
 
     OK = "The fit describes the record, and the record determines the inertia."
     UNIDENTIFIABLE = (
-        "The fit describes the record, but the record does not determine the inertia: see "
-        "`null_directions`."
+        "The fit describes the record, but the record does not determine the inertia: "
+        "see `null_directions`."
     )
     MISFIT = (
-        "The fit follows the record, but what is left is no noise of the size stated: a torque "
-        "that the model has not, or a sensor's error (see `unmodelled`, `free`), or the noise is "
-        "not as stated. The errors are those of what is left."
+        "The fit follows the record, but what is left is no noise of the size stated: "
+        "a torque that the model has not, or a sensor's error (see `unmodelled`, "
+        "`free`), or the noise is not as stated. The errors are those of what is left."
     )
     WRONG_BASIN = (
-        "The fit does not describe the record: it ended in a wrong minimum, or the model is wrong. "
-        "With `throw=False` it can be looked at."
+        "The fit does not describe the record: it ended in a wrong minimum, or the "
+        "model is wrong. With `throw=False` it can be looked at."
     )
     AT_BOUNDARY = (
-        "The fit has run into the boundary of real bodies: all mass in a plane or on a line. The "
-        "record asks for a tensor that no body has, or hardly tells it."
+        "The fit has run into the boundary of real bodies: all mass in a plane or on a "
+        "line. The record asks for a tensor that no body has, or hardly tells it."
     )
     NOT_CONVERGED = (
         "The fit has not converged in the steps allowed. With `throw=False` it can be "
@@ -57,7 +57,7 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 _FAR = 1.0  # a change of a number beyond which the tensor is another one
-# An error above this, in natural units, and a direction is not told.
+# In natural units: a direction with a larger error is not determined.
 LARGEST_ERROR = 0.3
 
 
@@ -86,10 +86,11 @@ def arrays_of(fields: dict[str, Any]) -> list[Any]:
 
 
 class FitResult(eqx.Module):
-    """Inertia, state and nuisances with errors; by `fit_each` with an axis of fits in front.
+    """Inertia, state and what else was sought, with errors.
 
-    `print` shows it in words. Errors are standard errors; if no noise was stated, or it
-    does not explain what is left, their level is that of the residuals.
+    `fit_each` returns one with an axis of fits in front. `print` shows it in words.
+    Errors are standard errors. If no noise was stated, or it does not explain the
+    residuals, their level is that of the residuals.
 
     Attributes:
         status: A `jrigid.identify.Status`.
@@ -122,9 +123,8 @@ class FitResult(eqx.Module):
             is white.
         correlation_time_errors: Of that.
         level_by_trial: Of each trial, in units of `level`.
-        kept: Which samples were, records side by side.
-        diagnostics: What was left of the record, what determined the numbers, and how
-            the fit got there.
+        kept: Which samples took part, records side by side.
+        diagnostics: Residuals, what determined the numbers, and how the fit got there.
         problem: The record as it was fitted, and how.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -246,7 +246,8 @@ class FitResult(eqx.Module):
         >>> record = jr.datasets.gyro_example()
         >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
         >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-        >>> print(found.interval(lambda tensor: tensor[2, 2] / jnp.trace(tensor)).round(2))
+        >>> share = lambda tensor: tensor[2, 2] / jnp.trace(tensor)
+        >>> print(found.interval(share).round(2))
         [0.44 0.44]
         """
         level_ = jnp.asarray(level, self.numbers.dtype)
@@ -254,21 +255,22 @@ class FitResult(eqx.Module):
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
-        """Lower and upper limits of I2/I1 and I3/I1 at 95 %, in columns; of a single fit."""
+        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first."""
         ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
         return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
         """Of `numbers`, then of each trial's state and own numbers."""
-        numbers, known = self.numbers_covariance, self.diagnostics
-        *lanes, trials, local, size = known.follow.shape
-        follow = known.follow.reshape(*lanes, trials * local, size)
-        across = -product("...ag,...gh->...ah", follow, numbers)
+        numbers = self.numbers_covariance
+        diagnostics = self.diagnostics
+        *lanes, trials, local, size = diagnostics.sensitivity.shape
+        sensitivity = diagnostics.sensitivity.reshape(*lanes, trials * local, size)
+        across = product("...ag,...gh->...ah", sensitivity, numbers)
         eye = jnp.eye(trials, dtype=numbers.dtype)
-        blocks = product("ts,...tlm->...tlsm", eye, known.local_covariance)
+        blocks = product("ts,...tlm->...tlsm", eye, diagnostics.local_covariance)
         blocks = blocks.reshape(*lanes, trials * local, trials * local)
-        blocks = blocks - product("...ah,...bh->...ab", across, follow)
+        blocks = blocks + product("...ah,...bh->...ab", across, sensitivity)
         return jnp.block([[numbers, jnp.swapaxes(across, -2, -1)], [across, blocks]])
 
     @property
@@ -302,19 +304,17 @@ class FitResult(eqx.Module):
         >>> print(t0)
         50.0
         """
-        attitude, omega = (
-            self.state.attitude[..., index, :],
-            self.state.omega[..., index, :],
-        )
+        attitude = self.state.attitude[..., index, :]
+        omega = self.state.omega[..., index, :]
         return State(attitude, omega), self.t0[..., index]
 
     def predict(
         self, ts: Real[_ArrayLike, "*times"], record: int = 0, trial: int = 0
     ) -> Float[Array, "*times k"]:
-        """What a sensor would read in a trial, by the model that was found; of a single fit.
+        """Predict the readings of a sensor in a trial, of a single fit.
 
-        The motion goes on from the trial's `state` at `t0`, with no torque that is not
-        modelled; the sensor has the errors that were found, its delay, its filter and
+        The motion goes on from the trial's `state` at `t0`, without an unmodelled
+        torque. The sensor has the errors that were estimated, its delay, its filter and
         its limit.
 
         Args:
@@ -324,7 +324,7 @@ class FitResult(eqx.Module):
             trial: Which trial.
 
         Raises:
-            ValueError: No such record or throw, or times before `t0` under a torque.
+            ValueError: No such record or trial, or times before `t0` under a torque.
 
         Gradients: in forward mode.
 
@@ -335,36 +335,33 @@ class FitResult(eqx.Module):
         >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
         [ 1.6 -2.4  1.2]
         """
-        trials, records = self.t0.shape[0], len(self.problem.samples.values)
-        for name, value, count in (
-            ("record", record, records),
-            ("trial", trial, trials),
-        ):
-            text = f"Argument `{name}` must be at least 0 and below {count}, but it is {value}."
-            demand(0 <= value < count, text)
+        _check_index("record", record, len(self.problem.samples.values))
+        _check_index("trial", trial, self.t0.shape[0])
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
-        after, options = jnp.all(times >= self.t0[trial]), self.problem.options
+        after = jnp.all(times >= self.t0[trial])
+        options = self.problem.options
         backward = options.free_motion or options.motion is not None
         demand(
             backward or not is_concrete(after) or bool(after),
-            "Argument `ts` must not be before the trial's `t0` where there is a torque, but it is.",
+            "Argument `ts` must not be before the trial's `t0` where there is a "
+            "torque, but it is.",
         )
-        found = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
-        return found.reshape(*times.shape, -1)
+        readings = _predicted(self, times.reshape(-1), record, jnp.asarray(trial))
+        return readings.reshape(*times.shape, -1)
 
     @property
     def body(self) -> MassProperties:
         """The body that was found, about its fixed point, by a `LogCholesky`.
 
         Raises:
-            ValueError: The shape that was sought was another one.
+            ValueError: The inertia model of the fit was another one.
         """
         numbers = self.numbers[..., self.unknowns.slices["inertia"]]
         body = self.unknowns.inertia_model.body(numbers)
         if body is None:
             raise ValueError(
-                "Argument `shape` of the fit must be a LogCholesky for a mass and a centre of mass "
-                "to follow, but it was not."
+                "Argument `inertia_model` of the fit must be a LogCholesky for a mass "
+                "and a centre of mass to follow, but it was not."
             )
         return body
 
@@ -378,12 +375,11 @@ class FitResult(eqx.Module):
             trial: Which trial.
         """
         part = self.problem.samples.parts[record]
-        return self.diagnostics.jacobian[trial, part], self.diagnostics.residuals[
-            trial, part
-        ]
+        jacobian = self.diagnostics.jacobian[trial, part]
+        return jacobian, self.diagnostics.residuals[trial, part]
 
     def residuals(self, record: int = 0) -> Float[Array, "trials n degrees"]:
-        """What is left of a record: predicted less observed, in its own units; of a single fit.
+        """Residuals of a record, predicted less observed, in its own units.
 
         NaN where nothing was seen, and of samples that are saturated or were left out.
 
@@ -396,41 +392,40 @@ class FitResult(eqx.Module):
         eye = jnp.eye(white.shape[-1], dtype=white.dtype)
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
         rows = self.diagnostics.residuals[:, samples.parts[record], :, None]
-        left = jnp.linalg.solve(white, rows)[..., 0]
-        return jnp.where(used[:, samples.parts[record]], left, jnp.nan)
+        residuals = jnp.linalg.solve(white, rows)[..., 0]
+        return jnp.where(used[:, samples.parts[record]], residuals, jnp.nan)
 
     @property
     def estimates(self) -> dict[str, tuple[Array, Array]]:
-        """Value and error of each array that `free` picked, of a single fit, by name.
+        """Value and error of each array that `free` picked, by name; of a single fit.
 
-        Of one that is sought anew in each trial, of each trial.
+        An array that is sought anew in each trial has an axis of trials in front.
         """
-        found = {}
+        estimates = {}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
             function = jax.vmap(x.with_errors) if x.own else x.with_errors
-            found[x.name] = function(numbers, covariance)
-        return found
+            estimates[x.name] = function(numbers, covariance)
+        return estimates
 
     def _of_sought(self, x: AbstractSought) -> tuple[Array, Array]:
-        """Numbers of an array that is sought, and their covariance; of each trial if it is own."""
+        """Numbers and covariance of an array that is sought, of each trial if own."""
         numbers = self.numbers_covariance
         if not x.own:
             part = self.unknowns.slices[x.name]
             return self.numbers[part], numbers[part, part]
         part = next(s for y, s in self.unknowns.own_slices if y is x)
-        known = self.diagnostics
-        first = known.follow.shape[1] - self.own_numbers.shape[1]
+        # Own numbers come after the numbers of a state.
+        first = self.diagnostics.sensitivity.shape[1] - self.own_numbers.shape[1]
         local = slice(first + part.start, first + part.stop)
-        follow = known.follow[:, local]
-        shared = product("tlg,gh,tmh->tlm", follow, numbers, follow)
-        return self.own_numbers[:, part], shared + known.local_covariance[
-            :, local, local
-        ]
+        sensitivity = self.diagnostics.sensitivity[:, local]
+        shared = product("tlg,gh,tmh->tlm", sensitivity, numbers, sensitivity)
+        alone = self.diagnostics.local_covariance[:, local, local]
+        return self.own_numbers[:, part], shared + alone
 
     @property
     def determined(self) -> dict[str, bool]:
-        """Whether the record determines the inertia, and each array that `free` picked, by name.
+        """Whether the record determines the inertia and each array of `free`, by name.
 
         An array is determined where its errors are below 0.3 of its size, or of its
         natural unit if that is larger; one that is sought anew in each trial, where it
@@ -445,34 +440,33 @@ class FitResult(eqx.Module):
         >>> print(found.determined)
         {'inertia': True, 'gyro.bias': True}
         """
-        found = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
+        verdicts = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
-            units = (
-                jax.vmap(x.natural_units)(numbers)
-                if x.own
-                else x.natural_units(numbers)
-            )
-            errors = errors_of(covariance) / units
-            took_part = jnp.any(self.kept, axis=-1)
-            errors = errors[took_part] if x.own else errors
-            found[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
-        return found
+            units_of = jax.vmap(x.natural_units) if x.own else x.natural_units
+            errors = errors_of(covariance) / units_of(numbers)
+            if x.own:
+                took_part = jnp.any(self.kept, axis=-1)
+                errors = errors[took_part]
+            verdicts[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
+        return verdicts
 
     @property
     def mirror_moments(self) -> Float[Array, "*fits 3"]:
-        """Moments, about the same axes, of the body that fits the mirrored readings of a gyro.
+        """Moments of the body that fits the mirrored readings of a gyro.
 
+        They are about the same axes, in the same order.
         With all axes of the gyro reversed, or one that is a principal axis, the rates
         obey Euler's equations of another body, whose (I2 - I3)/I1 and cyclic ones have
         the opposite sign: a gyro of unknown handedness cannot tell the two apart.
         """
         first, second, third = jnp.moveaxis(self.moments, -1, 0)
-        a, b = (second - third) / first, (third - first) / second
+        a = (second - third) / first
+        b = (third - first) / second
         other = (1 - a) / (1 + b)
-        found = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
-        total = jnp.sum(found, axis=-1, keepdims=True)
-        return found * jnp.sum(self.moments, axis=-1, keepdims=True) / total
+        mirrored = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
+        total = jnp.sum(mirrored, axis=-1, keepdims=True)
+        return mirrored * jnp.sum(self.moments, axis=-1, keepdims=True) / total
 
     @property
     def null_directions(self) -> tuple[str, ...]:
@@ -488,45 +482,79 @@ class FitResult(eqx.Module):
         return report(self)
 
 
+def _check_index(name: str, value: int, count: int) -> None:
+    """Raise ValueError unless there is such a record or trial."""
+    demand(
+        0 <= value < count,
+        f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
+    )
+
+
 @quick_jit
 def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array:
+    """Readings of a sensor in a trial (n, k), with its limit."""
     system, *sensors = result.fitted(trial)
-    sensor, none = sensors[record], jnp.zeros((ts.size, 0), ts.dtype)
-    samples, options = Samples(ts, (none,), none, none, none), result.problem.options
-    (shown,) = shown_by(
-        options, system, [sensor], *result.initial_state(trial), samples
-    )
+    sensor = sensors[record]
+    none = jnp.zeros((ts.size, 0), ts.dtype)
+    samples = Samples(ts, (none,), none, none, none)
+    state0, t0 = result.initial_state(trial)
+    options = result.problem.options
+    (shown,) = shown_by(options, system, [sensor], state0, t0, samples)
     largest = sensor.saturation()
-    return (
-        shown
-        if largest is None
-        else jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
-    )
+    if largest is None:
+        return shown
+    return jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
 
 
 def _of_moments(which: Any, tensor: Array) -> Array:
-    """Of the moments, ratios and shares some."""
+    """Some of the moments, ratios and shares of a tensor."""
     moments = eigh(tensor)[0]
-    found = jnp.concatenate(
-        [moments, moments[1:] / moments[0], moments / jnp.sum(moments)]
-    )
-    return found[which]
+    ratios = moments[1:] / moments[0]
+    return jnp.concatenate([moments, ratios, moments / jnp.sum(moments)])[which]
 
 
 def _spread(
     unknowns: Unknowns, numbers: Array, covariance: Array, function: Callable[..., Any]
 ) -> Array:
-    size = unknowns.of_inertia.stop
-    values, axes = jnp.linalg.eigh(covariance[:size, :size])
-    sizes = jnp.sqrt(jnp.maximum(values, 0.0) * size)
-    near = jnp.minimum(
-        sizes, _FAR
-    )  # what is told worse is carried on as a straight line
-    steps = jnp.pad(product("ij,j->ji", axes, near), ((0, 0), (0, numbers.size - size)))
-    of_numbers = lambda x: function(unknowns.inertia(x))  # noqa: E731
-    moves = jax.vmap(of_numbers)(numbers[None] + jnp.concatenate([steps, -steps]))
-    moves = moves - of_numbers(numbers)[None]
-    moves = product(
-        "ij,i->ij", moves, jnp.tile(sizes / jnp.where(near > 0, near, 1.0), 2)
-    )
-    return product("ki,kj->ij", moves, moves) / (2 * max(size, 1))
+    """Covariance of a function of the tensor: see `FitResult.spread`."""
+
+    def of_numbers(x: Array) -> Array:
+        return function(unknowns.inertia(x))
+
+    points, scales = sigma_points(numbers, covariance, unknowns.of_inertia.stop)
+    return spread_of(jax.vmap(of_numbers)(points), scales)
+
+
+def sigma_points(
+    numbers: AnyArray, covariance: AnyArray, size: int
+) -> tuple[AnyArray, AnyArray]:
+    """Points one standard error from the estimate along each axis of a covariance.
+
+    Errors are multiplied by the root of the count of axes, so that the mean square over
+    the points is the variance.
+
+    Args:
+        numbers: The estimate.
+        covariance: Of the numbers.
+        size: How many of them, the first ones, are moved.
+
+    Returns:
+        Points (2 size + 1, numbers), the estimate last. Factors by which moves of a
+        function between them are too small, as no point is moved by more than `_FAR`.
+    """
+    xp = numbers.__array_namespace__()
+    values, axes = xp.linalg.eigh(covariance[:size, :size])
+    errors = xp.sqrt(xp.maximum(values, 0.0) * size)
+    # What is determined worse is continued as a straight line.
+    near = xp.minimum(errors, _FAR)
+    steps = xp.pad(axes * near[None], ((0, numbers.size - size), (0, 0))).T
+    still = xp.zeros_like(numbers)[None]
+    points = numbers[None] + xp.concatenate([steps, -steps, still])
+    scales = xp.tile(errors / xp.where(near > 0, near, 1.0), 2)
+    return points.astype(numbers.dtype), scales
+
+
+def spread_of(values: AnyArray, scales: AnyArray) -> AnyArray:
+    """Covariance of a function, from its values at `sigma_points` (points, k)."""
+    moves = (values[:-1] - values[-1:]) * scales[:, None]
+    return product("ki,kj->ij", moves, moves) / max(len(scales), 2)

@@ -1,4 +1,4 @@
-"""Fits kept in files."""
+"""Save fits to files and load them."""
 
 import os
 import pickle
@@ -13,11 +13,11 @@ from jrigid.identify._result import FitResult
 
 
 def save(path: str | os.PathLike[str], result: FitResult) -> None:
-    """Write a fit to a file, with the record that it was made from, for `load`.
+    """Write a fit, with the record that it was made from, to a file for `load`.
 
-    The file is a pickle: functions and classes of one's own (a `FunctionSensor`'s
-    function, a torque, a shape) are in it by their names only, and must be importable
-    where it is read.
+    The file is a pickle. It holds functions and classes of one's own (the function of a
+    `FunctionSensor`, a torque, an inertia model) by their names only, and they must be
+    importable where it is read.
 
     Args:
         path: Of the file.
@@ -42,16 +42,18 @@ def save(path: str | os.PathLike[str], result: FitResult) -> None:
         data = pickle.dumps(jtu.tree_map(np.asarray, result))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
-            "Argument `result` must hold functions and classes that can be imported by their "
-            f"names, no lambda and none within a function, but one cannot: {error}."
+            "Argument `result` must hold functions and classes that can be imported by "
+            "their names, no lambda and none within a function, but one cannot: "
+            f"{error}."
         ) from error
     Path(path).write_bytes(data)
 
 
 def load(path: str | os.PathLike[str]) -> FitResult:
-    """Read a fit that `save` wrote with this version of jrigid; all it can do it still can.
+    """Read a fit that `save` wrote with this version of jrigid.
 
-    A pickle can run any code: load only files whose origin you trust.
+    The result can do all that the original could. A pickle can run any code: load only
+    files whose origin you trust.
 
     Args:
         path: Of the file.
@@ -66,15 +68,15 @@ def load(path: str | os.PathLike[str]) -> FitResult:
         result = pickle.loads(data)
     except Exception as error:
         raise ValueError(
-            "Argument `path` must be a file that `save` wrote, whose functions and classes can be "
-            f"imported, but it cannot be read: {error}."
+            "Argument `path` must be a file that `save` wrote, whose functions and "
+            f"classes can be imported, but it cannot be read: {error}."
         ) from error
     check_type("path", result, FitResult)
     arrays = jtu.tree_map(jnp.asarray, result)
     same = jtu.tree_map(lambda x, y: x.dtype == y.dtype, result, arrays)
     demand(
         jtu.tree_all(same),
-        "Argument `path` must be read with `jax_enable_x64` on, since it holds numbers of 64 bits, "
-        "but it is off.",
+        "Argument `path` must be read with `jax_enable_x64` on, since it holds numbers "
+        "of 64 bits, but it is off.",
     )
     return arrays

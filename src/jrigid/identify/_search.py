@@ -1,8 +1,8 @@
-"""The search for the minimum: stages, attempts from several bodies, probes of the weakest.
+"""The search for the minimum: stages, attempts from several bodies, and probes.
 
-The search is plain Python. Whatever it wants minimised it yields as a `Request`, and is
-sent the `Minimum`; so one driver serves a single record and many, whose requests share
-compiled calls.
+The search is plain Python: a generator that yields what is to be minimised as a
+`Request` and is sent the `Minimum`. So one driver serves a single record and many,
+whose requests share compiled calls.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from jrigid._types import AnyArray
 from jrigid.identify import _levels as levels
 from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
 from jrigid.identify._errors import Weakest, first_level, weakest
@@ -43,9 +44,8 @@ from jrigid.identify._result import LARGEST_ERROR
 from jrigid.identify._smoother import Point
 from jrigid.identify._unknowns import Unknowns
 
-ACCURACY = (
-    1e-6  # of the sum of squares a step would gain: a thousandth of the standard errors
-)
+# Of the sum of squares, a step is worth: a thousandth of the standard errors.
+ACCURACY = 1e-6
 _ROUGH = 0.3  # ... where a stage only has to start the next one
 # Weights of the links, in units of the noise; and a slower way for fits that went
 # wrong.
@@ -54,12 +54,13 @@ _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
 LANES = 8  # records of one compiled call, where there are several
-_LEVELS = (
-    12  # stages in which an unmodelled torque is sought, white and then of any form
-)
+# Stages in which an unmodelled torque is sought, white and then of any form.
+_LEVELS = 12
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
+_FLAT = 1e-3  # least second moment of the body that the first attempt starts from
+_ROUND = 0.1  # ... that others start from, since the first led nowhere
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
 _PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
@@ -67,17 +68,16 @@ _HARD = 1e4  # weight of what a probe holds, in natural units
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
-_BENT = (
-    2.0  # times what Fisher's information says: a valley that no covariance describes
-)
+# Times what Fisher's information says: a valley that no covariance describes.
+_BENT = 2.0
 _RIVAL = 25.0  # growth of chi-square beyond which another minimum does not matter
 
 
 class Line(eqx.Module):
     """Holds the numbers on a plane: a residual that is zero there."""
 
-    direction: Any
-    value: Any
+    direction: AnyArray
+    value: AnyArray
 
     def __call__(self, unknowns: Unknowns, numbers: Array) -> Array:
         """The residual."""
@@ -125,6 +125,38 @@ class Effort:
     report: Callable[[str], None] | None = None
 
 
+class Starts:
+    """Numbers from which attempts start, by one tensor for each attempt.
+
+    They are computed when they are needed: only a fit that went wrong needs more than
+    the first ones.
+
+    Attributes:
+        unknowns: With the frame of the inertia model chosen for the first tensor.
+    """
+
+    def __init__(self, unknowns: Unknowns, tensors: np.ndarray):
+        """Choose the frame, and compute the numbers of the first attempt.
+
+        Args:
+            unknowns: With the inertia model as it was given.
+            tensors: Where to start (attempts, 3, 3).
+        """
+        self._given = unknowns
+        self._tensors = tensors
+        self.unknowns, self._first = unknowns.start(tensors[0], _FLAT)
+
+    def __len__(self) -> int:
+        """How many attempts there may be."""
+        return len(self._tensors)
+
+    def __getitem__(self, attempt: int) -> np.ndarray:
+        """The numbers of an attempt."""
+        if attempt == 0:
+            return self._first
+        return self._given.start(self._tensors[attempt], _ROUND)[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A record and where its search begins.
@@ -134,7 +166,7 @@ class Case:
         single: One segment a trial.
         cut: Many segments.
         point: States at their starts, as observed.
-        starts: Numbers for each attempt (attempts, numbers).
+        starts: Numbers of each attempt.
         tensor: The inertia of the first start.
         torque: Unmodelled, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
@@ -146,7 +178,7 @@ class Case:
     single: Layout
     cut: Layout
     point: Point
-    starts: np.ndarray
+    starts: Starts
     tensor: np.ndarray
     torque: GaussMarkov
     coarse: bool
@@ -174,20 +206,15 @@ Search = Generator[Request, Minimum, Fit]
 
 def stages_of(case: Case, slow: bool) -> list[Stage]:
     """The stages of an attempt."""
-    options, effort = case.problem.options, case.effort
+    options = case.problem.options
     whole = not options.dense and (options.free_motion or not options.shooting)
     largest = _LARGEST[case.point.omega.dtype.itemsize]
-    end = Stage(largest, effort.max_steps, ACCURACY, whole=whole, last=True)
+    end = Stage(largest, case.effort.max_steps, ACCURACY, whole=whole, last=True)
     if options.dense:
-        if options.unmodelled == "known":
-            stages = [
-                Stage(x, 8, 0.01) for x in np.linspace(0, 1, _LEVEL_STEPS).tolist()
-            ]
-        else:
-            stages = [Stage(1.0, 8, 0.01) for _ in range(2 * _LEVELS)]
+        stages = _stages_of_torque(options.unmodelled)
         end = end._replace(weight=1.0)
     elif not options.shooting:
-        horizons = [2.0**-k for k in range(effort.doublings, 0, -1)]
+        horizons = [2.0**-k for k in range(case.effort.doublings, 0, -1)]
         stages = [Stage(0.0, _IN_A_STAGE, ACCURACY, horizon=x) for x in horizons]
     else:
         weights = _SLOW if slow else _WEIGHTS[options.free_motion]
@@ -199,13 +226,25 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
     return stages
 
 
+def _stages_of_torque(unmodelled: str) -> list[Stage]:
+    """Stages in which the level of an unmodelled torque is reached or sought."""
+    if unmodelled == "known":
+        weights = np.linspace(0, 1, _LEVEL_STEPS).tolist()
+    else:
+        weights = [1.0] * (2 * _LEVELS)
+    return [Stage(x, 8, 0.01) for x in weights]
+
+
 def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Search:
     """All stages from some numbers, each from where the one before ended."""
-    options, dtype = problem.options, case.point.omega.dtype
+    options = problem.options
+    dtype = case.point.omega.dtype
     kept = problem.samples.seen.astype(dtype)
     scales = np.ones(len(problem.samples.values), dtype)
     torque = _Torque(case, problem)
-    point, histories, minimum = case.point._replace(numbers=numbers), [], None
+    point = case.point._replace(numbers=numbers)
+    histories = []
+    minimum = None
     for stage in stages_of(case, slow):
         if torque.at_rest and not stage.last:
             continue
@@ -215,17 +254,7 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
             if stage.reject:
                 kept = without_outliers(problem, residual, kept, scales)
         torque.begin(stage)
-        settings = Settings(
-            kept=kept,
-            scales=scales,
-            disturbance=torque.disturbance,
-            weight=np.asarray(stage.weight, dtype),
-            horizon=np.asarray(stage.horizon, dtype),
-            soft=np.asarray(stage.soft),
-            enough=np.asarray(stage.enough, dtype),
-            steps=np.asarray(stage.steps),
-            damping=np.asarray(FIRST_DAMPING, dtype),
-        )
+        settings = _settings(stage, kept, scales, torque.disturbance)
         layout = case.single if stage.whole else case.cut
         minimum, history = yield from _stage(Request(problem, layout, point, settings))
         point = minimum.point
@@ -236,7 +265,7 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
             kept=kept,
             scales=scales,
             disturbance=torque.disturbance,
-            torque=torque.found,
+            torque=torque.sought,
             history=np.concatenate(histories),
         )
         if case.effort.report is not None:
@@ -244,6 +273,24 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
         if options.unmodelled == "estimate" and not stage.last:
             kept = torque.sought_anew(fit)
     return fit
+
+
+def _settings(
+    stage: Stage, kept: np.ndarray, scales: np.ndarray, disturbance: Disturbance
+) -> Settings:
+    """The settings of a stage."""
+    dtype = kept.dtype
+    return Settings(
+        kept=kept,
+        scales=scales,
+        disturbance=disturbance,
+        weight=np.asarray(stage.weight, dtype),
+        horizon=np.asarray(stage.horizon, dtype),
+        soft=np.asarray(stage.soft),
+        enough=np.asarray(stage.enough, dtype),
+        steps=np.asarray(stage.steps),
+        damping=np.asarray(FIRST_DAMPING, dtype),
+    )
 
 
 class _Torque:
@@ -255,8 +302,10 @@ class _Torque:
 
     def __init__(self, case: Case, problem: Problem):
         """Begin with a torque far too large: the fit then follows the record."""
-        self._case, self._problem, self._dtype = case, problem, case.point.omega.dtype
-        self._kind, trials = problem.options.unmodelled, case.point.omega.shape[0]
+        self._case = case
+        self._dtype = case.point.omega.dtype
+        self._kind = problem.options.unmodelled
+        trials = case.point.omega.shape[0]
         self._first = first_level(problem, case.cut, case.tensor)
         self._search = levels.Search(problem, case.cut, self._first)
         # Beside a noise that is not known a level far too large is nearly as likely as
@@ -268,7 +317,7 @@ class _Torque:
         self.at_rest = False
 
     @property
-    def found(self) -> levels.Torque | None:
+    def sought(self) -> levels.Torque | None:
         """The torque, where one is sought."""
         return self._current if self._kind == "estimate" else None
 
@@ -278,8 +327,8 @@ class _Torque:
             return
         torque = self._current.disturbance
         if self._kind == "known":
-            known, first = self._case.torque, self._first
-            level = first * (known.level / first) ** stage.weight
+            known = self._case.torque
+            level = self._first * (known.level / self._first) ** stage.weight
             torque = Disturbance(np.broadcast_to(level, torque.level.shape), known.time)
         self.disturbance = Disturbance(*(x.astype(self._dtype) for x in torque))
 
@@ -301,21 +350,28 @@ class _Torque:
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
-    """One stage, in calls of `STEPS` steps each: the minimum and the sums of squares of all."""
-    settings, left, histories = request.settings, int(request.settings.steps), []
+    """Minimise in calls of `STEPS` steps.
+
+    Returns:
+        The minimum, and the sum of squares after each step.
+    """
+    settings = request.settings
+    allowed = int(settings.steps)
+    histories = []
     while True:
-        steps = np.asarray(min(left, STEPS))
+        steps = np.asarray(min(allowed, STEPS))
         minimum = yield request._replace(settings=settings._replace(steps=steps))
         taken = int(minimum.steps)
         histories.append(minimum.history[:taken])
-        left -= taken
-        if bool(minimum.settled) or taken < steps or not left:
+        allowed -= taken
+        if bool(minimum.settled) or taken < steps or not allowed:
             return minimum, np.concatenate(histories)
         request = request._replace(point=minimum.point)
         settings = settings._replace(damping=minimum.damping)
 
 
 def _progress(stage: Stage, fit: Fit) -> str:
+    """A line of text about a stage that has ended."""
     part = min(stage.horizon, 1.0)
     return (
         f"fit: {fit.history.size} steps, links {stage.weight:g}, record {part:.3g}: "
@@ -337,22 +393,24 @@ def search(case: Case) -> Search:
     counted = np.sum(weights_of(problem, problem.samples.seen.astype(float)))
     few = case.coarse and bool(counted < _FEW)
     best = yield from attempt(case, problem, case.starts[0], slow=False)
-    wrong, weak = misfit(problem, best), weakest(problem, best)
-    ambiguous, index = few, 1
+    wrong = misfit(problem, best)
+    weak = weakest(problem, best)
+    ambiguous = few
+    index = 1
     while index < _attempts(case, best, wrong, weak.noise, ambiguous):
-        end = yield from attempt(case, problem, case.starts[index], slow=True)
-        off, seen = misfit(problem, end), weakest(problem, end)
-        fall = (weak.square - seen.square) / seen.noise
-        better = off < wrong or (off <= wrong and fall > 0)
-        apart = _are_apart(
-            best, end, problem.unknowns.judged, max(weak.error, seen.error)
-        )
+        other = yield from attempt(case, problem, case.starts[index], slow=True)
+        other_wrong = misfit(problem, other)
+        other_weak = weakest(problem, other)
+        fall = (weak.square - other_weak.square) / other_weak.noise
+        better = other_wrong < wrong or (other_wrong <= wrong and fall > 0)
+        error = max(weak.error, other_weak.error)
+        apart = _are_apart(best, other, problem.unknowns.judged, error)
         rival = apart and abs(fall) < _RIVAL
         ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
         if better:
-            best, wrong, weak = end, off, seen
+            best, wrong, weak = other, other_wrong, other_weak
         index += 1
-    best = best._replace(ambiguous=ambiguous)
+    best = dataclasses.replace(best, ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
         # Squares beside levels of their own differ, so fits with a level are not
         # probed.
@@ -362,7 +420,8 @@ def search(case: Case) -> Search:
 
 def no_search(case: Case) -> Search:
     """Evaluate nothing: for a record that cannot be used."""
-    dtype, samples = case.point.omega.dtype, case.problem.samples
+    dtype = case.point.omega.dtype
+    samples = case.problem.samples
     one = np.ones((), dtype)
     settings = Settings(
         kept=np.zeros(samples.ts.shape, dtype),
@@ -390,11 +449,13 @@ def no_search(case: Case) -> Search:
 def _attempts(
     case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool
 ) -> int:
-    """How many attempts to make: two of a misfit that follows the record, all of other failures.
+    """How many attempts to make.
 
-    A coarse record has many bodies that follow it, so its misfits are such failures.
+    Two of a misfit that follows the record, all of other failures. A coarse record has
+    many bodies that follow it, so its misfits are such failures.
     """
-    problem, count = case.problem, len(case.starts)
+    problem = case.problem
+    count = len(case.starts)
     if is_pure(problem, best, noise) and wrong < 0.5:  # no misfit
         return 1
     if ambiguous and wrong == 0:
@@ -424,10 +485,10 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         if growth < _SURE:
             largest = max(largest, error)
         if largest > _BENT * at.error:
-            return best._replace(ambiguous=True, probed_error=largest)
+            return dataclasses.replace(best, ambiguous=True, probed_error=largest)
         if largest >= LARGEST_ERROR:
             break
-    return best._replace(probed_error=largest)
+    return dataclasses.replace(best, probed_error=largest)
 
 
 def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
@@ -449,14 +510,14 @@ def _error_by_probe(
     growth: float,
 ) -> float:
     """In natural units, by how far the tensor moved: numbers are logarithms."""
-    before, after = best.minimum, end.minimum
+    tensor = best.minimum.tensor
     h = 1e-4
-    near = before.point.numbers + h * np.stack([direction, -direction])
+    near = best.minimum.point.numbers + h * np.stack([direction, -direction])
     ahead, back = np.asarray(tensors_at(problem.unknowns, near))
     slope = (ahead - back) / (2 * h)
     square = np.sum(slope * slope)
     if square > 0:
-        step = float(np.sum((after.tensor - before.tensor) * slope) / square)
+        step = float(np.sum((end.minimum.tensor - tensor) * slope) / square)
     return abs(step) / np.sqrt(max(growth, 1e-6))
 
 
@@ -464,6 +525,7 @@ def _error_by_probe(
 def run(searches: Iterable[Search]) -> list[Fit]:
     """Carry out a search, or many side by side: their requests share compiled calls."""
     searches = list(searches)
+    lanes = 1 if len(searches) == 1 else LANES
     fits: list[Any] = [None] * len(searches)
     answers: dict[int, Any] = dict.fromkeys(range(len(searches)))
     while answers:
@@ -475,11 +537,10 @@ def run(searches: Iterable[Search]) -> list[Fit]:
                 fits[index] = end.value
         answers = {}
         for group in _alike(requests):
-            lanes = 1 if len(searches) == 1 else LANES
             for first in range(0, len(group), lanes):
                 part = group[first : first + lanes]
-                found = minima([requests[i] for i in part], lanes)
-                answers |= dict(zip(part, found, strict=True))
+                results = minima([requests[i] for i in part], lanes)
+                answers |= dict(zip(part, results, strict=True))
     return fits
 
 
@@ -500,5 +561,5 @@ def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
     )
     padded = [*requests, *[idle] * (lanes - len(requests))]
     stacked = jtu.tree_map(lambda *x: np.stack([np.asarray(y) for y in x]), *padded)
-    found = jtu.tree_map(np.asarray, minimise(*stacked))
-    return [jtu.tree_map(lambda x, i=i: x[i], found) for i in range(len(requests))]
+    results = jtu.tree_map(np.asarray, minimise(*stacked))
+    return [jtu.tree_map(lambda x, i=i: x[i], results) for i in range(len(requests))]

@@ -1,6 +1,7 @@
-"""Inertia by linear regression from rates, attitudes or a wheel: starts for a fit, not answers.
+"""Inertia by linear regression, from rates, attitudes or a wheel.
 
-Errors of the samples stand on both sides of these equations and bias what comes out.
+The estimates are initial values for a fit: errors of the samples stand on both sides of
+these equations and bias what comes out.
 """
 
 from collections.abc import Callable
@@ -22,17 +23,25 @@ from jrigid.identify import _host as host
 from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import LogCholesky
 from jrigid.identify._layout import Told
+from jrigid.identify._problem import Options
 from jrigid.identify._records import first_and_last
+from jrigid.identify._unknowns import Unknowns
 
 _Times = Real[ArrayLike, " n"]
 _Vectors = Real[ArrayLike, "n 3"]
 _LEAST_SAMPLES = 8  # to a window
 _FEW_ATTITUDES = 40  # fewer than these do without the weak form
-_WINDOWS, _RADIANS = 128, 3.0
+_WINDOWS = 128
+_RADIANS = 3.0  # length of a window
 _EDGE = 1 - 1e-5  # of a window's half width
-_LARGEST_BLOCK = 2**17  # weights of samples in windows that are computed together
+# Weights of samples in windows that are computed together. BLAS would compute larger
+# products in several threads, which wait for each other for longer than they compute.
+_LARGEST_BLOCK = 2**13
 _TIMES = "Argument `ts` must be finite and increasing, but it is not."
-_FEW = "Argument `omegas` must hold four samples that are finite at least, but it holds fewer."
+_FEW = (
+    "Argument `omegas` must hold four samples that are finite at least, but it holds "
+    "fewer."
+)
 # A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without
 # a trace.
 _OF_SIX = np.eye(6)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
@@ -106,8 +115,8 @@ def _weak_rows(
     parts = min(windows, -(-windows * ts.size // _LARGEST_BLOCK))
     rows = []
     for block in np.array_split(centers, parts):
-        seen = slice(*np.searchsorted(ts, [block[0] - half, block[-1] + half]))
-        rows.append(_rows_of_windows(block, half, *(x[seen] for x in samples)))
+        inside = slice(*np.searchsorted(ts, [block[0] - half, block[-1] + half]))
+        rows.append(_rows_of_windows(block, half, *(x[inside] for x in samples)))
     return np.concatenate(rows)
 
 
@@ -121,7 +130,7 @@ def _rows_of_windows(
     rotor: AnyArray,
     torque: AnyArray,
 ) -> AnyArray:
-    """Equations of windows with these centers and half this width [s], (3 windows, 7)."""
+    """Equations (3 windows, 7) of windows with these centers and half widths [s]."""
     xp = ts.__array_namespace__()
     s = (ts[None] - centers[:, None]) / half
     # Samples at the very edge weigh nothing, but by rounding one that is not known,
@@ -134,7 +143,8 @@ def _rows_of_windows(
     weight = xp.where(whole & inside, step[None], 0.0)
     height = 1 - s * s
     cube = weight * height * height * height
-    bump, fall = cube * height, cube * 8 * s / half
+    bump = cube * height
+    fall = cube * 8 * s / half  # less the derivative of the bump
     parts = xp.concatenate([_momenta(omega), rotor[..., None]], axis=-1)
     turned = xp.cross(omega[..., None], parts, axis=1)
     rows = product("wn,nij->wij", fall, parts) + product("wn,nij->wij", bump, turned)
@@ -145,9 +155,14 @@ def _rows_of_windows(
 def _samples(
     padded: bool, ts: Array, *columns: Array
 ) -> tuple[Findings, Array, list[Array]]:
-    """Of trials (trials, n): what is wrong, which samples are known, and all, else zero."""
+    """Of trials (trials, n): what is wrong, which samples are known, and their values.
+
+    Values of the others are zero.
+    """
+    findings = Findings()
     known = jnp.all(jnp.isfinite(jnp.concatenate(columns, axis=-1)), axis=-1)
-    step, least, findings = jnp.diff(ts), jnp.min(jnp.sum(known, axis=1)), Findings()
+    least = jnp.min(jnp.sum(known, axis=1))
+    step = jnp.diff(ts)
     rising = (step > 0) & (step < jnp.inf) | padded & jnp.isnan(ts[:, 1:])
     rising = jnp.all(rising) & jnp.all(jnp.isfinite(ts[:, 0]))
     findings.require(rising, RESULTS.invalid_times, _TIMES)
@@ -159,6 +174,7 @@ def _samples(
 
 
 def _findings(padded: bool, *given: Array) -> Findings:
+    """What is wrong with samples."""
     return _samples(padded, *given)[0]
 
 
@@ -166,6 +182,7 @@ def _findings(padded: bool, *given: Array) -> Findings:
 def _solved(
     solve: Callable[..., Any], padded: bool, size: Any, *given: Array
 ) -> LinearEstimate:
+    """Solve by a function of samples that are known; NaN where they are not good."""
     findings, known, samples = _samples(padded, *given)
     inertia, values, *others = solve(size, known, *samples)
     return findings.guard(
@@ -182,7 +199,8 @@ def _answer(
     **columns: Any,
 ) -> LinearEstimate:
     """Of arguments checked and with an axis of trials in front."""
-    shape, width = np.shape(ts), {"attitudes": 4}
+    shape = np.shape(ts)
+    width = {"attitudes": 4}
     wanted = {name: (x, *shape, width.get(name, 3)) for name, x in columns.items()}
     ts, *arrays = shaped(ts=(ts, (None,), *[(None, None)] * padded), **wanted)
     count = ts.shape[-1]
@@ -191,8 +209,8 @@ def _answer(
         f"Argument `ts` must hold four times at least, but it holds {count}.",
     )
     given = [ts, *arrays] if ts.ndim == 2 else [x[None] for x in (ts, *arrays)]
-    found = _solved(solve, padded, size, *given)
-    return settle(found, throw, _findings, padded, *given)
+    estimate = _solved(solve, padded, size, *given)
+    return settle(estimate, throw, _findings, padded, *given)
 
 
 def _null_vector(rows: Array) -> tuple[Array, Array]:
@@ -211,11 +229,11 @@ def weak_form(
     radians: float = _RADIANS,
     throw: bool = True,
 ) -> LinearEstimate:
-    """Ratios of inertia from sampled rates of a free body, without derivatives of the samples.
+    """Ratios of inertia from sampled rates of a free body.
 
-    Euler's equations I omega' + omega x I omega = 0 are multiplied by smooth bumps, (1
-    - s^2)^4 on windows of some radians, and integrated by parts: linear equations for
-    I.
+    No derivatives of the samples are needed. Euler's equations I omega' + omega x I
+    omega = 0 are multiplied by smooth bumps, (1 - s^2)^4 on windows of some radians,
+    and integrated by parts. This gives linear equations for I.
 
     Args:
         ts: Times, increasing [s].
@@ -261,9 +279,9 @@ def momentum(
     *,
     throw: bool = True,
 ) -> LinearEstimate:
-    """Ratios of inertia from attitudes and rates of a free body: its momentum stays in space.
+    """Ratios of inertia from attitudes and rates of a free body.
 
-    R I omega = L is linear in I and L.
+    Its angular momentum stays in space: R I omega = L is linear in I and L.
 
     Args:
         ts: Times, increasing [s]; only their order is used.
@@ -294,7 +312,8 @@ def momentum(
 def _momentum(
     _: Any, known: Array, ts: Array, attitudes: Array, omegas: Array
 ) -> tuple:
-    known, size = known[..., None], rms(omegas, jnp.isfinite(ts))
+    known = known[..., None]
+    size = rms(omegas, jnp.isfinite(ts))
     unit = jnp.zeros_like(attitudes).at[..., 0].set(1)
     attitudes = jnp.where(known, attitudes, unit)
     turns = jnp.vectorize(rotation.to_matrix, signature="(4)->(3,3)")(attitudes)
@@ -314,7 +333,7 @@ def gyrostat(
     radians: float = _RADIANS,
     throw: bool = True,
 ) -> LinearEstimate:
-    """The whole inertia tensor, scale included, from rates beside a rotor of known momentum.
+    """The whole inertia tensor, scale included, from rates beside a known rotor.
 
     The weak form of I omega' + h' + omega x (I omega + h) = 0, solved by least squares
     over all trials. Short windows do best where something smooth is not modelled.
@@ -339,7 +358,8 @@ def gyrostat(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> wheel = jr.torques.Rotor(lambda t: jnp.array([0.0, 0.0, 0.5 * t]))
-    >>> body, ts = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]), wheel), jnp.linspace(0.0, 20.0, 801)
+    >>> body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]), wheel)
+    >>> ts = jnp.linspace(0.0, 20.0, 801)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 1.0, 0.3]))
     >>> omegas = jr.simulate(body, start, ts).states.omega
     >>> h = jnp.stack([0 * ts, 0 * ts, 0.5 * ts], axis=1)
@@ -351,13 +371,14 @@ def gyrostat(
 
 
 def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -> tuple:
-    trials, zero = ts.shape[0], jnp.zeros_like(rotor)
-    rows = jax.vmap(partial(_weak_rows, *size))(ts, known, omegas, rotor, zero).reshape(
-        -1, 7
-    )
+    trials = ts.shape[0]
+    rows_of_trials = jax.vmap(partial(_weak_rows, *size))
+    rows = rows_of_trials(ts, known, omegas, rotor, jnp.zeros_like(rotor))
+    rows = rows.reshape(-1, 7)
     rows = rows / or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows[:, :6]))))
-    left, values, vt, told = _singular(rows[:, :6])
-    half = vt.T * jnp.where(told, 1 / jnp.where(told, values, 1.0), 0.0)[None]
+    left, values, vt, determined = _singular(rows[:, :6])
+    inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1.0), 0.0)
+    half = vt.T * inverse[None]
     six = product("jk,rk,r->j", half, left, rows[:, 6])
     misfit = rows[:, 6] - product("rj,j->r", rows[:, :6], six)
     # Errors of neighbouring windows hang together: trials, or eight parts of one, are
@@ -378,46 +399,55 @@ def _singular(rows: AnyArray) -> tuple[AnyArray, ...]:
 
 
 def linear_starts(
-    options: Any, unknowns: Any, told: Told | None, given: np.ndarray | None
+    options: Options, unknowns: Unknowns, told: Told | None, given: np.ndarray | None
 ) -> np.ndarray:
     """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
     From attitudes, if there are few, since R I omega is constant in each trial of a
     free body; else from the weak form, with torques as they are at the samples.
+
+    Args:
+        options: Of the fit.
+        unknowns: What is sought.
+        told: Rates, and attitudes if there are any, that the record tells.
+        given: A tensor to start from, if there is one.
     """
-    dtype, free = unknowns.rate.dtype, options.free_motion
+    dtype = unknowns.rate.dtype
     known = unknowns.known_tensor.astype(dtype)
-    sought = unknowns.inertia_model.names and not isinstance(
-        unknowns.inertia_model, LogCholesky
-    )
-    if given is not None or told is None or not sought or options.motion is not None:
+    model = unknowns.inertia_model
+    linear = bool(model.names) and not isinstance(model, LogCholesky)
+    if given is not None or told is None or not linear or options.motion is not None:
         first = known if given is None else given.astype(dtype)
         return np.stack([first, _rounder(first)])
+    free = options.free_motion
     if free and told.attitude is not None and told.ts.shape[1] < _FEW_ATTITUDES:
         rows = _rows_of_attitudes(told)
     else:
-        there = told.there[..., None]
-        zero = np.zeros_like(told.omega)
-        omegas = np.where(there, told.omega, zero)
-        torques = zero if free else np.where(there, _torques_at(unknowns, told), zero)
-        # Times that are not there repeat one.
-        first = first_and_last(told.ts, told.there)[0]
-        ts = np.maximum.accumulate(
-            np.where(told.there, told.ts, first[:, None]), axis=1
-        )
-        trials = zip(ts, told.there, omegas, zero, torques, strict=True)
-        rows = np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in trials])
-    rows = np.where(
-        np.isfinite(rows), rows, 0.0
-    )  # a torque or a square may be out of range
+        rows = _rows_of_rates(told, None if free else _torques_at(unknowns, told))
+    # A torque or a square may be out of range.
+    rows = np.where(np.isfinite(rows), rows, 0.0)
     trace = None if unknowns.scaled and not free else np.trace(known)
     plain, leaning = _least_squares(rows, trace, np.trace(known))
     both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
     return np.concatenate([np.stack(both), _plain_bodies(told, leaning)])
 
 
+def _rows_of_rates(told: Told, torques: np.ndarray | None) -> np.ndarray:
+    """Equations (n, 7) of the weak form, of all trials."""
+    is_known = told.there[..., None]
+    zero = np.zeros_like(told.omega)
+    omegas = np.where(is_known, told.omega, zero)
+    torques = zero if torques is None else np.where(is_known, torques, zero)
+    # Times of samples that are not known repeat one.
+    first = first_and_last(told.ts, told.there)[0]
+    times = np.where(told.there, told.ts, first[:, None])
+    times = np.maximum.accumulate(times, axis=1)
+    trials = zip(times, told.there, omegas, zero, torques, strict=True)
+    return np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in trials])
+
+
 def _rows_of_attitudes(told: Told) -> np.ndarray:
-    """Equations (n, 7): the momentum in space at each sample is the mean one of its trial."""
+    """Equations (n, 7): the momentum in space at a sample is the trial's mean one."""
     assert told.attitude is not None
     weight = told.there[..., None, None].astype(told.omega.dtype)
     turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))
@@ -428,13 +458,16 @@ def _rows_of_attitudes(told: Told) -> np.ndarray:
 
 
 def _rounder(tensor: np.ndarray) -> np.ndarray:
-    """Of a body half way to a sphere."""
+    """The tensor of a body half way to a sphere."""
     third = np.trace(tensor) / 3
     return 0.5 * (tensor + third * np.eye(3, dtype=tensor.dtype))
 
 
 def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
-    """A sphere, and bodies of revolution along the axes of the rates, as large as the one given."""
+    """A sphere, and bodies of revolution along the axes of the rates.
+
+    They are as large as the body whose tensor is given.
+    """
     shown = np.where(told.there[..., None], told.omega, 0.0).reshape(-1, 3)
     axes = np.linalg.eigh(shown.T @ shown)[1]
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
@@ -442,7 +475,7 @@ def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
     return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
 
 
-def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
+def _torques_at(unknowns: Unknowns, told: Told) -> np.ndarray:
     """Torques at the samples; where attitudes are not known, at the unit quaternion."""
     attitude = told.attitude
     if attitude is None:
@@ -452,8 +485,10 @@ def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
 
 
 @small_program
-def _torques(unknowns: Any, ts: Any, attitude: Any, omega: Any) -> Any:
-    """As they are at the samples, by what is known of the system beforehand."""
+def _torques(
+    unknowns: Unknowns, ts: AnyArray, attitude: AnyArray, omega: AnyArray
+) -> Array:
+    """Torques at the samples, evaluated with the initial parameters."""
 
     def at(trial: Array, t: Array, q: Array, w: Array) -> Array:
         system = unknowns.original(trial)[0]
@@ -472,19 +507,22 @@ def _least_squares(
     sphere where the record says little.
     """
     rows = rows / or_one(np.max(np.abs(rows[:, :6])))
-    rows, right, dtype = rows[:, :6], rows[:, 6], rows.dtype
-    sphere, basis = np.asarray([1.0, 1, 1, 0, 0, 0], dtype) / 3, np.eye(6, dtype=dtype)
-    if trace is None:  # the sphere that does best, or one like the system's own
+    right = rows[:, 6]
+    rows = rows[:, :6]
+    sphere = np.asarray([1.0, 1, 1, 0, 0, 0], rows.dtype) / 3
+    if trace is None:
+        # The sphere that does best, or one like the system's own.
+        basis = np.eye(6, dtype=rows.dtype)
         along = rows @ sphere
         best_trace = np.sum(along * right) / or_one(np.sum(along * along))
         size = best_trace if best_trace > 0 else like
-    else:  # five directions
-        basis = np.asarray(_TRACELESS, dtype)
+    else:
+        basis = np.asarray(_TRACELESS, rows.dtype)
         size = trace
     wanted = right - rows @ (size * sphere)
-    left, values, vt, told = _singular(rows @ basis.T)
+    left, values, vt, determined = _singular(rows @ basis.T)
     along = wanted @ left
-    best = np.where(told, along, 0.0)
+    best = np.where(determined, along, 0.0)
     # The misfit of the best answer is how far rows can be trusted.
     misfit = wanted - left @ best
     floor = 2 * np.sqrt(np.sum(misfit * misfit)) / size
@@ -493,6 +531,6 @@ def _least_squares(
         return _tensor(size * sphere + weights @ vt @ basis)
 
     leaning = tensor(values * along / or_one(values * values + floor * floor))
-    plain = tensor(best / np.where(told, values, 1.0))
+    plain = tensor(best / np.where(determined, values, 1.0))
     good = np.all(np.linalg.eigvalsh(plain) > 0)
     return plain if good else leaning, leaning

@@ -9,25 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from jrigid._core.third_party import names_of
+from jrigid._types import AnyArray
 from jrigid.identify._errors import weakest_of
 from jrigid.identify._inertia_models import Fixed, Flat, Symmetric, Tensor, Top
 from jrigid.identify._reasons import reason
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 
-_LIKE, _SURE = (
-    0.1,
-    5.0,
-)  # correlation of neighbours, and its standard deviations, of no noise
-_FAINT = (
-    0.02  # relative change of a tensor by a unit of one of its numbers: of a thickness
-)
+_LIKE = 0.1  # correlation of neighbours that is no noise
+_SURE = 5.0  # standard deviations of that
+# Relative change of a tensor by a unit of one of its numbers: of a thickness.
+_FAINT = 0.02
 
 
 def _of_shape(result: FitResult, direction: np.ndarray) -> str:
     """What a change of the inertia model does to the body."""
-    tensor_of = lambda x: result.unknowns.inertia(x)  # noqa: E731
+    tensor_of = result.unknowns.inertia
     slope = jax.jvp(tensor_of, (result.numbers,), (jnp.asarray(direction),))[1]
-    axes, moments = np.asarray(result.axes), np.asarray(result.moments)
+    axes = np.asarray(result.axes)
+    moments = np.asarray(result.moments)
     inside = axes.T @ np.asarray(slope) @ axes
     if np.abs(inside).max() < _FAINT * moments.max():
         return "thickness"
@@ -45,23 +44,21 @@ def _of_shape(result: FitResult, direction: np.ndarray) -> str:
 
 def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
     """What a change of the inertia model, the scale's or an array's numbers is."""
-    unknowns, s = result.unknowns, result.unknowns.slices[name]
-    names, sizes, (owner, _, field) = (
-        result.names[s],
-        np.abs(direction[s]),
-        name.rpartition("."),
-    )
+    unknowns = result.unknowns
+    part = unknowns.slices[name]
+    sizes = np.abs(direction[part])
+    owner, _, field = name.rpartition(".")
     if name == "scale":
         return "overall scale"
     if name == "inertia" and not unknowns.inertia_model.absolute:
-        only = np.where(np.arange(direction.size) < s.stop, direction, 0.0)
+        only = np.where(np.arange(direction.size) < part.stop, direction, 0.0)
         return "" if result.diagnostics.pure_spin else _of_shape(result, only)
     if sizes.size == 3 and field == "bias":
-        axis = np.abs(np.asarray(result.axes).T @ direction[s]).argmax()
+        axis = np.abs(np.asarray(result.axes).T @ direction[part]).argmax()
         return f"{owner} bias along the axis of I{axis + 1}"
     if name == "inertia" or owner.startswith("torque"):
         least = 0.2 if name == "inertia" else 0.2 * sizes.max()
-        return ", ".join(np.array(names)[sizes > least])
+        return ", ".join(np.array(result.names[part])[sizes > least])
     return f"{owner} {field}"
 
 
@@ -76,55 +73,77 @@ def _untold(result: FitResult, direction: np.ndarray) -> str:
 
 
 def null_directions(result: FitResult) -> tuple[str, ...]:
-    """What the record does not tell."""
-    unknowns, options, seen = (
-        result.unknowns,
-        result.problem.options,
-        result.diagnostics,
-    )
-    known = unknowns.scaled or unknowns.inertia_model.absolute
+    """What the record does not determine."""
+    texts = [
+        *_undetermined_scale(result),
+        *_undetermined_numbers(result),
+        *_undetermined_attitude(result),
+    ]
+    return tuple(dict.fromkeys(filter(None, texts)))
+
+
+def _undetermined_scale(result: FitResult) -> list[str]:
+    """The overall scale, where nothing sets it."""
+    unknowns = result.unknowns
+    free_motion = result.problem.options.free_motion
     driven = any(x.name.startswith("torque") for x in unknowns.sought)
-    follow = (
-        "" if options.free_motion else ", which what is sought of the torque follows"
-    )
-    found = ["overall scale" + follow] * (not known and (driven or options.free_motion))
-    found += ["spin is pure: ratios not determined"] * bool(seen.pure_spin)
-    directions = np.asarray(seen.directions).T
-    weak = math.sqrt(seen.inflation) > LARGEST_ERROR * np.asarray(seen.singular_values)
-    found += [_untold(result, x) for x in directions[weak]]
+    if unknowns.scaled or unknowns.inertia_model.absolute:
+        return []
+    if free_motion:
+        return ["overall scale"]
+    return ["overall scale, which what is sought of the torque follows"] * driven
+
+
+def _undetermined_numbers(result: FitResult) -> list[str]:
+    """Directions of the numbers whose errors are large."""
+    unknowns = result.unknowns
+    diagnostics = result.diagnostics
+    texts = ["spin is pure: ratios not determined"] * bool(diagnostics.pure_spin)
+    directions = np.asarray(diagnostics.directions).T
+    values = np.asarray(diagnostics.singular_values)
+    weak = math.sqrt(diagnostics.inflation) > LARGEST_ERROR * values
+    texts += [_untold(result, x) for x in directions[weak]]
+    if diagnostics.pure_spin:
+        return texts
     loose = bool(np.any(result.ratios_errors > LARGEST_ERROR * result.ratios))
-    found += ["I1's ratio to the others"] * (
-        loose and not weak.any() and not seen.pure_spin
-    )
-    if seen.ambiguous and not seen.pure_spin:
-        covariance, numbers = np.asarray(result.numbers_covariance), result.numbers
-        units = np.asarray(unknowns.natural_units(numbers))
-        weakest = weakest_of(unknowns.judged, covariance, units)[1] * units
-        found.append(
-            f"{_untold(result, weakest)}: others far from it are nearly as good"
-        )
-    of_state = np.asarray(seen.state_singular_values)
+    if loose and not weak.any():
+        texts.append("I1's ratio to the others")
+    if diagnostics.ambiguous:
+        units = np.asarray(unknowns.natural_units(result.numbers))
+        covariance = np.asarray(result.numbers_covariance)
+        _, normal, _ = weakest_of(unknowns.judged, covariance, units)
+        weakest = _untold(result, normal * units)
+        texts.append(f"{weakest}: others far from it are nearly as good")
+    return texts
+
+
+def _undetermined_attitude(result: FitResult) -> list[str]:
+    """The heading, or the attitude, where no observation tells it."""
+    of_state = np.asarray(result.diagnostics.state_singular_values)
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
-    if options.depends_on_attitude and count:
-        found.append(
-            "heading about the vertical" if count == 1 else "attitude in space"
-        )
-    return tuple(dict.fromkeys(filter(None, found)))
+    if not (result.problem.options.depends_on_attitude and count):
+        return []
+    return ["heading about the vertical" if count == 1 else "attitude in space"]
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
+    """The diagonal, positive."""
     return np.maximum(np.diagonal(np.asarray(matrix)), 1e-300)
 
 
 def _of_record(result: FitResult) -> list[tuple[Any, str]]:
-    """What residuals, and values that repeat their largest one, would say, and if it is so."""
-    seen, known = result.diagnostics, result.problem.options.noise_known
-    by_trial = np.asarray(seen.chi_square_by_trial)
-    size = max(math.sqrt(result.reduced_chi_square), float(np.max(seen.scales)))
-    like, sure = seen.whiteness
+    """Notes on residuals, prior knowledge and saturation, and whether each holds."""
+    diagnostics = result.diagnostics
+    noise_known = result.problem.options.noise_known
+    by_trial = np.asarray(diagnostics.chi_square_by_trial)
+    size = max(math.sqrt(result.reduced_chi_square), float(np.max(diagnostics.scales)))
+    like, sure = diagnostics.whiteness
     low, high = np.maximum(np.quantile(by_trial, [0.1, 0.9]), 1e-300)
     notes = [
-        (known and size > 1.3, f"residuals are {size:.2g} times the stated noise"),
+        (
+            noise_known and size > 1.3,
+            f"residuals are {size:.2g} times the stated noise",
+        ),
         (
             abs(like) > _LIKE and sure > _SURE,
             "residuals are not white: neighbours correlate by "
@@ -135,6 +154,12 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
             f"trials differ: chi-square of nine tenths spreads by {high / low:.2g}",
         ),
     ]
+    return [*notes, *_of_priors(result), *_of_saturation(result)]
+
+
+def _of_priors(result: FitResult) -> list[tuple[Any, str]]:
+    """Notes on arrays that end far from what was known of them beforehand."""
+    notes = []
     for x in result.unknowns.sought:
         if not x.own and x.sigma is not None:
             numbers = result.numbers[result.unknowns.slices[x.name]]
@@ -143,50 +168,70 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
                 f"{x.name} is {far:.1f} standard deviations from what was known of it"
             )
             notes.append((far > 3, text))
-    for sensor, values in zip(
-        result.fitted()[1:], result.problem.samples.values, strict=True
-    ):
-        sizes, free = (
-            np.abs(values),
-            sensor.saturation() is None and not sensor.unit_length,
-        )
-        count = np.sum(sizes >= sizes.max() * (1 - 1e-9))
-        text = f"{count} values of {type(sensor).__name__} are its largest: saturated? (`limit`)"
-        notes.append((count > 3 and sizes.max() > 0 and free, text))
+    return notes
+
+
+def _of_saturation(result: FitResult) -> list[tuple[Any, str]]:
+    """Notes on records with values that repeat their largest one."""
+    notes = []
+    records = zip(result.fitted()[1:], result.problem.samples.values, strict=True)
+    for sensor, values in records:
+        sizes = np.abs(values)
+        largest = sizes.max()
+        may_saturate = sensor.saturation() is None and not sensor.unit_length
+        count = np.sum(sizes >= largest * (1 - 1e-9))
+        name = type(sensor).__name__
+        text = f"{count} values of {name} are its largest: saturated? (`limit`)"
+        notes.append((count > 3 and largest > 0 and may_saturate, text))
     return notes
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
-    notes, free_motion = _of_record(result), result.problem.options.free_motion
-    covariance = np.asarray(result.moments_covariance)
-    by_rates = not any(x.depends_on_attitude for x in result.fitted()[1:])
+    notes = _of_record(result)
     if not isinstance(result.unknowns.inertia_model, Symmetric | Top | Fixed):
-        ratios, moments = np.asarray(result.ratios), np.asarray(result.moments)
-        loose = (np.asarray(result.ratios_errors) > 0.03 * ratios).any()
-        notes.append(
-            (loose, "the ratios are weakly constrained: errors of 3 % or more")
-        )
-        for i in (0, 1):
-            (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
-            error = math.sqrt(max(first + second - 2 * across, 0.0))
-            text = f"I{i + 1} and I{i + 2} are equal within their errors: which is the larger, and "
-            text += "the axes of each, are not determined"
-            notes.append((moments[i + 1] - moments[i] < 2 * error, text))
-        least, middle, most = np.sort(np.asarray(result.mirror_moments, float))
-        real, unit = least > 0 and most < least + middle, max(least, 1e-300)
-        notes += [
-            (
-                by_rates and free_motion and real,
-                "with one axis of the gyro reversed the same record is that of a body with "
-                f"I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}",
-            ),
-        ]
+        notes += _of_ratios(result)
+        notes += _of_mirror(result)
     return tuple(text for holds, text in notes if holds)
 
 
-def _with_error(value: Any, error: Any) -> str:
-    value, error = float(value), float(error)
+def _of_ratios(result: FitResult) -> list[tuple[Any, str]]:
+    """Notes on ratios with large errors, and on moments that may be equal."""
+    ratios = np.asarray(result.ratios)
+    moments = np.asarray(result.moments)
+    covariance = np.asarray(result.moments_covariance)
+    loose = (np.asarray(result.ratios_errors) > 0.03 * ratios).any()
+    notes = [(loose, "the ratios are weakly constrained: errors of 3 % or more")]
+    for i in (0, 1):
+        (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
+        error = math.sqrt(max(first + second - 2 * across, 0.0))
+        text = (
+            f"I{i + 1} and I{i + 2} are equal within their errors: which is the "
+            "larger, and the axes of each, are not determined"
+        )
+        notes.append((moments[i + 1] - moments[i] < 2 * error, text))
+    return notes
+
+
+def _of_mirror(result: FitResult) -> list[tuple[Any, str]]:
+    """A note on the body that fits the readings of a gyro of the other handedness."""
+    by_rates = not any(x.depends_on_attitude for x in result.fitted()[1:])
+    least, middle, most = np.sort(np.asarray(result.mirror_moments, float))
+    is_real = least > 0 and most < least + middle
+    unit = max(least, 1e-300)
+    return [
+        (
+            by_rates and result.problem.options.free_motion and is_real,
+            "with one axis of the gyro reversed the same record is that of a body "
+            f"with I2/I1 = {middle / unit:.4g}, I3/I1 = {most / unit:.4g}",
+        )
+    ]
+
+
+def _with_error(value: np.floating, error: np.floating) -> str:
+    """A number with as many digits as its error leaves it."""
+    value = np.float64(value)
+    error = np.float64(error)
     if not error > 1e-9 * abs(value):
         return f"{value:.6g}"
     if not error < 10 * max(abs(value), 1e-300):
@@ -198,17 +243,16 @@ def _with_error(value: Any, error: Any) -> str:
     return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
-def _with_errors(values: Any, errors: Any, between: str = ", ") -> str:
+def _with_errors(values: AnyArray, errors: AnyArray, between: str = ", ") -> str:
+    """Numbers with their errors."""
     return between.join(map(_with_error, np.ravel(values), np.ravel(errors)))
 
 
 def _of_tensor(result: FitResult) -> list[str]:
+    """Ratios, moments and axes."""
     model = result.unknowns.inertia_model
-    unit = (
-        " kg m^2"
-        if result.unknowns.scaled or model.absolute
-        else " (trace as declared)"
-    )
+    is_scaled = result.unknowns.scaled or model.absolute
+    unit = " kg m^2" if is_scaled else " (trace as declared)"
     errors = np.sqrt(np.diagonal(np.asarray(result.moments_covariance)))
     lines = [
         "  ratios   I2/I1 = "
@@ -232,7 +276,8 @@ def _of_torque(result: FitResult) -> list[str]:
     """The unmodelled torque, and what of the errors it makes."""
     if result.problem.options.unmodelled == "none":
         return []
-    level, times = np.asarray(result.level), np.asarray(result.correlation_time)
+    level = np.asarray(result.level)
+    times = np.asarray(result.correlation_time)
     alike = np.all(level == level[0]) and np.all(times == times[0])
     axes = slice(0, 1 if alike else 3)
     pairs = list(zip(level[axes], np.asarray(result.level_errors)[axes], strict=True))
@@ -248,13 +293,13 @@ def _of_torque(result: FitResult) -> list[str]:
     shares = own / _diagonal(result.numbers_covariance)
     part = 100 * np.sqrt(np.median(shares)) if own.size else 100
     lines = [
-        f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would make "
-        f"{part:.0f} % of the errors"
+        f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would "
+        f"make {part:.0f} % of the errors"
     ]
     by_trial = np.asarray(result.level_by_trial)
     if np.any(by_trial != by_trial[0]):
-        least, most = by_trial.min(), by_trial.max()
-        lines.append(f"  its level in trials: {least:.2g} to {most:.2g} times that")
+        limits = f"{by_trial.min():.2g} to {by_trial.max():.2g}"
+        lines.append(f"  its level in trials: {limits} times that")
     return lines
 
 
@@ -262,45 +307,62 @@ def report(result: FitResult) -> str:
     """The fit in words."""
     if isinstance(result.chi_square, jax.core.Tracer):
         return "FitResult under a transformation"
-    codes = dict(enumerate(names_of(Status)))
     value = np.asarray(result.status)
     if value.ndim:
-        counts = {codes[code]: np.sum(value == code) for code in sorted(codes)}
-        text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        return f"{value.size} fits: {text}"
-    trials, steps = (
-        result.state.omega.shape[0],
-        np.sum(np.isfinite(result.diagnostics.history)),
-    )
-    seen = f"{np.sum(result.kept)} samples" + f" of {trials} trials" * (trials > 1)
-    known = result.problem.options.noise_known
-    left = None if known else jnp.sqrt(jnp.nanmean(result.residuals() ** 2))
-    noise = "" if known else f" (noise taken from the residuals: {left:.3g} rms)"
-    lines = [
-        " ".join(
-            filter(
-                None, [f"{codes[int(value)]}: {Status[result.status]}", reason(result)]
-            )
-        ),
-        f"  {seen}, {steps} steps; chi-square {result.chi_square:.1f} for "
+        return _of_many(value)
+    lines = _of_fit(result)
+    rejected = ", ".join(map(str, np.flatnonzero(result.rejected_trials)))
+    lines += [f"  trials left out: {rejected}"] * bool(rejected)
+    if result.diagnostics.pure_spin:
+        lines.append("  ratios   not determined")
+    else:
+        lines += _of_tensor(result)
+    lines += _of_torque(result)
+    lines += _of_estimates(result)
+    undetermined = "; ".join(result.null_directions) or "nothing"
+    lines.append(f"  not told by the record: {undetermined}")
+    return "\n".join(lines + [f"  {note}" for note in remarks(result)])
+
+
+def _of_many(codes: np.ndarray) -> str:
+    """How many fits ended in which way."""
+    names = dict(enumerate(names_of(Status)))
+    counts = {names[code]: np.sum(codes == code) for code in sorted(names)}
+    text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    return f"{codes.size} fits: {text}"
+
+
+def _of_fit(result: FitResult) -> list[str]:
+    """The status with its reason; samples, steps and chi-square."""
+    trials = result.state.omega.shape[0]
+    steps = np.sum(np.isfinite(result.diagnostics.history))
+    samples = f"{np.sum(result.kept)} samples"
+    if trials > 1:
+        samples += f" of {trials} trials"
+    noise = ""
+    if not result.problem.options.noise_known:
+        rms = jnp.sqrt(jnp.nanmean(result.residuals() ** 2))
+        noise = f" (noise taken from the residuals: {rms:.3g} rms)"
+    name = names_of(Status)[int(np.asarray(result.status))]
+    sentences = [f"{name}: {Status[result.status]}", reason(result)]
+    return [
+        " ".join(filter(None, sentences)),
+        f"  {samples}, {steps} steps; chi-square {result.chi_square:.1f} for "
         f"{result.degrees_of_freedom} degrees of freedom{noise}",
     ]
-    spoilt = ", ".join(map(str, np.flatnonzero(result.rejected_trials)))
-    lines += [f"  trials left out: {spoilt}"] * bool(spoilt)
-    lines += (
-        ["  ratios   not determined"]
-        if result.diagnostics.pure_spin
-        else _of_tensor(result)
-    )
-    lines += _of_torque(result)
-    own = [x for x in result.unknowns.sought if x.own and x.base.ndim]
-    each = {x.name for x in own if trials > 1}  # too many to print
-    pairs = {name: pair for name, pair in result.estimates.items() if name not in each}
-    lines += [f"  {name} = {_with_errors(*pair)}" for name, pair in pairs.items()]
-    if trials == 1:
+
+
+def _of_estimates(result: FitResult) -> list[str]:
+    """Arrays that were sought beside the inertia, and the rates of a single trial."""
+    is_single = result.state.omega.shape[0] == 1
+    # Arrays of each trial are too many to print.
+    own = {x.name for x in result.unknowns.sought if x.own and x.base.ndim}
+    lines = [
+        f"  {name} = {_with_errors(*pair)}"
+        for name, pair in result.estimates.items()
+        if is_single or name not in own
+    ]
+    if is_single:
         omega = ", ".join(f"{x:.5g}" for x in np.asarray(result.state.omega)[0])
         lines.append(f"  rates at t = {result.t0[0]:.6g} s: ({omega}) rad/s")
-    lines.append(
-        "  not told by the record: " + ("; ".join(result.null_directions) or "nothing")
-    )
-    return "\n".join(lines + [f"  {note}" for note in remarks(result)])
+    return lines

@@ -1,4 +1,4 @@
-"""What leaves a fit: predictions, shares, files, pictures, and the command line's answer."""
+"""Interfaces of a fit: predictions, shares, files, pictures and the command line."""
 
 import dataclasses
 import os
@@ -108,7 +108,10 @@ def with_parts(found, body, *sensors, omegas=None, t0=(0.0,)):
 
 
 def test_a_prediction_has_the_sensors_memory_and_the_torque(found, rng):
-    """A late, slow, biased gyro that saturates, of two trials in air; the second starts at 3 s."""
+    """A late, slow, biased gyro that saturates, of two trials in air.
+
+    The second starts at 3 s.
+    """
     late, slow, bias, limit, drag = 0.02, 0.015, 0.1, 1.7, 0.05
     omegas, start = np.array([[0.6, 2.0, 0.8], [1.5, -0.4, 1.9]]), 3.0
     gyro = identify.Gyro(
@@ -164,6 +167,21 @@ def test_shares_are_moments_over_their_sum(found):
         found.shares_errors, np.sqrt(np.diagonal(straight)), rtol=0.02
     )
     np.testing.assert_allclose(jnp.sum(found.shares_covariance, axis=0), 0, atol=1e-15)
+
+
+# Diagnostics
+
+
+def test_sensitivity_is_the_change_of_the_state_that_the_numbers_ask_for(found):
+    """The state follows changed numbers so that residuals grow least."""
+    size = found.numbers.size
+    jacobian = np.asarray(found.diagnostics.jacobian[0]).reshape(-1, size + 3)
+    slopes = jacobian[:, :size]
+    of_state = jacobian[:, size:]
+    expected = np.linalg.lstsq(of_state, -slopes, rcond=None)[0]
+    sensitivity = np.asarray(found.diagnostics.sensitivity[0])
+    atol = 1e-9 * np.abs(expected).max()
+    np.testing.assert_allclose(sensitivity, expected, rtol=1e-9, atol=atol)
 
 
 # Files
@@ -553,7 +571,7 @@ def test_a_unit_of_the_command_line_is_a_name_or_a_factor(text, unit):
 
 
 def test_three_trials_in_a_process_of_its_own(tmp_path):
-    """Rest, hand, flight, catch, three times; the noise and the bias are those of the rest."""
+    """Rest, hand, flight, catch, three times; noise and bias are those of the rest."""
     rng, step, lever = np.random.default_rng(3), 0.01, np.array([0.03, -0.02, 0.05])
     rates, forces = [np.zeros((300, 3))], [np.tile([0, 0, 9.81], (300, 1))]
     for _ in range(3):
