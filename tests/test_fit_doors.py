@@ -339,6 +339,16 @@ def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, picture
     )
 
 
+def test_observations_are_what_was_read_and_what_was_left(found, readings):
+    observations = found.observations()
+    np.testing.assert_array_equal(observations.times, TS[None])
+    np.testing.assert_allclose(observations.values, readings[None])
+    assert np.all(observations.kept)
+    left = np.asarray(found.residuals()) / SIGMA
+    np.testing.assert_allclose(observations.residuals, left, rtol=1e-9)
+    assert not found.has_unmodelled_torque
+
+
 def test_what_a_record_does_not_tell_is_written(found, pictures):
     ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
     assert ax.texts[0].get_text() == "not told: overall scale"
