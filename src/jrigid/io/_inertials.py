@@ -56,7 +56,7 @@ _MADE = (
 )
 _MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")  # of MJCF's compiler
 _TURNS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")  # MJCF's
-# Python's `float` also takes `1_0` and digits of other scripts, which no simulator does.
+# Python's `float` also takes `1_0` and digits of other scripts; simulators do not.
 _NUMBER = re.compile(
     r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity)",
     re.ASCII | re.IGNORECASE,

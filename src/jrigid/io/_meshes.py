@@ -17,8 +17,8 @@ Trimesh = Any  # `trimesh.Trimesh`; trimesh is an extra and states no types
 Scene = Any  # `trimesh.Scene`
 _ADVICE = (
     "Vertices at one place were merged already. `mesh.fill_holes()` of trimesh closes "
-    "small holes, `mesh.fix_normals()` turns faces, `trimesh.boolean.union` joins parts "
-    "that overlap."
+    "small holes, `mesh.fix_normals()` turns faces, `trimesh.boolean.union` joins "
+    "parts that overlap."
 )
 
 
@@ -44,11 +44,10 @@ def mesh_arrays(
     >>> print(vertices.shape, faces.shape, jr.from_mesh(vertices, faces).mass)
     (8, 3) (12, 3) 6.0
     """
-    demand(
-        hasattr(mesh, "merge_vertices"),
-        f"Argument `mesh` must be a mesh or scene of trimesh, but it is {kind_of(mesh)}."
-        " (`jrigid.from_mesh` takes arrays.)",
-    )
+    needed = "Argument `mesh` must be a mesh or scene of trimesh"
+    advice = "(`jrigid.from_mesh` takes arrays.)"
+    is_mesh = hasattr(mesh, "merge_vertices")
+    demand(is_mesh, f"{needed}, but it is {kind_of(mesh)}. {advice}")
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = np.asarray(merged.faces, np.int64)

@@ -8,7 +8,10 @@ from typing import NamedTuple
 from jrigid._checks import demand
 
 _BOM = "\ufeff"
-_MACROS = "Argument `path` must be expanded, but it has macros: `xacro a.xacro > a.urdf` first."
+_MACROS = (
+    "Argument `path` must be expanded, but it has macros: `xacro a.xacro > a.urdf` "
+    "first."
+)
 
 
 class Document(NamedTuple):

@@ -1,4 +1,4 @@
-"""A body in space: its mesh, the box or the ellipsoid that has its inertia, or a top."""
+"""A body in space: a mesh, a top, or the box or ellipsoid of the same inertia."""
 
 from typing import Any, NamedTuple
 

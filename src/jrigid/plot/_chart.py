@@ -1,4 +1,4 @@
-"""A map of a quantity over two parameters, its regions named and their borders drawn."""
+"""A map of a quantity over two parameters, with names and borders of its regions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -135,7 +135,8 @@ def _sides(
 ) -> list[_Region]:
     """What is below and above a level, if there is one."""
     masks = [] if level is None else [values <= level, values > level]
-    message = "Argument `regions` must name what is below and above a `level`, but it does not."
+    needed = "must name what is below and above a `level`"
+    message = f"Argument `regions` {needed}, but it does not."
     demand(len(names) in (0, len(masks)), message)
     names = names or [""] * len(masks)
     pairs = zip(names, masks, strict=True)

@@ -258,7 +258,7 @@ def _ratios(ax: Axes, result: FitResult, *_: int) -> None:
 
 
 def _draw_ellipses(ax: Axes, result: FitResult) -> None:
-    """Draw the ellipses of 68 % and 95 %, and that of the stated noise if it is smaller."""
+    """Draw ellipses of 68 % and 95 %, and that of the stated noise if it is smaller."""
     colour, _ = LOOKS[0]
     ellipses = [("68 %", "-", colour, _SQUARE_68), ("95 %", "--", colour, _SQUARE_95)]
     inflation = float(result.diagnostics.inflation)

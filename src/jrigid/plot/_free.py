@@ -168,7 +168,7 @@ class _Surface(NamedTuple):
         self.draw(path, color=colour, lw=1.8 if momentum.ndim == 1 else 0.9)
 
     def draw_axes(self) -> None:
-        """Draw the ends of the principal axes, with their numbers where they face us."""
+        """Draw ends of the principal axes, with numbers where they face the eye."""
         place: dict[str, Any] = {"ha": "center", "va": "center", "zorder": common.FRONT}
         for name, axis in zip("123", (self.axes * self.semi_axes).T, strict=True):
             for end in (axis, -axis):

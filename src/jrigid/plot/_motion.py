@@ -44,8 +44,8 @@ def motion(
             figure.
         system: The `RigidBody` or `SymmetricTop`; of a trajectory its own.
         ts: The times [s]; of a trajectory its own.
-        along: Direction in space along which the angular momentum is compared, (0, 0, 1) for
-            that about the vertical; None: the vector.
+        along: Direction in space along which the angular momentum is compared, (0, 0,
+            1) for that about the vertical; None: the vector.
 
     Returns:
         The axes by their names.
