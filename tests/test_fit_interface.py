@@ -1,7 +1,10 @@
 """Interfaces of a fit: predictions, shares, files, pictures and the command line."""
 
+import ast
 import dataclasses
+import inspect
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -354,6 +357,16 @@ def test_errors_beyond_the_noise_stated_are_drawn_about_the_bound(found, picture
     )
 
 
+def test_observations_are_what_was_read_and_what_was_left(found, readings):
+    observations = found.observations()
+    np.testing.assert_array_equal(observations.times, TS[None])
+    np.testing.assert_allclose(observations.values, readings[None])
+    assert np.all(observations.kept)
+    left = np.asarray(found.residuals()) / SIGMA
+    np.testing.assert_allclose(observations.residuals, left, rtol=1e-9)
+    assert not found.has_unmodelled_torque
+
+
 def test_what_a_record_does_not_tell_is_written(found, pictures):
     ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
     assert ax.texts[0].get_text() == "not told: overall scale"
@@ -475,10 +488,10 @@ def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
     [
         (["none.csv"], "No such file"),
         (["words.csv"], "Argument `path` must have names of its columns above numbers"),
-        (["good.csv", "--unit", "furlong"], "Argument `unit` must be one of"),
+        (["good.csv", "--unit", "furlong"], "Argument `--unit` must be one of"),
         (
             ["good.csv", "--columns", "rates=p,q,r"],
-            "Argument `columns` must name columns",
+            "Argument `--columns` must name columns",
         ),
         (
             ["held.csv", "--flights"],
@@ -487,7 +500,7 @@ def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
         (["still.csv"], "Argument `path` must hold rates of a gyro, but it has none"),
         (
             ["good.csv", "--sigma", "-1"],
-            "Arguments `sigma` and `covariance` of `Gyro` must be",
+            "Argument `--sigma` must be positive",
         ),
     ],
 )
@@ -523,6 +536,48 @@ def test_wrong_arguments_are_argparses_to_tell(arguments, capsys):
         _cli.main(arguments)
     assert stop.value.code == 2
     assert "usage: jrigid" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "seek it (`free`), by `free=lambda body, gyro: gyro.bias`.",
+            "seek it by `--bias`.",
+        ),
+        ("See `unmodelled` and `free`.", "See `--unmodelled` and `--bias`."),
+        ("Pass `sigma`, or the torque", "Pass `--sigma`, or the torque"),
+        ("or `absolute_sigma=False`.", "or no `--sigma`."),
+        ("Argument `inertia_model` must", "Argument `--inertia-model` must"),
+        ("by `unit='rad/s'`, 3", "by `--unit rad/s`, 3"),
+        ("counts (unit='counts')", "counts (--unit counts)"),
+        ("tenths, pass unit=0.00174533", "tenths, pass --unit 0.00174533"),
+        ("(`unit={'rates': ...}`, one", "(`--unit rates=...`, one"),
+        ("rates taken as rpm: `unit` says so", "rates taken as rpm: `--unit` says so"),
+    ],
+)
+def test_a_text_names_options_instead_of_arguments(text, expected):
+    assert _cli._with_options(text) == expected
+
+
+REPORTS = ("_reasons", "_words", "_result", "_fit")
+
+
+def is_doc(node):
+    first = node.body[0] if isinstance(node.body, list) else None
+    return isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+
+
+def test_no_reason_or_status_names_an_argument_that_has_an_option():
+    """What the report of a fit may say, from the source: it may be reworded there."""
+    sources = [inspect.getsource(sys.modules[f"jrigid.identify.{x}"]) for x in REPORTS]
+    nodes = [node for text in sources for node in ast.walk(ast.parse(text))]
+    docs = {x.body[0].value for x in nodes if getattr(x, "body", None) and is_doc(x)}
+    texts = {x.value for x in nodes if isinstance(x, ast.Constant) and x not in docs}
+    shown = [_cli._with_options(x) for x in texts if isinstance(x, str)]
+    assert any("`--unmodelled`" in x for x in shown)
+    named = r"`(free|sigma|absolute_sigma|unmodelled|loss|inertia_model|throw)\b"
+    assert not [x for x in shown if re.search(named, x)]
 
 
 def test_every_option_reaches_the_fit(readings, tmp_path, monkeypatch):

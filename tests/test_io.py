@@ -1,6 +1,7 @@
 """Doors: every convention against the package itself, not against ourselves."""
 
 import importlib
+import os
 import sys
 
 import jax
@@ -273,6 +274,45 @@ def test_a_part_that_is_no_body_is_named_with_what_to_do(rng):
             door((mesh.vertices, mesh.faces))
 
 
+@pytest.mark.parametrize(
+    ("suffix", "part"),
+    [
+        ("stl", 0.0),
+        ("stl", 0.5),
+        ("stl", 0.99),
+        ("ply", 0.02),
+        ("glb", 0.0),
+        ("xyz", 1),
+    ],
+)
+def test_a_file_of_a_mesh_that_is_cut_off_is_named(rng, tmp_path, suffix, part):
+    path = tmp_path / f"lump.{suffix}"
+    lump(rng).export(path, file_type="ply" if suffix == "xyz" else suffix)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(ValueError, match=rf"^File .*lump\.{suffix}' (holds|cannot)"):
+        jr.io.read_mesh(path)
+
+
+def test_a_mesh_must_be_a_file_and_its_faults_name_the_file(rng, tmp_path):
+    for path in (tmp_path, tmp_path / "none.stl"):
+        with pytest.raises(ValueError, match=r"`path` must be a file, but .* is none"):
+            jr.io.read_mesh(path)
+    mesh = lump(rng)
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    mesh.export(tmp_path / "open.obj")
+    with pytest.raises(ValueError, match=r"^Part .* of file .*open\.obj': .*`faces`"):
+        jr.io.read_mesh(tmp_path / "open.obj")
+
+
+def test_a_byte_order_mark_in_an_obj_is_harmless(rng, tmp_path):
+    mesh = lump(rng)
+    mesh.export(tmp_path / "a.obj")
+    text = (tmp_path / "a.obj").read_text()
+    (tmp_path / "b.obj").write_text(text, encoding="utf-8-sig")
+    assert_same(*(jr.io.read_mesh(tmp_path / f"{x}.obj") for x in "ab"))
+
+
 # Inertials
 
 mujoco = pytest.importorskip("mujoco")
@@ -535,6 +575,125 @@ def test_included_files_are_looked_for_where_mujoco_does(tmp_path, name, mass):
     assert jr.io.read_inertials(path)["b"].mass == mass
 
 
+OPTION = "<mujocoinclude><option/></mujocoinclude>"
+TWICE = r"has an `<include file='{}'>`, but MuJoCo takes each file only once"
+INCLUDES = {  # what main.xml includes, the other files, what is said
+    "twice": ("<include file='a.xml'/>" * 2, {"a": OPTION}, TWICE.format("a.xml")),
+    "twice, spelled otherwise": (
+        "<include file='a.xml'/><include file='./x/../a.xml'/>",
+        {"a": OPTION},
+        TWICE.format("./x/../a.xml"),
+    ),
+    "by two others": (
+        "<include file='a.xml'/><include file='b.xml'/>",
+        {
+            "a": OPTION.replace("<option", "<include file='c.xml'/><option"),
+            "b": OPTION.replace("<option", "<include file='c.xml'/><option"),
+            "c": OPTION,
+        },
+        r"b\.xml' " + TWICE.format("c.xml"),
+    ),
+    "itself": (
+        "<include file='a.xml'/>",
+        {"a": "<mujocoinclude><include file='a.xml'/></mujocoinclude>"},
+        r"a\.xml' " + TWICE.format("a.xml"),
+    ),
+    "main": (
+        "<include file='a.xml'/>",
+        {"a": "<mujocoinclude><include file='main.xml'/></mujocoinclude>"},
+        r"a\.xml' " + TWICE.format("main.xml"),
+    ),
+    "no name": ("<include/>", {}, r"main\.xml' has an `<include>` without a `file`"),
+    "no file": ("<include file='a.xml'/>", {}, "'a.xml'>`, but that is no file"),
+    "folder": ("<include file='.'/>", {}, "'.'>`, but that is no file"),
+    "empty": ("<include file='a.xml'/>", {"a": ""}, r"a\.xml' cannot be parsed as XML"),
+    "broken": (
+        "<include file='a.xml'/>",
+        {"a": "<mujocoinclude>\n<option></mujocoinclude>"},
+        r"a\.xml' cannot be parsed as XML: mismatched tag: line 2",
+    ),
+    "without elements": (
+        "<include file='a.xml'/>",
+        {"a": "<mujocoinclude><!-- later --></mujocoinclude>"},
+        r"a\.xml' is included, but it has no elements",
+    ),
+    "with children": (
+        "<include file='a.xml'><option/></include>",
+        {"a": OPTION},
+        "with children: delete them",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INCLUDES)
+def test_includes_that_mujoco_refuses_are_refused(tmp_path, name):
+    inside, others, match = INCLUDES[name]
+    path = tmp_path / "main.xml"
+    (tmp_path / "x").mkdir()
+    path.write_text(f"<mujoco>{inside}</mujoco>")
+    for other, text in others.items():
+        (tmp_path / f"{other}.xml").write_text(text)
+    with pytest.raises(ValueError):
+        mujoco.MjModel.from_xml_path(str(path))
+    with pytest.raises(ValueError, match=match):
+        jr.io.read_inertials(path)
+
+
+def test_a_pipe_is_refused_before_it_is_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.xml")
+    with pytest.raises(ValueError, match=r"pipe\.xml' is not a regular one"):
+        jr.io.read_inertials(tmp_path / "pipe.xml")
+    path = tmp_path / "main.xml"
+    path.write_text("<mujoco><include file='pipe.xml'/></mujoco>")
+    with pytest.raises(ValueError, match=r"'pipe\.xml'>`, but that is no file"):
+        jr.io.read_inertials(path)
+
+
+def test_byte_order_marks_are_harmless(tmp_path):
+    text = FILES["euler"].replace("<worldbody", "<include file='a.xml'/><worldbody")
+    (tmp_path / "a.xml").write_text(OPTION, encoding="utf-8-sig")
+    path = tmp_path / "main.xml"
+    path.write_text(text, encoding="utf-8-sig")
+    assert mujoco.MjModel.from_xml_path(str(path)).body("b").mass == 3
+    expected = jr.io.read_inertials(FILES["euler"])["b"]
+    assert_same(jr.io.read_inertials(path)["b"], expected, 0)
+    assert_same(jr.io.read_inertials("\ufeff" + FILES["euler"])["b"], expected, 0)
+    jr.io.write_inertials(tmp_path / "b.xml", {"b": expected}, template=path)
+    assert_same(jr.io.read_inertials(tmp_path / "b.xml")["b"], expected, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", r"File .*b\.urdf' cannot be parsed as XML: no element found: line 1"),
+        ("<robot>\n<link>\n</robot>", r"b\.urdf' cannot be .*: mismatched tag: line 3"),
+        ("<?xml version='1.0' encoding='none'?><robot/>", r"b\.urdf' cannot be parsed"),
+        (
+            urdf(f"<inertial><mass value='1_0'/><inertia {SIX}/></inertial>"),
+            r"b\.urdf': The inertial of 'b' cannot be read: '1_0' must be a number",
+        ),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_said_with_its_name(tmp_path, text, match):
+    path = tmp_path / "b.urdf"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=match):
+        jr.io.read_inertials(path)
+    if text.startswith("<robot>"):
+        with pytest.raises(ValueError, match=match):
+            jr.io.write_inertials(tmp_path / "c.urdf", {}, template=path)
+
+
+def test_a_file_that_is_not_there_is_no_empty_text(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.urdf"):
+        jr.io.read_inertials(tmp_path / "none.urdf")
+    for text in ("", " \n", "\ufeff"):
+        with pytest.raises(ValueError, match="must be a file or XML, but it is empty"):
+            jr.io.read_inertials(text)
+    with pytest.raises(ValueError, match=r"The text cannot be parsed as XML: .*line 1"):
+        jr.io.read_inertials("<robot>")
+
+
 DIAGONAL = "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1' {}/>"
 FULL = "<inertial mass='1' pos='0 0 0' fullinertia='1 1 1 0 0 0' {}/>"
 
@@ -557,6 +716,10 @@ FULL = "<inertial mass='1' pos='0 0 0' fullinertia='1 1 1 0 0 0' {}/>"
         ),
         (mjcf("<inertial mass='1' diaginertia='1 1 1'/>"), "it has no pos"),
         (mjcf("<inertial mass='1' pos='0 0 0'/>"), "it has no diaginertia"),
+        (
+            mjcf(DIAGONAL.replace("'1'", "'1_0'", 1).format("")),
+            "'1_0' must be a number",
+        ),
     ],
 )
 def test_what_mujoco_refuses_is_refused(text, match):

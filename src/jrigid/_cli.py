@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 
@@ -14,7 +15,7 @@ from jrigid._checks import demand
 from jrigid.identify import Status
 from jrigid.systems import RigidBody
 
-_LEAST = 4  # rows of a piece that is fitted
+_SHORTEST = 4  # rows of a piece that is fitted
 # 1 is for what cannot be used, 2 for what argparse does not understand.
 _EXIT = {
     "OK": 0,
@@ -24,19 +25,26 @@ _EXIT = {
     "WRONG_BASIN": 6,
     "NOT_CONVERGED": 7,
 }
-_OPTIONS = {
-    "`unmodelled`": "`--unmodelled`",
-    "`free`": "`--bias`",
-    "`sigma`": "`--sigma`",
-    "`absolute_sigma=False`": "no `--sigma`",
-}
-_INERTIA_MODELS = (
-    "tensor",
-    "moments",
-    "symmetric",
-    "top",
-    "flat",
-)  # of `jrigid.identify`
+# Classes of `jrigid.identify`, in lower case.
+_INERTIA_MODELS = ("tensor", "moments", "symmetric", "top", "flat")
+# Patterns of what reports and errors say of arguments in Python, and the options of the
+# command line that set them. They are applied in this order.
+_OPTIONS = (
+    (r"\(`free`\), by `free=[^`]*bias`", "by `--bias`"),
+    (r"`free(=[^`]*bias)?`", "`--bias`"),
+    (r"`unmodelled`", "`--unmodelled`"),
+    (r"Arguments `sigma` and `covariance` of `Gyro`", "Argument `--sigma`"),
+    (r"`sigma`", "`--sigma`"),
+    (r"`absolute_sigma=False`", "no `--sigma`"),
+    (r"`loss`", "`--robust`"),
+    (r"`inertia_model`", "`--inertia-model`"),
+    (r"(?<=\. )[^.]*`throw=False`[^.]*", "`--plot` and `--save` show it"),
+    (r"see `null_directions`", "see below what is not determined"),
+    (r"`columns`", "`--columns`"),
+    (r"`unit`", "`--unit`"),
+    (r"\bunit=\{'(\w+)': \.\.\.\}", r"--unit \1=..."),
+    (r"\bunit='?([\w./]+)'?", r"--unit \1"),
+)
 
 
 def _torque(text: str) -> str | identify.GaussMarkov:
@@ -48,6 +56,7 @@ def _torque(text: str) -> str | identify.GaussMarkov:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """The parser of all commands, of which there is one."""
     parser = argparse.ArgumentParser(
         "jrigid", description="The rotation of rigid bodies."
     )
@@ -55,80 +64,95 @@ def _parser() -> argparse.ArgumentParser:
     command = parser.add_subparsers(required=True).add_parser(
         "fit",
         help="inertia from a file with a gyro's record of free motion",
-        description="Inertia from a file with a gyro's record of free motion, of one trial or "
-        "several; units, clocks and repairs are said.",
-        epilog=f"Exit status: {codes}; 1 for a file that cannot be used, 2 for these arguments. "
-        "`--flights` takes noise and bias from where the body rests; without a sigma the noise is "
-        "taken from the residuals.",
+        description="Inertia from a file with a gyro's record of free motion, of one "
+        "trial or several; units, clocks and repairs are said.",
+        epilog=f"Exit status: {codes}; 1 for a file that cannot be used, 2 for these "
+        "arguments. `--flights` takes noise and bias from where the body rests; "
+        "without a sigma the noise is taken from the residuals.",
     )
-    add = command.add_argument
-    add("path", help="a file, or a folder, as `jrigid.records.read` takes it")
-    units = "of the rates: deg/s, counts or a factor; or times=ms, any number"
-    add("--unit", action="append", default=[], help=units)
-    add(
+    _add_options_of_reading(command)
+    _add_options_of_fit(command)
+    return parser
+
+
+def _add_options_of_reading(command: argparse.ArgumentParser) -> None:
+    """Add what says how the file is read."""
+    command.add_argument(
+        "path", help="a file, or a folder, as `jrigid.records.read` takes it"
+    )
+    command.add_argument(
+        "--unit",
+        action="append",
+        default=[],
+        help="of the rates: deg/s, counts or a factor; or times=ms, any number",
+    )
+    command.add_argument(
         "--columns",
         action="append",
         default=[],
         metavar="NAME=HEADERS",
         help="times=t, rates=gx,gy,gz, any number",
     )
-    add(
+    command.add_argument(
         "--flights",
         action="store_true",
         help="find trials in the record; else it is one trial",
     )
-    add(
+
+
+def _add_options_of_fit(command: argparse.ArgumentParser) -> None:
+    """Add what says how the record is fitted and what becomes of the fit."""
+    command.add_argument(
         "--sigma",
         type=float,
         help="noise of a reading [rad/s], whatever the file's unit",
     )
-    add("--bias", action="store_true", help="seek the gyro's bias")
-    add(
+    command.add_argument("--bias", action="store_true", help="seek the gyro's bias")
+    command.add_argument(
         "--inertia-model",
         choices=_INERTIA_MODELS,
         default="tensor",
         help="what is known of it (tensor: nothing)",
     )
-    add(
+    command.add_argument(
         "--unmodelled",
         type=_torque,
         default=identify.GaussMarkov(0.0),
         metavar="LEVEL[,TIME]",
-        help="of an unmodelled torque over the mean moment [rad/s^1.5], and its correlation time "
-        "[s] (white without one); or estimate",
+        help="of an unmodelled torque over the mean moment [rad/s^1.5], and its "
+        "correlation time [s] (white without one); or estimate",
     )
-    add("--robust", action="store_true", help="leave outliers out")
-    add("--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)")
-    add(
+    command.add_argument("--robust", action="store_true", help="leave outliers out")
+    command.add_argument(
+        "--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)"
+    )
+    command.add_argument(
         "--save",
         metavar="PKL",
         help="where to keep the fit, for `jrigid.identify.load`",
     )
-    return parser
 
 
-def _with_options(report: str) -> str:
-    """A report that names options of the command line instead of arguments of `fit`."""
-    for argument, option in _OPTIONS.items():
-        report = report.replace(argument, option)
-    return report
+def _with_options(text: str) -> str:
+    """Name options of the command line where a text names arguments in Python."""
+    for argument, option in _OPTIONS:
+        text = re.sub(argument, option, text)
+    return text
 
 
-def _trials(reading: records.Reading, fly: bool) -> list[records.Reading]:
+def _trials(reading: records.Reading, by_flights: bool) -> list[records.Reading]:
     """What is fitted: flights, or the stretches without a break."""
-    demand(
-        reading.rates is not None,
-        "Argument `path` must hold rates of a gyro, but it has none.",
-    )
-    if fly:
-        parts = records.flights(reading)
-        for part in parts:
-            print(f"  - {part.notes[-1]}")
+    message = "Argument `path` must hold rates of a gyro, but it has none."
+    demand(reading.rates is not None, message)
+    if by_flights:
+        trials = records.flights(reading)
+        for trial in trials:
+            print(f"  - {trial.notes[-1]}")
     else:
-        parts = [x for x in reading.pieces() if x.times.size >= _LEAST]
-    what = "flights" if fly else f"{_LEAST} readings without a break"
-    demand(len(parts) > 0, f"Argument `path` must hold {what}, but it has none.")
-    return parts
+        trials = [x for x in reading.pieces() if x.times.size >= _SHORTEST]
+    needed = "flights" if by_flights else f"{_SHORTEST} readings without a break"
+    demand(len(trials) > 0, f"Argument `path` must hold {needed}, but it has none.")
+    return trials
 
 
 def _at_rest(reading: records.Reading) -> tuple[np.ndarray | None, np.ndarray]:
@@ -153,12 +177,20 @@ def _unit(text: str) -> tuple[str, str | float]:
         return kind or "rates", unit
 
 
-def _fit(options: argparse.Namespace) -> int:
+def _reading(options: argparse.Namespace) -> records.Reading:
+    """The file, with the units and columns that the command line names."""
+    columns = {}
+    for text in options.columns:
+        name, _, headers = text.partition("=")
+        columns[name] = tuple(headers.split(",")) if "," in headers else headers
     units = dict(map(_unit, options.unit))
-    named = [x.partition("=") for x in options.columns]
-    columns = {name: tuple(x.split(",")) if "," in x else x for name, _, x in named}
-    reading = records.read(options.path, unit=units, columns=columns)
-    print(reading)
+    return records.read(options.path, unit=units, columns=columns)
+
+
+def _fit(options: argparse.Namespace) -> int:
+    """Read, fit, print, save and draw; returns the exit status."""
+    reading = _reading(options)
+    print(_with_options(str(reading)))
     trials = _trials(reading, options.flights)
     noise, bias = _at_rest(reading) if options.flights else (None, np.zeros(3))
     sigma = noise if options.sigma is None else options.sigma
@@ -175,26 +207,25 @@ def _fit(options: argparse.Namespace) -> int:
             throw=throw,
         )
 
-    found = fit(throw=False)
-    if found.status == Status.BAD_INPUT:
-        found = fit(throw=True)  # says what is wrong
-    print(_with_options(str(found)))
+    result = fit(throw=False)
+    if result.status == Status.BAD_INPUT:
+        result = fit(throw=True)  # raises an error that says what is wrong
+    print(_with_options(str(result)))
     if options.save:
-        identify.save(options.save, found)
+        identify.save(options.save, result)
     if options.plot:
         os.environ.setdefault("MPLBACKEND", "Agg")
-        plot.fit(found)["record"].figure.savefig(options.plot)
-    return next(
-        code for name, code in _EXIT.items() if found.status == getattr(Status, name)
-    )
+        plot.fit(result)["record"].figure.savefig(options.plot)
+    codes = (x for name, x in _EXIT.items() if result.status == getattr(Status, name))
+    return next(codes)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """What `jrigid` does in a shell; returns the exit status."""
+    """Run the command `jrigid`; returns the exit status."""
     options = _parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
         return _fit(options)
     except (ValueError, RuntimeError, OSError, ImportError) as error:
-        print(f"jrigid: {error}", file=sys.stderr)
+        print(f"jrigid: {_with_options(str(error))}", file=sys.stderr)
         return 1

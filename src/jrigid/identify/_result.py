@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -83,6 +83,23 @@ def arrays_of(fields: dict[str, Any]) -> list[Any]:
     return jtu.tree_leaves(
         [inner if x == "diagnostics" else fields[x] for x in of_result]
     )
+
+
+class Observations(NamedTuple):
+    """What was read in one record, an axis of trials in front.
+
+    Attributes:
+        times: [s]
+        values: What was read; NaN where nothing was.
+        kept: Whether a robust fit kept the sample.
+        residuals: Predicted less observed over the noise; NaN where there is none. A
+            noise that was not stated is that of the residuals.
+    """
+
+    times: Float[Array, "trials n"]
+    values: Float[Array, "trials n k"]
+    kept: Bool[Array, "trials n"]
+    residuals: Float[Array, "trials n degrees"]
 
 
 class FitResult(eqx.Module):
@@ -394,6 +411,39 @@ class FitResult(eqx.Module):
         rows = self.diagnostics.residuals[:, samples.parts[record], :, None]
         residuals = jnp.linalg.solve(white, rows)[..., 0]
         return jnp.where(used[:, samples.parts[record]], residuals, jnp.nan)
+
+    @property
+    def has_unmodelled_torque(self) -> bool:
+        """Whether the fit allows for one: `predict` then does not follow the record."""
+        return self.problem.options.dense
+
+    def observations(self, record: int = 0) -> Observations:
+        """What was read in a record, and what was left of it; of a single fit.
+
+        Args:
+            record: Which record.
+        """
+        samples = self.problem.samples
+        part = samples.parts[record]
+        values = samples.values[record]
+        sensor = self.fitted()[1 + record]
+        width = sensor.degrees or values.shape[-1]
+        seen = samples.weight[:, part] > 0
+        if sensor.degrees is None:
+            # A number may be missing without the others of its sample.
+            seen = seen[..., :width]
+        else:
+            seen = jnp.any(seen, axis=-1, keepdims=True)
+        # A noise that was not stated is that of the residuals.
+        known = self.problem.options.noise_known
+        size = 1.0 if known else jnp.sqrt(self.reduced_chi_square)
+        residuals = self.diagnostics.residuals[:, part, :width] / size
+        return Observations(
+            times=samples.ts[:, part],
+            values=jnp.where(seen, values, jnp.nan),
+            kept=self.kept[:, part],
+            residuals=jnp.where(residuals == 0, jnp.nan, residuals),
+        )
 
     @property
     def estimates(self) -> dict[str, tuple[Array, Array]]:

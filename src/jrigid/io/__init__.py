@@ -1,8 +1,8 @@
-"""Doors to other packages and their files: attitudes, meshes, inertials, tables.
+"""Interoperability: attitudes, meshes, inertials and tables of other packages.
 
-What comes in is in SI units, attitudes scalar first and body to space, tensors about
-the centre of mass; each function says what the other side means. The packages are the
-extra `jrigid[io]`.
+What these functions return is in SI units, with attitudes scalar first and body to
+space, and tensors about the centre of mass. Each function states the conventions of the
+other package. The packages are the extra `jrigid[io]`.
 """
 
 from jrigid.io._attitudes import from_jaxlie as from_jaxlie

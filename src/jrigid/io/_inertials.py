@@ -1,10 +1,10 @@
-"""Inertials of URDF, MJCF and SDF, in and out."""
+"""Inertials of URDF, MJCF and SDF: read and write."""
 
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from io import StringIO
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -12,7 +12,11 @@ import numpy as np
 from jrigid._checks import check_option, check_type, demand
 from jrigid._extra import extra
 from jrigid.io._physical import faults, nearest_physical, values_of
+from jrigid.io._xml import around_root, document, tree_of
 from jrigid.mass import MassProperties
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _SIX = {
     "ixx": (0, 0),
@@ -22,7 +26,8 @@ _SIX = {
     "ixz": (0, 2),
     "iyz": (1, 2),
 }
-_NEW = {  # a file and a link in it
+# A new file and a link in it, by suffix.
+_NEW = {
     ".urdf": ("<robot name='bodies'>{}</robot>", "<link name={}/>"),
     ".xml": ("<mujoco><worldbody>{}</worldbody></mujoco>", "<body name={}/>"),
     ".sdf": (
@@ -30,17 +35,13 @@ _NEW = {  # a file and a link in it
         "<link name={}/>",
     ),
 }
-_RPY = {
-    "angle": "radian",
-    "eulerseq": "XYZ",
-}  # roll, pitch, yaw about fixed axes, in MJCF's words
-
-_POSES = {
-    "euler_rpy": "0 0 0 0 0 0",
-    "quat_xyzw": "0 0 0 0 0 0 1",
-}  # SDF's, where none is given
+# Roll, pitch, yaw about fixed axes, in MJCF's words.
+_RPY = {"angle": "radian", "eulerseq": "XYZ"}
+# SDF's poses where none is given, by their format.
+_POSES = {"euler_rpy": "0 0 0 0 0 0", "quat_xyzw": "0 0 0 0 0 0 1"}
 _SAVED = "save the compiled model by `mujoco.mj_saveLastXML`"
-_MADE = (  # links that a program makes: in which format, of what, what to do
+# Links that a program makes: in which format, by which element, and what to do.
+_MADE = (
     (
         "sdf",
         ".//include",
@@ -53,118 +54,162 @@ _MADE = (  # links that a program makes: in which format, of what, what to do
     ),
     ("mujoco", ".//attach", f"`<attach>` adds bodies: {_SAVED} and read that."),
 )
-_MACROS = "Argument `path` must be expanded, but it has macros: `xacro a.xacro > a.urdf` first."
-_TURNS = "quat", "axisangle", "xyaxes", "zaxis", "euler"  # MJCF's
+_MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")  # of MJCF's compiler
+_TURNS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")  # MJCF's
+# Python's `float` also takes `1_0` and digits of other scripts; simulators do not.
+_NUMBER = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity)",
+    re.ASCII | re.IGNORECASE,
+)
 
 _Unphysical = Literal["raise", "nearest", "keep"]
-# Each of these says an inertial as MJCF's attributes, and how its angles are meant.
-_Said = tuple[Mapping[str, str], Mapping[str, str]]
 
 
-def _urdf(inertial: ET.Element, _: ET.Element) -> _Said:
+class _Stated(NamedTuple):
+    """What a file states of an inertial.
+
+    Attributes:
+        attributes: As MJCF's attributes, whatever the format.
+        options: How angles are meant, as the attributes of MJCF's compiler.
+    """
+
+    attributes: Mapping[str, str]
+    options: Mapping[str, str]
+
+
+def _urdf(inertial: ET.Element, _: ET.Element) -> _Stated:
+    """An inertial of URDF. Source: wiki.ros.org/urdf/XML/link."""
     known = {f"{x.tag} {k}": text for x in inertial for k, text in x.attrib.items()}
     mass, *six = _texts(known, "mass value", *(f"inertia {k}" for k in _SIX))
-    pose = {
+    attributes = {
+        "mass": mass,
+        "fullinertia": " ".join(six),
         "pos": known.get("origin xyz", "0 0 0"),
         "euler": known.get("origin rpy", "0 0 0"),
     }
-    return {"mass": mass, "fullinertia": " ".join(six), **pose}, _RPY
+    return _Stated(attributes, _RPY)
 
 
-def _sdf(inertial: ET.Element, _: ET.Element) -> _Said:
-    texts = {
-        x.tag: [x.text, *(part.tail for part in x)] for x in inertial.iter()
-    }  # past comments
-    known = {tag: " ".join(filter(None, parts)).strip() for tag, parts in texts.items()}
+def _sdf(inertial: ET.Element, _: ET.Element) -> _Stated:
+    """An inertial of SDF. Source: SDFormat 1.12, inertial."""
+    is_automatic = _flag(inertial.attrib, "auto")
+    demand(not is_automatic, "`auto` is for the simulator to compute.")
+    known = {x.tag: _text_of(x) for x in inertial.iter()}
     about = getattr(inertial.find("pose"), "attrib", {})
-    demand(
-        not _flag(inertial.attrib, "auto"), "`auto` is for the simulator to compute."
-    )
+    position, turn, options = _sdf_pose(known.get("pose", ""), about)
+    six = [known.get(k) or f"{i == j:d}" for k, (i, j) in _SIX.items()]
+    attributes = {
+        "mass": known.get("mass") or "1",
+        "fullinertia": " ".join(six),
+        "pos": position,
+    }
+    return _Stated(attributes | turn, options)
+
+
+def _text_of(element: ET.Element) -> str:
+    """The text of an element, also that behind comments."""
+    parts = [element.text, *(part.tail for part in element)]
+    return " ".join(filter(None, parts)).strip()
+
+
+def _sdf_pose(
+    text: str, about: Mapping[str, str]
+) -> tuple[str, dict[str, str], Mapping[str, str]]:
+    """Position, turn and meaning of the angles, in MJCF's words."""
     demand(not about.get("relative_to"), "Its pose must be relative to the link.")
     kind = about.get("rotation_format", "euler_rpy")
     check_option("rotation_format", kind, tuple(_POSES))
-    pose = known.get("pose") or _POSES[kind]
+    pose = text or _POSES[kind]
     _numbers(pose, len(_POSES[kind].split()))
     x, y, z, *turn = pose.split()
-    six = " ".join(known.get(k) or f"{i == j:d}" for k, (i, j) in _SIX.items())
-    said = {"mass": known.get("mass") or "1", "fullinertia": six, "pos": f"{x} {y} {z}"}
+    position = f"{x} {y} {z}"
     if kind == "quat_xyzw":
-        return {**said, "quat": " ".join([turn[3], *turn[:3]])}, {}
+        # MJCF's quaternions are scalar first.
+        return position, {"quat": " ".join([turn[3], *turn[:3]])}, {}
     unit = "degree" if _flag(about, "degrees") else "radian"
-    return {**said, "euler": " ".join(turn)}, _RPY | {"angle": unit}
+    return position, {"euler": " ".join(turn)}, _RPY | {"angle": unit}
 
 
-def _mjcf(inertial: ET.Element, root: ET.Element) -> _Said:
-    options = {
-        k: x for compiler in root.iter("compiler") for k, x in compiler.attrib.items()
-    }
-    demand(
-        options.get("inertiafromgeom") != "true",
-        "`inertiafromgeom` makes MuJoCo overlook it.",
-    )
-    for k in ("settotalmass", "boundmass", "boundinertia"):
-        message = (
-            f"`{k}` makes MuJoCo change it: {_SAVED}, delete `{k}` there and read that."
-        )
-        demand(float(options.get(k, 0)) <= 0, message)
-    known, full = inertial.attrib, "fullinertia" in inertial.attrib
-    rivals = (*_TURNS, "fullinertia", "diaginertia") if full else _TURNS
+def _mjcf(inertial: ET.Element, root: ET.Element) -> _Stated:
+    """An inertial of MJCF. Source: MuJoCo, XML reference, body/inertial."""
+    options: dict[str, str] = {}
+    for compiler in root.iter("compiler"):  # the last one wins
+        options |= compiler.attrib
+    from_shapes = options.get("inertiafromgeom") == "true"
+    demand(not from_shapes, "`inertiafromgeom` makes MuJoCo overlook it.")
+    for name in _MASS_OPTIONS:
+        advice = f"{_SAVED}, delete `{name}` there and read that."
+        is_set = _number(options.get(name, "0")) > 0
+        demand(not is_set, f"`{name}` makes MuJoCo change it: {advice}")
+    known = inertial.attrib
+    is_full = "fullinertia" in known
+    rivals = (*_TURNS, "fullinertia", "diaginertia") if is_full else _TURNS
     given = [k for k in rivals if k in known]
     demand(len(given) <= 1, f"MuJoCo takes only one of {', '.join(given)}.")
-    _texts(known, "mass", "pos", "fullinertia" if full else "diaginertia")
-    return {"fullinertia": f"{known.get('diaginertia')} 0 0 0", **known}, options
+    _texts(known, "mass", "pos", "fullinertia" if is_full else "diaginertia")
+    full = {"fullinertia": f"{known.get('diaginertia')} 0 0 0"}
+    return _Stated(full | known, options)
 
 
-_FORMATS = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
+_Reader = Callable[[ET.Element, ET.Element], _Stated]  # of an inertial and the root
+_FORMATS: dict[str, _Reader] = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
 
 
 def _texts(known: Mapping[str, str], *names: str) -> list[str]:
+    """The texts of these names, none of which may be missing or blank."""
     missing = [k for k in names if not known.get(k, "").strip()]
     demand(not missing, f"it has no {', no '.join(missing)}.")
     return [known[k] for k in names]
 
 
 def _flag(attributes: Mapping[str, str], name: str) -> bool:
-    """A truth of SDF."""
+    """A boolean of SDF, False where it is absent."""
     value = attributes.get(name, "false").lower()
     check_option(name, value, ("true", "1", "false", "0"))
     return value in ("true", "1")
 
 
+def _number(text: str) -> float:
+    """A number as simulators read it."""
+    is_number = _NUMBER.fullmatch(text.strip())
+    demand(bool(is_number), f"{text!r} must be a number, but it is not.")
+    return float(text)
+
+
 def _numbers(text: str, count: int) -> np.ndarray:
+    """Numbers between white space."""
     demand("$" not in text, f"{text!r} is a formula: expand it first, by `xacro`.")
-    values = np.array([float(x) for x in text.split()])
+    values = np.array([_number(x) for x in text.split()])
     demand(values.size == count, f"{text!r} must be {count} numbers, but it is not.")
     return values
 
 
-def _turn(said: Mapping[str, str], options: Mapping[str, str]) -> Any:
-    """From the axes of the tensor to those of the link."""
-    turns = extra("io", "scipy.spatial.transform").Rotation
+def _turn(stated: _Stated) -> "Rotation":
+    """The rotation from the axes of the tensor to those of the link."""
+    attributes, options = stated
+    rotations = extra("io", "scipy.spatial.transform").Rotation
     unit = np.pi / 180 if options.get("angle", "degree") == "degree" else 1.0
-    if text := said.get("quat"):
-        return turns.from_quat(np.roll(_numbers(text, 4), -1))
-    if text := said.get("axisangle"):
+    if text := attributes.get("quat"):
+        return rotations.from_quat(np.roll(_numbers(text, 4), -1))
+    if text := attributes.get("axisangle"):
         axis, angle = np.split(_numbers(text, 4), [3])
-        return turns.from_rotvec(axis / np.linalg.norm(axis) * angle * unit)
-    if text := said.get("xyaxes"):
+        return rotations.from_rotvec(axis / np.linalg.norm(axis) * angle * unit)
+    if text := attributes.get("xyaxes"):
         x, y = _numbers(text, 6).reshape(2, 3)
         z = np.cross(x, y)
         axes = [v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)]
-        return turns.from_matrix(np.stack(axes, axis=1))
-    if text := said.get(
-        "zaxis"
-    ):  # the shortest turn there, of half a turn that about x
+        return rotations.from_matrix(np.stack(axes, axis=1))
+    if text := attributes.get("zaxis"):
+        # The shortest turn to that axis; of half a turn that about x.
         x, y, z = _numbers(text, 3)
         half = [-y, x, 0.0, np.linalg.norm([x, y, z]) + z]
-        return turns.from_quat(half if np.any(half) else [1.0, 0.0, 0.0, 0.0])
-    turn = turns.identity()
-    angles = _numbers(said.get("euler") or "0 0 0", 3) * unit
+        return rotations.from_quat(half if np.any(half) else [1.0, 0.0, 0.0, 0.0])
+    angles = _numbers(attributes.get("euler") or "0 0 0", 3) * unit
+    turn = rotations.identity()
     for axis, angle in zip(options.get("eulerseq", "xyz"), angles, strict=True):
-        one = turns.from_euler(axis.lower(), angle)
-        turn = (
-            turn * one if axis.islower() else one * turn
-        )  # about moving or fixed axes
+        one = rotations.from_euler(axis.lower(), angle)
+        # Small letters are axes that move with the body, capitals fixed ones.
+        turn = turn * one if axis.islower() else one * turn
     return turn
 
 
@@ -172,53 +217,34 @@ def _read(
     inertial: ET.Element, root: ET.Element
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass, tensor about it in the axes of the link."""
-    said, options = _FORMATS[root.tag](inertial, root)
-    a, b, c, d, e, f = _numbers(said["fullinertia"], 6)
-    turn = _turn(said, options).as_matrix()
+    stated = _FORMATS[root.tag](inertial, root)
+    a, b, c, d, e, f = _numbers(stated.attributes["fullinertia"], 6)
+    turn = _turn(stated).as_matrix()
     tensor = turn @ np.array([[a, d, e], [d, b, f], [e, f, c]]) @ turn.T
-    return float(_numbers(said["mass"], 1)[0]), _numbers(said["pos"], 3), tensor
-
-
-def _opened(source: str | Path) -> Any:
-    """The path of a file, or what reads as the file of this text."""
-    text = source.strip() if isinstance(source, str) else ""
-    return StringIO(text) if text.startswith("<") else Path(source)
-
-
-def _root(source: str | Path, main: Path | None = None) -> ET.Element:
-    """The tree of a file, or of XML itself, with comments; MJCF's includes are read too.
-
-    They are looked for beside the main file, then beside the file that they are in.
-    """
-    builder = ET.TreeBuilder(insert_comments=True, insert_pis=True)
-    file = _opened(source)
-    root = ET.parse(file, ET.XMLParser(target=builder)).getroot()
-    demand(not any("/xacro}" in str(x.tag) for x in root.iter()), _MACROS)
-    for parent in list(root.iter()) if root.tag not in ("robot", "sdf") else ():
-        for child in parent.findall("include"):
-            message = "Argument `path` must be a path, but it is the text of a file with includes."
-            demand(isinstance(file, Path), message)
-            i, name, top = list(parent).index(child), child.attrib["file"], main or file
-            beside = top if (top.parent / name).exists() else file
-            parent[i : i + 1] = list(_root(beside.parent / name, top))
-    return root
+    mass = float(_numbers(stated.attributes["mass"], 1)[0])
+    return mass, _numbers(stated.attributes["pos"], 3), tensor
 
 
 def _links(root: ET.Element) -> dict[str, ET.Element]:
-    """Links, or MJCF's bodies, by their names; SDF's with the models' where there are several."""
+    """Links, or MJCF's bodies, by name.
+
+    Where an SDF file has several models, their names stand before those of the links.
+    """
     check_option("path", root.tag, tuple(_FORMATS))
-    models, links = {root: ""}, {}
+    scopes = {root: ""}
     for parent in root.iter() if root.tag == "sdf" else ():
-        own = models.get(parent, "")
-        models |= {x: f"{own}{x.get('name')}::" for x in parent.iterfind("model")}
-    for model, scope in models.items():
+        outer = scopes.get(parent, "")
+        for model in parent.iterfind("model"):
+            scopes[model] = f"{outer}{model.get('name')}::"
+    is_one_model = len(scopes) <= 2  # beside the root
+    links = {}
+    for model, scope in scopes.items():
         elements = model.iterfind(".//body" if root.tag == "mujoco" else "link")
         for i, element in enumerate(elements, 1):
-            name = scope * (len(models) > 2) + element.get("name", f"body {i}")
-            demand(
-                name not in links,
-                f"Names of links must be unique, but {name!r} is not.",
-            )
+            name = element.get("name", f"body {i}")
+            name = name if is_one_model else scope + name
+            message = f"Names of links must be unique, but {name!r} is not."
+            demand(name not in links, message)
             links[name] = element
     return links
 
@@ -226,12 +252,13 @@ def _links(root: ET.Element) -> dict[str, ET.Element]:
 def read_inertials(
     path: str | Path, *, unphysical: _Unphysical = "raise", thickness: float = 0.0
 ) -> dict[str, MassProperties]:
-    """Mass properties of the links of a URDF, MJCF or SDF file, by name, in the links' axes.
+    """Read the mass properties of the links of a URDF, MJCF or SDF file, by name.
 
-    The format is that of the root: `<robot>`, `<mujoco>`, `<sdf>`. Links without an
-    inertial are left out, also those whose inertia MuJoCo would take from their shapes;
-    the links of an SDF file of several models are called `model::link`, of nested ones
-    `outer::inner::link`.
+    The format is that of the root: `<robot>`, `<mujoco>` or `<sdf>`. Bodies are in the
+    axes of their links. Links without an inertial are left out, also those whose
+    inertia MuJoCo would take from their shapes. The links of an SDF file of several
+    models are called `model::link`, of nested ones `outer::inner::link`. Files that
+    MJCF includes are read where MuJoCo reads them.
 
     Args:
         path: The file, or its text.
@@ -246,11 +273,13 @@ def read_inertials(
         The bodies; centres of mass from the origins of their links.
 
     Raises:
-        ValueError: A file of another kind, or whose links or numbers its program makes
-            of others (macros, SDF's includes, MJCF's `replicate`, `settotalmass`);
-            numbers that are missing or that are formulas; bodies that are none in the
-            precision of jax (float32 but with `jax_enable_x64`), by the names of the
-            links.
+        ValueError: A file of another kind, XML that is not well-formed, or an include
+            that MuJoCo refuses (a file that is missing, empty or included twice); a
+            file whose links or numbers its program makes of others (macros, SDF's
+            includes, MJCF's `replicate`, `settotalmass`); numbers that are missing, are
+            formulas or are none; bodies that are none in the precision of jax (float32
+            but with `jax_enable_x64`). The text names the file and the link.
+        FileNotFoundError: No such file.
 
     Source: URDF, wiki.ros.org/urdf/XML/link; MuJoCo, XML reference, body/inertial;
         SDFormat 1.12, inertial. All three mean tensors about the centre of mass with
@@ -263,23 +292,29 @@ def read_inertials(
     [2.  1.  2.5]
     """
     check_option("unphysical", unphysical, get_args(_Unphysical))
-    root = _root(path)
+    source = document(path)
+    root = tree_of(source)
     for tag, place, message in _MADE:
-        found = root.tag == tag and root.find(place) is not None
-        demand(not found, f"Argument `path` must hold all links itself, but {message}")
-    bodies, wrong = {}, []
+        is_made = root.tag == tag and root.find(place) is not None
+        demand(
+            not is_made, f"Argument `path` must hold all links itself, but {message}"
+        )
+    bodies = {}
+    wrong = []
     for name, link in _links(root).items():
-        if (inertial := link.find("inertial")) is None:
+        inertial = link.find("inertial")
+        if inertial is None:
             continue
         try:
             mass, center, tensor = _read(inertial, root)
         except ValueError as error:
-            raise ValueError(
-                f"The inertial of {name!r} cannot be read: {error}"
-            ) from error
+            where = "" if source.path is None else f"{source.name}: "
+            message = f"{where}The inertial of {name!r} cannot be read: {error}"
+            raise ValueError(message) from error
         if unphysical == "nearest":
             tensor = np.asarray(nearest_physical(tensor, mass, thickness))
-        bodies[name] = body = MassProperties.unchecked(mass, center, tensor)
+        body = MassProperties.unchecked(mass, center, tensor)
+        bodies[name] = body
         if unphysical != "keep":
             wrong += [f"{name!r}: {text}" for text in faults(*values_of(body))]
     demand(not wrong, "\n".join(["Some inertials are those of no body.", *wrong]))
@@ -288,43 +323,25 @@ def read_inertials(
 
 def _written(kind: str, body: MassProperties) -> ET.Element:
     """An inertial in the axes of the link."""
-    center, mass, *values = (
-        " ".join(map(str, np.ravel(value)))
-        for value in (
-            body.center_of_mass,
-            body.mass,
-            *(body.inertia[ij] for ij in _SIX.values()),
-        )
-    )
+    center = _joined(body.center_of_mass)
+    mass = _joined(body.mass)
+    six = {k: _joined(body.inertia[ij]) for k, ij in _SIX.items()}
     if kind == "mujoco":
-        text = f"pos='{center}' mass='{mass}' fullinertia='{' '.join(values)}'"
+        full = " ".join(six.values())
+        text = f"pos='{center}' mass='{mass}' fullinertia='{full}'"
         return ET.fromstring(f"<inertial {text}/>")
     if kind == "robot":
-        text = " ".join(f"{k}='{x}'" for k, x in zip(_SIX, values, strict=True))
-        text = f"<origin xyz='{center}' rpy='0 0 0'/><mass value='{mass}'/><inertia {text}/>"
-    else:
-        text = "".join(f"<{k}>{x}</{k}>" for k, x in zip(_SIX, values, strict=True))
-        text = (
-            f"<pose>{center} 0 0 0</pose><mass>{mass}</mass><inertia>{text}</inertia>"
-        )
-    return ET.fromstring(f"<inertial>{text}</inertial>")
+        pose = f"<origin xyz='{center}' rpy='0 0 0'/><mass value='{mass}'/>"
+        inertia = " ".join(f"{k}='{x}'" for k, x in six.items())
+        return ET.fromstring(f"<inertial>{pose}<inertia {inertia}/></inertial>")
+    pose = f"<pose>{center} 0 0 0</pose><mass>{mass}</mass>"
+    inertia = "".join(f"<{k}>{x}</{k}>" for k, x in six.items())
+    return ET.fromstring(f"<inertial>{pose}<inertia>{inertia}</inertia></inertial>")
 
 
-def _around(source: str | Path) -> tuple[str, str]:
-    """Comments before and after the root; the prefixes of its namespaces are kept from now on."""
-    depth, before, around = 0, True, ["", ""]
-    events = ("start", "end", "comment", "pi", "start-ns")
-    for event, x in ET.iterparse(_opened(source), events):
-        depth += (event == "start") - (event == "end")
-        before &= event != "start"
-        if event == "start-ns" and x[0].strip("0123456789") not in (
-            "",
-            "ns",
-        ):  # as ET takes
-            ET.register_namespace(*x)
-        elif event in ("comment", "pi") and not depth:
-            around[not before] += ET.tostring(x, "unicode").strip() + "\n"
-    return around[0], around[1]
+def _joined(value: object) -> str:
+    """All digits of the numbers of an array."""
+    return " ".join(map(str, np.ravel(np.asarray(value))))
 
 
 def write_inertials(
@@ -333,10 +350,11 @@ def write_inertials(
     *,
     template: str | Path | None = None,
 ) -> None:
-    """Write mass properties as the inertials of a URDF (.urdf), MJCF (.xml) or SDF (.sdf) file.
+    """Write mass properties as the inertials of a URDF, MJCF or SDF file.
 
     Tensors are written in the axes of the link, about the centre of mass, to the last
-    digit of their precision.
+    digit of their precision. The format of a new file is that of its suffix: `.urdf`,
+    `.xml` or `.sdf`.
 
     Args:
         path: The file to write.
@@ -349,8 +367,8 @@ def write_inertials(
             needs.
 
     Raises:
-        ValueError: A suffix of no format, a link that the template has not, a template
-            with macros.
+        ValueError: A suffix of no format, a link that the template has not, or a
+            template that `read_inertials` could not read (macros, broken XML).
 
     >>> import jrigid as jr
     >>> from tempfile import TemporaryDirectory
@@ -367,17 +385,19 @@ def write_inertials(
         check_option("path", Path(path).suffix, tuple(_NEW))
         file, link = _NEW[Path(path).suffix]
         template = file.format("".join(link.format(quoteattr(name)) for name in bodies))
-    links = _links(root := _root(template))
+    source = document(template)
+    root = tree_of(source)
+    links = _links(root)
     strange = sorted(set(bodies) - set(links))
-    message = f"Argument `bodies` must name links of the template, but {strange} are not in it."
-    demand(not strange, message)
+    message = f"but {strange} are not in it."
+    demand(not strange, f"Argument `bodies` must name links of the template, {message}")
     for name, body in bodies.items():
-        if (old := links[name].find("inertial")) is not None:
+        old = links[name].find("inertial")
+        if old is not None:
             links[name].remove(old)
         links[name].insert(0, _written(root.tag, body))
     ET.indent(root)
-    before, after = _around(template)
-    text = f"{before}{ET.tostring(root, 'unicode')}\n{after}"
-    Path(path).write_text(
-        f"<?xml version='1.0' encoding='utf-8'?>\n{text}", encoding="utf-8"
-    )
+    before, after = around_root(source)
+    head = "<?xml version='1.0' encoding='utf-8'?>\n"
+    text = f"{head}{before}{ET.tostring(root, 'unicode')}\n{after}"
+    Path(path).write_text(text, encoding="utf-8")

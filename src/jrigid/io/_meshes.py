@@ -13,19 +13,22 @@ from jrigid._types import ScalarLike
 from jrigid.mass import MassProperties, from_mesh
 
 Density = ScalarLike | Mapping[str, float]
+Trimesh = Any  # `trimesh.Trimesh`; trimesh is an extra and states no types
+Scene = Any  # `trimesh.Scene`
 _ADVICE = (
-    "Corners at one place were merged already. `mesh.fill_holes()` of trimesh closes small holes, "
-    "`mesh.fix_normals()` turns faces, `trimesh.boolean.union` joins parts that overlap."
+    "Vertices at one place were merged already. `mesh.fill_holes()` of trimesh closes "
+    "small holes, `mesh.fix_normals()` turns faces, `trimesh.boolean.union` joins "
+    "parts that overlap."
 )
 
 
 def mesh_arrays(
-    mesh: Any,
+    mesh: Trimesh,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Vertices and faces of a trimesh, as `jrigid.from_mesh` takes them.
+    """Return vertices and faces of a trimesh, as `jrigid.from_mesh` takes them.
 
-    Corners at one place become one vertex, which STL files and meshes with textures or
-    normals at their corners do not have, and faces that this makes lines are left out.
+    Vertices at one place become one vertex. STL files and meshes with textures or
+    normals at their corners have several. Faces that shrink to a line are left out.
 
     Args:
         mesh: A `trimesh.Trimesh`.
@@ -33,43 +36,85 @@ def mesh_arrays(
     Returns:
         Vertices, in the units of the mesh, and faces.
 
+    Raises:
+        ValueError: `mesh` is no mesh of trimesh.
+
     >>> import jrigid as jr, trimesh
     >>> vertices, faces = jr.io.mesh_arrays(trimesh.creation.box((1, 2, 3)))
     >>> print(vertices.shape, faces.shape, jr.from_mesh(vertices, faces).mass)
     (8, 3) (12, 3) 6.0
     """
-    message = f"Argument `mesh` must be a mesh or scene of trimesh, but it is {kind_of(mesh)}."
-    demand(
-        hasattr(mesh, "merge_vertices"), f"{message} (`jrigid.from_mesh` takes arrays.)"
-    )
+    needed = "Argument `mesh` must be a mesh or scene of trimesh"
+    advice = "(`jrigid.from_mesh` takes arrays.)"
+    is_mesh = hasattr(mesh, "merge_vertices")
+    demand(is_mesh, f"{needed}, but it is {kind_of(mesh)}. {advice}")
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = np.asarray(merged.faces, np.int64)
-    lines = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
-    return np.asarray(merged.vertices, float), faces[~lines]
+    is_line = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
+    return np.asarray(merged.vertices, float), faces[~is_line]
 
 
-def _parts(shape: Any) -> list[tuple[tuple[str, ...], Any]]:
+def _parts(shape: Trimesh | Scene) -> list[tuple[tuple[str, ...], Trimesh]]:
     """Meshes in the coordinates of the whole, each with the names it goes by."""
     if not hasattr(shape, "graph"):
-        return [((str(getattr(shape, "metadata", {}).get("name", "mesh")),), shape)]
+        name = getattr(shape, "metadata", {}).get("name", "mesh")
+        return [((str(name),), shape)]
     parts = []
     for node in shape.graph.nodes_geometry:
         transform, geometry = shape.graph[node]
-        if hasattr(
-            shape.geometry[geometry], "faces"
-        ):  # else a path or a cloud of points
+        # A scene may also hold paths and clouds of points.
+        if hasattr(shape.geometry[geometry], "faces"):
             mesh = shape.geometry[geometry].copy()
-            mesh.apply_transform(transform)  # turns the faces over where it mirrors
+            # This also turns the faces over where the transform mirrors.
+            mesh.apply_transform(transform)
             parts.append(((str(node), str(geometry)), mesh))
     demand(bool(parts), "Argument `mesh` must hold a mesh, but its scene holds none.")
     return parts
 
 
-def from_trimesh(
-    mesh: Any, density: Density = 1.0, *, scale: float = 1.0
+def _densities(
+    density: Density, parts: list[tuple[tuple[str, ...], Trimesh]]
+) -> list[ScalarLike]:
+    """The density of each part, checked."""
+    if not isinstance(density, Mapping):
+        return [density] * len(parts)
+    names = list(dict.fromkeys(name for names, _ in parts for name in names))
+    message = (
+        f"Argument `density` must name parts, {names}, but it names {list(density)}."
+    )
+    demand(set(density) <= set(names), message)
+    densities: list[ScalarLike] = []
+    for names, _ in parts:
+        own = [density[x] for x in names if x in density]
+        message = f"Argument `density` must have one of {names[0]!r}, but it has not."
+        demand(bool(own), message)
+        densities.append(own[0])
+    return densities
+
+
+def _joined(
+    shape: Trimesh | Scene, density: Density, scale: float, whole: str
 ) -> MassProperties:
-    """Mass properties of a trimesh, or of a scene of parts with their places, rigidly joined.
+    """The body of all parts; errors say of which `whole` a part is."""
+    demand(scale > 0, f"Argument `scale` must be positive, but it is {scale}.")
+    parts = _parts(shape)
+    bodies = []
+    for (names, part), own in zip(parts, _densities(density, parts), strict=True):
+        vertices, faces = mesh_arrays(part)
+        try:
+            bodies.append(from_mesh(scale * vertices, faces, own))
+        except (RuntimeError, ValueError) as error:
+            advice = f" {_ADVICE}" if "`faces`" in str(error) else ""
+            message = f"Part {names[0]!r} of {whole}: {error}{advice}"
+            raise ValueError(message) from error
+    return sum(bodies[1:], bodies[0])
+
+
+def from_trimesh(
+    mesh: Trimesh | Scene, density: Density = 1.0, *, scale: float = 1.0
+) -> MassProperties:
+    """Return the mass properties of a trimesh, or of a scene of parts, rigidly joined.
 
     Each part is a homogeneous body; where parts overlap their masses add.
 
@@ -95,33 +140,15 @@ def from_trimesh(
     >>> print(body.mass, body.center_of_mass)
     4.0 [1.5 0.  0. ]
     """
-    demand(scale > 0, f"Argument `scale` must be positive, but it is {scale}.")
-    parts, bodies = _parts(mesh), []
-    known: dict[str, Any] = {name: density for names, _ in parts for name in names}
-    densities = density if isinstance(density, Mapping) else known
-    message = f"Argument `density` must name parts, {list(known)}, but it names {list(densities)}."
-    demand(set(densities) <= set(known), message)
-    for names, part in parts:
-        own = [densities[x] for x in names if x in densities]
-        demand(
-            bool(own),
-            f"Argument `density` must have one of {names[0]!r}, but it has not.",
-        )
-        vertices, faces = mesh_arrays(part)
-        try:
-            bodies.append(from_mesh(scale * vertices, faces, own[0]))
-        except (RuntimeError, ValueError) as error:
-            advice = f" {_ADVICE}" if "`faces`" in str(error) else ""
-            raise ValueError(
-                f"Part {names[0]!r} of the mesh: {error}{advice}"
-            ) from error
-    return sum(bodies[1:], bodies[0])
+    return _joined(mesh, density, scale, "the mesh")
 
 
 def read_mesh(
     path: str | Path, density: Density = 1.0, *, scale: float = 1.0
 ) -> MassProperties:
-    """Mass properties of the parts in a file of meshes: STL, OBJ, PLY, glTF, all trimesh reads.
+    """Read the mass properties of the parts in a file of meshes.
+
+    The formats are those that trimesh reads: STL, OBJ, PLY, glTF and more.
 
     Args:
         path: The file.
@@ -134,7 +161,8 @@ def read_mesh(
 
     Raises:
         ImportError: Without the extra `jrigid[io]`.
-        ValueError: As `from_trimesh`.
+        ValueError: No such file, a file that is cut off or of another format than its
+            suffix says, or an error as in `from_trimesh`.
 
     >>> import jrigid as jr, tempfile, trimesh
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -144,4 +172,17 @@ def read_mesh(
     3.0
     """
     check_type("path", path, str, Path)
-    return from_trimesh(extra("io", "trimesh").load_scene(path), density, scale=scale)
+    trimesh = extra("io", "trimesh")
+    file = repr(str(path))
+    is_file = Path(path).is_file()
+    demand(is_file, f"Argument `path` must be a file, but {file} is none.")
+    try:
+        scene = trimesh.load_scene(path)
+    except ImportError:  # a package that trimesh needs for this format
+        raise
+    except Exception as error:  # trimesh raises many types for files that are cut off
+        cause = f"{type(error).__name__}: {error}"
+        raise ValueError(f"File {file} cannot be read as a mesh. ({cause})") from error
+    message = f"File {file} holds no mesh: is it cut off, or is its suffix wrong?"
+    demand(any(hasattr(x, "faces") for x in scene.geometry.values()), message)
+    return _joined(scene, density, scale, f"file {file}")

@@ -1,12 +1,13 @@
-"""Pictures, drawn by matplotlib, which is imported when the first is drawn (`jrigid[plot]`).
+"""Pictures, drawn by matplotlib (`jrigid[plot]`).
 
-One convention: every function takes what the library returns, draws into the axes `ax`
-that it is given, or into a new figure, and returns the axes; what was drawn is in their
-`lines` and `collections`, the figure is `ax.figure`. Pictures of several panels (`fit`,
-`motion`) take and return a dict of axes by their names. What is on a sphere (`polhode`,
-`tip`, `body`) needs axes of three dimensions, `figure.add_subplot(projection="3d")`,
-which keep the view they have; what lies behind is faint. `animate` returns an
-`Animation`, to show in a notebook or to save.
+Every function takes what the library returns, draws into the axes `ax` that it is
+given, or into a new figure, and returns the axes. What was drawn is in their `lines`
+and `collections`, and the figure is `ax.figure`. Pictures of several panels (`fit`,
+`motion`) take and return a dict of axes by their names. Pictures on a sphere
+(`polhode`, `tip`, `body`) need axes of three dimensions,
+`figure.add_subplot(projection="3d")`, whose view is not changed. Lines behind the
+sphere are faint. `animate` returns an `Animation`, to show in a notebook or to save.
+Matplotlib is imported when the first picture is drawn.
 """
 
 from jrigid.plot._animate import Animation as Animation

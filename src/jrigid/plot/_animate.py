@@ -10,8 +10,10 @@ import jax
 import numpy as np
 
 from jrigid._checks import check_option, demand
+from jrigid._types import AnyArray
 from jrigid.plot import _common as common
 from jrigid.plot._body import Surface, place, surface_of
+from jrigid.plot._common import Body, Motion
 from jrigid.rotation import slerp
 from jrigid.top import SymmetricTop
 
@@ -37,7 +39,7 @@ class Animation(NamedTuple):
 
     @property
     def html(self) -> str:
-        """A page by itself, which asks for no server and no network: drag it to look around."""
+        """A page that needs no server and no network: drag it to look around."""
         arrays = self.surface._asdict() | {
             "attitudes": self.attitudes,
             "trace": self.trace,
@@ -76,6 +78,11 @@ class Animation(NamedTuple):
         if path.suffix == ".html":
             path.write_text(self.html, encoding="utf-8")
             return path
+        self._film(path)
+        return path
+
+    def _film(self, path: Path) -> None:
+        """Write a gif or a film, frame by frame."""
         plt = common.pyplot()
         from matplotlib import animation as film
 
@@ -84,16 +91,17 @@ class Animation(NamedTuple):
             raise RuntimeError(
                 "A film needs ffmpeg, which is not found; a .gif or .html does not."
             )
-        figure, recorder = plt.figure(figsize=(4.6, 4.6)), writer(fps=self.fps)
+        figure = plt.figure(figsize=(4.6, 4.6))
+        recorder = writer(fps=self.fps)
         ax = figure.add_axes((0, 0, 1, 1), projection="3d", elev=25, azim=35)
-        ax, drawn = common.space_axes(ax, 1.1), []
+        common.space_axes(ax, 1.1)
         clock = ax.text2D(0.04, 0.04, "", transform=ax.transAxes)
         lines = [ax.plot([], [], [], color="#D55E00", lw=1.5)[0] for _ in self.trace]
         trails = np.moveaxis(common.turned(self.attitudes, self.trace), 1, 0)
+        frames = zip(self.times, self.attitudes, strict=True)
+        drawn = []
         with recorder.saving(figure, path, dpi=100):
-            for i, (time, attitude) in enumerate(
-                zip(self.times, self.attitudes, strict=True)
-            ):
+            for i, (time, attitude) in enumerate(frames):
                 clock.set_text(f"t = {time:.3g} s")
                 for line, trail in zip(lines, trails, strict=True):
                     line.set_data_3d(*trail[: i + 1].T)
@@ -102,20 +110,19 @@ class Animation(NamedTuple):
                 drawn = place(ax, self.surface, attitude)
                 recorder.grab_frame()
         plt.close(figure)
-        return path
 
 
 def animate(
-    body: Any,
-    motion: Any,
+    body: Body,
+    motion: Motion,
     *,
-    ts: Any = None,
+    ts: AnyArray | None = None,
     kind: str = "box",
-    trace: Any = None,
+    trace: AnyArray | None = None,
     seconds: float = 10.0,
     fps: float = 20.0,
 ) -> Animation:
-    """A body along a motion.
+    """Show a body along a motion.
 
     Args:
         body: As for `body`: a mesh (vertices, faces), a `SymmetricTop`, or what has an
@@ -147,21 +154,28 @@ def animate(
     (200, 4) <iframe
     """
     attitudes = np.asarray(common.states_of(motion).attitude, float)
-    ts, seen = common.times_of(motion, ts), np.all(np.isfinite(attitudes), axis=-1)
-    ts, attitudes = ts[seen], attitudes[seen]
-    demand(
-        len(ts) > 1, "Argument `motion` must hold two states at least, but it does not."
-    )
-    demand(
-        bool(np.all(np.diff(ts) >= 0)), "Argument `ts` must not decrease, but it does."
-    )
+    known_times = common.times_of(motion, ts)
+    finite = np.all(np.isfinite(attitudes), axis=-1)
+    known_times = known_times[finite]
+    attitudes = attitudes[finite]
+    message = "Argument `motion` must hold two states at least, but it does not."
+    demand(len(known_times) > 1, message)
+    message = "Argument `ts` must not decrease, but it does."
+    demand(bool(np.all(np.diff(known_times) >= 0)), message)
     demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
-    times = np.linspace(ts[0], ts[-1], max(round(seconds * fps), 2))
+    frames = max(round(seconds * fps), 2)
+    times = np.linspace(known_times[0], known_times[-1], frames)
+    attitudes = _at(times, known_times, attitudes)
+    if trace is None:
+        trace = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
+    points = np.reshape(np.asarray(trace, float), (-1, 3))
+    return Animation(surface_of(body, kind), times, attitudes, points, fps)
+
+
+def _at(times: np.ndarray, ts: np.ndarray, attitudes: np.ndarray) -> np.ndarray:
+    """Attitudes at other times, between those at `ts`."""
     before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
-    part = (times - ts[before]) / np.maximum(np.diff(ts)[before], np.finfo(float).tiny)
-    attitudes = np.asarray(
-        jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part)
-    )
-    point = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
-    trace = point if trace is None else np.reshape(np.asarray(trace, float), (-1, 3))
-    return Animation(surface_of(body, kind), times, attitudes, trace, fps)
+    # Times may repeat, as at an event.
+    steps = np.maximum(np.diff(ts)[before], np.finfo(float).tiny)
+    part = (times - ts[before]) / steps
+    return np.asarray(jax.vmap(slerp)(attitudes[before], attitudes[before + 1], part))

@@ -1,12 +1,15 @@
-"""A body in space: its mesh, the box or the ellipsoid that has its inertia, or a top."""
+"""A body in space: a mesh, a top, or the box or ellipsoid of the same inertia."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jrigid._checks import check_option, demand, kind_of
+from jrigid._types import AnyArray
+from jrigid.dynamics import State
 from jrigid.mass import from_mesh
 from jrigid.plot import _common as common
+from jrigid.plot._common import Axes3D, Body
 from jrigid.top import SymmetricTop
 
 _LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from
@@ -39,8 +42,8 @@ class Surface(NamedTuple):
     kinds: np.ndarray
     lines: np.ndarray
 
-    def colours(self, attitude: Any) -> np.ndarray:
-        """Of the faces of a body that is turned, with light and shade (m, 3)."""
+    def colours(self, attitude: AnyArray) -> np.ndarray:
+        """Colours of the faces of a turned body, with light and shade (m, 3)."""
         from matplotlib.colors import to_rgb
 
         base = np.array([to_rgb(colour) for colour, _ in common.LOOKS])[self.kinds]
@@ -55,59 +58,101 @@ def _rings(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners and faces, four corners each, of a body of revolution."""
     turn = 2 * np.pi * np.arange(sides) / sides
-    ring = [np.outer(radii, np.cos(turn)), np.outer(radii, np.sin(turn))]
-    vertices = np.stack([*ring, np.outer(heights, np.ones(sides))], axis=-1).reshape(
-        -1, 3
-    )
+    x = np.outer(radii, np.cos(turn))
+    y = np.outer(radii, np.sin(turn))
+    z = np.outer(heights, np.ones(sides))
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     row, k = np.meshgrid(
         np.arange(radii.size - 1) * sides, np.arange(sides), indexing="ij"
     )
     after = (k + 1) % sides
-    faces = np.stack(
-        [row + k, row + after, row + sides + after, row + sides + k], axis=-1
-    )
-    return vertices, faces.reshape(-1, 4)
+    corners = [row + k, row + after, row + sides + after, row + sides + k]
+    return vertices, np.stack(corners, axis=-1).reshape(-1, 4)
 
 
 _BALL = _rings(np.sin(_POLAR), np.cos(_POLAR), 24)
 
 
+class _Outline(NamedTuple):
+    """A body before it is scaled.
+
+    Attributes:
+        vertices: Corners, body components (n, 3).
+        faces: The corners of each face.
+        center: From which the principal axes stick out.
+        axes: Principal axes in columns.
+        sides: How far the body reaches along each of them.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    center: np.ndarray
+    axes: np.ndarray
+    sides: np.ndarray
+
+
+def _of_top() -> _Outline:
+    """A top that stands on its tip."""
+    vertices, faces = _rings(_TOP[0], _TOP[1], _SIDES)
+    radius = _TOP[0, 2]
+    center = np.array([0, 0, 1 - radius])
+    return _Outline(vertices, faces, center, np.eye(3), np.full(3, radius))
+
+
+def _of_mesh(mesh: tuple[AnyArray, AnyArray]) -> _Outline:
+    """A mesh where it is, with the principal axes of the solid."""
+    vertices = np.asarray(mesh[0], float)
+    faces = np.asarray(mesh[1])
+    solid = from_mesh(vertices, faces)
+    center = np.asarray(solid.center_of_mass)
+    _, axes = common.principal(solid)
+    sides = np.max(np.abs((vertices - center) @ axes), axis=0)
+    return _Outline(vertices, faces, center, axes, sides)
+
+
+def _of_inertia(body: Body, kind: str) -> _Outline:
+    """The box or ellipsoid that has an inertia, up to a factor."""
+    moments, axes = common.principal(body)
+    squares = np.sum(moments) / 2 - moments
+    sides = np.sqrt(np.maximum(squares, _FLAT * np.max(squares)))
+    vertices, faces = (_CORNERS, _QUADS) if kind == "box" else _BALL
+    return _Outline(vertices * sides @ axes.T, faces, np.zeros(3), axes, sides)
+
+
+def _is_mesh(body: Body) -> bool:
+    """Whether a body is given as (vertices, faces)."""
+    return isinstance(body, tuple) and len(body) == 2
+
+
 def surface_of(body: Any, kind: str) -> Surface:
-    """The surface of a mesh, of a top, or of the box or ellipsoid with a body's inertia."""
+    """The surface of a mesh, of a top, or of the box or ellipsoid with an inertia."""
     check_option("kind", kind, ("box", "ellipsoid"))
     if isinstance(body, SymmetricTop):
-        vertices, faces = _rings(_TOP[0], _TOP[1], _SIDES)
-        axes, sides = np.eye(3), np.full(3, _TOP[0, 2])
-        center = np.array([0, 0, 1 - sides[2]])
-    elif isinstance(body, tuple) and len(body) == 2:
-        vertices, faces = np.asarray(body[0], float), np.asarray(body[1])
-        solid = from_mesh(vertices, faces)
-        center, (_, axes) = np.asarray(solid.center_of_mass), common.principal(solid)
-        sides = np.max(np.abs((vertices - center) @ axes), axis=0)
+        outline = _of_top()
+    elif _is_mesh(body):
+        outline = _of_mesh(body)
     else:
-        (moments, axes), center = common.principal(body), np.zeros(3)
-        squares = np.sum(moments) / 2 - moments
-        sides = np.sqrt(np.maximum(squares, _FLAT * np.max(squares)))
-        vertices, faces = (_CORNERS, _QUADS) if kind == "box" else _BALL
-        vertices = vertices * sides @ axes.T
+        outline = _of_inertia(body, kind)
+    vertices, faces, center, axes, sides = outline
     size = np.max(np.linalg.norm(vertices, axis=1))
     first, second, third = np.moveaxis(vertices[faces[:, :3]], 1, 0)
     normals = np.cross(second - first, third - first)
-    normals /= np.maximum(
-        np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny
-    )
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.maximum(lengths, np.finfo(float).tiny)
     kinds = np.argmax(np.abs(normals @ axes), axis=1)
-    ends = (
-        np.stack([sides / size, sides / size + 0.25], axis=1)[..., None]
-        * axes.T[:, None]
-    )
+    reaches = np.stack([sides / size, sides / size + 0.25], axis=1)
+    ends = reaches[..., None] * axes.T[:, None]
     return Surface(vertices / size, faces, normals, kinds, center / size + ends)
 
 
 def body(
-    body: Any, attitude: Any = (1.0, 0, 0, 0), *, ax: Any = None, kind: str = "box"
-) -> Any:
-    """A body with its principal axes.
+    body: Body,
+    attitude: AnyArray | State | tuple[float, ...] = (1.0, 0, 0, 0),
+    *,
+    ax: Axes3D | None = None,
+    kind: str = "box",
+) -> Axes3D:
+    """Draw a body with its principal axes.
 
     Args:
         body: A mesh (vertices, faces) as for `from_mesh`, drawn about the origin of its
@@ -132,27 +177,32 @@ def body(
     Box of the same inertia
     I = 0.00089, 0.00205, 0.00285 kg m$^2$
     """
-    found = np.asarray(getattr(attitude, "attitude", attitude))
-    wrong = f"Argument `attitude` must be one quaternion or State, but it is {kind_of(attitude)}."
-    demand(found.shape == (4,), wrong)
-    surface, ax = surface_of(body, kind), common.space_axes(ax, 1.1)
-    place(ax, surface, found)
-    mesh, top = (
-        isinstance(body, tuple) and len(body) == 2,
-        isinstance(body, SymmetricTop),
-    )
-    title = (
-        "Mesh" if mesh else "Top" if top else f"{kind.capitalize()} of the same inertia"
-    )
-    if not mesh:
-        moments = np.diag(common.tensor_of(body)) if top else common.principal(body)[0]
-        title += "\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments)
-    ax.set_title(title)
-    return ax
+    is_state = isinstance(attitude, common.Rotating)
+    quaternion = np.asarray(attitude.attitude if is_state else attitude)
+    needed = "Argument `attitude` must be one quaternion or State"
+    demand(quaternion.shape == (4,), f"{needed}, but it is {kind_of(attitude)}.")
+    surface = surface_of(body, kind)
+    space = common.space_axes(ax, 1.1)
+    place(space, surface, quaternion)
+    space.set_title(_title(body, kind))
+    return space
 
 
-def place(ax: Any, surface: Surface, attitude: np.ndarray) -> list[Any]:
-    """Draw a surface and its axes as they are turned; the artists."""
+def _title(body: Body, kind: str) -> str:
+    """What is drawn, and its moments unless it is a mesh."""
+    if _is_mesh(body):
+        return "Mesh"
+    if isinstance(body, SymmetricTop):
+        name = "Top"
+        moments = np.diag(common.tensor_of(body))
+    else:
+        name = f"{kind.capitalize()} of the same inertia"
+        moments, _ = common.principal(body)
+    return "{}\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(name, *moments)
+
+
+def place(ax: Axes3D, surface: Surface, attitude: AnyArray) -> list[Any]:
+    """Draw a surface and its axes as they are turned; returns the artists."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     corners = common.turned(attitude, surface.vertices)[surface.faces]
@@ -160,11 +210,10 @@ def place(ax: Any, surface: Surface, attitude: np.ndarray) -> list[Any]:
     faces = Poly3DCollection(
         corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4
     )
-    artists = [ax.add_collection3d(faces)]
+    artists: list[Any] = [ax.add_collection3d(faces)]
     for name, line in zip("123", common.turned(attitude, surface.lines), strict=True):
-        front = common.FRONT * (
-            (line[1] - line[0]) @ common.eye(ax) > 0
-        )  # or behind all
+        # An axis that points away from the eye is behind everything.
+        front = common.FRONT * ((line[1] - line[0]) @ common.eye(ax) > 0)
         artists += ax.plot(*line.T, color="k", lw=1, zorder=front)
         artists.append(ax.text(*(1.2 * line[1] - 0.2 * line[0]), name, zorder=front))
     return artists

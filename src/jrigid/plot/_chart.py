@@ -1,13 +1,15 @@
-"""A map of a quantity over two parameters, its regions named and their borders drawn."""
+"""A map of a quantity over two parameters, with names and borders of its regions."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from jrigid._checks import demand
 from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of
-from jrigid.plot._common import flat_axes
+from jrigid._types import AnyArray
+from jrigid.plot._common import Axes, flat_axes
+from jrigid.sweep import SweepResult
 
 # Pale tints of Okabe and Ito's colours, on which black reads.
 _TINTS = (
@@ -20,20 +22,58 @@ _TINTS = (
     "#FFFFFF",
     "#B8B8E0",
 )
-_SHOWN = 2, 98  # percentiles of the values between which the colours run
+_PERCENTILES = 2, 98  # of the values, between which the colours run
 _NARROW = 0.08  # of the shorter side of the map: regions without room for a name
 
 
+@runtime_checkable
+class _DataArray(Protocol):
+    """What is used of xarray's, which is an extra."""
+
+    dims: tuple[str, ...]
+    coords: Mapping[str, Any]
+    attrs: Mapping[str, Any]
+    values: np.ndarray
+
+    def __getitem__(self, name: str) -> Any:
+        """A coordinate."""
+        ...
+
+
+class _Map(NamedTuple):
+    """A quantity over two axes.
+
+    Attributes:
+        names: Of the axes, with units.
+        points: Of the axes.
+        values: Numbers, codes or texts (n, m).
+        kinds: Names of the codes, if they have any.
+    """
+
+    names: list[str]
+    points: list[Any]
+    values: np.ndarray
+    kinds: Sequence[str] | np.ndarray | None
+
+
+class _Region(NamedTuple):
+    """Where a map has one value, or is on one side of a level."""
+
+    name: str
+    mask: np.ndarray
+    tint: str
+
+
 def chart(
-    values: Any,
-    grid: Mapping[str, Any] | None = None,
+    values: object,
+    grid: Mapping[str, AnyArray] | None = None,
     *,
-    ax: Any = None,
+    ax: Axes | None = None,
     level: float | None = None,
     regions: Sequence[str] = (),
     title: str = "",
-) -> Any:
-    """A map over two parameters: regions with names and borders, or numbers by colour and a level.
+) -> Axes:
+    """Draw a map over two parameters: named regions, or numbers by colour with a level.
 
     Args:
         values: A `SweepResult` of one quantity (of several
@@ -46,8 +86,8 @@ def chart(
         level: Of numbers, where the border runs: 0 for a growth rate squared.
         regions: Names of what is below and above the level; of integers, booleans and
             codes, that of code 0, of code 1 and so on, be they on the map or not. A
-            code keeps its tint on every map; where codes exceed seven, and of texts,
-            tints go by the order of those there.
+            code has the same tint on every map. Where codes exceed seven, and for
+            texts, tints go by the order of those on the map.
         title: What the numbers are, with their unit.
 
     Returns:
@@ -62,124 +102,157 @@ def chart(
     >>> def kind(yaw, roll):
     ...     return jr.stability.satellite_stability(jnp.stack([yaw, roll, 1.0])).region
     >>> ratios = jnp.linspace(0.02, 1.2, 60)
-    >>> ax = jr.plot.chart(jr.stability.stability_map(kind, {"yaw": ratios, "roll": ratios}))
+    >>> grid = {"yaw": ratios, "roll": ratios}
+    >>> ax = jr.plot.chart(jr.stability.stability_map(kind, grid))
     >>> print([text.get_text() for text in ax.texts])
     ['unstable', 'Lagrange', 'undefined']
     """
-    from matplotlib import colors, patches
-    from scipy import ndimage
-
-    names, points, values, kinds = _parts(values, grid)
-    if numbers := values.dtype.kind == "f":
-        masks = [] if level is None else [values <= level, values > level]
-        wrong = "Argument `regions` must name what is below and above a `level`, but it does not."
-        demand(len(regions) in (0, len(masks)), wrong)
-        (low, high), cmap, tints = np.nanpercentile(values, _SHOWN), "cividis", _TINTS
-        borders = [(values, level)] * bool(min(map(np.any, masks), default=False))
+    values_on = _map_of(values, grid)
+    if values_on.values.dtype.kind == "f":
+        sides = _sides(values_on.values, level, regions)
+        ax = flat_axes(ax)
+        _draw_numbers(ax, values_on, title)
+        if min((np.any(x.mask) for x in sides), default=False):
+            _draw_border(ax, values_on, values_on.values, level)
+        _name(ax, values_on, sides, box_alpha=0.75)
+        title = ""  # it is that of the colour bar
     else:
-        demand(
-            level is None,
-            "Argument `level` must be left out for regions, but it is not.",
-        )
-        values, present, regions = _regions(values, kinds, regions)
-        low, high, cmap = -0.5, len(_TINTS) - 0.5, colors.ListedColormap(_TINTS)
-        masks, tints = [values == x for x in present], [_TINTS[x] for x in present]
-        borders = [(mask, 0.5) for mask in masks[:-1]]
-    ax = flat_axes(ax)
-    mesh = ax.pcolormesh(
-        *points, values.T, vmin=low, vmax=high, cmap=cmap, rasterized=True
-    )
-    if numbers:
-        ax.figure.colorbar(mesh, ax=ax, label=title, extend="both")
-    for field, border in borders:
-        ax.contour(*points, field.T, [border], colors="k", linewidths=1.0)
-    box = {
-        "facecolor": "w",
-        "alpha": 0.75 * numbers,
-        "lw": 0,
-        "boxstyle": "round,pad=0.2",
-    }
-    small: list[Any] = []
-    for mask, name, tint in zip(masks, regions, tints, strict=False):
-        room: Any = ndimage.distance_transform_edt(np.pad(mask, 1))
-        if np.max(room) > _NARROW * min(values.shape):
-            place = np.unravel_index(np.argmax(room), room.shape)
-            at = [x[k - 1] for x, k in zip(points, place, strict=True)]
-            ax.text(*at, name, ha="center", va="center", bbox=box)
-        elif not numbers:
-            small.append(patches.Patch(facecolor=tint, edgecolor="k", label=name))
-    if small:
-        ax.legend(
-            handles=small,
-            loc="lower right",
-            bbox_to_anchor=(1, 1),
-            ncols=4,
-            frameon=False,
-        )
-    ax.set(xlabel=names[0], ylabel=names[1])
-    ax.set_title("" if numbers else title, loc="left")
+        message = "Argument `level` must be left out for regions, but it is not."
+        demand(level is None, message)
+        codes, on_map = _regions(values_on, regions)
+        ax = flat_axes(ax)
+        _draw_codes(ax, values_on, codes)
+        for region in on_map[:-1]:
+            _draw_border(ax, values_on, region.mask, 0.5)
+        _list_beside(ax, _name(ax, values_on, on_map, box_alpha=0.0))
+    ax.set(xlabel=values_on.names[0], ylabel=values_on.names[1])
+    ax.set_title(title, loc="left")
     return ax
 
 
-def _regions(
-    values: Any, kinds: Any, regions: Sequence[str]
-) -> tuple[np.ndarray, Any, list[str]]:
-    """The number of the tint everywhere, the numbers that are there, and their names."""
+def _sides(
+    values: np.ndarray, level: float | None, names: Sequence[str]
+) -> list[_Region]:
+    """What is below and above a level, if there is one."""
+    masks = [] if level is None else [values <= level, values > level]
+    needed = "must name what is below and above a `level`"
+    message = f"Argument `regions` {needed}, but it does not."
+    demand(len(names) in (0, len(masks)), message)
+    names = names or [""] * len(masks)
+    pairs = zip(names, masks, strict=True)
+    return [_Region(name, mask, _TINTS[0]) for name, mask in pairs]
+
+
+def _draw_numbers(ax: Axes, drawn: _Map, title: str) -> None:
+    """Draw numbers by colour, with a colour bar."""
+    low, high = np.nanpercentile(drawn.values, _PERCENTILES)
+    colours: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": "cividis"}
+    mesh = ax.pcolormesh(*drawn.points, drawn.values.T, rasterized=True, **colours)
+    ax.figure.colorbar(mesh, ax=ax, label=title, extend="both")
+
+
+def _draw_codes(ax: Axes, drawn: _Map, codes: np.ndarray) -> None:
+    """Draw each code in its tint."""
+    from matplotlib.colors import ListedColormap
+
+    colours: dict[str, Any] = {"vmin": -0.5, "vmax": len(_TINTS) - 0.5}
+    colours["cmap"] = ListedColormap(_TINTS)
+    ax.pcolormesh(*drawn.points, codes.T, rasterized=True, **colours)
+
+
+def _draw_border(ax: Axes, drawn: _Map, field: np.ndarray, level: float | None) -> None:
+    """Draw where a field crosses a level."""
+    ax.contour(*drawn.points, field.T, [level], colors="k", linewidths=1.0)
+
+
+def _name(
+    ax: Axes, drawn: _Map, regions: list[_Region], box_alpha: float
+) -> list[_Region]:
+    """Write each region's name where it is widest; those without room are returned."""
+    from scipy import ndimage
+
+    box: dict[str, Any] = {"facecolor": "w", "alpha": box_alpha, "lw": 0}
+    box["boxstyle"] = "round,pad=0.2"
+    narrow = []
+    for region in regions:
+        # Padded, so that the edge of the map counts as a border.
+        room: Any = ndimage.distance_transform_edt(np.pad(region.mask, 1))
+        if np.max(room) > _NARROW * min(drawn.values.shape):
+            place = np.unravel_index(np.argmax(room), room.shape)
+            x, y = (x[k - 1] for x, k in zip(drawn.points, place, strict=True))
+            if region.name:
+                ax.text(x, y, region.name, ha="center", va="center", bbox=box)
+        else:
+            narrow.append(region)
+    return narrow
+
+
+def _list_beside(ax: Axes, regions: list[_Region]) -> None:
+    """List regions in a legend above the map."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(facecolor=x.tint, edgecolor="k", label=x.name) for x in regions]
+    if handles:
+        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1)}
+        ax.legend(handles=handles, ncols=4, frameon=False, **place)
+
+
+def _regions(drawn: _Map, names: Sequence[str]) -> tuple[np.ndarray, list[_Region]]:
+    """The number of the tint everywhere, and the regions that are on the map."""
+    values = drawn.values
+    kinds = names or drawn.kinds
     if values.dtype.kind not in "biu":
-        demand(
-            not regions, "Argument `regions` must be left out for texts, but it is not."
-        )
+        message = "Argument `regions` must be left out for texts, but it is not."
+        demand(not names, message)
         kinds, values = np.unique(values, return_inverse=True)
+        values = values.reshape(drawn.values.shape)
     present, ranks = np.unique(values.astype(int), return_inverse=True)
-    least, most, few = present[0], present[-1], present.size <= len(_TINTS)
-    demand(few, f"Argument `values` must be of few regions, but it has {present.size}.")
-    named = not regions or bool(0 <= least <= most < len(regions))
-    demand(
-        named, f"Argument `regions` must name the codes 0 to {most}, but it does not."
-    )
-    texts = regions or kinds
-    names = [str(x if texts is None else texts[x]) for x in present]
+    message = f"Argument `values` must be of few regions, but it has {present.size}."
+    demand(present.size <= len(_TINTS), message)
+    least = present[0]
+    most = present[-1]
+    are_named = not names or bool(0 <= least <= most < len(names))
+    message = f"Argument `regions` must name the codes 0 to {most}, but it does not."
+    demand(are_named, message)
+    texts = [str(x if kinds is None else kinds[x]) for x in present]
     if least < 0 or most >= len(_TINTS):  # more codes than tints
-        return ranks.reshape(values.shape), range(present.size), names
-    return values, present, names
+        values = ranks.reshape(values.shape)
+        present = np.arange(present.size)
+    tinted = zip(texts, present, strict=True)
+    return values, [_Region(text, values == x, _TINTS[x]) for text, x in tinted]
 
 
-def _parts(
-    values: Any, grid: Mapping[str, Any] | None
-) -> tuple[Any, Any, np.ndarray, Any]:
-    """Names of the axes with units, their points, numbers, codes or texts, names of the codes."""
-    axes, about, kinds = dict(grid or {}), {}, None
-    if hasattr(values, "axes"):  # a SweepResult
-        axes, about, values = values.axes, values.attributes, values.values
-    several = (
-        ", ".join(values) if hasattr(values, "keys") else ""
-    )  # also xarray's Dataset
-    demand(
-        not several,
-        f"Argument `values` must be one quantity, but it is several: {several}.",
-    )
-    if hasattr(values, "coords"):  # xarray's
-        axes, texts = (
-            {x: values[x].values for x in values.dims},
-            values.attrs.get("flag_meanings"),
-        )
-        about, kinds = {x: values[x].attrs for x in axes}, texts and texts.split()
+def _map_of(values: object, grid: Mapping[str, AnyArray] | None) -> _Map:
+    """The axes and values of a map, checked."""
+    axes: Mapping[str, Any] = grid or {}
+    about: Mapping[str, Mapping[str, str]] = {}
+    kinds = None
+    if isinstance(values, SweepResult):
+        axes = values.axes
+        about = values.attributes
+        values = values.values
+    # Also xarray's Dataset is a mapping.
+    several = ", ".join(values) if isinstance(values, Mapping) else ""
+    message = f"Argument `values` must be one quantity, but it is several: {several}."
+    demand(not several, message)
+    if isinstance(values, _DataArray):
+        axes = {x: values[x].values for x in values.dims}
+        about = {x: values[x].attrs for x in values.dims}
+        meanings = values.attrs.get("flag_meanings")
+        kinds = meanings.split() if meanings else None
         values = values.values
     if isinstance(values, EnumerationItem):
         kinds = enumeration_of(values).texts
         values = code_of(values)
-    values, shape = np.asarray(values), tuple(np.size(x) for x in axes.values())
-    kinds = ("False", "True") if values.dtype.kind == "b" else kinds
-    ok = (
-        len(grid or axes) == values.ndim == 2
-        and values.shape == shape
-        and min(shape) > 1
-    )
-    wanted = "Argument `values` must be over two axes with the points of `grid`, two at least"
-    demand(ok, f"{wanted}, but its shape is {values.shape} and that of `grid` {shape}.")
+    array = np.asarray(values)
+    kinds = ("False", "True") if array.dtype.kind == "b" else kinds
+    shape = tuple(np.size(x) for x in axes.values())
+    titles = grid or axes
+    is_map = len(titles) == array.ndim == 2 and array.shape == shape and min(shape) > 1
+    needed = "must be over two axes with the points of `grid`, two at least"
+    message = f"but its shape is {array.shape} and that of `grid` {shape}."
+    demand(is_map, f"Argument `values` {needed}, {message}")
     units = [about.get(x, {}).get("units") for x in axes]
-    names = [
-        f"{x} [{unit}]" if unit else x
-        for x, unit in zip(grid or axes, units, strict=True)
-    ]
-    return names, list(axes.values()), values, kinds
+    pairs = zip(titles, units, strict=True)
+    names = [f"{x} [{unit}]" if unit else x for x, unit in pairs]
+    return _Map(names, list(axes.values()), array, kinds)

@@ -1,30 +1,44 @@
-"""Poinsot's pictures: polhodes on the sphere or the ellipsoid, the herpolhode in its plane."""
+"""Poinsot's pictures: polhodes on the sphere or the ellipsoid, and the herpolhode."""
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from jrigid._checks import check_option, check_shape, demand
+from jrigid._types import AnyArray
 from jrigid.free import free_rotation, mean_precession_rate, polhode_period
 from jrigid.plot import _common as common
-from jrigid.plot._common import LOOKS, TURN, looks, on_surface, states_of
+from jrigid.plot._common import (
+    LOOKS,
+    TURN,
+    Axes,
+    Axes3D,
+    Body,
+    Look,
+    Motion,
+    Rotating,
+    looks,
+    on_surface,
+    states_of,
+)
+from jrigid.simulate import Trajectory
+from jrigid.systems import RigidBody
 
 _FAMILY = np.radians([20, 40, 60, 78])  # widths of the polhodes drawn of any body
-_EQUAL = (
-    1e-9  # relative difference of moments below which no polhode goes round their axes
-)
-_KEPT = 1e-3  # relative change of the momentum of a free motion
-_MOST, _TURNS, _PERIODS = (
-    4000,
-    20,
-    3,
-)  # points, precessions and polhodes of a herpolhode
+# Relative difference of moments below which no polhode goes round their axes.
+_EQUAL = 1e-9
+_CONSERVED = 1e-3  # relative change of the angular momentum of a free motion
+# Most points, precessions and polhode periods of a herpolhode.
+_POINTS = 4000
+_PRECESSIONS = 20
+_PERIODS = 3
 
 
 def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int]:
-    """L / |L| along a polhode with 2 E / |L|^2 given, and the number of the axis it is about.
+    """L / |L| along a polhode with 2 E / |L|^2 given, and the number of its axis.
 
     The sphere and the ellipsoid cut each other above an ellipse in the plane of the
     other axes.
@@ -32,45 +46,151 @@ def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int
     rates = 1 / moments
     spread = rates[0] - rates[2]
     about = 2 if level <= rates[1] and rates[1] - rates[2] > _EQUAL * spread else 0
-    other, over = 2 - about, level - rates[about]
+    other = 2 - about
     gaps = np.array([rates[other], rates[1]]) - rates[about]
-    wide, high = np.sqrt(np.clip(over / gaps, 0, 1))
+    wide, high = np.sqrt(np.clip((level - rates[about]) / gaps, 0, 1))
     curve = np.zeros((TURN.size, 3))
-    curve[:, other], curve[:, 1] = wide * np.cos(TURN), high * np.sin(TURN)
+    curve[:, other] = wide * np.cos(TURN)
+    curve[:, 1] = high * np.sin(TURN)
     curve[:, about] = side * np.sqrt(np.maximum(1 - np.sum(curve**2, axis=1), 0))
     return curve, about
 
 
-def _momentum(body: Any, motion: Any) -> tuple[np.ndarray, bool]:
-    """Angular momentum in the body, of parts within too, and whether these have any."""
-    states = None if np.ndim(motion) else states_of(motion)
-    omega = np.asarray(motion if states is None else states.omega, float)
-    check_shape("motions", omega, (3,), (None, 3))
-    demand(bool(np.any(omega)), "Arguments `motions` must turn, but one is at rest.")
-    system, own = getattr(motion, "system", body), omega @ common.tensor_of(body)
-    if states is None or not hasattr(system, "torque"):
-        return own, False
+class _Momentum(NamedTuple):
+    """Angular momentum in body axes, with that of parts within.
 
-    def of(t: Any, state: Any, args: Any) -> Any:
+    Attributes:
+        values: (3,) of a state, or (n, 3) along a path [kg m^2/s].
+        has_parts: Whether parts within the body have any.
+    """
+
+    values: np.ndarray
+    has_parts: bool
+
+    @classmethod
+    def of(cls, body: Body, motion: Any) -> "_Momentum":
+        """Of angular velocities, or of a motion."""
+        states = None if np.ndim(motion) else states_of(motion)
+        omega = np.asarray(motion if states is None else states.omega, float)
+        check_shape("motions", omega, (3,), (None, 3))
+        message = "Arguments `motions` must turn, but one is at rest."
+        demand(bool(np.any(omega)), message)
+        of_body = omega @ common.tensor_of(body)
+        system = motion.system if isinstance(motion, Trajectory) else body
+        if states is None or not isinstance(system, RigidBody):
+            return cls(of_body, False)
+        of_parts = _of_parts(system, motion, states)
+        return cls(of_body + of_parts, bool(np.any(of_parts)))
+
+
+def _of_parts(system: RigidBody, motion: Motion, states: Rotating) -> np.ndarray:
+    """Angular momentum of parts within the body, body axes."""
+    ts: AnyArray = np.zeros(states.omega.shape[:-1])
+    args = None
+    if isinstance(motion, Trajectory):
+        ts = motion.ts
+        args = motion.args
+
+    def momentum(t: Array, state: Any, args: Any) -> Array:
         return system.torque.internal_momentum(t, system.with_parts(state), args)
 
-    ts, args = (
-        getattr(motion, "ts", np.zeros(omega.shape[:-1])),
-        getattr(motion, "args", None),
-    )
-    inner = np.asarray(
-        (of if own.ndim == 1 else jax.vmap(of, (0, 0, None)))(ts, states, args)
-    )
-    return own + inner, bool(np.any(inner))
+    if states.omega.ndim == 1:
+        return np.asarray(momentum(ts, states, args))
+    return np.asarray(jax.vmap(momentum, (0, 0, None))(ts, states, args))
 
 
-def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -> Any:
-    """Paths of the angular momentum in the body, with the separatrix.
+class _Surface(NamedTuple):
+    """The sphere or ellipsoid on which polhodes are drawn.
 
-    On the sphere L / |L|, or on the ellipsoid of energy L / sqrt(2 E I3). With no
-    motion given, polhodes of all kinds of a free rigid body with this inertia. Where
-    parts within the body have momentum (a rotor), L has it, only motions of `simulate`
-    have paths, on the sphere, and the polhodes of the rigid body are left out.
+    Attributes:
+        ax: Axes of three dimensions.
+        moments: Principal moments, ascending.
+        axes: Principal axes in columns.
+        semi_axes: Of the surface, along the principal axes.
+    """
+
+    ax: Axes3D
+    moments: np.ndarray
+    axes: np.ndarray
+    semi_axes: np.ndarray
+
+    @property
+    def rates(self) -> np.ndarray:
+        """1 / I, which is 2 E / |L|^2 of spin about each principal axis."""
+        return 1 / self.moments
+
+    @property
+    def has_polhodes(self) -> bool:
+        """Whether angular momenta move: not in a body of equal moments."""
+        return bool(self.rates[0] - self.rates[2] > _EQUAL * self.rates[0])
+
+    def draw(self, unit: np.ndarray, **style: Any) -> None:
+        """Draw L / |L| in principal axes; the ellipsoid's point is on the same ray."""
+        length = np.linalg.norm(unit / self.semi_axes, axis=1, keepdims=True)
+        points = unit / length
+        normals = points / self.semi_axes**2
+        on_surface(self.ax, points @ self.axes.T, normals @ self.axes.T, **style)
+
+    def draw_family(self, about: int, side: int, is_faint: bool) -> None:
+        """Draw polhodes about one end of a principal axis, and the separatrix."""
+        style: dict[str, Any] = {
+            "color": LOOKS[about // 2][0],
+            "ls": "--" if about else "-",
+            "lw": 1.1,
+            "label": f"about axis {about + 1}",
+        }
+        if is_faint:
+            style |= {"color": "0.6", "lw": 0.7, "label": None}
+        rates = self.rates
+        gap = rates[1] - rates[about]
+        if abs(gap) > _EQUAL * rates[0]:
+            for width in _FAMILY:
+                level = rates[about] + gap * np.sin(width) ** 2
+                self.draw(_cone(self.moments, level, side)[0], **style)
+        if about and min(rates[0] - rates[1], gap) > _EQUAL * rates[0]:
+            curve, _ = _cone(self.moments, rates[1], side)
+            self.draw(curve, color="k", lw=1.6, label="separatrix")
+
+    def draw_motion(
+        self, momentum: np.ndarray, look: Look, name: str, is_free: bool
+    ) -> None:
+        """Draw where a motion starts, and its path or its polhode."""
+        colour, marker = look
+        sizes = np.linalg.norm(momentum, axis=-1, keepdims=True)
+        path = np.atleast_2d(momentum / np.where(sizes > 0, sizes, np.nan)) @ self.axes
+        start = path[np.isfinite(path[:, 0])][:1]
+        self.draw(start, color=colour, marker=marker, ls="none", label=name)
+        if momentum.ndim == 1 and is_free:
+            level = np.sum(path**2 * self.rates)
+            curve, about = _cone(self.moments, level, 1)
+            curve[:, about] *= np.sign(path[0, about])
+            path = curve
+        self.draw(path, color=colour, lw=1.8 if momentum.ndim == 1 else 0.9)
+
+    def draw_axes(self) -> None:
+        """Draw ends of the principal axes, with numbers where they face the eye."""
+        place: dict[str, Any] = {"ha": "center", "va": "center", "zorder": common.FRONT}
+        for name, axis in zip("123", (self.axes * self.semi_axes).T, strict=True):
+            for end in (axis, -axis):
+                line = end * [[1.0], [1.15]]
+                on_surface(self.ax, line, np.stack([end, end]), color="k", lw=1)
+                if end @ common.eye(self.ax) >= 0:
+                    self.ax.text(*(1.22 * end), name, **place)
+
+
+def polhode(
+    body: Body,
+    *motions: Motion,
+    ax: Axes3D | None = None,
+    surface: str = "sphere",
+) -> Axes3D:
+    """Draw paths of the angular momentum in the body, with the separatrix.
+
+    The paths are L / |L| on the sphere, or L / sqrt(2 E I3) on the ellipsoid of energy.
+    With no motion given, they are polhodes of all kinds of a free rigid body with this
+    inertia. Where parts within the body have momentum (a rotor), L includes it. Then
+    only motions of `simulate` have paths, on the sphere, and the polhodes of the rigid
+    body are left out.
 
     Args:
         body: Whatever has an inertia, or moments or a tensor [kg m^2].
@@ -93,82 +213,44 @@ def polhode(body: Any, *motions: Any, ax: Any = None, surface: str = "sphere") -
     Angular momentum in the body, L/|L|
     """
     check_option("surface", surface, ("sphere", "ellipsoid"))
-    (moments, axes), momenta = (
-        common.principal(body),
-        [_momentum(body, x) for x in motions],
+    moments, axes = common.principal(body)
+    momenta = [_Momentum.of(body, x) for x in motions]
+    has_parts = any(x.has_parts for x in momenta)
+    is_sphere = has_parts or surface == "sphere"
+    semi_axes = np.ones(3) if is_sphere else np.sqrt(moments / moments[2])
+    space = common.space_axes(ax, 1.15)
+    common.globe(space, semi_axes, axes)
+    drawn_on = _Surface(space, moments, axes, semi_axes)
+    is_free = drawn_on.has_polhodes and not has_parts
+    if is_free:
+        for about, side in product((0, 2), (1, -1)):
+            drawn_on.draw_family(about, side, is_faint=bool(motions))
+    for look, (i, momentum) in looks(enumerate(momenta)):
+        drawn_on.draw_motion(momentum.values, look, f"motion {i + 1}", is_free)
+    drawn_on.draw_axes()
+    scale = "|L|" if is_sphere else "$\\sqrt{2 E I_3}$"
+    space.set_title(f"Angular momentum in the body, L/{scale}")
+    space.legend(
+        *space.get_legend_handles_labels(),
+        loc="lower center",
+        frameon=False,
+        title="I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments),
+        ncols=4,
     )
-    inner = any(x for _, x in momenta)
-    surface = "sphere" if inner else surface
-    semi_axes = np.ones(3) if surface == "sphere" else np.sqrt(moments / moments[2])
-    ax, rates = common.space_axes(ax, 1.15), 1 / moments
-    common.globe(ax, semi_axes, axes)
-
-    def draw(unit: np.ndarray, **style: Any) -> None:
-        """Of L / |L| in principal axes; the ellipsoid's point is on the same ray."""
-        points = unit / np.linalg.norm(unit / semi_axes, axis=1, keepdims=True)
-        on_surface(ax, points @ axes.T, points / semi_axes**2 @ axes.T, **style)
-
-    parted = rates[0] - rates[2] > _EQUAL * rates[0]  # else momenta stay where they are
-    for about, side in product((0, 2), (1, -1)) if parted and not inner else ():
-        style = {"color": LOOKS[about // 2][0], "ls": "--" if about else "-", "lw": 1.1}
-        style |= (
-            {"color": "0.6", "lw": 0.7}
-            if motions
-            else {"label": f"about axis {about + 1}"}
-        )
-        gap = rates[1] - rates[about]
-        for width in _FAMILY if abs(gap) > _EQUAL * rates[0] else ():
-            draw(
-                _cone(moments, rates[about] + gap * np.sin(width) ** 2, side)[0],
-                **style,
-            )
-        if about and min(rates[0] - rates[1], gap) > _EQUAL * rates[0]:
-            draw(
-                _cone(moments, rates[1], side)[0], color="k", lw=1.6, label="separatrix"
-            )
-    for (colour, marker), (i, (momentum, _)) in looks(enumerate(momenta)):
-        sizes = np.linalg.norm(momentum, axis=-1, keepdims=True)
-        path = np.atleast_2d(momentum / np.where(sizes > 0, sizes, np.nan)) @ axes
-        style = {
-            "color": colour,
-            "marker": marker,
-            "ls": "none",
-            "label": f"motion {i + 1}",
-        }
-        draw(path[np.isfinite(path[:, 0])][:1], **style)
-        if momentum.ndim == 1 and parted and not inner:
-            curve, about = _cone(moments, np.sum(path**2 * rates), 1)
-            curve[:, about] *= np.sign(path[0, about])
-            path = curve
-        draw(path, color=colour, lw=1.8 if momentum.ndim == 1 else 0.9)
-    for name, axis in zip("123", (axes * semi_axes).T, strict=True):
-        for end in (axis, -axis):
-            on_surface(ax, end * [[1.0], [1.15]], np.stack([end, end]), color="k", lw=1)
-            if end @ common.eye(ax) >= 0:
-                ax.text(
-                    *(1.22 * end), name, ha="center", va="center", zorder=common.FRONT
-                )
-    scale = "|L|" if surface == "sphere" else "$\\sqrt{2 E I_3}$"
-    ax.set_title(f"Angular momentum in the body, L/{scale}")
-    style = {
-        "title": "I = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(*moments),
-        "ncols": 4,
-    }
-    ax.legend(
-        *ax.get_legend_handles_labels(), loc="lower center", frameon=False, **style
-    )
-    return ax
+    return space
 
 
-def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any:
-    """The angular velocity in space, in the invariable plane, between the bounds it touches.
+def herpolhode(
+    body: Body, motion: Motion, *, ax: Axes | None = None, ts: AnyArray | None = None
+) -> Axes:
+    """Draw the angular velocity in the invariable plane, between the bounds it touches.
 
     Args:
         body: Whatever has an inertia, or moments or a tensor [kg m^2].
         motion: A state, or what `free_rotation` returned, or `simulate` of a free body.
         ax: Axes.
         ts: Times since the state [s]; by default three polhode periods, or twenty turns
-            about the momentum if that is less.
+            about the angular momentum if that is less.
 
     Returns:
         The axes: components at right angles to the momentum [rad/s], the first along
@@ -185,46 +267,22 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
     >>> print(ax.get_xlabel())
     angular velocity across the momentum [rad/s]
     """
-    state, inertia = states_of(motion), common.tensor_of(body)
+    inertia = common.tensor_of(body)
     start = common.start_of(motion)
     omega = np.asarray(start.omega, float)
     demand(bool(np.any(omega)), "Argument `motion` must turn, but it is at rest.")
-    if state.omega.ndim == 1:
-        turn = 2 * np.pi / float(mean_precession_rate(inertia, omega))
-        most = min(_PERIODS * float(polhode_period(inertia, omega)), _TURNS * turn)
-        ts = np.linspace(0, most, _MOST) if ts is None else ts
-        state = free_rotation(inertia, start, ts).states
-    vectors = np.stack(
-        [np.asarray(state.omega), np.asarray(state.omega) @ inertia], axis=-2
-    )
-    curve, momenta = np.moveaxis(common.turned(state.attitude, vectors), -2, 0)
-    seen = np.isfinite(np.sum(curve, axis=1))
-    curve, momenta, momentum = curve[seen], momenta[seen], momenta[seen][0]
-    size, changes = np.linalg.norm(momentum), np.linalg.norm(momenta - momentum, axis=1)
-    free = bool(np.max(changes) < _KEPT * size)
-    demand(
-        free,
-        "Argument `motion` must be free and keep I omega in space, but it does not.",
-    )
-    up, across = momentum / size, np.cross(momentum / size, curve[0])
-    if np.linalg.norm(across) < _EQUAL * np.linalg.norm(
-        omega
-    ):  # a pure spin: any will do
-        across = np.cross(up, np.roll(up, 1) + np.eye(3)[0])
-    across /= np.linalg.norm(across)
-    (moments, axes), ax = common.principal(body), common.flat_axes(ax)
-    unit = omega @ inertia @ axes / size
-    around = (
-        _cone(moments, np.sum(unit**2 / moments), 1)[0]
-        if np.ptp(moments)
-        else unit[None]
-    )
-    radii = size * np.linalg.norm(np.cross(around, around / moments), axis=1)
-    bounds = np.array([np.min(radii), np.max(radii)])
-    bounds[bounds < _EQUAL * np.linalg.norm(omega)] = 0.0
+    states = states_of(motion)
+    if states.omega.ndim == 1:
+        times = _times_of_herpolhode(inertia, omega) if ts is None else ts
+        states = free_rotation(inertia, start, times).states
+    curve, momentum = _in_space(states, inertia)
+    up = momentum / np.linalg.norm(momentum)
+    across = _across(up, curve[0], omega)
+    plane = curve @ np.stack([np.cross(across, up), across], axis=1)
+    bounds = _bounds_of_herpolhode(inertia, omega, float(np.linalg.norm(momentum)))
+    ax = common.flat_axes(ax)
     for radius, style in zip(bounds, (":", "--"), strict=True):
         ax.plot(radius * np.cos(TURN), radius * np.sin(TURN), style, color="0.4", lw=1)
-    plane = curve @ np.stack([np.cross(across, up), across], axis=1)
     ax.plot(*plane.T, color=LOOKS[0][0], lw=0.9)
     ax.plot(*plane[0], LOOKS[1][1], color=LOOKS[1][0])
     ax.plot(0, 0, "+", color="k", ms=9)
@@ -235,3 +293,49 @@ def herpolhode(body: Any, motion: Any, *, ax: Any = None, ts: Any = None) -> Any
     common.label(ax, title, *names)
     ax.locator_params(nbins=6)
     return ax
+
+
+def _times_of_herpolhode(inertia: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Times in which the curve shows its shape [s]."""
+    turn = 2 * np.pi / float(mean_precession_rate(inertia, omega))
+    periods = _PERIODS * float(polhode_period(inertia, omega))
+    return np.linspace(0, min(periods, _PRECESSIONS * turn), _POINTS)
+
+
+def _in_space(states: Rotating, inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angular velocities in space, and the angular momentum that must stay the same."""
+    omegas = np.asarray(states.omega)
+    vectors = np.stack([omegas, omegas @ inertia], axis=-2)
+    curve, momenta = np.moveaxis(common.turned(states.attitude, vectors), -2, 0)
+    finite = np.isfinite(np.sum(curve, axis=1))
+    curve = curve[finite]
+    momenta = momenta[finite]
+    changes = np.linalg.norm(momenta - momenta[0], axis=1)
+    is_free = bool(np.max(changes) < _CONSERVED * np.linalg.norm(momenta[0]))
+    message = "must be free and keep I omega in space, but it does not."
+    demand(is_free, f"Argument `motion` {message}")
+    return curve, momenta[0]
+
+
+def _across(up: np.ndarray, first: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """A unit vector at right angles to the angular momentum and the first point."""
+    across = np.cross(up, first)
+    # A pure spin is along the angular momentum: any vector across it will do.
+    if np.linalg.norm(across) < _EQUAL * np.linalg.norm(omega):
+        across = np.cross(up, np.roll(up, 1) + np.eye(3)[0])
+    return across / np.linalg.norm(across)
+
+
+def _bounds_of_herpolhode(
+    inertia: np.ndarray, omega: np.ndarray, size: float
+) -> np.ndarray:
+    """Least and largest distance from the angular momentum, whose size is given."""
+    moments, axes = common.principal(inertia)
+    unit = omega @ inertia @ axes / size
+    polhode = unit[None]
+    if np.ptp(moments):
+        polhode, _ = _cone(moments, np.sum(unit**2 / moments), 1)
+    radii = size * np.linalg.norm(np.cross(polhode, polhode / moments), axis=1)
+    bounds = np.array([np.min(radii), np.max(radii)])
+    bounds[bounds < _EQUAL * np.linalg.norm(omega)] = 0.0
+    return bounds

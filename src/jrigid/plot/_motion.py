@@ -1,29 +1,41 @@
 """A trajectory, and how well it keeps what it should."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
-from jrigid._checks import demand
-from jrigid._types import VectorLike
-from jrigid.plot._common import label, looks, pyplot, states_of, times_of
+from jrigid._motion import HasRigidBody
+from jrigid._types import AnyArray, VectorLike
+from jrigid.plot._common import (
+    Axes,
+    Motion,
+    label,
+    looks,
+    pyplot,
+    states_of,
+    times_of,
+)
+from jrigid.simulate import Trajectory
+from jrigid.systems import AbstractSystem
 
 
 def motion(
-    motion: Any,
-    axes: Mapping[str, Any] | None = None,
+    motion: Motion,
+    axes: Mapping[str, Axes] | None = None,
     *,
-    system: Any = None,
-    ts: Any = None,
+    system: AbstractSystem | HasRigidBody | None = None,
+    ts: AnyArray | None = None,
     along: VectorLike | None = None,
-) -> dict[str, Any]:
-    """The angular velocity of a motion, and the drift of its energy and angular momentum.
+) -> dict[str, Axes]:
+    """Draw the angular velocity of a motion, and the drift of what it may conserve.
 
-    "omega": body components. "drift": changes since the first finite state, relative to
-    the largest value on the way: rounding and the errors of the integration where they
-    are conserved, the work of the torques where they are not.
+    "omega" shows body components. "drift" shows changes of energy and angular momentum
+    since the first finite state, relative to the largest value on the way. Where they
+    are conserved these are rounding and the errors of the integration; elsewhere they
+    are the work of the torques.
 
     Args:
         motion: What `simulate` returned; or `free_rotation` or `top_motion`, with
@@ -32,8 +44,8 @@ def motion(
             figure.
         system: The `RigidBody` or `SymmetricTop`; of a trajectory its own.
         ts: The times [s]; of a trajectory its own.
-        along: Direction in space along which the momentum is compared, (0, 0, 1) for
-            that about the vertical; None: the vector.
+        along: Direction in space along which the angular momentum is compared, (0, 0,
+            1) for that about the vertical; None: the vector.
 
     Returns:
         The axes by their names.
@@ -49,40 +61,72 @@ def motion(
     >>> print(axes["drift"].get_ylabel())
     relative change
     """
-    system = getattr(motion, "system", None) if system is None else system
-    demand(
-        system is not None,
-        "Argument `system` must be given for this motion, but it is not.",
-    )
-    system = system.as_rigid_body() if hasattr(system, "as_rigid_body") else system
-    ts, states = times_of(motion, ts), states_of(motion)
+    body = _system_of(motion, system)
+    times = times_of(motion, ts)
+    omegas = np.asarray(states_of(motion).omega)
     if axes is None:
         figure: Any = pyplot().figure(figsize=(8, 6), layout="constrained")
         axes = dict(figure.subplot_mosaic([["omega"], ["drift"]], sharex=True))
     if "omega" in axes:
-        columns = zip("xyz", ("-", "--", "-."), np.asarray(states.omega).T, strict=True)
-        for (colour, _), (name, style, column) in looks(columns):
-            axes["omega"].plot(ts, column, style, color=colour, lw=1.2, label=name)
-        label(axes["omega"], "Angular velocity", "time [s]", "in the body [rad/s]")
+        _draw_rates(axes["omega"], times, omegas)
     if "drift" in axes:
-        args, times = (
-            getattr(motion, "args", None),
-            jax.numpy.asarray(ts, states.omega.dtype),
-        )
-        kept = {"energy": system.energy, "angular momentum": system.angular_momentum}
-        for (colour, marker), (name, of) in looks(kept.items()):
-            each = jax.vmap(lambda t, state, of=of: of(t, state, args))
-            values = np.asarray(each(times, states)).reshape(ts.size, -1)
-            if along is not None and values.shape[1] > 1:
-                values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
-            first = values[np.argmax(np.all(np.isfinite(values), axis=1))]
-            sizes, changes = (
-                np.linalg.norm(x, axis=1) for x in (values, values - first)
-            )
-            changes = np.where(changes > 0, changes, np.nan) / (np.nanmax(sizes) or 1.0)
-            axes["drift"].plot(ts, changes, marker, color=colour, ms=3, label=name)
-        eps = np.finfo(times.dtype).eps
-        axes["drift"].axhline(eps, color="0.5", lw=1, ls=":", label="rounding")
-        axes["drift"].set_yscale("log")
-        label(axes["drift"], "Drift", "time [s]", "relative change")
+        _draw_drift(axes["drift"], body, motion, times, along)
     return dict(axes)
+
+
+def _system_of(
+    motion: Motion, system: AbstractSystem | HasRigidBody | None
+) -> AbstractSystem:
+    """The system given, or that of a trajectory."""
+    if system is None and isinstance(motion, Trajectory):
+        system = motion.system
+    if system is None:
+        raise ValueError(
+            "Argument `system` must be given for this motion, but it is not."
+        )
+    return system.as_rigid_body() if isinstance(system, HasRigidBody) else system
+
+
+def _draw_rates(ax: Axes, times: np.ndarray, omegas: np.ndarray) -> None:
+    """Draw the angular velocity in the body."""
+    columns = zip("xyz", ("-", "--", "-."), omegas.T, strict=True)
+    for (colour, _), (name, style, column) in looks(columns):
+        ax.plot(times, column, style, color=colour, lw=1.2, label=name)
+    label(ax, "Angular velocity", "time [s]", "in the body [rad/s]")
+
+
+def _draw_drift(
+    ax: Axes,
+    system: AbstractSystem,
+    motion: Motion,
+    ts: np.ndarray,
+    along: VectorLike | None,
+) -> None:
+    """Draw the relative changes of energy and angular momentum."""
+    states = states_of(motion)
+    times = jax.numpy.asarray(ts, states.omega.dtype)
+    args = motion.args if isinstance(motion, Trajectory) else None
+    quantities: dict[str, Callable[..., Array]] = {
+        "energy": system.energy,
+        "angular momentum": system.angular_momentum,
+    }
+    for (colour, marker), (name, quantity) in looks(quantities.items()):
+        each = jax.vmap(quantity, in_axes=(0, 0, None))
+        values = np.asarray(each(times, states, args)).reshape(ts.size, -1)
+        if along is not None and values.shape[1] > 1:
+            values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
+        changes = _relative_changes(values)
+        ax.plot(ts, changes, marker, color=colour, ms=3, label=name)
+    eps = np.finfo(times.dtype).eps
+    ax.axhline(eps, color="0.5", lw=1, ls=":", label="rounding")
+    ax.set_yscale("log")
+    label(ax, "Drift", "time [s]", "relative change")
+
+
+def _relative_changes(values: np.ndarray) -> np.ndarray:
+    """Changes since the first finite row over the largest; NaN where there is none."""
+    first = values[np.argmax(np.all(np.isfinite(values), axis=1))]
+    sizes = np.linalg.norm(values, axis=1)
+    changes = np.linalg.norm(values - first, axis=1)
+    # A logarithmic axis cannot show zero.
+    return np.where(changes > 0, changes, np.nan) / (np.nanmax(sizes) or 1.0)

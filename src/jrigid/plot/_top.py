@@ -1,10 +1,9 @@
-"""Pictures of a heavy top: the path of its tip, and the well in which its axis nods."""
-
-from typing import Any
+"""Pictures of a heavy top: the path of its tip, and its effective potential."""
 
 import numpy as np
 
 from jrigid.plot import _common as common
+from jrigid.plot._common import Axes, Axes3D, Look, Motion
 from jrigid.top import SymmetricTop, conserved, nutation_bounds
 from jrigid.top import effective_potential as potential
 
@@ -13,24 +12,27 @@ _ELEVATION = 25, 55  # of the eye, least and most [degrees]
 _BAND = 12  # lines across the band of nutation
 
 
-def _bounds(top: SymmetricTop, *motions: Any) -> np.ndarray:
+def _bounds(top: SymmetricTop, *motions: Motion) -> np.ndarray:
     """The least and the largest tilt of each motion (n, 2) [rad]."""
     return np.array([nutation_bounds(top, common.start_of(x)) for x in motions], float)
 
 
 def _words(band: np.ndarray) -> str:
+    """Tilts in degrees, one of a steady precession."""
     return " to ".join(dict.fromkeys(f"{x:.1f}°" for x in np.degrees(band)))
 
 
-def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
-    """Paths of the top's axis on the unit sphere, each with the two circles that it touches.
+def tip(
+    top: SymmetricTop, motion: Motion, *more: Motion, ax: Axes3D | None = None
+) -> Axes3D:
+    """Draw paths of the top's axis on the unit sphere, with the circles they touch.
 
-    Of several each is named by its tilts.
+    Of several motions each is named by its tilts.
 
     Args:
         top: The top.
         motion: What `top_motion` or `simulate` returned.
-        more: Others.
+        more: Further motions.
         ax: Axes of three dimensions.
 
     Returns:
@@ -47,53 +49,65 @@ def tip(top: SymmetricTop, motion: Any, *more: Any, ax: Any = None) -> Any:
     >>> print(jr.plot.tip(top, motion).get_title())
     Tip of the top, tilts 28.6° to 43.4°
     """
-    motions, bounds = (motion, *more), _bounds(top, motion, *more)
-    up = 90 - np.degrees(np.mean(bounds))  # look at the band from the side of its pole
-    ax = common.space_axes(ax, 1.1, np.copysign(np.clip(abs(up), *_ELEVATION), up))
-    common.globe(ax, np.ones(3), np.eye(3))
+    bounds = _bounds(top, motion, *more)
+    # Look at the band from the side of its pole.
+    up = 90 - np.degrees(np.mean(bounds))
+    elevation = np.copysign(np.clip(abs(up), *_ELEVATION), up)
+    space = common.space_axes(ax, 1.1, elevation)
+    common.globe(space, np.ones(3), np.eye(3))
     vertical = np.array([[0, 0, 1.0], [0, 0, 1.2]])
-    common.on_surface(ax, vertical, vertical, color="k", lw=1)
-    ax.text(0, 0, 1.25, "up", ha="center", zorder=common.FRONT)
-    for (colour, marker), (motion, band) in common.looks(
-        zip(motions, bounds, strict=True)
-    ):
-        for circle in common.circles(band):
-            common.on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
-        x, y, z = np.moveaxis(
-            common.circles(np.linspace(band[0], band[1], _BAND)), -1, 0
-        )
-        ax.plot_surface(x, y, z, color=colour, alpha=0.15, lw=0, rasterized=True)
-        attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
-        path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
-        common.on_surface(ax, path, path, color=colour, lw=1.5)
-        ax.lines[-2].set_label(
-            _words(band)
-        )  # the part in front, also of tilts that are there
-        start = path[np.isfinite(path[:, 0])][:1]
-        common.on_surface(ax, start, start, color=colour, marker=marker, ls="none")
+    common.on_surface(space, vertical, vertical, color="k", lw=1)
+    space.text(0, 0, 1.25, "up", ha="center", zorder=common.FRONT)
+    pairs = zip((motion, *more), bounds, strict=True)
+    for look, (one, band) in common.looks(pairs):
+        _draw_band(space, band, look)
+        _draw_path(space, one, _words(band), look)
+    title = "Tip of the top"
     if more:
-        ax.legend(
+        space.legend(
             loc="lower center",
             ncols=4,
             frameon=False,
             handlelength=1.0,
             columnspacing=1.0,
         )
-    ax.set_title(
-        "Tip of the top" if more else f"Tip of the top, tilts {_words(bounds[0])}"
-    )
-    return ax
+    else:
+        title = f"{title}, tilts {_words(bounds[0])}"
+    space.set_title(title)
+    return space
+
+
+def _draw_band(ax: Axes3D, band: np.ndarray, look: Look) -> None:
+    """Draw the circles that a path touches and the band between them."""
+    for circle in common.circles(band):
+        common.on_surface(ax, circle, circle, color="0.4", ls="--", lw=0.9)
+    points = common.circles(np.linspace(band[0], band[1], _BAND))
+    x, y, z = np.moveaxis(points, -1, 0)
+    ax.plot_surface(x, y, z, color=look[0], alpha=0.15, lw=0, rasterized=True)
+
+
+def _draw_path(ax: Axes3D, motion: Motion, name: str, look: Look) -> None:
+    """Draw the path of the tip and where it starts."""
+    colour, marker = look
+    attitudes = np.asarray(common.states_of(motion).attitude).reshape(-1, 4)
+    path = common.turned(attitudes, np.eye(3)[2:])[:, 0]
+    common.on_surface(ax, path, path, color=colour, lw=1.5)
+    # The last but one line is the part in front. It gets a label also where another
+    # path has the same one.
+    ax.lines[-2].set_label(name)
+    start = path[np.isfinite(path[:, 0])][:1]
+    common.on_surface(ax, start, start, color=colour, marker=marker, ls="none")
 
 
 def effective_potential(
-    top: SymmetricTop, motion: Any, *more: Any, ax: Any = None
-) -> Any:
-    """The well in which the axis nods, and the energy's level between the turning points.
+    top: SymmetricTop, motion: Motion, *more: Motion, ax: Axes | None = None
+) -> Axes:
+    """Draw the effective potential, and the energy between the turning points.
 
     Args:
         top: The top.
         motion: A state, or what `top_motion` or `simulate` returned.
-        more: Others.
+        more: Further motions.
         ax: Axes.
 
     Returns:
@@ -104,20 +118,21 @@ def effective_potential(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
-    >>> ax = jr.plot.effective_potential(top, jr.top.initial_state(top, 0.5, omega3=5.0))
+    >>> state = jr.top.initial_state(top, 0.5, omega3=5.0)
+    >>> ax = jr.plot.effective_potential(top, state)
     >>> print(ax.get_xlabel(), ax.get_ylabel())
     tilt [degrees] energy of the tilt [J]
     """
-    bounds, starts = _bounds(top, motion, *more), map(common.start_of, (motion, *more))
+    bounds = _bounds(top, motion, *more)
+    starts = map(common.start_of, (motion, *more))
     ax = common.flat_axes(ax)
     margin = max(0.6 * np.ptp(bounds), _LEAST)
-    ends = np.clip(
-        [np.min(bounds) - margin, np.max(bounds) + margin], 1e-3, np.pi - 1e-3
-    )
-    tilts, heights = np.linspace(ends[0], ends[1], 400), []
-    for (colour, marker), (state, band) in common.looks(
-        zip(starts, bounds, strict=True)
-    ):
+    ends = [np.min(bounds) - margin, np.max(bounds) + margin]
+    ends = np.clip(ends, 1e-3, np.pi - 1e-3)
+    tilts = np.linspace(ends[0], ends[1], 400)
+    heights = []
+    pairs = zip(starts, bounds, strict=True)
+    for (colour, marker), (state, band) in common.looks(pairs):
         p_phi, p_psi, energy = conserved(top, state)
         well = np.asarray(potential(top, tilts, p_phi, p_psi))
         level = float(energy - p_psi**2 / (2 * top.I3))

@@ -1,4 +1,7 @@
-"""Records of sensors: files read, units and clocks put right and said, flights and noise found."""
+"""Records of sensors: files with their units and clocks, flights, and noise.
+
+What is recognised, converted or repaired is said in the notes of a `Reading`.
+"""
 
 from jrigid.records._clock import Clock as Clock
 from jrigid.records._clock import repair as repair

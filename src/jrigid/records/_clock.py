@@ -9,9 +9,8 @@ from jrigid._checks import check_option, check_shape
 
 # Intervals that a row may come too late; a clock that goes back further was reset
 _LATE = 20
-_COUNTERS = 2.0**32 * np.array(
-    [1e-6, 1e-3]
-)  # when micro- and milliseconds in 32 bits wrap [s]
+# When micro- and milliseconds in 32 bits wrap [s]
+_COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])
 _DIGITS = 10.0 ** -np.arange(5)  # [s] decimal digits that times may end with
 _ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
 _COARSE = 0.02  # of the interval: a coarser digit is worth a repair
@@ -76,47 +75,81 @@ def repair(
     """
     check_option("clock", clock, (None, "recorded", "uniform"))
     check_shape("times", np.asarray(times), (None,))
-    notes: list[str] = []
-    t, rows = np.array(times, float), np.arange(len(times))
-
-    def keep(good: np.ndarray, others: str) -> None:
-        nonlocal t, rows
-        _say(notes, int(np.sum(~good)), f"{others} dropped")
-        t, rows = t[good], rows[good]
-
-    keep(np.isfinite(t), "without a time")
-    steps = np.diff(t)
+    kept = _Rows(times)
+    kept.keep(np.isfinite(kept.times), "without a time")
+    steps = np.diff(kept.times)
     if not (steps > 0).any():
-        return Clock(t[:1], rows[:1], (), (*notes, "all rows are of one time"))
+        notes = (*kept.notes, "all rows are of one time")
+        return Clock(kept.times[:1], kept.rows[:1], (), notes)
     interval = float(np.median(steps[steps > 0]))
-    resets = _resets(t, interval, notes)
-    _say(notes, int(np.sum(np.diff(t) < 0)), "out of order sorted in")
-    order = np.argsort(t, kind="stable")
-    t, rows = t[order], rows[order]
+    resets = _resets(kept.times, interval, kept.notes)
+    kept.sort()
     if values is not None:
-        same = np.diff(values[rows], axis=0, prepend=np.nan) == 0
-        keep(~same.all(axis=1) | (np.diff(t, prepend=np.nan) != 0), "written twice")
-    new = np.diff(t, prepend=np.nan) != 0
-    if clock == "recorded" or np.mean(~new) <= _SEVERAL:
-        keep(new, _REPEATED)
-    steps = np.diff(t)
-    gaps = np.flatnonzero(steps > gap * interval) + 1
-    if gaps.size:
-        longest = gaps[np.argmax(steps[gaps - 1])]
-        many = f"{gaps.size} gaps, the longest" if gaps.size > 1 else "1 gap,"
-        notes.append(
-            f"{many} of {steps[longest - 1]:.3g} s after {t[longest - 1]:.6g} s"
-        )
-    breaks = np.union1d(gaps, np.searchsorted(t, resets))
+        kept.drop_copies(values)
+    is_new = np.diff(kept.times, prepend=np.nan) != 0
+    # Many equal times are those of a coarse clock, which is put on a line below.
+    if clock == "recorded" or np.mean(~is_new) <= _SEVERAL:
+        kept.keep(is_new, _REPEATED)
+    gaps = _gaps(kept.times, gap * interval, kept.notes)
+    breaks = np.union1d(gaps, np.searchsorted(kept.times, resets))
     if clock != "recorded":
-        t = _evened(t, breaks, clock == "uniform", notes)
-    new = ~(np.diff(t, prepend=np.nan) <= 0)
-    breaks = np.cumsum(new)[breaks] - 1
-    keep(new, _REPEATED)
-    return Clock(t, rows, tuple(breaks.tolist()), tuple(notes))
+        kept.times = _evened(kept.times, breaks, clock == "uniform", kept.notes)
+    is_new = ~(np.diff(kept.times, prepend=np.nan) <= 0)
+    breaks = np.cumsum(is_new)[breaks] - 1
+    kept.keep(is_new, _REPEATED)
+    return Clock(kept.times, kept.rows, tuple(breaks.tolist()), tuple(kept.notes))
+
+
+class _Rows:
+    """Times and the rows of the input that they belong to, while some are dropped.
+
+    Attributes:
+        times: [s]
+        rows: Rows of the input.
+        notes: What was done, in words.
+    """
+
+    def __init__(self, times: Float[np.ndarray, " rows"]):
+        """All rows of the input."""
+        self.times = np.array(times, float)
+        self.rows = np.arange(len(times))
+        self.notes: list[str] = []
+
+    def keep(self, is_good: np.ndarray, others: str) -> None:
+        """Drop the rows that are not good, and note what the others are."""
+        _say(self.notes, int(np.sum(~is_good)), f"{others} dropped")
+        self.times = self.times[is_good]
+        self.rows = self.rows[is_good]
+
+    def sort(self) -> None:
+        """Put the rows in the order of their times."""
+        late = int(np.sum(np.diff(self.times) < 0))
+        _say(self.notes, late, "out of order sorted in")
+        order = np.argsort(self.times, kind="stable")
+        self.times = self.times[order]
+        self.rows = self.rows[order]
+
+    def drop_copies(self, values: np.ndarray) -> None:
+        """Drop rows with the time and the values of the row before."""
+        changes = np.diff(values[self.rows], axis=0, prepend=np.nan)
+        is_same = np.all(changes == 0, axis=1)
+        is_later = np.diff(self.times, prepend=np.nan) != 0
+        self.keep(~is_same | is_later, "written twice")
+
+
+def _gaps(t: np.ndarray, longest: float, notes: list[str]) -> np.ndarray:
+    """Rows before which a step is longer than that."""
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > longest) + 1
+    if gaps.size:
+        last = gaps[np.argmax(steps[gaps - 1])] - 1
+        many = f"{gaps.size} gaps, the longest" if gaps.size > 1 else "1 gap,"
+        notes.append(f"{many} of {steps[last]:.3g} s after {t[last]:.6g} s")
+    return gaps
 
 
 def _say(notes: list[str], count: int, what: str) -> None:
+    """Note how many rows something was done to, if any."""
     if count:
         notes.append(f"{count} row{'s' if count > 1 else ''} {what}")
 
@@ -133,9 +166,8 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
         elif back > _LATE * interval:
             t[row:] += back + interval
             resets.append(float(t[row]))
-            notes.append(
-                f"the clock went back by {back:.3g} s at row {row}: a break of any length"
-            )
+            went = f"the clock went back by {back:.3g} s at row {row}"
+            notes.append(f"{went}: a break of any length")
     return resets
 
 

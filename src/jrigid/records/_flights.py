@@ -152,9 +152,8 @@ def _by_momentum(
     reach = max(1, round(_REACH["momentum"] / reading.interval))
     law = _of_a_tensor(reading.times, rates, reach)
     _forget_breaks(law, reading, reach)
-    free = _consensus(
-        *law, size, max(2, round(min_duration / reading.interval)) - 2 * reach
-    )
+    shortest = max(2, round(min_duration / reading.interval)) - 2 * reach
+    free = _consensus(law, size, shortest)
     # An equation holds for all that it looks at, and hardly for its ends.
     free = np.convolve(free, np.ones(2 * (4 * reach // 5) + 1), mode="same") > 0.5
     return runs(free)
@@ -177,7 +176,7 @@ def _by_forces(
         shifted = _shifted(reading, forces, tried)
         law = _of_a_lever(t, rates, shifted, reach)
         _forget_breaks(law, reading, reach)
-        free = _consensus(*law, size, max(2, shortest))
+        free = _consensus(law, size, max(2, shortest))
         if free.sum() > (_BETTER if tried else 1.0) * best.sum():
             best = free
             delay = tried
@@ -207,7 +206,7 @@ def _shifted(reading: Reading, forces: np.ndarray, delay: float) -> np.ndarray:
 def _forget_breaks(law: "_Law", reading: Reading, reach: int) -> None:
     """Drop, in place, the equations that look across a break or an end."""
     for row in (0, *reading.breaks, reading.times.size):
-        law[1][max(row - reach, 0) : row + reach] = np.nan
+        law.wanted[max(row - reach, 0) : row + reach] = np.nan
 
 
 def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -374,9 +373,26 @@ def _jumps(
     )
 
 
-# Equations of each row that hold in flight, |model x - wanted| < bound(x, rows), over
-# their errors.
-_Law = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray, slice], np.ndarray | float]]
+_Bound = Callable[[np.ndarray, slice], np.ndarray | float]
+
+
+class _Law(NamedTuple):
+    """Equations of each row that hold in flight, |model x - wanted| < bound(x, rows).
+
+    Attributes:
+        model: Over the errors (rows, equations, unknowns).
+        wanted: Over the errors (rows, equations); NaN where nothing is known.
+        bound: By the unknowns and the rows.
+    """
+
+    model: np.ndarray
+    wanted: np.ndarray
+    bound: _Bound
+
+
+def _constant_bound(_unknowns: np.ndarray, _rows: slice) -> float:
+    """Errors are in units of what is allowed."""
+    return 1.0
 
 
 def _of_a_lever(
@@ -389,7 +405,8 @@ def _of_a_lever(
     # An axis at the end of its range tells nothing here: 0 = 0.
     read = ~_at_the_end(forces)
     model = model * read[..., None]
-    return model / tolerance[..., None], forces * read / tolerance, lambda *_: 1.0
+    wanted = forces * read / tolerance
+    return _Law(model / tolerance[..., None], wanted, _constant_bound)
 
 
 def _at_the_end(forces: np.ndarray) -> np.ndarray:
@@ -434,48 +451,61 @@ def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]
     return slopes
 
 
+class _MomentumBound(NamedTuple):
+    """The angular momentum, in parts of that of the sphere.
+
+    Attributes:
+        tensors: A sphere, and five tensors without a trace.
+        rates: Angular velocities [rad/s].
+        spin: Their sizes [rad/s].
+    """
+
+    tensors: np.ndarray
+    rates: np.ndarray
+    spin: np.ndarray
+
+    def __call__(self, x: np.ndarray, rows: slice) -> np.ndarray | float:
+        """Zero for a tensor that no body has, which then explains nothing."""
+        tensor = self.tensors[0] + np.tensordot(x[:-1], self.tensors[1:], 1)
+        moments = np.linalg.eigvalsh(tensor)
+        if moments[0] <= 0 or moments[2] > _LARGEST:
+            return 0.0
+        sizes = 3 * np.linalg.norm(self.rates[rows] @ tensor, axis=1)
+        return sizes / np.maximum(self.spin[rows], _SPIN)
+
+
 def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
-    """The momentum of a tensor of trace 1 stays, but for a drag in proportion to the rates.
+    """The angular momentum of a tensor of trace 1 stays, but for a linear drag.
 
     The unknowns are five numbers of the tensor and the drag [1/s]; errors are in parts
-    of the momentum.
+    of the angular momentum.
     """
-    # A sphere and five tensors without a trace, which make up all others; their angular
-    # momenta.
+    # A sphere and five tensors without a trace make up all others.
     x, y, z = np.eye(3)
     off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
     tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
     momenta = np.einsum("kij,tj->tik", tensors, rates)
     turning = np.cross(rates[:, :, None], momenta, axis=1)
+    in_space = momenta + _integral(t, turning)
     dragged = _integral(t, rates)
-    whole = np.concatenate(
-        [momenta + _integral(t, turning), dragged[..., None]], axis=2
-    )
+    whole = np.concatenate([in_space, dragged[..., None]], axis=2)
     spin = np.linalg.norm(rates, axis=1)
-    # Third differences of smooth rates are noise, of 20 times its variance; the median
-    # of 3 axes.
-    noise = np.median(np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)) / np.sqrt(
-        20 * 2.37
-    )
     relative, times_noise = _KEPT
-    tolerance = np.where(
-        spin > _SPIN, (relative * spin + times_noise * noise) / 3, np.nan
-    )
+    tolerance = (relative * spin + times_noise * _noise_of(rates)) / 3
+    tolerance = np.where(spin > _SPIN, tolerance, np.nan)
     change = _across(whole, reach) / tolerance[:, None, None]
+    bound = _MomentumBound(tensors, rates, spin)
+    return _Law(change[..., 1:], -change[..., 0], bound)
 
-    def bound(x: np.ndarray, rows: slice) -> np.ndarray | float:
-        """The momentum, in parts of the sphere's; moments are positive and none exceeds others."""
-        tensor = tensors[0] + np.tensordot(x[:-1], tensors[1:], 1)
-        moments = np.linalg.eigvalsh(tensor)
-        if moments[0] <= 0 or moments[2] > _LARGEST:
-            return 0.0
-        return (
-            3
-            * np.linalg.norm(rates[rows] @ tensor, axis=1)
-            / np.maximum(spin[rows], _SPIN)
-        )
 
-    return change[..., 1:], -change[..., 0], bound
+def _noise_of(rates: np.ndarray) -> float:
+    """Standard deviation of the noise of smooth rates [rad/s].
+
+    Their third differences are noise of 20 times its variance. 2.37 is the median of
+    chi-square with three degrees of freedom, one for each axis.
+    """
+    sizes = np.linalg.norm(np.diff(rates, 3, axis=0), axis=1)
+    return np.median(sizes) / np.sqrt(20 * 2.37)
 
 
 def _integral(t: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -489,36 +519,66 @@ def _across(x: np.ndarray, reach: int) -> np.ndarray:
     return np.roll(x, -reach, axis=0) - np.roll(x, reach, axis=0)
 
 
-def _consensus(
-    model: np.ndarray, wanted: np.ndarray, bound: Callable, size: int, least: int
-) -> np.ndarray:
-    """Rows that the best unknowns explain: those that explain the longest part in long runs."""
-    known = np.isfinite(wanted.sum(axis=1) + model.sum(axis=(1, 2)))
-    model = np.where(known[:, None, None], model, 0.0)
-    wanted = np.where(known[:, None], wanted, 0.0)
-    drawn = np.eye(model.shape[2]) / _USUAL**2
+class _Equations(NamedTuple):
+    """The equations of a law, with zeros in rows of which nothing is known.
 
-    def solve(rows: slice | np.ndarray) -> np.ndarray:
-        """Least squares, drawn to zero by what is usual where the rows do not tell."""
-        a = model[rows].reshape(-1, len(drawn))
-        return np.linalg.solve(a.T @ a + drawn, a.T @ wanted[rows].ravel())
+    Attributes:
+        law: With finite numbers.
+        known: Rows of which something is known.
+        shortest: Rows that a run must have to count.
+    """
 
-    def explained(x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
-        beside = np.linalg.norm(model[rows] @ x - wanted[rows], axis=1)
-        return known[rows] & (beside < bound(x, rows))
+    law: _Law
+    known: np.ndarray
+    shortest: int
 
-    def in_runs(x: np.ndarray) -> np.ndarray:
-        kept = explained(x)
-        for first, last in runs(kept):
-            kept[first:last] = last - first >= least
-        return kept
+    @classmethod
+    def of(cls, law: _Law, shortest: int) -> "_Equations":
+        """Put zeros where numbers are missing."""
+        model, wanted, bound = law
+        known = np.isfinite(wanted.sum(axis=1) + model.sum(axis=(1, 2)))
+        model = np.where(known[:, None, None], model, 0.0)
+        wanted = np.where(known[:, None], wanted, 0.0)
+        return cls(_Law(model, wanted, bound), known, shortest)
 
-    windows = range(0, len(known) - size, max(size // 2, len(known) // _GUESSES))
-    windows = [slice(first, first + size) for first in windows]
-    guesses = [np.zeros(len(drawn)), *map(solve, windows)]
-    sound = [
-        explained(x, w).mean() >= _SOUND
-        for x, w in zip(guesses[1:], windows, strict=True)
-    ]
-    best = max(map(in_runs, itertools.compress(guesses, [True, *sound])), key=np.sum)
-    return max(in_runs(solve(best)), best, key=np.sum)
+    @property
+    def unknowns(self) -> int:
+        """How many numbers are sought."""
+        return self.law.model.shape[2]
+
+    def solve(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Least squares, drawn to zero by what is usual where rows do not determine it."""
+        drawn = np.eye(self.unknowns) / _USUAL**2
+        a = self.law.model[rows].reshape(-1, self.unknowns)
+        return np.linalg.solve(a.T @ a + drawn, a.T @ self.law.wanted[rows].ravel())
+
+    def explained(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Rows whose equations hold with these unknowns."""
+        residuals = self.law.model[rows] @ x - self.law.wanted[rows]
+        sizes = np.linalg.norm(residuals, axis=1)
+        return self.known[rows] & (sizes < self.law.bound(x, rows))
+
+    def in_runs(self, x: np.ndarray) -> np.ndarray:
+        """Rows that these unknowns explain in runs that are long enough."""
+        explained = self.explained(x)
+        for first, last in runs(explained):
+            explained[first:last] = last - first >= self.shortest
+        return explained
+
+
+def _consensus(law: _Law, size: int, shortest: int) -> np.ndarray:
+    """Rows that the best unknowns explain: those that explain most rows in long runs.
+
+    Unknowns are guessed from windows of `size` rows.
+    """
+    equations = _Equations.of(law, shortest)
+    count = len(equations.known)
+    firsts = range(0, count - size, max(size // 2, count // _GUESSES))
+    guesses = [np.zeros(equations.unknowns)]
+    for window in (slice(first, first + size) for first in firsts):
+        guess = equations.solve(window)
+        # A guess that does not explain its own window is not tried on the rest.
+        if equations.explained(guess, window).mean() >= _SOUND:
+            guesses.append(guess)
+    best = max(map(equations.in_runs, guesses), key=np.sum)
+    return max(equations.in_runs(equations.solve(best)), best, key=np.sum)

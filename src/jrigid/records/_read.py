@@ -1,4 +1,4 @@
-"""Tables become a reading: which columns are of which sensor, in which unit, on whose clock."""
+"""Make a reading of tables: columns of sensors, their units, and one clock."""
 
 import numbers
 import re
@@ -218,51 +218,78 @@ def read(
     `COORDINATES.md`; betaflight/blackbox-tools, `units.h` and `parser.c`.
     """
     units = _Units(_asked(unit), [])
+    columns = columns or {}
     tables = tables_of(path, log)
+    chosen, main = _chosen(tables, columns)
+    own, raw = _on_one_clock(chosen, main, clock, units)
+    measured = _in_si(chosen, raw, own.times, units)
+    used = {main.columns[0]}
+    for kind in measured:
+        if chosen[kind].table is main.table:
+            used.update(chosen[kind].columns)
+    others = _others(main, own.rows, used)
+    notes = tuple(dict.fromkeys(units.notes))
+    return Reading(
+        own.times, **measured, columns=others, breaks=own.breaks, notes=notes
+    )
+
+
+def _chosen(
+    tables: list[Table], columns: Columns
+) -> tuple[dict[str, _Sensor], _Sensor]:
+    """The sensors that are read, by what they measure, and the one that has the clock."""
     headers = ", ".join(header for table in tables for header in table.headers)
-    _rename(tables, columns or {})
-    sensors = [found for table in tables for found in _sensors(table, columns or {})]
+    _rename(tables, columns)
+    sensors = [x for table in tables for x in _sensors(table, columns)]
     sensors.sort(key=lambda x: "uncal" in x[1].label.lower())
     chosen = dict(reversed(sensors))  # the first of a kind
     if "specific_forces" in chosen:
+        # Parts of the force, with and without gravity, are not needed then.
         chosen = {kind: sensor for kind, sensor in chosen.items() if kind in _MEASURED}
     main = next((chosen[kind] for kind in _MEASURED if kind in chosen), None)
     if main is None:
-        needed = "Argument `path` must hold three columns of a sensor, but none is recognised: "
         raise ValueError(
-            f"{needed}name them by `columns`. There are {headers or 'no tables'}."
+            "Argument `path` must hold three columns of a sensor, but none is "
+            f"recognised: name them by `columns`. There are {headers or 'no tables'}."
         )
-    apart = (
-        columns.keys() - _UNITS.keys() - set(main.table.headers) if columns else set()
-    )
-    demand(
-        not apart,
-        f"Argument `columns` must name columns of one file, but {apart} is apart.",
-    )
-    own, raw = _on_one_clock(chosen, main, clock, units)
-    found, used = {}, {main.columns[0]}
-    for kind in reversed(_MEASURED):  # rates last: gravity may tell their unit
-        if kind in chosen:
-            sensor, turned = chosen[kind], ""
-            if kind == "rates" and "specific_forces" in found:
-                scale = sensor.table.scales.get(sensor.columns[1], 1.0)
-                turned = _turned(own.times, scale * raw[kind], found["specific_forces"])
-            factor = units.factor(kind, sensor, raw[kind], turned)
-            if factor is not None:
-                found[kind] = factor * raw[kind]
-                used.update(sensor.columns if sensor.table is main.table else ())
-    rest = zip(
-        main.table.headers, main.table.values[main.rows[own.rows]].T, strict=True
-    )
-    scales = main.table.scales
-    rest = [
-        (header, scales.get(j, 1.0) * x)
-        for j, (header, x) in enumerate(rest)
-        if header and j not in used
-    ]
-    others = {header: x for header, x in rest if np.isfinite(x).any()}
-    said = tuple(dict.fromkeys(units.notes))
-    return Reading(own.times, **found, columns=others, breaks=own.breaks, notes=said)
+    apart = columns.keys() - _UNITS.keys() - set(main.table.headers)
+    message = f"must name columns of one file, but {apart} is apart."
+    demand(not apart, f"Argument `columns` {message}")
+    return chosen, main
+
+
+def _in_si(
+    chosen: dict[str, _Sensor],
+    raw: dict[str, np.ndarray],
+    times: np.ndarray,
+    units: _Units,
+) -> dict[str, np.ndarray]:
+    """What is measured, in SI; without that whose unit nobody says."""
+    measured: dict[str, np.ndarray] = {}
+    # The rates come last, because gravity may tell their unit.
+    for kind in reversed(_MEASURED):
+        if kind not in chosen:
+            continue
+        sensor = chosen[kind]
+        turned = ""
+        if kind == "rates" and "specific_forces" in measured:
+            scale = sensor.table.scales.get(sensor.columns[1], 1.0)
+            turned = _turned(times, scale * raw[kind], measured["specific_forces"])
+        factor = units.factor(kind, sensor, raw[kind], turned)
+        if factor is not None:
+            measured[kind] = factor * raw[kind]
+    return measured
+
+
+def _others(main: _Sensor, rows: np.ndarray, used: set[int]) -> dict[str, np.ndarray]:
+    """Columns of the main table that are no sensor's and hold numbers, by header."""
+    table = main.table
+    values = table.values[main.rows[rows]].T
+    others = {}
+    for j, (header, column) in enumerate(zip(table.headers, values, strict=True)):
+        if header and j not in used and np.isfinite(column).any():
+            others[header] = table.scales.get(j, 1.0) * column
+    return others
 
 
 def _asked(unit: Unit | Mapping[str, Unit] | None) -> dict[str, Unit]:
@@ -351,10 +378,32 @@ def _on_one_clock(
     chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
 ) -> tuple[Clock, dict[str, np.ndarray]]:
     """The clock of the main sensor put right, and what each sensor reads at its times."""
-    times, raw = (
-        {},
-        {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()},
-    )
+    raw = {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()}
+    times = _times(chosen, raw, units)
+    clocks = {k: repair(times[k], raw[k][:, 1:], clock=clock) for k in chosen}
+    own = clocks[next(kind for kind, x in chosen.items() if x is main)]
+    are_several = any(x.table is not main.table for x in chosen.values())
+    for kind, sensor in chosen.items():
+        notes = [*sensor.table.notes, *clocks[kind].notes]
+        if sensor.missed:
+            count = f"{sensor.missed} row{'s' if sensor.missed > 1 else ''}"
+            notes.insert(0, f"{count} without numbers of all three axes dropped")
+        raw[kind] = raw[kind][clocks[kind].rows, 1:]
+        if not np.array_equal(own.times, clocks[kind].times):
+            notes.append("times of its own; brought to those of the rest linearly")
+            raw[kind] = _onto(own.times, clocks[kind], raw[kind])
+        prefix = f"{sensor.label}: " if are_several else ""
+        units.notes.extend(prefix + x for x in notes)
+    if "linear" in chosen:
+        _add_gravity(chosen, raw, units)
+    return own, raw
+
+
+def _times(
+    chosen: dict[str, _Sensor], raw: dict[str, np.ndarray], units: _Units
+) -> dict[str, np.ndarray]:
+    """Times of each sensor [s], from 0 if they count from some epoch."""
+    times = {}
     for kind, sensor in chosen.items():
         t = raw[kind][:, 0]
         times[kind] = t * units.factor("times", sensor, t)
@@ -362,31 +411,26 @@ def _on_one_clock(
     if _EPOCH < origin < np.inf:
         units.notes.append(f"times count from {origin:.6f} s of the file's clock")
         times = {kind: t - origin for kind, t in times.items()}
-    clocks = {
-        kind: repair(times[kind], raw[kind][:, 1:], clock=clock) for kind in chosen
-    }
-    own = clocks[next(kind for kind, x in chosen.items() if x is main)]
-    several = any(x.table is not main.table for x in chosen.values())
-    for kind, (label, table, _, _, missed) in chosen.items():
-        said = [*table.notes, *clocks[kind].notes]
-        if missed:
-            count = f"{missed} row{'s' if missed > 1 else ''}"
-            said.insert(0, f"{count} without numbers of all three axes dropped")
-        raw[kind] = raw[kind][clocks[kind].rows, 1:]
-        if not np.array_equal(own.times, clocks[kind].times):
-            said.append("times of its own; brought to those of the rest linearly")
-            raw[kind] = _onto(own.times, clocks[kind], raw[kind])
-        units.notes.extend(f"{label}: {x}" if several else x for x in said)
-    if "linear" in chosen:
-        label, table, columns, rows, _ = chosen["linear"]
-        gravity = chosen.get("gravity")
-        if gravity is None:
-            units.notes.append(f"{label}: without gravity, no specific force; left out")
-        else:
-            raw["specific_forces"] = raw["linear"] + raw["gravity"]
-            columns, label = columns + gravity.columns, f"{label} with gravity"
-            chosen["specific_forces"] = _Sensor(label, table, columns, rows)
-    return own, raw
+    return times
+
+
+def _add_gravity(
+    chosen: dict[str, _Sensor], raw: dict[str, np.ndarray], units: _Units
+) -> None:
+    """Add gravity to an acceleration without it: the specific force, in place."""
+    linear = chosen["linear"]
+    gravity = chosen.get("gravity")
+    if gravity is None:
+        text = "without gravity, no specific force; left out"
+        units.notes.append(f"{linear.label}: {text}")
+        return
+    raw["specific_forces"] = raw["linear"] + raw["gravity"]
+    chosen["specific_forces"] = _Sensor(
+        f"{linear.label} with gravity",
+        linear.table,
+        linear.columns + gravity.columns,
+        linear.rows,
+    )
 
 
 def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
