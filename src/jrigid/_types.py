@@ -1,12 +1,12 @@
 """Aliases for the array types of public signatures, and modules that print their numbers."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.core
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 from jaxtyping import Real as _Real
 from typing_extensions import TypeAliasType
 
@@ -43,6 +43,28 @@ else:
         def __class_getitem__(cls, item: tuple[Any, str]) -> TypeAliasType:
             """An alias of that name."""
             return TypeAliasType(f"Real[ArrayLike, '{item[1]}']", _Real[item])
+
+
+@runtime_checkable
+class BodyState(Protocol):
+    """State of a body: a `State`, a `FloatingState`, or that of a user's system."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def attitude(self) -> Float[Array, "*batch 4"]:
+        """Unit quaternion, scalar first, body to space."""
+        ...
+
+    @property
+    def omega(self) -> Float[Array, "*batch 3"]:
+        """Angular velocity, body components [rad/s]."""
+        ...
+
+    @property
+    def internal(self) -> PyTree:
+        """States of internal parts, an entry for each torque that carries some."""
+        ...
 
 
 _FEW = 12  # numbers that an array is shown with
