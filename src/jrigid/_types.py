@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import equinox as eqx
 import jax.core
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from jaxtyping import Real as _Real
 from typing_extensions import TypeAliasType
 
@@ -46,23 +46,29 @@ else:
 
 
 @runtime_checkable
-class BodyState(Protocol):
-    """State of a body: a `State`, a `FloatingState`, or that of a user's system."""
+class RotationState(Protocol):
+    """A dataclass with an attitude and an angular velocity."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
+    # Any, since type checkers take a field with a converter of equinox for a descriptor.
     @property
-    def attitude(self) -> Float[Array, "*batch 4"]:
-        """Unit quaternion, scalar first, body to space."""
+    def attitude(self) -> Any:
+        """Unit quaternion, scalar first, body to space, an array (4,)."""
         ...
 
     @property
-    def omega(self) -> Float[Array, "*batch 3"]:
-        """Angular velocity, body components [rad/s]."""
+    def omega(self) -> Any:
+        """Angular velocity, body components [rad/s], an array (3,)."""
         ...
 
+
+@runtime_checkable
+class BodyState(RotationState, Protocol):
+    """State of a body: a `State`, a `FloatingState`, or that of a user's system."""
+
     @property
-    def internal(self) -> PyTree:
+    def internal(self) -> Any:
         """States of internal parts, an entry for each torque that carries some."""
         ...
 
