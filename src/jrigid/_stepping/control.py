@@ -6,11 +6,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-# Bounds of a step in radians of the fastest rate, which is that of the turning or of the
-# linearised motion. At an equilibrium the error estimate is zero: a step that is too
-# long leaves the value right and the derivative wrong. Between these bounds the length
-# of a step follows from the term of the exponential series that a method of its order
-# omits: that term may be this many tolerances. The second numbers hold where
+# Bounds of a step in radians of the fastest rate, which is that of the turning or of
+# the linearised motion. At an equilibrium the error estimate is zero: a step that is
+# too long leaves the value right and the derivative wrong. Between these bounds the
+# length of a step follows from the term of the exponential series that a method of its
+# order omits: that term may be this many tolerances. The second numbers hold where
 # derivatives are taken, which are more sensitive than the error estimate.
 SMALLEST_BOUND = 0.4
 _LARGEST_BOUNDS = 1.2, 0.8

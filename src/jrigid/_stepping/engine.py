@@ -72,6 +72,16 @@ def _state_after(trial: Trial, ended: Bool[Array, ""]) -> Int[Array, ""]:
     return jnp.where(ended, ENDED, new_state)
 
 
+def _jump_after(
+    motion: Motion, jump: Int[Array, ""], t1: Array, keep: Bool[Array, ""]
+) -> Int[Array, ""]:
+    """Index of the next jump after a step to `t1`."""
+    if not motion.jumps.size:
+        return jump
+    passed = keep & (t1 >= _entry(motion.jumps, jump))
+    return jump + passed.astype(jump.dtype)
+
+
 def _progress_if(
     running: Bool[Array, ""],
     progress: Progress,
@@ -202,16 +212,13 @@ class Engine(NamedTuple):
         new_state = jnp.where(too_many, TOO_MANY_STEPS, new_state)
         hit = hit & keep
         reached = jnp.where(hit, output, motion.times.size)
-        if motion.jumps.size:
-            passed = keep & (t1 >= _entry(motion.jumps, jump))
-            jump = jump + passed.astype(jump.dtype)
         clock = [jnp.where(keep, t1, t), following, trial.verdict.rate, end]
         counts = [
             new_state,
             tried + 1,
             accepted + keep.astype(accepted.dtype),
             output + hit.astype(output.dtype),
-            jump,
+            _jump_after(motion, jump, t1, keep),
             which,
         ]
         return Attempt(

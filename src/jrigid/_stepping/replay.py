@@ -1,9 +1,9 @@
 """Reverse mode: run a motion again, and reverse its steps from its end.
 
-The log holds the rates of the stages of some hundred attempts at a step. A longer motion
-is run once from its start to store checkpoints. Then it is run part by part from the
-last checkpoint. Rejected attempts are in the log too, as steps of length zero, so that
-all lanes count the same attempts.
+The log holds the rates of the stages of some hundred attempts at a step. A longer
+motion is run once from its start to store checkpoints. Then it is run part by part from
+the last checkpoint. Rejected attempts are in the log too, as steps of length zero, so
+that all lanes count the same attempts.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ from jrigid._stepping.step import apart
 
 Tree = TypeVar("Tree")
 
-# The log holds at least and at most this many attempts, and between these bounds as many
-# as this number of bytes has room for.
+# The log holds at least and at most this many attempts, and between these bounds as
+# many as this number of bytes has room for.
 _FEWEST = 64
 _MOST = 1024
 _BYTES = 2**26
@@ -160,7 +160,7 @@ class _Replay(NamedTuple):
     def forwards(
         self, back: _Back, checkpoints: _Checkpoints, log: _Step
     ) -> tuple[Int[Array, ""], Int[Array, ""], _Step, _Checkpoints]:
-        """Run from the last checkpoint to the attempt before which cotangents are known.
+        """Run from the last checkpoint to the state whose cotangent is known.
 
         Returns:
             The number of the next attempt, the index of the checkpoint at which the run

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -180,14 +180,14 @@ def units(
     args: PyTree,
     fastest_of: Callable[[Array], Array] = spectral_radius,
 ) -> tuple[Array, Array]:
-    """The fastest rate of the motion [rad/s], and a scale for each component of the state.
+    """The fastest rate of the motion [rad/s], and scales of the state's components.
 
     The rate is what `fastest_of` returns for the Jacobian, by default its spectral
     radius, and at least the rate of turning. For a body at rest this is the rate that
     its torque gives it within a radian. If nothing turns the body, it is the inverse of
     the length of the run.
     """
-    rates = system.vector_field(t0, state0, args)
+    rates: Any = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
     turning, spinning_up = safe_norm(jnp.stack([state0.omega, rates.omega]))
     rate = jnp.maximum(turning, jnp.sqrt(spinning_up))

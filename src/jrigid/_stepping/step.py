@@ -95,7 +95,7 @@ class _Sums(NamedTuple):
     def _weights_and_terms(
         self, iteration: Array, terms: tuple[Array, ...]
     ) -> list[tuple[Array, Array]]:
-        """For each table, the coefficients of its row and the terms that they weight."""
+        """For each table, the coefficients of a row and the terms that they weight."""
         row = self.row(iteration)
         return [
             (_row(table[:, : len(x)], row, x.dtype), x)
