@@ -1,4 +1,4 @@
-"""Aliases for the array types of public signatures, and modules that print their numbers."""
+"""Aliases of array types, protocols of states, and modules that print their numbers."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
@@ -29,9 +29,14 @@ if TYPE_CHECKING:
 
     AnyArray = Any
     AnyMatrix = Any
+    TimeLike = float | Array
 else:
-    #: An array of JAX, or of numpy on the host: to a type checker the two have nothing in common.
+    #: An array of JAX, or of numpy on the host. To a type checker the two have nothing
+    #: in common.
     AnyArray = Array | np.ndarray | np.generic
+    #: A time or a step that diffrax passes to a solver. Type checkers reject arithmetic
+    #: with `ScalarLike`, which includes numbers of numpy.
+    TimeLike = ScalarLike
     #: A matrix of either kind, shown in signatures by this name.
     AnyMatrix = TypeAliasType(
         "AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"]
@@ -51,7 +56,7 @@ class RotationState(Protocol):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    # Any, since type checkers take a field with a converter of equinox for a descriptor.
+    # Any, since type checkers take a field with an equinox converter for a descriptor.
     @property
     def attitude(self) -> Any:
         """Unit quaternion, scalar first, body to space, an array (4,)."""
@@ -73,7 +78,8 @@ class BodyState(RotationState, Protocol):
         ...
 
 
-_FEW = 12  # numbers that an array is shown with
+# Largest size of an array whose numbers are shown.
+_FEW = 12
 
 
 class Readable(eqx.Module):
