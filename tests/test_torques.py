@@ -872,7 +872,7 @@ def test_other_bad_values_are_left_to_the_simulation(name):
 def test_a_quadratic_drag_and_samples_of_the_wrong_sign_are_refused():
     with pytest.raises(RuntimeError, match="`coefficient` of `QuadraticDrag` must"):
         tq.QuadraticDrag(-0.1)
-    with pytest.raises(RuntimeError, match="`scale` of `Sampled` must .* it is -2.0."):
+    with pytest.raises(RuntimeError, match=r"`scale` of `Sampled` must .* it is -2\.0"):
         tq.Sampled(np.arange(3.0), np.ones((3, 3)), scale=-2.0)
     # By rounding an eigenvalue of a product may be negative.
     tq.LinearDrag(np.outer(ROW, ROW))

@@ -294,7 +294,7 @@ class AbstractTorque(Readable):
         """Both torques together."""
         return Sum((self, other))
 
-    def __radd__(self, other: TorqueFunction | int) -> "AbstractTorque":
+    def __radd__(self, other: Any) -> "AbstractTorque":
         """Both torques together; `0 + torque` is the torque, so that `sum()` works.
 
         A plain function cannot be the first item of `sum`, since Python adds it to 0
