@@ -36,13 +36,13 @@ def _apply(
     parameters = equation.params
     pairs = list(zip(values, batched, strict=True))
     if third_party.is_elementwise(equation):
-        shape = equation.outvars[0].aval.shape
+        shape = third_party.shape_of(equation.outvars[0])
         values = [_spread(x, has, shape, lanes) for x, has in pairs]
         return third_party.apply(primitive, parameters, *values)
     with_lanes = third_party.with_last_axis(equation, lanes)
     if with_lanes is None:
         return _apply_by_vmap(equation, pairs)
-    shapes = [x.aval.shape for x in equation.invars]
+    shapes = [third_party.shape_of(x) for x in equation.invars]
     triples = zip(values, batched, shapes, strict=True)
     values = [_spread(x, has, shape, lanes) for x, has, shape in triples]
     fold = third_party.FOLDS.get(primitive)

@@ -57,7 +57,7 @@ class _Code(EnumerationItem):  # pyright: ignore[reportGeneralTypeIssues]
         return np.array(code_of(self), dtype)
 
 
-def with_codes(enumeration: EnumerationMeta) -> Any:
+def with_codes(enumeration: type) -> Any:
     """The same enumeration, with items that `int` and numpy convert to codes."""
     items = vars(enumeration)["_name_to_item"]
     for name, item in items.items():
@@ -71,12 +71,12 @@ def enumeration_of(item: PyTree) -> Any:
     return item._enumeration
 
 
-def names_of(enumeration: EnumerationMeta) -> tuple[str, ...]:
+def names_of(enumeration: type) -> tuple[str, ...]:
     """The names of an enumeration's items, in the order of their codes."""
     return tuple(vars(enumeration)["_name_to_item"])
 
 
-def messages_of(enumeration: EnumerationMeta) -> tuple[str, ...]:
+def messages_of(enumeration: type) -> tuple[str, ...]:
     """The messages of an enumeration's items, in the order of their codes."""
     return tuple(vars(enumeration)["_index_to_message"])
 
@@ -104,6 +104,11 @@ jaxpr_as_fun = core.jaxpr_as_fun
 
 #: The parameters of an operation, by their names.
 Parameters = dict[str, Any]
+
+
+def shape_of(variable: Any) -> tuple[int, ...]:
+    """The shape of an input or an output of an operation in a program."""
+    return variable.aval.shape
 
 
 def used_inputs(program: core.ClosedJaxpr) -> list[bool]:
@@ -260,8 +265,8 @@ def is_elementwise(equation: core.JaxprEqn) -> bool:
     """
     if equation.primitive not in ELEMENTWISE or _is_sharded(equation.params):
         return False
-    shape = equation.outvars[0].aval.shape
-    shapes = [x.aval.shape for x in equation.invars]
+    shape = shape_of(equation.outvars[0])
+    shapes = [shape_of(x) for x in equation.invars]
     return shape in shapes and all(x in ((), shape) for x in shapes)
 
 

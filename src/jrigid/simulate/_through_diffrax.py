@@ -123,7 +123,7 @@ def solve_by_diffrax(
     omega: int,
     options: Options,
     event: diffrax.Event | None,
-) -> tuple[Array, Array, Array, diffrax.RESULTS, dict[str, Array]]:
+) -> tuple[Array, Array, Array, diffrax.RESULTS, dict[str, Array | int]]:
     """Integrate a motion by `diffrax.diffeqsolve`.
 
     Args:
