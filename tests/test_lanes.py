@@ -431,6 +431,6 @@ def test_what_is_not_kept_is_run_again(monkeypatch):
     kept = gradient(100_000)
     monkeypatch.setattr(replay, "_MOST", 6)
     monkeypatch.setattr(replay, "_FEWEST", 6)
-    monkeypatch.setattr(replay, "_KEPT", 3)
+    monkeypatch.setattr(replay, "_CHECKPOINTS", 3)
     again = gradient(100_001)
     np.testing.assert_allclose(again, kept, rtol=1e-11)

@@ -237,6 +237,16 @@ def test_steps_are_never_longer_than_the_fastest_rate_at_the_start_allows():
     assert int(motion.stats["num_steps"]) > rate * 30.0 / _LARGEST_BOUNDS[0]
 
 
+def test_an_implicit_solver_locates_an_event():
+    event = diffrax.Event(_turned_by(1.3))
+    state0 = jr.State(UPRIGHT, np.array([0.0, 0.0, 1.0]))
+    trajectory = jr.simulate(
+        BODY, state0, 5.0, event=event, solver=diffrax.Kvaerno5(), rtol=1e-6
+    )
+    assert trajectory.result == jr.RESULTS.event_occurred
+    np.testing.assert_allclose(trajectory.final_time, 1.3, rtol=1e-5)
+
+
 # Stiffness
 # -----------------------------------------------------------------------------------
 

@@ -790,54 +790,92 @@ ROW = np.array([1.0, -2.0, 0.5])
 SKEW = np.array([[1.0, 0.2, 0.0], [-0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])
 NAN3 = np.array([0.0, np.nan, 0.0])
 BAD_VALUES = {
-    "mu": (tq.GravityGradient(np.inf, orbit), "invalid_torque", "mu"),
-    "mass": (tq.UniformGravity(-1.0, LEVER, GRAVITY), "invalid_torque", "mass"),
-    "nan mass": (tq.UniformGravity(np.nan, LEVER, GRAVITY), "invalid_torque", "mass"),
-    "lever": (tq.UniformGravity(1.0, NAN3, GRAVITY), "invalid_torque", "lever"),
-    "gravity": (tq.UniformGravity(1.0, LEVER, NAN3), "invalid_torque", "gravity"),
-    "damper": (tq.InternalDamper(0.0, 0.1), "invalid_torque", "inertia"),
-    "coupling": (tq.InternalDamper(0.1, -0.1), "invalid_torque", "coupling"),
-    "nan coupling": (tq.InternalDamper(0.1, np.nan), "invalid_torque", "coupling"),
-    "wheel": (tq.SpinningMass(-1.0, LEVER), "invalid_torque", "inertia"),
-    "axis": (tq.SpinningMass(1.0, np.zeros(3)), "invalid_torque", "axis"),
-    "linear": (tq.LinearDrag(-0.1), "invalid_torque", "coefficient"),
-    "linear, axes": (
-        tq.LinearDrag(np.array([1.0, -1.0, 0.0])),
-        "invalid_torque",
-        "coefficient",
-    ),
-    "linear, tensor": (tq.LinearDrag(INDEFINITE), "invalid_torque", "coefficient"),
-    "quadratic": (tq.QuadraticDrag(np.inf), "invalid_torque", "coefficient"),
-    "quadratic, tensor": (tq.QuadraticDrag(SKEW), "invalid_torque", "coefficient"),
-    "constant": (tq.Constant(NAN3), "invalid_torque", "torque"),
-    "rotor": (tq.Rotor(NAN3), "invalid_torque", "momentum"),
-    "dipole": (tq.MagneticDipole(NAN3, FIELD), "invalid_torque", "moment"),
-    "field": (tq.MagneticDipole(LEVER, NAN3), "invalid_torque", "field"),
-    "friction": (tq.CoulombFriction(-0.1, 1.0), "invalid_torque", "magnitude"),
-    "width": (tq.CoulombFriction(0.1, 0.0), "invalid_torque", "width"),
-    "bearing": (tq.CoulombFriction(0.1, 1.0, np.zeros(3)), "invalid_torque", "axis"),
-    "area": (sunlit(areas=-PLATES["areas"]), "invalid_torque", "areas"),
-    "normal": (sunlit(normals=NORMALS * [[1], [0], [1]]), "invalid_torque", "normals"),
-    "center": (sunlit(centers=np.full((3, 3), np.nan)), "invalid_torque", "centers"),
-    "sun": (sunlit(sun=NAN3), "invalid_torque", "sun"),
-    "specular": (sunlit(specular=-0.1), "invalid_torque", "specular"),
-    "diffuse": (
-        sunlit(diffuse=np.array([0.1, np.nan, 0.2])),
-        "invalid_torque",
-        "diffuse",
-    ),
-    "pressure": (sunlit(pressure=-1.0), "invalid_torque", "pressure"),
+    "mu": (lambda: tq.GravityGradient(np.inf, orbit), "mu"),
+    "mass": (lambda: tq.UniformGravity(-1.0, LEVER, GRAVITY), "mass"),
+    "nan mass": (lambda: tq.UniformGravity(np.nan, LEVER, GRAVITY), "mass"),
+    "lever": (lambda: tq.UniformGravity(1.0, NAN3, GRAVITY), "lever"),
+    "gravity": (lambda: tq.UniformGravity(1.0, LEVER, NAN3), "gravity"),
+    "damper": (lambda: tq.InternalDamper(0.0, 0.1), "inertia"),
+    "coupling": (lambda: tq.InternalDamper(0.1, -0.1), "coupling"),
+    "nan coupling": (lambda: tq.InternalDamper(0.1, np.nan), "coupling"),
+    "wheel": (lambda: tq.SpinningMass(-1.0, LEVER), "inertia"),
+    "axis": (lambda: tq.SpinningMass(1.0, np.zeros(3)), "axis"),
+    "linear": (lambda: tq.LinearDrag(-0.1), "coefficient"),
+    "linear, axes": (lambda: tq.LinearDrag(np.array([1.0, -1.0, 0.0])), "coefficient"),
+    "linear, tensor": (lambda: tq.LinearDrag(INDEFINITE), "coefficient"),
+    "quadratic": (lambda: tq.QuadraticDrag(np.inf), "coefficient"),
+    "quadratic, tensor": (lambda: tq.QuadraticDrag(SKEW), "coefficient"),
+    "constant": (lambda: tq.Constant(NAN3), "torque"),
+    "rotor": (lambda: tq.Rotor(NAN3), "momentum"),
+    "dipole": (lambda: tq.MagneticDipole(NAN3, FIELD), "moment"),
+    "field": (lambda: tq.MagneticDipole(LEVER, NAN3), "field"),
+    "friction": (lambda: tq.CoulombFriction(-0.1, 1.0), "magnitude"),
+    "width": (lambda: tq.CoulombFriction(0.1, 0.0), "width"),
+    "bearing": (lambda: tq.CoulombFriction(0.1, 1.0, np.zeros(3)), "axis"),
+    "area": (lambda: sunlit(areas=-PLATES["areas"]), "areas"),
+    "normal": (lambda: sunlit(normals=NORMALS * [[1], [0], [1]]), "normals"),
+    "center": (lambda: sunlit(centers=np.full((3, 3), np.nan)), "centers"),
+    "sun": (lambda: sunlit(sun=NAN3), "sun"),
+    "specular": (lambda: sunlit(specular=-0.1), "specular"),
+    "diffuse": (lambda: sunlit(diffuse=np.array([0.1, np.nan, 0.2])), "diffuse"),
+    "pressure": (lambda: sunlit(pressure=-1.0), "pressure"),
 }
+
+
+def unchecked(build):
+    """A torque whose parameters are traced, and so not known, when it is built."""
+    return eqx.filter_jit(build)()
 
 
 @pytest.mark.parametrize("name", BAD_VALUES)
 def test_a_bad_parameter_is_found_alone_and_in_a_sum(name):
-    torque, code, argument = BAD_VALUES[name]
+    build, argument = BAD_VALUES[name]
+    torque = unchecked(build)
     for bad in (torque, tq.LinearDrag(0.1) + torque, tq.Sum((tq.Sum((torque,)),))):
         findings = findings_of(bad)
-        assert findings.result == getattr(jr.RESULTS, code)
+        assert findings.result == jr.RESULTS.invalid_torque
         with pytest.raises(RuntimeError, match=f"Argument `{argument}` of `"):
             findings.guard(jnp.zeros(()), throw=True)
+
+
+# Parameters of the wrong sign, and the end of the message.
+WRONG_SIGN = {
+    "mass": "must be finite and not negative, but it is -1.0.",
+    "damper": "must be positive and finite, but it is 0.0.",
+    "coupling": "must be finite and not negative, but it is -0.1.",
+    "wheel": "must be positive and finite, but it is -1.0.",
+    "linear": "must be finite and not negative .*, but it is -0.1.",
+    "linear, axes": r"must be finite and not negative .*, but it is \[ 1. -1.  0.\].",
+    "linear, tensor": r"must be .* positive semi-definite\), but it is \[\[1. 2. 0.\]",
+    "friction": "must be finite and not negative, but it is -0.1.",
+    "width": "must be positive and finite, but it is 0.0.",
+    "area": "must be finite and not negative, but it is ",
+    "specular": "must be finite and not negative, but it is -0.1.",
+    "pressure": "must be finite and not negative, but it is -1.0.",
+}
+
+
+@pytest.mark.parametrize("name", WRONG_SIGN)
+def test_a_known_parameter_of_the_wrong_sign_is_refused_when_the_torque_is_built(name):
+    build, argument = BAD_VALUES[name]
+    message = f"Argument `{argument}` of `[A-Za-z]*` {WRONG_SIGN[name]}"
+    with pytest.raises(RuntimeError, match=message):
+        build()
+
+
+@pytest.mark.parametrize("name", sorted(BAD_VALUES.keys() - WRONG_SIGN))
+def test_other_bad_values_are_left_to_the_simulation(name):
+    build, _ = BAD_VALUES[name]
+    assert findings_of(build()).result == jr.RESULTS.invalid_torque
+
+
+def test_a_quadratic_drag_and_samples_of_the_wrong_sign_are_refused():
+    with pytest.raises(RuntimeError, match="`coefficient` of `QuadraticDrag` must"):
+        tq.QuadraticDrag(-0.1)
+    with pytest.raises(RuntimeError, match=r"`scale` of `Sampled` must .* it is -2\.0"):
+        tq.Sampled(np.arange(3.0), np.ones((3, 3)), scale=-2.0)
+    # By rounding an eigenvalue of a product may be negative.
+    tq.LinearDrag(np.outer(ROW, ROW))
 
 
 def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
@@ -882,7 +920,7 @@ def test_good_parameters_are_let_pass_and_bad_lanes_are_told_apart():
 def test_what_a_torque_says_of_a_bad_value_shows_it():
     for torque, message in (
         (
-            tq.LinearDrag(-0.25),
+            unchecked(lambda: tq.LinearDrag(-0.25)),
             r"`coefficient` of `LinearDrag` must be .*, but it is not: -0\.25",
         ),
         (

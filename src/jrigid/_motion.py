@@ -1,4 +1,4 @@
-"""What every call that moves a body asks of its arguments: system, state and times."""
+"""Input validation of functions that move a body: system, state and times."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jrigid._checks import (
     RESULTS,
@@ -30,21 +30,28 @@ from jrigid._checks import (
 )
 from jrigid._core.third_party import used_inputs
 from jrigid._numerics import safe_norm
+from jrigid._types import BodyState
 from jrigid.dynamics import ExactStates, State
 from jrigid.rotation import normalize
 from jrigid.systems import AbstractSystem, RigidBody
 
 Motion = TypeVar("Motion", bound=Any)
+State_ = TypeVar("State_", bound=BodyState)
+
+#: Notes invalid values of a body, as `check(findings, body)`.
+Check = Callable[[Findings, Any], None]
+#: Attitude and angular velocity of a body, as `flow(body, state0, time)`.
+Flow = Callable[[Any, State, Array], tuple[Array, Array]]
 
 _SIZES = {"position": 3, "velocity": 3, "attitude": 4, "omega": 3}
 
 
 @runtime_checkable
 class HasRigidBody(Protocol):
-    """What is a rigid body in other words, a `jrigid.SymmetricTop` for one."""
+    """A body that can be converted to a `RigidBody`, such as a `SymmetricTop`."""
 
     def as_rigid_body(self) -> RigidBody:
-        """The same as a system for `simulate`."""
+        """The same body as a system for `simulate`."""
         ...
 
 
@@ -53,28 +60,29 @@ def motion_arguments(
     state: Any,
     kind: type = AbstractSystem,
     name: str = "state0",
-    **times: Any,
+    **times: object,
 ) -> tuple[Any, Any, tuple[Array, ...]]:
     """System, state and times with types and shapes checked, or ValueError.
 
     Args:
-        system: Of the kind, or with a method `as_rigid_body`.
+        system: An object of the kind, or with a method `as_rigid_body`.
         state: Its state. Internal parts that are not given start at rest relative to
             the body.
-        kind: What the system must be.
-        name: What the state is called.
+        kind: Class that the system must have.
+        name: Name of the argument that holds the state.
         times: By their names: `ts` of any shape, the others numbers.
 
     Returns:
-        The system; the state, all of it in one dtype; the times in one dtype, theirs:
-        they may have more digits than the state, and are to be subtracted before they
-        are rounded to its own.
+        The system; the state, all of it in one dtype; the times in a dtype of their
+        own. It may be more precise than that of the state, so times must be subtracted
+        before they are rounded to the dtype of the state.
     """
     if isinstance(system, HasRigidBody):
         system = system.as_rigid_body()
     if not isinstance(system, kind):
-        names = "jrigid system (a RigidBody, a FloatingBody)"
-        wanted = names if kind is AbstractSystem else kind.__name__
+        wanted = kind.__name__
+        if kind is AbstractSystem:
+            wanted = "jrigid system (a RigidBody, a FloatingBody)"
         raise ValueError(
             f"Argument `system` must be a {wanted}, but it is {kind_of(system)}."
         )
@@ -83,10 +91,12 @@ def motion_arguments(
     return system, system.with_parts(state), numbers(**times)
 
 
-def _in_one_dtype(name: str, state: Any, *others: Any) -> tuple[Any, tuple[Array, ...]]:
+def _in_one_dtype(
+    name: str, state: State_, *others: object
+) -> tuple[State_, tuple[Array, ...]]:
     """A state and other arrays in one dtype; ValueError for a shape that is wrong."""
-    known = {field: value for field, value in vars(state).items() if field in _SIZES}
-    for field, value in known.items():
+    vectors = {field: value for field, value in vars(state).items() if field in _SIZES}
+    for field, value in vectors.items():
         size = _SIZES[field]
         if not eqx.is_array(value):
             raise ValueError(
@@ -94,41 +104,46 @@ def _in_one_dtype(name: str, state: Any, *others: Any) -> tuple[Any, tuple[Array
                 f"but it is {value!r}."
             )
         check_shape(f"{name}.{field}", value, (size,))
-    parts, structure = jtu.tree_flatten((known, state.internal))
+    parts, structure = jtu.tree_flatten((vectors, state.internal))
     arrays = float_arrays(*parts, *others)
     if arrays[0].dtype not in (jnp.float32, jnp.float64):
         raise ValueError(
             f"Arguments must be float32 or float64, but they are {arrays[0].dtype}."
         )
-    known, internal = structure.unflatten(arrays[: len(parts)])
-    return dataclasses.replace(state, **known, internal=internal), arrays[len(parts) :]
+    vectors, internal = structure.unflatten(arrays[: len(parts)])
+    state = dataclasses.replace(state, **vectors, internal=internal)
+    return state, arrays[len(parts) :]
 
 
-def plain_state(name: str, state: Any, *others: Any) -> tuple[State, tuple[Array, ...]]:
+def plain_state(
+    name: str, state: object, *others: object
+) -> tuple[State, tuple[Array, ...]]:
     """A state without internal parts and other arrays in one dtype, or ValueError."""
     check_type(name, state, State)
+    assert isinstance(state, State)  # for type checkers
     if jtu.tree_leaves(state.internal):
         raise ValueError(
-            f"Argument `{name}.internal` must be empty, but it is not: a body with moving parts "
-            "has no motion in closed form; use `jrigid.simulate`."
+            f"Argument `{name}.internal` must be empty, but it is not: a body with "
+            "moving parts has no motion in closed form; use `jrigid.simulate`."
         )
     return _in_one_dtype(name, state, *others)
 
 
-# Times are told apart while their last bit is worth less than this turn [rad].
+# Times are distinct as long as the body turns less than this in their last bit [rad].
 _BLUR = 0.1
 
 
 def resolves(t0: Array, rate: Array) -> Array:
-    """Whether times near `t0` can be told apart in their dtype, for a body that turns at a rate."""
+    """Whether the dtype of `t0` resolves times near it, for a body with this rate."""
     blur = (jnp.finfo(t0.dtype).eps * jnp.abs(t0)).astype(rate.dtype)
     return ~(blur * rate > _BLUR)
 
 
-def numbers(**values: Any) -> tuple[Array, ...]:
-    """Floating point arrays of one dtype: `ts` of any shape, of the others each a number.
+def numbers(**values: object) -> tuple[Array, ...]:
+    """Convert numbers to arrays of one floating point dtype; `ts` may have any shape.
 
-    A ValueError names what is not.
+    Raises:
+        ValueError: An argument is no number; the error names it.
     """
     for name, value in values.items():
         try:
@@ -146,7 +161,8 @@ def numbers(**values: Any) -> tuple[Array, ...]:
     return float_arrays(*values.values())
 
 
-def _check_state(findings: Findings, state: Any) -> None:
+def _check_state(findings: Findings, state: BodyState) -> None:
+    """Note a state that is not finite, or whose attitude is no unit quaternion."""
     findings.require(
         all_finite(state), RESULTS.invalid_state, value=ravel_pytree(state)[0]
     )
@@ -156,9 +172,21 @@ def _check_state(findings: Findings, state: Any) -> None:
 
 
 def check_motion(
-    findings: Findings, system: Any, state: Any, t: Array, args: Any
+    findings: Findings,
+    system: AbstractSystem,
+    state: BodyState,
+    t: Array,
+    args: PyTree,
 ) -> None:
-    """Note bad values of a system and its state at a time in the precision of the state."""
+    """Note invalid values of a system and its state.
+
+    Args:
+        findings: Collects what is wrong.
+        system: The system.
+        state: Its state.
+        t: The time, in the precision of the state.
+        args: Of torques and forces.
+    """
     system.check(findings)
     _check_state(findings, state)
     field = system.vector_field(t, state, args)
@@ -166,13 +194,11 @@ def check_motion(
     rate = jnp.maximum(
         turning, jnp.where(spinning_up < jnp.inf, jnp.sqrt(spinning_up), 0.0)
     )
-    # Rates whose squares, and the last bits of those, are within the range of the
-    # dtype.
+    # The squares of the rates, and the last bits of the squares, must be within the
+    # range of the dtype.
     info = np.finfo(rate.dtype)
-    slowest, fastest = (
-        float(info.tiny / info.eps) ** 0.5,
-        float(info.max * info.eps) ** 0.5,
-    )
+    slowest = float(info.tiny / info.eps) ** 0.5
+    fastest = float(info.max * info.eps) ** 0.5
     in_range = (rate == 0) | ((rate > slowest) & (rate < fastest))
     findings.require(in_range, RESULTS.rate_out_of_range, value=rate)
     # The rate of the attitude is finite where the state is.
@@ -181,41 +207,51 @@ def check_motion(
 
 
 def harmless_motion(ok: Array, motion: Motion) -> Motion:
-    """A named tuple with a `state0`, whose attitude is normalised; where it is bad, ones.
+    """Normalise the attitude of a motion, and replace an invalid motion by ones.
 
-    No other lane is to wait for a bad one, and no NaN to reach the derivatives of what
-    it shares with the others: ones, since there are forces that are singular at the
-        origin.
+    Thus no lane waits for an invalid one, and no NaN reaches the derivatives of what
+    lanes share. The values are ones, since some forces are singular at the origin.
+
+    Args:
+        ok: Whether the motion is valid.
+        motion: A named tuple with a field `state0`.
     """
     motion = harmless(ok, motion)
     attitude = normalize(motion.state0.attitude)
     return motion._replace(state0=dataclasses.replace(motion.state0, attitude=attitude))
 
 
-def solver_of(solver: Any, default: diffrax.AbstractSolver, or_else: str = "") -> Any:
-    """A solver that estimates its error, or the default for None; ValueError for any other."""
+def solver_of(
+    solver: object, default: diffrax.AbstractSolver, or_else: str = ""
+) -> diffrax.AbstractSolver:
+    """A solver with an error estimate, or ValueError.
+
+    Args:
+        solver: The solver, or None for the default.
+        default: The default.
+        or_else: Further solvers that the caller accepts, for the error message.
+    """
     if not isinstance(solver, diffrax.AbstractAdaptiveSolver | None):
         raise ValueError(
-            f"Argument `solver` must be a diffrax solver with an error estimate{or_else}, "
-            f"but it is {type(solver).__name__}."
+            "Argument `solver` must be a diffrax solver with an error estimate"
+            f"{or_else}, but it is {type(solver).__name__}."
         )
     return default if solver is None else solver
 
 
 def depends_on(function: Callable[[Array], Any], x: Array) -> bool:
-    """Whether a function looks at its argument, as far as its program shows."""
+    """Whether the program of a function uses its argument."""
     return used_inputs(jax.make_jaxpr(function)(x))[0]
 
 
-def exact_motion(
-    check: Callable, flow: Callable, throw: bool, *motion: Any
-) -> ExactStates:
-    """A motion in closed form at times of any shape; a bad value is an error or NaN and a code.
+def exact_motion(check: Check, flow: Flow, throw: bool, *motion: Any) -> ExactStates:
+    """An exact motion at times of any shape.
 
     Args:
-        check: Of findings and a body: notes what is wrong with it.
-        flow: Of a body, a state and a time since then: attitude and angular velocity.
-        throw: Whether to raise.
+        check: Notes invalid values of the body.
+        flow: The exact flow.
+        throw: Whether an invalid value raises an error; if not, it gives NaN and a
+            result code.
         motion: The body, its state at `t0` (as from `plain_state`), the times and `t0`,
             all in one dtype.
     """
@@ -225,29 +261,31 @@ def exact_motion(
 
 
 def _motion_findings(
-    check: Callable, body: Any, state0: State, ts: Array, t0: Array
+    check: Check, body: PyTree, state0: State, ts: Array, t0: Array
 ) -> Findings:
+    """Errors in the arguments of an exact motion."""
     findings = Findings()
     check(findings, body)
     _check_state(findings, state0)
     for name, times in (("t0", t0), ("ts", ts)):
-        # The sum shows in what way
         message = f"Argument `{name}` must be finite, but it is not."
+        # The error shows the sum of the times, which is NaN or infinite.
         findings.require(
             all_finite(times), RESULTS.invalid_times, message, jnp.sum(times)
         )
-    told_apart = resolves(t0, safe_norm(state0.omega))
-    findings.require(told_apart, RESULTS.unresolved_times, value=t0)
+    resolved = resolves(t0, safe_norm(state0.omega))
+    findings.require(resolved, RESULTS.unresolved_times, value=t0)
     return findings
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _exact_states(
-    check: Callable, flow: Callable, body: Any, state0: State, ts: Array, t0: Array
+    check: Check, flow: Flow, body: PyTree, state0: State, ts: Array, t0: Array
 ) -> ExactStates:
+    """The states at all times, NaN and with a result code for invalid arguments."""
     findings = _motion_findings(check, body, state0, ts, t0)
 
-    def states(body: Any, state0: State, times: Array) -> State:
+    def states(body: PyTree, state0: State, times: Array) -> State:
         at_time = partial(flow, body, state0)
         return State(*jnp.vectorize(at_time, signature="()->(4),(3)")(times))
 

@@ -25,7 +25,7 @@ _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
 
 def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
-    """Euclidean norm without overflow; at the zero vector the value is 0 and the gradient 0."""
+    """Euclidean norm without overflow; value and gradient are 0 at the zero vector."""
     scale = power_of_two(_over_components(jnp.maximum, jnp.abs(vector)))
     return scale * root_of_positive(sum_of_squares(vector * (1 / scale)[..., None]))
 
@@ -63,7 +63,7 @@ def without_gradient(value: AnyArray) -> AnyArray:
 
 
 def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
-    """Root of the mean square length of the vectors that are there; 1 where it tells no size."""
+    """Root mean square length of the vectors that are `there`; 1 if it is not a size."""
     xp = vectors.__array_namespace__()
     shown = xp.where(there[..., None], vectors, 0.0)
     largest = without_gradient(or_one(xp.max(xp.abs(shown))))
@@ -74,7 +74,7 @@ def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
 
 
 def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The square root where there is one, else 0; the slope at 0, infinite in truth, is 0."""
+    """The square root of a positive number, else 0; the slope at 0 is 0."""
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
@@ -122,7 +122,10 @@ def _within_range(root: Array) -> Array:
 
 
 def cosh_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """cosh(sqrt(z)) for any real z (the cosine where z < 0), analytic at z = 0; never infinite."""
+    """cosh(sqrt(z)) for any real z, analytic at z = 0; never infinite.
+
+    For negative z it is cos(sqrt(-z)).
+    """
     large = z > _SERIES_BELOW
     root = _within_range(jnp.sqrt(jnp.where(large, z, 1.0)))
     return jnp.where(large, jnp.cosh(root), cos_sqrt(jnp.where(large, 0.0, -z)))
@@ -205,7 +208,7 @@ def _is_matrix_product(subscripts: str) -> bool:
 
 
 def with_columns(function: Callable[..., Components]) -> Callable[..., Components]:
-    """Give a function of scalars a derivative rule that computes its Jacobian with its value.
+    """Give a function of scalars a derivative rule by its whole Jacobian.
 
     Reverse mode then transposes a small matrix, not the loops in `function`. The rule
     is plain code, which every mode differentiates again.
@@ -229,7 +232,10 @@ def with_columns(function: Callable[..., Components]) -> Callable[..., Component
 
 @jax.custom_jvp
 def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """arctan(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0: halved angles, then a series."""
+    """arctan(sqrt(z)) / sqrt(z) for z >= 0, analytic at z = 0.
+
+    The angle is halved three times, then a series is summed.
+    """
     factor = jnp.ones_like(z)
     for _ in range(3):
         below = 1 + jnp.sqrt(1 + z)
@@ -241,7 +247,10 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
 def _arctanc_sqrt_jvp(
     arguments: Components, changes: Components
 ) -> tuple[Array, Array]:
-    """The slope once, for any number of tangents; plain code, which every mode differentiates."""
+    """Compute the slope once, for any number of tangents.
+
+    It is plain code, which can be differentiated in every mode.
+    """
     function = arctanc_sqrt.__wrapped__
     value, slope = jax.jvp(function, arguments, (jnp.ones_like(arguments[0]),))
     return value, slope * changes[0]

@@ -1,7 +1,7 @@
-"""Aliases for the array types of public signatures, and modules that print their numbers."""
+"""Aliases of array types, protocols of states, and modules that print their numbers."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.core
@@ -29,9 +29,14 @@ if TYPE_CHECKING:
 
     AnyArray = Any
     AnyMatrix = Any
+    TimeLike = float | Array
 else:
-    #: An array of JAX, or of numpy on the host: to a type checker the two have nothing in common.
+    #: An array of JAX, or of numpy on the host. To a type checker the two have nothing
+    #: in common.
     AnyArray = Array | np.ndarray | np.generic
+    #: A time or a step that diffrax passes to a solver. Type checkers reject arithmetic
+    #: with `ScalarLike`, which includes numbers of numpy.
+    TimeLike = ScalarLike
     #: A matrix of either kind, shown in signatures by this name.
     AnyMatrix = TypeAliasType(
         "AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"]
@@ -45,7 +50,36 @@ else:
             return TypeAliasType(f"Real[ArrayLike, '{item[1]}']", _Real[item])
 
 
-_FEW = 12  # numbers that an array is shown with
+@runtime_checkable
+class RotationState(Protocol):
+    """A dataclass with an attitude and an angular velocity."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    # Any, since type checkers take a field with an equinox converter for a descriptor.
+    @property
+    def attitude(self) -> Any:
+        """Unit quaternion, scalar first, body to space, an array (4,)."""
+        ...
+
+    @property
+    def omega(self) -> Any:
+        """Angular velocity, body components [rad/s], an array (3,)."""
+        ...
+
+
+@runtime_checkable
+class BodyState(RotationState, Protocol):
+    """State of a body: a `State`, a `FloatingState`, or that of a user's system."""
+
+    @property
+    def internal(self) -> Any:
+        """States of internal parts, an entry for each torque that carries some."""
+        ...
+
+
+# Largest size of an array whose numbers are shown.
+_FEW = 12
 
 
 class Readable(eqx.Module):

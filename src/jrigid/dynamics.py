@@ -1,4 +1,4 @@
-"""Angular momentum, kinetic energy, Euler's equations, and the state of a turning body."""
+"""State of a turning body, angular momentum, kinetic energy, Euler's equations."""
 
 from typing import Any
 
@@ -25,8 +25,8 @@ class State(Readable):
         attitude: Unit quaternion, scalar first, body to space.
         omega: Angular velocity, body components [rad/s].
         internal: A tuple with an entry for each torque that carries parts, in the order
-            of the torques (see `jrigid.torques`): one wheel's spin is `(spin,)`. None
-            if there are none, and before `system.with_parts(state)`, or `simulate`,
+            of the torques (see `jrigid.torques`): that of one wheel is `(spin,)`. None
+            if there are no parts, and before `system.with_parts(state)`, or `simulate`,
             adds parts at rest in the body.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -41,17 +41,18 @@ class State(Readable):
 
 
 class ExactStates(Readable):
-    """States of a motion in closed form, and what became of the call.
+    """States of an exact motion, and a result code.
 
     Attributes:
         states: State at each time; the leading axes of its leaves are those of the
             times.
-        result: `jrigid.RESULTS.successful`, or what is wrong with the arguments; one
-            for each lane under vmap. `jrigid.RESULTS[motion.result]` is its text.
+        result: `jrigid.RESULTS.successful`, or a code for an error in the arguments;
+            one for each lane under vmap. `jrigid.RESULTS[motion.result]` is its text.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    >>> motion = jr.free_rotation(jnp.array([1.0, 1.0, 2.0]), state0, jnp.array([0.0, jnp.pi]))
+    >>> inertia, ts = jnp.array([1.0, 1.0, 2.0]), jnp.array([0.0, jnp.pi])
+    >>> motion = jr.free_rotation(inertia, state0, ts)
     >>> print(motion.omega[1, 2], motion.result == jr.RESULTS.successful)
     1.0 True
     """
@@ -78,7 +79,7 @@ def _inertia_and_vector(
 
 
 def _inertia_times(inertia: Array, vector: Array) -> tuple[Array, ...]:
-    """Components of I v; written out, so that XLA can fuse it and no dot is involved."""
+    """Components of I v, written out so that XLA fuses them, without a dot."""
     a, b, c = vector
     if inertia.ndim == 1:
         return inertia[0] * a, inertia[1] * b, inertia[2] * c
@@ -91,14 +92,20 @@ def _inverse_times(inertia: Array, vector: Array) -> Array:
     """I^-1 v for a symmetric tensor, through the cofactors."""
     if inertia.ndim == 1:
         return vector / inertia
-    # In units of the largest moment: a product of three can be out of the range of
-    # float32.
+    # In units of the largest moment, since a product of three moments can be out of the
+    # range of float32.
     unit = jax.lax.stop_gradient(jnp.max(jnp.diagonal(inertia)))
-    inertia, vector = inertia / unit, vector / unit
+    inertia = inertia / unit
+    vector = vector / unit
     a, b, c = inertia[0, 0], inertia[1, 1], inertia[2, 2]
     d, e, f = inertia[0, 1], inertia[0, 2], inertia[1, 2]
-    aa, bb, cc = b * c - f * f, a * c - e * e, a * b - d * d
-    dd, ee, ff = e * f - d * c, d * f - b * e, d * e - a * f
+    # Cofactors of the entries with the same letters.
+    aa = b * c - f * f
+    bb = a * c - e * e
+    cc = a * b - d * d
+    dd = e * f - d * c
+    ee = d * f - b * e
+    ff = d * e - a * f
     determinant = a * aa + d * dd + e * ee
     x, y, z = vector
     rows = [
@@ -123,7 +130,8 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     Gradients: bilinear, finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.angular_momentum(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
+    >>> inertia, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])
+    >>> print(jr.angular_momentum(inertia, omega))
     [1. 2. 3.]
     """
     return jnp.stack(_inertia_times(*_inertia_and_vector(inertia, omega)))
@@ -155,8 +163,8 @@ def euler_equations(
 ) -> Vector:
     """Euler's equations: the rate of the angular velocity in body components.
 
-    I omega' = N - omega x (I omega). Moments may be any positive numbers: the triangle
-    inequality is not asked for.
+    I omega' = N - omega x (I omega). Moments may be any positive numbers, also those
+    that violate the triangle inequality.
 
     Args:
         inertia: Principal moments or symmetric tensor [kg m^2].
@@ -170,7 +178,8 @@ def euler_equations(
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 36.5.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.euler_equations(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
+    >>> inertia, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])
+    >>> print(jr.euler_equations(inertia, omega))
     [-1.          1.         -0.33333333]
     """
     tensor, w = _inertia_and_vector(inertia, omega)
@@ -183,14 +192,16 @@ def euler_equations(
 
 
 def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
+    """(I omega) x omega, which is exactly zero for a sphere."""
     a, b, c = omega
     if inertia.ndim == 1:
-        # Differences of moments first: exactly zero for a sphere.
+        # Differences of moments are exactly zero for a sphere.
         i1, i2, i3 = inertia
         return jnp.stack([(i2 - i3) * b * c, (i3 - i1) * c * a, (i1 - i2) * a * b])
-    # An isotropic part of the tensor gives no torque; without it a sphere's is exactly
-    # zero.
-    i, shift = inertia, inertia[2, 2]
+    # An isotropic part of the tensor has no effect. Without it the tensor of a sphere
+    # is exactly zero.
+    i = inertia
+    shift = inertia[2, 2]
     p = (i[0, 0] - shift) * a + i[0, 1] * b + i[0, 2] * c
     q = i[1, 0] * a + (i[1, 1] - shift) * b + i[1, 2] * c
     r = i[2, 0] * a + i[2, 1] * b

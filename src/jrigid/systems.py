@@ -1,15 +1,15 @@
-"""Systems for diffrax: vector fields and invariants of bodies that turn, and that fly."""
+"""Systems: vector fields and invariants of bodies with a fixed point or in flight."""
 
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import (
     INERTIA,
@@ -25,18 +25,28 @@ from jrigid._checks import (
     state_array,
     traced_by_jax,
 )
-from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
+from jrigid._types import (
+    BodyState,
+    InertiaLike,
+    Readable,
+    Scalar,
+    ScalarLike,
+    Vector,
+)
 from jrigid.dynamics import State, angular_momentum, euler_equations, kinetic_energy
 from jrigid.mass import MassProperties
 from jrigid.rotation import attitude_rate, rotate
 from jrigid.torques import AbstractTorque, Sum, TorqueFunction, as_torque
 
+State_ = TypeVar("State_", bound=BodyState)
+
 
 class AbstractSystem(Readable):
-    """What `jrigid.simulate` integrates: an inertia, a torque, a vector field, invariants.
+    """A system for `jrigid.simulate`: inertia, torque, vector field and invariants.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> bodies = jr.RigidBody(jnp.ones(3)), jr.FloatingBody(jr.solids.sphere(1.0, 0.1))
+    >>> ball = jr.solids.sphere(1.0, 0.1)
+    >>> bodies = jr.RigidBody(jnp.ones(3)), jr.FloatingBody(ball)
     >>> print([isinstance(x, jr.AbstractSystem) for x in bodies])
     [True, True]
     >>> print([x.state_type.__name__ for x in bodies])
@@ -48,22 +58,26 @@ class AbstractSystem(Readable):
     torque: eqx.AbstractVar[AbstractTorque]
 
     @abc.abstractmethod
-    def vector_field(self, t: ScalarLike, state: Any, args: Any) -> Any:
+    def vector_field(self, t: ScalarLike, state: BodyState, args: PyTree) -> BodyState:
         """Time derivative of the state, in the state's own structure."""
 
     @abc.abstractmethod
-    def energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def energy(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Total energy [J]: kinetic, potential and that of internal parts."""
 
     @abc.abstractmethod
-    def angular_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
-        """Total angular momentum [kg m^2/s], space components, internal parts included."""
+    def angular_momentum(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
+        """Total angular momentum, internal parts included.
 
-    def with_parts(self, state: Any) -> Any:
-        """A state with all that the body carries: its own parts, or parts at rest in the body.
+        Returns:
+            Space components [kg m^2/s].
+        """
 
-        `simulate` takes a state without them; a vector field in one's own `diffeqsolve`
-        does not.
+    def with_parts(self, state: State_) -> State_:
+        """The state, with internal parts at rest in the body if it has none.
+
+        `simulate` adds them to a state without parts. The vector field needs them, for
+        example in a `diffeqsolve` of your own.
 
         Args:
             state: State, with an entry in `internal` for each torque that carries
@@ -76,29 +90,33 @@ class AbstractSystem(Readable):
             state = dataclasses.replace(
                 state, internal=self.torque.internal_at_rest(state)
             )
-        self._inertia_and_torque(state)  # which looks at the parts
+        # Raises an error for wrong parts.
+        self._inertia_and_torque(state)
         return state
 
     @property
     def jumps(self) -> Float[Array, " jumps"]:
-        """Times at which the torque says that it is not smooth [s]."""
+        """Times at which the torque declares that it is not smooth [s]."""
         return self.torque.jumps
 
-    def torque_on(self, t: ScalarLike, state: Any, args: Any) -> Vector:
-        """The torque on this body [N m], body components, of torques that know its inertia."""
+    def torque_on(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
+        """The torque on this body [N m], body components."""
         return self._inertia_and_torque(state)[1](t, state, args)
 
-    def _inertia_and_torque(self, state: Any) -> tuple[Array, AbstractTorque]:
-        """The inertia, in the dtype of a state with this body's parts, and the torque on it."""
-        have, want = (
-            [(jtu.keystr(path), x.shape) for path, x in jtu.tree_leaves_with_path(tree)]
-            for tree in (state.internal, self.torque.internal_at_rest(state))
-        )
+    def _inertia_and_torque(self, state: BodyState) -> tuple[Array, AbstractTorque]:
+        """The inertia in the dtype of the state, and the torque on a body with it.
+
+        Raises:
+            ValueError: The state does not have the internal parts of this body.
+        """
+        have = _shapes(state.internal)
+        want = _shapes(self.torque.internal_at_rest(state))
         if have != want:
             raise ValueError(
-                "Argument `internal` of the state must be a tuple with an entry for each torque "
-                f"that carries parts, here of the shapes {want}, but it holds {have}: "
-                "`system.with_parts(state)` adds parts at rest to a state that has none."
+                "Argument `internal` of the state must be a tuple with an entry for "
+                f"each torque that carries parts, here of the shapes {want}, but it "
+                f"holds {have}: `system.with_parts(state)` adds parts at rest to a "
+                "state that has none."
             )
         inertia = self.inertia.astype(state.omega.dtype)
         return inertia, self.torque.of_body(inertia)
@@ -107,12 +125,18 @@ class AbstractSystem(Readable):
         """Note parameters with bad values, for `simulate`.
 
         Args:
-            findings: What has been found so far; `require` adds to it.
+            findings: Collects what is wrong, by its method `require`.
         """
         findings.require(
             is_inertia(self.inertia), RESULTS.invalid_inertia, value=self.inertia
         )
         self.torque.check(findings)
+
+
+def _shapes(tree: PyTree) -> list[tuple[str, tuple[int, ...]]]:
+    """Paths and shapes of the leaves of a pytree."""
+    leaves = jtu.tree_leaves_with_path(tree)
+    return [(jtu.keystr(path), x.shape) for path, x in leaves]
 
 
 class FloatingState(Readable):
@@ -128,7 +152,10 @@ class FloatingState(Readable):
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state = jr.FloatingState(
-    ...     jnp.zeros(3), jnp.array([3.0, 0.0, 4.0]), jnp.array([1.0, 0, 0, 0]), jnp.ones(3)
+    ...     position=jnp.zeros(3),
+    ...     velocity=jnp.array([3.0, 0.0, 4.0]),
+    ...     attitude=jnp.array([1.0, 0.0, 0.0, 0.0]),
+    ...     omega=jnp.ones(3),
     ... )
     """
 
@@ -175,7 +202,7 @@ class RigidBody(AbstractSystem):
         return isinstance(self.torque, Sum) and not self.torque.terms
 
     def vector_field(
-        self, t: ScalarLike, state: State | FloatingState, args: Any
+        self, t: ScalarLike, state: State | FloatingState, args: PyTree
     ) -> State:
         """Time derivative of the state.
 
@@ -199,7 +226,9 @@ class RigidBody(AbstractSystem):
             internal_rate,
         )
 
-    def energy(self, t: ScalarLike, state: State | FloatingState, args: Any) -> Scalar:
+    def energy(
+        self, t: ScalarLike, state: State | FloatingState, args: PyTree
+    ) -> Scalar:
         """Total energy [J]: kinetic, potential, and that of internal parts.
 
         Args:
@@ -213,15 +242,12 @@ class RigidBody(AbstractSystem):
         Gradients: finite for any non-zero attitude quaternion.
         """
         inertia, torque = self._inertia_and_torque(state)
-        own = kinetic_energy(inertia, state.omega)
-        return (
-            own
-            + torque.internal_energy(t, state, args)
-            + torque.potential(t, state, args)
-        )
+        energy = kinetic_energy(inertia, state.omega)
+        energy = energy + torque.internal_energy(t, state, args)
+        return energy + torque.potential(t, state, args)
 
     def angular_momentum(
-        self, t: ScalarLike, state: State | FloatingState, args: Any
+        self, t: ScalarLike, state: State | FloatingState, args: PyTree
     ) -> Vector:
         """Total angular momentum about the fixed point, internal parts included.
 
@@ -240,8 +266,14 @@ class RigidBody(AbstractSystem):
         return rotate(state.attitude, own + torque.internal_momentum(t, state, args))
 
 
+#: `(t, state, args) -> (3,)`: the force on a body, space components [N].
+ForceFunction = Callable[[Any, Any, Any], Any]
+
+
 class Force(eqx.Module):
-    """A force with a potential energy, for `FloatingBody`; a plain callable is one without.
+    """A force with a potential energy, for `FloatingBody`.
+
+    A plain function can be passed as a force without potential energy.
 
     Attributes:
         fn: `(t, state, args) -> (3,)` space components [N].
@@ -254,10 +286,10 @@ class Force(eqx.Module):
     ... )
     """
 
-    fn: Callable[[Any, Any, Any], Any]
+    fn: ForceFunction
     potential: Callable[[Any, Any, Any], Any]
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Force [N], space components."""
         return self.fn(t, state, args)
 
@@ -266,25 +298,27 @@ class FloatingBody(AbstractSystem):
     """A body in flight: its centre of mass moves under forces while it turns.
 
     Attributes:
-        mass_properties: Mass and inertia; where in the body the centre of mass is plays
-            no role.
+        mass_properties: Mass and inertia; the place of the centre of mass in the body
+            does not matter.
         force: `(t, state, args) -> (3,)` total force, space components [N], or None.
         torque: The torque about the centre of mass.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> weight = lambda t, state, args: jnp.array([0.0, 0.0, -9.8])
-    >>> racket = jr.FloatingBody(jr.solids.box(1.0, jnp.array([0.1, 0.3, 0.05])), weight)
+    >>> def weight(t, state, args):
+    ...     return jnp.array([0.0, 0.0, -9.8])
+    >>> box = jr.solids.box(1.0, jnp.array([0.1, 0.3, 0.05]))
+    >>> racket = jr.FloatingBody(box, weight)
     """
 
     state_type: ClassVar[type] = FloatingState
     mass_properties: MassProperties
-    force: Callable[[Any, Any, Any], Any] | None
+    force: ForceFunction | None
     torque: AbstractTorque
 
     def __init__(
         self,
         mass_properties: MassProperties,
-        force: Callable[[Any, Any, Any], Any] | None = None,
+        force: ForceFunction | None = None,
         torque: TorqueFunction | None = None,
     ):
         """A body in flight.
@@ -301,17 +335,20 @@ class FloatingBody(AbstractSystem):
                 "Argument `force` must be a callable (t, state, args) -> (3,), "
                 f"but it is {force!r}."
             )
-        self.mass_properties, self.force = mass_properties, force
+        self.mass_properties = mass_properties
+        self.force = force
         self.torque = as_torque(torque)
 
     @property
-    def inertia(self) -> Float[Array, "..."]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def inertia(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> Float[Array, "..."]:
         """Inertia tensor about the centre of mass [kg m^2]."""
         return self.mass_properties.inertia
 
     @property
     def jumps(self) -> Float[Array, " jumps"]:
-        """Times at which the torque or the force says that it is not smooth [s]."""
+        """Times at which the torque or the force declares that it is not smooth [s]."""
         return jumps_within([self.torque, self.force])
 
     @property
@@ -323,14 +360,14 @@ class FloatingBody(AbstractSystem):
         """Note a mass that is not positive, then as any system.
 
         Args:
-            findings: What has been found so far; `require` adds to it.
+            findings: Collects what is wrong, by its method `require`.
         """
         mass = jax.lax.stop_gradient(self.mass_properties.mass)
         findings.require(all_positive(mass), RESULTS.invalid_mass, value=mass)
         self.rotation.check(findings)
 
     def vector_field(
-        self, t: ScalarLike, state: FloatingState, args: Any
+        self, t: ScalarLike, state: FloatingState, args: PyTree
     ) -> FloatingState:
         """Time derivative of the state.
 
@@ -379,7 +416,7 @@ class FloatingBody(AbstractSystem):
         """
         return kinetic_energy(self.inertia.astype(state.omega.dtype), state.omega)
 
-    def energy(self, t: ScalarLike, state: FloatingState, args: Any) -> Scalar:
+    def energy(self, t: ScalarLike, state: FloatingState, args: PyTree) -> Scalar:
         """Total energy [J]: both kinetic parts, potentials, and that of internal parts.
 
         Args:
@@ -411,7 +448,7 @@ class FloatingBody(AbstractSystem):
         return self.mass_properties.mass.astype(state.velocity.dtype) * state.velocity
 
     def angular_momentum(
-        self, t: ScalarLike, state: FloatingState, args: Any
+        self, t: ScalarLike, state: FloatingState, args: PyTree
     ) -> Vector:
         """Total angular momentum about the origin of space: orbital plus rotational.
 

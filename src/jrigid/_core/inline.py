@@ -1,4 +1,4 @@
-"""A function traced once, without the calls of jitted functions within it."""
+"""Trace a function once, without the calls of jitted functions within it."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,11 +10,11 @@ from jrigid._core import third_party
 
 
 def inlined(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The results of a function of arrays, as `function(*arguments)`.
+    """`function(*arguments)`, as a sequence of operations without calls.
 
-    Under several nested vmaps JAX traces each call of a jitted function (each
-    `jnp.where`) once more for every vmap. Here the function is traced once by itself,
-    and what surrounds it sees its arithmetic only: half of the time to trace a fit.
+    Under nested vmaps JAX traces each call of a jitted function, such as `jnp.where`,
+    once for every vmap. Here the function is traced once by itself, and the vmaps see
+    its operations only. This halves the time to trace a fit.
     """
     leaves, structure = jtu.tree_flatten(arguments)
     shapes = [
@@ -26,24 +26,21 @@ def inlined(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*structure.unflatten(leaves))
 
     program, results = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    found = _evaluate(program.jaxpr, program.consts, leaves)
-    return jtu.tree_structure(results).unflatten(found)
+    values = _evaluate(program.jaxpr, program.consts, leaves)
+    return jtu.tree_structure(results).unflatten(values)
 
 
 def _evaluate(
-    jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Any]
+    jaxpr: third_party.Jaxpr, constants: Sequence[Any], arguments: Sequence[Any]
 ) -> list[Any]:
     """Evaluate a program, and within it the programs that it calls."""
-    values = dict(
-        zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True)
-    )
+    variables = [*jaxpr.constvars, *jaxpr.invars]
+    values = dict(zip(variables, [*constants, *arguments], strict=True))
 
     def read(variable: Any) -> Any:
-        return (
-            variable.val
-            if isinstance(variable, third_party.Literal)
-            else values[variable]
-        )
+        if isinstance(variable, third_party.Literal):
+            return variable.val
+        return values[variable]
 
     for equation in jaxpr.eqns:
         inputs = [read(x) for x in equation.invars]

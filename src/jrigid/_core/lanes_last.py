@@ -1,48 +1,48 @@
-"""A function of one lane, on many lanes along the last axis.
+"""Evaluate a function of one lane on many lanes, which are along the last axis.
 
-`jax.vmap(..., in_axes=-1, out_axes=-1)` means the same, but its rules move the lanes to
-the front and back again, which takes longer than the work where the work is a few
-numbers a lane. Here what goes number by number, or takes arrays apart and puts them
-together, leaves the lanes where they are; all else is left to `vmap`.
+`jax.vmap(..., in_axes=-1, out_axes=-1)` has the same result, but its rules move the
+lanes to the front and back again. For a few numbers in each lane this takes longer than
+the computation. Here elementwise operations, and operations that split and join arrays,
+leave the lanes along the last axis. `vmap` does all others.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
 
 from jrigid._core import third_party
 
-# Of so few terms sums are written out, to be computed with what is around them.
+# Reductions of at most this many terms are written out, so that XLA fuses them.
 _FEW = 8
 
 
-def _spread(x: Any, has_lanes: bool, shape: tuple[int, ...], lanes: int) -> Any:
-    """A value in all lanes, and of this shape in each if it is a number."""
+def _spread(x: PyTree, has_lanes: bool, shape: tuple[int, ...], lanes: int) -> Array:
+    """Broadcast a value to all lanes, and a number to this shape in each lane."""
     x = x if has_lanes else jnp.asarray(x)[..., None]
     x = x.reshape((1,) * (len(shape) + 1 - x.ndim) + x.shape)
     return jnp.broadcast_to(x, (*shape, lanes))
 
 
-def _apply(equation: Any, values: list, batched: list[bool], lanes: int) -> list:
+def _apply(
+    equation: third_party.JaxprEqn, values: list, batched: list[bool], lanes: int
+) -> list:
     """The results, with lanes, of an operation on values some of which have lanes."""
-    primitive, parameters = equation.primitive, equation.params
+    primitive = equation.primitive
+    parameters = equation.params
     pairs = list(zip(values, batched, strict=True))
     if third_party.is_elementwise(equation):
-        shape = equation.outvars[0].aval.shape
+        shape = third_party.shape_of(equation.outvars[0])
         values = [_spread(x, has, shape, lanes) for x, has in pairs]
         return third_party.apply(primitive, parameters, *values)
     with_lanes = third_party.with_last_axis(equation, lanes)
     if with_lanes is None:
-        axis = 0 if primitive in third_party.LANES_IN_FRONT else -1
-        axes = [axis if has else None for has in batched]
-        values = [jnp.moveaxis(x, -1, axis) if has else x for x, has in pairs]
-        alone = functools.partial(third_party.apply, primitive, parameters)
-        return jax.vmap(alone, axes, -1)(*values)
-    shapes = [x.aval.shape for x in equation.invars]
+        return _apply_by_vmap(equation, pairs)
+    shapes = [third_party.shape_of(x) for x in equation.invars]
     triples = zip(values, batched, shapes, strict=True)
     values = [_spread(x, has, shape, lanes) for x, has, shape in triples]
     fold = third_party.FOLDS.get(primitive)
@@ -52,16 +52,26 @@ def _apply(equation: Any, values: list, batched: list[bool], lanes: int) -> list
     return third_party.apply(primitive, with_lanes, *values)
 
 
-def _in_lanes(x: Any, has: bool, lanes: int) -> Any:
-    return (
-        x
-        if has
-        else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
-    )
+def _apply_by_vmap(
+    equation: third_party.JaxprEqn, pairs: Sequence[tuple[Any, bool]]
+) -> list:
+    """The results, with lanes, of an operation for which there is no rule here."""
+    axis = 0 if equation.primitive in third_party.LANES_IN_FRONT else -1
+    axes = [axis if has else None for _, has in pairs]
+    values = [jnp.moveaxis(x, -1, axis) if has else x for x, has in pairs]
+    alone = functools.partial(third_party.apply, equation.primitive, equation.params)
+    return jax.vmap(alone, axes, -1)(*values)
 
 
-def _results_vary(jaxpr: Any, batched: Sequence[bool]) -> list[bool]:
-    """Which results of a program have lanes, if these of its arguments have."""
+def _in_lanes(x: PyTree, has_lanes: bool, lanes: int) -> Array:
+    """Broadcast a value to all lanes if it has none."""
+    if has_lanes:
+        return x
+    return jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+
+
+def _results_vary(jaxpr: third_party.Jaxpr, batched: Sequence[bool]) -> list[bool]:
+    """Which results of a program have lanes if these of its arguments have."""
     known = dict(zip(jaxpr.invars, batched, strict=True))
 
     def has_lanes(x: Any) -> bool:
@@ -76,7 +86,7 @@ def _results_vary(jaxpr: Any, batched: Sequence[bool]) -> list[bool]:
         elif scan is not None:
             results = _vary(scan, flags)
         elif called is not None:
-            inner = getattr(called, "jaxpr", called)
+            inner = third_party.jaxpr_of(called)
             results = _results_vary(inner, flags)
         else:
             results = [True] * len(equation.outvars)
@@ -87,7 +97,7 @@ def _results_vary(jaxpr: Any, batched: Sequence[bool]) -> list[bool]:
 def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
     """Which results of a scan have lanes.
 
-    What it carries has lanes if one trip gives it lanes.
+    A part of the carry has lanes if an iteration gives it lanes.
     """
     flags = list(batched)
     while True:
@@ -100,15 +110,18 @@ def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
 
 
 class _Evaluation:
-    """A jaxpr on values some of which have lanes."""
+    """Evaluates programs on values some of which have lanes."""
 
     def __init__(self, lanes: int):
-        """So many lanes."""
+        """An evaluation with this number of lanes."""
         self.lanes = lanes
         self.functions: dict[Any, Any] = {}
 
     def __call__(
-        self, jaxpr: Any, consts: Any, arguments: Any
+        self,
+        jaxpr: third_party.Jaxpr,
+        consts: Sequence[Any],
+        arguments: Iterable[tuple[Any, bool]],
     ) -> list[tuple[Any, bool]]:
         """Values, and whether they have lanes."""
         known: dict[Any, tuple[Any, bool]] = {}
@@ -124,7 +137,7 @@ class _Evaluation:
         return [read(x) for x in jaxpr.outvars]
 
     def results(
-        self, eqn: Any, pairs: list[tuple[Any, bool]]
+        self, eqn: third_party.JaxprEqn, pairs: list[tuple[Any, bool]]
     ) -> list[tuple[Any, bool]]:
         """The results of an operation, and whether they have lanes."""
         values = [x for x, _ in pairs]
@@ -144,17 +157,20 @@ class _Evaluation:
                 *(_in_lanes(*x, self.lanes) for x in pairs[:arrays]),
                 *values[arrays:],
             ]
-            found = third_party.slice_with_last_axis(eqn, self.lanes, *values)
-            return [(found, True)]
+            result = third_party.slice_with_last_axis(eqn, self.lanes, *values)
+            return [(result, True)]
         called = third_party.called_program(eqn)
         if called is not None:
             return self.call(called, values, tuple(batched))
         return [(x, True) for x in _apply(eqn, values, batched, self.lanes)]
 
     def call(
-        self, called: Any, values: list, batched: tuple[bool, ...]
+        self,
+        called: third_party.ClosedJaxpr | third_party.Jaxpr,
+        values: list,
+        batched: tuple[bool, ...],
     ) -> list[tuple[Any, bool]]:
-        """A function's; one that is called often is traced once."""
+        """The results of a called function, which is traced once for all its calls."""
         key = id(called), batched
         if key not in self.functions:
             closed = isinstance(called, third_party.ClosedJaxpr)
@@ -163,42 +179,45 @@ class _Evaluation:
 
             @jax.jit
             def function(*values: Any) -> list:
-                found = self(inner, consts, zip(values, batched, strict=True))
-                flags[:] = [has for _, has in found]
-                return [x for x, _ in found]
+                results = self(inner, consts, zip(values, batched, strict=True))
+                flags[:] = [has for _, has in results]
+                return [x for x, _ in results]
 
             self.functions[key] = function, flags
         function, flags = self.functions[key]
         return list(zip(function(*values), flags, strict=True))
 
-    def whole(self, closed: Any, arguments: Any) -> list:
+    def whole(
+        self, closed: third_party.ClosedJaxpr, arguments: Iterable[tuple[Any, bool]]
+    ) -> list:
         """All results of a branch or a body, in all lanes."""
-        found = self(closed.jaxpr, closed.consts, arguments)
-        return [_in_lanes(*x, self.lanes) for x in found]
+        results = self(closed.jaxpr, closed.consts, arguments)
+        return [_in_lanes(*x, self.lanes) for x in results]
 
     def scan(
         self,
         scan: third_party.Scan,
         pairs: list[tuple[Any, bool]],
     ) -> list[tuple[Any, bool]]:
-        """A loop of a known length."""
-        consts, carry, rows = pairs[scan.constants], pairs[scan.carry], pairs[scan.rows]
-
+        """The results of a loop of known length."""
+        consts = pairs[scan.constants]
+        carry = pairs[scan.carry]
+        rows = pairs[scan.rows]
         varies = _vary(scan, [has for _, has in pairs])
 
-        def in_lanes(found: list[tuple[Any, bool]]) -> list:
-            """Values, in lanes where what the loop carries has lanes."""
+        def in_lanes(pairs: list[tuple[Any, bool]]) -> list:
+            """Values, in lanes where the results of the loop have lanes."""
             return [
                 _in_lanes(x, has, self.lanes) if vary else x
-                for (x, has), vary in zip(found, varies, strict=False)
+                for (x, has), vary in zip(pairs, varies, strict=False)
             ]
 
         def step(carry: list, values: list) -> tuple[list, list]:
-            kept = zip(carry, varies, strict=False)
+            carried = zip(carry, varies, strict=False)
             row = zip(values, (has for _, has in rows), strict=True)
-            arguments = [*consts, *kept, *row]
-            found = in_lanes(self(scan.body.jaxpr, scan.body.consts, arguments))
-            return found[: len(carry)], found[len(carry) :]
+            arguments = [*consts, *carried, *row]
+            results = in_lanes(self(scan.body.jaxpr, scan.body.consts, arguments))
+            return results[: len(carry)], results[len(carry) :]
 
         rows_alone = [x for x, _ in rows]
         end, stacked = jax.lax.scan(
@@ -212,19 +231,20 @@ class _Evaluation:
         values: list,
         batched: list[bool],
     ) -> list[tuple[Any, bool]]:
-        """A branch that all lanes take."""
+        """The results of a branch that all lanes take."""
 
-        def branch(closed: Any) -> Callable[..., list]:
-            return lambda *values: self.whole(
-                closed, zip(values, batched[1:], strict=True)
-            )
+        def branch(closed: third_party.ClosedJaxpr) -> Callable[..., list]:
+            def results(*values: Any) -> list:
+                return self.whole(closed, zip(values, batched[1:], strict=True))
+
+            return results
 
         in_lanes = [branch(x) for x in branches]
         return [(x, True) for x in jax.lax.switch(values[0], in_lanes, *values[1:])]
 
 
 def lanes_last(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The results of a function of arrays, all of which have lanes along their last axis."""
+    """The results of a function of one lane, for arguments with lanes last."""
     leaves, structure = jtu.tree_flatten(arguments)
     lanes = leaves[0].shape[-1]
     shapes = [jax.ShapeDtypeStruct(x.shape[:-1], x.dtype) for x in leaves]
@@ -233,5 +253,5 @@ def lanes_last(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*structure.unflatten(leaves))
 
     jaxpr, results = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    found = _Evaluation(lanes).whole(jaxpr, [(x, True) for x in leaves])
-    return jtu.tree_structure(results).unflatten(found)
+    values = _Evaluation(lanes).whole(jaxpr, [(x, True) for x in leaves])
+    return jtu.tree_structure(results).unflatten(values)

@@ -1,9 +1,9 @@
 """Every use of what jax, equinox and diffrax do not document.
 
-Such parts may change with any release. So all of them are here, with the versions that
-they were tested with, and pyproject.toml bounds equinox and diffrax below the next
-minor release. `tests/test_third_party.py` goes through the tables of primitives, and
-`tests/test_house.py` checks that no other module reaches for private parts itself.
+Such parts may change with any release. Therefore all of them are in this module, with
+the versions with which they were tested, and pyproject.toml bounds equinox and diffrax
+below the next minor release. `tests/test_third_party.py` checks the tables of
+primitives. `tests/test_house.py` checks that no other module uses private parts.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,6 +18,7 @@ from jax.extend import core
 from jax.interpreters import ad as ad
 from jax.interpreters import batching, partial_eval
 from jax.interpreters import mlir as mlir
+from jaxtyping import PyTree
 
 #: Oldest and newest versions with which the test suite has passed.
 TESTED_WITH = {
@@ -28,65 +29,86 @@ TESTED_WITH = {
 
 # equinox: enumerations ----------------------------------------------------------------
 
-#: The class of the class `equinox.Enumeration`, to derive one with more abilities.
+#: The metaclass of `equinox.Enumeration`, as a base of metaclasses.
 EnumerationMeta = type(eqx.Enumeration)
 
 #: The class of the items of every enumeration.
 EnumerationItem = type(diffrax.RESULTS.successful)
 
 
-def code_of(item: Any) -> Any:
+def code_of(item: PyTree) -> Any:
     """The integer code of an item of an enumeration, or the codes of many lanes.
 
-    An array, or what stands for one in a tree of shapes.
+    It is an array, or its substitute in a pytree of shapes.
     """
     return item._value
 
 
 class _Code(EnumerationItem):  # pyright: ignore[reportGeneralTypeIssues]
-    """An item that is an integer where one is asked for."""
+    """An item that `int` and numpy convert to its code."""
 
     def __index__(self) -> int:
         return int(code_of(self))
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(
+        self, dtype: np.dtype | type | None = None, copy: bool | None = None
+    ) -> np.ndarray:
         del copy
         return np.array(code_of(self), dtype)
 
 
-def with_codes(enumeration: Any) -> Any:
-    """The same enumeration, whose items `int` and numpy take for their codes."""
+def with_codes(enumeration: type) -> Any:
+    """The same enumeration, with items that `int` and numpy convert to codes."""
     items = vars(enumeration)["_name_to_item"]
     for name, item in items.items():
-        items[name] = _Code(code_of(item), enumeration)  # pyright: ignore[reportCallIssue]
+        code: Any = code_of(item)
+        items[name] = _Code(code, enumeration)  # pyright: ignore[reportCallIssue]
     return enumeration
 
 
-def enumeration_of(item: Any) -> Any:
+def enumeration_of(item: PyTree) -> Any:
     """The enumeration that an item belongs to."""
     return item._enumeration
 
 
-def names_of(enumeration: Any) -> tuple[str, ...]:
+def names_of(enumeration: type) -> tuple[str, ...]:
     """The names of an enumeration's items, in the order of their codes."""
     return tuple(vars(enumeration)["_name_to_item"])
 
 
-def messages_of(enumeration: Any) -> tuple[str, ...]:
+def messages_of(enumeration: type) -> tuple[str, ...]:
     """The messages of an enumeration's items, in the order of their codes."""
     return tuple(vars(enumeration)["_index_to_message"])
+
+
+# diffrax: terms -----------------------------------------------------------------------
+
+
+def unwrapped_term(term: Any) -> tuple[Any, Any]:
+    """A term as the user passed it, and the direction of time.
+
+    In `diffeqsolve` time always grows. It passes each term to the solver in a wrapper
+    with the direction of time, 1 or -1.
+    """
+    return getattr(term, "term", term), getattr(term, "direction", 1)
 
 
 # jax: programs ------------------------------------------------------------------------
 
 ClosedJaxpr = core.ClosedJaxpr
 Jaxpr = core.Jaxpr
+JaxprEqn = core.JaxprEqn
 Literal = core.Literal
 Primitive = core.Primitive
 jaxpr_as_fun = core.jaxpr_as_fun
 
 #: The parameters of an operation, by their names.
 Parameters = dict[str, Any]
+
+
+def shape_of(variable: Any) -> tuple[int, ...]:
+    """The shape of an input or an output of an operation in a program."""
+    return variable.aval.shape
 
 
 def used_inputs(program: core.ClosedJaxpr) -> list[bool]:
@@ -97,7 +119,12 @@ def used_inputs(program: core.ClosedJaxpr) -> list[bool]:
 
 
 def set_vmap_rule(primitive: core.Primitive, rule: Callable[..., Any]) -> None:
-    """What `jax.vmap` does with a primitive: `rule(arguments, axes)`, the result and its axis."""
+    """Set the rule of `jax.vmap` for a primitive.
+
+    Args:
+        primitive: The primitive.
+        rule: `rule(arguments, axes)` returns the result and its axis.
+    """
     batching.primitive_batchers[primitive] = rule
 
 
@@ -115,13 +142,13 @@ def known_primitives(names: str) -> frozenset[core.Primitive]:
 
     Primitives are compared as objects, since another package may use the same name.
     """
-    found = set()
+    primitives = set()
     for name in names.split():
         attribute = f"{name}_p"
         for module in (core.primitives, jax.lax):
             if hasattr(module, attribute):
-                found.add(getattr(module, attribute))
-    return frozenset(found)
+                primitives.add(getattr(module, attribute))
+    return frozenset(primitives)
 
 
 # jax: primitives on arrays with one more axis, at the end -----------------------------
@@ -186,8 +213,8 @@ CHANGED_BY_AXIS = {
 #: Slices at places that are computed, and how many arrays come before the places.
 DYNAMIC_SLICES = {"dynamic_slice": 1, "dynamic_update_slice": 2}
 
-#: Calls of other programs, and the parameter that holds the program. What a call holds
-#: beside it, such as a derivative rule, does not matter to its values.
+#: Calls of other programs, and the parameter that holds the program. Other parameters
+#: of a call, such as a derivative rule, do not affect its values.
 CALLS = {
     "jit": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -199,11 +226,11 @@ CALLS = {
 
 def _by_primitive(table: dict[str, Any]) -> dict[core.Primitive, Any]:
     """A table by primitives instead of their names."""
-    found = {}
-    for name, value in table.items():
-        for primitive in known_primitives(name):
-            found[primitive] = value
-    return found
+    return {
+        primitive: value
+        for name, value in table.items()
+        for primitive in known_primitives(name)
+    }
 
 
 #: What reductions do with two numbers.
@@ -226,11 +253,11 @@ _SHARDINGS = ("sharding", "out_sharding")
 
 
 def _is_sharded(parameters: dict[str, Any]) -> bool:
-    """Whether a layout over devices is asked for, which has an entry for each axis."""
+    """Whether there is a layout over devices, which has an entry for each axis."""
     return any(parameters.get(name) is not None for name in _SHARDINGS)
 
 
-def is_elementwise(equation: Any) -> bool:
+def is_elementwise(equation: core.JaxprEqn) -> bool:
     """Whether each number of the result depends on those at the same place alone.
 
     Arguments have the shape of the result, or are single numbers. This excludes a
@@ -238,12 +265,12 @@ def is_elementwise(equation: Any) -> bool:
     """
     if equation.primitive not in ELEMENTWISE or _is_sharded(equation.params):
         return False
-    shape = equation.outvars[0].aval.shape
-    shapes = [x.aval.shape for x in equation.invars]
+    shape = shape_of(equation.outvars[0])
+    shapes = [shape_of(x) for x in equation.invars]
     return shape in shapes and all(x in ((), shape) for x in shapes)
 
 
-def with_last_axis(equation: Any, size: int) -> Parameters | None:
+def with_last_axis(equation: core.JaxprEqn, size: int) -> Parameters | None:
     """Parameters with which an operation does the same to arrays with one more axis.
 
     The axis is the last one and of this size. None for a primitive that is not in the
@@ -259,12 +286,12 @@ def with_last_axis(equation: Any, size: int) -> Parameters | None:
     return None
 
 
-def dynamic_slice_of(equation: Any) -> int | None:
-    """How many arrays a slice at a computed place takes, or None for anything else."""
+def dynamic_slice_of(equation: core.JaxprEqn) -> int | None:
+    """Number of arrays that a slice at a computed place takes, or None for no slice."""
     return _DYNAMIC_SLICES.get(equation.primitive)
 
 
-def slice_with_last_axis(equation: Any, size: int, *values: Any) -> Any:
+def slice_with_last_axis(equation: core.JaxprEqn, size: int, *values: Any) -> Any:
     """A slice, read or written, of arrays with one more axis at their end."""
     arrays = _DYNAMIC_SLICES[equation.primitive]
     starts = [*values[arrays:], jax.numpy.zeros_like(values[-1])]
@@ -274,9 +301,16 @@ def slice_with_last_axis(equation: Any, size: int, *values: Any) -> Any:
     return jax.lax.dynamic_update_slice(values[0], values[1], starts)
 
 
-def called_program(equation: Any) -> Any:
+def called_program(
+    equation: core.JaxprEqn,
+) -> core.ClosedJaxpr | core.Jaxpr | None:
     """The program that an operation calls, a `ClosedJaxpr` or a `Jaxpr`, or None."""
     return equation.params.get(_CALLS.get(equation.primitive, ""))
+
+
+def jaxpr_of(program: core.ClosedJaxpr | core.Jaxpr) -> core.Jaxpr:
+    """The program without its constants."""
+    return program.jaxpr if isinstance(program, core.ClosedJaxpr) else program
 
 
 class Scan(NamedTuple):
@@ -295,7 +329,7 @@ _CONDS = known_primitives("cond")
 
 
 def _scan_counts(parameters: Parameters) -> tuple[int, int] | None:
-    """How many constants and how many arrays of the carry a scan takes first."""
+    """Numbers of constants and of arrays in the carry, the first inputs of a scan."""
     if "num_consts" in parameters and "num_carry" in parameters:
         return parameters["num_consts"], parameters["num_carry"]
     if "ft_in" in parameters:  # from jax 0.12 on
@@ -304,7 +338,7 @@ def _scan_counts(parameters: Parameters) -> tuple[int, int] | None:
     return None
 
 
-def scan_of(equation: Any) -> Scan | None:
+def scan_of(equation: core.JaxprEqn) -> Scan | None:
     """The parts of a loop of a known length; None for anything else."""
     if equation.primitive not in _SCANS:
         return None
@@ -324,7 +358,7 @@ def scan_of(equation: Any) -> Scan | None:
     )
 
 
-def branches_of(equation: Any) -> Sequence[core.ClosedJaxpr] | None:
+def branches_of(equation: core.JaxprEqn) -> Sequence[core.ClosedJaxpr] | None:
     """The branches of a `jax.lax.cond` or `switch`, or None.
 
     The first argument chooses the branch; the others are its arguments.
@@ -334,15 +368,15 @@ def branches_of(equation: Any) -> Sequence[core.ClosedJaxpr] | None:
     return equation.params.get("branches")
 
 
-#: For elementary functions XLA's CPU compiler calls the C library, number by number.
+#: For elementary functions XLA's CPU compiler calls the C library for each number.
 _NO_ARITHMETIC = known_primitives(
     "acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p "
     "log2 logistic pow sin sinh tan tanh cond scan while"
 )
 
 
-def arithmetic_operations(jaxpr: Any) -> int | None:
-    """How many operations a program has if all are arithmetic, else None.
+def arithmetic_operations(jaxpr: core.Jaxpr) -> int | None:
+    """Number of operations of a program if all are arithmetic, else None.
 
     Elementary functions, loops and branches are not arithmetic.
     """
@@ -354,7 +388,7 @@ def arithmetic_operations(jaxpr: Any) -> int | None:
         if called is None:
             total += 1
             continue
-        count = arithmetic_operations(getattr(called, "jaxpr", called))
+        count = arithmetic_operations(jaxpr_of(called))
         if count is None:
             return None
         total += count

@@ -6,41 +6,43 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-# No step is longer than so many radians of the fastest rate, that of the turning or of
-# the linearised motion: at an equilibrium the error estimate sees nothing, and a step
-# too long to be accurate leaves the value right and the derivative wrong. Between these
-# bounds a step is as long as makes the term of the exponential that a method of its
-# order leaves out so many tolerances. The second numbers hold where derivatives are
-# taken, which see more than the error estimate does.
+# Bounds of a step in radians of the fastest rate, which is that of the turning or of
+# the linearised motion. At an equilibrium the error estimate is zero: a step that is
+# too long leaves the value right and the derivative wrong. Between these bounds the
+# length of a step follows from the term of the exponential series that a method of its
+# order omits: that term may be this many tolerances. The second numbers hold where
+# derivatives are taken, which are more sensitive than the error estimate.
 SMALLEST_BOUND = 0.4
 _LARGEST_BOUNDS = 1.2, 0.8
 _TOLERANCES = 30.0, 0.1
-# A step is repeated if it turns out, at its end, to have been longer than this many of
-# those bounds.
+# A step is repeated if, by the rate at its end, it was longer than this many bounds.
 _TOO_LONG = 2.0
-# So is one in which the rate changes by this factor, until the change is confined to a
-# step of this many radians: the error estimate does not see a torque that is switched
-# on at an equilibrium.
+# A step in which the rate changes by this factor is repeated until the change is
+# confined to a step of this many radians. The error estimate misses a torque that is
+# switched on at an equilibrium.
 _JUMP = 4.0
 _CONFINED = 1e-6
-# A step may commit the whole tolerance if it covers so many radians, a shorter one
+# A step of this many radians may commit the whole tolerance. A shorter one may commit
 # less: steps are short where a torque is not smooth, and there the estimate is no
-# bound. Errors in proportion to the radians would be enough for steps whose estimates
-# are bounds; with the square the worst of 16 torques of each kind was 1.8 times the
-# promise, where it had been 10.7 (benchmarks/bench_nonsmooth.py, on whose motions the
-# numbers below were chosen). A jump can be passed because there is a smallest part,
-# and because steps of a few times the shortest length may commit the whole again.
+# bound. The share grows with the square of the radians. Shares in proportion to the
+# radians are enough where estimates are bounds; with them the worst of 16 torques of
+# each kind had 10.7 times the promised error, with squares it has 1.8 times
+# (benchmarks/bench_nonsmooth.py, whose motions were used to choose these numbers). A
+# step can pass a jump because the share has a minimum, and because steps of a few times
+# the shortest length may commit the whole tolerance again.
 _WHOLE = 1.0
-_SMALLEST_PART = 3e-3
+_SMALLEST_SHARE = 3e-3
 _AT_A_JUMP = 8.0
-# Factors by which a step may shrink and grow.
-_SAFETY, _SHRINK, _GROW = 0.88, 0.2, 1e3
-# An error estimate below so many eps of the state is rounding noise.
+# Safety factor of a new step, and the factors by which a step may shrink and grow.
+_SAFETY = 0.88
+_SHRINK = 0.2
+_GROW = 1e3
+# An error estimate below this many eps of the state is rounding noise.
 _NOISE = 8.0
 
 
 class Limits(NamedTuple):
-    """What holds the steps of a motion. Times are in seconds since its start.
+    """Bounds of the steps of a motion. Times are in seconds since its start.
 
     Attributes:
         end: Where the motion ends.
@@ -49,7 +51,7 @@ class Limits(NamedTuple):
         radians: Longest step, in radians of the fastest rate.
         fine: The same where derivatives are taken.
         longest: Longest step.
-        shortest: Shortest step, of which a quarter can still be told from none.
+        shortest: Shortest step; a quarter of it still changes the time.
         start_rate: Fastest rate at the start [rad/s].
     """
 
@@ -69,13 +71,13 @@ class Limits(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What becomes of a step.
+    """Whether a step is accepted, and the length of the next one.
 
     Attributes:
-        accepted: Whether the motion goes on from its end.
+        accepted: Whether the motion continues from the end of the step.
         stuck: Whether no shorter step can be tried.
-        step: Length of the next one.
-        rate: Fastest rate where the next one starts.
+        step: Length of the next step.
+        rate: Fastest rate where the next step starts.
     """
 
     accepted: Bool[Array, ""]
@@ -85,9 +87,9 @@ class Verdict(NamedTuple):
 
 
 def largest_steps(order: int, rtol: Float[Array, ""]) -> Float[Array, "2"]:
-    """How many radians of the fastest rate a step of this order may span.
+    """Longest step of a method of this order, in radians of the fastest rate.
 
-    The second number is that where derivatives are taken.
+    The second number holds where derivatives are taken.
     """
     error = math.factorial(order + 1) * rtol * jnp.array(_TOLERANCES, rtol.dtype)
     largest = jnp.array(_LARGEST_BOUNDS, rtol.dtype)
@@ -97,11 +99,62 @@ def largest_steps(order: int, rtol: Float[Array, ""]) -> Float[Array, "2"]:
 def in_tolerances(
     limits: Limits, scales: Array, y0: Array, y1: Array, error: Array
 ) -> Float[Array, ""]:
-    """Root mean square of the components of an error, as multiples of their tolerances."""
+    """Root mean square of an error's components, each divided by its tolerance."""
     size = jnp.maximum(jnp.abs(y0 / scales), jnp.abs(y1 / scales))
     multiples = (error / scales) / (limits.atol + size * limits.rtol)
     norm = jnp.sqrt(jnp.mean(multiples * multiples))
     return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def _share_of_tolerance(
+    limits: Limits, h: Float[Array, ""], rate: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The share of the tolerance that a step of length `h` may commit."""
+    radians = h * rate / _WHOLE
+    share = jnp.clip(radians * radians, _SMALLEST_SHARE, 1.0)
+    return jnp.where(h < _AT_A_JUMP * limits.shortest, 1.0, share)
+
+
+def _judge_error(
+    limits: Limits,
+    order: int,
+    h: Float[Array, ""],
+    error: Float[Array, ""],
+    rate: Float[Array, ""],
+) -> tuple[Bool[Array, ""], Float[Array, ""]]:
+    """Whether the error of a step is small enough, and the length that it suggests."""
+    share = _share_of_tolerance(limits, h, rate)
+    # Rounding noise in the estimate must not decide on this step or on the next one.
+    noise = _NOISE * jnp.finfo(error.dtype).eps
+    small = (error < share) | (error * limits.rtol < noise)
+    error = error / share
+    beyond_noise = jnp.maximum(error * limits.rtol, noise) / limits.rtol
+    factor = _SAFETY * beyond_noise ** (-1 / order)
+    factor = jnp.where(
+        small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY)
+    )
+    return small, factor * h
+
+
+def _longest_tolerable(
+    limits: Limits,
+    longest: Float[Array, ""],
+    rate0: Float[Array, ""],
+    rate1: Float[Array, ""],
+) -> Float[Array, ""]:
+    """The longest step that is accepted between two fastest rates.
+
+    Args:
+        limits: Of the motion.
+        longest: Longest step by the rate at its end.
+        rate0: Fastest rate at the start of the step.
+        rate1: The same at its end.
+    """
+    # Changes below the rate at the start do not matter: a body speeds up from rest.
+    before, after = (jnp.maximum(rate, limits.start_rate) for rate in (rate0, rate1))
+    jumped = (after > _JUMP * before) | (before > _JUMP * after)
+    confined = jnp.maximum(_CONFINED / jnp.maximum(before, after), limits.shortest)
+    return jnp.where(jumped, confined, _TOO_LONG * longest)
 
 
 def judge(
@@ -119,38 +172,22 @@ def judge(
         limits: Of the motion.
         order: Of the method.
         step: The length that was chosen.
-        h: The length that was tried, up to an output time if one was near.
+        h: The length that was tried, which ends at an output time if one is near.
         error: In tolerances.
         rate0: Fastest rate at the start of the step.
         rate1: The same at its end.
     """
-    radians = h * rate0 / _WHOLE
-    part = jnp.clip(radians * radians, _SMALLEST_PART, 1.0)
-    part = jnp.where(h < _AT_A_JUMP * limits.shortest, 1.0, part)
-    # An estimate may be rounding noise, which must not decide on a step or on the next.
-    noise = _NOISE * jnp.finfo(error.dtype).eps
-    small = (error < part) | (error * limits.rtol < noise)
-    error = error / part
-    beyond_noise = jnp.maximum(error * limits.rtol, noise) / limits.rtol
-    factor = _SAFETY * beyond_noise ** (-1 / order)
-    factor = jnp.where(
-        small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY)
-    )
-    following = factor * h
-    # A step that was cut short says little about the next one.
+    small, following = _judge_error(limits, order, h, error, rate0)
+    # A step that was cut short at an output time says little about the next one.
     following = jnp.where(small & (h < step), jnp.maximum(following, step), following)
     following = jnp.minimum(following, limits.longest)
     stuck = ~small & (4 * following <= limits.shortest)
-    # Where a torque jumps, differences see a rate without bound: steps must not become
-    # zero there.
+    # Where a torque jumps, differences yield a rate without bound, which must not
+    # reduce the steps to zero.
     longest = jnp.maximum(limits.radians / rate1, limits.shortest)
-    # Changes below the rate at the start do not matter: a body speeds up from rest.
-    before, after = (jnp.maximum(r, limits.start_rate) for r in (rate0, rate1))
-    jumped = (after > _JUMP * before) | (before > _JUMP * after)
-    confined = jnp.maximum(_CONFINED / jnp.maximum(before, after), limits.shortest)
-    tolerable = jnp.where(jumped, confined, _TOO_LONG * longest)
+    tolerable = _longest_tolerable(limits, longest, rate0, rate1)
     too_long = small & (h > tolerable)
-    # Whatever made the rate change is somewhere in the step: halving finds it.
+    # The cause of a change of the rate lies somewhere in the step: halving finds it.
     halved = jnp.maximum(tolerable / _TOO_LONG, 0.5 * h)
     bound = jnp.where(too_long, halved, longest)
     following = jnp.where(small, jnp.minimum(following, bound), following)

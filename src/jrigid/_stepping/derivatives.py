@@ -2,29 +2,28 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jrigid._core.lanes import as_lanes
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.guards import guard_derivative
 from jrigid._stepping.motion import Motion, constant, steps_fixed
-from jrigid._stepping.replay import Changes, pull_alone, pull_in_lanes
+from jrigid._stepping.replay import Cotangents, pull_alone, pull_in_lanes
 from jrigid._stepping.run import Ends, record_alone, run_alone, run_in_lanes
 
 
-def _finely(motion: Motion) -> Motion:
-    """A motion in steps for derivatives."""
+def _with_fine_steps(motion: Motion) -> Motion:
+    """The motion, with the step bounds that derivatives need."""
     return motion._replace(limits=motion.limits.for_derivatives())
 
 
 def solve(engine: Engine, motion: Motion) -> Ends:
-    """A motion; under `jax.vmap` many, in lanes. Without derivatives."""
+    """Run a motion without derivatives; under `jax.vmap` many motions, in lanes."""
 
     def alone(problem: Motion, y0: Array) -> Ends:
         return run_alone(engine, problem._replace(y0=y0))
@@ -36,87 +35,133 @@ def solve(engine: Engine, motion: Motion) -> Ends:
 
 
 def solve_reverse(engine: Engine, motion: Motion) -> Ends:
-    """A motion with first derivatives in reverse mode."""
+    """Run a motion with first derivatives in reverse mode."""
     solved = eqx.filter_custom_vjp(partial(solve, engine))
 
-    def forwards(perturbed: Any, motion: Motion) -> tuple[Ends, Any]:
+    def forwards(perturbed: Motion, motion: Motion) -> tuple[Ends, tuple[Array, Array]]:
         del perturbed
-        ends = solve(engine, guard_derivative(_finely(motion)))
+        ends = solve(engine, guard_derivative(_with_fine_steps(motion)))
         return ends, (ends.t, ends.counts[1])
 
-    def backwards(reached: Any, change: Ends, perturbed: Any, motion: Motion) -> Any:
+    def backwards(
+        reached: tuple[Array, Array], change: Ends, perturbed: Motion, motion: Motion
+    ) -> Motion:
         motion, change = guard_derivative((motion, change))
-        t, tried = reached
-        zeros = jnp.zeros((*motion.times.shape, *motion.y0.shape), motion.y0.dtype)
-        changes = Changes(
-            zeros if change.ys is None else change.ys,
-            jnp.zeros_like(motion.y0) if change.y is None else change.y,
-        )
-        # Run again, the motion ends where it ended: at an event, or where it failed.
-        motion = _finely(motion)
-        motion = motion._replace(limits=motion.limits._replace(end=t))
-        moved, rest = _split(motion, perturbed)
-        alone, together = (partial(x, engine) for x in (pull_alone, pull_in_lanes))
-        total, y0 = as_lanes(together, rest, moved, changes, tried, alone=alone)
-        # The parameters of a motion without steps may be anything.
-        total = jtu.tree_map(lambda x: jnp.where(tried > 0, x, 0.0), total)
-        return total._replace(y0=y0)
+        return _pulled_back(engine, motion, change, perturbed, *reached)
 
     solved.def_fwd(forwards)
     solved.def_bwd(backwards)
     return solved(steps_fixed(motion))
 
 
+def _pulled_back(
+    engine: Engine,
+    motion: Motion,
+    change: Ends,
+    perturbed: Motion,
+    end: Array,
+    tried: Array,
+) -> Motion:
+    """Cotangents of the parameters and of the start, from those of the results.
+
+    Args:
+        engine: Integrates the motion.
+        motion: The motion.
+        change: Cotangents of its results, None where there is none.
+        perturbed: Which parts of the motion have derivatives.
+        end: Where the motion ended.
+        tried: Number of attempts after which it ended.
+    """
+    zeros = jnp.zeros((*motion.times.shape, *motion.y0.shape), motion.y0.dtype)
+    changes = Cotangents(
+        zeros if change.ys is None else change.ys,
+        jnp.zeros_like(motion.y0) if change.y is None else change.y,
+    )
+    # The second run ends where the first one ended: at an event, or where it failed.
+    motion = _with_fine_steps(motion)
+    motion = motion._replace(limits=motion.limits._replace(end=end))
+    varied, rest = _split(motion, perturbed)
+    total, y0 = as_lanes(
+        partial(pull_in_lanes, engine),
+        rest,
+        varied,
+        changes,
+        tried,
+        alone=partial(pull_alone, engine),
+    )
+    # The parameters of a motion without steps need not be finite.
+    total = jtu.tree_map(lambda x: jnp.where(tried > 0, x, 0.0), total)
+    return total._replace(y0=y0)
+
+
 def solve_forward(engine: Engine, motion: Motion) -> Ends:
-    """A motion with derivatives in forward mode, along the steps of its value."""
+    """Run a motion with derivatives in forward mode, along the steps of its value."""
     solved = eqx.filter_custom_jvp(partial(solve, engine))
 
-    def of_states(value: Ends, tangent: Ends) -> tuple[Ends, Ends]:
-        """Only states have tangents: steps are fixed."""
-        return value, tangent._replace(t=None, counts=None)
-
-    def alone(rest: Motion, moved: Motion, tangent: Motion) -> tuple[Ends, Ends]:
-        def ends(moved: Motion) -> Ends:
-            return run_alone(engine, eqx.combine(moved, rest))
-
-        return of_states(*eqx.filter_jvp(ends, (moved,), (tangent,)))
-
-    def together(
-        shared: Motion, rest: Motion, moved: Motion, tangent: Motion
-    ) -> tuple[Ends, Ends]:
-        def ends(moved: Motion) -> Ends:
-            return run_in_lanes(engine, shared, eqx.combine(moved, rest))
-
-        return of_states(*eqx.filter_jvp(ends, (moved,), (tangent,)))
-
     @solved.def_jvp
-    def _(primals: Any, tangents: Any) -> tuple[Ends, Ends]:
-        (motion,), (tangent,) = primals, tangents
-        perturbed = jtu.tree_map(
-            lambda x: x is not None, tangent, is_leaf=lambda x: x is None
-        )
-        moved, rest = _split(_finely(motion), perturbed, start=True)
-        tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, moved))
-        return as_lanes(together, rest, moved, tangents=tangent, alone=alone)
+    def _(primals: tuple[Motion], tangents: tuple[PyTree]) -> tuple[Ends, Ends]:
+        (motion,) = primals
+        (tangent,) = tangents
+        return _pushed_forward(engine, motion, tangent)
 
     return solved(steps_fixed(motion))
 
 
+def _is_none(x: PyTree) -> bool:
+    """Whether a leaf is None."""
+    return x is None
+
+
+def _pushed_forward(
+    engine: Engine, motion: Motion, tangent: Motion
+) -> tuple[Ends, Ends]:
+    """The results of a motion and their tangents, from a tangent of the motion."""
+
+    def of_states(value: Ends, tangent: Ends) -> tuple[Ends, Ends]:
+        """Drop the tangents of steps, which are fixed."""
+        return value, tangent._replace(t=None, counts=None)
+
+    def alone(rest: Motion, varied: Motion, tangent: Motion) -> tuple[Ends, Ends]:
+        def ends(varied: Motion) -> Ends:
+            return run_alone(engine, eqx.combine(varied, rest))
+
+        return of_states(*eqx.filter_jvp(ends, (varied,), (tangent,)))
+
+    def together(
+        shared: Motion, rest: Motion, varied: Motion, tangent: Motion
+    ) -> tuple[Ends, Ends]:
+        def ends(varied: Motion) -> Ends:
+            return run_in_lanes(engine, shared, eqx.combine(varied, rest))
+
+        return of_states(*eqx.filter_jvp(ends, (varied,), (tangent,)))
+
+    perturbed = jtu.tree_map(lambda x: x is not None, tangent, is_leaf=_is_none)
+    varied, rest = _split(_with_fine_steps(motion), perturbed, start=True)
+    tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, varied))
+    return as_lanes(together, rest, varied, tangents=tangent, alone=alone)
+
+
 def _split(
-    motion: Motion, perturbed: Any, start: bool = False
+    motion: Motion, perturbed: Motion, start: bool = False
 ) -> tuple[Motion, Motion]:
-    """The parameters that have derivatives, and the start if asked, apart from the rest."""
+    """Split a motion into the parameters that have derivatives, and the rest.
+
+    Args:
+        motion: The motion.
+        perturbed: Which parameters have derivatives.
+        start: Whether the state at the start goes with the parameters.
+    """
     which = jtu.tree_map(lambda _: False, motion)
     which = which._replace(parameters=perturbed.parameters, y0=start)
     return eqx.partition(motion, which)
 
 
 def solve_direct(engine: Engine, motion: Motion) -> Ends:
-    """A motion with derivatives of every mode and order.
+    """Run a motion with derivatives of every mode and order.
 
-    The motion is run once without derivatives. Its steps are then repeated, by a scan.
+    The first run has no derivatives and records the steps. A scan repeats them.
     """
-    motion = _finely(steps_fixed(motion))
+    motion = _with_fine_steps(steps_fixed(motion))
     end, record = record_alone(engine, constant(motion))
 
     def step(y: Array, recorded: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -126,7 +171,8 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
 
         @jax.checkpoint
         def taken(y: Array) -> Array:
-            # Lanes that take no step do so at their start, where the field is finite.
+            # Under vmap lanes without a step are evaluated too. They start from the
+            # start of the motion, where the field is finite.
             y = jnp.where(h > 0, y, motion.y0)
             return engine.stepper.taken(smooth, motion.parameters, t, h, y)
 
@@ -134,24 +180,24 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
         y = jnp.where(h > 0, after, y)
         return y, y
 
-    y, all_ = jax.lax.scan(step, motion.y0, (record.places, record.jumps))
-    numbers = jnp.arange(len(all_))
+    y, after_steps = jax.lax.scan(step, motion.y0, (record.places, record.jumps))
+    numbers = jnp.arange(len(after_steps))
     count = motion.times.size
     of_output = jnp.zeros(count + 1, numbers.dtype).at[record.outputs].set(numbers)
-    ys = all_[of_output[:count]]
+    ys = after_steps[of_output[:count]]
     ys = jnp.where((motion.times <= 0)[:, None], motion.y0, ys)
     return Ends(ys, end.t, y, end.counts)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def moved_by(
-    field: Callable[[Any, Array, Array], Array],
-    parameters: Any,
+    field: Callable[[PyTree, Array, Array], Array],
+    parameters: PyTree,
     t: Array,
     y: Array,
     dt: Array,
 ) -> Array:
-    """A state a time `dt` later, for its derivatives: dt itself is zero."""
+    """The state a time `dt` later, where `dt` is zero but has derivatives."""
     del field, parameters, t, dt
     return y
 

@@ -1,4 +1,4 @@
-"""How motions are integrated: one attempt at a step after another."""
+"""The loop body of an integration: one attempt at a step."""
 
 from typing import NamedTuple
 
@@ -22,14 +22,14 @@ from jrigid._stepping.steppers import Field, Stepper, Stretch, Trial
 
 
 class Attempt(NamedTuple):
-    """What an attempt at a step leads to.
+    """The result of an attempt at a step.
 
     Attributes:
-        progress: Where the motion is now.
+        progress: Of the motion after the attempt.
         h: Length of the step; 0 if it was not accepted.
         rates: Of the stages.
-        output: The number of the output time that was reached; as many as there are
-            where none was.
+        output: Index of the output time that was reached; if none was, the number of
+            output times.
     """
 
     progress: Progress
@@ -39,16 +39,16 @@ class Attempt(NamedTuple):
 
 
 class _Passage(NamedTuple):
-    """What a step means for the conditions of an event.
+    """The effect of a step on the conditions of an event.
 
     Attributes:
-        keep: Whether the step is accepted; one that passes the place is repeated, up to
-            it.
-        repeat: Whether it is repeated.
-        ended: Whether the motion ends with it.
-        end: Where the motion ends now.
-        which: The condition that ends it.
-        values: Of the conditions, where the motion is now.
+        keep: Whether the step is accepted. A step that passes the time of the event is
+            repeated up to that time.
+        repeat: Whether the step is repeated.
+        ended: Whether the motion ends with the step.
+        end: Time at which the motion ends.
+        which: Index of the condition that ends it.
+        values: Of the conditions after the step.
     """
 
     keep: Bool[Array, ""]
@@ -60,21 +60,59 @@ class _Passage(NamedTuple):
 
 
 def _entry(times: Float[Array, " times"], number: Int[Array, ""]) -> Float[Array, ""]:
-    """One of the times; infinity after the last."""
+    """The time of an index; infinity after the last one."""
     last = times.size - 1
     return jnp.where(number <= last, times[jnp.minimum(number, last)], jnp.inf)
 
 
+def _state_after(trial: Trial, ended: Bool[Array, ""]) -> Int[Array, ""]:
+    """State of a motion after a trial, without regard to events and counts of steps."""
+    stuck = jnp.where(trial.infinite, NOT_FINITE, STUCK)
+    new_state = jnp.where(trial.verdict.stuck, stuck, RUNNING)
+    return jnp.where(ended, ENDED, new_state)
+
+
+def _jump_after(
+    motion: Motion, jump: Int[Array, ""], t1: Array, keep: Bool[Array, ""]
+) -> Int[Array, ""]:
+    """Index of the next jump after a step to `t1`."""
+    if not motion.jumps.size:
+        return jump
+    passed = keep & (t1 >= _entry(motion.jumps, jump))
+    return jump + passed.astype(jump.dtype)
+
+
+def _progress_if(
+    running: Bool[Array, ""],
+    progress: Progress,
+    keep: Bool[Array, ""],
+    trial: Trial,
+    clock: list[Array],
+    counts: list[Array],
+    values: Float[Array, " conditions"],
+) -> Progress:
+    """Progress after an attempt; a motion that has ended keeps its clock and counts."""
+    new_clock = jnp.stack(clock)
+    new_counts = jnp.stack([x.astype(progress.counts.dtype) for x in counts])
+    return Progress(
+        jnp.where(keep, trial.y1, progress.y),
+        trial.direction,
+        jnp.where(running, new_clock, progress.clock),
+        jnp.where(running, new_counts, progress.counts),
+        values,
+    )
+
+
 class Engine(NamedTuple):
-    """How motions are integrated: all that is known when they are compiled.
+    """Configuration of an integration, which is static when it is compiled.
 
     Attributes:
         field: The vector field.
-        stepper: How a step is tried.
-        max_steps: Most attempts at a step.
+        stepper: Tries a step.
+        max_steps: Largest number of attempts at a step.
         conditions: Of an event, or None.
         in_lanes: Whether many motions are integrated at once.
-        replays: Whether the rates of the stages are handed on, for the reverse mode.
+        replays: Whether attempts return the rates of all stages, for the reverse mode.
     """
 
     field: Field
@@ -86,7 +124,7 @@ class Engine(NamedTuple):
 
     @property
     def keeps_rates(self) -> bool:
-        """Whether an attempt hands on the rates of all stages."""
+        """Whether an attempt returns the rates of all stages."""
         return self.replays or self.conditions is not None
 
     def begin(self, motion: Motion) -> Progress:
@@ -116,8 +154,8 @@ class Engine(NamedTuple):
     def smooth_field(self, motion: Motion, jump: Int[Array, ""]) -> Field:
         """The vector field between two jumps, of which `jump` is the later one.
 
-        A step that ends at a jump must not see what is beyond it, nor one that starts
-        there what was before.
+        A step that ends at a jump must not evaluate the field beyond it, and a step
+        that starts at a jump must not evaluate it before.
         """
         if motion.jumps.size == 0:
             return self.field
@@ -126,7 +164,8 @@ class Engine(NamedTuple):
             [jnp.full_like(motion.jumps[:1], -jnp.inf), motion.jumps]
         )
         padded = jnp.append(padded, jnp.inf)
-        low, high = padded[jump] + beside, padded[jump + 1] - beside
+        low = padded[jump] + beside
+        high = padded[jump + 1] - beside
 
         def field(parameters: list[Array], t: Array, y: Array) -> Array:
             return self.field(parameters, jnp.clip(t, low, high), y)
@@ -136,7 +175,8 @@ class Engine(NamedTuple):
     def attempt(self, motion: Motion, progress: Progress) -> Attempt:
         """Try one step."""
         t, step, _, end = progress.clock
-        output, jump = progress.counts[3], progress.counts[4]
+        output = progress.counts[3]
+        jump = progress.counts[4]
         goal = jnp.minimum(_entry(motion.times, output), end)
         if motion.jumps.size:
             goal = jnp.minimum(goal, _entry(motion.jumps, jump))
@@ -150,21 +190,19 @@ class Engine(NamedTuple):
     def _settled(
         self, motion: Motion, progress: Progress, t1: Array, trial: Trial
     ) -> Attempt:
-        """Where the motion is after a step was tried."""
-        y, _, clock, counts, values = progress
-        t, step, _, end = clock
-        state, tried, accepted, output, jump, which = counts
-        y1, along, verdict, infinite, rates = trial
+        """Progress of the motion after a trial of a step."""
+        t, step, _, end = progress.clock
+        state, tried, accepted, output, jump, which = progress.counts
         running = state == RUNNING
-        keep, following = verdict.accepted & running, verdict.step
-        stuck = jnp.where(infinite, NOT_FINITE, STUCK)
-        new_state = jnp.where(verdict.stuck, stuck, RUNNING)
-        # The last of the output times may be there several times.
+        keep = trial.verdict.accepted & running
+        following = trial.verdict.step
         hit = keep & (t1 >= _entry(motion.times, output))
+        # The last output time may occur several times, each of which takes an attempt.
         again = t1 >= _entry(motion.times, output + hit.astype(output.dtype))
-        new_state = jnp.where(keep & (t1 >= end) & ~again, ENDED, new_state)
+        new_state = _state_after(trial, keep & (t1 >= end) & ~again)
+        values = progress.values
         if self.conditions is not None:
-            taken = Stretch(t, t1, y, y1, rates)
+            taken = Stretch(t, t1, progress.y, trial.y1, trial.rates)
             passage = self._passage(self.conditions, motion, progress, taken, keep)
             keep, repeat, at_event, end, which, values = passage
             new_state = jnp.where(at_event, EVENT, new_state)
@@ -174,27 +212,21 @@ class Engine(NamedTuple):
         new_state = jnp.where(too_many, TOO_MANY_STEPS, new_state)
         hit = hit & keep
         reached = jnp.where(hit, output, motion.times.size)
-        if motion.jumps.size:
-            passed = keep & (t1 >= _entry(motion.jumps, jump))
-            jump = jump + passed.astype(jump.dtype)
-        new_clock = jnp.stack([jnp.where(keep, t1, t), following, verdict.rate, end])
-        new_counts = [
+        clock = [jnp.where(keep, t1, t), following, trial.verdict.rate, end]
+        counts = [
             new_state,
             tried + 1,
             accepted + keep.astype(accepted.dtype),
             output + hit.astype(output.dtype),
-            jump,
+            _jump_after(motion, jump, t1, keep),
             which,
         ]
-        new_counts = jnp.stack([x.astype(counts.dtype) for x in new_counts])
-        progress = Progress(
-            jnp.where(keep, y1, y),
-            along,
-            jnp.where(running, new_clock, clock),
-            jnp.where(running, new_counts, counts),
-            values,
+        return Attempt(
+            _progress_if(running, progress, keep, trial, clock, counts, values),
+            jnp.where(keep, t1 - t, 0.0),
+            trial.rates,
+            reached,
         )
-        return Attempt(progress, jnp.where(keep, t1 - t, 0.0), rates, reached)
 
     def _passage(
         self,
@@ -205,11 +237,12 @@ class Engine(NamedTuple):
         keep: Bool[Array, ""],
     ) -> _Passage:
         """Look for an event in a step that would be accepted if `keep`."""
-        end, which = progress.clock[3], progress.counts[5]
+        end = progress.clock[3]
+        which = progress.counts[5]
         now = conditions.values(motion.observed, taken.t1, taken.y1)
         now = jax.lax.stop_gradient(now)
         happened = conditions.happened(progress.values, now)
-        # Once it is found, the end of the motion is there.
+        # After the time of an event is known, the motion ends there.
         sought = keep & (end == motion.limits.end) & jnp.any(happened)
         exact, crossed = conditions.crossing(
             motion.observed,

@@ -1,13 +1,13 @@
-"""Conditions that end a motion, and when the first of them is met."""
+"""Conditions that end a motion, and the time at which the first of them is met."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-# Halvings of a step that find when a condition came to hold.
+# Halvings of a step that find the time of an event, by the size of a number in bytes.
 _BISECTIONS = {8: 60, 4: 31}
 
 
@@ -16,8 +16,8 @@ class Conditions(NamedTuple):
 
     Attributes:
         values: Of (arrays, t, y): one value for each condition.
-        boolean: Which of them are true or false.
-        direction: Which change of sign ends the motion: any for None, up for True.
+        boolean: Which of the conditions are booleans.
+        direction: Change of sign that ends the motion: any for None, upward for True.
     """
 
     values: Callable[[list[Array], Array, Array], Float[Array, " conditions"]]
@@ -26,7 +26,8 @@ class Conditions(NamedTuple):
 
     def happened(self, before: Array, after: Array) -> Bool[Array, " conditions"]:
         """Which conditions end the motion, by their values before and after a step."""
-        old, new = jnp.sign(before), jnp.sign(after)
+        old = jnp.sign(before)
+        new = jnp.sign(after)
         each = []
         for i, (boolean, up) in enumerate(
             zip(self.boolean, self.direction, strict=True)
@@ -50,18 +51,18 @@ class Conditions(NamedTuple):
         state_at: Callable[[Array], Float[Array, " n"]],
         sought: Bool[Array, ""],
     ) -> tuple[Float[Array, ""], Bool[Array, " conditions"]]:
-        """When the first of the conditions that happened in a step came to hold.
+        """The time at which the first of the conditions is met within a step.
 
-        A number changes its sign there, a boolean becomes true. It is found by
-        bisection, which cannot miss it.
+        There a number changes its sign, or a boolean becomes true. Bisection finds the
+        time and cannot miss it.
 
         Args:
             observed: Arrays that the conditions depend on.
-            happened: Which conditions are asked for.
-            last: Their values at the end of the step.
+            happened: Which conditions are met in the step.
+            last: Values of the conditions at the end of the step.
             ends: Times at which the step starts and ends.
-            state_at: The state within the step, of the time.
-            sought: Whether it is to be found at all.
+            state_at: The state within the step, as a function of time.
+            sought: Whether the time is needed; if not, there is no bisection.
 
         Returns:
             The time, and the conditions that hold there.
@@ -72,7 +73,9 @@ class Conditions(NamedTuple):
             values = self.values(observed, t, state_at(t))
             return happened & (jnp.sign(values) == jnp.sign(last))
 
-        def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        def halve(
+            _: Int[Array, ""], bracket: tuple[Array, Array]
+        ) -> tuple[Array, Array]:
             low, high = bracket
             middle = low + 0.5 * (high - low)
             late = jnp.any(changed(middle))

@@ -7,13 +7,14 @@ import diffrax
 import numpy as np
 from jaxtyping import Float
 
-# The rows of a tableau are summed in so many groups, by the number of stages.
+# Number of groups in which the rows of a tableau are summed, by the largest number of
+# stages for which it holds.
 _GROUPS = {4: 1, 8: 2}
 _MOST_GROUPS = 4
 
 
-#: Of consecutive rows of tables: the first row of each, and for each table the columns that
-#: one of its rows uses.
+#: Groups of consecutive rows of tables. Each has its first row and, for each table, the
+#: columns with a coefficient in one of its rows.
 Groups = tuple[tuple[int, tuple[tuple[int, ...], ...]], ...]
 
 
@@ -23,12 +24,11 @@ class Method(NamedTuple):
     Attributes:
         order: Order of the error of a step's result.
         times: Fractions of the step at which the stages are.
-        rows: Coefficients of the places of the stages; the last row is that of the
+        rows: Coefficients of the states at the stages; the last row is that of the
             error estimate.
         groups: Consecutive rows that use nearly the same stages.
-        reverse_groups: The same of the rows, and of the columns of the same numbers, by
-            which the reverse of a step sums.
-        own: How many of the stages the solver knows itself.
+        reverse_groups: Groups of the tables `reverse_rows`.
+        own: Number of stages in the solver's own tableau.
     """
 
     order: int
@@ -40,12 +40,12 @@ class Method(NamedTuple):
 
     @property
     def stages(self) -> int:
-        """How often a step evaluates the vector field."""
+        """Number of evaluations of the vector field in a step."""
         return len(self.times)
 
     @property
     def reverse_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """The rows, and the columns as rows, by which the reverse of a step sums."""
+        """The two tables by which the reverse of a step sums: rows, and columns."""
         return _of_reverse(self.rows)
 
 
@@ -75,34 +75,40 @@ def method_of(solver: diffrax.AbstractERK) -> Method:
 
 
 def _of_reverse(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of all stages but the last, from coefficients and those of the error."""
+    """Rows, and columns as rows, of all stages but the last.
+
+    Args:
+        table: Coefficients of the stages; the last row is that of the error estimate.
+    """
     return table[:-2], table[:-1, :-1].T
 
 
 def _groups(first: int, *tables: np.ndarray) -> Groups:
-    """Group rows so that sums over the columns of their groups have the fewest terms.
+    """Group rows such that sums over the columns of their groups have the fewest terms.
 
     Args:
         first: The number of the first row.
-        tables: Of as many rows. A group has the rows of the same numbers of each.
+        tables: Tables of the same number of rows, which have the same groups of rows.
     """
     count = len(tables[0])
     used = [[set(np.flatnonzero(row).tolist()) for row in table] for table in tables]
     groups = next((g for most, g in _GROUPS.items() if count <= most), _MOST_GROUPS)
 
     def divided(cuts: tuple[int, ...]) -> list[tuple[int, list[set[int]], int]]:
+        """First row, columns by table, and number of rows of each group."""
         pairs = itertools.pairwise((0, *cuts, count))
         return [
             (a, [set().union(*rows[a:b]) for rows in used], b - a) for a, b in pairs
         ]
 
     def terms(cuts: tuple[int, ...]) -> int:
+        """Number of terms of all sums."""
         return sum(
             length * sum(map(len, columns)) for _, columns, length in divided(cuts)
         )
 
     best = min(itertools.combinations(range(1, count), groups - 1), key=terms)
-    # A sum has a term, if only one with the coefficient zero.
+    # A sum has at least one term, if necessary one with the coefficient zero.
     return tuple(
         (first + start, tuple(tuple(sorted(x or {0})) for x in columns))
         for start, columns, _ in divided(best)

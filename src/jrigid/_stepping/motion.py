@@ -1,6 +1,6 @@
-"""A motion that is integrated: its data, and how far it has come."""
+"""A motion that is integrated: its data and its progress."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,12 +10,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._stepping.control import Limits
 
-# States of a motion that is integrated.
+Tree = TypeVar("Tree")
+
+# States of a motion that is integrated; EMPTY is the state of a lane without a motion.
 RUNNING, ENDED, STUCK, NOT_FINITE, EVENT, TOO_MANY_STEPS, EMPTY = range(7)
 
 
 class Motion(NamedTuple):
-    """What is integrated, from time 0 on.
+    """The data of a motion that starts at time 0.
 
     Attributes:
         parameters: Arrays that the vector field depends on.
@@ -27,7 +29,7 @@ class Motion(NamedTuple):
         beside: For each jump, the distance from it at which the vector field is
             evaluated.
         scales: Scales of the components of the state.
-        limits: What holds the steps. A motion whose fastest rate is zero ends at its
+        limits: Bounds of the steps. A motion whose fastest rate is zero ends at its
             start.
     """
 
@@ -41,14 +43,14 @@ class Motion(NamedTuple):
     limits: Limits
 
 
-def constant(tree: Any) -> Any:
-    """The same without derivatives: what decides on steps is not differentiated."""
+def constant(tree: Tree) -> Tree:
+    """The same pytree without derivatives; the choice of steps has none."""
     arrays, others = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.lax.stop_gradient(arrays), others)
 
 
 def steps_fixed(motion: Motion) -> Motion:
-    """A motion whose parameters and start alone have derivatives."""
+    """The motion, of which only the parameters and the start have derivatives."""
     fixed = constant(motion._replace(parameters=[], y0=motion.y0[:0]))
     return fixed._replace(parameters=motion.parameters, y0=motion.y0)
 
@@ -59,10 +61,11 @@ class Progress(NamedTuple):
     Attributes:
         y: The state.
         direction: Of a small displacement, which finds the fastest rate.
-        clock: The time; the length of the next step; the fastest rate; where the motion
-            ends, which an event may change.
-        counts: One of the states above; steps tried; steps accepted; the next of the
-            output times; the next of the jumps; the condition that ends the motion.
+        clock: The time; the length of the next step; the fastest rate; the time at
+            which the motion ends, which an event may change.
+        counts: One of the states above; steps tried; steps accepted; index of the next
+            output time; index of the next jump; index of the condition that ends the
+            motion.
         values: Of the conditions of an event.
     """
 
@@ -84,13 +87,13 @@ class Progress(NamedTuple):
 
 
 def first_direction(y: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A direction to which no motion keeps, of length 1."""
+    """A direction of length 1 that is no eigenvector of a usual motion."""
     direction = np.cos(np.arange(y.size))
     return jnp.asarray(direction / np.linalg.norm(direction), y.dtype)
 
 
 def fastest_rate(scales: Array, omega: int, y: Array, other: Array) -> Array:
-    """The rate that bounds the steps: that of turning, or another if it is faster.
+    """The rate that bounds the steps: that of turning, or `other` if it is faster.
 
     Args:
         scales: Of the components of the state.
@@ -98,7 +101,7 @@ def fastest_rate(scales: Array, omega: int, y: Array, other: Array) -> Array:
         y: The state.
         other: Rate of the linearised motion.
     """
-    # In its unit: rates are within the range of numbers, their squares need not be.
+    # Scaled, since the squares of rates may be out of the range of the dtype.
     unit = scales[omega]
     turning = unit * jnp.sqrt(jnp.sum((y[omega : omega + 3] / unit) ** 2))
     rate = jnp.maximum(other, turning)

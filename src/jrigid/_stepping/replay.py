@@ -1,13 +1,13 @@
-"""Reverse mode: a motion is run again, and its steps are taken back from its end.
+"""Reverse mode: run a motion again, and reverse its steps from its end.
 
-The rates of the stages are kept for some hundred attempts at a step. A longer motion is
-run from its start once, to keep its state every so many attempts, then part after part
-from the last of these states. Rejected attempts are kept too, as steps of length zero:
-so all lanes count the same attempts.
+The log holds the rates of the stages of some hundred attempts at a step. A longer
+motion is run once from its start to store checkpoints. Then it is run part by part from
+the last checkpoint. Rejected attempts are in the log too, as steps of length zero, so
+that all lanes count the same attempts.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,13 +21,18 @@ from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import Motion, Progress
 from jrigid._stepping.step import apart
 
-# Rates are kept for so many attempts, within so many bytes.
-_FEWEST, _MOST, _BYTES = 64, 1024, 2**26
-# So many states are kept.
-_KEPT = 256
+Tree = TypeVar("Tree")
+
+# The log holds at least and at most this many attempts, and between these bounds as
+# many as this number of bytes has room for.
+_FEWEST = 64
+_MOST = 1024
+_BYTES = 2**26
+# Largest number of checkpoints.
+_CHECKPOINTS = 256
 
 
-class Changes(NamedTuple):
+class Cotangents(NamedTuple):
     """Cotangents of the results of a motion: the states at its times and at its end."""
 
     ys: Float[Array, "*motions times n"]
@@ -35,12 +40,12 @@ class Changes(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """An attempt that is kept.
+    """What the reverse of an attempt needs.
 
     Attributes:
         place: Time and length of the step, then the state at its start, as one array.
         rates: Of its stages.
-        output: The number of the output time that it reached.
+        output: Index of the output time that it reached.
     """
 
     place: Float[Array, " n+2"]
@@ -48,82 +53,99 @@ class _Step(NamedTuple):
     output: Int[Array, ""]
 
 
-class _Kept(NamedTuple):
-    """States that are kept, in order; those from `count` on are out of date."""
+class _Checkpoints(NamedTuple):
+    """Checkpoints in order, of which the first `count` are valid."""
 
     progress: Progress
-    attempts: Int[Array, " kept"]
+    attempts: Int[Array, " checkpoints"]
     count: Int[Array, ""]
 
 
 class _Back(NamedTuple):
-    """How far the cotangents have come.
+    """Progress of the cotangents, backward in time.
 
     Attributes:
-        attempt: All attempts from this one on are taken back.
-        change: Cotangent of the state before it.
+        attempt: All attempts from this one on have been reversed.
+        change: Cotangent of the state before this attempt.
         total: Cotangents of the parameters.
     """
 
     attempt: Int[Array, ""]
     change: Float[Array, " n"]
-    total: Any
+    total: Motion
 
 
 class _Replay(NamedTuple):
-    """Motions that are taken back together: one, or lanes.
+    """Motions that are reversed together: one, or lanes.
+
+    A motion comes in two parts, `fixed` and `varied`, which `equinox.combine` joins.
 
     Attributes:
-        engine: How they are integrated.
+        engine: Integrates the motions.
         over: Maps a function of one motion over the lanes.
-        fixed: The parts of the motion that are not asked for.
-        moved: The parts whose cotangents are asked for; only `parameters`.
+        fixed: Without those parameters whose cotangents are needed.
+        varied: With these parameters alone.
         changes: Cotangents of the results.
-        estimate: How many attempts there are, about.
+        estimate: About how many attempts there are.
     """
 
     engine: Engine
     over: Callable[..., Any]
-    fixed: Any
-    moved: Any
-    changes: Changes
+    fixed: Motion
+    varied: Motion
+    changes: Cotangents
     estimate: Int[Array, ""]
 
+    def begin(self) -> Progress:
+        """The motions at their start."""
+
+        def of_one(fixed: Motion, varied: Motion) -> Progress:
+            return self.engine.begin(eqx.combine(fixed, varied))
+
+        return self.over(of_one, self.fixed, self.varied)
+
     def attempt(self, progress: Progress) -> tuple[Progress, _Step]:
-        """Try a step, and keep what its reverse needs."""
+        """Try a step, and return what its reverse needs."""
 
-        def one(fixed: Any, moved: Any, progress: Progress) -> tuple[Progress, _Step]:
-            made = self.engine.attempt(eqx.combine(fixed, moved), progress)
-            at = jnp.stack([progress.t, made.h])
+        def of_one(
+            fixed: Motion, varied: Motion, progress: Progress
+        ) -> tuple[Progress, _Step]:
+            attempt = self.engine.attempt(eqx.combine(fixed, varied), progress)
+            at = jnp.stack([progress.t, attempt.h])
             place = jnp.concatenate([at, progress.y])
-            return made.progress, _Step(place, made.rates, made.output)
+            return attempt.progress, _Step(place, attempt.rates, attempt.output)
 
-        return self.over(one, self.fixed, self.moved, progress)
+        return self.over(of_one, self.fixed, self.varied, progress)
 
-    def take_back(self, step: _Step, change: Array, total: Any) -> tuple[Array, Any]:
+    def reverse(
+        self, step: _Step, change: Array, total: Motion
+    ) -> tuple[Array, Motion]:
         """Cotangents before a step, from those after it."""
 
-        def one(
-            fixed: Any, moved: Any, changes: Changes, step: _Step, carry: tuple
-        ) -> tuple[Array, Any]:
+        def of_one(
+            fixed: Motion,
+            varied: Motion,
+            changes: Cotangents,
+            step: _Step,
+            carry: tuple[Array, Motion],
+        ) -> tuple[Array, Motion]:
             change, total = carry
             t, h, y = step.place[0], step.place[1], step.place[2:]
-            # Not every step ends at an output time.
+            # The last row belongs to steps that do not end at an output time.
             nothing = jnp.zeros_like(changes.ys[:1])
-            asked = jnp.concatenate([changes.ys, nothing])[step.output]
-            motion: Motion = eqx.combine(fixed, moved)
+            of_output = jnp.concatenate([changes.ys, nothing])[step.output]
+            motion: Motion = eqx.combine(fixed, varied)
             jump = jnp.sum(motion.jumps <= t)
             smooth = self.engine.smooth_field(motion, jump)
+            change = change + of_output
 
-            change = change + asked
-
-            def complete(moved: Any) -> list[Array]:
-                return eqx.combine(moved, fixed).parameters
+            def complete(varied: Motion) -> list[Array]:
+                return eqx.combine(varied, fixed).parameters
 
             of_parameters, change = self.engine.stepper.pull_back(
                 smooth,
                 complete,
-                moved,
+                varied,
                 (t, h, y),
                 step.rates,
                 change,
@@ -132,146 +154,192 @@ class _Replay(NamedTuple):
             return change, jtu.tree_map(jnp.add, total, of_parameters)
 
         return self.over(
-            one, self.fixed, self.moved, self.changes, step, (change, total)
+            of_one, self.fixed, self.varied, self.changes, step, (change, total)
         )
 
-    def forwards(self, back: _Back, kept: _Kept, log: _Step) -> tuple:
-        """Run from the last of the states that are kept to where cotangents are."""
+    def forwards(
+        self, back: _Back, checkpoints: _Checkpoints, log: _Step
+    ) -> tuple[Int[Array, ""], Int[Array, ""], _Step, _Checkpoints]:
+        """Run from the last checkpoint to the state whose cotangent is known.
+
+        Returns:
+            The number of the next attempt, the index of the checkpoint at which the run
+            started, the latest attempts, and all checkpoints.
+        """
         size = log.output.shape[0]
-        start = kept.count - 1
+        start = checkpoints.count - 1
         progress, attempt = jtu.tree_map(
-            lambda x: x[start], (kept.progress, kept.attempts)
+            lambda x: x[start], (checkpoints.progress, checkpoints.attempts)
         )
-        room = _KEPT - kept.count
+        room = _CHECKPOINTS - checkpoints.count
         left = jnp.minimum(back.attempt, self.estimate) - attempt
+        # Checkpoints are spread over the rest of the run as far as they suffice.
         stretch = jnp.maximum(size, -(-left // (room + 1)))
 
-        def goes_on(attempt: Array, progress: Progress) -> Array:
+        def continues(attempt: Array, progress: Progress) -> Array:
             return (attempt < back.attempt) & jnp.any(progress.running)
 
-        def once(carry: tuple) -> tuple:
+        def one_attempt(carry: tuple) -> tuple:
             attempt, progress, log, until = carry
             progress, step = self.attempt(progress)
-            log = jtu.tree_map(lambda all_, x: _put(all_, x, attempt % size), log, step)
+            log = _put(log, step, attempt % size)
             return attempt + 1, progress, log, until
 
-        def some(carry: tuple) -> tuple:
-            attempt, progress, log, kept = carry
+        def to_checkpoint(carry: tuple) -> tuple:
+            attempt, progress, log, checkpoints = carry
             attempt, progress, log, _ = jax.lax.while_loop(
-                lambda carry: (carry[0] < carry[3]) & goes_on(*carry[:2]),
-                once,
+                lambda carry: (carry[0] < carry[3]) & continues(*carry[:2]),
+                one_attempt,
                 (attempt, progress, log, attempt + stretch),
             )
-            # What is stored after the last place is not read.
-            states, attempts = jtu.tree_map(
-                lambda all_, x: _put(all_, x, kept.count),
-                (kept.progress, kept.attempts),
-                (progress, attempt),
-            )
-            count = jnp.minimum(kept.count + 1, _KEPT)
-            return attempt, progress, log, _Kept(states, attempts, count)
+            return attempt, progress, log, _appended(checkpoints, progress, attempt)
 
-        attempt, _, log, kept = jax.lax.while_loop(
-            lambda carry: goes_on(*carry[:2]), some, (attempt, progress, log, kept)
+        attempt, _, log, checkpoints = jax.lax.while_loop(
+            lambda carry: continues(*carry[:2]),
+            to_checkpoint,
+            (attempt, progress, log, checkpoints),
         )
-        return attempt, start, log, kept
+        return attempt, start, log, checkpoints
 
     def backwards(self, first: Array, back: _Back, log: _Step) -> _Back:
-        """Take back the attempts from `first` on, whose rates are kept."""
+        """Reverse the attempts from `first` on, which are in the log."""
         size = log.output.shape[0]
 
         def once(back: _Back) -> _Back:
             attempt = back.attempt - 1
             step = jtu.tree_map(lambda x: x[attempt % size], log)
-            change, total = self.take_back(step, back.change, back.total)
+            change, total = self.reverse(step, back.change, back.total)
             return _Back(attempt, change, total)
 
         return jax.lax.while_loop(lambda back: back.attempt > first, once, back)
 
-    def pull(self) -> tuple[Any, Array]:
+    def pull(self) -> tuple[Motion, Array]:
         """Cotangents of the parameters and of the start."""
-        begin = self.over(
-            lambda fixed, moved: self.engine.begin(eqx.combine(fixed, moved)),
-            self.fixed,
-            self.moved,
-        )
-        shapes = jax.eval_shape(self.attempt, begin)[1]
-        bytes_ = sum(x.size * x.dtype.itemsize for x in jtu.tree_leaves(shapes))
-        size = min(max(_BYTES // bytes_, _FEWEST), _MOST)
-        log = jtu.tree_map(lambda x: jnp.zeros((size, *x.shape), x.dtype), shapes)
-        states = jtu.tree_map(
-            lambda x: jnp.zeros((_KEPT + 1, *x.shape), x.dtype).at[0].set(x), begin
-        )
-        none = jnp.zeros((), jnp.int32)
-        kept = _Kept(states, jnp.zeros(_KEPT + 1, jnp.int32), none + 1)
-        total = jtu.tree_map(jnp.zeros_like, self.moved)
-        unknown = jnp.iinfo(jnp.int32).max
-        back = _Back(none + unknown, self.changes.y, total)
+        begin = self.begin()
+        log = _empty_log(jax.eval_shape(self.attempt, begin)[1])
+        checkpoints = _first_checkpoint(begin)
+        total = jtu.tree_map(jnp.zeros_like, self.varied)
+        unknown = jnp.zeros((), jnp.int32) + jnp.iinfo(jnp.int32).max
+        back = _Back(unknown, self.changes.y, total)
 
-        def part(carry: tuple[_Back, _Kept, _Step]) -> tuple[_Back, _Kept, _Step]:
-            back, kept, log = carry
-            attempt, start, log, kept = self.forwards(back, kept, log)
-            # The first run finds how many attempts there are.
+        def part(
+            carry: tuple[_Back, _Checkpoints, _Step],
+        ) -> tuple[_Back, _Checkpoints, _Step]:
+            back, checkpoints, log = carry
+            attempt, start, log, checkpoints = self.forwards(back, checkpoints, log)
+            # The first run counts the attempts.
             back = back._replace(attempt=attempt)
-            first = jnp.maximum(kept.attempts[start], attempt - size)
+            first = jnp.maximum(
+                checkpoints.attempts[start], attempt - log.output.shape[0]
+            )
             back = self.backwards(first, back, log)
-            # States at later attempts are out of date.
-            valid = jnp.arange(_KEPT + 1, dtype=jnp.int32) < kept.count
-            valid = valid & (kept.attempts < back.attempt)
-            count = jnp.maximum(jnp.sum(valid), 1).astype(kept.count.dtype)
-            return back, kept._replace(count=count), log
+            return back, _without_later(checkpoints, back.attempt), log
 
         back, _, _ = jax.lax.while_loop(
-            lambda carry: carry[0].attempt > 0, part, (back, kept, log)
+            lambda carry: carry[0].attempt > 0, part, (back, checkpoints, log)
         )
 
-        def at_start(fixed: Any, changes: Changes) -> Array:
+        def at_start(fixed: Motion, changes: Cotangents) -> Array:
             early = (fixed.times <= 0)[:, None]
             return jnp.sum(jnp.where(early, changes.ys, 0.0), axis=0)
 
         return back.total, back.change + self.over(at_start, self.fixed, self.changes)
 
 
-def _put(all_: Array, x: Array, at: Array) -> Array:
-    """Store an entry of an array along its first axis, in place."""
-    return jax.lax.dynamic_update_index_in_dim(all_, x, at, 0)
+def _empty_log(shapes: _Step) -> _Step:
+    """Room for the latest attempts, as many as the memory for them allows."""
+    size = sum(x.size * x.dtype.itemsize for x in jtu.tree_leaves(shapes))
+    count = min(max(_BYTES // size, _FEWEST), _MOST)
+    return jtu.tree_map(lambda x: jnp.zeros((count, *x.shape), x.dtype), shapes)
+
+
+def _first_checkpoint(begin: Progress) -> _Checkpoints:
+    """Room for all checkpoints, of which the first is the start of the motion."""
+    states = jtu.tree_map(
+        lambda x: jnp.zeros((_CHECKPOINTS + 1, *x.shape), x.dtype).at[0].set(x), begin
+    )
+    attempts = jnp.zeros(_CHECKPOINTS + 1, jnp.int32)
+    return _Checkpoints(states, attempts, jnp.zeros((), jnp.int32) + 1)
+
+
+def _appended(
+    checkpoints: _Checkpoints, progress: Progress, attempt: Array
+) -> _Checkpoints:
+    """Append a checkpoint; without effect if the buffer is full."""
+    # The row after the last checkpoint is never read.
+    states, attempts = _put(
+        (checkpoints.progress, checkpoints.attempts),
+        (progress, attempt),
+        checkpoints.count,
+    )
+    count = jnp.minimum(checkpoints.count + 1, _CHECKPOINTS)
+    return _Checkpoints(states, attempts, count)
+
+
+def _without_later(checkpoints: _Checkpoints, attempt: Array) -> _Checkpoints:
+    """The checkpoints before an attempt, and always the first one."""
+    valid = jnp.arange(_CHECKPOINTS + 1, dtype=jnp.int32) < checkpoints.count
+    valid = valid & (checkpoints.attempts < attempt)
+    count = jnp.maximum(jnp.sum(valid), 1).astype(checkpoints.count.dtype)
+    return checkpoints._replace(count=count)
+
+
+def _put(buffers: Tree, entries: Tree, index: Array) -> Tree:
+    """Store an entry in each of the arrays of a pytree, along the first axis."""
+
+    def stored(buffer: Array, entry: Array) -> Array:
+        return jax.lax.dynamic_update_index_in_dim(buffer, entry, index, 0)
+
+    return jtu.tree_map(stored, buffers, entries)
 
 
 def pull_alone(
-    engine: Engine, fixed: Any, moved: Any, changes: Changes, tried: Array
-) -> tuple[Any, Array]:
+    engine: Engine, fixed: Motion, varied: Motion, changes: Cotangents, tried: Array
+) -> tuple[Motion, Array]:
     """Cotangents of the parameters and of the start of one motion.
 
     Args:
-        engine: How it is integrated.
-        fixed: The parts of the motion that are not asked for.
-        moved: The others.
+        engine: Integrates the motion.
+        fixed: The motion without those parameters whose cotangents are needed.
+        varied: The motion with these parameters alone.
         changes: Cotangents of its results.
-        tried: After how many attempts it ended.
+        tried: Number of attempts after which it ended.
     """
 
     def over(function: Callable[..., Any], *arguments: Any) -> Any:
         return apart(function, tried >= 0, *arguments)
 
     engine = engine._replace(replays=True, conditions=None)
-    return _Replay(engine, over, fixed, moved, changes, tried).pull()
+    return _Replay(engine, over, fixed, varied, changes, tried).pull()
 
 
 def pull_in_lanes(
-    engine: Engine, shared: Any, rest: Any, moved: Any, changes: Changes, tried: Array
-) -> tuple[Any, Array]:
-    """The same of many motions, which have an index in front of all but what they share."""
+    engine: Engine,
+    shared: Motion,
+    rest: Motion,
+    varied: Motion,
+    changes: Cotangents,
+    tried: Array,
+) -> tuple[Motion, Array]:
+    """Cotangents of the parameters and of the start of many motions.
+
+    All arguments but `engine` and `shared`, which the motions have in common, have an
+    axis of motions in front.
+    """
     engine = engine._replace(replays=True, conditions=None, in_lanes=True)
 
-    def block(rest: Any, moved: Any, changes: Changes, tried: Array) -> Any:
-        def over(function: Callable[..., Any], fixed: Any, *arguments: Any) -> Any:
-            return lanes_last(
-                lambda x, *y: function(eqx.combine(x, shared), *y), fixed, *arguments
-            )
+    def block(
+        rest: Motion, varied: Motion, changes: Cotangents, tried: Array
+    ) -> tuple[Motion, Array]:
+        def over(function: Callable[..., Any], fixed: Motion, *arguments: Any) -> Any:
+            def of_lane(fixed: Motion, *arguments: Any) -> Any:
+                return function(eqx.combine(fixed, shared), *arguments)
 
-        replay = _Replay(engine, over, rest, moved, changes, jnp.max(tried))
+            return lanes_last(of_lane, fixed, *arguments)
+
+        replay = _Replay(engine, over, rest, varied, changes, jnp.max(tried))
         return replay.pull()
 
-    # Motions of the same length go together: none waits for another.
+    # Motions of the same length are in one block, so that none waits for another.
     order = jnp.argsort(tried)
-    return some_at_a_time(block, order, rest, moved, changes, tried)
+    return some_at_a_time(block, order, rest, varied, changes, tried)

@@ -1,34 +1,36 @@
-"""Scales in which a motion is measured: time, each variable, the fastest rate."""
+"""Scales of a motion: its fastest rate, and one for each component of its state."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PyTree
 
 from jrigid._checks import internal_parts
 from jrigid._numerics import power_of_two, safe_norm
+from jrigid._types import BodyState
 from jrigid.systems import AbstractSystem, FloatingState
 
-# Squarings of the Jacobian whose norm estimates its spectral radius.
+# Squarings of the Jacobian: the norm of this power estimates its spectral radius.
 _SQUARINGS = 6
 
 
 def jacobian(
     field: Callable[[Array], Array], y: Float[Array, " n"], scales: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
-    """Jacobian of a vector field by differences, which need nothing but its values.
+    """Transposed Jacobian of a vector field, in scaled components, by differences.
 
-    Of the components in their scales; a row for each component of the state.
+    Differences need no derivative rules of a user's function. Each row belongs to a
+    component of the state.
     """
     largest = jnp.maximum(1.0, jnp.abs(y / scales))
     step = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest
-    # The first row is the place itself.
+    # The first row is zero: the state itself.
     which = np.eye(y.size + 1, y.size, k=-1, dtype=y.dtype)
     rates = jax.vmap(lambda row: field(y + row * step * scales))(which)
     return (rates[1:] - rates[:1]) / (step[:, None] * scales[None])
@@ -41,22 +43,23 @@ def rate_along(
     direction: Float[Array, " n"],
     scales: Float[Array, " n"],
 ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-    """Rate of the linearised motion from a small displacement, and where that points then.
+    """Rate of the linearised motion along a direction, and the next direction.
 
-    Called from step to step it is a power iteration, which finds the fastest rate. It
-    takes the Jacobian twice: once does not tell the rate of an oscillation.
+    Repeated at each step this is a power iteration, which finds the fastest rate. The
+    Jacobian is applied twice, since a single application does not give the rate of an
+    oscillation.
 
     Args:
-        field: Rates at a place.
-        y: The place.
-        base: The rates there.
+        field: Vector field, of the state.
+        y: The state.
+        base: Value of the field at that state.
         direction: Of the displacement, of length 1 in the scales.
         scales: Of the components.
     """
     largest = jnp.maximum(1.0, jnp.max(jnp.abs(y / scales)))
     nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest * scales
 
-    def change(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def change(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rate, direction = carry
         rates = (field(y + nudge * direction) - base) / nudge
         length = jnp.sqrt(jnp.sum(rates * rates))
@@ -70,11 +73,11 @@ def rate_along(
 def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """Upper estimate of the largest magnitude of an eigenvalue: ||J^64||^(1/64).
 
-    It does not depend much on the scales of the components, as a norm would. Products
-    are written out: a dot of this size costs several times more.
+    Unlike a norm it depends little on the scales of the components. Products are
+    written out, since a dot of this size takes several times longer.
     """
 
-    def square(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def square(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, log_factor = carry
         largest = jnp.max(jnp.abs(matrix))
         scale = jnp.where(largest > 0, largest, 1.0)
@@ -82,7 +85,7 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
         matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
         return matrix, 2.0 * (log_factor + jnp.log(scale))
 
-    # The power is exp(log_factor) times the matrix that is carried along.
+    # The power is exp(log_factor) times the matrix in the carry.
     start = matrix, jnp.zeros_like(matrix[0, 0])
     power, log_factor = jax.lax.fori_loop(0, _SQUARINGS, square, start)
     norm = jnp.max(jnp.sum(jnp.abs(power), axis=1))
@@ -90,10 +93,10 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 def undamped_rate(matrix: Array) -> Array:
-    """Largest magnitude of an eigenvalue that does not die away within a radian of its own.
+    """Largest magnitude of an eigenvalue whose motion is not damped within a radian.
 
-    What an implicit solver has to follow: it may step over the others. A matrix that is
-    not finite has none.
+    An implicit solver must follow these motions and may step over the others. The
+    result is zero for a matrix that is not finite.
     """
     matrix = jax.lax.stop_gradient(matrix)
     values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
@@ -103,16 +106,23 @@ def undamped_rate(matrix: Array) -> Array:
 
 def spread(
     system: AbstractSystem,
-    state: Any,
+    state: BodyState,
     rate: Array,
-    length: Any = None,
-    speed: Any = None,
+    length: Array | None = None,
+    speed: Array | None = None,
 ) -> Array:
-    """A scale for each component of the state of what turns at a rate; length and speed of flight.
+    """A scale for each component of the state of a body that turns at a rate.
 
-    Those of internal parts are what the torque says.
+    The torque states the scales of its internal parts.
+
+    Args:
+        system: The body.
+        state: Its state.
+        rate: Of turning [rad/s].
+        length: Scale of the position of a body in flight [m].
+        speed: Scale of its velocity [m/s].
     """
-    scale: dict[str, Any] = {
+    scale: dict[str, PyTree[Array]] = {
         "position": length,
         "velocity": speed,
         "attitude": jnp.ones_like(rate),
@@ -120,67 +130,101 @@ def spread(
         "internal": internal_parts(system.torque.internal_scale(rate)),
     }
     full = {
-        x: jtu.tree_map(jnp.full_like, value, scale[x])
-        for x, value in vars(state).items()
+        name: jtu.tree_map(jnp.full_like, value, scale[name])
+        for name, value in vars(state).items()
     }
     return ravel_pytree(dataclasses.replace(state, **full))[0]
 
 
+class _Start(NamedTuple):
+    """A system at its start, for the choice of units.
+
+    Attributes:
+        system: The system.
+        state: Its state.
+        t0: The time.
+        args: Of torques and forces.
+        rate: Rate of turning [rad/s].
+        fastest_of: The fastest rate that a Jacobian tells.
+    """
+
+    system: AbstractSystem
+    state: BodyState
+    t0: Array
+    args: PyTree
+    rate: Array
+    fastest_of: Callable[[Array], Array]
+
+    def powers(self, length: Array, speed: Array) -> Array:
+        """Scales of the components of the state, as powers of two."""
+        scales = spread(self.system, self.state, self.rate, length, speed)
+        return power_of_two(scales)
+
+    def fastest(self, scales: Array) -> Array:
+        """The fastest rate of the linearised motion, at least that of turning."""
+        flat, unravel = ravel_pytree(self.state)
+
+        def field(y: Array) -> Array:
+            rates = self.system.vector_field(self.t0, unravel(y), self.args)
+            return ravel_pytree(rates)[0]
+
+        radius = self.fastest_of(jacobian(field, flat, scales))
+        return jnp.maximum(self.rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
+
+
 def units(
     system: AbstractSystem,
-    state0: Any,
+    state0: BodyState,
     duration: Array,
     t0: Array,
-    args: Any,
+    args: PyTree,
     fastest_of: Callable[[Array], Array] = spectral_radius,
 ) -> tuple[Array, Array]:
-    """The fastest rate of the motion [rad/s], and a scale for each component of the state.
+    """The fastest rate of the motion [rad/s], and scales of the state's components.
 
-    The rate is what `fastest_of` says of the Jacobian, by default its spectral radius,
-    and at least that of turning: a body at rest turns at the rate its torque would give
-    it within a radian, and one that nothing turns is measured by the length of the run.
+    The rate is what `fastest_of` returns for the Jacobian, by default its spectral
+    radius, and at least the rate of turning. For a body at rest this is the rate that
+    its torque gives it within a radian. If nothing turns the body, it is the inverse of
+    the length of the run.
     """
-    rates = system.vector_field(t0, state0, args)
+    rates: Any = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
     turning, spinning_up = safe_norm(jnp.stack([state0.omega, rates.omega]))
     rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
     rate = jnp.where(rate > 0, rate, 1 / span)
-    flat, unravel = ravel_pytree(state0)
+    start = _Start(system, state0, t0, args, rate, fastest_of)
+    if isinstance(state0, FloatingState):
+        return _units_in_flight(start, state0, rates.velocity, span)
+    scales = start.powers(rate, rate)
+    return start.fastest(scales), scales
 
-    def powers(length: Array, speed: Array) -> Array:
-        return power_of_two(spread(system, state0, rate, length, speed))
 
-    def fastest(scales: Array) -> Array:
-        def field(y: Array) -> Array:
-            return ravel_pytree(system.vector_field(t0, unravel(y), args))[0]
+def _units_in_flight(
+    start: _Start, state0: FloatingState, acceleration: Array, span: Array
+) -> tuple[Array, Array]:
+    """The fastest rate and the scales of a body in flight.
 
-        radius = fastest_of(jacobian(field, flat, scales))
-        return jnp.maximum(rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
-
-    if not isinstance(state0, FloatingState):
-        scales = powers(rate, rate)
-        return fastest(scales), scales
-    # First scales of the place alone, to find how fast the motion of the centre of mass
-    # changes; then its way in that time, or in the whole run if that is shorter. A run
-    # of many orbits is not to be measured by |a| T^2. A body at rest on which no force
-    # acts is measured in metres.
+    The first scales belong to the place alone. They give the rate at which the motion
+    of the centre of mass changes. The length is then the way within the inverse of that
+    rate, or within the run if that is shorter: a run of many orbits must not be
+    measured by |a| T^2. A body at rest on which no force acts is measured in metres.
+    """
     position, velocity, pull = (
-        safe_norm(x) for x in (state0.position, state0.velocity, rates.velocity)
+        safe_norm(x) for x in (state0.position, state0.velocity, acceleration)
     )
-
-    def length_and_speed(
-        length: Array, speed: Array, time: Array
-    ) -> tuple[Array, Array]:
-        length = jnp.where(length > 0, length, speed * time)
-        length = jnp.where(length > 0, length, 1.0)
-        return length, jnp.where(speed > 0, speed, length / time)
-
-    time = jnp.minimum(span, 1 / rate)
+    time = jnp.minimum(span, 1 / start.rate)
     bend = jnp.where(pull > 0, velocity / jnp.where(pull > 0, pull, 1.0), time)
     way = jnp.maximum(position, velocity * jnp.minimum(time, bend))
     speed = jnp.where(velocity > 0, velocity, pull * time)
-    quickest = fastest(powers(*length_and_speed(way, speed, time)))
+    quickest = start.fastest(start.powers(*_length_and_speed(way, speed, time)))
     time = jnp.minimum(span, 1 / quickest)
     speed = jnp.maximum(velocity, pull * time)
     way = jnp.maximum(position, speed * time)
-    return quickest, powers(*length_and_speed(way, speed, time))
+    return quickest, start.powers(*_length_and_speed(way, speed, time))
+
+
+def _length_and_speed(length: Array, speed: Array, time: Array) -> tuple[Array, Array]:
+    """Scales of length and speed, each from the other or from 1 m where it is zero."""
+    length = jnp.where(length > 0, length, speed * time)
+    length = jnp.where(length > 0, length, 1.0)
+    return length, jnp.where(speed > 0, speed, length / time)

@@ -1,13 +1,13 @@
 """A step of an explicit Runge-Kutta method as a loop over its stages, and its reverse.
 
-The vector field stands once in the loop, so the compiled program does not grow with the
-number of stages. The reverse of a step is another Runge-Kutta step (E. Hairer, C.
-Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed., section VI.3): it is
+The loop evaluates the vector field in one place, so the compiled program does not grow
+with the number of stages. The reverse of a step is another Runge-Kutta step (E. Hairer,
+C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed., section VI.3). It is
 written out here, as a loop too.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,14 @@ from jaxtyping import Array, Float
 
 from jrigid._core.third_party import arithmetic_operations
 from jrigid._stepping.method import Groups, Method
+from jrigid._types import AnyArray
 
-# A computation of so many operations is short. The field of a heavy top has 179, that
-# of a heavy top with a tangent beside it 474.
+# A vector field with at most this many operations is short. That of a heavy top has
+# 179, that of a heavy top with a tangent beside it 474.
 _SHORT = 250
+
+#: A pytree of arrays.
+Parameters = TypeVar("Parameters")
 
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
 
@@ -32,18 +36,19 @@ def combine(method: Method, rates: Float[Array, "stages n"], row: int) -> Array:
 
 
 class _Sums(NamedTuple):
-    """Sums over the stages, of which a loop computes one after another.
+    """Weighted sums over the stages, one for each iteration of a loop.
 
-    XLA's CPU runtime executes up to 8 operations of a loop one after the other; where
-    there are more, each costs several times as much. So what can be computed in the
-    branch of a group is computed there, the number of the row too.
+    XLA's CPU runtime executes up to 8 operations of a loop one after the other. If a
+    loop has more, each takes several times longer. Therefore as much as possible is
+    computed in the branch of a group, the index of the row too.
 
     Attributes:
-        tables: A row of coefficients for each sum. Those of several tables are computed
-            together.
+        tables: Tables of coefficients with a row for each sum. The sums by several
+            tables are computed together.
         groups: Of the rows. In lanes, where sums take a large part of the time of a
-            step, a sum has the terms of its group. Elsewhere it has all of its zeros.
-        row: The row for a trip of the loop.
+            step, a sum has the terms of its group. Elsewhere it has a term for each
+            stage, zeros included.
+        row: The row for an iteration of the loop.
         in_lanes: Whether there are many lanes.
     """
 
@@ -55,85 +60,96 @@ class _Sums(NamedTuple):
     def then(
         self,
         function: Callable[..., Any],
-        trip: Array,
+        iteration: Array,
         terms: tuple[Array, ...],
         *arguments: Array,
     ) -> Any:
-        """`function(*totals, *arguments)` of the sums for a trip of the loop.
+        """`function(*totals, *arguments)` of the sums for an iteration of the loop.
 
         Args:
             function: Of the sum by each table, and of the arguments.
-            trip: The number of the trip.
+            iteration: The number of the iteration.
             terms: What the rows of each table sum.
             arguments: Of the function.
         """
-
-        def weighted(
-            trip: Array, terms: tuple[Array, ...]
-        ) -> list[tuple[Array, Array]]:
-            number = self.row(trip)
-            return [
-                (_row(table[:, : len(x)], number, x.dtype), x)
-                for table, x in zip(self.tables, terms, strict=True)
-            ]
-
         if not self.in_lanes:
-            pairs = weighted(trip, terms)
-            return function(
-                *(jnp.sum(a[:, None] * x, axis=0) for a, x in pairs), *arguments
-            )
+            pairs = self._weights_and_terms(iteration, terms)
+            totals = (jnp.sum(a[:, None] * x, axis=0) for a, x in pairs)
+            return function(*totals, *arguments)
 
-        def of_group(columns: tuple[tuple[int, ...], ...]) -> Callable[..., Any]:
-            def result(trip: Array, terms: tuple[Array, ...], *arguments: Array) -> Any:
-                pairs = zip(weighted(trip, terms), columns, strict=True)
-                totals = [
-                    _sum([a[i] for i in used], [x[i] for i in used])
-                    for (a, x), used in pairs
-                ]
+        def branch_of(columns: tuple[tuple[int, ...], ...]) -> Callable[..., Any]:
+            def branch(
+                iteration: Array, terms: tuple[Array, ...], *arguments: Array
+            ) -> Any:
+                totals = self._totals(iteration, terms, columns)
                 return function(*totals, *arguments)
 
-            return result
+            return branch
 
         group = jnp.zeros((), jnp.int32)
         for first, _ in self.groups[1:]:
-            group = group + (self.row(trip) >= first).astype(group.dtype)
-        branches = [of_group(columns) for _, columns in self.groups]
-        return jax.lax.switch(group, branches, trip, terms, *arguments)
+            group = group + (self.row(iteration) >= first).astype(group.dtype)
+        branches = [branch_of(columns) for _, columns in self.groups]
+        return jax.lax.switch(group, branches, iteration, terms, *arguments)
+
+    def _weights_and_terms(
+        self, iteration: Array, terms: tuple[Array, ...]
+    ) -> list[tuple[Array, Array]]:
+        """For each table, the coefficients of a row and the terms that they weight."""
+        row = self.row(iteration)
+        return [
+            (_row(table[:, : len(x)], row, x.dtype), x)
+            for table, x in zip(self.tables, terms, strict=True)
+        ]
+
+    def _totals(
+        self,
+        iteration: Array,
+        terms: tuple[Array, ...],
+        columns: tuple[tuple[int, ...], ...],
+    ) -> list[Array]:
+        """The sums by each table, over the columns that its group uses."""
+        pairs = self._weights_and_terms(iteration, terms)
+        return [
+            _sum([a[i] for i in used], [x[i] for i in used])
+            for (a, x), used in zip(pairs, columns, strict=True)
+        ]
 
 
-def _sum(weights: list, rates: list[Array]) -> Array:
-    """A sum written out, which is compiled together with what is around it."""
+def _sum(weights: Sequence[AnyArray], rates: list[Array]) -> Array:
+    """A sum written out term by term, which XLA fuses with the code around it."""
     terms = [jnp.asarray(a, k.dtype) * k for a, k in zip(weights, rates, strict=True)]
     return sum(terms[1:], terms[0])
 
 
-def _row(table: np.ndarray, row: Array, dtype: Any) -> Array:
+def _row(table: np.ndarray, row: Array, dtype: np.dtype) -> Array:
     """A row of a table of constants."""
     return jax.lax.dynamic_index_in_dim(jnp.asarray(table, dtype), row, keepdims=False)
 
 
 def apart(function: Callable[..., Any], true: Array, *arguments: Any) -> Any:
-    """A function's result, computed as a program of its own within a loop.
+    """The result of a function, computed in a branch of its own within a loop.
 
     XLA's CPU runtime executes the operations of a loop one after the other, at 25 ns
-    each, only where all of their arrays are small (512 bytes) or there are few; others
-    cost several times more. Operations in a branch are judged apart from the loop
-    around it.
+    each, if all of their arrays are small (512 bytes) or if there are few operations.
+    Otherwise each takes several times longer. The rule is applied to a branch and to
+    the loop around it separately.
 
     Args:
         function: Of the arguments.
-        true: A condition that holds, though the compiler cannot know it.
+        true: A traced boolean that is always True, so that XLA cannot remove the
+            branch. Must not be batched.
         arguments: Of the function.
     """
     shapes = jax.eval_shape(function, *arguments)
 
     def never(*arguments: Any) -> Any:
-        given = jtu.tree_leaves(arguments)
+        inputs = jtu.tree_leaves(arguments)
 
-        def anything(shape: Any) -> Array:
-            # An array that is there already costs no kernel, as a new one would.
+        def anything(shape: jax.ShapeDtypeStruct) -> Array:
+            # An input of the right shape costs no kernel; a new array does.
             alike = (
-                x for x in given if x.shape == shape.shape and x.dtype == shape.dtype
+                x for x in inputs if x.shape == shape.shape and x.dtype == shape.dtype
             )
             return next(alike, jnp.zeros(shape.shape, shape.dtype))
 
@@ -157,15 +173,15 @@ def stages(
     y: Array,
     in_lanes: bool = False,
 ) -> tuple[Float[Array, "stages n"], Float[Array, " n"]]:
-    """The rates of all stages of a step, and its result.
+    """The rates of all stages of a step, and the state at its end.
 
     Args:
         method: The method.
         field: The vector field.
-        t: Where the step starts.
-        h: Its length.
-        y: The state there.
-        in_lanes: Whether it will have many lanes.
+        t: Start of the step.
+        h: Length of the step.
+        y: State at the start.
+        in_lanes: Whether the step will have many lanes.
     """
     joined = in_lanes and _is_short(field, t, y)
     return _loop(method, field, (t, h, y), method.stages, in_lanes, joined)
@@ -179,18 +195,18 @@ def _loop(
     in_lanes: bool,
     joined: bool,
 ) -> tuple[Float[Array, "count n"], Float[Array, " n"]]:
-    """The rates of the first `count` stages, and the place of the stage after them.
+    """The rates of the first `count` stages, and the state at the stage after them.
 
-    The place of the last stage is the result of the step. If `joined`, the kernel that
-    computes a rate also puts it into the table: this takes less time in lanes, unless
-    the field is not short. Of such a kernel LLVM makes slow code.
+    The state at the last stage is the result of the step. If `joined`, the kernel that
+    computes a rate also stores it in the table. In lanes this takes less time for a
+    short field. For a longer one LLVM compiles such a kernel to slow code.
     """
     t, h, y = step
 
-    def following(i: Array) -> Array:
+    def next_row(i: Array) -> Array:
         return jnp.minimum(i + 1, method.stages - 1)
 
-    sums = _Sums((method.rows,), method.groups, following, in_lanes)
+    sums = _Sums((method.rows,), method.groups, next_row, in_lanes)
 
     def place_of(total: Array, h: Array, y: Array) -> Array:
         return y + h * total
@@ -228,7 +244,7 @@ def equal_steps(
 
     Gradients: in every mode, of every order.
     """
-    # The rate of the last stage, at the end of a step, serves the error estimate alone.
+    # Only the error estimate needs the rate of the last stage, at the end of a step.
     needed = method.stages - 1
 
     def step(i: Array, y: Array) -> Array:
@@ -247,57 +263,59 @@ def error_of(method: Method, rates: Float[Array, "stages n"], h: Array) -> Array
 
 def pull_back(
     method: Method,
-    field: Callable[[Any, Array, Array], Array],
-    parameters: Any,
+    field: Callable[[Parameters, Array, Array], Array],
+    parameters: Parameters,
     step: tuple[Float[Array, ""], Float[Array, ""], Float[Array, " n"]],
     rates: Float[Array, "stages n"],
     change: Float[Array, " n"],
     in_lanes: bool = False,
-) -> tuple[Any, Float[Array, " n"]]:
+) -> tuple[Parameters, Float[Array, " n"]]:
     """Cotangents of the parameters and of the start of a step, from that of its result.
 
-    With the places Y_i of the stages, p_i the cotangent of Y_i, and p of the last place
+    With the states Y_i of the stages, p_i the cotangent of Y_i, and p of the last stage
     given: u_i = h sum_j a_ji p_j, p_i = J(Y_i)^T u_i, and that of the start is the sum
     of all p_i.
 
     Args:
         method: The method.
         field: The vector field, of parameters, time and state.
-        parameters: Those whose cotangents are asked for.
-        step: Where it starts, its length, the state at its start. A step of length 0
-            was not taken: its rates do not matter.
+        parameters: The parameters whose cotangents are needed.
+        step: Start, length, and state at the start. A step of length 0 was not taken:
+            its rates do not matter.
         rates: Of its stages.
         change: Cotangent of its result.
-        in_lanes: Whether it will have many lanes.
+        in_lanes: Whether the step will have many lanes.
     """
     t, h, y = step
     last = method.stages - 1
 
-    def number(k: Array) -> Array:
+    def row(k: Array) -> Array:
         return last - 1 - k
 
-    sums = _Sums(method.reverse_rows, method.reverse_groups, number, in_lanes)
+    sums = _Sums(method.reverse_rows, method.reverse_groups, row, in_lanes)
 
-    def place_and_weighted(
-        total: Array, total_back: Array, h: Array, y: Array
-    ) -> tuple[Array, Array]:
-        return y + jnp.where(h != 0, h * total, 0.0), h * total_back
-
-    def of_rate(weighted: Array, at: Array, place: Array) -> tuple[Any, Array]:
+    def of_rate(weighted: Array, at: Array, place: Array) -> tuple[Parameters, Array]:
         _, pull = jax.vjp(lambda x, y: field(x, at, y), parameters, place)
         return pull(weighted)
 
-    def stage(k: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        places, total = carry
-        i = number(k)
-        place, weighted = sums.then(place_and_weighted, k, (rates, places), h, y)
-        of_stage = weighted, t + _row(method.times, i, y.dtype) * h, place
+    def stage(k: Array, carry: tuple[Array, Parameters]) -> tuple[Array, Parameters]:
+        cotangents, total = carry
+        i = row(k)
+        place, weighted = sums.then(_place_and_weighted, k, (rates, cotangents), h, y)
+        of_stage = (weighted, t + _row(method.times, i, y.dtype) * h, place)
         # The reverse of a field is never short (see `_loop`).
         of_parameters, of_place = apart(of_rate, k >= 0, *of_stage)
-        places = jax.lax.dynamic_update_index_in_dim(places, of_place, i, 0)
-        return places, jtu.tree_map(jnp.add, total, of_parameters)
+        cotangents = jax.lax.dynamic_update_index_in_dim(cotangents, of_place, i, 0)
+        return cotangents, jtu.tree_map(jnp.add, total, of_parameters)
 
-    places = jnp.zeros_like(rates).at[last].set(change)
+    cotangents = jnp.zeros_like(rates).at[last].set(change)
     zeros = jtu.tree_map(jnp.zeros_like, parameters)
-    places, total = jax.lax.fori_loop(0, last, stage, (places, zeros))
-    return total, jnp.sum(places, axis=0)
+    cotangents, total = jax.lax.fori_loop(0, last, stage, (cotangents, zeros))
+    return total, jnp.sum(cotangents, axis=0)
+
+
+def _place_and_weighted(
+    total: Array, total_back: Array, h: Array, y: Array
+) -> tuple[Array, Array]:
+    """The state at a stage, and the cotangent of the rate there."""
+    return y + jnp.where(h != 0, h * total, 0.0), h * total_back

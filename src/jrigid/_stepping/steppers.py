@@ -1,7 +1,7 @@
-"""How a step of a motion is tried: with error control, or at a length that is given."""
+"""Ways to try a step of a motion: with error control, or with a given length."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import diffrax
 import jax
@@ -17,7 +17,11 @@ from jrigid._stepping.step import apart, error_of, pull_back, stages
 #: A vector field, of (parameters, t, y).
 Field = Callable[[list[Array], Array, Array], Array]
 
-# Equal steps are one fewer where so little of one would be left, by rounding perhaps.
+#: A pytree of arrays from which the parameters of a motion are made.
+Tree = TypeVar("Tree")
+
+# A remainder of this fraction of a step, perhaps from rounding, does not make one more
+# equal step.
 _RAGGED = 1e-3
 
 
@@ -26,9 +30,9 @@ class Trial(NamedTuple):
 
     Attributes:
         y1: The state at its end.
-        direction: That finds the fastest rate, from there on.
-        verdict: Whether it is accepted, and what comes next.
-        infinite: Whether it met a rate that is not finite.
+        direction: Of a small displacement, which finds the fastest rate.
+        verdict: Whether the step is accepted, and the length of the next one.
+        infinite: Whether a rate is not finite.
         rates: Of its stages, or of the last one alone.
     """
 
@@ -50,7 +54,7 @@ class Stretch(NamedTuple):
 
 
 class Stepper(Protocol):
-    """A way to step. `parameters` are those of the motion."""
+    """Tries a step. `parameters` are those of the motion."""
 
     @property
     def first(self) -> float:
@@ -70,9 +74,9 @@ class Stepper(Protocol):
         in_lanes: bool,
         keeps_rates: bool,
     ) -> Trial:
-        """The result of a step to a time, and whether it stands.
+        """The result of a step to a time, and whether it is accepted.
 
-        With `keeps_rates` it has the rates of all stages.
+        With `keeps_rates` the result has the rates of all stages.
         """
         ...
 
@@ -91,23 +95,23 @@ class Stepper(Protocol):
     def pull_back(
         self,
         field: Field,
-        complete: Callable[[Any], list[Array]],
-        moved: Any,
+        complete: Callable[[Tree], list[Array]],
+        varied: Tree,
         step: tuple[Array, Array, Array],
         rates: Array,
         change: Array,
         in_lanes: bool,
-    ) -> tuple[Any, Float[Array, " n"]]:
-        """Cotangents of `moved` and of the start of a step, from that of its result.
+    ) -> tuple[Tree, Float[Array, " n"]]:
+        """Cotangents of `varied` and of the start of a step, from that of its result.
 
         Args:
             field: The vector field.
-            complete: The parameters, of `moved`.
-            moved: What they are made from.
-            step: Where it starts, its length, the state at its start.
+            complete: Returns the parameters of the motion from `varied`.
+            varied: The arrays whose cotangents are needed.
+            step: Start, length, and state at the start.
             rates: Of its stages.
             change: Cotangent of its result.
-            in_lanes: Whether it has many lanes.
+            in_lanes: Whether there are many lanes.
         """
         ...
 
@@ -131,7 +135,7 @@ class ErrorControlled(NamedTuple):
         return 0.1
 
     def end(self, t: Array, step: Array, goal: Array) -> Float[Array, ""]:
-        """The end of the step, or the goal, before which no sliver is left."""
+        """The end of the step, or the goal if the step ends just before it."""
         near = t + step > goal * (1 - 100 * jnp.finfo(t.dtype).eps)
         return jnp.where(near, goal, t + step)
 
@@ -151,29 +155,28 @@ class ErrorControlled(NamedTuple):
         def rates_at(t: Array, y: Array) -> Array:
             return field(motion.parameters, t, y)
 
+        def fixed_rates_at_end(y: Array) -> Array:
+            return jax.lax.stop_gradient(rates_at(t1, y))
+
         def step_to(h: Array, y: Array) -> tuple[Array, ...]:
             rates, y1 = stages(self.method, rates_at, t, h, y, in_lanes)
-            known = rates if keeps_rates else rates[-1:]
-            return y1, error_of(self.method, rates, h), known
+            returned = rates if keeps_rates else rates[-1:]
+            return y1, error_of(self.method, rates, h), returned
 
         h = t1 - t
         if in_lanes:
             y1, estimate, rates = step_to(h, y)
         else:
             y1, estimate, rates = apart(step_to, counts[1] >= 0, h, y)
-        # What decides on steps is not differentiated.
-        before, there, estimate, base = jax.lax.stop_gradient(
+        # The choice of steps is not differentiated.
+        before, after, estimate, base = jax.lax.stop_gradient(
             (y, y1, estimate, rates[-1])
         )
-        error = in_tolerances(limits, motion.scales, before, there, estimate)
+        error = in_tolerances(limits, motion.scales, before, after, estimate)
         fastest, along = rate_along(
-            lambda y: jax.lax.stop_gradient(rates_at(t1, y)),
-            there,
-            base,
-            direction,
-            motion.scales,
+            fixed_rates_at_end, after, base, direction, motion.scales
         )
-        rate1 = fastest_rate(motion.scales, self.omega, there, fastest)
+        rate1 = fastest_rate(motion.scales, self.omega, after, fastest)
         verdict = judge(limits, self.method.order, step, h, error, rate0, rate1)
         return Trial(y1, along, verdict, ~(error < jnp.inf), rates)
 
@@ -182,9 +185,9 @@ class ErrorControlled(NamedTuple):
     ) -> Float[Array, " n"]:
         """The state within a step, by the dense output of the method."""
         del parameters
-        known = (step.t1 - step.t0) * step.rates[: self.method.own]
+        increments = (step.t1 - step.t0) * step.rates[: self.method.own]
         curve = self.interpolation(
-            t0=step.t0, t1=step.t1, y0=step.y0, y1=step.y1, k=known
+            t0=step.t0, t1=step.t1, y0=step.y0, y1=step.y1, k=increments
         )
         return curve.evaluate(t)
 
@@ -197,19 +200,19 @@ class ErrorControlled(NamedTuple):
     def pull_back(
         self,
         field: Field,
-        complete: Callable[[Any], list[Array]],
-        moved: Any,
+        complete: Callable[[Tree], list[Array]],
+        varied: Tree,
         step: tuple[Array, Array, Array],
         rates: Array,
         change: Array,
         in_lanes: bool,
-    ) -> tuple[Any, Float[Array, " n"]]:
+    ) -> tuple[Tree, Float[Array, " n"]]:
         """The reverse of a step, which is another Runge-Kutta step."""
 
-        def of_moved(moved: Any, t: Array, y: Array) -> Array:
-            return field(complete(moved), t, y)
+        def of_varied(varied: Tree, t: Array, y: Array) -> Array:
+            return field(complete(varied), t, y)
 
-        return pull_back(self.method, of_moved, moved, step, rates, change, in_lanes)
+        return pull_back(self.method, of_varied, varied, step, rates, change, in_lanes)
 
 
 class EqualSteps(NamedTuple):
@@ -244,7 +247,8 @@ class EqualSteps(NamedTuple):
         del field, in_lanes, keeps_rates
         y, direction, (t, step, rate, _), _, _ = progress
         y1 = self.advance(motion.parameters, t, t1 - t, y)
-        yes, no = jnp.array(True), jnp.array(False)
+        yes = jnp.array(True)
+        no = jnp.array(False)
         none = jnp.zeros((0, *y.shape), y.dtype)
         return Trial(y1, direction, Verdict(yes, no, step, rate), no, none)
 
@@ -264,18 +268,18 @@ class EqualSteps(NamedTuple):
     def pull_back(
         self,
         field: Field,
-        complete: Callable[[Any], list[Array]],
-        moved: Any,
+        complete: Callable[[Tree], list[Array]],
+        varied: Tree,
         step: tuple[Array, Array, Array],
         rates: Array,
         change: Array,
         in_lanes: bool,
-    ) -> tuple[Any, Float[Array, " n"]]:
+    ) -> tuple[Tree, Float[Array, " n"]]:
         """The reverse of a step, by automatic differentiation."""
         del field, rates, in_lanes
         t, h, y = step
 
-        def after(moved: Any, y: Array) -> Array:
-            return self.advance(complete(moved), t, h, y)
+        def after(varied: Tree, y: Array) -> Array:
+            return self.advance(complete(varied), t, h, y)
 
-        return jax.vjp(after, moved, y)[1](change)
+        return jax.vjp(after, varied, y)[1](change)

@@ -1,4 +1,4 @@
-"""Solvers that make no error estimate: steps of equal length, which are all accepted."""
+"""Solvers without an error estimate: steps of equal length, which are all accepted."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,13 +7,14 @@ from typing import Any
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jrigid._motion import depends_on
 from jrigid._stepping.control import SMALLEST_BOUND
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import Motion
 from jrigid._stepping.steppers import EqualSteps
+from jrigid._types import BodyState, ScalarLike, Vector
 from jrigid.simulate._options import Options
 from jrigid.simulate._prepare import Prepared, opened
 from jrigid.solvers import FreeRotation, Splitting
@@ -22,19 +23,22 @@ from jrigid.systems import RigidBody
 
 def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     """An engine for the steps of a solver, and the motion with its parameters."""
-    system, args = given.inputs.system, given.inputs.args
-    motion, solver = given.motion, options.solver
+    system = given.inputs.system
+    args = given.inputs.args
+    solver = options.solver
+    motion = given.motion
     limits = motion.limits
+    terms: Any
     if isinstance(solver, Splitting):
         longest = options.max_step
 
-        def torque(t: Any, state: Any, args: Any) -> Array:
+        def torque(t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
             return system.torque_on(given.start + t, state, args)
 
         _check_splitting(torque, limits.end, given.inputs.state0, args)
-        terms: Any = solver.terms(RigidBody(system.inertia, torque))
+        terms = solver.terms(RigidBody(system.inertia, torque))
     else:
-        # Short steps, so that no change of sign is missed.
+        # Steps are short, so that an event misses no change of sign.
         longest = jnp.minimum(SMALLEST_BOUND / given.fastest, options.max_step)
         terms = FreeRotation(system.inertia.astype(motion.y0.dtype))
 
@@ -50,8 +54,10 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     return Engine(given.field, EqualSteps(plain), options.max_steps), motion
 
 
-def _check_splitting(torque: Callable, t: Array, state0: Any, args: Any) -> None:
-    """Raise ValueError for a torque that splitting cannot serve."""
+def _check_splitting(
+    torque: Callable[..., Vector], t: Array, state0: BodyState, args: PyTree
+) -> None:
+    """Raise ValueError for a torque that splitting cannot integrate."""
 
     def of_omega(omega: Array) -> Array:
         return torque(t, dataclasses.replace(state0, omega=omega), args)

@@ -2,53 +2,60 @@
 
 import inspect
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jrigid._checks import traced_by_jax
 from jrigid._stepping.events import Conditions
+from jrigid._types import BodyState
 
-# Each Newton step doubles the orders of the derivatives that are right: two serve the
-# second derivative.
+# Each Newton step doubles the order of the derivatives that are right. Two steps are
+# enough for the second derivative.
 _NEWTON_STEPS = 2
 
 
+#: A condition of an event, of (t, y, args) with the state as one array.
+Condition = Callable[[Array, Array, PyTree], Array]
+
+
 def condition_of_states(
-    condition: Callable, t0: Array, to_state: Callable, options: dict[str, Any]
-) -> Callable[[Array, Any, Any], Any]:
+    condition: Callable[..., Array],
+    t0: Array,
+    to_state: Callable[[Array], BodyState],
+    options: dict[str, object],
+) -> Condition:
     """A condition, called with the time since `t0` and a state as one array.
 
-    Like diffrax, it is given those of the options by name that it asks for.
+    Like diffrax this passes the options that the user's function has as arguments.
     """
-    known = inspect.signature(condition).parameters.values()
-    every = any(x.kind is x.VAR_KEYWORD for x in known)
-    names = {x.name for x in known}
-    asked = {name: x for name, x in options.items() if every or name in names}
+    parameters = inspect.signature(condition).parameters.values()
+    takes_all = any(x.kind is x.VAR_KEYWORD for x in parameters)
+    names = {x.name for x in parameters}
+    passed = {name: x for name, x in options.items() if takes_all or name in names}
 
-    def of_array(t: Array, y: Any, args: Any) -> Any:
+    def of_array(t: Array, y: Array, args: PyTree) -> Array:
         with traced_by_jax("the condition of an event"):
-            return condition(t0 + t, to_state(y), args, **asked)
+            return condition(t0 + t, to_state(y), args, **passed)
 
     return of_array
 
 
 def conditions_of(
-    each: list[Callable],
-    direction: Any,
-    values: Callable,
+    each: list[Condition],
+    direction: PyTree[bool | None],
+    values: Callable[[list[Array], Array, Array], Array],
     example: tuple[Array, Array],
-    args: Any,
+    args: PyTree,
 ) -> Conditions:
     """The conditions of an event.
 
     Args:
-        each: Functions of (t, y, args).
-        direction: As that of `diffrax.Event`.
+        each: The conditions, as functions.
+        direction: As in `diffrax.Event`.
         values: Of (arrays, t, y): one value for each condition.
         example: A time and a state.
         args: Passed to the conditions.
@@ -67,7 +74,7 @@ def place_of_event(
     y: Float[Array, " n"],
     met: Bool[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-    """Time and state at which a condition is zero, from a place very near to it.
+    """Time and state at which a condition is zero, from a time very near to it.
 
     Gradients: those of the implicit function, of first and second order, in every mode.
 
@@ -81,17 +88,17 @@ def place_of_event(
     """
 
     def later(dt: Array) -> Array:
-        """By the midpoint rule, whose derivatives are right to second order."""
+        """The state by the midpoint rule, whose second derivatives are right."""
         middle = y + 0.5 * dt * field(t, y)
         return y + dt * field(t + 0.5 * dt, middle)
 
-    def distance(dt: Array, _: Any = None) -> Array:
+    def distance(dt: Array, _: None = None) -> Array:
         return value(t + dt, later(dt))
 
     dt = jnp.zeros_like(t)
     if finder is not None:
-        found = optx.root_find(distance, finder, dt, throw=False)
-        dt = jnp.where(met, found.value, 0.0)
+        solution = optx.root_find(distance, finder, dt, throw=False)
+        dt = jnp.where(met, solution.value, 0.0)
     else:
         for _ in range(_NEWTON_STEPS):
             now, slope = jax.jvp(distance, (dt,), (jnp.ones_like(dt),))

@@ -1,4 +1,4 @@
-"""The options of `simulate`: checked when it is traced, and the values that it judges."""
+"""The arguments and options of `simulate`, and the checks of its options."""
 
 import warnings
 from collections.abc import Callable
@@ -6,14 +6,17 @@ from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, PyTree
 
 from jrigid._checks import check_type, is_concrete, whole_number
 from jrigid._motion import numbers, solver_of
 from jrigid._stepping.scales import spectral_radius, undamped_rate
+from jrigid._types import BodyState, ScalarLike
 from jrigid.solvers import ExactFree, Splitting, Verner9
 from jrigid.systems import AbstractSystem, RigidBody
 
+# By the size of a number in bytes.
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
 SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
@@ -26,13 +29,13 @@ _ADJOINTS = (
 
 
 class Inputs(NamedTuple):
-    """What moves, and when."""
+    """The arguments of `simulate`: the system, its state, and times."""
 
     system: AbstractSystem
-    state0: Any
+    state0: BodyState
     ts: Array
     t0: Array
-    args: Any
+    args: PyTree
     jumps: Array
 
     @property
@@ -47,35 +50,49 @@ class Inputs(NamedTuple):
     def since_start(self) -> Array:
         """Times since the start, in the precision of the state.
 
-        They may come in more digits: they are subtracted in their own.
+        They are subtracted in their own precision, which may be higher.
         """
         return (self.ts.reshape(-1) - self.t0).astype(self.state0.omega.dtype)
 
 
-class Options(NamedTuple):
-    """How it is integrated."""
+class Requested(NamedTuple):
+    """The options of `simulate` as the user passed them, None for a default."""
 
-    solver: Any
-    rtol: Any
-    atol: Any
-    adjoint: Any
-    max_steps: Any
-    max_step: Any
-    event: Any
-    meter: Any
+    solver: diffrax.AbstractSolver | None
+    rtol: ScalarLike | None
+    atol: ScalarLike | None
+    adjoint: diffrax.AbstractAdjoint | None
+    max_steps: int | None
+    max_step: ScalarLike | None
+    event: diffrax.Event | None
+    progress: bool | diffrax.AbstractProgressMeter
+
+
+class Options(NamedTuple):
+    """The options of an integration, checked and without defaults."""
+
+    solver: diffrax.AbstractSolver
+    rtol: Array
+    atol: Array
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int
+    max_step: Array
+    event: diffrax.Event | None
+    meter: diffrax.AbstractProgressMeter
 
     @property
     def is_implicit(self) -> bool:
-        """True of a solver that may step over what is damped."""
+        """True of a solver that may step over damped motions."""
         return isinstance(self.solver, diffrax.AbstractImplicitSolver)
 
     @property
     def is_worth_foreseeing(self) -> bool:
-        """Whether a motion that needs too many steps is to fail before its first one.
+        """Whether a motion that needs too many steps fails before its first one.
 
-        It runs for minutes before it has used up the default number. A smaller one
-        bounds the work: such a run hands out what it reached. Where an event ends a
-        motion, nothing is known beforehand, and the closed form takes no steps.
+        It would run for minutes until it has used up the default number. A smaller
+        number bounds the work, and such a run returns the states that it reached. If an
+        event ends a motion, the number of steps is not known in advance. The closed
+        form takes no steps.
         """
         if self.event is not None or isinstance(self.solver, ExactFree):
             return False
@@ -83,59 +100,104 @@ class Options(NamedTuple):
 
     @property
     def fastest_of(self) -> Callable[[Array], Array]:
-        """What bounds the steps, of the Jacobian: its fastest rate, or that which nothing damps."""
+        """The rate of the Jacobian that bounds the steps.
+
+        It is the fastest rate, or the fastest undamped rate for an implicit solver.
+        """
         return undamped_rate if self.is_implicit else spectral_radius
 
 
 def _default_max_steps(adjoint: diffrax.AbstractAdjoint) -> int:
-    """The largest number of steps, unless it is given."""
+    """Default of the largest number of steps."""
     direct = isinstance(adjoint, diffrax.DirectAdjoint)
     return _DEFAULT_MAX_STEPS_DIRECT if direct else _DEFAULT_MAX_STEPS
 
 
-def checked_options(asked: Options, system: AbstractSystem, dtype: Any) -> Options:
+def checked_options(
+    requested: Requested, system: AbstractSystem, dtype: np.dtype
+) -> Options:
     """The options with their defaults, or ValueError."""
-    solver, rtol, atol, adjoint, max_steps, max_step, event, meter = asked
-    if isinstance(solver, Splitting):
-        if max_step is None or not isinstance(system, RigidBody):
-            raise ValueError(
-                "Argument `solver` must not be Splitting for anything but a RigidBody, its step "
-                "given as `max_step`, but it is."
-            )
-    elif not isinstance(solver, ExactFree):
-        solver = solver_of(solver, Verner9(), ", or ExactFree() or Splitting()")
-    elif not (isinstance(system, RigidBody) and system.is_free):
-        raise ValueError(
-            "Argument `solver` must not be ExactFree for anything but a RigidBody without a "
-            "torque, but it is."
-        )
+    solver = _checked_solver(requested, system)
+    adjoint = requested.adjoint
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint()
     check_type("adjoint", adjoint, *_ADJOINTS)
+    max_steps = requested.max_steps
     if max_steps is None:
         max_steps = _default_max_steps(adjoint)
-    if event is not None:
-        check_type("event", event, diffrax.Event)
-    check_type("progress", meter, bool, diffrax.AbstractProgressMeter)
-    if isinstance(meter, bool):
-        meter = diffrax.TextProgressMeter() if meter else diffrax.NoProgressMeter()
-    size = jnp.dtype(dtype).itemsize
-    rtol = _DEFAULT_RTOL[size] if rtol is None else rtol
-    limits = {"rtol": rtol, "atol": rtol if atol is None else atol}
-    arrays = numbers(**limits, max_step=jnp.inf if max_step is None else max_step)
-    smallest = SMALLEST_RTOL[size]
-    for name, value in limits.items():  # what is known now; the rest is judged
-        if is_concrete(value) and not smallest <= float(value) < 1:
-            raise ValueError(
-                f"Argument `{name}` must be at least {smallest} and below 1 in "
-                f"{jnp.dtype(dtype).name}, but it is {float(value)}."
-            )
-    if size == 4:
+    if requested.event is not None:
+        check_type("event", requested.event, diffrax.Event)
+    check_type("progress", requested.progress, bool, diffrax.AbstractProgressMeter)
+    rtol, atol, max_step = _checked_tolerances(requested, dtype)
+    if dtype.itemsize == 4:
         warnings.warn(
             "simulate() runs in float32: errors of 1e-6 a radian are usual. Switch on "
             "`jax_enable_x64` and pass float64 arrays for more.",
             stacklevel=3,
         )
+    return Options(
+        solver=solver,
+        rtol=rtol,
+        atol=atol,
+        adjoint=adjoint,
+        max_steps=whole_number("max_steps", max_steps),
+        max_step=max_step,
+        event=requested.event,
+        meter=_meter(requested.progress),
+    )
+
+
+def _checked_solver(
+    requested: Requested, system: AbstractSystem
+) -> diffrax.AbstractSolver:
+    """The solver, or ValueError for one that cannot serve the system."""
+    solver = requested.solver
+    if isinstance(solver, Splitting):
+        if requested.max_step is None or not isinstance(system, RigidBody):
+            raise ValueError(
+                "Argument `solver` must not be Splitting for anything but a RigidBody, "
+                "its step given as `max_step`, but it is."
+            )
+        return solver
+    if not isinstance(solver, ExactFree):
+        return solver_of(solver, Verner9(), ", or ExactFree() or Splitting()")
+    if not (isinstance(system, RigidBody) and system.is_free):
+        raise ValueError(
+            "Argument `solver` must not be ExactFree for anything but a RigidBody "
+            "without a torque, but it is."
+        )
+    return solver
+
+
+def _checked_tolerances(
+    requested: Requested, dtype: np.dtype
+) -> tuple[Array, Array, Array]:
+    """Relative and absolute tolerance and longest step; ValueError for known bad ones.
+
+    Tolerances that are traced are checked with the other values.
+    """
+    rtol = requested.rtol
+    if rtol is None:
+        rtol = _DEFAULT_RTOL[dtype.itemsize]
+    atol = rtol if requested.atol is None else requested.atol
+    max_step = jnp.inf if requested.max_step is None else requested.max_step
+    arrays = numbers(rtol=rtol, atol=atol, max_step=max_step)
+    smallest = SMALLEST_RTOL[dtype.itemsize]
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        number: Any = value
+        if is_concrete(value) and not smallest <= float(number) < 1:
+            raise ValueError(
+                f"Argument `{name}` must be at least {smallest} and below 1 in "
+                f"{dtype.name}, but it is {float(number)}."
+            )
     rtol, atol, max_step = (x.astype(dtype) for x in arrays)
-    max_steps = whole_number("max_steps", max_steps)
-    return Options(solver, rtol, atol, adjoint, max_steps, max_step, event, meter)
+    return rtol, atol, max_step
+
+
+def _meter(
+    progress: bool | diffrax.AbstractProgressMeter,
+) -> diffrax.AbstractProgressMeter:
+    """The progress meter of diffrax that an argument stands for."""
+    if not isinstance(progress, bool):
+        return progress
+    return diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()

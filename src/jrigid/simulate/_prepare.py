@@ -1,44 +1,48 @@
-"""From the arguments of `simulate` to a motion that can be integrated."""
+"""Convert the arguments of `simulate` to a motion that can be integrated."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
-from jrigid._checks import RESULTS, Findings, array_of_shape, harmless
+from jrigid._checks import RESULTS, AnyBool, Findings, array_of_shape, harmless
 from jrigid._core.third_party import ClosedJaxpr, jaxpr_as_fun
 from jrigid._motion import check_motion, harmless_motion, resolves
 from jrigid._stepping.control import Limits, largest_steps
 from jrigid._stepping.motion import Motion, constant
 from jrigid._stepping.scales import units
+from jrigid._types import BodyState
 from jrigid.simulate._options import SMALLEST_RTOL, Inputs, Options
 from jrigid.solvers import Splitting
 from jrigid.systems import AbstractSystem
 
-# One step may commit this fraction of rtol, less with methods of lower order than 8,
-# whose estimates are as large as their errors.
-_FRACTION, _FRACTION_OF_LOWER_ORDERS = 0.5, 0.03
-# The error of the energy adds up over the turns, and that of the phase over the
-# energy's: in a long run one step may commit no more than so much of rtol for each
-# radian.
+# One step may commit this fraction of rtol. The fraction is smaller for methods of an
+# order below 8, whose error estimates are as large as their errors.
+_FRACTION = 0.5
+_FRACTION_OF_LOWER_ORDERS = 0.03
+# The error of the energy adds up over the turns, and the error of the phase adds up
+# from that of the energy. Therefore the fraction falls with the radians of a long run.
+# It is at most this number divided by the radians.
 _RADIANS = 50.0
 # Below this many eps of the state the error estimate is rounding noise.
 _NOISE = 40.0
 # No step is shorter than this many eps of the run.
 _SHORTEST = 64.0
-# The vector field is evaluated so many eps of the time beside a jump.
+# The vector field is evaluated this many eps of the time beside a jump.
 _BESIDE = 4.0
-_RATE_BITS = 16  # of the rate that bounds the steps
-# By rounding a run may take fewer steps than the fewest it needs, by this fraction.
+# Bits of the mantissa of the rate that bounds the steps.
+_RATE_BITS = 16
+# By rounding a run may take fewer steps than the smallest number, by this fraction.
 _SAVED = 1e-2
 _TOO_FEW_STEPS = (
-    "The maximum number of solver steps is too small for the fastest rate at the start [rad/s] "
-    "and the radians requested. (Closed forms cost no more for more turns: `jrigid.free_rotation` "
-    "of a free body, `jrigid.top_motion` of a symmetric top. Else check the units, shorten `ts` or "
-    "pass a larger `max_steps`.)"
+    "The maximum number of solver steps is too small for the fastest rate at the start "
+    "[rad/s] and the radians requested. (Closed forms cost no more for more turns: "
+    "`jrigid.free_rotation` of a free body, `jrigid.top_motion` of a symmetric top. "
+    "Else check the units, shorten `ts` or pass a larger `max_steps`.)"
 )
 
 
@@ -46,14 +50,15 @@ class Prepared(NamedTuple):
     """A motion ready to be integrated.
 
     Attributes:
-        findings: What is wrong with the arguments.
-        inputs: The arguments, harmless where they are wrong.
-        motion: In numbers, its parameters and times as they were given: what lanes
-            share stays shared. Where an argument is wrong its fastest rate is zero.
+        findings: Errors in the arguments.
+        inputs: The arguments, harmless where they are invalid.
+        motion: The motion as arrays. Its parameters and times are those of the
+            arguments, so that lanes share what they share there. Its fastest rate is
+            zero where an argument is invalid.
         field: Vector field of (parameters, t, y).
-        parameters: Those of the field, harmless where an argument is wrong.
-        times: The output times, all zero where an argument is wrong.
-        to_state: The state of an array.
+        parameters: Those of the field, harmless where an argument is invalid.
+        times: The output times, all zero where an argument is invalid.
+        to_state: Converts an array to a state.
         omega: Where in the array the angular velocity starts.
         start: Time of the start, in the precision of the state.
         fastest: Fastest rate at the start [rad/s].
@@ -65,14 +70,14 @@ class Prepared(NamedTuple):
     field: Callable[[list[Array], Array, Array], Array]
     parameters: list[Array]
     times: Array
-    to_state: Callable[[Array], Any]
+    to_state: Callable[[Array], BodyState]
     omega: int
     start: Array
     fastest: Array
 
     @property
     def harmless_motion(self) -> Motion:
-        """The motion with parameters and times of each lane, harmless where one is wrong."""
+        """The motion, with harmless parameters and times for invalid arguments."""
         limits = self.motion.limits._replace(end=jax.lax.stop_gradient(self.times[-1]))
         return self.motion._replace(
             parameters=self.parameters, times=self.times, limits=limits
@@ -80,26 +85,19 @@ class Prepared(NamedTuple):
 
 
 def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
-    """Every invalid value among the arguments; what holds the steps, and scales."""
+    """Check the values of the arguments; bound the steps, and choose scales."""
     inputs = constant(inputs)
-    system, state0, ts, t0, args, _ = inputs
-    findings, flat, since_start = Findings(), ts.reshape(-1), inputs.since_start
-    smallest = SMALLEST_RTOL[since_start.dtype.itemsize]
-    for x in (options.rtol, options.atol):
-        ok = (x >= smallest) & (x < 1)
-        findings.require(ok, RESULTS.invalid_tolerance, value=x)
-    positive = options.max_step > 0
-    findings.require(positive, RESULTS.invalid_max_step, value=options.max_step)
-    before = jnp.concatenate([t0[None], flat[:-1]])
-    wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
-    value = flat[jnp.argmax(wrong)]
-    findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=value)
+    system, state0, _, t0, args, _ = inputs
+    findings = Findings()
+    since_start = inputs.since_start
+    _check_values_of_options(findings, options, since_start.dtype)
+    _check_times(findings, inputs, since_start)
     start = t0.astype(since_start.dtype)
     check_motion(findings, system, state0, start, args)
     fastest, scales = jax.lax.stop_gradient(
         units(system, state0, since_start[-1], start, args, options.fastest_of)
     )
-    # A compiler rounds differently in different lanes; their steps are to be the same.
+    # Compiled code rounds differently in different lanes, which must take equal steps.
     bits = jnp.finfo(fastest.dtype).nexp
     fastest = jax.lax.reduce_precision(fastest, bits, _RATE_BITS)
     findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
@@ -109,16 +107,37 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
     return findings, limits, scales
 
 
-def require_enough_steps(findings: Findings, ok: Array, limits: Limits) -> None:
-    """Note that the steps are too few for a motion, with its fastest rate and its radians."""
+def _check_values_of_options(
+    findings: Findings, options: Options, dtype: np.dtype
+) -> None:
+    """Note a tolerance or a longest step out of range."""
+    smallest = SMALLEST_RTOL[dtype.itemsize]
+    for x in (options.rtol, options.atol):
+        ok = (x >= smallest) & (x < 1)
+        findings.require(ok, RESULTS.invalid_tolerance, value=x)
+    positive = options.max_step > 0
+    findings.require(positive, RESULTS.invalid_max_step, value=options.max_step)
+
+
+def _check_times(findings: Findings, inputs: Inputs, since_start: Array) -> None:
+    """Note times that are not finite, decrease, or are before the start."""
+    flat = inputs.ts.reshape(-1)
+    before = jnp.concatenate([inputs.t0[None], flat[:-1]])
+    wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
+    value = flat[jnp.argmax(wrong)]
+    findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=value)
+
+
+def require_enough_steps(findings: Findings, ok: AnyBool, limits: Limits) -> None:
+    """Note, unless `ok`, that a motion needs more steps; shows its rate and radians."""
     value = jnp.stack([limits.start_rate, limits.start_rate * limits.end])
     findings.require(ok, RESULTS.max_steps_reached, _TOO_FEW_STEPS, value)
 
 
 def _can_be_enough(limits: Limits, options: Options) -> Array:
-    """Whether the largest number of steps can lead to the end of a motion.
+    """Whether the largest number of steps can reach the end of a motion.
 
-    No step is longer than the longest at the start, even where the rate falls.
+    No step is longer than the longest at the start, even if the rate falls.
     """
     longest = (
         options.max_step if isinstance(options.solver, Splitting) else limits.longest
@@ -129,7 +148,11 @@ def _can_be_enough(limits: Limits, options: Options) -> Array:
 def opened(
     function: Callable[..., Array], *example: Array
 ) -> tuple[Callable, list[Array]]:
-    """A function with the arrays that it closes over as a first argument, and these."""
+    """Convert the arrays that a function closes over to its first argument.
+
+    Returns:
+        The function of these arrays and its own arguments, and the arrays.
+    """
     closed = jax.make_jaxpr(function)(*example)
 
     def of(consts: list[Array], *arguments: Array) -> Array:
@@ -140,7 +163,7 @@ def opened(
 
 
 def prepared(inputs: Inputs, options: Options) -> Prepared:
-    """The motion that the arguments ask for."""
+    """The motion, ready to be integrated."""
     findings, limits, scales = judged(inputs, options)
     usable = harmless_motion(findings.ok, inputs)
     y0, to_state = ravel_pytree(usable.state0)
@@ -173,7 +196,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         inputs=usable,
         motion=motion,
         field=field,
-        # Functions of a user may close over bad values, too.
+        # Functions of a user may close over invalid values, too.
         parameters=harmless(findings.ok, parameters),
         times=times,
         to_state=to_state,
@@ -183,8 +206,8 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
     )
 
 
-def _place_of_omega(state: Any) -> int:
-    """Where the angular velocity starts in a state as one array."""
+def _place_of_omega(state: BodyState) -> int:
+    """Index of the angular velocity in a state that is flattened to an array."""
     before = 0
     for name, part in vars(state).items():
         if name == "omega":
@@ -193,8 +216,8 @@ def _place_of_omega(state: Any) -> int:
     return before
 
 
-def jumps_of(system: AbstractSystem, jumps: Any, dtype: Any) -> Array:
-    """Times at which the vector field is not smooth: those given and the system's."""
+def jumps_of(system: AbstractSystem, jumps: ArrayLike | None, dtype: np.dtype) -> Array:
+    """Times at which the vector field is not smooth: the user's and the system's."""
     own = array_of_shape("jumps", system.jumps, None)
     if jumps is None:
         return own.astype(dtype)
@@ -203,17 +226,17 @@ def jumps_of(system: AbstractSystem, jumps: Any, dtype: Any) -> Array:
 
 
 def limits_of(end: Array, fastest: Array, options: Options) -> Limits:
-    """What holds the steps of a motion."""
+    """Bounds of the steps of a motion."""
     eps = jnp.finfo(end.dtype).eps
     order = options.solver.order(None)
     high = order is None or order >= 8
     fraction = _FRACTION if high else _FRACTION_OF_LOWER_ORDERS
     radians = end * fastest
     share = jnp.minimum(fraction, _RADIANS / jnp.maximum(radians, _RADIANS))
-    asked = jnp.stack([options.rtol, options.atol])
-    rtol, atol = jnp.maximum(share * asked, _NOISE * eps)
+    tolerances = jnp.stack([options.rtol, options.atol])
+    rtol, atol = jnp.maximum(share * tolerances, _NOISE * eps)
     span, fine = largest_steps(order or 8, share * options.rtol)
-    # What an implicit solver steps over bounds it only where it is on the way.
+    # The rate at the start does not bound an implicit solver, which may step over it.
     longest = jnp.inf if options.is_implicit else span / fastest
     return Limits(
         end=end,

@@ -1,4 +1,4 @@
-"""simulate(): integrate a motion, and return its states at the times asked for."""
+"""simulate(): integrate a motion, and return its states at the output times."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
@@ -34,12 +34,18 @@ from jrigid._stepping.motion import (
     TOO_MANY_STEPS,
     Motion,
 )
+from jrigid._stepping.run import Ends
 from jrigid._stepping.steppers import ErrorControlled
-from jrigid._types import Real, ScalarLike
+from jrigid._types import BodyState, Real, ScalarLike
 from jrigid.rotation import normalize
 from jrigid.simulate._equal_steps import equal_steps
-from jrigid.simulate._event import condition_of_states, conditions_of, place_of_event
-from jrigid.simulate._options import Inputs, Options, checked_options
+from jrigid.simulate._event import (
+    Condition,
+    condition_of_states,
+    conditions_of,
+    place_of_event,
+)
+from jrigid.simulate._options import Inputs, Options, Requested, checked_options
 from jrigid.simulate._prepare import (
     Prepared,
     judged,
@@ -56,9 +62,9 @@ from jrigid.systems import AbstractSystem
 
 def simulate(
     system: AbstractSystem | HasRigidBody,
-    state0: Any,
+    state0: BodyState,
     ts: Real[_ArrayLike, "..."],
-    args: Any = None,
+    args: PyTree = None,
     *,
     t0: ScalarLike = 0.0,
     solver: diffrax.AbstractSolver | None = None,
@@ -74,40 +80,41 @@ def simulate(
 ) -> Trajectory:
     r"""Integrate the motion of a body and return its states at the times `ts`.
 
-    The variables are measured in their own scales, so the answer does not depend on the
-    unit of time, and the error control is set for the promises below. One thing it
-    cannot know: a pulse of torque that is shorter than a step is missed, unless `jumps`
-        or `max_step` tell of it.
+    The variables are measured in their own scales, so the result does not depend on the
+    unit of time. The error control is set for the accuracy that `rtol` states below. A
+    pulse of torque that is shorter than a step is missed, unless `jumps` or `max_step`
+    is given.
 
     Args:
-        system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or what has a
-            method `as_rigid_body`, as a `SymmetricTop`. A torque that is a function is
-            compiled anew for each new function object, which takes seconds, and memory
-            that only `jax.clear_caches()` frees: define it once, and hand on what
-            changes through `args`.
-        state0: Its state at `t0`. Where a damper or a rotor needs an internal state and
-            none is given, it starts at rest relative to the body.
-        ts: Times [s], non-decreasing in the order of their memory, none before `t0`;
-            any shape. Their dtype may have more digits than the state's, and needs them
-            where `t0` is far from 0, as the seconds of 1970 are.
+        system: A `RigidBody`, a `FloatingBody`, another `AbstractSystem`, or an object
+            with a method `as_rigid_body`, such as a `SymmetricTop`. A torque that is a
+            function is compiled again for each new function object. This takes seconds,
+            and memory that only `jax.clear_caches()` frees. Define the function once,
+            and pass what changes through `args`.
+        state0: Its state at `t0`. A damper or a rotor whose internal state is not given
+            starts at rest relative to the body.
+        ts: Times [s] of any shape, non-decreasing in the order of their memory, none
+            before `t0`. Their dtype may be more precise than the state's. It must be
+            where `t0` is far from 0, such as the seconds since 1970.
         args: Passed to torques and forces.
         t0: Time of `state0` [s].
         solver: A diffrax solver with an error estimate; `jrigid.solvers.Verner9()` by
-            default. An implicit one (`diffrax.Kvaerno5()`) steps over what drag or a
-            damper kills within a radian of its own rate. For a `RigidBody` without
-            torque `jrigid.solvers.ExactFree()` gives the closed form, for one in a
-            potential `jrigid.solvers.Splitting()` symplectic steps of the length
+            default. An implicit one (`diffrax.Kvaerno5()`) steps over motions that drag
+            or a damper stops within a radian. For a `RigidBody` without torque
+            `jrigid.solvers.ExactFree()` evaluates the closed form. For one in a
+            potential `jrigid.solvers.Splitting()` takes symplectic steps of the length
             `max_step`.
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an
             angle of turn phi [rad] the relative error of energy and space angular
             momentum stays below rtol (1 + phi), that of the state of a regular motion
-            below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). One step is held
-            to half of rtol for that, and to less in long runs or by a method of lower
-            order. Where derivatives are taken steps are shorter, and the value is
-            closer for it. What counts is the fastest part of the motion: for a body in
-            flight that turns slowly, or not at all, phi is the angle of its orbit, and
-            errors of position and velocity are relative to their initial magnitudes (to
-            those they reach in the run, or in a radian, where they start at zero).
+            below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). To this end the
+            error of a step is at most half of rtol, and less in long runs or for a
+            method of lower order. Where derivatives are taken, steps are shorter and
+            values more accurate. The fastest part of the motion determines phi: for a
+            body in flight that turns slowly, or not at all, it is the angle of the
+            orbit. Errors of position and velocity are relative to their initial
+            magnitudes, or, if these are zero, to those that they reach in the run or in
+            a radian.
         atol: The same for components near zero, as a fraction of the scale of their
             variable (the initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`,
@@ -116,8 +123,8 @@ def simulate(
             and order.
         max_steps: Largest number of steps; by default 2e7, enough for some 5e5 turns,
             but 4096 for `DirectAdjoint`, whose cost grows with it. A motion that
-            certainly needs more than the default fails before its first step; with a
-            smaller number it goes as far as that leads. For a free body
+            certainly needs more than the default fails before its first step. With a
+            smaller number it fails when the steps are used up. For a free body
             `jrigid.free_rotation` has no such bound.
         max_step: Longest step [s]. Steps follow the fastest rate of the motion, which
             is evaluated where each begins and ends. A pulse of torque much shorter than
@@ -125,10 +132,10 @@ def simulate(
             between two evaluations and is then missed: bound the step by the length of
             the pulse, or name its start and end as `jumps`.
         jumps: Times [s] at which a torque or a force is not smooth: where it is
-            switched, or the knots of a table that it is interpolated in. Steps end
-            exactly there. A torque that has a property `jumps`, as those of
-            `jrigid.torques`, declares its own; a plain function cannot. A switch or a
-            knot that is not named is found and costs more steps; a pulse shorter than a
+            switched, or the times of a table in which it is interpolated. Steps end
+            exactly there. A torque with a property `jumps`, such as those of
+            `jrigid.torques`, declares its own; a plain function cannot. A jump that is
+            not named is found by more and shorter steps, but a pulse shorter than a
             step is missed.
         event: A `diffrax.Event` that ends the motion; its condition functions are
             called with (t, state, args), in SI units. The time at which a number
@@ -144,11 +151,11 @@ def simulate(
 
     Gradients: those of the motion, in the state, the system's parameters, `args`, `t0`
     and `ts`, also at pure spin and the sleeping top. Their error, relative to the norm
-    of the Jacobian, is at most 1000 rtol up to 1e4 radians; from there on it grows as
-    radians^2. A mode that the adjoint cannot serve raises an error that names one that
-    can. A lane that fails, from its input or on the way, has no part in the gradients
-    of what lanes share once its states are masked by `result`, unless the vector field
-    itself has no finite derivative where it starts.
+    of the Jacobian, is at most 1000 rtol up to 1e4 radians; beyond, it grows as
+    radians^2. A mode that the adjoint does not support raises an error that names an
+    adjoint that does. If the states of a failed lane are masked by `result`, it does
+    not contribute to the gradients of what lanes share, unless the vector field has no
+    finite derivative at its start.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
@@ -157,9 +164,10 @@ def simulate(
     >>> print(trajectory.states.attitude.shape, trajectory.energy.round(6))
     (5, 4) [1.00005 1.00005 1.00005 1.00005 1.00005]
 
-    Without raising, one result code tells what became of it, and has a message:
+    With `throw=False` a result code with a message states what went wrong:
 
-    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.01, jnp.nan, 0.0]))
+    >>> omega = jnp.array([0.01, jnp.nan, 0.0])
+    >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
     >>> trajectory = jr.simulate(body, state0, 100.0, throw=False)
     >>> print(trajectory.result == jr.RESULTS.successful)
     False
@@ -168,19 +176,28 @@ def simulate(
     """
     body, state0, (ts, t0) = motion_arguments(system, state0, ts=ts, t0=t0)
     jumps = jumps_of(body, jumps, ts.dtype)
-    asked = Options(solver, rtol, atol, adjoint, max_steps, max_step, event, progress)
-    options = checked_options(asked, body, state0.omega.dtype)
+    requested = Requested(
+        solver, rtol, atol, adjoint, max_steps, max_step, event, progress
+    )
+    options = checked_options(requested, body, state0.omega.dtype)
     inputs = Inputs(body, state0, ts, t0, args, jumps)
     with forward_only(options.adjoint):
         trajectory = _simulate(inputs, options)
-    final = trajectory.result, trajectory.final_time
-    return settle(trajectory, throw, _findings, inputs, options, *final)
+    return settle(
+        trajectory,
+        throw,
+        _findings,
+        inputs,
+        options,
+        trajectory.result,
+        trajectory.final_time,
+    )
 
 
 def _findings(
-    inputs: Inputs, options: Options, result: Any, final_time: Array
+    inputs: Inputs, options: Options, result: RESULTS, final_time: Array
 ) -> Findings:
-    """What is wrong with the arguments, and where a torque became NaN."""
+    """Errors in the arguments, and the time at which a torque became NaN."""
     findings, limits, _ = judged(inputs, options)
     enough = result != RESULTS.max_steps_reached
     require_enough_steps(findings, enough, limits)
@@ -189,7 +206,7 @@ def _findings(
     return findings
 
 
-# What the ways in which our own loop can end mean to the user.
+# Result codes for the states in which our own loop ends.
 _RESULTS: dict[int, Any] = {
     EVENT: RESULTS.event_occurred,
     STUCK: RESULTS.dt_min_reached,
@@ -199,16 +216,16 @@ _RESULTS: dict[int, Any] = {
 
 
 class _Solved(NamedTuple):
-    """A motion that was integrated, its times since the start.
+    """The result of an integration, with times since the start.
 
     Attributes:
         ys: States at the output times, as arrays.
-        reached: Which of them the motion got to.
-        t: Where it ended.
-        y: The state there.
-        result: What became of it.
-        tried: How many steps were tried.
-        accepted: How many of them were accepted.
+        reached: Which of the output times the motion reached.
+        t: Time at which the motion ended.
+        y: State at that time.
+        result: Result code.
+        tried: Number of steps that were tried.
+        accepted: Number of steps that were accepted.
     """
 
     ys: Array
@@ -222,8 +239,9 @@ class _Solved(NamedTuple):
 
 @eqx.filter_jit
 def _simulate(inputs: Inputs, options: Options) -> Trajectory:
+    """Prepare, integrate, and convert to a trajectory."""
     given = prepared(inputs, options)
-    differentiated = given.motion, given.parameters, given.times
+    differentiated = (given.motion, given.parameters, given.times)
     motion, parameters, times = guard_inputs(options.adjoint, differentiated)
     given = given._replace(motion=motion, parameters=parameters, times=times)
     solved = _solved(given, options)
@@ -233,17 +251,19 @@ def _simulate(inputs: Inputs, options: Options) -> Trajectory:
 
 def _solved(given: Prepared, options: Options) -> _Solved:
     """The motion, integrated by the loop that serves the solver."""
-    kind = options.solver
+    solver = options.solver
     if not isinstance(options.meter, diffrax.NoProgressMeter):
-        # A progress meter calls back, which rules of derivatives do not allow.
+        # Our own derivative rules do not allow the callbacks of a progress meter.
         return _by_diffrax(given, options)
-    if isinstance(kind, diffrax.AbstractERK):
-        stepper = ErrorControlled(method_of(kind), kind.interpolation_cls, given.omega)
+    if isinstance(solver, diffrax.AbstractERK):
+        stepper = ErrorControlled(
+            method_of(solver), solver.interpolation_cls, given.omega
+        )
         engine = Engine(given.field, stepper, options.max_steps)
         return _integrated(engine, given.motion, given, options)
-    if isinstance(kind, ExactFree) and options.event is None:
+    if isinstance(solver, ExactFree) and options.event is None:
         return _closed_form(given)
-    if isinstance(kind, ExactFree | Splitting):
+    if isinstance(solver, ExactFree | Splitting):
         engine, motion = equal_steps(given, options)
         return _integrated(engine, motion, given, options)
     return _by_diffrax(given, options)
@@ -265,37 +285,48 @@ def _closed_form(given: Prepared) -> _Solved:
 
 
 def _by_diffrax(given: Prepared, options: Options) -> _Solved:
-    """The motion by the loop of diffrax."""
-    motion, event = given.harmless_motion, options.event
+    """Integrate the motion by the loop of diffrax."""
+    motion = given.harmless_motion
+    event = options.event
     if event is not None:
-        each, _ = _each_condition(given, options)
-        structure = jtu.tree_structure(event.cond_fn, is_leaf=callable)
-        conditions = structure.unflatten(
-            [lambda t, y, _, f=f, **__: f(t, y, given.inputs.args) for f in each]
-        )
-        event = dataclasses.replace(event, cond_fn=conditions)
+        event = _event_of_arrays(given, options, event)
     ys, t, y, result, stats = solve_by_diffrax(
         given.field, motion, given.omega, options, event
     )
-    result = RESULTS.promote(result)
-    fixed = jax.lax.stop_gradient(motion.times)
-    ys = jax.vmap(partial(moved_by, given.field, given.parameters))(
-        fixed, ys, motion.times - fixed
-    )
+    result: Any = RESULTS.promote(result)
+    ys = _with_derivatives_in_times(given, motion.times, ys)
     if event is None:
-        whole = result == RESULTS.successful
-        t = jnp.where(whole, motion.times[-1], t)
-        y = jnp.where(whole, ys[-1], y)
-    reached = fixed <= jax.lax.stop_gradient(t)
+        complete = result == RESULTS.successful
+        t, y = _end_without_event(motion.times, t, y, ys, complete)
+    reached = jax.lax.stop_gradient(motion.times) <= jax.lax.stop_gradient(t)
     tried = jnp.asarray(stats["num_steps"], jnp.int32)
     accepted = jnp.asarray(stats["num_accepted_steps"], jnp.int32)
     return _Solved(ys, reached, t, y, result, tried, accepted)
 
 
+def _event_of_arrays(
+    given: Prepared, options: Options, event: diffrax.Event
+) -> diffrax.Event:
+    """The event, with conditions on states as arrays."""
+    each, _ = _each_condition(given, options, event)
+
+    def with_args(condition: Condition) -> Callable[..., Array]:
+        # diffrax passes some or all arguments by name.
+        def of_array(t: Array, y: Array, args: PyTree, **_: object) -> Array:
+            del args
+            return condition(t, y, given.inputs.args)
+
+        return of_array
+
+    structure = jtu.tree_structure(event.cond_fn, is_leaf=callable)
+    conditions = structure.unflatten([with_args(x) for x in each])
+    return dataclasses.replace(event, cond_fn=conditions)
+
+
 def _integrated(
     engine: Engine, motion: Motion, given: Prepared, options: Options
 ) -> _Solved:
-    """The motion by our own loop."""
+    """Integrate the motion by our own loop."""
     conditions, observed = _conditions(given, options)
     engine = engine._replace(conditions=conditions)
     motion = motion._replace(observed=observed)
@@ -308,49 +339,79 @@ def _integrated(
             parameters=harmless(given.findings.ok, motion.parameters)
         )
     ends = solve(engine, motion)
-    state, tried, accepted = ends.counts[0], ends.counts[1], ends.counts[2]
-    fixed = jax.lax.stop_gradient(given.times)
-    # Where the derivatives in the output times are.
+    ys = _with_derivatives_in_times(given, given.times, ends.ys)
+    t, y = _end(given, options, engine.conditions, motion, ends, ys)
+    reached = jax.lax.stop_gradient(given.times) <= jax.lax.stop_gradient(t)
+    result = _result_of(ends.counts[0])
+    return _Solved(ys, reached, t, y, result, ends.counts[1], ends.counts[2])
+
+
+def _with_derivatives_in_times(given: Prepared, times: Array, ys: Array) -> Array:
+    """States at the output times, whose derivatives in these times are the rates."""
+    fixed = jax.lax.stop_gradient(times)
     later = jax.vmap(partial(moved_by, given.field, given.parameters))
-    ys = later(fixed, ends.ys, given.times - fixed)
-    t, y = jax.lax.stop_gradient(ends.t), ends.y
-    if conditions is None:
-        whole = state == ENDED
-        t = jnp.where(whole, given.times[-1], t)
-        y = jnp.where(whole, ys[-1], y)
-    else:
-        which = ends.counts[5]
-        real = ~jnp.array(conditions.boolean)[which]
-        t, y = place_of_event(
-            partial(given.field, given.parameters),
-            lambda t, y: conditions.values(motion.observed, t, y)[which],
-            options.event.root_finder,
-            t,
-            y,
-            (state == EVENT) & real,
-        )
+    return later(fixed, ys, times - fixed)
+
+
+def _end(
+    given: Prepared,
+    options: Options,
+    conditions: Conditions | None,
+    motion: Motion,
+    ends: Ends,
+    ys: Array,
+) -> tuple[Array, Array]:
+    """Time and state at the end of a motion, with their derivatives."""
+    t = jax.lax.stop_gradient(ends.t)
+    state = ends.counts[0]
+    if conditions is None or options.event is None:
+        return _end_without_event(given.times, t, ends.y, ys, state == ENDED)
+    which = ends.counts[5]
+    is_number = ~jnp.array(conditions.boolean)[which]
+    return place_of_event(
+        partial(given.field, given.parameters),
+        lambda t, y: conditions.values(motion.observed, t, y)[which],
+        options.event.root_finder,
+        t,
+        ends.y,
+        (state == EVENT) & is_number,
+    )
+
+
+def _end_without_event(
+    times: Array, t: Array, y: Array, ys: Array, complete: Array
+) -> tuple[Array, Array]:
+    """Time and state at the end: those of the last output if the motion is complete."""
+    t = jnp.where(complete, times[-1], t)
+    return t, jnp.where(complete, ys[-1], y)
+
+
+def _result_of(state: Array) -> RESULTS:
+    """The result code for the state in which our own loop ended."""
     result: Any = RESULTS.successful
     for code, item in _RESULTS.items():
         result = RESULTS.where(state == code, item, result)
-    reached = fixed <= jax.lax.stop_gradient(t)
-    return _Solved(ys, reached, t, y, result, tried, accepted)
+    return result
 
 
-def _each_condition(given: Prepared, options: Options) -> tuple[list[Callable], Any]:
-    """The conditions of the event, of (t, y, args), and an example of t and y."""
+def _each_condition(
+    given: Prepared, options: Options, event: diffrax.Event
+) -> tuple[list[Condition], tuple[Array, Array]]:
+    """The conditions of an event, and an example of a time and a state."""
     system = given.inputs.system
 
-    def vector_field(t: Any, state: Any, args: Any) -> Any:
+    def vector_field(t: ScalarLike, state: BodyState, args: PyTree) -> BodyState:
         return system.vector_field(t, state, args)
 
-    known = {
+    # The options that diffrax passes to conditions and that exist here.
+    passed = {
         "terms": diffrax.ODETerm(vector_field),
         "solver": options.solver,
         "max_steps": options.max_steps,
     }
     each = [
-        condition_of_states(x, given.start, given.to_state, known)
-        for x in jtu.tree_leaves(options.event.cond_fn, is_leaf=callable)
+        condition_of_states(x, given.start, given.to_state, passed)
+        for x in jtu.tree_leaves(event.cond_fn, is_leaf=callable)
     ]
     return each, (given.motion.times[-1], given.motion.y0)
 
@@ -358,25 +419,26 @@ def _each_condition(given: Prepared, options: Options) -> tuple[list[Callable], 
 def _conditions(
     given: Prepared, options: Options
 ) -> tuple[Conditions | None, list[Array]]:
-    """The conditions of the event, if there is one, and the arrays that they depend on."""
-    if options.event is None:
+    """The conditions of the event, if any, and the arrays that they depend on."""
+    event = options.event
+    if event is None:
         return None, []
     args = given.inputs.args
-    each, example = _each_condition(given, options)
+    each, example = _each_condition(given, options, event)
 
     def values(t: Array, y: Array) -> Array:
-        found = [jnp.asarray(x(t, y, args)).astype(y.dtype) for x in each]
-        return jnp.stack(found)
+        return jnp.stack([jnp.asarray(x(t, y, args)).astype(y.dtype) for x in each])
 
     plain, observed = opened(values, *example)
-    return conditions_of(each, options.event.direction, plain, example, args), observed
+    return conditions_of(each, event.direction, plain, example, args), observed
 
 
 def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
-    """What became of the motion."""
-    findings, usable = given.findings, given.inputs
+    """The trajectory of an integrated motion."""
+    findings = given.findings
+    usable = given.inputs
 
-    def state_at(reached: Array, y: Array) -> Any:
+    def state_at(reached: Array, y: Array) -> BodyState:
         state = given.to_state(harmless(reached, y))
         state = dataclasses.replace(state, attitude=normalize(state.attitude))
         return nan_where(~reached, state)
@@ -391,11 +453,10 @@ def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
     result = RESULTS.where(findings.ok, result, findings.result)
     final_time = usable.t0 + solved.t.astype(usable.t0.dtype)
     final_time = nan_where(~findings.ok, final_time)
-    tried, accepted = solved.tried, solved.accepted
     counts = {
-        "num_steps": tried,
-        "num_accepted_steps": accepted,
-        "num_rejected_steps": tried - accepted,
+        "num_steps": solved.tried,
+        "num_accepted_steps": solved.accepted,
+        "num_rejected_steps": solved.tried - solved.accepted,
     }
     moved = eqx.partition((usable.system, usable.args), eqx.is_array)
     return Trajectory(

@@ -1,6 +1,6 @@
-"""Solvers that diffrax's own loop serves: implicit ones, and those of a user.
+"""Integration by the loop of diffrax: implicit solvers, and those of a user.
 
-What is used of diffrax is what it documents: terms, controllers, `diffeqsolve`.
+Only documented parts of diffrax are used: terms, controllers, `diffeqsolve`.
 """
 
 import dataclasses
@@ -13,14 +13,21 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jrigid._checks import all_finite
 from jrigid._stepping.control import Limits, in_tolerances, judge
-from jrigid._stepping.motion import constant, fastest_rate, first_direction
+from jrigid._stepping.motion import Motion, constant, fastest_rate, first_direction
 from jrigid._stepping.scales import jacobian, rate_along, undamped_rate
+from jrigid._stepping.steppers import Field
+from jrigid._types import ScalarLike
+from jrigid.simulate._options import Options
 
-_FIRST_STEP = 0.1  # of the longest
+# First step, as a part of the longest.
+_FIRST_STEP = 0.1
+
+#: Length of the step, the fastest rate at its start, and the direction that finds it.
+_ControllerState = tuple[Array, Array, Array]
 
 
 class RateController(diffrax.AbstractAdaptiveStepSizeController):
@@ -31,10 +38,10 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
         scales: Of the components of the state.
         field: The vector field, of time and state, without derivatives.
         omega: Where in the state the angular velocity starts.
-        damped: Whether the solver may step over what is damped.
-        rtol: What diffrax and its root finders ask for.
-        atol: The same.
-        norm: The same.
+        damped: Whether the solver may step over damped motions.
+        rtol: Relative tolerance of the root finders of diffrax.
+        atol: Their absolute tolerance.
+        norm: Their norm.
     """
 
     limits: Limits
@@ -44,15 +51,25 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
     damped: bool = eqx.field(static=True)
     rtol: Array
     atol: Array
-    norm: Callable[[Any], Array] = optx.rms_norm
+    norm: Callable[[PyTree], Array] = optx.rms_norm
 
-    def wrap(self, direction: Any) -> "RateController":
-        """The same: time grows."""
+    def wrap(self, direction: ScalarLike) -> "RateController":
+        """The controller itself, since time always grows here."""
         del direction
         return self
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step; its length, the fastest rate, a direction."""
+    def init(
+        self,
+        terms: PyTree,
+        t0: Array,
+        t1: Array,
+        y0: Array,
+        dt0: None,
+        args: PyTree,
+        func: Callable[..., PyTree],
+        error_order: int | None,
+    ) -> tuple[Array, _ControllerState]:
+        """The end of the first step, and the state of the controller."""
         del terms, t1, dt0, args, func, error_order
         longest = jnp.minimum(
             self.limits.radians / self.limits.start_rate, self.limits.longest
@@ -60,21 +77,24 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
         first = _FIRST_STEP * longest
         return t0 + first, (first, self.limits.start_rate, first_direction(y0))
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, *others):
-        """Whether the step stands, and the next one."""
+    def adapt_step_size(
+        self,
+        t0: Array,
+        t1: Array,
+        y0: Array,
+        y1_candidate: Array,
+        args: PyTree,
+        y_error: Array,
+        error_order: int,
+        controller_state: _ControllerState,
+    ) -> tuple[Array, Array, Array, bool, _ControllerState, diffrax.RESULTS]:
+        """Whether the step is accepted, and the start and the end of the next one."""
         del args
-        y_error, error_order, (step, rate0, direction) = others
+        step, rate0, direction = controller_state
         before, t, y, error = constant((y0, t1, y1_candidate, y_error))
         limits = self.limits
         h = constant(t1 - t0)
-        if self.damped:
-            rates = jacobian(lambda y: self.field(t, y), y, self.scales)
-            fastest, along = undamped_rate(rates), direction
-        else:
-            base = self.field(t, y)
-            fastest, along = rate_along(
-                lambda y: self.field(t, y), y, base, direction, self.scales
-            )
+        fastest, along = self._fastest(t, y, direction)
         size = in_tolerances(limits, self.scales, before, y, error)
         rate1 = fastest_rate(self.scales, self.omega, y, fastest)
         verdict = judge(limits, error_order, step, h, size, rate0, rate1)
@@ -83,47 +103,47 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
             verdict.stuck, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful
         )
         start = jnp.where(keep, t1, t0)
-        state = verdict.step, verdict.rate, jnp.where(keep, along, direction)
+        state = (verdict.step, verdict.rate, jnp.where(keep, along, direction))
         return keep, start, start + verdict.step, False, state, result
+
+    def _fastest(self, t: Array, y: Array, direction: Array) -> tuple[Array, Array]:
+        """The fastest rate that bounds the steps, and the direction that finds it."""
+
+        def field(y: Array) -> Array:
+            return self.field(t, y)
+
+        if self.damped:
+            return undamped_rate(jacobian(field, y, self.scales)), direction
+        return rate_along(field, y, field(y), direction, self.scales)
 
 
 def solve_by_diffrax(
-    field: Callable[[list[Array], Array, Array], Array],
-    motion: Any,
+    field: Field,
+    motion: Motion,
     omega: int,
-    options: Any,
+    options: Options,
     event: diffrax.Event | None,
-) -> tuple[Array, Array, Array, Any, dict[str, Any]]:
-    """States at the output times, the end and the state there, what became of it."""
+) -> tuple[Array, Array, Array, diffrax.RESULTS, dict[str, Array | int]]:
+    """Integrate a motion by `diffrax.diffeqsolve`.
+
+    Args:
+        field: Vector field of (parameters, t, y).
+        motion: The motion.
+        omega: Where in the state the angular velocity starts.
+        options: Of the integration.
+        event: That ends the motion, of states as arrays.
+
+    Returns:
+        States at the output times, the time at the end and the state there, the result
+        code, and statistics.
+    """
     fixed = constant(motion)
     limits = fixed.limits
-    controller: Any = RateController(
-        limits=limits,
-        scales=fixed.scales,
-        field=jtu.Partial(field, fixed.parameters),
-        omega=omega,
-        damped=isinstance(options.solver, diffrax.AbstractImplicitSolver),
-        rtol=limits.rtol,
-        atol=limits.atol * fixed.scales,
-    )
-    controller = diffrax.ClipStepSizeController(
-        controller,
-        step_ts=fixed.times,
-        jump_ts=fixed.jumps if fixed.jumps.size else None,
-    )
-
-    def rates(t: Any, y: Any, parameters: Any) -> Array:
-        return field(parameters, t, y)
-
-    terms = diffrax.ODETerm(rates)
-    if not isinstance(options.adjoint, diffrax.ForwardMode):
-        # A rate that is not finite would reach the derivatives of other lanes.
-        terms = diffrax.ODETerm(jtu.Partial(_guarded, fixed.y0, field))
     if event is not None and event.root_finder is None:
         finder = optx.Bisection(_exactness(limits), _exactness(limits), flip="detect")
         event = dataclasses.replace(event, root_finder=finder)
     solution = diffrax.diffeqsolve(
-        terms,
+        _terms(field, fixed, options),
         options.solver,
         jnp.zeros_like(limits.end),
         limits.end,
@@ -133,16 +153,50 @@ def solve_by_diffrax(
         saveat=diffrax.SaveAt(
             subs=[diffrax.SubSaveAt(ts=fixed.times), diffrax.SubSaveAt(t1=True)]
         ),
-        stepsize_controller=controller,
+        stepsize_controller=_controller(field, fixed, omega, options),
         adjoint=options.adjoint,
         max_steps=options.max_steps,
         event=event,
         throw=False,
         progress_meter=options.meter,
     )
-    saved: Any = solution.ts, solution.ys
+    saved: Any = (solution.ts, solution.ys)
     (_, ends), (ys, end_ys) = saved
     return ys, ends[-1], end_ys[-1], solution.result, solution.stats
+
+
+def _controller(
+    field: Field, fixed: Motion, omega: int, options: Options
+) -> diffrax.ClipStepSizeController:
+    """The step-size controller, with steps that end at output times and jumps."""
+    limits = fixed.limits
+    controller: Any = RateController(
+        limits=limits,
+        scales=fixed.scales,
+        field=jtu.Partial(field, fixed.parameters),
+        omega=omega,
+        damped=options.is_implicit,
+        rtol=limits.rtol,
+        atol=limits.atol * fixed.scales,
+    )
+    return diffrax.ClipStepSizeController(
+        controller,
+        step_ts=fixed.times,
+        jump_ts=fixed.jumps if fixed.jumps.size else None,
+    )
+
+
+def _terms(field: Field, fixed: Motion, options: Options) -> diffrax.ODETerm:
+    """The vector field as a term, with the parameters as `args`."""
+    if isinstance(options.adjoint, diffrax.ForwardMode):
+
+        def rates(t: Array, y: Array, parameters: list[Array]) -> Array:
+            return field(parameters, t, y)
+
+        vector_field: Any = rates
+        return diffrax.ODETerm(vector_field)
+    # A rate that is not finite would reach the derivatives of other lanes.
+    return diffrax.ODETerm(jtu.Partial(_guarded, fixed.y0, field))
 
 
 def _exactness(limits: Limits) -> float:
@@ -151,16 +205,17 @@ def _exactness(limits: Limits) -> float:
 
 
 def _guarded(
-    y0: Array, field: Callable, t: Array, y: Array, parameters: list[Array]
+    y0: Array, field: Field, t: Array, y: Array, parameters: list[Array]
 ) -> Array:
-    """The vector field, with a large number for NaN and infinities.
+    """The vector field, with a large number in place of NaN and infinities.
 
-    A step into a place where the field is not finite is rejected. In reverse mode a
-    cotangent of zero times NaN would be NaN, in everything that lanes share:
-    derivatives there are taken at the start instead, where the field is finite.
+    A step to a state where the field is not finite is rejected. In reverse mode its
+    cotangent of zero times NaN would be NaN in everything that lanes share. Therefore
+    derivatives are evaluated at the start instead, where the field is finite.
     """
     rates = jax.lax.stop_gradient(field(parameters, t, y))
     finite = all_finite(rates)
-    t, y = jnp.where(finite, t, jnp.zeros_like(t)), jnp.where(finite, y, y0)
+    t = jnp.where(finite, t, jnp.zeros_like(t))
+    y = jnp.where(finite, y, y0)
     largest = jnp.sqrt(jnp.finfo(rates.dtype).max)
     return jnp.where(finite, field(parameters, t, y), largest)

@@ -1,16 +1,17 @@
-"""The free body, as equations and as a diffrax solver that makes no error."""
+"""The free body: its equations, and a diffrax solver that solves them exactly."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jrigid._checks import INERTIA, array_of_shape, float_arrays
-from jrigid._types import InertiaLike
+from jrigid._core.third_party import unwrapped_term
+from jrigid._types import InertiaLike, RotationState, TimeLike
 from jrigid.dynamics import euler_equations
 from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, multiply
@@ -18,10 +19,10 @@ from jrigid.solvers._dense import Dense
 
 
 class FreeRotation(diffrax.AbstractTerm):
-    """The equations of a free body, for any diffrax solver, and for `ExactFree` to solve exactly.
+    """The equations of a free body, for any diffrax solver and for `ExactFree`.
 
-    The state is a `State`, or any dataclass with `attitude` and `omega`, whose other
-    fields rest.
+    The state is a `State`, or any dataclass with `attitude` and `omega`. Its other
+    fields are constant.
 
     Attributes:
         inertia: Principal moments or tensor [kg m^2]; not checked.
@@ -39,24 +40,23 @@ class FreeRotation(diffrax.AbstractTerm):
         """The free body with this inertia."""
         self.inertia = array_of_shape("inertia", inertia, *INERTIA)
 
-    def vf(self, t: Any, y: Any, args: Any) -> Any:
+    def vf(self, t: TimeLike, y: RotationState, args: PyTree) -> RotationState:
         """Time derivative of the state."""
         del t, args
         rest = jtu.tree_map(lambda x: 0 * x, y)
         omega = euler_equations(self.inertia.astype(y.omega.dtype), y.omega)
-        return dataclasses.replace(
-            rest, attitude=attitude_rate(y.attitude, y.omega), omega=omega
-        )
+        attitude = attitude_rate(y.attitude, y.omega)
+        return dataclasses.replace(rest, attitude=attitude, omega=omega)
 
-    def contr(self, t0: Any, t1: Any, **_: Any) -> Any:
+    def contr(self, t0: TimeLike, t1: TimeLike, **_: object) -> TimeLike:
         """The step of time."""
         return t1 - t0
 
-    def prod(self, vf: Any, control: Any) -> Any:
+    def prod(self, vf: RotationState, control: TimeLike) -> RotationState:
         """Derivative times step."""
         return jtu.tree_map(lambda rate: control * rate, vf)
 
-    def after(self, y: Any, step: Any) -> Any:
+    def after(self, y: RotationState, step: TimeLike) -> RotationState:
         """The state a time `step` later [s], exactly."""
         inertia, omega, step = (
             x.astype(y.omega.dtype) for x in float_arrays(self.inertia, y.omega, step)
@@ -68,25 +68,25 @@ class FreeRotation(diffrax.AbstractTerm):
 class _ExactInterpolation(Dense):
     """Dense output that is the exact motion."""
 
-    t0: Any
-    t1: Any
-    y0: Any
-    inertia: Any
-    direction: Any
+    t0: TimeLike
+    t1: TimeLike
+    y0: RotationState
+    inertia: Float[Array, "..."]
+    direction: Float[Array, ""]
 
-    def at(self, t: Any) -> Any:
+    def at(self, t: TimeLike) -> RotationState:
         """The state at t."""
         return FreeRotation(self.inertia).after(self.y0, self.direction * (t - self.t0))
 
 
 class ExactFree(diffrax.AbstractSolver):
-    """The exact flow of the free body as a diffrax solver: one step goes any distance.
+    """The exact flow of the free body as a diffrax solver: a step has any length.
 
     `simulate(RigidBody(inertia), ..., solver=ExactFree())` evaluates the closed form at
-    the times asked for. In `diffrax.diffeqsolve` it solves the term
-    `FreeRotation(inertia)`, its dense output exact too; a splitting scheme can call its
-    `step`, or `FreeRotation.after`, as a stage. Attitudes keep the norm they start
-    with.
+    the output times. In `diffrax.diffeqsolve` the solver solves the term
+    `FreeRotation(inertia)`, and its dense output is exact too. A splitting scheme can
+    call its `step`, or `FreeRotation.after`, as a stage. The norm of an attitude does
+    not change.
 
     Gradients: those of the motion, see `jrigid.free_rotation`.
     Source: docs/free_rotation.md; as a stage: A. Dullweber, B. Leimkuhler, R.
@@ -106,34 +106,45 @@ class ExactFree(diffrax.AbstractSolver):
         _ExactInterpolation
     )
 
-    def order(self, terms: Any) -> None:
-        """None: there is no error to speak of."""
+    def order(self, terms: PyTree) -> None:
+        """None, since the error does not depend on the step."""
         del terms
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        """Nothing is carried from step to step."""
+    def init(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: TimeLike,
+        t1: TimeLike,
+        y0: RotationState,
+        args: PyTree,
+    ) -> None:
+        """The solver has no state."""
         del terms, t0, t1, y0, args
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: Any,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> tuple[Any, None, dict[str, Any], None, Any]:
+        terms: diffrax.AbstractTerm,
+        t0: TimeLike,
+        t1: TimeLike,
+        y0: RotationState,
+        args: PyTree,
+        solver_state: None,
+        made_jump: ArrayLike,
+    ) -> tuple[RotationState, None, dict[str, PyTree], None, diffrax.RESULTS]:
         """The state at t1, with no error estimate."""
         del args, solver_state, made_jump
-        # diffeqsolve lets time grow, and wraps the term in one that knows its
-        # direction.
-        term = getattr(terms, "term", terms)
-        direction = jnp.asarray(getattr(terms, "direction", 1), y0.omega.dtype)
+        term, direction = unwrapped_term(terms)
+        direction = jnp.asarray(direction, y0.omega.dtype)
         info = {"y0": y0, "inertia": term.inertia, "direction": direction}
         y1 = term.after(y0, direction * (t1 - t0))
         return y1, None, info, None, diffrax.RESULTS.successful
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: TimeLike,
+        y0: RotationState,
+        args: PyTree,
+    ) -> RotationState:
         """The vector field."""
         return terms.vf(t0, y0, args)

@@ -1,9 +1,10 @@
 """Torques on a body: composable, added with `+` and `sum()`.
 
 A torque is any callable `(t, state, args) -> (3,)` body components [N m]. The classes
-here add what a plain function cannot carry: a potential energy, and internal parts (a
-damper, a rotor) with a state, a momentum and an energy of their own. Their parameters
-are judged by `simulate` and its like, which integrate.
+here add a potential energy, and internal parts (a damper, a rotor) with a state, an
+angular momentum and an energy of their own. A parameter of the wrong sign raises an
+error when the torque is built, if its value is known then. `simulate` and other
+functions that integrate check all parameters.
 """
 
 from jrigid.torques._base import AbstractTorque as AbstractTorque

@@ -1,18 +1,19 @@
-"""What a torque is, and how torques add."""
+"""The base class of torques, the sum of torques, and functions as torques."""
 # ruff: noqa: ARG002
 
-# A torque takes t, state and args, whatever it looks at.
+# All torques have the arguments t, state and args, which some of them do not use.
 
 import abc
 import dataclasses
 import inspect
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from jrigid._checks import (
     RESULTS,
@@ -22,54 +23,117 @@ from jrigid._checks import (
     array_of_shape,
     check_shape,
     demand,
+    is_concrete,
     jumps_within,
 )
 from jrigid._numerics import safe_norm
-from jrigid._types import InertiaLike, Readable, Scalar, ScalarLike, Vector
+from jrigid._types import (
+    BodyState,
+    InertiaLike,
+    Readable,
+    Scalar,
+    ScalarLike,
+    Vector,
+)
 
-#: `(t, state, args) -> (3,)`: the torque on a body, body components [N m].
+#: `(t, state, args) -> (3,)`: the torque on a body, body components [N m]. The types
+#: of its arguments are open, since a user's function may state narrower ones.
 TorqueFunction = Callable[[Any, Any, Any], Any]
 
+#: Lengths of the axes of an array, None for any length.
+Shape = tuple[int | None, ...]
 
-# What a parameter must be, in words and as a test: the metadata of its field.
-# `positive` asks a search to keep to one side of zero.
-FINITE = {"rule": ("finite", all_finite)}
-POSITIVE = {"rule": ("positive and finite", all_positive), "positive": True}
-NOT_NEGATIVE = {
-    "rule": ("finite and not negative", lambda x: all_finite(x) & jnp.all(x >= 0)),
+
+class Rule(NamedTuple):
+    """What a parameter of a torque must be.
+
+    Attributes:
+        words: The rule in words.
+        holds: Whether a value obeys the rule, traced or not; `simulate` asks.
+        is_refused: Whether a known value is refused when the torque is built. NaN is
+            not, since a builder with `throw=False` returns it for a bad body.
+    """
+
+    words: str
+    holds: Callable[[Array], Bool[Array, ""]]
+    is_refused: Callable[[np.ndarray], bool | np.bool_] | None = None
+
+
+def _finite_and_not_negative(x: Array) -> Bool[Array, ""]:
+    """True where no component is negative, infinite or NaN."""
+    return all_finite(x) & jnp.all(x >= 0)
+
+
+def _finite_and_not_zero(x: Array) -> Bool[Array, ""]:
+    """True where all vectors are finite and none is zero."""
+    return all_finite(x) & jnp.all(jnp.any(x, axis=-1))
+
+
+def has_negative(x: np.ndarray) -> np.bool_:
+    """Whether a component is negative."""
+    return np.any(x < 0)
+
+
+def _has_none_positive(x: np.ndarray) -> np.bool_:
+    """Whether a component is zero or negative."""
+    return np.any(x <= 0)
+
+
+# Metadata of the fields of torques: the rule for a parameter, and with `positive` that
+# a search must keep it on one side of zero.
+FINITE = {"rule": Rule("finite", all_finite)}
+POSITIVE = {
+    "rule": Rule("positive and finite", all_positive, _has_none_positive),
     "positive": True,
 }
-NOT_ZERO = {
-    "rule": (
-        "finite and not zero",
-        lambda x: all_finite(x) & jnp.all(jnp.any(x, axis=-1)),
-    )
+NOT_NEGATIVE = {
+    "rule": Rule("finite and not negative", _finite_and_not_negative, has_negative),
+    "positive": True,
 }
+NOT_ZERO = {"rule": Rule("finite and not zero", _finite_and_not_zero)}
+
+
+def _parameters_with_rules(module: eqx.Module) -> Iterator[tuple[str, Rule, Array]]:
+    """In words, the parameters of a module that have rules; the rules; the values."""
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        # A parameter may also be a function of time, or None.
+        if "rule" in field.metadata and eqx.is_array(value):
+            name = f"Argument `{field.name}` of `{type(module).__name__}`"
+            yield name, field.metadata["rule"], value
 
 
 def check_parameters(findings: Findings, torque: "AbstractTorque") -> None:
     """Note each parameter that breaks the rule of its field."""
-    for field in dataclasses.fields(torque):
-        value = getattr(torque, field.name)
-        if "rule" in field.metadata and eqx.is_array(
-            value
-        ):  # not a function of time, nor None
-            words, holds = field.metadata["rule"]
-            name = f"Argument `{field.name}` of `{type(torque).__name__}`"
-            message = f"{name} must be {words}, but it is not."
-            value = jax.lax.stop_gradient(value)
-            findings.require(holds(value), RESULTS.invalid_torque, message, value)
+    for name, rule, value in _parameters_with_rules(torque):
+        message = f"{name} must be {rule.words}, but it is not."
+        value = jax.lax.stop_gradient(value)
+        findings.require(rule.holds(value), RESULTS.invalid_torque, message, value)
 
 
-def array(name: str, *shape: Any) -> Callable[[Any], Array]:
+def refuse_known_parameters(module: eqx.Module) -> None:
+    """Raise RuntimeError for a parameter that is known now and refused by its rule."""
+    for name, rule, value in _parameters_with_rules(module):
+        if rule.is_refused is None or not is_concrete(value):
+            continue
+        known = np.asarray(value)
+        if rule.is_refused(known):
+            raise RuntimeError(f"{name} must be {rule.words}, but it is {known}.")
+
+
+def array(name: str, *shape: int | Shape | None) -> Callable[[ArrayLike], Array]:
     """A converter to an array of this shape, or of one of these shapes."""
-    return lambda value: array_of_shape(name, value, *shape)
+
+    def convert(value: ArrayLike) -> Array:
+        return array_of_shape(name, value, *shape)
+
+    return convert
 
 
 def direction(name: str, *shape: int | None, optional: bool = False) -> dict[str, Any]:
-    """What makes a field one of vectors of length 1; zero stays zero, which is refused."""
+    """Options of a field of vectors, which get length 1; `simulate` refuses zero."""
 
-    def convert(value: Any) -> Array | None:
+    def convert(value: ArrayLike | None) -> Array | None:
         if value is None and optional:
             return None
         vectors = array_of_shape(name, value, *shape)
@@ -80,29 +144,42 @@ def direction(name: str, *shape: int | None, optional: bool = False) -> dict[str
 
 
 def vector_or_function(name: str) -> dict[str, Any]:
-    """What makes a field a vector or a function, which is left as it is."""
-    convert = array(name, 3)
-    return {"converter": lambda x: x if callable(x) else convert(x), "metadata": FINITE}
+    """Options of a field for a vector, or for a function that returns one."""
+    to_vector = array(name, 3)
+
+    def convert(
+        value: ArrayLike | Callable[..., Any],
+    ) -> Array | Callable[..., Any]:
+        return value if callable(value) else to_vector(value)
+
+    return {"converter": convert, "metadata": FINITE}
 
 
 def value_of(
-    name: str, source: Any, state: Any, *arguments: Any, shape: tuple[int, ...] = (3,)
+    name: str,
+    source: Array | Callable[..., Any],
+    state: BodyState,
+    *arguments: PyTree,
+    shape: tuple[int, ...] = (3,),
 ) -> Array:
-    """The value of an array, or of a function of the arguments, in the dtype of a state."""
-    found = source(*arguments) if callable(source) else source
-    text = f"Argument `{name}` must return an array, but it returns None: without `return`?"
-    demand(found is not None, text)
-    value = jnp.asarray(found, state.omega.dtype)
+    """An array, or the value of a function of the arguments, in a state's dtype."""
+    result = source(*arguments) if callable(source) else source
+    demand(
+        result is not None,
+        f"Argument `{name}` must return an array, but it returns None: "
+        "without `return`?",
+    )
+    value = jnp.asarray(result, state.omega.dtype)
     check_shape(name, value, shape)
     return value
 
 
-def in_dtype_of(state: Any, *parameters: Array) -> list[Array]:
+def in_dtype_of(state: BodyState, *parameters: Array) -> list[Array]:
     """Parameters of a torque in the dtype of a state."""
     return [x.astype(state.omega.dtype) for x in parameters]
 
 
-def zero_like(state: Any) -> Scalar:
+def zero_like(state: BodyState) -> Scalar:
     """Zero of the dtype of a state."""
     return jnp.zeros((), state.omega.dtype)
 
@@ -110,9 +187,10 @@ def zero_like(state: Any) -> Scalar:
 class AbstractTorque(Readable):
     """A torque, its potential energy, and the internal parts that exert it.
 
-    Subclasses give `__call__`; the rest defaults to a torque without potential or
-    internal parts. A torque with internal parts sees in `state.internal` a tuple with
-    an entry for each of its own, alone and in a sum, and answers with such tuples.
+    Subclasses define `__call__`. The other methods default to a torque without
+    potential or internal parts. For a torque with internal parts `state.internal` is a
+    tuple with an entry for each of its own parts, alone and in a sum, and its methods
+    return such tuples.
 
     Gradients: those of the subclass's own functions.
 
@@ -124,20 +202,25 @@ class AbstractTorque(Readable):
     ...         return -self.stiffness * jr.rotation.log(state.attitude)
     ...
     ...     def potential(self, t, state, args):
-    ...         return 0.5 * self.stiffness * jnp.sum(jr.rotation.log(state.attitude) ** 2)
+    ...         angle = jr.rotation.log(state.attitude)
+    ...         return 0.5 * self.stiffness * jnp.sum(angle**2)
     >>> turned = jr.State(jr.rotation.exp(jnp.array([0.0, 0.5, 0.0])), jnp.zeros(3))
     >>> print((Spring(2.0) + jr.torques.LinearDrag(0.1))(0.0, turned, None).round(6))
     [ 0. -1.  0.]
     """
 
+    def __check_init__(self) -> None:
+        """Raise RuntimeError for a known parameter that no such torque has."""
+        refuse_known_parameters(self)
+
     @abc.abstractmethod
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
 
     def of_body(self, inertia: InertiaLike) -> "AbstractTorque":
         """The torque on a body of this inertia: itself, unless it depends on it.
 
-        `RigidBody` and `FloatingBody` ask for it at every use, with their own inertia.
+        `RigidBody` and `FloatingBody` call it at every use, with their own inertia.
         """
         return self
 
@@ -145,8 +228,8 @@ class AbstractTorque(Readable):
     def jumps(self) -> Float[Array, " jumps"]:
         """Times at which the torque is not smooth [s]; steps of `simulate` end there.
 
-        By default they are those that its parts declare: torques in a sum, a `Sampled`
-        in a field. A subclass that switches at known times returns these:
+        By default they are those of its parts: torques in a sum, a `Sampled` in a
+        field. A subclass that switches at known times returns these:
 
         >>> import equinox as eqx, jax, jax.numpy as jnp, jrigid as jr
         >>> class Pulse(jr.torques.AbstractTorque):
@@ -155,7 +238,8 @@ class AbstractTorque(Readable):
         ...     end: jax.Array = eqx.field(converter=jnp.asarray)
         ...
         ...     def __call__(self, t, state, args):
-        ...         return jnp.where((t > self.start) & (t < self.end), self.torque, 0.0)
+        ...         inside = (t > self.start) & (t < self.end)
+        ...         return jnp.where(inside, self.torque, 0.0)
         ...
         ...     @property
         ...     def jumps(self):
@@ -167,27 +251,34 @@ class AbstractTorque(Readable):
         """
         return jumps_within([getattr(self, x.name) for x in dataclasses.fields(self)])
 
-    def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def potential(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Potential energy [J]; zero if the torque has none."""
         return zero_like(state)
 
-    def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
+    def internal_at_rest(self, state: BodyState) -> tuple[PyTree, ...]:
         """Internal state of parts that move with the body; `()` if there are none."""
         return ()
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
+    def internal_rate(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
         return ()
 
     def internal_scale(self, rate: Scalar) -> tuple[PyTree, ...]:
-        """Size of the internal state when the body turns at `rate` [rad/s], for error control."""
+        """Size of the internal state of a body that turns at `rate` [rad/s].
+
+        The error control of `simulate` uses it.
+        """
         return ()
 
-    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
         """Angular momentum of the internal parts [kg m^2/s], body components."""
         return jnp.zeros_like(state.omega)
 
-    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def internal_energy(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Kinetic energy of the internal parts [J]."""
         return zero_like(state)
 
@@ -195,7 +286,7 @@ class AbstractTorque(Readable):
         """Note parameters with bad values, for `simulate` and its like.
 
         Args:
-            findings: What has been found so far; `require` adds to it.
+            findings: Collects what is wrong, by its method `require`.
         """
         check_parameters(findings, self)
 
@@ -206,9 +297,8 @@ class AbstractTorque(Readable):
     def __radd__(self, other: Any) -> "AbstractTorque":
         """Both torques together; `0 + torque` is the torque, so that `sum()` works.
 
-        A plain function may not come first in `sum`, since Python adds it to 0 without
-        asking any
-        torque: `Sum([function, torque])` takes them in any order.
+        A plain function cannot be the first item of `sum`, since Python adds it to 0
+        before it meets a torque. `Sum([function, torque])` takes them in any order.
         """
         return self if other == 0 else Sum((other, self))
 
@@ -230,23 +320,24 @@ def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
         return Sum(())
     if not callable(torque):
         raise ValueError(
-            f"Argument `torque` must be a callable (t, state, args) -> (3,), but it is {torque!r}."
+            "Argument `torque` must be a callable (t, state, args) -> (3,), "
+            f"but it is {torque!r}."
         )
     if isinstance(torque, AbstractTorque):
         return torque
     demand(
         _takes_three(torque),
-        "Argument `torque` must be a callable (t, state, args) -> (3,), but it does not take these "
-        f"three: {torque!r}.",
+        "Argument `torque` must be a callable (t, state, args) -> (3,), but it does "
+        f"not take these three: {torque!r}.",
     )
     return Torque(torque)
 
 
 def _takes_three(function: Callable[..., Any]) -> bool:
-    """Whether a function can be called with three arguments, as far as its signature is known."""
+    """Whether a function can be called with three arguments, or may be."""
     try:
         inspect.signature(function).bind(None, None, None)
-    except ValueError:  # as of functions written in C
+    except ValueError:  # The signature of a function written in C is not known.
         return True
     except TypeError:
         return False
@@ -257,11 +348,11 @@ class Sum(AbstractTorque):
     """Torques acting together; what `+` makes.
 
     The internal state is a tuple with an entry for each torque that carries parts, in
-    their order. Such a torque sees its own entries as `state.internal`; the others see
-    all of it.
+    their order. For such a torque `state.internal` holds its own entries, for the
+    others all entries.
 
     Attributes:
-        terms: The torques, those of sums within the sum among them.
+        terms: The torques; a sum within the sum is replaced by its terms.
 
     Gradients: the sum of those of the terms.
 
@@ -284,17 +375,18 @@ class Sum(AbstractTorque):
         torques = [as_torque(term) for term in terms]
         self.terms = sum((x.terms if isinstance(x, Sum) else (x,) for x in torques), ())
 
-    def _views(self, state: Any) -> Iterator[tuple[AbstractTorque, Any]]:
-        """Each term, and the state as it sees it."""
+    def _views(self, state: BodyState) -> Iterator[tuple[AbstractTorque, BodyState]]:
+        """Each term, and the state with the entries of that term."""
         first = 0
         for term in self.terms:
-            view, last = state, first + len(term.internal_at_rest(state))
+            last = first + len(term.internal_at_rest(state))
+            view = state
             if last > first:
                 view = dataclasses.replace(state, internal=state.internal[first:last])
             yield term, view
             first = last
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Sum of the torques [N m], body components."""
         return sum(
             (x(t, own, args) for x, own in self._views(state)),
@@ -305,18 +397,20 @@ class Sum(AbstractTorque):
         """The torques on a body of this inertia."""
         return Sum(term.of_body(inertia) for term in self.terms)
 
-    def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def potential(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Sum of the potential energies [J]."""
         return sum(
             (x.potential(t, own, args) for x, own in self._views(state)),
             zero_like(state),
         )
 
-    def internal_at_rest(self, state: Any) -> tuple[PyTree, ...]:
+    def internal_at_rest(self, state: BodyState) -> tuple[PyTree, ...]:
         """Internal states of the terms that have one."""
         return sum((term.internal_at_rest(state) for term in self.terms), ())
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[PyTree, ...]:
+    def internal_rate(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> tuple[PyTree, ...]:
         """Time derivative of the internal state."""
         return sum((x.internal_rate(t, own, args) for x, own in self._views(state)), ())
 
@@ -324,12 +418,14 @@ class Sum(AbstractTorque):
         """Size of the internal state when the body turns at `rate` [rad/s]."""
         return sum((term.internal_scale(rate) for term in self.terms), ())
 
-    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
         """Angular momentum of all internal parts [kg m^2/s], body components."""
         momenta = (x.internal_momentum(t, own, args) for x, own in self._views(state))
         return sum(momenta, jnp.zeros_like(state.omega))
 
-    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def internal_energy(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Kinetic energy of all internal parts [J]."""
         energies = (x.internal_energy(t, own, args) for x, own in self._views(state))
         return sum(energies, zero_like(state))
@@ -372,11 +468,11 @@ class Torque(AbstractTorque):
         self.fn = fn
         self.potential_fn = potential
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         return value_of("torque", self.fn, state, t, state, args)
 
-    def potential(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def potential(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Potential energy [J]; zero if none was given."""
         if self.potential_fn is None:
             return zero_like(state)
@@ -397,6 +493,6 @@ class Constant(AbstractTorque):
 
     torque: Float[Array, "3"] = eqx.field(converter=array("torque", 3), metadata=FINITE)
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         return self.torque.astype(state.omega.dtype)

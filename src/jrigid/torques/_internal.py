@@ -1,16 +1,16 @@
 """Torques of internal parts with a momentum of their own: a damper, a rotor."""
 # ruff: noqa: ARG002
 
-# A torque takes t, state and args, whatever it looks at.
+# All torques have the arguments t, state and args, which some of them do not use.
 
-from typing import Any
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jrigid._types import Scalar, ScalarLike, Vector
+from jrigid._types import BodyState, Scalar, ScalarLike, Vector
 from jrigid.torques._base import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -40,12 +40,18 @@ class InternalDamper(AbstractTorque):
         inertia: Moment of inertia of the sphere [kg m^2], positive.
         coupling: c [N m s], not negative.
 
+    Raises:
+        RuntimeError: The inertia is not positive, or the coupling is negative, and the
+            value is known when the damper is built.
+
     Gradients: finite everywhere.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.InternalDamper(0.2, 0.05))
+    >>> damper = jr.torques.InternalDamper(0.2, 0.05)
+    >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), damper)
     >>> sphere = jnp.array([0.0, 0.0, 3.0])
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]), (sphere,))
+    >>> omega = jnp.array([0.0, 0.0, 1.0])
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega, (sphere,))
     >>> print(body.torque_on(0.0, state, None).round(6))
     [0.  0.  0.1]
     """
@@ -55,17 +61,19 @@ class InternalDamper(AbstractTorque):
         converter=array("coupling"), metadata=NOT_NEGATIVE
     )
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         return self.coupling.astype(state.omega.dtype) * (
             state.internal[0] - state.omega
         )
 
-    def internal_at_rest(self, state: Any) -> tuple[Vector]:
+    def internal_at_rest(self, state: BodyState) -> tuple[Vector]:
         """The sphere turning with the body."""
         return (state.omega,)
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Vector]:
+    def internal_rate(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> tuple[Vector]:
         """Rate of the sphere's angular velocity, in the turning axes of the body."""
         pull = self(t, state, args) / self.inertia.astype(state.omega.dtype)
         return (-pull - jnp.cross(state.omega, *state.internal),)
@@ -74,20 +82,22 @@ class InternalDamper(AbstractTorque):
         """The sphere turns about as fast as the body."""
         return (rate,)
 
-    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
         """Angular momentum of the sphere [kg m^2/s]."""
         return self.inertia.astype(state.omega.dtype) * state.internal[0]
 
-    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def internal_energy(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Kinetic energy of the sphere [J]."""
         return 0.5 * jnp.sum(state.internal[0] * self.internal_momentum(t, state, args))
 
 
 class Rotor(AbstractTorque):
-    """A rotor inside the body with a prescribed momentum h (a gyrostat): -h' - omega x h.
+    """A rotor with a prescribed angular momentum h (a gyrostat): -h' - omega x h.
 
-    The body's inertia includes the locked rotor. For a wheel that turns as its motor
-    makes it see `SpinningMass`.
+    The body's inertia includes the locked rotor. `SpinningMass` is a wheel whose spin
+    follows from the torque of its motor.
 
     Attributes:
         momentum: h, relative to the body, body components [kg m^2/s]: an array, or
@@ -103,16 +113,23 @@ class Rotor(AbstractTorque):
     [-0.  -0.  -0.5]
     """
 
-    momentum: Any = eqx.field(**vector_or_function("momentum"))
+    momentum: Float[Array, "3"] | Callable[[ScalarLike], Vector] = eqx.field(
+        **vector_or_function("momentum")
+    )
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         time = jnp.asarray(t, state.omega.dtype)
-        momentum_at = lambda t: self.internal_momentum(t, state, args)  # noqa: E731
+
+        def momentum_at(t: Scalar) -> Vector:
+            return self.internal_momentum(t, state, args)
+
         momentum, rate = jax.jvp(momentum_at, (time,), (jnp.ones_like(time),))
         return -rate - jnp.cross(state.omega, momentum)
 
-    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
         """Angular momentum of the rotor [kg m^2/s], body components."""
         return value_of("momentum", self.momentum, state, t)
 
@@ -135,7 +152,8 @@ class SpinningMass(AbstractTorque):
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> wheel = jr.torques.SpinningMass(0.2, jnp.array([0.0, 3.0, 4.0]))
-    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), (jnp.array(10.0),))
+    >>> spins = (jnp.array(10.0),)
+    >>> state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), spins)
     >>> print(wheel.internal_momentum(0.0, state, None).round(6))
     [0.  1.2 1.6]
     """
@@ -144,40 +162,46 @@ class SpinningMass(AbstractTorque):
     axis: Float[Array, "3"] = eqx.field(**direction("axis", 3))
     motor_torque: TorqueFunction | None = None
 
-    def _motor(self, t: ScalarLike, state: Any, args: Any) -> Array:
+    def _motor(self, t: ScalarLike, state: BodyState, args: PyTree) -> Array:
+        """Torque of the motor on the wheel [N m]."""
         if self.motor_torque is None:
             return zero_like(state)
         return value_of(
             "motor_torque", self.motor_torque, state, t, state, args, shape=()
         )
 
-    def __call__(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         (axis,) = in_dtype_of(state, self.axis)
         push = -self._motor(t, state, args) * axis
         return push - jnp.cross(state.omega, self.internal_momentum(t, state, args))
 
-    def internal_at_rest(self, state: Any) -> tuple[Scalar]:
+    def internal_at_rest(self, state: BodyState) -> tuple[Scalar]:
         """The wheel turning with the body."""
         (axis,) = in_dtype_of(state, self.axis)
         return (jnp.sum(axis * state.omega),)
 
-    def internal_rate(self, t: ScalarLike, state: Any, args: Any) -> tuple[Scalar]:
+    def internal_rate(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> tuple[Scalar]:
         """Rate of the wheel's spin [rad/s^2]."""
         (inertia,) = in_dtype_of(state, self.inertia)
         return (self._motor(t, state, args) / inertia,)
 
     def internal_scale(self, rate: Scalar) -> tuple[Scalar]:
-        """The wheel's spin is judged against the body's."""
+        """The scale of the wheel's spin is the rate of the body."""
         return (rate,)
 
-    def internal_momentum(self, t: ScalarLike, state: Any, args: Any) -> Vector:
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
         """Angular momentum of the wheel about its axis [kg m^2/s], body components."""
         inertia, axis = in_dtype_of(state, self.inertia, self.axis)
         (spin,) = state.internal
         return inertia * spin * axis
 
-    def internal_energy(self, t: ScalarLike, state: Any, args: Any) -> Scalar:
+    def internal_energy(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
         """Kinetic energy of the wheel about its axis [J]."""
-        (inertia,), (spin,) = in_dtype_of(state, self.inertia), state.internal
+        (inertia,) = in_dtype_of(state, self.inertia)
+        (spin,) = state.internal
         return 0.5 * inertia * spin**2

@@ -5,25 +5,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._types import ScalarLike, Vector
+from jrigid._types import Scalar, ScalarLike, Vector
 from jrigid.torques._base import array
 
 
 class KeplerOrbit(eqx.Module):
     """Position on an ellipse, as a function of time, for `GravityGradient`.
 
-    At time 0 the body is at the pericentre, on the x axis of space; it moves towards y,
-    and z is the normal of the orbit.
+    At time 0 the body is at the pericentre, on the x axis of space. It moves in the
+    direction of y, and z is the normal of the orbit.
 
     Attributes:
         mu: Gravitational parameter of the attractor [m^3/s^2].
         semi_major_axis: Semi-major axis [m].
         eccentricity: Eccentricity, from 0 to below 1.
 
-    NaN for the numbers of no ellipse.
-
-    Digits: all up to an eccentricity of 0.99; of more extreme ones some are lost near
-    the pericentre.
+    The position is NaN for an eccentricity out of this range. It is right to rounding
+    up to an eccentricity of 0.99; beyond, some digits are lost near the pericentre.
 
     Gradients: finite for eccentricities below 1.
     Source: S. Mikkola, Celestial Mechanics 40 (1987) 329, for the start; J. M. A.
@@ -46,30 +44,46 @@ class KeplerOrbit(eqx.Module):
 
     def __call__(self, t: ScalarLike) -> Vector:
         """Position at a time, space components [m]."""
-        a, e = self.semi_major_axis, self.eccentricity
+        a = self.semi_major_axis
+        e = self.eccentricity
         mean = self.mean_motion * jnp.asarray(t, a.dtype)
         mean = mean - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(mean / (2 * jnp.pi)))
-        known, fixed = jax.lax.stop_gradient((mean, e))
-        # The root of a cubic is near enough at any eccentricity.
-        scale = 4 * fixed + 0.5
-        alpha, beta = (1 - fixed) / scale, 0.5 * jnp.abs(known) / scale
-        z = jnp.cbrt(beta + jnp.sqrt(alpha**3 + beta * beta))
-        sine = 2 * beta / (z * z + alpha + (alpha / z) ** 2)
-        sine = sine - 0.078 * sine**5 / (1 + fixed)
-        anomaly = known + jnp.sign(known) * fixed * (3 * sine - 4 * sine**3)
-        for _ in range(3):  # of fourth order
-            sine, cosine = fixed * jnp.sin(anomaly), fixed * jnp.cos(anomaly)
-            f, slope = anomaly - sine - known, 1 - cosine
-            first = -f / slope
-            second = -f / (slope + 0.5 * first * sine)
-            anomaly = anomaly - f / (
-                slope + 0.5 * second * sine + second**2 * cosine / 6
-            )
-        for _ in range(2):  # Newton's steps, which carry the derivatives
-            anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (
-                1 - e * jnp.cos(anomaly)
-            )
+        anomaly = _eccentric_anomaly(mean, e)
         x = a * (jnp.cos(anomaly) - e)
         y = a * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
+        fixed = jax.lax.stop_gradient(e)
         ellipse = (fixed >= 0) & (fixed < 1)
         return jnp.where(ellipse, jnp.stack([x, y, jnp.zeros_like(x)]), jnp.nan)
+
+
+def _eccentric_anomaly(mean: Scalar, e: Scalar) -> Scalar:
+    """The solution E of Kepler's equation, mean = E - e sin E."""
+    anomaly = _without_derivatives(*jax.lax.stop_gradient((mean, e)))
+    # Newton's steps give the derivatives: two, for those of second order too.
+    for _ in range(2):
+        anomaly = anomaly - (anomaly - e * jnp.sin(anomaly) - mean) / (
+            1 - e * jnp.cos(anomaly)
+        )
+    return anomaly
+
+
+def _without_derivatives(mean: Scalar, e: Scalar) -> Scalar:
+    """The eccentric anomaly, from Mikkola's start by steps of Danby."""
+    # The root of a cubic is a good start at any eccentricity.
+    scale = 4 * e + 0.5
+    alpha = (1 - e) / scale
+    beta = 0.5 * jnp.abs(mean) / scale
+    z = jnp.cbrt(beta + jnp.sqrt(alpha**3 + beta * beta))
+    sine = 2 * beta / (z * z + alpha + (alpha / z) ** 2)
+    sine = sine - 0.078 * sine**5 / (1 + e)
+    anomaly = mean + jnp.sign(mean) * e * (3 * sine - 4 * sine**3)
+    # Each step is of fourth order.
+    for _ in range(3):
+        sine = e * jnp.sin(anomaly)
+        cosine = e * jnp.cos(anomaly)
+        f = anomaly - sine - mean
+        slope = 1 - cosine
+        first = -f / slope
+        second = -f / (slope + 0.5 * first * sine)
+        anomaly = anomaly - f / (slope + 0.5 * second * sine + second**2 * cosine / 6)
+    return anomaly

@@ -6,29 +6,34 @@ from jaxtyping import Array, Float
 
 from jrigid._checks import check_shape, float_arrays
 from jrigid._types import Readable, ScalarLike
-from jrigid.torques._base import FINITE, POSITIVE, array
+from jrigid.torques._base import FINITE, POSITIVE, array, refuse_known_parameters
 
 
 class Sampled(Readable):
     """A function of time from samples: scale values(t - delay), smooth between them.
 
-    Cubic between neighbouring samples, with the slope of the parabola through each and
-    its neighbours; held before the first and after the last. Give it where a torque
-    takes a function of time, `Rotor(Sampled(ts, momenta))`; `jrigid.identify.fit` can
-    seek its scale, its delay and its values.
+    The function is cubic between neighbouring samples. Its slope at a sample is that of
+    the parabola through the sample and its neighbours. It is constant before the first
+    sample and after the last one. Pass it where a torque takes a function of time, as
+    in `Rotor(Sampled(ts, momenta))`. `jrigid.identify.fit` can estimate its scale, its
+    delay and its values.
 
     Attributes:
-        ts: Times [s] (n,), increasing; repeated ones at the end pad.
+        ts: Times [s] (n,), increasing; the last one may be repeated as padding.
         values: One row for each time (n, ...).
         scale: Factor of the values, positive.
-        delay: By which the function is later than the samples [s], as a torque that
-            follows its command; of samples that lag behind what they measure it is
-            negative.
+        delay: Time by which the function is later than the samples [s]: positive for a
+            torque that follows its command, negative for samples that lag behind what
+            they measure.
+
+    Raises:
+        RuntimeError: The scale is not positive, and known when the object is built.
 
     Gradients: those of the cubics, in everything; the second derivative in time jumps.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> speed = jr.torques.Sampled(jnp.array([0.0, 1.0, 2.0]), jnp.array([[0.0], [1.0], [4.0]]))
+    >>> ts, values = jnp.array([0.0, 1.0, 2.0]), jnp.array([[0.0], [1.0], [4.0]])
+    >>> speed = jr.torques.Sampled(ts, values)
     >>> print(speed(1.5))
     [2.25]
     """
@@ -43,7 +48,8 @@ class Sampled(Readable):
     )
 
     def __check_init__(self) -> None:
-        """Raise ValueError for shapes that do not belong together."""
+        """Raise an error for shapes that do not match or a scale that is refused."""
+        refuse_known_parameters(self)
         check_shape("values", self.values, (*self.ts.shape, *self.values.shape[1:]))
 
     @property
@@ -53,31 +59,53 @@ class Sampled(Readable):
 
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
-        ts, values = self.ts, self.values
+        ts = self.ts
+        values = self.values
         t = jnp.clip(
             jnp.asarray(t, ts.dtype) - self.delay.astype(ts.dtype), ts[0], ts[-1]
         )
         last = ts.size - 1
         i = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, last - 1)
-
-        def steepness(j: Array) -> tuple[Array, Array]:
-            """Mean slope from sample j to the next, and how long that is; 0 beyond the ends."""
-            inside = (j >= 0) & (j < last)
-            j = jnp.clip(j, 0, last - 1)
-            span = jnp.where(inside, ts[j + 1] - ts[j], 0.0).astype(values.dtype)
-            return (values[j + 1] - values[j]) / jnp.where(span > 0, span, 1.0), span
-
-        (before, a), (within, b), (after, c) = (steepness(i + k) for k in (-1, 0, 1))
-        # Parabolas through three samples; at an end that of the last three, of two a
-        # chord.
-        ab, bc = (jnp.where(x > 0, x + b, 1.0) for x in (a, c))
-        bend_before = jnp.where(a > 0, (within - before) / ab, 0.0)
-        bend_after = jnp.where(c > 0, (after - within) / bc, 0.0)
-        left = within - b * jnp.where(a > 0, bend_before, bend_after)
-        right = within + b * jnp.where(c > 0, bend_after, bend_before)
+        intervals = [self._interval(i + k) for k in (-1, 0, 1)]
+        _, (mean, b), _ = intervals
+        left, right = _end_slopes(*intervals)
         since = (t - ts[i]).astype(values.dtype)
         u = jnp.where(b > 0, since / jnp.where(b > 0, b, 1.0), 0.0)
         bend = u * (1 - u) * b
-        value = values[i] + u * b * within
-        value = value + bend * ((1 - u) * (left - within) - u * (right - within))
+        value = values[i] + u * b * mean
+        value = value + bend * ((1 - u) * (left - mean) - u * (right - mean))
         return self.scale.astype(values.dtype) * value
+
+    def _interval(self, j: Array) -> tuple[Array, Array]:
+        """Mean slope from sample j to the next, and the time between them.
+
+        Both are zero before the first sample and after the last one.
+        """
+        last = self.ts.size - 1
+        inside = (j >= 0) & (j < last)
+        j = jnp.clip(j, 0, last - 1)
+        span = jnp.where(inside, self.ts[j + 1] - self.ts[j], 0.0)
+        span = span.astype(self.values.dtype)
+        rise = self.values[j + 1] - self.values[j]
+        return rise / jnp.where(span > 0, span, 1.0), span
+
+
+def _end_slopes(
+    before: tuple[Array, Array],
+    within: tuple[Array, Array],
+    after: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Slopes of the cubic at the ends of an interval, from it and its neighbours.
+
+    They are those of the parabolas through three samples each. In the first and the
+    last interval one parabola gives both slopes; of two samples alone it is a line.
+    """
+    slope_before, a = before
+    slope, b = within
+    slope_after, c = after
+    ab, bc = (jnp.where(x > 0, x + b, 1.0) for x in (a, c))
+    bend_before = jnp.where(a > 0, (slope - slope_before) / ab, 0.0)
+    bend_after = jnp.where(c > 0, (slope_after - slope) / bc, 0.0)
+    left = slope - b * jnp.where(a > 0, bend_before, bend_after)
+    right = slope + b * jnp.where(c > 0, bend_after, bend_before)
+    return left, right
