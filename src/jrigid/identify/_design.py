@@ -60,8 +60,8 @@ class Plan(Readable):
     """An experiment that has not been made: a body, a state and times.
 
     A plan states what a record would determine, with derivatives in all that is
-    planned. A plan that is made within a function of the rates, the times or the samples
-    of a rotor can be improved by gradients: see `optimal_trial`.
+    planned. A plan that is made within a function of the rates, the times or the
+    samples of a rotor can be improved by gradients: see `optimal_trial`.
 
     Attributes:
         system: The body as it is assumed to be.

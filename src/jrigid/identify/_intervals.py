@@ -174,12 +174,12 @@ def interval(
     from the estimate, in the metric of its errors. The noise is the same for all.
 
     Where moments coincide the function has a kink, and slopes mislead. Each step
-    therefore goes along the slope, or from there onto tensors with equal moments, or
-    straight towards these if they are far. The lowest (highest) of these is taken, until
-    no step leads lower (higher). For the upper limit, an estimate below all but 5 % of
-    the estimates at the least value counts as that quantile, so that no interval is
-    empty. Tensors beyond flat bodies, I3 > I1 + I2, are replaced by a nearby flat body,
-    as in a fit.
+    therefore has several candidates: a point along the slope, and tensors with equal
+    moments near it, or points towards these if they are far. It goes to the lowest
+    (highest) candidate, until none is lower (higher). For the upper limit, an estimate
+    below all but 5 % of the estimates at the least value counts as that quantile, so
+    that no interval is empty. Tensors beyond flat bodies, I3 > I1 + I2, are replaced by
+    a nearby flat body, as in a fit.
 
     Where the function is linear the limits are those of a normal distribution.
 

@@ -230,6 +230,29 @@ def _stepped(
     return jtu.tree_map(lambda a, b: jnp.where(better, a, b), after, shorter)
 
 
+def _descended(
+    derive: Callable[[Array], tuple[Array, Array]],
+    project: Callable[[Array], Array],
+    steps: int,
+    x: Array,
+) -> tuple[_Descent, Array]:
+    """The end of a search from a vector, and the score after each step."""
+
+    def step(now: _Descent, _: None) -> tuple[_Descent, Array]:
+        now = _stepped(derive, project, now)
+        return now, now.score
+
+    # Any score is better than this one, so that the first step evaluates `x`.
+    initial = _Descent(
+        x=x,
+        score=jnp.asarray(jnp.inf, x.dtype),
+        slope=jnp.zeros_like(x),
+        size=jnp.asarray(_FIRST_STEP, x.dtype),
+        share=jnp.asarray(1.0, x.dtype),
+    )
+    return jax.lax.scan(step, initial, None, steps)
+
+
 @quick_jit
 def _optimum(
     plan: Plan,
@@ -250,21 +273,7 @@ def _optimum(
     grad = jax.grad if plan.system.is_free else jax.jacfwd
     derive = grad(scored, has_aux=True)
 
-    def step(now: _Descent, _: None) -> tuple[_Descent, Array]:
-        now = _stepped(derive, project, now)
-        return now, now.score
-
-    def descend(x: Array) -> tuple[_Descent, Array]:
-        # Any score is better than this one, so that the first step evaluates `x`.
-        initial = _Descent(
-            x=x,
-            score=jnp.asarray(jnp.inf, x.dtype),
-            slope=jnp.zeros_like(x),
-            size=jnp.asarray(_FIRST_STEP, x.dtype),
-            share=jnp.asarray(1.0, x.dtype),
-        )
-        return jax.lax.scan(step, initial, None, steps)
-
+    descend = partial(_descended, derive, project, steps)
     shape = (starts - 1, first.size)
     others = jax.random.uniform(jax.random.key(0), shape, first.dtype, -1.0, 1.0)
     initial = jnp.concatenate([first[None], others])
