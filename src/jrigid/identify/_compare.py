@@ -74,6 +74,7 @@ def _line(name: str, width: int, cells: Sequence[str]) -> str:
 
 def _unknowns(result: FitResult) -> Scalar:
     """Number of unknowns, with those of the states that the record shows."""
+    # Singular values of rounding size belong to directions that no sample shows.
     values = result.diagnostics.state_singular_values
     states = jnp.sum(values > SHOWN * values[:, :1])
     return result.numbers.size + result.diagnostics.torque_numbers + states
@@ -128,6 +129,8 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     n = jnp.sum(jnp.where(first.kept[..., None], first.problem.samples.weight, 0.0))
     unknowns = jnp.stack([_unknowns(x) for x in fits])
     chi_square = jnp.stack([x.chi_square for x in fits])
+    # -2 log of the likelihood, up to a constant, at the most likely noise if that is
+    # not stated.
     misfit = chi_square if noise_known else n * jnp.log(chi_square / n)
     misfit = misfit + jnp.stack([x.diagnostics.log_determinant for x in fits])
     k = unknowns.astype(n.dtype)
@@ -176,6 +179,7 @@ def _fit_of_states(result: FitResult, trials: list[Any]) -> FitResult:
         return [x.sensor for x in trial]
 
     records = [eqx.tree_at(sensors_of, x, sensors) for x in records]
+    # `fit` needs a positive level about each axis, unless all are zero.
     level = jnp.maximum(result.level, _LEAST * jnp.max(result.level))
     return fit(
         systems,

@@ -258,7 +258,8 @@ def _planned(plan: Plan) -> _Planned:
     options = problems.Options(system.is_free, by_sensor or needs_attitude(system))
     layout = whole(samples, 1, plan.t0)
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
-    # Readings equal to the predictions, so that the residuals are zero.
+    # Readings equal to the predictions, so that the residuals are zero. They are data:
+    # derivatives of a plan do not go through them.
     values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
     records = [x.with_values(y) for x, y in zip(records, values, strict=True)]
     problem = dataclasses.replace(problem, samples=samples_of(records, one))
@@ -427,6 +428,7 @@ def _profile(
     problem = dataclasses.replace(result.problem, options=options)
     slope = np.asarray(_slope(unknowns, result.numbers, Static(function)))
     variance = slope @ result.numbers_covariance @ slope / inflation
+    # In this unit the residual that holds the function outweighs the record.
     unit = (_HELD_TO * np.sqrt(variance)).astype(dtype)
     layout = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
     attitude = result.state.attitude[:, None]

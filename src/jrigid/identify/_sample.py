@@ -144,6 +144,7 @@ def log_density(result: FitResult) -> LogDensity:
         own = of_trials[:, state_size:]
         point = Point(numbers, own, attitude, omega, no_torque)
         rows = rows_at_position(point, of_trials[:, None, :state_size])
+        # An inflation above 1 means noise as large as the residuals, not as stated.
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
         likelihood = -0.5 * chi_square / result.diagnostics.inflation
         return likelihood + _log_jacobian(unknowns, numbers, own)

@@ -236,6 +236,7 @@ def _trained(
             _print_losses(epoch, after)
         if float(after.validation) < best.loss:
             best = _Best(params, float(after.validation), epoch)
+        # A loss that is not finite makes all parameters NaN, so that training ends.
         elif epoch - best.epoch >= patience or not np.isfinite(best.loss):
             break
         params = after.params
@@ -448,7 +449,8 @@ def _epoch(task: _Task, params: PyTree, memory: PyTree, key: Array) -> _AfterEpo
     ) -> tuple[tuple[PyTree, PyTree], Array]:
         params, memory = carry
         value, slope = jax.value_and_grad(loss)(params, index)
-        with jax.numpy_dtype_promotion("standard"):  # optax mixes types
+        # optax mixes types, which fails under strict promotion.
+        with jax.numpy_dtype_promotion("standard"):
             updates, memory = task.optimizer.update(slope, memory, params)
             params = eqx.apply_updates(params, updates)
         return (params, memory), value
