@@ -10,7 +10,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
 from jrigid._checks import demand
-from jrigid._types import Scalar
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
@@ -72,7 +71,7 @@ def _line(name: str, width: int, cells: Sequence[str]) -> str:
     return name.ljust(width) + "".join(x.rjust(_WIDTH) for x in cells)
 
 
-def _unknowns(result: FitResult) -> Scalar:
+def _unknowns(result: FitResult) -> Int[Array, ""]:
     """Number of unknowns, with those of the states that the record shows."""
     # Singular values of rounding size belong to directions that no sample shows.
     values = result.diagnostics.state_singular_values

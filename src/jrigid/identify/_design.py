@@ -436,7 +436,7 @@ def _profile(
     point = Point(result.numbers, result.own_numbers, attitude, omega, omega[..., :0])
     settings = _profile_settings(result)
 
-    def request(value: np.ndarray) -> Request:
+    def request(value: AnyArray) -> Request:
         held = unknowns.holding(_Held(function, value.astype(dtype), unit))
         at_value = dataclasses.replace(problem, unknowns=held)
         return Request(at_value, layout, point, settings)

@@ -91,7 +91,7 @@ def block_bootstrap(
     centred = residuals - jnp.mean(residuals, axis=0, keepdims=True)
     blocks = -(-times // block)  # rounded up
 
-    def shift(key: RandomKey) -> Array:
+    def shift(key: Array) -> Array:
         starts = jax.random.randint(key, (blocks,), 0, times - block + 1)
         rows = (starts[:, None] + jnp.arange(block)[None, :]).reshape(-1)[:times]
         return influence @ centred[rows].reshape(-1)

@@ -341,7 +341,7 @@ def _cut(record: Record, windows: Sequence[_Window]) -> Record:
             np.where(is_sample, np.asarray(x)[trial[:, None], index], np.nan)
         )
 
-    def arrays(x: Record) -> tuple[Array | None, ...]:
+    def arrays(x: Record) -> tuple[Any, ...]:  # not arrays inside `tree_at`
         return x.ts, x.values, x.sigma, x.covariance
 
     segments = tuple(map(cut, arrays(record)))
