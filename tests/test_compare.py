@@ -1,4 +1,4 @@
-"""Which model a record asks for: criteria, and trials that a fit has not seen."""
+"""Comparison of models by criteria, and by trials that are not in the fit."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ MOMENTS = np.array([0.6, 1.02, 1.38])
 
 
 def trials(rng, drag=0.0, turn=0.0, count=1, noise=NOISE):
-    """Records of a body that the air brakes, its principal axes turned from the gyro's."""
+    """Records of a body with air drag, its principal axes turned from the gyro's."""
     axes = Rotation.from_rotvec(turn * np.array([0.6, -0.4, 0.9])).as_matrix()
     omega = rng.normal(size=(count, 3))
     omega /= np.linalg.norm(omega, axis=1, keepdims=True)
@@ -31,14 +31,14 @@ def of_axes(record):
     return {"known axes": known, "any axes": identify.fit(BLIND, record, throw=False)}
 
 
-def test_three_numbers_too_many_are_told_from_three_too_few(rng):
+def test_three_numbers_too_many_are_distinguished_from_three_too_few(rng):
     for turn, best, least in ((0.0, "known axes", 8), (0.3, "any axes", 10)):
-        found = [
+        tables = [
             identify.compare(of_axes(trials(rng, turn=turn)[0])) for _ in range(10)
         ]
-        wins = [x.names[int(jnp.argmin(x.bic))] == best for x in found]
+        wins = [x.names[int(jnp.argmin(x.bic))] == best for x in tables]
         assert sum(wins) >= least, wins
-    one = found[0]
+    one = tables[0]
     np.testing.assert_array_equal(one.unknowns, [2 + 3, 5 + 3])
     np.testing.assert_array_equal(
         one.degrees_of_freedom, 240 - np.asarray(one.unknowns)
@@ -73,8 +73,8 @@ def test_each_trial_or_group_is_left_out_once():
         def __init__(self, chi_square):
             self.chi_square = jnp.asarray(chi_square)
 
-    def refit(found, group):
-        return Shown(float(found) * 100 + sum(group))
+    def refit(total, group):
+        return Shown(float(total) * 100 + sum(group))
 
     squares = identify.cross_validate(sum, [1, 2, [3, 4]], refit=refit)
     np.testing.assert_array_equal(squares, [901, 802, 307])
@@ -137,9 +137,9 @@ def test_without_a_stated_noise_the_residuals_take_its_place(rng):
     records = trials(rng, turn=0.3, noise=None)
     table = identify.compare(of_axes(records[0]))
     assert int(jnp.argmin(table.bic)) == 1
-    left = 240 * np.log(np.asarray(table.chi_square) / 240)
+    misfit = 240 * np.log(np.asarray(table.chi_square) / 240)
     np.testing.assert_allclose(
-        table.bic, left + np.log(240) * np.asarray(table.unknowns)
+        table.bic, misfit + np.log(240) * np.asarray(table.unknowns)
     )
 
 
@@ -147,7 +147,7 @@ def test_without_a_stated_noise_the_residuals_take_its_place(rng):
 def test_the_likelihood_of_an_unmodelled_torque_is_that_of_a_dense_covariance(
     time, rng
 ):
-    """Of a sphere, whose rates are the noise, a constant and the integral of the torque."""
+    """A sphere: its rates are noise, a constant and the integral of the torque."""
     ts, level = TS[:30], 0.05
     later, earlier = np.maximum(*np.meshgrid(ts, ts)), np.minimum(*np.meshgrid(ts, ts))
     spread = level**2 * earlier
@@ -163,7 +163,7 @@ def test_the_likelihood_of_an_unmodelled_torque_is_that_of_a_dense_covariance(
         + rng.multivariate_normal(np.zeros(ts.size), NOISE**2 * covariance, 3).T
     )
     torque = identify.GaussMarkov(level, time)
-    found = identify.fit(
+    result = identify.fit(
         BLIND,
         identify.Rates(ts, values, NOISE),
         inertia_model=identify.Fixed(),
@@ -171,13 +171,13 @@ def test_the_likelihood_of_an_unmodelled_torque_is_that_of_a_dense_covariance(
     )
     inverse = np.linalg.inv(covariance)
     ones = np.ones(ts.size)
-    left = (values - ones @ inverse @ values / (ones @ inverse @ ones)) / NOISE
+    residuals = (values - ones @ inverse @ values / (ones @ inverse @ ones)) / NOISE
     np.testing.assert_allclose(
-        found.chi_square, np.sum(left * (inverse @ left)), rtol=1e-6
+        result.chi_square, np.sum(residuals * (inverse @ residuals)), rtol=1e-6
     )
     log_determinant = 3 * np.linalg.slogdet(covariance)[1]
     np.testing.assert_allclose(
-        found.diagnostics.log_determinant, log_determinant, rtol=1e-6
+        result.diagnostics.log_determinant, log_determinant, rtol=1e-6
     )
 
 
@@ -190,10 +190,10 @@ def test_an_unmodelled_torque_is_preferred_where_there_is_one(rng):
         record = identify.Rates(TS, record.values + np.cumsum(kicks, axis=0), NOISE)
         plain = identify.fit(BLIND, record, throw=False)
         torque = identify.fit(BLIND, record, unmodelled="estimate", throw=False)
-        found = identify.compare({"none": plain, "torque": torque})
-        assert found.names[int(jnp.argmin(found.bic))] == best, str(found)
+        table = identify.compare({"none": plain, "torque": torque})
+        assert table.names[int(jnp.argmin(table.bic))] == best, str(table)
         assert (
-            found.unknowns[1] - found.unknowns[0] == torque.diagnostics.torque_numbers
+            table.unknowns[1] - table.unknowns[0] == torque.diagnostics.torque_numbers
         )
         assert torque.diagnostics.torque_numbers > 0
 
@@ -204,13 +204,13 @@ def test_trials_with_a_wheel_of_their_own_are_left_out_in_turn(rng):
     tensor, ts = np.diag(MOMENTS), np.arange(60) * 0.02
     pairs = []
     for i in range(4):
-        moved, told = worlds.wheel_profile(
+        moved, recorded = worlds.wheel_profile(
             np.array([0.2, -0.3, 1.0]), 1.5, 0.1 + 0.1 * i, 0.6
         )
         omega = 5.0 * rng.normal(size=3)
         motion = worlds.tumble(tensor, omega, ts, wheel=moved)
         clock = np.arange(61 + i) * 0.02
-        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
+        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, recorded(clock)[0]))
         values = motion.omega + NOISE * rng.normal(size=motion.omega.shape)
         pairs.append(
             (jr.RigidBody(np.ones(3), wheel), identify.Rates(ts, values, NOISE))

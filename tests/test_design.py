@@ -1,4 +1,4 @@
-"""Plans of records, improved by the gradients of their bound, and fits that keep their promise."""
+"""Plans: gradients of their bound, the best trial, and fits that reach the bound."""
 
 import equinox as eqx
 import jax
@@ -44,11 +44,11 @@ def test_the_best_trial_beats_random_ones(best, rng):
     trials *= MOST / np.linalg.norm(trials, axis=1, keepdims=True)
     trials[200:] *= rng.uniform(size=(200, 1)) ** (1 / 3)  # and within the limit
     errors = np.asarray(error(np.concatenate([trials, omega[None], [[0.0, 0.1, 1.0]]])))
-    *random, found, first = errors
-    assert found <= np.nanmin(random)
-    np.testing.assert_allclose(np.exp(best.score), found, rtol=1e-9)
+    *random, least, first = errors
+    assert least <= np.nanmin(random)
+    np.testing.assert_allclose(np.exp(best.score), least, rtol=1e-9)
     np.testing.assert_allclose(np.exp(best.start_score), first, rtol=1e-9)
-    assert found < 0.1 * first
+    assert least < 0.1 * first
 
 
 def test_the_best_trial_is_one_that_no_small_change_betters(best, rng):
@@ -75,7 +75,7 @@ def test_a_plan_is_a_pytree_of_all_that_is_planned():
 
 @pytest.mark.slow  # programs of their own
 def test_a_plan_s_bound_has_its_slopes_in_both_modes():
-    """In the plan itself and in the rate it is made of, outside of jit, against differences."""
+    """In the plan and in the rates it is made of, outside of jit, by differences."""
 
     def log_error(plan):
         return jnp.log(jnp.trace(plan.bound.ratios_covariance)) / 2
@@ -117,8 +117,8 @@ def test_fits_of_the_best_trial_scatter_as_it_promises(best, rng):
         motion = jr.free_rotation(NEARLY_SYMMETRIC.inertia, plan.state, TS)
         values = np.asarray(motion.omega) + NOISE * rng.normal(size=(300, 60, 3))
         records = [identify.Rates(TS, y, NOISE) for y in values]
-        found = identify.fit_each(NEARLY_SYMMETRIC, records)
-        off = np.asarray(found.ratios) - np.array([1.05, 1.6])
+        results = identify.fit_each(NEARLY_SYMMETRIC, records)
+        off = np.asarray(results.ratios) - np.array([1.05, 1.6])
         spread.append(np.sqrt(np.trace(np.cov(off.T))))
         if plan is best.plan:
             half = np.linalg.inv(
@@ -131,7 +131,7 @@ def test_fits_of_the_best_trial_scatter_as_it_promises(best, rng):
 
 @pytest.mark.slow  # a program of its own
 def test_the_spin_and_the_times_together():
-    """Few samples, at the times that tell most: fewer errors than any even spacing in the box."""
+    """Few samples at chosen times give smaller errors than evenly spaced ones."""
     plan = plan_of(np.array([0.3, 0.5, 0.8]), np.linspace(0, 18, 12))
     best = identify.optimal_trial(
         plan, lambda x: (x.state.omega, x.observations.ts), (1.0, (0.0, 18.0)), starts=4

@@ -1,4 +1,7 @@
-"""Intervals hold the truth where moments nearly coincide and at bounds; benchmarks count more."""
+"""Intervals contain the true value where moments nearly coincide and at bounds.
+
+`benchmarks/bench_intervals.py` has more trials.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +19,14 @@ GAP = 2**0.5 * ERROR  # standard error of an isolated gap
 
 
 def basis():
-    found = np.zeros((5, 3, 3))
-    found[0], found[1] = np.diag([-1, 1, 0]) / 2**0.5, np.diag([1, 1, -2]) / 6**0.5
+    matrices = np.zeros((5, 3, 3))
+    matrices[0], matrices[1] = (
+        np.diag([-1, 1, 0]) / 2**0.5,
+        np.diag([1, 1, -2]) / 6**0.5,
+    )
     for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)), 2):
-        found[k, i, j] = found[k, j, i] = 0.5**0.5
-    return found
+        matrices[k, i, j] = matrices[k, j, i] = 0.5**0.5
+    return matrices
 
 
 def ratio(which, tensor):
@@ -61,15 +67,15 @@ def coverage(gaps, which, errors, rng, trials=200):
     gaps = np.array(gaps) * GAP
     moments = 1 + np.cumsum([0, *gaps])
     turn = np.einsum("ni,iab->nab", rng.normal(size=(trials, 5)) * errors, basis())
-    found = intervals(
+    limits = intervals(
         jnp.asarray(which), jnp.asarray(np.diag(moments) + turn), covariance(errors)
     )
-    return tuple(covered(x, moments[which] / moments[0]) for x in found)
+    return tuple(covered(x, moments[which] / moments[0]) for x in limits)
 
 
 ALIKE = ERROR * np.ones(5)
-# 200 trials: a standard error of 1.5 points, so that 90 % is more than three below 95
-# %.
+# 200 trials have a standard error of 1.5 points, so that 90 % is more than three of
+# them below 95 %.
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.3, 1.0])
@@ -91,14 +97,14 @@ def test_errors_that_differ_by_directions_do_no_harm(factor, rng):
 
 
 def test_where_the_function_is_linear_the_errors_are_the_usual_ones():
-    found = interval(
+    limits = interval(
         lambda x: x[0, 1],
         jnp.diag(jnp.array([1.0, 1.5, 2.0])),
         covariance(ALIKE),
         jnp.asarray(0.9),
     )
     np.testing.assert_allclose(
-        found, ERROR * 0.5**0.5 * 1.6448536 * np.array([-1, 1]), rtol=1e-6
+        limits, ERROR * 0.5**0.5 * 1.6448536 * np.array([-1, 1]), rtol=1e-6
     )
 
 
@@ -118,8 +124,8 @@ def test_equal_moments_and_flat_bodies_are_closed_ends():
 def test_a_fit_hands_out_intervals(rng):
     record = jr.datasets.gyro_example()
     readings = identify.Rates(record.times, record.omegas, record.sigma)
-    found = identify.fit(jr.RigidBody(np.ones(3)), readings)
-    usual = np.asarray(found.ratios) + 1.96 * np.outer([-1, 1], found.ratios_errors)
-    np.testing.assert_allclose(found.ratios_intervals, usual, atol=1e-4)
-    wide, narrow = found.interval(thickness), found.interval(thickness, level=0.5)
+    result = identify.fit(jr.RigidBody(np.ones(3)), readings)
+    usual = np.asarray(result.ratios) + 1.96 * np.outer([-1, 1], result.ratios_errors)
+    np.testing.assert_allclose(result.ratios_intervals, usual, atol=1e-4)
+    wide, narrow = result.interval(thickness), result.interval(thickness, level=0.5)
     assert wide[0] < narrow[0] < narrow[1] < wide[1]

@@ -1,4 +1,4 @@
-"""train() against an independent simulator: a table learns a drag that no model was told."""
+"""train() against an independent simulator: a table learns an unmodelled drag."""
 
 import equinox as eqx
 import jax
@@ -98,7 +98,7 @@ def test_training_stops_when_validation_has_stopped_to_fall(scene, learnt, capsy
 
 @pytest.mark.slow
 def test_the_loss_of_the_truth_is_one(rng):
-    """A gyro with a memory, pictures at other times; long and short trials, of a few segments."""
+    """A gyro with a lag, attitudes at other times, trials of different lengths."""
     tensor, lag = worlds.random_body(rng), 0.004
     grid = np.arange(-400, 1001) / 1000
     start = rng.normal(size=(12, 3))
@@ -161,7 +161,7 @@ def test_bad_arguments_are_named(scene, untyped):
     with pytest.raises(ValueError, match="`system` must be a RigidBody"):
         identify.train(scene.tensor, scene.trials, ADAM, key=key)
     upright = jr.torques.MagneticDipole(np.ones(3), np.ones(3))
-    with pytest.raises(ValueError, match="must tell the whole state"):
+    with pytest.raises(ValueError, match="must show the whole state"):
         identify.train(jr.RigidBody(scene.tensor, upright), scene.trials, ADAM, key=key)
     with pytest.raises(RuntimeError, match="`inertia` must"):
         train(jr.RigidBody(-scene.tensor, body.torque))

@@ -1,4 +1,4 @@
-"""Which of several models a record asks for: by what they leave, and by trials they never saw."""
+"""Comparison of models by information criteria and by cross-validation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
@@ -14,23 +14,29 @@ from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._inertia_models import Fixed
+from jrigid.identify._records import Record
 from jrigid.identify._result import FitResult
 from jrigid.systems import RigidBody
 
-_LEAST = 1e-3  # of the largest level, where one of an axis is zero
+# Level of an unmodelled torque about an axis for which a fit finds none, over the
+# largest level.
+_LEAST = 1e-3
+_HEADS = ("chi-square", "freedom", "unknowns", "AIC", "BIC")
+_WIDTH = 12  # of a column
 
 
 class Comparison(NamedTuple):
-    """Fits of one record side by side; `print` shows it.
+    """Fits of one record side by side. `print` shows a table.
 
     Attributes:
-        names: Of the models.
-        chi_square: Of each.
-        degrees_of_freedom: Residuals less what was sought.
-        unknowns: How many numbers were sought, those of the states and an unmodelled torque with
-            them.
-        aic: Akaike's criterion: a model is the better the less it is.
-        bic: The Bayesian one, which asks more of each unknown: 10 less is strong evidence.
+        names: Names of the models.
+        chi_square: Chi-square of each.
+        degrees_of_freedom: Number of residuals less number of unknowns.
+        unknowns: Number of unknowns, including those of the states and of an unmodelled
+            torque.
+        aic: Akaike information criterion. A smaller value means a better model.
+        bic: Bayesian information criterion, which weighs each unknown more. A value
+            smaller by 10 is strong evidence.
     """
 
     names: tuple[str, ...]
@@ -41,153 +47,203 @@ class Comparison(NamedTuple):
     bic: Float[Array, " fits"]
 
     def __str__(self) -> str:
-        """A table, the best by BIC first; criteria over those of the best."""
-        first = max(5, *map(len, self.names))
-        heads = "chi-square", "freedom", "unknowns", "AIC", "BIC"
-        lines = ["model".ljust(first) + "".join(x.rjust(12) for x in heads)]
-        columns = *self[1:4], self.aic - jnp.min(self.aic), self.bic - jnp.min(self.bic)
+        """A table, the best by BIC first; criteria are relative to the best."""
+        width = max(len(x) for x in ("model", *self.names))
+        columns = (
+            self.chi_square,
+            self.degrees_of_freedom,
+            self.unknowns,
+            self.aic - jnp.min(self.aic),
+            self.bic - jnp.min(self.bic),
+        )
+        lines = [_line("model", width, _HEADS)]
         for i in jnp.argsort(self.bic).tolist():
-            numbers = (
-                f"{x[i].item():.1f}" if x.dtype.kind == "f" else str(x[i])
-                for x in columns
-            )
-            lines.append(
-                self.names[i].ljust(first) + "".join(x.rjust(12) for x in numbers)
-            )
+            cells = [_cell(column[i]) for column in columns]
+            lines.append(_line(self.names[i], width, cells))
         return "\n".join(lines)
 
 
-def compare(results: Mapping[str, FitResult]) -> Comparison:
-    """Fits of one record with different models: what each leaves, and what it asks for that.
+def _cell(number: Array) -> str:
+    return f"{number.item():.1f}" if number.dtype.kind == "f" else str(number)
 
-    With the noise stated the criteria are chi-square + 2 k and chi-square + k log n, of k unknowns
-    and n residuals; else n log(chi-square / n) stands for chi-square. What was known beforehand
-    counts as sought, and its squares are in chi-square. An unmodelled torque makes readings depend
-    on each other, so that the logarithm of their covariance's determinant is added to chi-square;
-    its numbers count as unknowns where they were sought.
+
+def _line(name: str, width: int, cells: Sequence[str]) -> str:
+    return name.ljust(width) + "".join(x.rjust(_WIDTH) for x in cells)
+
+
+def _unknowns(result: FitResult) -> Int[Array, ""]:
+    """Number of unknowns, with those of the states that the record shows."""
+    # Singular values of rounding size belong to directions that no sample shows.
+    values = result.diagnostics.state_singular_values
+    states = jnp.sum(values > SHOWN * values[:, :1])
+    return result.numbers.size + result.diagnostics.torque_numbers + states
+
+
+def compare(results: Mapping[str, FitResult]) -> Comparison:
+    """Compare fits of one record with different models by information criteria.
+
+    With the noise stated the criteria are chi-square + 2 k and chi-square + k log n, of
+    k unknowns and n residuals. Otherwise n log(chi-square / n) replaces chi-square.
+    Quantities with a prior count as unknowns, and the squares of the prior are in
+    chi-square. An unmodelled torque correlates the readings, so that the logarithm of
+    the determinant of their covariance is added to chi-square. Its numbers count as
+    unknowns where they were sought.
 
     Args:
         results: Each fit by the name of its model.
 
     Returns:
-        The table.
+        The comparison, which `print` shows as a table.
 
     Raises:
-        ValueError: Fits of different samples.
+        ValueError: The fits are of different samples.
 
     Gradients: none.
-    Source: G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6 (1978) 461.
+    Source: G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6
+        (1978) 461.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
-    >>> whole = jr.identify.fit(body, readings)
-    >>> known_axes = jr.identify.fit(body, readings, inertia_model=jr.identify.Moments())
-    >>> print(jr.identify.compare({"axes known": known_axes, "any body": whole}))
+    >>> any_body = jr.identify.fit(body, readings)
+    >>> known_axes = jr.identify.fit(
+    ...     body, readings, inertia_model=jr.identify.Moments())
+    >>> print(jr.identify.compare({"axes known": known_axes, "any body": any_body}))
     model       chi-square     freedom    unknowns         AIC         BIC
     axes known       594.7         595           5         0.0         0.0
     any body         593.0         592           8         4.3        17.5
     """
     fits = tuple(results.values())
-    asked = [((x.problem.samples, x.kept), x.problem.options.noise_known) for x in fits]
+    first = fits[0]
+    noise_known = first.problem.options.noise_known
+
+    def data(x: FitResult) -> tuple[Any, ...]:
+        return x.problem.samples, x.kept, x.problem.options.noise_known
+
     demand(
-        all(bool(eqx.tree_equal(x, asked[0], rtol=1e-6)) for x in asked),
-        "Argument `results` must be fits of the same samples, their noise taken alike, but they "
-        "are not.",
+        all(bool(eqx.tree_equal(data(x), data(first), rtol=1e-6)) for x in fits),
+        "Argument `results` must be fits of the same samples, with the noise stated in "
+        "all or in none, but they are not.",
     )
-    n = jnp.sum(jnp.where(fits[0].kept[..., None], fits[0].problem.samples.weight, 0.0))
-    values = [x.diagnostics.state_singular_values for x in fits]
-    states = [jnp.sum(x > SHOWN * x[:, :1]) for x in values]
-    counts = [x.numbers.size + x.diagnostics.torque_numbers for x in fits]
-    unknowns = jnp.stack([x + y for x, y in zip(counts, states, strict=True)])
-    square, freedom = (
-        jnp.stack([getattr(x, y) for x in fits]) for y in Comparison._fields[1:3]
+    n = jnp.sum(jnp.where(first.kept[..., None], first.problem.samples.weight, 0.0))
+    unknowns = jnp.stack([_unknowns(x) for x in fits])
+    chi_square = jnp.stack([x.chi_square for x in fits])
+    # -2 log of the likelihood, up to a constant, at the most likely noise if that is
+    # not stated.
+    misfit = chi_square if noise_known else n * jnp.log(chi_square / n)
+    misfit = misfit + jnp.stack([x.diagnostics.log_determinant for x in fits])
+    k = unknowns.astype(n.dtype)
+    return Comparison(
+        names=tuple(results),
+        chi_square=chi_square,
+        degrees_of_freedom=jnp.stack([x.degrees_of_freedom for x in fits]),
+        unknowns=unknowns,
+        aic=misfit + 2 * k,
+        bic=misfit + k * jnp.log(n),
     )
-    left, k = (
-        square if asked[0][1] else n * jnp.log(square / n),
-        unknowns.astype(n.dtype),
-    )
-    left = left + jnp.stack([x.diagnostics.log_determinant for x in fits])
-    criteria = left + 2 * k, left + k * jnp.log(n)
-    return Comparison(tuple(results), square, freedom, unknowns, *criteria)
 
 
-def _split(trial: Any) -> tuple[RigidBody | None, tuple[Any, ...]]:
+def _split(trial: Any) -> tuple[RigidBody | None, tuple[Record, ...]]:
     """The body of a trial, if it has one of its own, and its records."""
     is_pair = isinstance(trial, tuple) and isinstance(trial[0], RigidBody)
     body, records = trial if is_pair else (None, trial)
     return body, records if isinstance(records, tuple) else (records,)
 
 
-def _with_what_was_found(found: FitResult, body: RigidBody | None) -> RigidBody:
-    """A body that a fit has not seen, with the inertia and the torque that the fit found."""
+def _with_estimates(result: FitResult, body: RigidBody | None) -> RigidBody:
+    """The fitted body, or another one with the estimates of inertia and torque."""
     if body is None:
-        return found.system
-    sensors = found.unknowns.original(0)[1:]
+        return result.system
+    unknowns = result.unknowns
+    sensors = unknowns.original(0)[1:]
     leaves = jtu.tree_leaves(eqx.filter((body, *sensors), eqx.is_inexact_array))
-    leaves += [
-        jnp.zeros_like(x[0]) for x in found.unknowns.groups.values()
-    ]  # it is in none
-    return found.unknowns.parts(found.numbers, found.own_numbers[0], tuple(leaves))[0]
+    # The trial of this body was not in the fit, so that it belongs to no group.
+    leaves += [jnp.zeros_like(x[0]) for x in unknowns.groups.values()]
+    own = result.own_numbers[0]
+    return unknowns.parts(result.numbers, own, tuple(leaves))[0]
 
 
-def _with_its_own_state(found: FitResult, trials: list[Any]) -> FitResult:
-    options = found.problem.options
-    sensors = found.fitted()[1:]
+def _fit_of_states(result: FitResult, trials: list[Any]) -> FitResult:
+    """Fit the states of other trials, and keep all else that a fit found."""
+    options = result.problem.options
+    sensors = result.fitted()[1:]
     bodies, records = zip(*map(_split, trials), strict=True)
-    systems = [_with_what_was_found(found, x) for x in bodies]
-    records = [
-        eqx.tree_at(lambda x: [y.sensor for y in x], x, sensors) for x in records
-    ]
-    stated = all(x.states_noise for trial in records for x in trial)
-    demand(stated, "Argument `trials` must state the noise, but one does not.")
-    level = jnp.maximum(found.level, _LEAST * jnp.max(found.level))
-    torque = GaussMarkov(level, found.correlation_time)
-    loss = "robust" if options.robust else "squares"
-    rest = {"unmodelled": torque, "loss": loss, "motion": options.motion}
-    return fit(systems, records, inertia_model=Fixed(), throw=False, **rest)
+    systems = [_with_estimates(result, x) for x in bodies]
+    demand(
+        all(x.states_noise for trial in records for x in trial),
+        "Argument `trials` must state the noise, but one does not.",
+    )
+
+    def sensors_of(trial: tuple[Record, ...]) -> list[Any]:
+        return [x.sensor for x in trial]
+
+    records = [eqx.tree_at(sensors_of, x, sensors) for x in records]
+    # `fit` needs a positive level about each axis, unless all are zero.
+    level = jnp.maximum(result.level, _LEAST * jnp.max(result.level))
+    return fit(
+        systems,
+        records,
+        inertia_model=Fixed(),
+        unmodelled=GaussMarkov(level, result.correlation_time),
+        loss="robust" if options.robust else "squares",
+        motion=options.motion,
+        throw=False,
+    )
 
 
 def cross_validate(
     fit_function: Callable[[list[Any]], FitResult],
     trials: Sequence[Any],
     *,
-    refit: Callable[[FitResult, list[Any]], FitResult] = _with_its_own_state,
+    refit: Callable[[FitResult, list[Any]], FitResult] = _fit_of_states,
 ) -> Float[Array, " trials"]:
-    """How well trials that a fit has not seen are described: chi-square of each, left out in turn.
+    """Return chi-square of each trial, as predicted by a fit of the other trials.
 
-    A fit of the others gives the body, its torque and the sensors; of the trial left out only the
-    state is sought. Models are compared trial by trial: the difference and its scatter tell which
-    predicts better, with no count of unknowns.
+    A fit of the other trials gives the body, its torque and the sensors. Of the trial
+    that is left out only the state is sought. Compare models trial by trial: the
+    differences and their scatter show which model predicts better, without a count of
+    unknowns.
 
     Args:
-        fit_function: Fits a list of trials: `lambda trials: jr.identify.fit(body, trials, ...)`.
-        trials: Of each a record or a tuple of records; or, where trials have bodies of their own,
-            as with a record of a wheel for each, a pair of the body and these, which
-            `fit_function` then takes apart. A list of trials is left out as a group.
-        refit: What finds the states of trials left out from the fit of the others, where the
-            default cannot: numbers sought by `each`, a motion that depends on an attitude that was
-            not observed. The default keeps the level and the correlation time of an unmodelled
-            torque, the loss and the motion.
+        fit_function: Fits a list of trials, such as
+            `lambda trials: jr.identify.fit(body, trials, ...)`.
+        trials: A record or a tuple of records for each trial. Where trials have bodies
+            of their own, such as a rotor with its own record, an entry is a pair of the
+            body and the records, which `fit_function` has to separate. A list of trials
+            is left out as a group.
+        refit: Finds the states of the trials left out, given the fit of the others. The
+            default keeps the level and the correlation time of an unmodelled torque,
+            the loss and the motion. Pass a function where the default fails: for
+            unknowns by `each`, or a motion that depends on an attitude that was not
+            observed.
 
     Returns:
         Chi-square of each trial or group.
+
+    Raises:
+        ValueError: There is only one trial or group, or the noise is not stated.
 
     Gradients: none.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))
     >>> parts = [slice(0, 100), slice(50, 150), slice(100, 200)]
-    >>> rates = lambda x: jr.identify.Rates(record.times[x], record.omegas[x], record.sigma)
-    >>> trials = [rates(x) for x in parts]  # of 300 numbers each, less three of its state
-    >>> print(jr.identify.cross_validate(lambda x: jr.identify.fit(body, x), trials).round())
+    >>> trials = [
+    ...     jr.identify.Rates(record.times[x], record.omegas[x], record.sigma)
+    ...     for x in parts]
+    >>> squares = jr.identify.cross_validate(
+    ...     lambda trials: jr.identify.fit(body, trials), trials)
+    >>> print(squares.round())  # of 300 numbers each, less three of its state
     [293. 300. 307.]
     """
     groups = [x if isinstance(x, list) else [x] for x in trials]
     demand(
         len(groups) > 1,
-        f"Argument `trials` must hold two trials or groups at least, but it holds {len(groups)}.",
+        "Argument `trials` must hold two trials or groups at least, but it holds "
+        f"{len(groups)}.",
     )
-    others = ([*chain(*groups[:i], *groups[i + 1 :])] for i in range(len(groups)))
-    fits = map(refit, map(fit_function, others), groups)
-    return jnp.stack([x.chi_square for x in fits])
+    squares = []
+    for i, group in enumerate(groups):
+        others = [*chain(*groups[:i], *groups[i + 1 :])]
+        squares.append(refit(fit_function(others), group).chi_square)
+    return jnp.stack(squares)

@@ -1,7 +1,8 @@
-"""What a planned record would tell, the likelihood along a line, and residuals for other losses."""
+"""What a planned record would determine, profile likelihoods and residuals."""
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -15,7 +16,7 @@ from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import INERTIA, check_shape, check_type, demand, nan_where
 from jrigid._numerics import or_one, product
-from jrigid._types import Readable, Real
+from jrigid._types import AnyArray, Matrix, Readable, Real, Scalar
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify import _problem as problems
@@ -28,22 +29,27 @@ from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
 from jrigid.identify._minimise import FIRST_DAMPING, STEPS, Minimum, Settings
 from jrigid.identify._quality import Fit
-from jrigid.identify._records import Samples, of_trials, samples_of
+from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.identify._result import FitResult, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
-from jrigid.identify._smoother import Point, Rows
+from jrigid.identify._smoother import Links, Point, Rows
 from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
 
+# Second moments of the mass, of their trace, below which a planned body counts as flat.
+_FLATTEST = 1e-9
+# Standard errors by which a profile may miss the value at which it holds a function.
+_HELD_TO = 1e-3
+
 
 class Bound(NamedTuple):
-    """The least errors a planned record allows, by Cramer and Rao.
+    """The smallest errors that a planned record allows, by Cramer and Rao.
 
     Attributes:
-        covariance: Of the numbers sought and the states, as in `FitResult`; very large
-            numbers where the record tells nothing.
-        ratios_covariance: Of I2/I1 and I3/I1.
+        covariance: Covariance of the unknowns and the states, as in `FitResult`. It is
+            very large where the record determines nothing.
+        ratios_covariance: Covariance of I2/I1 and I3/I1.
     """
 
     covariance: Float[Array, "all all"]
@@ -51,31 +57,33 @@ class Bound(NamedTuple):
 
 
 class Plan(Readable):
-    """A record before it is taken: what it would tell, with derivatives in all that is planned.
+    """An experiment that has not been made: a body, a state and times.
 
-    Made within a function of the rate, the times, a wheel's samples, it can be improved
-    by descent: see `optimal_trial`.
+    A plan states what a record would determine, with derivatives in all that is
+    planned. A plan that is made within a function of the rates, the times or the
+    samples of a rotor can be improved by gradients: see `optimal_trial`.
 
     Attributes:
-        system: The body as it is thought to be.
+        system: The body as it is assumed to be.
         state: State at `t0`, of one trial, or with an axis of trials in front.
-        observations: When and how well it will be observed, as for `fit`; values play
-            no role and may be None.
-        t0: Time of the state [s], or of that of each trial; under a torque not later
-            than the first observation, or all is NaN.
-        free: What is sought beside the inertia, as for `fit`; nothing of each trial.
+        observations: When and how precisely the body will be observed, as for `fit`.
+            The values have no effect and may be None.
+        t0: Time of the state [s], or of that of each trial. Under a torque it must not
+            be later than the first observation, or all results are NaN.
+        free: What is sought beside the inertia, as for `fit`, but nothing by `each`.
         scale: "trace", "known" or "rotor".
         inertia_model: What is known of the tensor.
 
     Raises:
-        ValueError: A request that no record could answer, or noise that is not stated.
+        ValueError: No record could answer the request, or the noise is not stated.
 
-    Gradients: of `information` and `bound` in the state, the times and the noise, of
-    the bound where the record tells all that is sought; in the tensor they are not to
-    be relied on. Under a torque in forward mode.
+    Gradients: of `information` and `bound` in the state, the times and the noise. Those
+    of the bound exist where the record determines all that is sought. Gradients in the
+    tensor are not reliable. Under a torque only forward mode works.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
-    >>> body, ts = jr.RigidBody(jnp.array([1.0, 1.7, 2.3])), jnp.linspace(0.0, 20.0, 100)
+    >>> body = jr.RigidBody(jnp.array([1.0, 1.7, 2.3]))
+    >>> ts = jnp.linspace(0.0, 20.0, 100)
     >>> def error(omega):
     ...     start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
     ...     plan = jr.identify.Plan(body, start, jr.identify.Rates(ts, None, 0.01))
@@ -103,239 +111,297 @@ class Plan(Readable):
         scale: str = "trace",
         inertia_model: AbstractInertiaModel | None = None,
     ):
-        """A body, its state at `t0`, and what will be seen of it."""
+        """Plan to observe a body from its state at `t0`."""
         check_type("system", system, RigidBody)
         check_type("state", state, State)
         check_shape("inertia", system.inertia, *INERTIA)
-        inertia_model, records = (
-            Tensor() if inertia_model is None else inertia_model,
-            of_trials(observations),
-        )
+        inertia_model = Tensor() if inertia_model is None else inertia_model
+        records = of_trials(observations)
         check_type("inertia_model", inertia_model, AbstractInertiaModel)
         refuse(system, records, scale, inertia_model)
         demand(
             all(x.states_noise for x in records),
-            "Argument `observations` must state the noise (`sigma` or `covariance`), but it does "
-            "not.",
+            "Argument `observations` must state the noise (`sigma` or `covariance`), "
+            "but it does not.",
         )
-        self.system, self.state, self.observations = system, state, observations
+        self.system = system
+        self.state = state
+        self.observations = observations
         self.t0 = jnp.asarray(t0, records[0].ts.dtype)
-        self.free, self.scale, self.inertia_model = free, scale, inertia_model
+        self.free = free
+        self.scale = scale
+        self.inertia_model = inertia_model
 
     @property
     @quick_jit
     def information(self) -> Float[Array, "all all"]:
-        """Fisher information about all numbers that are sought, and the states.
+        """Fisher information about all unknowns and the states at `t0`.
 
-        These are at `t0`, of each trial the rate and, if it matters, a small turn.
+        The state of each trial counts by its rates and, if it has an effect, a small
+        turn of its attitude.
         """
-        jacobian = _jacobian(_planned(self)[1].rows)
+        jacobian = _jacobian(_planned(self).minimum.rows)
         return product("ri,rj->ij", jacobian, jacobian)
 
     @property
     @quick_jit
     def bound(self) -> Bound:
-        """The least errors: the inverse of the information."""
-        problem, found, _ = _planned(self)
-        # From the derivatives themselves: their squares lose digits.
-        jacobian, numbers = _jacobian(found.rows), found.point.numbers
-        size = or_one(
-            jax.lax.stop_gradient(jnp.sqrt(jnp.sum(jacobian * jacobian, axis=0)))
-        )
-        # Where nothing is told the last rows keep the bound finite, and very large.
-        eye = jnp.eye(size.size, dtype=jacobian.dtype)
-        floor = 64 * jnp.finfo(eye.dtype).eps * eye
-        _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
-        half = jax.scipy.linalg.solve_triangular(r, eye) / size[:, None]
+        """The smallest errors: the inverse of the information."""
+        planned = _planned(self)
+        unknowns = planned.problem.unknowns
+        numbers = planned.minimum.point.numbers
+        root = _inverse_root(_jacobian(planned.minimum.rows))
 
         def ratios(numbers: Array) -> Array:
-            moments = jnp.linalg.eigvalsh(problem.unknowns.inertia(numbers))
+            moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
             return moments[1:] / moments[0]
 
-        of_ratios = product(
-            "ij,jk->ik", jax.jacfwd(ratios)(numbers), half[: numbers.size]
+        slopes = jax.jacfwd(ratios)(numbers)
+        of_ratios = product("ij,jk->ik", slopes, root[: numbers.size])
+        return Bound(
+            covariance=product("ij,kj->ik", root, root),
+            ratios_covariance=product("ij,kj->ik", of_ratios, of_ratios),
         )
-        return Bound(*(product("ij,kj->ik", x, x) for x in (half, of_ratios)))
 
     @property
     def predicted(self) -> FitResult:
-        """A result before there is a record, of chi-square 0; no gradients, outside of jit.
+        """The expected result of a fit, with a chi-square of 0.
 
-        Its errors are those of `bound`, its `status` says whether all that is sought is
-        told, and `null_directions` what is not, in words.
+        Its errors are those of `bound`. Its `status` states whether the record
+        determines all that is sought, and `null_directions` names what it does not
+        determine. It has no gradients and cannot be used under `jit`.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)
-        >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 1.0]))
+        >>> omega = jnp.array([0.5, 0.0, 1.0])
+        >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
         >>> top = jr.RigidBody(jnp.array([1.0, 1.0, 1.7]))
-        >>> plan = jr.identify.Plan(top, start, record, free=lambda body, gyro: gyro.scale)
+        >>> plan = jr.identify.Plan(
+        ...     top, start, record, free=lambda body, gyro: gyro.scale)
         >>> print(plan.predicted.null_directions)
         ('overall scale', 'I3/I1 against gyro scale')
         """
-        problem, minimum, layout = jtu.tree_map(np.asarray, _planned_once(self))
-        # Rounding alone is left of residuals; NaN stays, where there is no motion.
+        planned = jtu.tree_map(np.asarray, _planned_once(self))
+        minimum = planned.minimum
+        samples = planned.problem.samples
+        # Residuals are rounding errors only. NaN stays, where there is no motion.
         rows = minimum.rows._replace(residual=0 * minimum.rows.residual)
-        minimum = minimum._replace(rows=rows)
-        dtype, samples = layout.ts.dtype, problem.samples
-        kept, scales = samples.seen.astype(dtype), np.ones(len(samples.values), dtype)
-        none = no_disturbance(kept.shape[0], dtype)
-        found = Fit(minimum, layout, kept, scales, none, None, np.zeros(0, dtype))
+        dtype = planned.layout.ts.dtype
+        kept = samples.seen.astype(dtype)
+        fit = Fit(
+            minimum=minimum._replace(rows=rows),
+            layout=planned.layout,
+            kept=kept,
+            scales=np.ones(len(samples.values), dtype),
+            disturbance=no_disturbance(kept.shape[0], dtype),
+            torque=None,
+            history=np.zeros(0, dtype),
+        )
         lengths = [x.shape[1] for x in samples.values]
-        return result_of(conclude(problem, found, lengths))
+        return result_of(conclude(planned.problem, fit, lengths))
 
 
-def _planned(plan: Plan) -> tuple[problems.Problem, Minimum, Layout]:
-    """Derivatives of a record that is what the body and the state say."""
-    system, state, inertia_model = plan.system, plan.state, plan.inertia_model
+class _Planned(NamedTuple):
+    """A fit of a record that agrees exactly with a plan."""
+
+    problem: problems.Problem
+    minimum: Minimum
+    layout: Layout
+
+
+def _unknowns(
+    plan: Plan, records: tuple[Record, ...], samples: Samples
+) -> tuple[Unknowns, AnyArray]:
+    """What a plan seeks, and its numbers for the assumed tensor."""
+    trials, _ = samples.ts.shape
+    dtype = samples.ts.dtype
+    model = plan.inertia_model
+    unknowns = unknowns_of(
+        (plan.system,),
+        tuple(x.sensor for x in records),
+        sizes_of(samples),
+        plan.free,
+        model,
+        plan.scale != "trace" and not model.absolute,
+        typical_rate(None, plan.state, dtype),
+        trials,
+    )
+    demand(
+        not any(x.own for x in unknowns.sought) and not unknowns.groups,
+        "Argument `free` must pick nothing of `each` trial, but it does.",
+    )
+    inertia = as_tensor(plan.system.inertia.astype(dtype))
+    return unknowns.start(inertia, _FLATTEST)
+
+
+def _first_point(state: State, numbers: AnyArray, own: AnyArray) -> Point:
+    """Numbers and the state of each trial, whose first sample is its only node."""
+    trials = own.shape[0]
+    dtype = own.dtype
+    attitude = jnp.broadcast_to(state.attitude.astype(dtype), (trials, 4))[:, None]
+    omega = jnp.broadcast_to(state.omega.astype(dtype), (trials, 3))[:, None]
+    return Point(numbers, own, attitude, omega, omega[..., :0])
+
+
+def _planned(plan: Plan) -> _Planned:
+    """Derivatives of a record that agrees exactly with a plan."""
+    system = plan.system
     records = of_trials(plan.observations)
     records = tuple(x.with_values(jnp.ones_like(x.values)) for x in records)
     one = jnp.ones((), records[0].ts.dtype)
-    samples, sensors = samples_of(records, one), tuple(x.sensor for x in records)
-    (trials, _), dtype = samples.ts.shape, samples.ts.dtype
-    sizes, rate = sizes_of(samples), typical_rate(None, state, dtype)
-    scaled = plan.scale != "trace" and not inertia_model.absolute
-    unknowns = unknowns_of(
-        (system,), sensors, sizes, plan.free, inertia_model, scaled, rate, trials
-    )
-    shared = not any(x.own for x in unknowns.sought) and not unknowns.groups
-    demand(shared, "Argument `free` must pick nothing of `each` trial, but it does.")
-    unknowns, numbers = unknowns.start(as_tensor(system.inertia.astype(dtype)), 1e-9)
-    attitude = jnp.broadcast_to(state.attitude.astype(dtype), (trials, 4))[:, None]
-    omega = jnp.broadcast_to(state.omega.astype(dtype), (trials, 3))[:, None]
-    point = Point(
-        numbers, unknowns.own_start(trials, dtype), attitude, omega, omega[..., :0]
-    )
-    depends_on_attitude = any(x.depends_on_attitude for x in sensors) or needs_attitude(
-        system
-    )
-    options, layout = (
-        problems.Options(system.is_free, depends_on_attitude),
-        whole(samples, 1, plan.t0),
-    )
+    samples = samples_of(records, one)
+    trials, _ = samples.ts.shape
+    dtype = samples.ts.dtype
+    unknowns, numbers = _unknowns(plan, records, samples)
+    point = _first_point(plan.state, numbers, unknowns.own_start(trials, dtype))
+    by_sensor = any(x.sensor.depends_on_attitude for x in records)
+    options = problems.Options(system.is_free, by_sensor or needs_attitude(system))
+    layout = whole(samples, 1, plan.t0)
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
-    # Values as they would be seen: a residual of zero.
-    seen = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
-    records = [x.with_values(y) for x, y in zip(records, seen, strict=True)]
+    # Readings equal to the predictions, so that the residuals are zero. They are data:
+    # derivatives of a plan do not go through them.
+    values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
+    records = [x.with_values(y) for x, y in zip(records, values, strict=True)]
     problem = dataclasses.replace(problem, samples=samples_of(records, one))
     rows, links = problems.evaluation(problem, layout)(point)
-    if not system.is_free:  # which is followed forward only
+    if not system.is_free:
+        # `simulate` cannot go back from `t0` to an earlier sample.
         first = first_and_last(samples.ts, samples.seen)[0]
         rows = nan_where(jnp.any(layout.start > first[:, None]), rows)
-    prior = problem.known - problem.held
-    weight = jnp.pad(
-        samples.seen.astype(dtype), ((0, 0), (0, prior)), constant_values=1
-    )
-    none = jnp.zeros((), dtype)
-    minimum = Minimum(
-        point=point,
-        rows=rows,
-        links=links,
-        weight=jnp.pad(weight, ((0, 0), (0, problem.held))),
-        kicks=none,
-        square=none,
-        settled=jnp.asarray(True),
-        steps=jnp.asarray(0),
-        history=none[None],
-        damping=none,
-        tensor=unknowns.inertia(numbers),
-        units=unknowns.natural_units(numbers),
-    )
-    return problem, minimum, layout
+    minimum = _minimum_at(problem, point, rows, links)
+    return _Planned(problem, minimum, layout)
 
 
 _planned_once = quick_jit(_planned)
 
 
+def _minimum_at(
+    problem: problems.Problem, point: Point, rows: Rows, links: Links
+) -> Minimum:
+    """A search that ended at a point without taking a step."""
+    dtype = problem.samples.ts.dtype
+    # After the samples come rows of priors, and rows that hold a fit near its start.
+    priors = problem.known - problem.held
+    weight = problem.samples.seen.astype(dtype)
+    weight = jnp.pad(weight, ((0, 0), (0, priors)), constant_values=1)
+    weight = jnp.pad(weight, ((0, 0), (0, problem.held)))
+    zero = jnp.zeros((), dtype)
+    return Minimum(
+        point=point,
+        rows=rows,
+        links=links,
+        weight=weight,
+        kicks=zero,
+        square=zero,
+        settled=jnp.asarray(True),
+        steps=jnp.asarray(0),
+        history=zero[None],
+        damping=zero,
+        tensor=problem.unknowns.inertia(point.numbers),
+        units=problem.unknowns.natural_units(point.numbers),
+    )
+
+
 def _jacobian(rows: Rows) -> Array:
-    """Of all residuals in the numbers and in each trial's state."""
+    """Derivatives of all residuals in the numbers and in the state of each trial."""
     trials, samples, width = rows.residual.shape
     count = samples * width
-    locals_ = rows.of_state.shape[-1]
-    jg = rows.of_border.reshape(trials, count, rows.of_border.shape[-1])
-    jl = rows.of_state.reshape(trials, count, locals_)
-    eye = jnp.eye(trials, dtype=jl.dtype)
-    apart = (eye[:, None, :, None] * jl[:, :, None, :]).reshape(
-        trials * count, trials * locals_
-    )
-    return jnp.concatenate([jg.reshape(trials * count, jg.shape[-1]), apart], axis=1)
+    states = rows.of_state.shape[-1]
+    of_numbers = rows.of_border.reshape(trials, count, rows.of_border.shape[-1])
+    of_state = rows.of_state.reshape(trials, count, states)
+    # Residuals of a trial depend on its own state alone.
+    eye = jnp.eye(trials, dtype=of_state.dtype)
+    blocks = eye[:, None, :, None] * of_state[:, :, None, :]
+    columns = [
+        of_numbers.reshape(trials * count, of_numbers.shape[-1]),
+        blocks.reshape(trials * count, trials * states),
+    ]
+    return jnp.concatenate(columns, axis=1)
+
+
+def _inverse_root(jacobian: Array) -> Array:
+    """A matrix R with R R^T the inverse of J^T J.
+
+    It is computed from the derivatives themselves, because their squares lose digits.
+    """
+    square = jnp.sum(jacobian * jacobian, axis=0)
+    size = or_one(jax.lax.stop_gradient(jnp.sqrt(square)))
+    # Where nothing is determined the last rows keep the result finite, and very large.
+    eye = jnp.eye(size.size, dtype=jacobian.dtype)
+    floor = 64 * jnp.finfo(eye.dtype).eps * eye
+    _, r = jnp.linalg.qr(jnp.concatenate([jacobian / size[None, :], floor]))
+    return jax.scipy.linalg.solve_triangular(r, eye) / size[:, None]
 
 
 def profile(
     result: FitResult,
-    function: Callable[[Array], Array],
+    function: Callable[[Matrix], Scalar],
     values: Real[_ArrayLike, " n"],
 ) -> Float[Array, " n"]:
-    """Profile likelihood: how chi-square grows as a function of the tensor is held at values.
+    """Return the growth of chi-square as a function of the tensor is held at values.
 
-    Errors that are not symmetric, and bounds that the quadratic form at the best fit
-    misses, show
-    here: the interval in which the growth is below 1 holds 68 %, that below 3.84 95 %.
+    This is the profile likelihood. It shows asymmetric errors and bounds, which the
+    quadratic form at the minimum does not. The interval in which the growth is below 1
+    contains the true value in 68 % of all cases, that below 3.84 in 95 %.
 
     Args:
         result: A fit (not vmapped).
-        function: Inertia tensor to scalar; define it once.
-        values: What it is held at.
+        function: Function of the inertia tensor that returns a scalar. Define it once,
+            since each new function object is compiled.
+        values: Values at which it is held.
 
     Returns:
         Growth of chi-square, in units of the noise; NaN where no fit was found.
 
     Raises:
-        ValueError: A fit with an unmodelled torque.
+        ValueError: The fit has an unmodelled torque.
 
-    Gradients: none to be relied on.
+    Gradients: not reliable.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
-    >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-    >>> largest = lambda inertia: jnp.linalg.eigvalsh(inertia)[2] / jnp.trace(inertia)
-    >>> best, error = found.moments[2] / 3, found.moments_covariance[2, 2] ** 0.5 / 3
-    >>> growth = jr.identify.profile(found, largest, best + error * jnp.array([-1.0, 0.0, 1.0]))
-    >>> print(growth.round(1) + 0)
+    >>> result = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+    >>> def largest_share(inertia):
+    ...     return jnp.linalg.eigvalsh(inertia)[2] / jnp.trace(inertia)
+    >>> best = result.moments[2] / 3
+    >>> error = result.moments_covariance[2, 2] ** 0.5 / 3
+    >>> values = best + error * jnp.array([-1.0, 0.0, 1.0])
+    >>> print(jr.identify.profile(result, largest_share, values).round(1) + 0)
     [1. 0. 1.]
     """
     values = jnp.asarray(values, result.numbers.dtype)
     check_shape("values", values, (None,))
-    text = "Argument `result` must be of a fit without an unmodelled torque, but it is not."
-    demand(not result.problem.options.dense, text)
+    demand(
+        not result.problem.options.dense,
+        "Argument `result` must be of a fit without an unmodelled torque, but it is "
+        "not.",
+    )
     return _profile(result, function, values)
 
 
 @program
-def _held_on(unknowns: Unknowns, numbers: Array, function: Static) -> Array:
-    """The slope of a function of the tensor in the numbers."""
+def _slope(unknowns: Unknowns, numbers: Array, function: Static) -> Array:
+    """Derivative of a function of the tensor in the numbers."""
     return jax.grad(lambda x: function.value(unknowns.inertia(x)))(numbers)
 
 
 class _Held(eqx.Module):
     """Holds a function of the tensor at a value: a residual that is zero there."""
 
-    function: Callable[[Array], Array] = eqx.field(static=True)
-    value: Any
-    unit: Any
+    function: Callable[[Matrix], Scalar] = eqx.field(static=True)
+    value: AnyArray
+    unit: AnyArray
 
     def __call__(self, unknowns: Unknowns, numbers: Array) -> Array:
         return (self.function(unknowns.inertia(numbers)) - self.value) / self.unit
 
 
-def _profile(
-    result: FitResult, function: Callable[[Array], Array], values: Array
-) -> Array:
-    """Fit anew at each value, all of them side by side."""
-    options = result.problem.options._replace(
-        shooting=False, unmodelled="none", nodes=1
-    )
-    result = jtu.tree_map(np.asarray, result)
-    problem = dataclasses.replace(result.problem, options=options)
-    unknowns, numbers, dtype = result.unknowns, result.numbers, result.numbers.dtype
-    slope = np.asarray(_held_on(unknowns, numbers, Static(function)))
-    unit = 1e-3 * np.sqrt(
-        slope @ result.numbers_covariance @ slope / result.diagnostics.inflation
-    )
-    single = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
-    states = result.state.attitude[:, None], result.state.omega[:, None]
+def _profile_settings(result: FitResult) -> Settings:
+    """Settings of a minimisation that begins at a fit."""
+    dtype = result.numbers.dtype
     one = np.ones((), dtype)
-    settings = Settings(
+    return Settings(
         kept=result.kept.astype(dtype),
         scales=result.diagnostics.scales,
         disturbance=no_disturbance(result.kept.shape[0], dtype),
@@ -346,18 +412,54 @@ def _profile(
         steps=np.asarray(STEPS),
         damping=FIRST_DAMPING * one,
     )
-    point = Point(numbers, result.own_numbers, *states, states[1][..., :0])
 
-    def request(value: Any) -> Request:
-        hold = _Held(function, value.astype(dtype), unit.astype(dtype))
-        held = dataclasses.replace(problem, unknowns=unknowns.holding(hold))
-        return Request(held, single, point, settings)
 
+def _profile(
+    result: FitResult, function: Callable[[Matrix], Scalar], values: Array
+) -> Array:
+    """Fit again with the function held at each value, all values in one batch."""
+    result = jtu.tree_map(np.asarray, result)
+    dtype = result.numbers.dtype
+    unknowns = result.unknowns
+    inflation = result.diagnostics.inflation
+    options = result.problem.options._replace(
+        shooting=False, unmodelled="none", nodes=1
+    )
+    problem = dataclasses.replace(result.problem, options=options)
+    slope = np.asarray(_slope(unknowns, result.numbers, Static(function)))
+    variance = slope @ result.numbers_covariance @ slope / inflation
+    # In this unit the residual that holds the function outweighs the record.
+    unit = (_HELD_TO * np.sqrt(variance)).astype(dtype)
+    layout = jtu.tree_map(np.asarray, whole(problem.samples, 1, result.t0))
+    attitude = result.state.attitude[:, None]
+    omega = result.state.omega[:, None]
+    point = Point(result.numbers, result.own_numbers, attitude, omega, omega[..., :0])
+    settings = _profile_settings(result)
+
+    def request(value: AnyArray) -> Request:
+        held = unknowns.holding(_Held(function, value.astype(dtype), unit))
+        at_value = dataclasses.replace(problem, unknowns=held)
+        return Request(at_value, layout, point, settings)
+
+    requests = [request(x) for x in np.asarray(values)]
     growth = []
-    for found in minima([request(x) for x in np.asarray(values)], len(values)):
-        more = (found.square - result.chi_square) / result.diagnostics.inflation
-        growth.append(more if found.settled else np.nan)
+    for minimum in minima(requests, len(requests)):
+        added = (minimum.square - result.chi_square) / inflation
+        growth.append(added if minimum.settled else np.nan)
     return jnp.asarray(np.asarray(growth, dtype))
+
+
+def _motion(
+    adjoint: diffrax.AbstractAdjoint | None,
+    system: RigidBody,
+    state: State,
+    ts: Array,
+    t0: Array,
+) -> State:
+    """States of a motion, exact where it is free."""
+    if system.is_free:
+        return free_rotation(system.inertia, state, ts, t0=t0).states
+    return simulate(system, state, ts, t0=t0, adjoint=adjoint).states
 
 
 def residuals(
@@ -368,22 +470,22 @@ def residuals(
     t0: Real[_ArrayLike, "*trials"] = 0.0,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Float[Array, "trials rows"]:
-    """Whitened residuals of a motion, for a loss or an optimiser of one's own (optax, say).
+    """Return whitened residuals of a motion, for a custom loss or optimiser.
 
     Args:
         system: The body.
         state: Its state at `t0`, of one trial, or with an axis of trials in front.
         observations: As for `fit`.
-        t0: Time of the state [s], or of that of each trial: `found.t0` for that of a
-            fit. Under a torque not later than the first sample.
-        adjoint: For `jrigid.simulate`, if there is a torque.
+        t0: Time of the state [s], or of that of each trial. For the state of a fit it
+            is `result.t0`. Under a torque it must not be later than the first sample.
+        adjoint: Passed to `jrigid.simulate`, which computes a motion under a torque.
 
     Returns:
-        Predicted less observed, in units of the noise where that is stated; zero where
-        nothing was seen.
+        Predicted less observed, in units of the noise where that is stated. A residual
+        is zero where nothing was observed.
 
     Raises:
-        RuntimeError: What `free_rotation` or `simulate` raises.
+        RuntimeError: `free_rotation` or `simulate` fails.
 
     Gradients: those of the motion, in every mode that `free_rotation` or `simulate`
         has.
@@ -393,30 +495,29 @@ def residuals(
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
     >>> def loss(moments, omega):
     ...     state = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), omega)
-    ...     return jnp.mean(jr.identify.residuals(jr.RigidBody(moments), state, readings) ** 2)
+    ...     rows = jr.identify.residuals(jr.RigidBody(moments), state, readings)
+    ...     return jnp.mean(rows**2)
     >>> print(loss(record.true_moments, jnp.array([0.3, 3.0, 0.4])).round(2))
     1.0
     """
     check_type("system", system, RigidBody)
     check_type("state", state, State)
     records = of_trials(observations)
-    guess = jnp.ones((), records[0].values.dtype)
-    samples, sensors = samples_of(records, guess), [x.sensor for x in records]
-    trials, begin = samples.ts.shape[0], jnp.asarray(t0, samples.ts.dtype)
-    shapes = (state.attitude, (4,)), (state.omega, (3,)), (begin, ())
-    q, w, begin = (jnp.broadcast_to(x, (trials, *shape)) for x, shape in shapes)
+    sensors = [x.sensor for x in records]
+    # Where no noise is stated the residuals are in units of the readings.
+    samples = samples_of(records, jnp.ones((), records[0].values.dtype))
+    trials = samples.ts.shape[0]
+    times = jnp.asarray(t0, samples.ts.dtype)
+    attitude = jnp.broadcast_to(state.attitude, (trials, 4))
+    omega = jnp.broadcast_to(state.omega, (trials, 3))
+    times = jnp.broadcast_to(times, (trials,))
+    options = problems.Options(
+        free_motion=False, depends_on_attitude=True, motion=partial(_motion, adjoint)
+    )
 
-    def motion(system: Any, start: State, ts: Array, t0: Array) -> State:
-        if system.is_free:
-            return free_rotation(system.inertia, start, ts, t0=t0).states
-        return simulate(system, start, ts, t0=t0, adjoint=adjoint).states
-
-    options = problems.Options(False, True, motion=motion)
-
-    def trial(q: Array, w: Array, begin: Array, samples: Samples) -> Array:
-        values = problems.shown_by(
-            options, system, sensors, State(q, w), begin, samples
-        )
+    def of_trial(q: Array, w: Array, t0: Array, samples: Samples) -> Array:
+        state = State(q, w)
+        values = problems.shown_by(options, system, sensors, state, t0, samples)
         return problems.whitened(sensors, samples, values).reshape(-1)
 
-    return jax.vmap(trial)(q, w, begin, samples)
+    return jax.vmap(of_trial)(attitude, omega, times, samples)

@@ -1,9 +1,9 @@
-"""What is known of a tensor beforehand: inertia models, each with its unknown numbers."""
-# ruff: noqa: ARG002 (all take what one of them needs)
+"""Inertia models: what is known of a tensor before a fit, and the unknown numbers."""
+# ruff: noqa: ARG002 (each model has the arguments that some models need)
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,35 +18,40 @@ from jrigid.identify._host import cholesky, principal_axes
 from jrigid.mass import MassProperties, inertia_of_second_moment
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
-# Second moments of the mass, of their trace, below which a fit has run into a boundary.
+# Second moments of the mass, over their trace, below which a fit is at a boundary.
 BOUNDARY = 1e-7
 
 
 def as_tensor(inertia: AnyArray) -> AnyArray:
-    """A tensor, of moments or itself."""
+    """The tensor of principal moments, or the tensor itself."""
     return inertia.__array_namespace__().diag(inertia) if inertia.ndim == 1 else inertia
 
 
 def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:
-    """The nearest shape of a body with extent in three directions: second moments of trace 1."""
+    """Second moments of trace 1 of the nearest body with extent in three directions.
+
+    Args:
+        tensor: Inertia tensor.
+        flattest: Least second moment.
+    """
     xp = tensor.__array_namespace__()
-    # Second moments are tr(I) / 2 - I, of half the trace of I.
-    values, axes = principal_axes(
-        xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor)
-    )
+    # The second moments are tr(I) / 2 - I. Their trace is half that of I.
+    second = xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor)
+    values, axes = principal_axes(second)
     values = xp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / xp.sum(values), axes)
 
 
 class AbstractInertiaModel(Readable):
-    """What is known of a tensor: a few numbers without bounds, and the tensor that they make.
+    """A tensor as a function of a few unbounded numbers.
 
-    A subclass says how many numbers there are, where to start and what tensor they make. With
-    `absolute` that tensor is the body's, [kg m^2]; otherwise its trace does not matter, and `fit`
-    sets it.
+    A subclass defines the names of the numbers, their initial values and the tensor. If
+    `absolute` is True that is the tensor of the body [kg m^2]. Otherwise its trace has
+    no effect, and `fit` sets it.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> class Ballast(jr.identify.AbstractInertiaModel):  # an unknown mass at a known place
+    >>> class Ballast(jr.identify.AbstractInertiaModel):
+    ...     # A body with an unknown mass at a known place.
     ...     empty: jnp.ndarray
     ...     place: jnp.ndarray
     ...     absolute = True
@@ -56,7 +61,8 @@ class AbstractInertiaModel(Readable):
     ...         return self, jnp.zeros(1)
     ...
     ...     def inertia(self, numbers):
-    ...         return self.empty + jr.inertia_tensor(jnp.exp(numbers), self.place[None])
+    ...         masses = jnp.exp(numbers)
+    ...         return self.empty + jr.inertia_tensor(masses, self.place[None])
     >>> loaded = Ballast(jnp.eye(3), jnp.array([0.1, 0.0, 0.0])).inertia(jnp.zeros(1))
     >>> print(jnp.diagonal(loaded))
     [1.   1.01 1.01]
@@ -68,41 +74,39 @@ class AbstractInertiaModel(Readable):
     @abc.abstractmethod
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
-    ) -> tuple[Any, AnyArray]:
-        """The model, in a frame chosen for a tensor, and its numbers there.
+    ) -> tuple["AbstractInertiaModel", AnyArray]:
+        """Choose a frame for a tensor; return the model in it and the initial numbers.
 
         Args:
-            tensor: Where to start: of numpy in a fit, of JAX in a plan. `tensor.
-                __array_namespace__()` is the module whose functions serve both.
-            known: The system's own tensor, which may be known in part.
-            flattest: Least second moment of the mass, of the trace of the three.
+            tensor: Initial tensor, a numpy array in a fit and a JAX array in a plan.
+                The functions of `tensor.__array_namespace__()` work for both.
+            known: Tensor of the system, which may be known in part.
+            flattest: Least second moment of the mass, over the trace of the three.
         """
 
     @abc.abstractmethod
     def inertia(self, numbers: Array) -> Array:
-        """The tensor."""
+        """Tensor that the numbers describe."""
 
     def units(self) -> Array:
-        """Sizes of the numbers in which an error is large or small."""
+        """Natural units of the numbers: sizes at which an error counts as large."""
         return jnp.ones(len(self.names))
 
     def body(self, numbers: Array) -> MassProperties | None:
-        """The body about its fixed point, of a model that determines the mass and where it is."""
+        """Body about its fixed point; None for a model of the tensor alone."""
         return None
 
 
 def _names(count: int) -> tuple[str, ...]:
-    return (
-        tuple(f"inertia[{i}]" for i in range(count))
-        if count > 1
-        else ("inertia",) * count
-    )
+    """Names of several numbers of a tensor."""
+    return tuple(f"inertia[{i}]" for i in range(count))
 
 
 class Tensor(AbstractInertiaModel):
-    """Nothing is known: any real body, by five numbers.
+    """Any real body, by five numbers.
 
-    The second moments of the mass are L L^T with L11 = 1: log L22, log L33, L21, L31, L32.
+    The second moments of the mass are L L^T with L11 = 1. The numbers are log L22,
+    log L33, L21, L31 and L32.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.identify.Tensor().inertia(jnp.array([0.0, 0.0, 0.5, 0.0, 0.0])))
@@ -116,62 +120,72 @@ class Tensor(AbstractInertiaModel):
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Tensor", AnyArray]:
-        """The numbers of the nearest real body."""
+        """Return the numbers of the nearest real body."""
         xp = tensor.__array_namespace__()
         sigma = real_body(tensor, flattest)
         lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
-        return self, xp.concatenate(
-            [xp.log(xp.diagonal(lower)[1:]), lower[_parameters.SIDES]]
-        )
+        logarithms = xp.log(xp.diagonal(lower)[1:])
+        return self, xp.concatenate([logarithms, lower[_parameters.SIDES]])
 
     def inertia(self, numbers: Array) -> Array:
-        """The tensor, of whatever trace."""
-        return inertia_of_second_moment(
-            _parameters.squared(jnp.exp(jnp.pad(numbers[:2], (1, 0))), numbers[2:])
-        )
+        """Tensor of an arbitrary trace."""
+        diagonal = jnp.exp(jnp.pad(numbers[:2], (1, 0)))
+        second = _parameters.squared(diagonal, numbers[2:])
+        return inertia_of_second_moment(second)
 
 
 class _InFrame(AbstractInertiaModel):
-    """A model in axes of its own."""
+    """A model whose numbers describe second moments in a frame of its own.
+
+    Attributes:
+        frame: Its axes, as columns. `start` chooses them; None means the body axes.
+    """
 
     frame: AnyMatrix | None = None
 
     def sigma(self, numbers: Array) -> Array:
-        """Second moments in the frame, of whatever trace: by default of its axes, the last ones."""
+        """Second moments in the frame, by default with logarithms as the numbers."""
         return jnp.diag(jnp.exp(jnp.pad(numbers, (3 - numbers.size, 0))))
 
     def inertia(self, numbers: Array) -> Array:
-        """The tensor, of whatever trace."""
+        """Tensor of an arbitrary trace."""
         frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
-        return inertia_of_second_moment(
-            product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
-        )
+        second = product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
+        return inertia_of_second_moment(second)
 
 
 class Moments(_InFrame):
-    """The principal axes are known, those of the system's tensor: two numbers."""
+    """A body whose principal axes are those of the system's tensor, by two numbers.
+
+    The numbers are logarithms of ratios of second moments.
+    """
 
     names: ClassVar[tuple[str, ...]] = _names(2)
 
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Moments", AnyArray]:
-        """Logarithms of ratios of second moments, in the system's axes."""
+        """Return the numbers of the nearest real body."""
         xp = tensor.__array_namespace__()
         eye = xp.eye(3, dtype=tensor.dtype)
-        frame = xp.where(xp.all(known * (1 - eye) == 0), eye, principal_axes(known)[1])
+        # Axes of a diagonal tensor stay in the order of the body axes.
+        is_diagonal = xp.all(known * (1 - eye) == 0)
+        frame = xp.where(is_diagonal, eye, principal_axes(known)[1])
         values = product("ki,kl,li->i", frame, real_body(tensor, flattest), frame)
         return Moments(frame), xp.log(values[1:] / values[0])
 
 
 class Symmetric(_InFrame):
-    """Two moments are equal, about an axis that is sought: three numbers.
+    """A body with two equal moments about an unknown axis, by three numbers.
 
-    The logarithm of the odd second moment over the others, and where axis 3 of the frame turns to.
+    The first number is the logarithm of the second moment along the axis of symmetry
+    over the other two. The others are the direction of that axis, (x, y, 1) in the
+    frame.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> model = jr.identify.Symmetric(jnp.eye(3))
-    >>> print(jnp.linalg.eigvalsh(model.inertia(jnp.array([jnp.log(2.0), 0.1, -0.2]))).round(6))
+    >>> inertia = model.inertia(jnp.array([jnp.log(2.0), 0.1, -0.2]))
+    >>> print(jnp.linalg.eigvalsh(inertia).round(6))
     [2. 3. 3.]
     """
 
@@ -180,7 +194,7 @@ class Symmetric(_InFrame):
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Symmetric", AnyArray]:
-        """The odd moment's axis as axis 3 of the frame."""
+        """Choose a frame whose axis 3 is the axis of symmetry."""
         xp = tensor.__array_namespace__()
         values, frame = principal_axes(real_body(tensor, flattest))
         last = values[2] - values[1] > values[1] - values[0]
@@ -190,33 +204,37 @@ class Symmetric(_InFrame):
         return Symmetric(frame), xp.pad(size, (0, 2))
 
     def sigma(self, numbers: Array) -> Array:
-        """Of an axis near axis 3."""
+        """Second moments of a body that is symmetric about an axis near axis 3."""
         axis = jnp.append(numbers[1:], jnp.ones_like(numbers[0]))
         dyad = axis[:, None] * axis[None, :] / jnp.sum(axis * axis)
         return jnp.eye(3, dtype=numbers.dtype) + (jnp.exp(numbers[0]) - 1) * dyad
 
 
 class Top(_InFrame):
-    """Two moments are equal, and the axis is body axis 3: one number.
+    """A body with two equal moments about body axis 3, by one number.
+
+    The number is the logarithm of the second moment along that axis over the others.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jnp.diagonal(jr.identify.Top().inertia(jnp.log(jnp.array([2.0])))))
     [3. 3. 2.]
     """
 
-    names: ClassVar[tuple[str, ...]] = _names(1)
+    names: ClassVar[tuple[str, ...]] = ("inertia",)
 
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Top", AnyArray]:
-        """Of the body's own axes."""
+        """Return the number of the nearest real body."""
         xp = tensor.__array_namespace__()
         values = xp.diagonal(real_body(tensor, flattest))
         return self, xp.log(2 * values[2:] / (values[0] + values[1]))
 
 
 class Flat(_InFrame):
-    """All mass is in a plane, which is sought: four numbers.
+    """A flat body in an unknown plane, by four numbers.
+
+    The second moments are L L^T in the frame, where the third column of L is zero.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> tensor = jr.identify.Flat(jnp.eye(3)).inertia(jnp.array([0.3, 0.1, 0.2, -0.1]))
@@ -230,27 +248,27 @@ class Flat(_InFrame):
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Flat", AnyArray]:
-        """The largest second moment first, the thickness last."""
+        """Choose a frame with the largest second moment first, the thickness last."""
         xp = tensor.__array_namespace__()
         values, frame = principal_axes(real_body(tensor, flattest))
-        return Flat(frame[:, ::-1]), xp.pad(
-            0.5 * xp.log(values[1:2] / values[2:]), (0, 3)
-        )
+        size = 0.5 * xp.log(values[1:2] / values[2:])
+        return Flat(frame[:, ::-1]), xp.pad(size, (0, 3))
 
     def sigma(self, numbers: Array) -> Array:
-        """L L^T, the third column of L zero."""
+        """Second moments L L^T."""
         sizes = jnp.exp(jnp.pad(numbers[:1], (1, 0)))
         return _parameters.squared(jnp.pad(sizes, (0, 1)), numbers[1:])
 
 
 class Fixed(AbstractInertiaModel):
-    """All of the tensor is known, the system's; nothing of it is sought.
+    """A body whose tensor is known: it is that of the system.
 
     Attributes:
-        known: The tensor [kg m^2]; `fit` sets it.
+        known: The tensor [kg m^2], which `fit` sets.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jnp.diagonal(jr.identify.Fixed(jnp.eye(3)).inertia(jnp.zeros(0))))
+    >>> model = jr.identify.Fixed(jnp.eye(3))
+    >>> print(jnp.diagonal(model.inertia(jnp.zeros(0))))
     [1. 1. 1.]
     """
 
@@ -261,36 +279,41 @@ class Fixed(AbstractInertiaModel):
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Fixed", AnyArray]:
-        """No numbers."""
+        """Return no numbers."""
         return Fixed(known), tensor.__array_namespace__().zeros(0, tensor.dtype)
 
     def inertia(self, numbers: Array) -> Array:
-        """The tensor that is known."""
+        """Known tensor."""
         assert self.known is not None
         return self.known.astype(numbers.dtype)
 
 
 class LogCholesky(AbstractInertiaModel):
-    """A body about a fixed point, sought by `fit` in its ten log-Cholesky numbers.
+    """A body about a fixed point, by its ten log-Cholesky numbers.
 
-    The origin of the body's coordinates is the fixed point; the inertia about it, and the mass and
-    the lever of any `torques.UniformGravity` of the system, all follow from the ten numbers. Motion
-    under gravity tells the inertia about the point over the mass times the lever, eight numbers:
-    freeze two at least, such as "alpha", half the logarithm of the mass, and a length. A rotor or
-    a torque of known size tells one more.
+    The fixed point is the origin of the body's coordinates. The ten numbers determine
+    the inertia about it, and the mass and the lever of any `torques.UniformGravity` of
+    the system.
+
+    Motion under gravity determines eight numbers: the inertia about the fixed point
+    over the mass times the lever. Freeze two numbers at least, such as "alpha", half
+    the logarithm of the mass, and a length. A rotor or a torque of known size
+    determines one more.
 
     Attributes:
-        parameters: (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) to start from.
+        parameters: Initial (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3).
         frozen: Names of those that are known.
 
     Raises:
-        RuntimeError: A flat body.
+        ValueError: A name is unknown, or all numbers are frozen.
+        RuntimeError: The body is flat.
 
     Gradients: as `body_from_log_cholesky`.
     Source: as `body_from_log_cholesky`.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> arm = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0])).translated(jnp.array([0.0, 0.0, 1.5]))
+    >>> box = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0]))
+    >>> arm = box.translated(jnp.array([0.0, 0.0, 1.5]))
     >>> print(jr.identify.LogCholesky(arm, frozen=("alpha", "t1", "t2")).names)
     ('d1', 'd2', 'd3', 's12', 's23', 's13', 't3')
     """
@@ -303,12 +326,19 @@ class LogCholesky(AbstractInertiaModel):
         self.frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
         for name in self.frozen:
             check_option("frozen", name, LOG_CHOLESKY)
-        text = "Argument `frozen` must leave a number to seek, but it does not."
-        demand(bool(self.names), text)
-        parameters, findings = _parameters.log_cholesky_from_body(body), Findings()
-        text = "Argument `body` must have extent in three directions, I3 < I1 + I2, but it has not."
-        ok, code = all_finite(parameters), RESULTS.unphysical_inertia
-        findings.require(ok, code, text, body.inertia)
+        demand(
+            bool(self.names),
+            "Argument `frozen` must leave a number to seek, but it does not.",
+        )
+        parameters = _parameters.log_cholesky_from_body(body)
+        findings = Findings()
+        findings.require(
+            all_finite(parameters),
+            RESULTS.unphysical_inertia,
+            "Argument `body` must have extent in three directions, I3 < I1 + I2, but "
+            "it has not.",
+            body.inertia,
+        )
         self.parameters = findings.guard(parameters, throw=True)
 
     @property
@@ -317,28 +347,28 @@ class LogCholesky(AbstractInertiaModel):
         return tuple(name for name in LOG_CHOLESKY if name not in self.frozen)
 
     def units(self) -> Array:
-        """1, or, of numbers in metres, the size of the body."""
+        """The size of the body for numbers in metres, 1 for the others."""
         body = _parameters.body_from_log_cholesky(self.parameters)
-        square = 0.5 * jnp.trace(body.inertia) / body.mass + jnp.sum(
-            body.center_of_mass**2
-        )
-        of_length = np.array([name[0] in "st" for name in self.names])
-        return jnp.where(of_length, jnp.sqrt(square), 1.0)
+        about_center = 0.5 * jnp.trace(body.inertia) / body.mass
+        size = jnp.sqrt(about_center + jnp.sum(body.center_of_mass**2))
+        is_length = np.array([name[0] in "st" for name in self.names])
+        return jnp.where(is_length, size, 1.0)
 
     def start(
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["LogCholesky", AnyArray]:
-        """The numbers sought, as they were given."""
+        """Return the numbers of the body that was given, except frozen ones."""
         return self, self.parameters[self._indices()].astype(tensor.dtype)
 
     def inertia(self, numbers: Array) -> Array:
-        """The tensor about the fixed point [kg m^2]."""
+        """Tensor about the fixed point [kg m^2]."""
         return self.body(numbers).about(jnp.zeros(3, numbers.dtype))
 
     def body(self, numbers: Array) -> MassProperties:
-        """The body, of other numbers for those that are sought."""
+        """Body with new values for the numbers that are not frozen."""
         whole = self.parameters.astype(numbers.dtype).at[self._indices()].set(numbers)
         return _parameters.body_from_log_cholesky(whole)
 
-    def _indices(self) -> Any:
+    def _indices(self) -> np.ndarray:
+        """Positions of the numbers that are not frozen."""
         return np.array([LOG_CHOLESKY.index(name) for name in self.names])

@@ -1,6 +1,7 @@
-"""The trial that tells most: a plan improved by the gradients of its bound."""
+"""Search for the most informative experiment by gradients of its error bound."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import demand
 from jrigid._numerics import or_one
@@ -16,17 +17,21 @@ from jrigid._types import Scalar
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._design import Bound, Plan
 
+_FIRST_STEP = 0.1  # in units of the limits, along a gradient of length 1
+_STEP_SIZES = (1e-6, 1e6)
+_DECREASE = 1e-4  # of what the slope predicts, for a step to be accepted (Armijo)
+
 
 class Optimum(NamedTuple):
-    """A plan that is better than its neighbours, and than those the other starts led to.
+    """A plan that is better than its neighbours and than the other plans found.
 
     Attributes:
-        plan: The plan, whose `bound` and `predicted` say what it promises.
-        score: What was made small.
-        start_score: Of the plan that was given.
-        slope: Length of the step that the gradient still asks for, within the limits,
-            in units of these: small at an optimum.
-        history: Score from each start, the given plan first, after each step.
+        plan: The plan. Its `bound` and `predicted` state what to expect from it.
+        score: The score that was minimised.
+        start_score: Score of the plan that was given.
+        slope: Length of the step that the gradient still asks for within the limits, in
+            units of these. It is small at an optimum.
+        history: Score after each step from each initial plan, the given plan first.
     """
 
     plan: Plan
@@ -37,6 +42,7 @@ class Optimum(NamedTuple):
 
 
 def _log_error(bound: Bound) -> Array:
+    """Logarithm of the root of the summed variances of the ratios."""
     return jnp.log(jnp.trace(bound.ratios_covariance)) / 2
 
 
@@ -49,33 +55,33 @@ def optimal_trial(
     starts: int = 8,
     steps: int = 100,
 ) -> Optimum:
-    """The spin, the sampling times, a wheel's profile that tell most, by gradients of the bound.
+    """Find the spin, sampling times or rotor profile that determine most.
 
-    Spectral projected gradients from several starts, since there are many optima. A
-    bound holds near the body that was thought of.
+    The search uses spectral projected gradients. It begins from several initial plans,
+    since there are many optima. A bound holds near the body that the plan assumes.
 
     Args:
-        plan: What to begin with, and all that stays as it is.
-        choose: Picks an array of the plan, or a tuple of arrays,
-            `lambda plan: plan.state.omega`,
+        plan: The plan to begin with. What is not chosen stays as it is.
+        choose: Function that picks an array of the plan, or a tuple of arrays, such as
+            `lambda plan: plan.state.omega` or
             `lambda plan: (plan.state.omega, plan.observations.ts)`.
-        limits: What the array must keep to, or a tuple with an entry for each array:
-            `(low, high)`, in which numbers or arrays bound each element; a number, the
-            greatest length along the last axis; or a function that brings an array back
+        limits: Limits of the array, or a tuple with an entry for each array. An entry
+            is `(low, high)`, numbers or arrays that bound each element; or a number,
+            the greatest length along the last axis; or a function that returns an array
             within its limits.
-        score: What is to be small, of the bound. By default the logarithm of the root
-            of the summed variances of I2/I1 and I3/I1.
-        starts: The given plan and others at random within the limits, of a function
-            near the plan.
-        steps: Evaluations from each start.
+        score: Function of the bound that is minimised. By default it is the logarithm
+            of the root of the summed variances of I2/I1 and I3/I1.
+        starts: Number of initial plans: the given one, and random ones within the
+            limits. Where a limit is a function they are near the given plan.
+        steps: Number of evaluations from each initial plan.
 
     Returns:
-        The best plan found. Times that were chosen may come in another order, and run
-        together where much is told: sort them, or give limits that keep each near its
-            own.
+        The best plan found. Chosen times may be in another order, and several may
+        coincide where the motion is most informative. Sort them, or give limits that
+        keep each time near its initial value.
 
     Raises:
-        ValueError: As many limits as arrays were not given.
+        ValueError: The number of limits is not the number of arrays.
 
     Gradients: none.
     Source: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM Journal on Optimization 10
@@ -90,85 +96,189 @@ def optimal_trial(
     >>> print(errors.round(4), abs(best.plan.state.omega).round(2))
     [0.2349 0.0047] [0.41 0.91 0.02]
     """
-    leaves = jtu.tree_leaves(choose(plan))
-    given = [limits] if len(leaves) == 1 else list(limits)
+    arrays = jtu.tree_leaves(choose(plan))
+    entries = [limits] if len(arrays) == 1 else list(limits)
     demand(
-        len(given) == len(leaves),
-        f"Argument `limits` must have an entry for each of {len(leaves)} arrays that `choose` "
-        f"picks, but it has {len(given)}.",
+        len(entries) == len(arrays),
+        f"Argument `limits` must have an entry for each of {len(arrays)} arrays that "
+        f"`choose` picks, but it has {len(entries)}.",
     )
-    given = jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), given)
-    return _optimum(plan, choose, given, score, starts, steps)
+    entries = jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), entries)
+    return _optimum(plan, choose, entries, score, starts, steps)
 
 
-def _limited(limit: Any, x: Array) -> tuple[Any, Array, Array]:
-    """What brings an array back within its limits, their middle and their size."""
-    if callable(limit):
-        return limit, x, jnp.full_like(x, jnp.sqrt(jnp.mean(x**2)))
-    if isinstance(limit, tuple):
-        low, high = (jnp.broadcast_to(y.astype(x.dtype), x.shape) for y in limit)
-        return lambda x: jnp.clip(x, low, high), (low + high) / 2, (high - low) / 2
-    length = lambda x: jnp.linalg.norm(x, axis=-1, keepdims=True)  # noqa: E731
-    most = jnp.full_like(x, limit)
-    return lambda x: x * most / jnp.maximum(most, length(x)), jnp.zeros_like(x), most
+# An entry of the argument `limits`.
+_Entry = Callable[[Array], Array] | tuple[Array, Array] | Array
+
+
+class _Limit(NamedTuple):
+    """Limits of an array.
+
+    Attributes:
+        project: Returns an array within the limits.
+        middle: Middle of the limits.
+        size: Half of their width.
+    """
+
+    project: Callable[[Array], Array]
+    middle: Array
+    size: Array
+
+
+def _shortened(most: Array, x: Array) -> Array:
+    """Vectors along the last axis, none longer than a length."""
+    length = jnp.linalg.norm(x, axis=-1, keepdims=True)
+    return x * most / jnp.maximum(most, length)
+
+
+def _limit(entry: _Entry, x: Array) -> _Limit:
+    """Limits that an entry of the argument `limits` states for an array."""
+    if callable(entry):
+        return _Limit(entry, x, jnp.full_like(x, jnp.sqrt(jnp.mean(x**2))))
+    if isinstance(entry, tuple):
+        low, high = (jnp.broadcast_to(y.astype(x.dtype), x.shape) for y in entry)
+        project = partial(jnp.clip, min=low, max=high)
+        return _Limit(project, (low + high) / 2, (high - low) / 2)
+    most = jnp.full_like(x, entry)
+    return _Limit(partial(_shortened, most), jnp.zeros_like(x), most)
+
+
+class _Chosen(NamedTuple):
+    """The chosen arrays of a plan as one vector, in units of their limits.
+
+    The vector is zero in the middle of the limits.
+
+    Attributes:
+        plan: The plan.
+        choose: Picks the arrays of a plan.
+        arrays_of: The arrays that a vector in their own units holds.
+        limits: Limits of each array.
+        middle: Middle of the limits, as a vector.
+        unit: Half of their width.
+    """
+
+    plan: Plan
+    choose: Callable[[Plan], Any]
+    arrays_of: Callable[[Array], PyTree[Array]]
+    limits: list[_Limit]
+    middle: Array
+    unit: Array
+
+    def plan_at(self, x: Array) -> Plan:
+        """The plan with arrays from a vector."""
+        arrays = self.arrays_of(self.middle + self.unit * x)
+        return eqx.tree_at(self.choose, self.plan, arrays)
+
+    def project(self, x: Array) -> Array:
+        """The vector with each array within its limits."""
+        arrays = jtu.tree_leaves(self.arrays_of(self.middle + self.unit * x))
+        pairs = zip(self.limits, arrays, strict=True)
+        inside = _vector(limit.project(array) for limit, array in pairs)
+        return (inside - self.middle) / self.unit
+
+
+def _vector(arrays: Iterable[Array]) -> Array:
+    return ravel_pytree(list(arrays))[0]
+
+
+def _chosen(
+    plan: Plan, choose: Callable[[Plan], Any], entries: list[_Entry]
+) -> tuple[_Chosen, Array]:
+    """The chosen arrays as a vector, and that of the plan itself."""
+    given, arrays_of = ravel_pytree(choose(plan))
+    pairs = zip(entries, jtu.tree_leaves(arrays_of(given)), strict=True)
+    limits = [_limit(entry, array) for entry, array in pairs]
+    middle = _vector(x.middle for x in limits)
+    unit = or_one(_vector(x.size for x in limits))
+    chosen = _Chosen(plan, choose, arrays_of, limits, middle, unit)
+    return chosen, (given - middle) / unit
+
+
+class _Descent(NamedTuple):
+    """Where a search is.
+
+    Attributes:
+        x: The vector of chosen arrays.
+        score: Score there.
+        slope: Its gradient.
+        size: Step for a gradient of 1, by the curvature along the last step.
+        share: Fraction of the step to try next, less than 1 after failures.
+    """
+
+    x: Array
+    score: Array
+    slope: Array
+    size: Array
+    share: Array
+
+
+def _stepped(
+    derive: Callable[[Array], tuple[Array, Array]],
+    project: Callable[[Array], Array],
+    now: _Descent,
+) -> _Descent:
+    """Try one step; keep the place and shorten the step if the score does not fall."""
+    move = now.share * (project(now.x - now.size * now.slope) - now.x)
+    slope, score = derive(now.x + move)
+    # The step size of Barzilai and Borwein.
+    bend = jnp.sum(move * (slope - now.slope))
+    size = jnp.where(bend > 0, jnp.sum(move**2) / or_one(bend), 10 * now.size)
+    size = jnp.clip(size, *_STEP_SIZES)
+    after = _Descent(now.x + move, score, slope, size, jnp.ones_like(now.share))
+    better = score <= now.score + _DECREASE * jnp.sum(now.slope * move)
+    shorter = now._replace(share=now.share / 4)
+    return jtu.tree_map(lambda a, b: jnp.where(better, a, b), after, shorter)
+
+
+def _descended(
+    derive: Callable[[Array], tuple[Array, Array]],
+    project: Callable[[Array], Array],
+    steps: int,
+    x: Array,
+) -> tuple[_Descent, Array]:
+    """The end of a search from a vector, and the score after each step."""
+
+    def step(now: _Descent, _: None) -> tuple[_Descent, Array]:
+        now = _stepped(derive, project, now)
+        return now, now.score
+
+    # Any score is better than this one, so that the first step evaluates `x`.
+    initial = _Descent(
+        x=x,
+        score=jnp.asarray(jnp.inf, x.dtype),
+        slope=jnp.zeros_like(x),
+        size=jnp.asarray(_FIRST_STEP, x.dtype),
+        share=jnp.asarray(1.0, x.dtype),
+    )
+    return jax.lax.scan(step, initial, None, steps)
 
 
 @quick_jit
 def _optimum(
     plan: Plan,
     choose: Callable[[Plan], Any],
-    limits: list[Any],
+    entries: list[_Entry],
     score: Callable[[Bound], Array],
     starts: int,
     steps: int,
 ) -> Optimum:
-    given, place = ravel_pytree(choose(plan))
-    pairs = zip(limits, jtu.tree_leaves(place(given)), strict=True)
-    within, *sizes = zip(*(_limited(limit, x) for limit, x in pairs), strict=True)
-    middle, unit = (ravel_pytree(x)[0] for x in sizes)
-    unit, start = or_one(unit), (starts - 1, given.size)
+    chosen, first = _chosen(plan, choose, entries)
+    project = chosen.project
 
-    def project(x: Array) -> Array:
-        arrays = zip(within, jtu.tree_leaves(place(middle + unit * x)), strict=True)
-        return (
-            ravel_pytree([back(array) for back, array in arrays])[0] - middle
-        ) / unit
+    def scored(x: Array) -> tuple[Array, Array]:
+        value = score(chosen.plan_at(x).bound)
+        return value, value
 
-    def planned(x: Array) -> Plan:
-        return eqx.tree_at(choose, plan, place(middle + unit * x))
+    # A motion under a torque has derivatives in forward mode only.
+    grad = jax.grad if plan.system.is_free else jax.jacfwd
+    derive = grad(scored, has_aux=True)
 
-    scored = lambda x: (score(planned(x).bound),) * 2  # noqa: E731
-    # Under a torque forward alone.
-    derive = (jax.grad if plan.system.is_free else jax.jacfwd)(scored, has_aux=True)
-
-    def step(now: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], Array]:
-        x, value, slope, size, share = now
-        move = share * (project(x - size * slope) - x)
-        ahead_slope, ahead = derive(x + move)
-        bend = jnp.sum(move * (ahead_slope - slope))
-        size = jnp.where(bend > 0, jnp.sum(move**2) / or_one(bend), 10 * size)
-        after = (
-            x + move,
-            ahead,
-            ahead_slope,
-            jnp.clip(size, 1e-6, 1e6),
-            jnp.ones_like(share),
-        )
-        better = ahead <= value + 1e-4 * jnp.sum(slope * move)
-        now = jtu.tree_map(
-            lambda a, b: jnp.where(better, a, b), after, (*now[:4], share / 4)
-        )
-        return now, now[1]
-
-    def descend(x: Array) -> tuple[tuple[Array, ...], Array]:
-        begin = (
-            jnp.asarray(y, x.dtype) for y in (x, jnp.inf, jnp.zeros_like(x), 0.1, 1.0)
-        )
-        return jax.lax.scan(step, tuple(begin), None, steps)
-
-    others = jax.random.uniform(jax.random.key(0), start, given.dtype, -1.0, 1.0)
-    begin = jnp.concatenate([((given - middle) / unit)[None], others])
-    (x, values, slopes, *_), history = jax.lax.map(descend, jax.vmap(project)(begin))
-    best = jnp.argmin(values)
-    slope = jnp.linalg.norm(project(x[best] - slopes[best]) - x[best])
-    return Optimum(planned(x[best]), values[best], history[0, 0], slope, history)
+    descend = partial(_descended, derive, project, steps)
+    shape = (starts - 1, first.size)
+    others = jax.random.uniform(jax.random.key(0), shape, first.dtype, -1.0, 1.0)
+    initial = jnp.concatenate([first[None], others])
+    ends, history = jax.lax.map(descend, jax.vmap(project)(initial))
+    index = jnp.argmin(ends.score)
+    best = jtu.tree_map(lambda y: y[index], ends)
+    slope = jnp.linalg.norm(project(best.x - best.slope) - best.x)
+    return Optimum(chosen.plan_at(best.x), best.score, history[0, 0], slope, history)

@@ -1,7 +1,7 @@
-"""The posterior of a fit, for samplers of others."""
+"""Posterior of a fit as a function, for samplers of other packages."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +13,25 @@ from jrigid._types import Scalar
 from jrigid.dynamics import State
 from jrigid.identify._inertia_models import AbstractInertiaModel
 from jrigid.identify._layout import whole
-from jrigid.identify._problem import Problem, rows_at
+from jrigid.identify._problem import Options, Problem, rows_at
 from jrigid.identify._result import FitResult
 from jrigid.identify._smoother import Point
+from jrigid.identify._unknowns import Unknowns
 from jrigid.simulate import simulate
+from jrigid.systems import RigidBody
 
 
 class LogDensity(NamedTuple):
-    """A posterior density and where and how to sample it.
+    """A posterior density, and where and how to sample it.
+
+    A position holds the numbers of the fit. After them follow, for each trial, the
+    change of its state from that of the fit and the trial's own numbers. This is the
+    order of `covariance`.
 
     Attributes:
-        function: Logarithm of the density, but for a constant, of a position.
-        start: The position of the fit: its numbers, then, for each trial, the moves of
-            its state from that of the fit, zero, and its own numbers: in the order of
-                `covariance`.
-        covariance: That of the fit: the inverse of a mass matrix.
+        function: Logarithm of the density at a position, up to a constant.
+        start: The position of the fit, at which the states do not change.
+        covariance: Covariance of the fit, which is the inverse of a mass matrix.
     """
 
     function: Callable[[Array], Scalar]
@@ -35,89 +39,117 @@ class LogDensity(NamedTuple):
     covariance: Float[Array, "size size"]
 
 
-def _simulated(system: Any, state: State, ts: Array, t0: Array) -> State:
-    """A motion with derivatives in reverse mode."""
+def _simulated(system: RigidBody, state: State, ts: Array, t0: Array) -> State:
+    """States of a motion, with derivatives in reverse mode."""
     return simulate(system, state, ts, t0=t0, throw=False).states
 
 
 def _log_volume(model: AbstractInertiaModel, numbers: Array) -> Array:
-    """Logarithm of the volume of tensors that a volume of the numbers of a model makes."""
+    """Logarithm of the volume of tensors per volume of the numbers of a model."""
 
     def tensor(x: Array) -> Array:
         inertia = model.inertia(x)
         return inertia if model.absolute else inertia / jnp.trace(inertia)
 
-    if model.body(numbers) is not None:  # more numbers than a tensor has
+    # A model of a body has more numbers than a tensor. Its prior is flat in these.
+    if model.body(numbers) is not None:
         return jnp.zeros((), numbers.dtype)
     slopes = jax.jacfwd(tensor)(numbers).reshape(9, -1) / jnp.trace(tensor(numbers))
     return 0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]
 
 
-def log_density(result: FitResult) -> LogDensity:
-    """The posterior of a fit as a function without bounds, for blackjax, numpyro and their like.
-
-    Prior: what `prior` said in `free`; apart from that flat in the tensor (of a fixed
-    trace, or, where the scale is sought, in the logarithm of the scale too; of a
-    `LogCholesky`, in its numbers), in the arrays picked, and in the states: the
-    logarithms of the Jacobians that belong to the numbers are in the density. A record
-    that fits two bodies, the mirror one, or spins about any axis, has two modes: a
-        sampler that starts at a fit stays in its own.
+def _log_jacobian(unknowns: Unknowns, numbers: Array, own: Array) -> Array:
+    """Logarithm of the volume of all that is sought per volume of its numbers.
 
     Args:
-        result: A single fit without an unmodelled torque. A noise that was not stated
-            is as large as the residuals say.
+        unknowns: What is sought.
+        numbers: Numbers shared by all trials.
+        own: Numbers of each trial (trials, n).
+    """
+    slices = unknowns.slices
+    parts = [_log_volume(unknowns.inertia_model, numbers[slices["inertia"]])]
+    parts += [x.log_volume(numbers[slices[x.name]]) for x in unknowns.shared]
+    parts += [
+        jnp.sum(jax.vmap(x.log_volume)(own[:, part])) for x, part in unknowns.own_slices
+    ]
+    return jnp.sum(jnp.stack(parts))
+
+
+def _from_one_state(problem: Problem) -> Problem:
+    """The problem with one state for each trial, differentiable in reverse mode."""
+    options: Options = problem.options
+    motion = options.motion
+    if motion is None and not options.free_motion:
+        motion = _simulated
+    options = options._replace(shooting=False, nodes=1, motion=motion)
+    return Problem(options, problem.unknowns, problem.samples, problem.noise)
+
+
+def log_density(result: FitResult) -> LogDensity:
+    """Return the posterior of a fit as a function, for blackjax, numpyro and others.
+
+    The function is defined for all positions. The prior is what `prior` states in
+    `free`, and otherwise flat in the following quantities:
+
+    - the tensor of a fixed trace, or of any trace with a flat logarithm where the scale
+      is sought. For `LogCholesky` it is flat in the ten numbers;
+    - the arrays that `free` picks;
+    - the states.
+
+    The density contains the logarithms of the Jacobians that belong to the numbers. The
+    posterior has two modes where the record fits two bodies, or a body and its mirror
+    image. A sampler that starts at a fit stays in the mode of that fit.
+
+    Args:
+        result: A single fit without an unmodelled torque. If no noise was stated, its
+            size follows from the residuals.
 
     Raises:
-        ValueError: A fit with an unmodelled torque.
+        ValueError: The fit has an unmodelled torque.
 
     Gradients: in every mode; in reverse mode under a torque.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
-    >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
-    >>> density = jr.identify.log_density(found)
+    >>> result = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings)
+    >>> density = jr.identify.log_density(result)
     >>> print(density.start.shape, bool(jnp.isfinite(density.function(density.start))))
     (8,) True
     """
-    problem, options = result.problem, result.problem.options
-    text = "Argument `result` must be of a fit without an unmodelled torque, but it is not."
-    demand(not options.dense, text)
-    motion = options.motion or (None if options.free_motion else _simulated)
-    options = options._replace(shooting=False, nodes=1, motion=motion)
-    problem = Problem(options, problem.unknowns, problem.samples, problem.noise)
-    unknowns, layout = problem.unknowns, whole(problem.samples, 1, result.t0)
-    states = result.state.attitude[:, None], result.state.omega[:, None]
-    size = result.numbers.size
-    (trials, own), local = (
-        result.own_numbers.shape,
-        6 if options.depends_on_attitude else 3,
+    demand(
+        not result.problem.options.dense,
+        "Argument `result` must be of a fit without an unmodelled torque, but it is "
+        "not.",
     )
-    known = (0, 0), (0, problem.known - problem.held)
-    weight = jnp.pad(jnp.where(result.kept, 1.0, 0.0), known, constant_values=1.0)
-    rows_of = rows_at(problem, layout)
+    problem = _from_one_state(result.problem)
+    unknowns = problem.unknowns
+    rows_at_position = rows_at(problem, whole(problem.samples, 1, result.t0))
+    # Each trial has one node, at its first state.
+    attitude = result.state.attitude[:, None]
+    omega = result.state.omega[:, None]
+    no_torque = omega[..., :0]
+    size = result.numbers.size
+    trials, own_size = result.own_numbers.shape
+    state_size = 6 if problem.options.depends_on_attitude else 3
+    # Priors stand in rows after the samples. Rows that hold a fit near its start while
+    # little of the record takes part are left out.
+    priors = problem.known - problem.held
+    samples = jnp.where(result.kept, 1.0, 0.0)
+    weight = jnp.pad(samples, ((0, 0), (0, priors)), constant_values=1.0)
 
     def function(position: Array) -> Array:
-        numbers, rest = position[:size], position[size:].reshape(trials, local + own)
-        point = Point(numbers, rest[:, local:], *states, states[1][..., :0])
-        rows = rows_of(point, rest[:, None, :local])
+        numbers = position[:size]
+        of_trials = position[size:].reshape(trials, state_size + own_size)
+        own = of_trials[:, state_size:]
+        point = Point(numbers, own, attitude, omega, no_torque)
+        rows = rows_at_position(point, of_trials[:, None, :state_size])
+        # An inflation above 1 means noise as large as the residuals, not as stated.
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
         likelihood = -0.5 * chi_square / result.diagnostics.inflation
-        return likelihood + log_jacobian(numbers, rest[:, local:])
+        return likelihood + _log_jacobian(unknowns, numbers, own)
 
-    def log_jacobian(numbers: Array, own: Array) -> Array:
-        parts = [
-            _log_volume(unknowns.inertia_model, numbers[unknowns.slices["inertia"]])
-        ]
-        shared = [x for x in unknowns.sought if not x.own]
-        parts += [x.log_volume(numbers[unknowns.slices[x.name]]) for x in shared]
-        parts += [
-            jnp.sum(jax.vmap(x.log_volume)(own[:, s])) for x, s in unknowns.own_slices
-        ]
-        return jnp.sum(jnp.stack(parts))
-
-    still = jnp.zeros((trials, local), result.numbers.dtype)
-    start = jnp.concatenate([still, result.own_numbers], axis=1).reshape(-1)
-    return LogDensity(
-        function, jnp.concatenate([result.numbers, start]), result.covariance
-    )
+    no_change = jnp.zeros((trials, state_size), result.numbers.dtype)
+    of_trials = jnp.concatenate([no_change, result.own_numbers], axis=1).reshape(-1)
+    start = jnp.concatenate([result.numbers, of_trials])
+    return LogDensity(function, start, result.covariance)

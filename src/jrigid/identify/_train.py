@@ -1,9 +1,9 @@
-"""Torques too rich for Levenberg-Marquardt, a network or a table, learnt from trials in batches."""
+"""Training of torques with many parameters, such as a network or a table."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import diffrax
 import equinox as eqx
@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import check_type, demand, whole_number
 from jrigid._numerics import product
 from jrigid._stepping.method import method_of
-from jrigid._types import RandomKey
+from jrigid._types import AnyArray, RandomKey
 from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import forced_flow, needs_attitude
@@ -25,25 +25,40 @@ from jrigid.identify._inputs import judge
 from jrigid.identify._layout import longest_turn, told_by
 from jrigid.identify._problem import Options, shown_by, whitened
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
+from jrigid.identify._sensors import AbstractSensor
 from jrigid.rotation import exp, multiply
 from jrigid.systems import RigidBody
 
 _METHOD = method_of(diffrax.Tsit5())
-# Longest step [rad]. After 50 gaps of up to 0.2 rad the error is below 1e-6 of the state.
+# Longest step [rad]. After 50 gaps of up to 0.2 rad the error is below 1e-6 of the
+# state.
 _TURN = 0.2
-_NEWTON = 2  # Gauss-Newton steps to a segment's state: the observed one is off by the noise alone
+# Gauss-Newton steps to the state of a segment. Two are enough, because the observed
+# state is off by the noise alone.
+_NEWTON = 2
 _RIDGE = 1e-12  # of the normal equations, for a turn that no sample shows
 
 
+@runtime_checkable
+class _Optimizer(Protocol):
+    """An `optax.GradientTransformation`, which is imported only where it is used."""
+
+    @property
+    def init(self) -> Callable[..., PyTree]: ...
+
+    @property
+    def update(self) -> Callable[..., tuple[PyTree, PyTree]]: ...
+
+
 class TrainResult(NamedTuple):
-    """What `train` learnt, and how it went.
+    """A trained system and its losses.
 
     Attributes:
-        system: That of the least validation loss.
-        training: Mean loss over the batches of each epoch, while it changes.
-        validation: Loss of the validation trials before each epoch; the first is that of the system
-            as it was given.
-        epoch: How many epochs had passed at the least validation loss.
+        system: The system with the least validation loss.
+        training: Mean loss over the batches of each epoch, while the system changes.
+        validation: Loss of the validation trials before each epoch. The first is that
+            of the system as it was given.
+        epoch: Number of epochs before the least validation loss.
     """
 
     system: RigidBody
@@ -52,26 +67,51 @@ class TrainResult(NamedTuple):
     epoch: int
 
 
-class _Data(NamedTuple):
-    """All segments: what was seen, and a state at the first sample, as observed."""
+class _Segments(NamedTuple):
+    """Samples of all segments, and the observed state at the first sample of each."""
 
     samples: Samples
     guess: State
 
 
-class _Setting(NamedTuple):
-    """What is fixed when an epoch is compiled."""
+class _Task(NamedTuple):
+    """What stays the same in all epochs.
 
-    optimizer: Any
+    Attributes:
+        optimizer: Optimiser of the parameters.
+        rest: The system without the parameters that are trained.
+        sensors: Sensor of each record.
+        segments: All segments.
+        trained: Indices of the segments that are trained on.
+        judged: Indices of the segments of validation trials.
+        batch: Number of segments in a step of the optimiser.
+        depends_on_attitude: Whether the torque or a sensor depends on the attitude.
+        steps: Number of integration steps between two samples.
+    """
+
+    optimizer: _Optimizer
+    rest: PyTree
+    sensors: list[AbstractSensor]
+    segments: _Segments
+    trained: AnyArray
+    judged: AnyArray
     batch: int
     depends_on_attitude: bool
-    steps: int  # of the motion between two samples
+    steps: int
+
+
+class _Best(NamedTuple):
+    """Parameters with the least validation loss, and how many epochs precede them."""
+
+    params: PyTree
+    loss: float
+    epoch: int
 
 
 def train(
     system: RigidBody,
     observations: Any,
-    optimizer: Any,
+    optimizer: _Optimizer,
     *,
     key: RandomKey,
     free: Callable[[Any], Any] | None = None,
@@ -82,177 +122,242 @@ def train(
     patience: int = 30,
     progress: bool = False,
 ) -> TrainResult:
-    r"""A torque with many parameters, from what was observed, by an optimiser of optax.
+    r"""Fit a torque with many parameters to observations by an optimiser of optax.
 
-    Trials are cut into segments. The loss is the sum of a segment's squared residuals, in units of
-    their noise, at the state that fits the segment best, over its degrees of freedom: 1 for a
-    torque that leaves noise alone. States are no parameters: Gauss and Newton's steps find them
-    anew for each torque, so that trials never trained on can be judged in the same way. Of all
-    epochs the system with the least loss of the validation trials is returned.
+    Trials are cut into segments. The loss is the sum of the squared residuals of a
+    segment, in units of their noise, over its degrees of freedom. The residuals are
+    those at the state that fits the segment best. The loss is 1 for a torque that
+    leaves only noise.
 
-    The inertia is held: a torque that may be anything takes over the gyroscopic one, and no record
-    tells the two apart. `fit` seeks it beside a torque with few parameters, and with the one learnt
-    here in its place: `fit(train(...).system, observations)`.
+    States are not parameters. Gauss-Newton steps compute them again for each torque, so
+    that validation trials are judged in the same way. The result is the system with the
+    least validation loss of all epochs.
+
+    The inertia is held. An arbitrary torque can replace the gyroscopic one, and no
+    record distinguishes the two. `fit` seeks the inertia beside a torque with few
+    parameters, or beside the trained torque: `fit(train(...).system, observations)`.
 
     Args:
-        system: The body; its torque holds parameters to start from (an `equinox.Module`).
-        observations: As for `fit`, of two trials or more. Rates must be told, and attitudes where
-            the torque or a sensor looks at them.
+        system: The body. Its torque holds the initial parameters (an
+            `equinox.Module`).
+        observations: As for `fit`, of two trials or more. Rates must be observed, and
+            attitudes where the torque or a sensor depends on them.
         optimizer: An `optax.GradientTransformation`.
-        key: For the order of the segments: the same key gives the same bits on the same machine.
-        free: Which arrays of the system are trained: a function that picks them, or parts that
-            hold them, `lambda body: body.torque.network`; by default all of the torque. What must
-            be positive is for the torque to keep so.
-        validation: Indices of trials that are not trained on; by default each fifth from the last.
-        segment: About how many samples of the first record are in one; long ones tell more.
-        batch: How many segments make a step of the optimiser. What is left over in an epoch waits.
-        epochs: At most so many.
-        patience: Stop when the validation loss has not fallen for so many epochs.
-        progress: Print the losses of each epoch.
+        key: Random key for the order of the segments. The same key gives the same bits
+            on the same machine.
+        free: Function that picks the arrays of the system that are trained, or parts
+            that hold them, such as `lambda body: body.torque.network`. By default the
+            whole torque is trained. The torque itself must keep positive what has to be
+            positive.
+        validation: Indices of trials that are not trained on. By default every fifth
+            trial, counted from the last.
+        segment: Approximate number of samples of the first record in a segment. Long
+            segments determine more.
+        batch: Number of segments in a step of the optimiser. Segments that do not fill
+            a batch are left out of that epoch.
+        epochs: Largest number of epochs.
+        patience: Training stops when the validation loss has not fallen for this many
+            epochs.
+        progress: Whether to print the losses of each epoch.
 
     Returns:
-        The system that was learnt, and both losses of each epoch.
+        The trained system, and both losses of each epoch.
 
     Raises:
-        ValueError: A request that makes no sense.
-        RuntimeError: Bad values in the record or the system; a loss that is not finite from the
-            first on.
+        ValueError: An argument has a wrong type, shape or option.
+        RuntimeError: The record or the system has bad values, or the first loss is not
+            finite.
 
     Gradients: none.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr, optax
-    >>> seen = jr.datasets.gyro_example()
-    >>> halves = [jr.identify.Rates(seen.times[i], seen.omegas[i], seen.sigma)
-    ...           for i in (slice(0, 100), slice(100, 200))]
-    >>> dragged = jr.RigidBody(seen.true_moments, jr.torques.LinearDrag(0.02))  # there is none
-    >>> learnt = jr.identify.train(
-    ...     dragged, halves, optax.adam(3e-3), key=jax.random.key(0), batch=2, epochs=20)
-    >>> print(learnt.validation[0] > 2 * min(learnt.validation))
+    >>> record = jr.datasets.gyro_example()
+    >>> halves = [
+    ...     jr.identify.Rates(record.times[i], record.omegas[i], record.sigma)
+    ...     for i in (slice(0, 100), slice(100, 200))]
+    >>> drag = jr.torques.LinearDrag(0.02)  # which this body does not have
+    >>> body = jr.RigidBody(record.true_moments, drag)
+    >>> result = jr.identify.train(
+    ...     body, halves, optax.adam(3e-3), key=jax.random.key(0), batch=2, epochs=20)
+    >>> print(result.validation[0] > 2 * min(result.validation))
     True
     """
     import optax
 
     check_type("system", system, RigidBody)
     check_type("optimizer", optimizer, optax.GradientTransformation)
-    for name, value in (("segment", segment), ("batch", batch), ("patience", patience)):
-        whole_number(name, value)
+    whole_number("segment", segment)
+    whole_number("batch", batch)
+    whole_number("patience", patience)
     whole_number("epochs", epochs)
     params, rest = _parameters(system, free)
     records = of_trials(observations)
-    stated = all(x.states_noise for x in records)
-    demand(stated, "Argument `observations` must state the noise, but it does not.")
-    held_out = _held_out(validation, records[0].ts.shape[0])
-    records, trial = _segments(records, segment)
-    data, depends_on_attitude, steps = _prepared(system, records)
-    trained = np.flatnonzero(~np.isin(trial, held_out))
-    setting = _Setting(optimizer, min(batch, trained.size), depends_on_attitude, steps)
-    sensors, judged = (
-        [x.sensor for x in records],
-        np.flatnonzero(np.isin(trial, held_out)),
+    demand(
+        all(x.states_noise for x in records),
+        "Argument `observations` must state the noise, but it does not.",
     )
-    memory, best, since = optimizer.init(params), (params, np.inf), 0
+    held_out = _held_out(validation, records[0].ts.shape[0])
+    windows = _windows(records[0], segment)
+    records = tuple(_cut(x, windows) for x in records)
+    is_held_out = np.isin([x.trial for x in windows], held_out)
+    trained = np.flatnonzero(~is_held_out)
+    prepared = _prepared(system, records)
+    task = _Task(
+        optimizer=optimizer,
+        rest=rest,
+        sensors=[x.sensor for x in records],
+        segments=prepared.segments,
+        trained=trained,
+        judged=np.flatnonzero(is_held_out),
+        batch=min(batch, trained.size),
+        depends_on_attitude=prepared.depends_on_attitude,
+        steps=prepared.steps,
+    )
+    best, training, judged = _trained(task, params, key, epochs, patience, progress)
+    return TrainResult(eqx.combine(best.params, rest), training, judged, best.epoch)
+
+
+def _trained(
+    task: _Task,
+    params: PyTree,
+    key: RandomKey,
+    epochs: int,
+    patience: int,
+    progress: bool,
+) -> tuple[_Best, Array, Array]:
+    """The best parameters, and the training and validation losses of each epoch."""
+    memory = task.optimizer.init(params)
+    best = _Best(params, np.inf, 0)
     losses: list[tuple[Array, Array]] = []
-    held = rest, sensors, data, trained, judged
     for epoch in range(epochs + 1):
-        now = jax.random.fold_in(key, epoch)
-        new, memory, mean, loss = _epoch(setting, params, memory, now, *held)
-        losses.append((mean, loss))
+        after = _epoch(task, params, memory, jax.random.fold_in(key, epoch))
+        losses.append((after.training, after.validation))
         if progress:
-            print(
-                f"epoch {epoch}: training {mean:.4g}, validation {loss:.4g}", flush=True
-            )
-        if float(loss) < best[1]:
-            best, since = (params, float(loss)), epoch
-        elif epoch - since >= patience or not np.isfinite(best[1]):
+            _print_losses(epoch, after)
+        if float(after.validation) < best.loss:
+            best = _Best(params, float(after.validation), epoch)
+        # A loss that is not finite makes all parameters NaN, so that training ends.
+        elif epoch - best.epoch >= patience or not np.isfinite(best.loss):
             break
-        params = new
-    if not np.isfinite(best[1]):
+        params = after.params
+        memory = after.memory
+    if not np.isfinite(best.loss):
         raise RuntimeError(
             "Argument `system` must have a finite loss to start from, but has none."
         )
-    training, seen = (jnp.stack(x) for x in zip(*losses, strict=True))
-    return TrainResult(eqx.combine(best[0], rest), training, seen, since)
+    training, validation = (jnp.stack(x) for x in zip(*losses, strict=True))
+    return best, training, validation
 
 
 def _parameters(
     system: RigidBody, free: Callable[[Any], Any] | None
-) -> tuple[Any, Any]:
-    """The system's arrays that are trained, and the rest."""
-    pick = (lambda body: body.torque) if free is None else free
-    none = jtu.tree_map(lambda _: False, system)
-    mask = eqx.tree_at(pick, none, replace_fn=lambda x: jtu.tree_map(lambda _: True, x))
+) -> tuple[PyTree, PyTree]:
+    """The arrays of the system that are trained, and the rest of it."""
+
+    def whole_torque(body: RigidBody) -> Any:
+        return body.torque
+
+    def all_of(part: PyTree) -> PyTree:
+        return jtu.tree_map(lambda _: True, part)
+
+    nothing = jtu.tree_map(lambda _: False, system)
+    mask = eqx.tree_at(
+        whole_torque if free is None else free, nothing, replace_fn=all_of
+    )
     mask = jtu.tree_map(
         lambda chosen, x: chosen and eqx.is_inexact_array(x), mask, system
     )
     params, rest = eqx.partition(system, mask)
     demand(
         params.inertia is None and bool(jtu.tree_leaves(params)),
-        "Argument `free` must pick floating point arrays of the system, beside the inertia, which "
-        "is held, but it does not.",
+        "Argument `free` must pick floating point arrays of the system, beside the "
+        "inertia, which is held, but it does not.",
     )
     return params, rest
 
 
 def _held_out(validation: Sequence[int] | None, trials: int) -> np.ndarray:
+    """Indices of the validation trials."""
     demand(
         trials > 1,
-        "Argument `observations` must hold two trials or more, one of them to judge by, but it "
-        "holds one.",
+        "Argument `observations` must hold two trials or more, one of them to judge "
+        "by, but it holds one.",
     )
-    chosen = (
-        np.arange(trials)[::-5]
-        if validation is None
-        else np.unique(np.asarray(validation))
-    )
+    default = np.arange(trials)[::-5]
+    chosen = default if validation is None else np.unique(np.asarray(validation))
     demand(
         0 < chosen.size < trials and bool(np.all(np.isin(chosen, np.arange(trials)))),
-        f"Argument `validation` must be indices of some of {trials} trials, not all, but it is "
-        f"{validation!r}.",
+        f"Argument `validation` must be indices of some of {trials} trials, not all, "
+        f"but it is {validation!r}.",
     )
     return chosen
 
 
-def _segments(
-    records: tuple[Record, ...], length: int
-) -> tuple[tuple[Record, ...], np.ndarray]:
-    """Records whose trials are segments, of equal counts in each trial; and the trial of each."""
-    windows, first = [], [np.asarray(x) for x in (records[0].ts, records[0].known)]
-    for i, (ts, known) in enumerate(zip(*first, strict=True)):
-        seen = ts[np.any(known, axis=-1)]
-        parts = np.array_split(seen, max(1, round(seen.size / length)))
-        edges = [-np.inf, *(x[0] for x in parts[1:]), np.inf]
-        windows += [(i, a, b) for a, b in pairwise(edges)]
-    trial = np.array([i for i, _, _ in windows])
+class _Window(NamedTuple):
+    """A segment: its trial, and its time from the start to before the end [s]."""
 
-    def cut(record: Record) -> Record:
-        ts, known = np.asarray(record.ts), np.any(np.asarray(record.known), axis=-1)
-        rows = [
-            np.flatnonzero(known[i] & (a <= ts[i]) & (ts[i] < b)) for i, a, b in windows
-        ]
-        most = max(x.size for x in rows)
-        index = np.stack(
-            [np.pad(x, (0, most - x.size), constant_values=-1) for x in rows]
+    trial: int
+    start: float
+    end: float
+
+
+def _windows(record: Record, length: int) -> list[_Window]:
+    """Segments of about equal counts of a record's samples in each trial."""
+    windows = []
+    pairs = zip(np.asarray(record.ts), np.asarray(record.known), strict=True)
+    for trial, (ts, known) in enumerate(pairs):
+        observed = ts[np.any(known, axis=-1)]
+        parts = np.array_split(observed, max(1, round(observed.size / length)))
+        edges = [-np.inf, *(x[0] for x in parts[1:]), np.inf]
+        windows += [_Window(trial, start, end) for start, end in pairwise(edges)]
+    return windows
+
+
+def _samples_inside(record: Record, windows: Sequence[_Window]) -> np.ndarray:
+    """Indices of the samples of each segment, padded by -1 to the longest."""
+    ts = np.asarray(record.ts)
+    known = np.any(np.asarray(record.known), axis=-1)
+    rows = []
+    for trial, start, end in windows:
+        inside = known[trial] & (start <= ts[trial]) & (ts[trial] < end)
+        rows.append(np.flatnonzero(inside))
+    longest = max(x.size for x in rows)
+    pads = [(0, longest - x.size) for x in rows]
+    return np.stack(
+        [np.pad(x, pad, constant_values=-1) for x, pad in zip(rows, pads, strict=True)]
+    )
+
+
+def _cut(record: Record, windows: Sequence[_Window]) -> Record:
+    """A record whose trials are the segments, the shorter ones padded by NaN."""
+    trial = np.array([x.trial for x in windows])
+    index = _samples_inside(record, windows)
+
+    def cut(x: Array | None) -> Array | None:
+        if x is None:
+            return None
+        is_sample = (index >= 0).reshape(*index.shape, *[1] * (x.ndim - 2))
+        return jnp.asarray(
+            np.where(is_sample, np.asarray(x)[trial[:, None], index], np.nan)
         )
 
-        def taken(x: Array | None) -> Array | None:
-            if x is None:
-                return None
-            there = (index >= 0).reshape(*index.shape, *[1] * (x.ndim - 2))
-            return jnp.asarray(
-                np.where(there, np.asarray(x)[trial[:, None], index], np.nan)
-            )
+    def arrays(x: Record) -> tuple[Any, ...]:  # not arrays inside `tree_at`
+        return x.ts, x.values, x.sigma, x.covariance
 
-        fields = lambda x: (x.ts, x.values, x.sigma, x.covariance)  # noqa: E731
-        new = tuple(map(taken, fields(record)))
-        return eqx.tree_at(fields, record, new, is_leaf=lambda x: x is None)
-
-    return tuple(map(cut, records)), trial
+    segments = tuple(map(cut, arrays(record)))
+    return eqx.tree_at(arrays, record, segments, is_leaf=lambda x: x is None)
 
 
 class _Observed(NamedTuple):
-    """What segments tell of their states, and the most that one turns between samples [rad]."""
+    """What segments show of their states.
 
-    data: _Data | None
+    Attributes:
+        segments: The segments, None where no state is observed.
+        has_attitude: Whether attitudes are observed.
+        turn: The largest turn between two samples [rad].
+    """
+
+    segments: _Segments | None
     has_attitude: bool
     turn: float
 
@@ -261,118 +366,146 @@ class _Observed(NamedTuple):
 def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     records = on_host(records)
     samples = samples_of(records, np.ones((), records[0].values.dtype))
-    told = told_by(records, samples, None)
-    judge((system,), records, None, None, told, throw=True)
-    if told is None:
+    readings = told_by(records, samples, None)
+    judge((system,), records, None, None, readings, throw=True)
+    if readings is None:
         return _Observed(None, False, 0.0)
-    trial = np.arange(len(told.ts))
-    first = np.argmax(told.there, axis=1)
-    if told.attitude is None:
+    trial = np.arange(len(readings.ts))
+    first = np.argmax(readings.there, axis=1)
+    if readings.attitude is None:
         attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(trial), 1))
     else:
-        attitude = told.attitude[trial, first]
-    data = _Data(samples, State(attitude, told.omega[trial, first]))
-    return _Observed(data, told.attitude is not None, longest_turn(told))
-
-
-def _prepared(
-    system: RigidBody, records: tuple[Record, ...]
-) -> tuple[_Data, bool, int]:
-    """Segments, whether the attitude matters, and steps between two samples."""
-    seen = _observed(system, records)
-    depends_on_attitude = any(
-        x.sensor.depends_on_attitude for x in records
-    ) or needs_attitude(system)
-    inside = system.with_parts(State(jnp.zeros(4), jnp.zeros(3))).internal is not None
-    if seen.data is None or inside or (depends_on_attitude and not seen.has_attitude):
-        raise ValueError(
-            "Argument `observations` must tell the whole state, rates and, where a torque or a "
-            "sensor looks at them, attitudes, and no part may move inside the body, but it is not "
-            "so."
-        )
-    demand(
-        bool(
-            np.min(np.sum(seen.data.samples.weight, axis=(1, 2)))
-            > (6 if depends_on_attitude else 3)
-        ),
-        "Argument `observations` must hold more numbers in each trial, and `segment` in each "
-        "segment, than a state has, but one does not.",
+        attitude = readings.attitude[trial, first]
+    return _Observed(
+        segments=_Segments(samples, State(attitude, readings.omega[trial, first])),
+        has_attitude=readings.attitude is not None,
+        turn=longest_turn(readings),
     )
-    return seen.data, depends_on_attitude, max(1, int(np.ceil(seen.turn / _TURN)))
+
+
+class _Prepared(NamedTuple):
+    """Segments and how their motion is computed; see `_Task`."""
+
+    segments: _Segments
+    depends_on_attitude: bool
+    steps: int
+
+
+def _prepared(system: RigidBody, records: tuple[Record, ...]) -> _Prepared:
+    """Segments, checked for what training needs."""
+    observed = _observed(system, records)
+    by_sensor = any(x.sensor.depends_on_attitude for x in records)
+    depends_on_attitude = by_sensor or needs_attitude(system)
+    state = system.with_parts(State(jnp.zeros(4), jnp.zeros(3)))
+    lacks_attitude = depends_on_attitude and not observed.has_attitude
+    if observed.segments is None or state.internal is not None or lacks_attitude:
+        raise ValueError(
+            "Argument `observations` must show the whole state, rates and, where a "
+            "torque or sensor depends on them, attitudes, without parts that move "
+            "inside the body, but it does not."
+        )
+    numbers = np.sum(observed.segments.samples.weight, axis=(1, 2))
+    demand(
+        bool(np.min(numbers) > (6 if depends_on_attitude else 3)),
+        "Argument `observations` must hold more numbers in each trial, and `segment` "
+        "in each segment, than a state has, but one does not.",
+    )
+    steps = max(1, int(np.ceil(observed.turn / _TURN)))
+    return _Prepared(observed.segments, depends_on_attitude, steps)
+
+
+class _AfterEpoch(NamedTuple):
+    """What an epoch returns.
+
+    Attributes:
+        params: Parameters after the last batch.
+        memory: State of the optimiser.
+        training: Mean loss of the batches.
+        validation: Validation loss before the first batch.
+    """
+
+    params: PyTree
+    memory: PyTree
+    training: Array
+    validation: Array
+
+
+def _print_losses(epoch: int, after: _AfterEpoch) -> None:
+    losses = f"training {after.training:.4g}, validation {after.validation:.4g}"
+    print(f"epoch {epoch}: {losses}", flush=True)
 
 
 @quick_jit
-def _epoch(
-    setting: _Setting,
-    params: Any,
-    memory: Any,
-    key: Array,
-    rest: Any,
-    sensors: Any,
-    data: _Data,
-    trained: Array,
-    judged: Array,
-) -> tuple[Any, Any, Array, Array]:
-    """Parameters and optimiser after each batch; mean loss on the way; validation loss before."""
+def _epoch(task: _Task, params: PyTree, memory: PyTree, key: Array) -> _AfterEpoch:
+    """Take one step of the optimiser for each batch of segments."""
 
-    def loss(params: Any, index: Array) -> Array:
-        some = jtu.tree_map(lambda x: x[index], data)
-        of_one = lambda x: _chi_square(setting, params, rest, sensors, x)  # noqa: E731
-        squares, freedom = jax.vmap(of_one)(some)
+    def loss(params: PyTree, index: AnyArray) -> Array:
+        segments = jtu.tree_map(lambda x: x[index], task.segments)
+        squares, freedom = jax.vmap(partial(_chi_square, task, params))(segments)
         return jnp.sum(squares) / jnp.sum(freedom)
 
-    def step(carry: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], Array]:
+    def step(
+        carry: tuple[PyTree, PyTree], index: Array
+    ) -> tuple[tuple[PyTree, PyTree], Array]:
         params, memory = carry
         value, slope = jax.value_and_grad(loss)(params, index)
-        with jax.numpy_dtype_promotion("standard"):  # optax mixes types
-            updates, memory = setting.optimizer.update(slope, memory, params)
+        # optax mixes types, which fails under strict promotion.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, memory = task.optimizer.update(slope, memory, params)
             params = eqx.apply_updates(params, updates)
         return (params, memory), value
 
-    count = trained.size // setting.batch * setting.batch
-    order = jax.random.permutation(key, trained)[:count].reshape(-1, setting.batch)
-    before = loss(params, judged)
+    count = task.trained.size // task.batch * task.batch
+    order = jax.random.permutation(key, task.trained)[:count].reshape(-1, task.batch)
+    validation = loss(params, task.judged)
     (params, memory), losses = jax.lax.scan(step, (params, memory), order)
-    return params, memory, jnp.mean(losses), before
+    return _AfterEpoch(params, memory, jnp.mean(losses), validation)
 
 
-def _chi_square(
-    setting: _Setting, params: Any, rest: Any, sensors: Any, data: _Data
-) -> tuple[Array, Array]:
-    """Squares of a segment at the state that fits it best, and degrees of freedom."""
-    guess = data.guess
-    options = Options(
-        False, setting.depends_on_attitude, motion=partial(_motion, setting)
-    )
+def _chi_square(task: _Task, params: PyTree, segment: _Segments) -> tuple[Array, Array]:
+    """Sum of squares of a segment at its best state, and its degrees of freedom."""
+    samples = segment.samples
+    guess = segment.guess
+    motion = partial(_motion, task.depends_on_attitude, task.steps)
+    options = Options(False, task.depends_on_attitude, motion=motion)
 
-    def rows(params: Any, move: Array) -> Array:
-        system, attitude = eqx.combine(params, rest), guess.attitude
-        if setting.depends_on_attitude:
+    def rows(params: PyTree, move: Array) -> Array:
+        system = eqx.combine(params, task.rest)
+        attitude = guess.attitude
+        if task.depends_on_attitude:
             attitude = multiply(attitude, exp(move[3:]))
         state = State(attitude, guess.omega + move[:3])
-        shown = shown_by(
-            options, system, sensors, state, data.samples.ts[0], data.samples
-        )
-        return whitened(sensors, data.samples, shown).reshape(-1)
+        shown = shown_by(options, system, task.sensors, state, samples.ts[0], samples)
+        return whitened(task.sensors, samples, shown).reshape(-1)
 
-    # The slope in the parameters at the best state is that with the state held.
-    still = jax.lax.stop_gradient(params)
+    # At the best state chi-square does not change with the state to first order. Its
+    # slope in the parameters is therefore that with the state held.
+    held = jax.lax.stop_gradient(params)
 
-    def newton(_: Any, move: Array) -> Array:
-        slopes, left = jax.jacfwd(lambda x: (rows(still, x),) * 2, has_aux=True)(move)
+    def rows_twice(move: Array) -> tuple[Array, Array]:
+        residuals = rows(held, move)
+        return residuals, residuals
+
+    def gauss_newton(_: Array | int, move: Array) -> Array:
+        slopes, residuals = jax.jacfwd(rows_twice, has_aux=True)(move)
         normal = product("ni,nj->ij", slopes, slopes)
-        normal = normal + _RIDGE * jnp.trace(normal) * jnp.eye(
-            move.size, dtype=move.dtype
-        )
-        return move - jnp.linalg.solve(normal, product("ni,n->i", slopes, left))
+        eye = jnp.eye(move.size, dtype=move.dtype)
+        normal = normal + _RIDGE * jnp.trace(normal) * eye
+        return move - jnp.linalg.solve(normal, product("ni,n->i", slopes, residuals))
 
-    none = jnp.zeros(6 if setting.depends_on_attitude else 3, guess.omega.dtype)
-    move = jax.lax.fori_loop(0, _NEWTON, newton, none)
-    return jnp.sum(rows(params, move) ** 2), jnp.sum(data.samples.weight) - move.size
+    size = 6 if task.depends_on_attitude else 3
+    no_move = jnp.zeros(size, guess.omega.dtype)
+    move = jax.lax.fori_loop(0, _NEWTON, gauss_newton, no_move)
+    return jnp.sum(rows(params, move) ** 2), jnp.sum(samples.weight) - size
 
 
 def _motion(
-    setting: _Setting, system: RigidBody, state: State, ts: Array, t0: Array
+    depends_on_attitude: bool,
+    steps: int,
+    system: RigidBody,
+    state: State,
+    ts: Array,
+    t0: Array,
 ) -> State:
     """States at the times, of which the first is that of the state."""
     del t0
@@ -380,13 +513,7 @@ def _motion(
     def gap(before: State, times: tuple[Array, Array]) -> tuple[State, State]:
         start, end = times
         after = forced_flow(
-            system,
-            before,
-            start,
-            end,
-            setting.depends_on_attitude,
-            _METHOD,
-            setting.steps,
+            system, before, start, end, depends_on_attitude, _METHOD, steps
         )
         return after, after
 
