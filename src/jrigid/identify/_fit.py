@@ -30,14 +30,14 @@ from jrigid.identify._inputs import (
     typical_rate,
 )
 from jrigid.identify._layout import (
+    DirectReadings,
     Layout,
-    Told,
     angle_turned,
+    direct_readings_of,
     longest_turn,
     node_states,
     segments,
     segments_needed,
-    told_by,
     whole,
 )
 from jrigid.identify._minimise import tensors_at
@@ -402,7 +402,7 @@ class _Observed(NamedTuple):
     """What the records say of the state on the way, and of the size of rates and values."""
 
     samples: Samples
-    told: Told | None
+    readings: DirectReadings | None
     rate: AnyArray
     sizes: tuple[AnyArray, ...]
     angle: float
@@ -418,14 +418,14 @@ def _observed(
     sizes = sizes_of(samples)
     if not records[0].states_noise:
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
-    told = told_by(records, samples, attitude0)
-    rate = typical_rate(told, state, samples.ts.dtype)
+    readings = direct_readings_of(records, samples, attitude0)
+    rate = typical_rate(readings, state, samples.ts.dtype)
     angle, coarse = 0.0, False
-    if told is not None:
-        angle = float(np.max(angle_turned(told)[:, -1]))
-        coarse = longest_turn(told) > np.pi
+    if readings is not None:
+        angle = float(np.max(angle_turned(readings)[:, -1]))
+        coarse = longest_turn(readings) > np.pi
     return _Observed(
-        samples, told, rate, sizes, angle, coarse, noise_of(records, samples, rate)
+        samples, readings, rate, sizes, angle, coarse, noise_of(records, samples, rate)
     )
 
 
@@ -449,9 +449,9 @@ def _begun(
     length: float,
 ) -> _Begun:
     """Where the search begins."""
-    told, samples = observed.told, observed.samples
+    readings, samples = observed.readings, observed.samples
     trials, dtype = samples.ts.shape[0], samples.ts.dtype
-    tensors = linear_starts(options, unknowns, told, tensor)
+    tensors = linear_starts(options, unknowns, readings, tensor)
     unknowns, numbers = unknowns.starts(
         tensors, [_FLAT] + [_ROUND] * (len(tensors) - 1)
     )
@@ -459,9 +459,9 @@ def _begun(
     single = cut = whole(samples, options.nodes)
     attitude = np.zeros((trials, options.nodes, 4), dtype)
     attitude[..., 0] = 1
-    if options.shooting and told is not None:
-        cut, opening = segments(samples, told, options.nodes, length)
-        omega, seen = node_states(told, opening, cut.start)
+    if options.shooting and readings is not None:
+        cut, opening = segments(samples, readings, options.nodes, length)
+        omega, seen = node_states(readings, opening, cut.start)
         attitude = attitude if seen is None else seen
     else:
         assert state is not None
@@ -489,10 +489,10 @@ def _case(asked: _Asked, effort: Effort, throw: bool) -> tuple[Case, Any]:
     if state is not None and options.depends_on_attitude:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
-    result = judge(asked.systems, records, tensor, state, observed.told, throw)
+    result = judge(asked.systems, records, tensor, state, observed.readings, throw)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
-    if options.shooting and observed.told is not None:
-        count = observed.told.ts.shape[1]
+    if options.shooting and observed.readings is not None:
+        count = observed.readings.ts.shape[1]
         options = options._replace(nodes=segments_needed(observed.angle, count, length))
     unknowns = unknowns_of(
         on_host(asked.systems),

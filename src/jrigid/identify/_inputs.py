@@ -25,7 +25,7 @@ from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
-from jrigid.identify._layout import Told
+from jrigid.identify._layout import DirectReadings
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor
 from jrigid.systems import RigidBody
@@ -125,10 +125,12 @@ def refuse(
     )
 
 
-def typical_rate(told: Told | None, state: State | None, dtype: Any) -> AnyArray:
+def typical_rate(
+    readings: DirectReadings | None, state: State | None, dtype: Any
+) -> AnyArray:
     """Rms of the rates, 1 where there are none."""
-    if told is not None:
-        return rms(told.omega, told.there)
+    if readings is not None:
+        return rms(readings.omega, readings.valid)
     assert state is not None
     omega = without_gradient(state.omega.astype(dtype))
     xp = omega.__array_namespace__()
@@ -188,13 +190,15 @@ def findings_of_start(
     return findings
 
 
-def findings_of_records(records: tuple[Record, ...], told: Told | None) -> Findings:
+def findings_of_records(
+    records: tuple[Record, ...], readings: DirectReadings | None
+) -> Findings:
     """What is wrong with records, whose arrays are numpy's."""
     findings = Findings()
     check_records(findings, records)
     known = any(tells(x, "attitude") for x in records)
-    if told is not None and told.ts.shape[1] > 1 and not known:
-        findings.require(_between(told) < np.pi, RESULTS.undersampled_rates)
+    if readings is not None and readings.ts.shape[1] > 1 and not known:
+        findings.require(_between(readings) < np.pi, RESULTS.undersampled_rates)
     return findings
 
 
@@ -203,7 +207,7 @@ def judge(
     records: tuple[Record, ...],
     tensor: Any,
     state: State | None,
-    told: Told | None,
+    readings: DirectReadings | None,
     throw: bool,
 ) -> Any:
     """The result code of the arguments of a fit; RuntimeError for a bad one if `throw`."""
@@ -211,7 +215,7 @@ def judge(
     if not is_good(result):
         settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
         return result
-    findings = findings_of_records(records, told)
+    findings = findings_of_records(records, readings)
     if throw and not findings.ok:
         findings.guard(None, throw)
     return findings.result
@@ -223,9 +227,9 @@ class _Judged(NamedTuple):
     result: Any
 
 
-def _between(told: Told) -> np.floating:
+def _between(readings: DirectReadings) -> np.floating:
     """Angle turned between neighbouring samples, as a median."""
-    ok = told.there[:, 1:] & told.there[:, :-1]
-    speed = np.sqrt(np.sum(told.omega[:, 1:] ** 2, axis=-1))
-    turned = np.diff(told.ts, axis=1) * speed
+    ok = readings.valid[:, 1:] & readings.valid[:, :-1]
+    speed = np.sqrt(np.sum(readings.omega[:, 1:] ** 2, axis=-1))
+    turned = np.diff(readings.ts, axis=1) * speed
     return np.nan_to_num(_median(turned[ok]))

@@ -21,7 +21,7 @@ from jrigid.dynamics import State
 from jrigid.identify import _host as host
 from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import LogCholesky
-from jrigid.identify._layout import Told
+from jrigid.identify._layout import DirectReadings
 from jrigid.identify._records import first_and_last
 
 _Times = Real[ArrayLike, " n"]
@@ -378,7 +378,10 @@ def _singular(rows: AnyArray) -> tuple[AnyArray, ...]:
 
 
 def linear_starts(
-    options: Any, unknowns: Any, told: Told | None, given: np.ndarray | None
+    options: Any,
+    unknowns: Any,
+    readings: DirectReadings | None,
+    given: np.ndarray | None,
 ) -> np.ndarray:
     """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
@@ -390,22 +393,29 @@ def linear_starts(
     sought = unknowns.inertia_model.names and not isinstance(
         unknowns.inertia_model, LogCholesky
     )
-    if given is not None or told is None or not sought or options.motion is not None:
+    if (
+        given is not None
+        or readings is None
+        or not sought
+        or options.motion is not None
+    ):
         first = known if given is None else given.astype(dtype)
         return np.stack([first, _rounder(first)])
-    if free and told.attitude is not None and told.ts.shape[1] < _FEW_ATTITUDES:
-        rows = _rows_of_attitudes(told)
+    if free and readings.attitude is not None and readings.ts.shape[1] < _FEW_ATTITUDES:
+        rows = _rows_of_attitudes(readings)
     else:
-        there = told.there[..., None]
-        zero = np.zeros_like(told.omega)
-        omegas = np.where(there, told.omega, zero)
-        torques = zero if free else np.where(there, _torques_at(unknowns, told), zero)
-        # Times that are not there repeat one.
-        first = first_and_last(told.ts, told.there)[0]
-        ts = np.maximum.accumulate(
-            np.where(told.there, told.ts, first[:, None]), axis=1
+        there = readings.valid[..., None]
+        zero = np.zeros_like(readings.omega)
+        omegas = np.where(there, readings.omega, zero)
+        torques = (
+            zero if free else np.where(there, _torques_at(unknowns, readings), zero)
         )
-        trials = zip(ts, told.there, omegas, zero, torques, strict=True)
+        # Times that are not there repeat one.
+        first = first_and_last(readings.ts, readings.valid)[0]
+        ts = np.maximum.accumulate(
+            np.where(readings.valid, readings.ts, first[:, None]), axis=1
+        )
+        trials = zip(ts, readings.valid, omegas, zero, torques, strict=True)
         rows = np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in trials])
     rows = np.where(
         np.isfinite(rows), rows, 0.0
@@ -413,14 +423,14 @@ def linear_starts(
     trace = None if unknowns.scaled and not free else np.trace(known)
     plain, leaning = _least_squares(rows, trace, np.trace(known))
     both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
-    return np.concatenate([np.stack(both), _plain_bodies(told, leaning)])
+    return np.concatenate([np.stack(both), _plain_bodies(readings, leaning)])
 
 
-def _rows_of_attitudes(told: Told) -> np.ndarray:
+def _rows_of_attitudes(readings: DirectReadings) -> np.ndarray:
     """Equations (n, 7): the momentum in space at each sample is the mean one of its trial."""
-    assert told.attitude is not None
-    weight = told.there[..., None, None].astype(told.omega.dtype)
-    turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))
+    assert readings.attitude is not None
+    weight = readings.valid[..., None, None].astype(readings.omega.dtype)
+    turned = weight * _momenta(readings.omega, host.to_matrix(readings.attitude))
     count = np.maximum(np.sum(weight, axis=1, keepdims=True), 1.0)
     mean = np.sum(turned, axis=1, keepdims=True) / count
     rows = np.pad(turned - weight * mean, [(0, 0)] * 3 + [(0, 1)])
@@ -433,22 +443,22 @@ def _rounder(tensor: np.ndarray) -> np.ndarray:
     return 0.5 * (tensor + third * np.eye(3, dtype=tensor.dtype))
 
 
-def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
+def _plain_bodies(readings: DirectReadings, like: np.ndarray) -> np.ndarray:
     """A sphere, and bodies of revolution along the axes of the rates, as large as the one given."""
-    shown = np.where(told.there[..., None], told.omega, 0.0).reshape(-1, 3)
+    shown = np.where(readings.valid[..., None], readings.omega, 0.0).reshape(-1, 3)
     axes = np.linalg.eigh(shown.T @ shown)[1]
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
     shapes = (shapes / shapes.sum(axis=1, keepdims=True)).astype(axes.dtype)
     return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
 
 
-def _torques_at(unknowns: Any, told: Told) -> np.ndarray:
+def _torques_at(unknowns: Any, readings: DirectReadings) -> np.ndarray:
     """Torques at the samples; where attitudes are not known, at the unit quaternion."""
-    attitude = told.attitude
+    attitude = readings.attitude
     if attitude is None:
-        unit = np.eye(1, 4, dtype=told.ts.dtype)[0]
-        attitude = np.broadcast_to(unit, (*told.ts.shape, 4))
-    return np.asarray(_torques(unknowns, told.ts, attitude, told.omega))
+        unit = np.eye(1, 4, dtype=readings.ts.dtype)[0]
+        attitude = np.broadcast_to(unit, (*readings.ts.shape, 4))
+    return np.asarray(_torques(unknowns, readings.ts, attitude, readings.omega))
 
 
 @small_program

@@ -22,7 +22,7 @@ from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import forced_flow, needs_attitude
 from jrigid.identify._host import on_host
 from jrigid.identify._inputs import judge
-from jrigid.identify._layout import longest_turn, told_by
+from jrigid.identify._layout import direct_readings_of, longest_turn
 from jrigid.identify._problem import Options, shown_by, whitened
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.rotation import exp, multiply
@@ -261,18 +261,18 @@ class _Observed(NamedTuple):
 def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     records = on_host(records)
     samples = samples_of(records, np.ones((), records[0].values.dtype))
-    told = told_by(records, samples, None)
-    judge((system,), records, None, None, told, throw=True)
-    if told is None:
+    readings = direct_readings_of(records, samples, None)
+    judge((system,), records, None, None, readings, throw=True)
+    if readings is None:
         return _Observed(None, False, 0.0)
-    trial = np.arange(len(told.ts))
-    first = np.argmax(told.there, axis=1)
-    if told.attitude is None:
+    trial = np.arange(len(readings.ts))
+    first = np.argmax(readings.valid, axis=1)
+    if readings.attitude is None:
         attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(trial), 1))
     else:
-        attitude = told.attitude[trial, first]
-    data = _Data(samples, State(attitude, told.omega[trial, first]))
-    return _Observed(data, told.attitude is not None, longest_turn(told))
+        attitude = readings.attitude[trial, first]
+    data = _Data(samples, State(attitude, readings.omega[trial, first]))
+    return _Observed(data, readings.attitude is not None, longest_turn(readings))
 
 
 def _prepared(
