@@ -22,10 +22,11 @@ from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem, evaluation
 from jrigid.identify._smoother import (
     Links,
+    Move,
     Point,
     Rows,
-    blocks_of,
     moved,
+    normal_equations,
     step_of,
 )
 from jrigid.identify._unknowns import Unknowns
@@ -135,7 +136,7 @@ class _Loop(NamedTuple):
     """
 
     best: _Evaluation
-    move: tuple[Array, Array, Array]
+    move: Move
     gain: Array
     damping: Array
     growth: Array
@@ -242,13 +243,11 @@ def _evaluate(
     return _Evaluation(point, rows, links, weight, kicks, square, square + kicks)
 
 
-def _next_step(
-    place: _Evaluation, push: Push, damping: Array
-) -> tuple[tuple[Array, Array, Array], Array]:
+def _next_step(place: _Evaluation, push: Push, damping: Array) -> tuple[Move, Array]:
     """Return the damped step from a point, and by how much it should lower the cost."""
     rows, links = _torque_included(place.rows, place.links, push, place.point.torque)
-    blocks = blocks_of(rows, links, place.weight, push.whitener)
-    return step_of(blocks, place.point.own.shape[-1], damping)
+    equations = normal_equations(rows, links, place.weight, push.whitener)
+    return step_of(equations, place.point.own.shape[-1], damping)
 
 
 def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array]:
@@ -325,7 +324,7 @@ def _initial_loop(problem: Problem, point: Point, settings: Settings) -> _Loop:
     )
     return _Loop(
         best=best,
-        move=(jnp.zeros_like(point.numbers), jnp.zeros_like(point.own), still),
+        move=Move(jnp.zeros_like(point.numbers), jnp.zeros_like(point.own), still),
         gain=one,
         damping=settings.damping,
         growth=2 * one,
