@@ -290,7 +290,7 @@ def test_a_level_without_bound_is_a_failed_fit():
     for _ in range(6):
         values = np.ones(3) + 0.01 * np.cumsum(rng.normal(size=(60, 3)), axis=0)
         readings = identify.Rates(np.arange(60) * 0.1, values)
-        options = {"shape": identify.Fixed(), "unmodelled": "estimate"}
+        options = {"inertia_model": identify.Fixed(), "unmodelled": "estimate"}
         found = identify.fit(BLIND, readings, throw=False, **options)
         failed.append(bool(found.status == Status.NOT_CONVERGED))
         assert failed[-1] == (not np.all(np.isfinite(found.level)))

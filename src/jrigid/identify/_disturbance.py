@@ -159,53 +159,81 @@ def push_of(
         tensor: Inertia.
         depends_on_attitude: Whether the state has an attitude.
     """
+    # Nodes without a link have a length too, so that no division by zero occurs.
     dt = jnp.where(linked, span, 1.0)
     time = jnp.maximum(disturbance.time, jnp.finfo(dt.dtype).tiny)
     steps = jnp.minimum(dt[..., None] / time[None, None], _LONGEST)
     covariance, response = _torque_over_a_step(steps)
-    level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
     # Rates, turns and torques, of which the state may have no turns.
     kinds = [0, 1, 2] if depends_on_attitude else [0, 2]
+    entries = [[covariance[..., i, j] for j in kinds] for i in kinds]
+    level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
     units = [level, level * dt[..., None], jnp.ones_like(level)]
+    units = [units[i] for i in kinds]
+    # Angular momentum over inertia is a rate; a torque stays as it is.
     eye = jnp.eye(3, dtype=dt.dtype)
-    momentum_of_state = [tensor, tensor, eye]
-    state_of_momentum = [jnp.linalg.inv(tensor), jnp.linalg.inv(tensor), eye]
-    whitener = _inverse_cholesky(
-        [[covariance[..., i, j] for j in kinds] for i in kinds]
-    )
-
-    def covariance_block(i: int, j: int) -> Array:
-        size = units[i] * covariance[..., i, j] * units[j]
-        return product(
-            "ak,...k,bk->...ab", state_of_momentum[i], size, state_of_momentum[j]
-        )
-
-    def whitener_block(i: int, j: int) -> Array:
-        size = whitener[kinds.index(i)][kinds.index(j)] / units[j]
-        return product("...a,ab->...ab", size, momentum_of_state[j])
-
-    def response_block(i: int) -> Array:
-        return product(
-            "ab,...b->...ab", state_of_momentum[i], units[i] * response[..., i]
-        )
-
+    momentum = [tensor] * (len(kinds) - 1) + [eye]
+    rates = [jnp.linalg.inv(tensor)] * (len(kinds) - 1) + [eye]
+    carried = [
+        product("ab,...b->...ab", rate, unit * response[..., kind])
+        for rate, unit, kind in zip(rates, units, kinds, strict=True)
+    ]
     is_link = linked.astype(dt.dtype)[..., None, None]
-    response_blocks = [response_block(i) for i in kinds]
     return Push(
-        covariance=is_link * _assembled(covariance_block, kinds),
-        whitener=is_link * _assembled(whitener_block, kinds),
-        carried=is_link * jnp.concatenate(response_blocks, axis=-2),
+        covariance=is_link * _covariance_matrix(entries, units, rates),
+        whitener=is_link * _whitening_matrix(entries, units, momentum),
+        carried=is_link * jnp.concatenate(carried, axis=-2),
     )
 
 
-def _assembled(block: Callable[[int, int], Array], kinds: list[int]) -> Array:
-    """A matrix of 3 by 3 blocks, for each pair of kinds."""
+def _covariance_matrix(
+    entries: list[list[Array]], units: list[Array], rates: list[Array]
+) -> Array:
+    """Covariance of rates, turns and torques.
+
+    Args:
+        entries: Covariance of each pair of kinds along each axis (..., 3).
+        units: Their units along each axis.
+        rates: Matrices that turn momenta into rates, of each kind.
+    """
+
+    def block(i: int, j: int) -> Array:
+        size = units[i] * entries[i][j] * units[j]
+        return product("ak,...k,bk->...ab", rates[i], size, rates[j])
+
+    return _assembled(block, len(units))
+
+
+def _whitening_matrix(
+    entries: list[list[Array]], units: list[Array], momentum: list[Array]
+) -> Array:
+    """Matrix that makes the same covariance the unit matrix.
+
+    Args:
+        entries: Covariance of each pair of kinds along each axis (..., 3).
+        units: Their units along each axis.
+        momentum: Matrices that turn rates into momenta, of each kind.
+    """
+    # Along each axis the kinds are correlated, but the axes are not.
+    inverse = _inverse_cholesky(entries)
+
+    def block(i: int, j: int) -> Array:
+        return product("...a,ab->...ab", inverse[i][j] / units[j], momentum[j])
+
+    return _assembled(block, len(units))
+
+
+def _assembled(block: Callable[[int, int], Array], count: int) -> Array:
+    """A matrix of `count` by `count` blocks."""
+    kinds = range(count)
     rows = [jnp.concatenate([block(i, j) for j in kinds], axis=-1) for i in kinds]
     return jnp.concatenate(rows, axis=-2)
 
 
 def _inverse_cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
     """Inverse of the Cholesky factor of a small matrix, whose entries are arrays."""
+    # Written out for matrices of two or three rows, where LAPACK would be called once
+    # for each link.
     size = len(matrix)
     zero = jnp.zeros_like(matrix[0][0])
     lower = [[zero] * size for _ in range(size)]
@@ -237,6 +265,7 @@ def with_torque(
     next_torque = jnp.where(linked, jnp.roll(torque, -1, axis=1), 0.0)
     gap = jnp.pad(links.gap, [(0, 0), (0, 0), (0, 3)])
     gap = gap + product("tnij,tnj->tni", push.carried, torque)
+    # The gap of the torque: what is left of it at the end, less the next one.
     gap = gap.at[..., local:].add(-next_torque)
     three_rows = [(0, 0), (0, 0), (0, 3), (0, 0)]
     of_state = jnp.pad(links.of_state, three_rows)

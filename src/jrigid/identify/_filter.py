@@ -81,12 +81,12 @@ class _Estimate(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """One sample as the filter reads it; all are multiplied by the root of its weight.
+    """One sample.
 
     Attributes:
-        residual: The residual and its derivatives in the first state, through the
-            filter's state only, and in the border (degrees, columns).
-        of_state: Derivatives in the state at its node (degrees, local).
+        residual: The residual and its derivatives as columns (degrees, columns), times
+            the root of the sample's weight.
+        of_state: Derivatives in the state at its node (degrees, local), times the same.
         crosses: Whether a link lies between the sample before and this one.
         link: Index of that link.
     """
@@ -131,6 +131,7 @@ def _with_reading(
         The estimate, the whitened innovation (columns,) and the logarithm of its
         variance.
     """
+    # The residual is predicted less observed, so that the gain lowers the state.
     state, covariance = estimate
     with_state = product("ij,j->i", covariance, of_state)
     variance = 1 + product("i,i->", of_state, with_state)
@@ -145,6 +146,47 @@ def _with_reading(
     )
 
 
+class _Filter(NamedTuple):
+    """The Kalman filter of one trial.
+
+    Attributes:
+        of_state: Derivatives of each link's end in the state at its start (nodes,
+            local, local).
+        gaps: Gaps of the links as columns (nodes, local, columns).
+        covariance: Covariance that each link adds (nodes, local, local).
+    """
+
+    of_state: Array
+    gaps: Array
+    covariance: Array
+
+    def across_link(self, estimate: _Estimate, link: Array) -> _Estimate:
+        """Predict the state at the end of a link."""
+        of_state = self.of_state[link]
+        state = product("ij,jc->ic", of_state, estimate.state) + self.gaps[link]
+        covariance = product("ij,jk,lk->il", of_state, estimate.covariance, of_state)
+        return _Estimate(state, covariance + self.covariance[link])
+
+    def step(
+        self, estimate: _Estimate, sample: _Sample
+    ) -> tuple[_Estimate, tuple[Array, Array]]:
+        """Update the estimate by a sample; return innovations and log determinant."""
+        after = self.across_link(estimate, sample.link)
+        estimate = _Estimate(
+            jnp.where(sample.crosses, after.state, estimate.state),
+            jnp.where(sample.crosses, after.covariance, estimate.covariance),
+        )
+        log_determinant = jnp.zeros((), estimate.state.dtype)
+        whitened = []
+        # The noise of the sample's numbers is independent, so that they can be used one
+        # by one, which needs no inverse of a matrix.
+        for residual, of_state in zip(sample.residual, sample.of_state, strict=True):
+            estimate, innovation, log = _with_reading(estimate, residual, of_state)
+            whitened.append(innovation)
+            log_determinant = log_determinant + log
+        return estimate, (jnp.stack(whitened), log_determinant)
+
+
 def _innovations_of_trial(
     rows: Rows, links: Links, weight: Array, push: Push
 ) -> tuple[Array, Array]:
@@ -154,29 +196,7 @@ def _innovations_of_trial(
     root = jnp.sqrt(weight)[:, None, None]
     residuals = _columns(rows.residual, inner, rows.of_border)
     gaps = _columns(links.gap, inner, links.of_border)
-    dtype = links.gap.dtype
-
-    def across_link(estimate: _Estimate, link: Array) -> _Estimate:
-        of_state = links.of_state[link]
-        state = product("ij,jc->ic", of_state, estimate.state) + gaps[link]
-        covariance = product("ij,jk,lk->il", of_state, estimate.covariance, of_state)
-        return _Estimate(state, covariance + push.covariance[link])
-
-    def step(estimate: _Estimate, sample: _Sample) -> tuple[_Estimate, tuple]:
-        after = across_link(estimate, sample.link)
-        estimate = _Estimate(
-            jnp.where(sample.crosses, after.state, estimate.state),
-            jnp.where(sample.crosses, after.covariance, estimate.covariance),
-        )
-        log_determinant = jnp.zeros((), dtype)
-        whitened = []
-        # The noise of the sample's numbers is independent: they come one by one.
-        for residual, of_state in zip(sample.residual, sample.of_state, strict=True):
-            estimate, innovation, log = _with_reading(estimate, residual, of_state)
-            whitened.append(innovation)
-            log_determinant = log_determinant + log
-        return estimate, (jnp.stack(whitened), log_determinant)
-
+    # Samples of several sensors are not in the order of time.
     order = jnp.argsort(rows.node, stable=True)
     node = rows.node[order]
     before = jnp.concatenate([jnp.zeros(1, node.dtype), node[:-1]])
@@ -186,8 +206,9 @@ def _innovations_of_trial(
         crosses=node > before,
         link=before,
     )
-    start = _initial_estimate(local, inner, residuals.shape[-1], dtype)
-    _, (innovations, log_determinants) = jax.lax.scan(step, start, samples)
+    start = _initial_estimate(local, inner, residuals.shape[-1], links.gap.dtype)
+    kalman = _Filter(links.of_state, gaps, push.covariance)
+    _, (innovations, log_determinants) = jax.lax.scan(kalman.step, start, samples)
     return innovations[jnp.argsort(order)], jnp.sum(log_determinants)
 
 
@@ -229,6 +250,7 @@ def _without_own(own: int, products: Array) -> tuple[Array, Array]:
 
 def _at_best_numbers(products: Array) -> tuple[Array, Array]:
     """Chi-square with the numbers that make it smallest, and their log determinant."""
+    # Without numbers only the square of the residuals is left.
     if products.shape[0] == 1:
         return products[0, 0], jnp.zeros_like(products[0, 0])
     solved, log_determinant = solve_positive(products[1:, 1:], products[1:, :1])
@@ -248,6 +270,7 @@ def _minus_two_log_likelihood(
     torque = Disturbance(jnp.exp(trials[:, None] + levels[None]), jnp.exp(times))
     rows, log_determinant = _filtered(record, torque)
     products = prior + product("tndi,tndj->tij", rows, rows)
+    # Numbers are eliminated as in least squares: first those of each trial.
     own = record.links.gap.shape[-1] + record.own.shape[-1]
     products, log_of_own = jax.vmap(lambda x: _without_own(own, x))(products)
     logs = log_determinant + log_of_own

@@ -77,7 +77,7 @@ def _index_after(valid: np.ndarray) -> np.ndarray:
 
 
 def _nearest_before(ts: np.ndarray, valid: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Index of the last valid sample not after each t; of the first if all are later."""
+    """Index of the last valid sample up to each t, or of the first one."""
     times = np.maximum.accumulate(np.where(valid, ts, -np.inf))
     after = np.searchsorted(times, t, side="right")
     latest = _index_before(np.append(valid, False))[after]
@@ -143,6 +143,7 @@ def _dead_reckoning(
     """Attitudes of a trial at times of rates, each from the last observed attitude."""
     latest = _nearest_before(attitude_ts, attitude_valid, ts)
     observed = _turned_by(attitude[latest], omega, ts - attitude_ts[latest])
+    # The first rate after a new attitude starts anew; the others add their turns.
     is_first = np.diff(latest, prepend=-1) != 0
     factors = np.where(is_first[:, None], observed, exp(_turns(ts, valid, omega)))
     return normalize(_running_products(factors, is_first))
@@ -210,6 +211,7 @@ def direct_readings_of(
         omega = _for_each_trial(_rates_from_attitudes, *attitudes)
         return DirectReadings(ts, valid, omega, attitude)
     ts, valid, omega = rates
+    # A missing reading is not zero after the sensor's bias is subtracted.
     omega = np.where(valid[..., None], omega, 0.0)
     if attitudes is None and attitude0 is not None:
         start = first_and_last(ts, valid)[0][:, None]
@@ -255,6 +257,7 @@ def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
     is_first = xp.broadcast_to(xp.arange(nodes) == 0, (ts.shape[0], nodes))
     begin = xp.broadcast_to(first if t0 is None else xp.asarray(t0), first.shape)
     start = xp.where(is_first, begin[:, None], 0.0)
+    # A trial of one sample has no length.
     span = xp.where(last > first, last - first, 1.0)
     return Layout(
         ts=ts,
@@ -284,6 +287,7 @@ def segments(
         measure = angle_turned(readings)
         most = max(nodes - 1, 1)
     else:
+        # Half a step off the edges of segments, where rounding would decide.
         measure = np.cumsum(readings.valid, axis=1).astype(samples.ts.dtype) - 0.5
         most = nodes
     size = np.maximum(length or 1.0, measure[:, -1] / most)
@@ -365,6 +369,7 @@ def segments_needed(angle: float, samples: int, length: float) -> int:
     """
     if not length:
         return min(samples, MOST_NODES)
+    # More segments than this would have fewer than two samples each.
     most = samples // 2 + 2
     if not 0 <= angle < math.inf:
         return most

@@ -34,6 +34,7 @@ from jrigid.identify._unknowns import Unknowns
 # The most steps of one call. It must suffice for a stage, which may end elsewhere in a
 # bent valley if it is cut in two.
 STEPS = 400
+# As Madsen, Nielsen & Tingleff (2004), section 3.2, recommend for rough initial values.
 FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-12
 # A search has converged only where it takes nearly undamped steps, and is given up
@@ -186,6 +187,7 @@ def _robust_weights(
     """
     width = jnp.sum(problem.samples.weight, axis=-1)
     size = of_samples(problem, settings.scales**2)[None]
+    # Samples without a reading have no width.
     bend = jnp.maximum(_BEND * width * size, 1e-30)
     known = square.shape[1] - bend.shape[1]
     bend = jnp.pad(bend, ((0, 0), (0, known)), constant_values=jnp.inf)
@@ -210,6 +212,7 @@ def push_over(
         )
     # Without such a torque the weights of multiple shooting stand in its place.
     local = problem.options.local
+    # They are in units of the noise, so that one schedule serves all records.
     linked = layout.linked.astype(numbers.dtype)
     size = jnp.diag(settings.weight / problem.noise[:local])
     whitener = product("ts,ij->tsij", linked, size)
@@ -310,6 +313,7 @@ def _initial_rows(problem: Problem, point: Point) -> tuple[Rows, Links]:
 
 def _initial_loop(problem: Problem, point: Point, settings: Settings) -> _Loop:
     """State of the loop before the first evaluation; its first step moves nothing."""
+    # An infinite cost makes the first evaluation the best one.
     rows, links = _initial_rows(problem, point)
     one = jnp.ones((), point.omega.dtype)
     still = jnp.concatenate([links.gap, jnp.zeros_like(point.torque)], axis=-1)
@@ -346,6 +350,7 @@ def _iteration(
     """Try the step, keep the better point and compute the next step, in all lanes."""
     point = over_lanes(moved)(loop.best.point, loop.move)
     new = over_lanes(_evaluate)(problem, layout, settings, push, point)
+    # Residuals are not finite where the motion could not be integrated.
     finite = jnp.all(jnp.isfinite(new.rows.of_border), axis=(1, 2, 3, 4))
     finite = jnp.isfinite(new.cost) & finite
     better = loop.going & finite & (new.cost <= loop.best.cost)
@@ -353,6 +358,8 @@ def _iteration(
     damping, growth = _next_damping(loop, better, new.cost)
     move, gain = over_lanes(_next_step)(best, push, damping)
     worthwhile = _worthwhile_gain(problem, settings, best.cost)
+    # Under strong damping a small gain does not mean convergence. Without any gain, or
+    # with NaN, rounding is reached.
     converged = (gain <= worthwhile) & (damping <= _UNDAMPED)
     settled = converged | (damping > _STUCK) | ~(gain > 1e-6 * worthwhile)
     steps = loop.steps + loop.going.astype(loop.steps.dtype)

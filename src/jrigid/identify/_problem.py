@@ -25,7 +25,8 @@ from jrigid.rotation import conjugate, exp, multiply, normalize
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody
 
-RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
+# Tolerance of the integration of a whole record, by the size of the dtype in bytes.
+RTOL = {8: 1e-9, 4: 1e-5}
 # Standard deviations beyond a limit, where a saturated reading no longer matters.
 _SURE = 6.0
 
@@ -151,6 +152,8 @@ def _integrated(
     def motion(times: Array) -> State:
         if options.motion is not None:
             return options.motion(system, first, times, t0)
+        # Few unknowns meet many residuals, hence forward mode. A motion that cannot be
+        # integrated is not finite, and the step that led there is rejected.
         return simulate(
             system,
             first,
@@ -214,6 +217,7 @@ def _states(
     first = _picked(nodes, 0)
     whole = _integrated(options, system, first, layout.ts, layout.start[0])
     states = _picked(whole, sample)
+    # The lags of a sensor are short, so that one step from its samples suffices.
     if lag is not None:
         states = _flow(options, system, states, ts, times)
     return states, nodes
@@ -328,6 +332,7 @@ def whitened(
     rows = product("nij,nj->ni", samples.whitener, jnp.concatenate(parts))
     if any(x.saturation() is not None for x in sensors):
         rows = _unlikely(rows, samples.sign)
+    # Missing readings have finite values, so that derivatives stay finite too.
     return rows * samples.weight
 
 
@@ -393,6 +398,7 @@ def _residuals(
     values, ends = _readings(
         options, system, sensors, nodes, trial.layout, trial.samples
     )
+    # Prior knowledge of the numbers of all trials must count once.
     held = numbers[unknowns.slices["scale"].stop :]
     shared = trial.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
     known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
@@ -409,6 +415,7 @@ def _linearised(
     problem: Problem, point: Point, leaves: tuple[AnyArray, ...], trial: _Trial
 ) -> tuple[Rows, Links]:
     """Rows and links of one trial, with derivatives in the border and the states."""
+    # Derivatives by directions, which share one evaluation of the residuals.
     local = problem.options.local
     still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
 
@@ -447,6 +454,7 @@ def _over_trials(
 
     def over(point: Point, *changes: Array) -> Any:
         axes = axes_of_point, stacked, 0, *(0 for _ in changes)
+        # `inlined` halves the time that tracing under nested vmaps takes.
         one = partial(inlined, function)
         return jax.vmap(one, in_axes=axes)(
             point, problem.unknowns.leaves, trials, *changes

@@ -164,6 +164,7 @@ def _sums_over_rows(nodes: int, rows: Rows, weight: Array) -> tuple[Array, ...]:
     def at_nodes(of_rows: Array) -> Array:
         return jax.ops.segment_sum(of_rows, node, nodes)
 
+    # Samples of one node are added; those of different nodes have no product.
     state = product("n,ndi->ndi", weight, of_state)
     border = product("n,ndi->ndi", weight, of_border)
     return (
@@ -228,6 +229,8 @@ def normal_equations(
 
 def _damped(matrix: Array, damping: Array) -> Array:
     """Matrices with a part of their diagonals added, and 1 where these are zero."""
+    # Marquardt's scaling makes the damping independent of units. A zero belongs to a
+    # state without samples, which stays where it is.
     diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
     more = jnp.where(diagonal > 0, damping * diagonal, 1.0)
     eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
@@ -244,10 +247,12 @@ def solve_positive(matrix: Array, columns: Array) -> tuple[Array, Array]:
     Returns:
         Solutions (n, k), and the logarithm of the determinant.
     """
+    # Unit diagonal, since rates, turns and numbers have different units.
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     size = jnp.where(size > 0, size, 1.0)
     scaled = matrix / size[:, None] / size[None, :]
     eye = jnp.eye(size.size, dtype=size.dtype)
+    # Rounding must not make a nearly singular matrix indefinite.
     lower = jnp.linalg.cholesky(scaled + 4 * jnp.finfo(size.dtype).eps * eye)
     solved = jax.scipy.linalg.cho_solve((lower, True), columns / size[:, None])
     return solved / size[:, None], 2 * jnp.sum(jnp.log(size * jnp.diagonal(lower)))
@@ -281,6 +286,7 @@ def _eliminate_state(
 def _eliminate_later_states(equations: NormalEquations) -> tuple[Array, ...]:
     """Fields of `FirstStates` for one trial."""
     states = _StateBlocks(equations.state, equations.side, equations.state_right)
+    # The first state stays, since the trial's own numbers are eliminated with it.
     first = _StateBlocks(*(x[0] for x in states))
     later = _StateBlocks(*(x[1:] for x in states)), equations.coupling[:-1]
     nothing = _StateBlocks(*map(jnp.zeros_like, first))
@@ -334,6 +340,7 @@ def _moves_of_states(solved: Array, first: Array, border: Array) -> Array:
     """Moves of a trial's states, from that of the first state and of the border."""
     local = first.size
 
+    # Back substitution, from the first state on.
     def forward(before: Array, node: Array) -> tuple[Array, Array]:
         move = -node[:, -1] - product("ij,j->i", node[:, :local], before)
         move = move - product("ij,j->i", node[:, local:-1], border)
@@ -362,6 +369,7 @@ def step_of(equations: NormalEquations, own: int, damping: Array) -> tuple[Move,
     first = first_states(damped)
     shared = shared_numbers(first, local + own)
     right = jnp.sum(shared.right, axis=0)
+    # There may be no numbers for all trials.
     numbers = -right
     if right.size:
         numbers = -solve_positive(shared.matrix, right[:, None])[0][:, 0]
@@ -375,6 +383,7 @@ def step_of(equations: NormalEquations, own: int, damping: Array) -> tuple[Move,
     owns = firsts[:, local:]
     of_own = equations.border_right[:, :own]
     of_numbers = jnp.sum(equations.border_right[:, own:], axis=0)
+    # With the damped part, which is not counted, the linear model gains more.
     gain = -jnp.sum(equations.state_right * states) - jnp.sum(of_own * owns)
     gain = gain - jnp.sum(of_numbers * numbers)
     return Move(numbers, owns, states), gain
@@ -386,6 +395,7 @@ def moved(point: Point, move: Move) -> Point:
     attitude = point.attitude
     local = states.shape[-1] - point.torque.shape[-1]
     if local == 6:
+        # Turns about body axes multiply from the right.
         turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
         attitude = turn(attitude, states[..., 3:6])
     return Point(

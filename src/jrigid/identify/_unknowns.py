@@ -139,6 +139,7 @@ class AbstractSought(Readable):
     def with_errors(self, x: Array, covariance: Array) -> tuple[Array, Array]:
         """The array and its standard errors."""
         slopes = jax.jacfwd(self.value)(x)
+        # Linear propagation of errors.
         square = jnp.einsum("...n,nm,...m->...", slopes, covariance, slopes)
         return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
 
@@ -171,6 +172,7 @@ class _Positive(AbstractSought):
     """A positive array: linear in large numbers, exponential in small ones."""
 
     def start(self) -> AnyArray:
+        # The inverse of softplus.
         xp = self.base.__array_namespace__()
         return xp.log(xp.expm1(xp.maximum(self.base / self.unit, _LEAST))).reshape(-1)
 
@@ -194,6 +196,7 @@ class _Definite(AbstractSought):
 
     def start(self) -> AnyArray:
         xp = self.base.__array_namespace__()
+        # Zero, a frequent initial value, has no logarithm.
         eye = _LEAST * xp.eye(3, dtype=self.unit.dtype)
         lower = cholesky(self.base / xp.max(self.unit) + eye)
         return xp.concatenate([xp.log(xp.diagonal(lower)), lower[SIDES]])
@@ -217,7 +220,7 @@ class _Arrays(NamedTuple):
 
     parts: tuple[RigidBody | AbstractSensor, ...]
     rest: tuple[Any, ...]
-    structure: jtu.PyTreeDef
+    structure: Any  # a PyTreeDef, which is no type to pyright
     paths: list[tuple[Any, ...]]
     values: list[AnyArray]
     leaves: list[AnyArray]
@@ -241,7 +244,7 @@ def _arrays_of(
     leaves = []
     stacked = []
     for values in zip(*of_trials, strict=True):
-        # Systems of which one was made from another share the arrays that are equal.
+        # Only the identical array counts as shared: values may be traced.
         differs = any(x is not values[0] for x in values)
         leaves.append(xp.stack(values) if differs else values[0])
         stacked.append(differs)
@@ -265,6 +268,7 @@ def _field_metadata(parts: Any, path: Sequence[Any]) -> Mapping[str, Any]:
     """The metadata of the field where a path ends."""
     metadata: Mapping[str, Any] = {}
     for key in path:
+        # Only fields have metadata: below tuples and dictionaries it stays the same.
         if isinstance(key, jtu.GetAttrKey):
             metadata = type(parts).__dataclass_fields__[key.name].metadata
             parts = getattr(parts, key.name)
@@ -291,6 +295,7 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
     if free is None:
         return []
     indices = range(len(arrays.paths))
+    # `free` is called with objects that have marks in place of their arrays.
     marked = eqx.combine(arrays.structure.unflatten(map(_Pick, indices)), arrays.rest)
     accepts = inspect.signature(free).parameters.values()
     takes_all = any(x.kind == x.VAR_POSITIONAL for x in accepts)
@@ -386,6 +391,7 @@ class Unknowns(eqx.Module):
         """The tensor."""
         tensor = self.inertia_model.inertia(numbers[self.slices["inertia"]])
         tensor = tensor.astype(numbers.dtype)
+        # Free motion determines the tensor up to a factor only.
         if not self.inertia_model.absolute:
             tensor = self.trace * tensor / jnp.trace(tensor)
         if self.scaled:
@@ -485,6 +491,7 @@ class Unknowns(eqx.Module):
                 value = _of_group(value, members[x.name], given)
             arrays[x.index] = value
         system, *sensors = self._built(arrays)
+        # Some models determine the mass and the lever of the weight, too.
         mass = self.inertia_model.body(numbers[slices["inertia"]])
         changed = self.inertia(numbers), _with_mass(system.torque, mass)
         return eqx.tree_at(lambda x: (x.inertia, x.torque), system, changed), *sensors
@@ -608,6 +615,7 @@ def _sought(
     base = arrays.values[pick.index].astype(dtype)
     is_of_system = path[0].idx == 0
     if is_of_system:
+        # An array of zeros has no size to be measured by.
         unit = or_one(xp.max(xp.abs(base)).astype(dtype))
     unit = xp.broadcast_to(xp.asarray(unit, dtype), base.shape).astype(dtype)
     kind = _Real
@@ -618,7 +626,7 @@ def _sought(
         name=_name(arrays.parts, path),
         own=pick.own,
         base=base,
-        unit=without_gradient(unit),
+        unit=without_gradient(unit),  # its choice must not change a derivative
         sigma=None if pick.sigma is None else xp.asarray(pick.sigma, dtype),
     )
 
