@@ -15,7 +15,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike
 
 from jrigid._numerics import product
-from jrigid._types import AnyArray
+from jrigid._types import AnyArray, Real
 from jrigid.identify._smoother import Links, Rows
 
 # Steps, in correlation times, beyond which the torque counts as white, or as constant.
@@ -52,7 +52,9 @@ class GaussMarkov(eqx.Module):
     level: AnyArray
     time: AnyArray
 
-    def __init__(self, level: ArrayLike, time: ArrayLike = 0.0):
+    def __init__(
+        self, level: Real[ArrayLike, "..."], time: Real[ArrayLike, "..."] = 0.0
+    ):
         """Broadcast both arguments to three axes."""
         self.level = np.broadcast_to(np.asarray(level, float), 3)
         self.time = np.broadcast_to(np.asarray(time, float), 3)

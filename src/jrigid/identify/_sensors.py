@@ -44,7 +44,8 @@ def _array(
         positive: Whether a fit keeps the array positive.
     """
 
-    def convert(value: ArrayLike | None) -> Array | None:
+    # Without annotations, which signatures of sensors would show.
+    def convert(value):
         return None if value is None else array_of_shape(name, value, *shapes)
 
     metadata = {"unit": unit, "positive": positive}
@@ -54,7 +55,7 @@ def _array(
 def _vector(name: str) -> Callable[[ArrayLike], Array]:
     """A converter to vectors."""
 
-    def convert(value: ArrayLike) -> Array:
+    def convert(value):
         return array_of_shape(name, value, 3)
 
     return convert

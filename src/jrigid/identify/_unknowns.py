@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from jrigid._checks import demand, is_concrete
 from jrigid._numerics import or_one, product, without_gradient
-from jrigid._types import AnyArray, Readable
+from jrigid._types import AnyArray, Readable, Real
 from jrigid.identify._host import cholesky
 from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
 from jrigid.identify._parameters import SIDES, squared
@@ -51,7 +51,7 @@ class _Pick:
     groups: tuple[int, ...] | None = None
 
 
-def prior(array: PyTree, sigma: ArrayLike) -> PyTree:
+def prior(array: PyTree, sigma: Real[ArrayLike, "..."]) -> PyTree:
     """State prior knowledge of an array that `free` picks: its value within `sigma`.
 
     Args:
