@@ -29,7 +29,7 @@ NOISE = 5e-3
 @pytest.mark.parametrize("steps", [1e-3, 0.1, 0.999, 1.001, 7.0, 300.0])
 def test_what_a_torque_adds_in_a_step_is_its_integral(steps):
     """White noise drives the torque, the torque the momentum, and the momentum the turn."""
-    found, along = disturbances._of_a_step(jnp.array(steps))
+    found, along = disturbances._torque_over_a_step(jnp.array(steps))
     with mpmath.workdps(30):
         a = mpmath.mpf(steps)
         # Responses to a unit kick r ago, of level 1 and dt = 1.
@@ -290,7 +290,7 @@ def test_a_level_without_bound_is_a_failed_fit():
     for _ in range(6):
         values = np.ones(3) + 0.01 * np.cumsum(rng.normal(size=(60, 3)), axis=0)
         readings = identify.Rates(np.arange(60) * 0.1, values)
-        options = {"shape": identify.Fixed(), "unmodelled": "estimate"}
+        options = {"inertia_model": identify.Fixed(), "unmodelled": "estimate"}
         found = identify.fit(BLIND, readings, throw=False, **options)
         failed.append(bool(found.status == Status.NOT_CONVERGED))
         assert failed[-1] == (not np.all(np.isfinite(found.level)))

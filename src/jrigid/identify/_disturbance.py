@@ -1,34 +1,35 @@
-"""A torque that no model has: what it adds to the body's momentum between two nodes.
+"""The unmodelled torque: what it adds to a body's angular momentum between two nodes.
 
-Along each body axis it is a Gauss-Markov process (Ornstein-Uhlenbeck), which forgets
-itself within a correlation time; white torque is the limit of none. Its value at each
-node, in units of its rms, is one more state of the smoother.
+Along each body axis it is a Gauss-Markov process (Ornstein-Uhlenbeck) with a
+correlation time. White torque is the limit of correlation time zero. The torque at each
+node, in units of its rms, is part of the smoother's state.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, ArrayLike
 
 from jrigid._numerics import product
-from jrigid._types import AnyArray
+from jrigid._types import AnyArray, Real
 from jrigid.identify._smoother import Links, Rows
 
 # Steps, in correlation times, beyond which the torque counts as white, or as constant.
-_LONGEST, _SHORTEST = 1e6, 1e-4
-_POINTS = (
-    8  # of a quadrature that is exact to rounding for steps below a correlation time
-)
+_LONGEST = 1e6
+_SHORTEST = 1e-4
+# Points of a quadrature that is exact to rounding for steps below a correlation time.
+_POINTS = 8
 
 
 class GaussMarkov(eqx.Module):
     """A random torque along the body axes, for `fit(unmodelled=...)`.
 
     Its spectral density is level^2 at low frequencies, and half of that at 1 / time
-    [rad/s]; the rms of the torque is level / sqrt(2 time). A time of zero is white
+    [rad/s]. The rms of the torque is level / sqrt(2 time). A time of zero means white
     torque.
 
     Args:
@@ -43,27 +44,29 @@ class GaussMarkov(eqx.Module):
     >>> record = jr.datasets.gyro_example()
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
     >>> torque = jr.identify.GaussMarkov(level=1e-3, time=0.5)
-    >>> found = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings, unmodelled=torque)
-    >>> print(found.correlation_time)
+    >>> result = jr.identify.fit(jr.RigidBody(jnp.ones(3)), readings, unmodelled=torque)
+    >>> print(result.correlation_time)
     [0.5 0.5 0.5]
     """
 
     level: AnyArray
     time: AnyArray
 
-    def __init__(self, level: Any, time: Any = 0.0):
-        """Repeat what is given for all axes."""
+    def __init__(
+        self, level: Real[ArrayLike, "..."], time: Real[ArrayLike, "..."] = 0.0
+    ):
+        """Broadcast both arguments to three axes."""
         self.level = np.broadcast_to(np.asarray(level, float), 3)
         self.time = np.broadcast_to(np.asarray(time, float), 3)
 
 
 class Disturbance(NamedTuple):
-    """The torque of a fit.
+    """The unmodelled torque of a fit.
 
     Attributes:
-        level: Root of its spectral density at low frequencies, of each trial about each
+        level: Root of its spectral density at low frequencies, in each trial along each
             axis (trials, 3) [N m sqrt(s)].
-        time: Correlation time about each axis (3,) [s].
+        time: Correlation time along each axis (3,) [s].
     """
 
     level: AnyArray
@@ -71,14 +74,16 @@ class Disturbance(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What the torque does over each link, in rates and turns.
+    """What the torque adds to the state over each link.
+
+    The state has rates, turns if it has an attitude, and the torque.
 
     Attributes:
-        covariance: Of what it adds at random (trials, nodes, local, local).
-        whitener: Turns that into independent numbers of unit variance; zero where no
-            link is.
-        carried: How the state at the end follows the torque at the start, in units of
-            its rms (trials, nodes, local, 3).
+        covariance: Covariance of the random part (trials, nodes, local, local).
+        whitener: Matrix that turns the random part into independent numbers of unit
+            variance; zero where there is no link.
+        carried: Derivative of the state at the end in the torque at the start, in units
+            of its rms (trials, nodes, local, 3).
     """
 
     covariance: Array
@@ -86,21 +91,31 @@ class Push(NamedTuple):
     carried: Array
 
 
-def _of_a_step(steps: Array) -> tuple[Array, Array]:
-    """Covariance of momentum, its integral and the torque, and how they follow the torque.
+def _torque_over_a_step(steps: Array) -> tuple[Array, Array]:
+    """Covariance of momentum, its integral and the torque, and their response to it.
 
     Args:
         steps: Lengths in correlation times.
 
     Returns:
-        Matrices (..., 3, 3) and columns (..., 3), in units of level dt^(1/2) for the
-        momentum, level dt^(3/2) for its integral and the rms for the torque.
+        Covariance (..., 3, 3) of what is added at random, and response (..., 3) to the
+        torque at the start. Units are level dt^(1/2) for the momentum, level dt^(3/2)
+        for its integral and the rms for the torque.
     """
     a = jnp.clip(steps, _SHORTEST, _LONGEST)
     x = -jnp.expm1(-a)
     root = jnp.sqrt(2 * a)
-    # Responses to a kick that came a fraction r of the step ago.
+    short = _covariance_of_short_steps(a, root)
+    long = _covariance_of_long_steps(a, x, root)
+    covariance = jnp.where((a < 1)[..., None, None], short, long)
+    response = jnp.stack([x / root, (a - x) / (root * a), 1 - x], axis=-1)
+    return covariance, response
+
+
+def _covariance_of_short_steps(a: Array, root: Array) -> Array:
+    """Covariance over steps of lengths a, by quadrature; root is that of 2 a."""
     points, weights = np.polynomial.legendre.leggauss(_POINTS)
+    # Responses to a kick that came a fraction r of the step before its end.
     r = jnp.asarray(0.5 + 0.5 * points, a.dtype)
     r = jnp.broadcast_to(r, (*a.shape, r.size))
     faded = -jnp.expm1(-a[..., None] * r)
@@ -108,8 +123,14 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
         [faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1
     )
     weights = jnp.asarray(0.5 * weights, a.dtype)
-    short = product("r,...ri,...rj->...ij", weights, responses, responses)
-    # The same integrals in closed form lose their digits in short steps.
+    return product("r,...ri,...rj->...ij", weights, responses, responses)
+
+
+def _covariance_of_long_steps(a: Array, x: Array, root: Array) -> Array:
+    """Covariance over steps of lengths a; x is 1 - exp(-a), root that of 2 a.
+
+    These are the same integrals in closed form, which loses its digits in short steps.
+    """
     momentum = (2 * a - 2 * x - x**2) / (2 * a)
     across = (a - x) ** 2 / (2 * a**2)
     integral = (x * (2 - x) - 2 * a - 2 * a**2 + 2 * a**3 / 3 + 4 * a * x) / (2 * a**3)
@@ -121,10 +142,7 @@ def _of_a_step(steps: Array) -> tuple[Array, Array]:
         [across, integral, integral_with_torque],
         [with_torque, integral_with_torque, torque],
     ]
-    closed = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    covariance = jnp.where((a < 1)[..., None, None], short, closed)
-    carried = jnp.stack([x / root, (a - x) / (root * a), 1 - x], axis=-1)
-    return covariance, carried
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def push_of(
@@ -134,57 +152,90 @@ def push_of(
     tensor: Array,
     depends_on_attitude: bool,
 ) -> Push:
-    """What the torque does over links.
+    """Return what the torque adds over links.
 
     Args:
         disturbance: The torque.
         span: Length of each link (trials, nodes) [s].
-        linked: Which links there are.
-        tensor: Inertia, which turns momentum into rates.
+        linked: Whether there is a link.
+        tensor: Inertia.
         depends_on_attitude: Whether the state has an attitude.
     """
-    kinds = [0, 1, 2] if depends_on_attitude else [0, 2]
+    # Nodes without a link have a length too, so that no division by zero occurs.
     dt = jnp.where(linked, span, 1.0)
     time = jnp.maximum(disturbance.time, jnp.finfo(dt.dtype).tiny)
-    covariance, carried = _of_a_step(
-        jnp.minimum(dt[..., None] / time[None, None], _LONGEST)
-    )
+    steps = jnp.minimum(dt[..., None] / time[None, None], _LONGEST)
+    covariance, response = _torque_over_a_step(steps)
+    # Rates, turns and torques, of which the state may have no turns.
+    kinds = [0, 1, 2] if depends_on_attitude else [0, 2]
+    entries = [[covariance[..., i, j] for j in kinds] for i in kinds]
     level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
     units = [level, level * dt[..., None], jnp.ones_like(level)]
+    units = [units[i] for i in kinds]
+    # Angular momentum over inertia is a rate; a torque stays as it is.
     eye = jnp.eye(3, dtype=dt.dtype)
-    momenta = [tensor, tensor, eye]  # from rates and turns
-    rates = [jnp.linalg.inv(tensor), jnp.linalg.inv(tensor), eye]  # and back
-    whitener = _inverse_cholesky(
-        [[covariance[..., i, j] for j in kinds] for i in kinds]
+    momentum = [tensor] * (len(kinds) - 1) + [eye]
+    rates = [jnp.linalg.inv(tensor)] * (len(kinds) - 1) + [eye]
+    carried = [
+        product("ab,...b->...ab", rate, unit * response[..., kind])
+        for rate, unit, kind in zip(rates, units, kinds, strict=True)
+    ]
+    is_link = linked.astype(dt.dtype)[..., None, None]
+    return Push(
+        covariance=is_link * _covariance_matrix(entries, units, rates),
+        whitener=is_link * _whitening_matrix(entries, units, momentum),
+        carried=is_link * jnp.concatenate(carried, axis=-2),
     )
 
-    # Matrices of blocks of three by three, for rates, turns and torques.
-    def spread(i: int, j: int) -> Array:
-        size = units[i] * covariance[..., i, j] * units[j]
+
+def _covariance_matrix(
+    entries: list[list[Array]], units: list[Array], rates: list[Array]
+) -> Array:
+    """Covariance of rates, turns and torques.
+
+    Args:
+        entries: Covariance of each pair of kinds along each axis (..., 3).
+        units: Their units along each axis.
+        rates: Matrices that turn momenta into rates, of each kind.
+    """
+
+    def block(i: int, j: int) -> Array:
+        size = units[i] * entries[i][j] * units[j]
         return product("ak,...k,bk->...ab", rates[i], size, rates[j])
 
-    def white(i: int, j: int) -> Array:
-        row = whitener[kinds.index(i)]
-        size = row[kinds.index(j)] / units[j]
-        return product("...a,ab->...ab", size, momenta[j])
+    return _assembled(block, len(units))
 
-    def assembled(block: Callable[[int, int], Array]) -> Array:
-        rows = [jnp.concatenate([block(i, j) for j in kinds], axis=-1) for i in kinds]
-        return jnp.concatenate(rows, axis=-2)
 
-    there = linked.astype(dt.dtype)[..., None, None]
-    along = [
-        product("ab,...b->...ab", rates[i], units[i] * carried[..., i]) for i in kinds
-    ]
-    return Push(
-        covariance=there * assembled(spread),
-        whitener=there * assembled(white),
-        carried=there * jnp.concatenate(along, axis=-2),
-    )
+def _whitening_matrix(
+    entries: list[list[Array]], units: list[Array], momentum: list[Array]
+) -> Array:
+    """Matrix that makes the same covariance the unit matrix.
+
+    Args:
+        entries: Covariance of each pair of kinds along each axis (..., 3).
+        units: Their units along each axis.
+        momentum: Matrices that turn rates into momenta, of each kind.
+    """
+    # Along each axis the kinds are correlated, but the axes are not.
+    inverse = _inverse_cholesky(entries)
+
+    def block(i: int, j: int) -> Array:
+        return product("...a,ab->...ab", inverse[i][j] / units[j], momentum[j])
+
+    return _assembled(block, len(units))
+
+
+def _assembled(block: Callable[[int, int], Array], count: int) -> Array:
+    """A matrix of `count` by `count` blocks."""
+    kinds = range(count)
+    rows = [jnp.concatenate([block(i, j) for j in kinds], axis=-1) for i in kinds]
+    return jnp.concatenate(rows, axis=-2)
 
 
 def _inverse_cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
-    """Of a small matrix of arrays: the lower triangle that makes it the unit matrix."""
+    """Inverse of the Cholesky factor of a small matrix, whose entries are arrays."""
+    # Written out for matrices of two or three rows, where LAPACK would be called once
+    # for each link.
     size = len(matrix)
     zero = jnp.zeros_like(matrix[0][0])
     lower = [[zero] * size for _ in range(size)]
@@ -195,8 +246,8 @@ def _inverse_cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
             lower[i][j] = jnp.sqrt(rest) if i == j else rest / lower[j][j]
         inverse[i][i] = 1 / lower[i][i]
         for j in range(i):
-            sum_ = sum(lower[i][k] * inverse[k][j] for k in range(j, i))
-            inverse[i][j] = -sum_ / lower[i][i]
+            off_diagonal = sum(lower[i][k] * inverse[k][j] for k in range(j, i))
+            inverse[i][j] = -off_diagonal / lower[i][i]
     return inverse
 
 
@@ -206,24 +257,30 @@ def with_torque(
     """Rows and links of states that hold the torque too.
 
     Args:
-        rows: Of states without the torque.
-        links: Between them.
-        push: What the torque does over each link.
-        torque: At each node (trials, nodes, 3), in units of its rms.
+        rows: Rows of states without the torque.
+        links: Links between them.
+        push: What the torque adds over each link.
+        torque: Torque at each node (trials, nodes, 3), in units of its rms.
     """
     local = links.gap.shape[-1]
     linked = jnp.any(push.whitener != 0, axis=(-2, -1))[..., None]
-    following = jnp.where(linked, jnp.roll(torque, -1, axis=1), 0.0)
+    next_torque = jnp.where(linked, jnp.roll(torque, -1, axis=1), 0.0)
     gap = jnp.pad(links.gap, [(0, 0), (0, 0), (0, 3)])
     gap = gap + product("tnij,tnj->tni", push.carried, torque)
-    gap = gap.at[..., local:].add(-following)
-    more = [(0, 0), (0, 0), (0, 3), (0, 0)]
-    of_state = jnp.concatenate([jnp.pad(links.of_state, more), push.carried], axis=-1)
-    wider = jnp.pad(rows.of_state, [(0, 0), (0, 0), (0, 0), (0, 3)])
-    links = Links(gap, jnp.pad(links.of_border, more), of_state, torque[:, 0])
-    return rows._replace(of_state=wider), links
+    # The gap of the torque: what is left of it at the end, less the next one.
+    gap = gap.at[..., local:].add(-next_torque)
+    three_rows = [(0, 0), (0, 0), (0, 3), (0, 0)]
+    of_state = jnp.pad(links.of_state, three_rows)
+    links = Links(
+        gap=gap,
+        of_border=jnp.pad(links.of_border, three_rows),
+        of_state=jnp.concatenate([of_state, push.carried], axis=-1),
+        torque=torque[:, 0],
+    )
+    rows_of_state = jnp.pad(rows.of_state, [(0, 0), (0, 0), (0, 0), (0, 3)])
+    return rows._replace(of_state=rows_of_state), links
 
 
-def no_disturbance(trials: int, dtype: Any) -> Disturbance:
-    """White, of level one: for fits that have no such torque."""
+def no_disturbance(trials: int, dtype: DTypeLike) -> Disturbance:
+    """White torque of level one, which fits without an unmodelled torque ignore."""
     return Disturbance(np.ones((trials, 3), dtype), np.zeros(3, dtype))

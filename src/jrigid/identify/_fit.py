@@ -33,14 +33,14 @@ from jrigid.identify._inputs import (
     typical_rate,
 )
 from jrigid.identify._layout import (
+    DirectReadings,
     Layout,
-    Told,
     angle_turned,
+    direct_readings_of,
     longest_turn,
     node_states,
     segments,
     segments_needed,
-    told_by,
     whole,
 )
 from jrigid.identify._minimise import tensors_at
@@ -463,7 +463,7 @@ class _Observed(NamedTuple):
 
     Attributes:
         samples: Of all records.
-        told: Rates and attitudes along the way, where a sensor tells them.
+        readings: Rates and attitudes along the way, where a sensor tells them.
         rate: Rms of the rates [rad/s].
         sizes: Rms of the values of each record.
         angle: Most radians that a trial turns.
@@ -472,7 +472,7 @@ class _Observed(NamedTuple):
     """
 
     samples: Samples
-    told: Told | None
+    readings: DirectReadings | None
     rate: AnyArray
     sizes: tuple[AnyArray, ...]
     angle: float
@@ -488,15 +488,15 @@ def _observed(
     sizes = sizes_of(samples)
     if not records[0].states_noise:
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
-    told = told_by(records, samples, attitude0)
-    rate = typical_rate(told, state, samples.ts.dtype)
+    readings = direct_readings_of(records, samples, attitude0)
+    rate = typical_rate(readings, state, samples.ts.dtype)
     angle = 0.0
     coarse = False
-    if told is not None:
-        angle = float(np.max(angle_turned(told)[:, -1]))
-        coarse = longest_turn(told) > np.pi
+    if readings is not None:
+        angle = float(np.max(angle_turned(readings)[:, -1]))
+        coarse = longest_turn(readings) > np.pi
     noise = noise_of(records, samples, rate)
-    return _Observed(samples, told, rate, sizes, angle, coarse, noise)
+    return _Observed(samples, readings, rate, sizes, angle, coarse, noise)
 
 
 class _Opening(NamedTuple):
@@ -528,17 +528,17 @@ def _opening(
     length: float,
 ) -> _Opening:
     """Choose where the search begins, by segments of some length [rad]."""
-    told = observed.told
+    readings = observed.readings
     samples = observed.samples
     trials = samples.ts.shape[0]
     dtype = samples.ts.dtype
-    tensors = linear_starts(options, unknowns, told, tensor)
+    tensors = linear_starts(options, unknowns, readings, tensor)
     starts = Starts(unknowns, tensors)
     unknowns = on_host(starts.unknowns)
     single = cut = whole(samples, options.nodes)
-    if options.shooting and told is not None:
-        cut, first_samples = segments(samples, told, options.nodes, length)
-        omega, attitude = node_states(told, first_samples, cut.start)
+    if options.shooting and readings is not None:
+        cut, first_samples = segments(samples, readings, options.nodes, length)
+        omega, attitude = node_states(readings, first_samples, cut.start)
         if attitude is None:
             attitude = np.zeros((trials, options.nodes, 4), dtype)
             attitude[..., 0] = 1
@@ -570,8 +570,8 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     observed = _observed(records, state, attitude0)
     input_result = _judged(task, records, observed, throw)
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
-    if options.shooting and observed.told is not None:
-        count = observed.told.ts.shape[1]
+    if options.shooting and observed.readings is not None:
+        count = observed.readings.ts.shape[1]
         options = options._replace(nodes=segments_needed(observed.angle, count, length))
     unknowns = _unknowns(task, records, observed)
     opening = _opening(unknowns, observed, tensor, state, options, length)
@@ -608,7 +608,7 @@ def _judged(
         records,
         task.tensor,
         task.state,
-        observed.told,
+        observed.readings,
         throw,
         of_start=task.bodies.result if from_bodies else None,
     )

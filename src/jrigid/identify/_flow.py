@@ -1,12 +1,10 @@
-"""Where a body is some time later, with derivatives made for least squares.
+"""State of a body some time later, with derivatives made for least squares.
 
-The free motion's derivative in a tensor is put together from the one in moments and
-rates, which takes a tenth of the time of `free_rotation`'s, whose every digit holds at
-repeated moments: moments nearer than a ten-millionth are taken that far apart, in the
-derivatives alone.
+The derivative of free motion in a tensor is assembled from those in moments and rates.
+This takes a tenth of the time of `free_rotation`'s derivative, which is exact at
+repeated moments too. Here moments nearer to each other than a ten-millionth are taken
+to be that far apart, in the derivatives only.
 """
-
-from typing import Any
 
 import diffrax
 import jax
@@ -24,6 +22,7 @@ from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, normalize
 from jrigid.systems import AbstractSystem, RigidBody
 
+# Least relative distance of moments in derivatives, by the size of the dtype in bytes.
 _APART = {8: 1e-7, 4: 1e-3}
 # A step of 0.75 radians has an error of 1e-7 of the state.
 ONE_STEP = method_of(diffrax.Dopri8())
@@ -31,50 +30,83 @@ ONE_STEP = method_of(diffrax.Dopri8())
 
 @jax.custom_jvp
 def free_flow(tensor: Array, omega: Array, t: Array) -> tuple[Array, Array]:
-    """Attitude relative to that at the start and angular velocity, of a tensor; unchecked."""
+    """Turn since time 0 and angular velocity at t of a free body; unchecked."""
     moments, axes = eigh(tensor)
     turned = relative_rotation(moments, product("ji,j->i", axes, omega), t)
     return from_principal_axes(axes, *turned)
 
 
-def _with_columns(point: Array, t: Array) -> Any:
-    """The motion in principal axes, and its derivatives in moments and rates, as columns."""
+def _motion_and_columns(
+    point: Array, t: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Motion in principal axes, and its derivatives in moments and rates as columns."""
 
-    def along(direction: Array) -> Any:
-        motion = lambda x: inlined(relative_rotation, x[:3], x[3:], t)  # noqa: E731
+    def motion(point: Array) -> tuple[Array, Array]:
+        return inlined(relative_rotation, point[:3], point[3:], t)
+
+    def derivative(
+        direction: Array,
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         return jax.jvp(motion, (point,), (direction,))
 
-    return jax.vmap(along, out_axes=(None, -1))(jnp.eye(6, dtype=point.dtype))
+    return jax.vmap(derivative, out_axes=(None, -1))(jnp.eye(6, dtype=point.dtype))
+
+
+def _kept_apart(moments: Array) -> Array:
+    """Ascending moments, moved apart where they nearly coincide."""
+    apart = 1 + _APART[moments.dtype.itemsize]
+    middle = jnp.maximum(moments[1], apart * moments[0])
+    return jnp.stack([moments[0], middle, jnp.maximum(moments[2], apart * middle)])
+
+
+def _turn_of_axes(moments: Array, change: Array) -> Array:
+    """Rotation vector of the principal axes, along them, for a change of the tensor.
+
+    To first order the off-diagonal change of a tensor in its principal axes turns them
+    by change[i, j] / (moments[i] - moments[j]).
+
+    Args:
+        moments: Moments, all different.
+        change: Change of the tensor in principal axes.
+    """
+    a, b, c = moments
+    return jnp.stack(
+        [change[1, 2] / (b - c), change[2, 0] / (c - a), change[0, 1] / (a - b)]
+    )
 
 
 @free_flow.defjvp
-def _free_flow_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (tensor, omega, t), (change, omega_change, t_change) = primals, tangents
+def _free_flow_jvp(
+    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Derivative of `free_flow`.
+
+    A change of the tensor changes the moments and turns the principal axes. As seen
+    from the axes, the initial rates turn the other way, and the result turns with them.
+    """
+    tensor, omega, t = primals
+    change, omega_change, t_change = tangents
     moments, axes = eigh(tensor)
-    omega, omega_change = (product("ji,j->i", axes, x) for x in (omega, omega_change))
-    apart = 1 + _APART[moments.dtype.itemsize]
-    middle = jnp.maximum(moments[1], apart * moments[0])
-    moments = jnp.stack([moments[0], middle, jnp.maximum(moments[2], apart * middle)])
+    omega = product("ji,j->i", axes, omega)
+    omega_change = product("ji,j->i", axes, omega_change)
+    moments = _kept_apart(moments)
     point = jnp.concatenate([moments, omega])
-    (p, w), (p_columns, w_columns) = inlined(_with_columns, point, t)
-    # Off the diagonal a change of the tensor turns the principal axes.
+    (p, w), (p_columns, w_columns) = inlined(_motion_and_columns, point, t)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
-    a, b, c = moments
-    turn = jnp.stack(
-        [inside[1, 2] / (b - c), inside[2, 0] / (c - a), inside[0, 1] / (a - b)]
-    )
+    turn = _turn_of_axes(moments, inside)
     columns = jnp.concatenate(
         [jnp.diagonal(inside), omega_change - jnp.cross(turn, omega)]
     )
-    p_change, w_change = (
-        product("ij,j->i", x, columns) for x in (p_columns, w_columns)
-    )
+    p_change = product("ij,j->i", p_columns, columns)
+    w_change = product("ij,j->i", w_columns, columns)
     vector = p_change[1:] + jnp.cross(turn, p[1:])
     p_change = jnp.concatenate([p_change[:1], vector]) + t_change * attitude_rate(p, w)
+    # Euler's equations: the time derivative of the rates.
     slope = jnp.cross(moments * w, w) / moments
     w_change = w_change + jnp.cross(turn, w) + t_change * slope
-    return from_principal_axes(axes, p, w), from_principal_axes(
-        axes, p_change, w_change
+    return (
+        from_principal_axes(axes, p, w),
+        from_principal_axes(axes, p_change, w_change),
     )
 
 
@@ -87,10 +119,19 @@ def forced_flow(
     method: Method = ONE_STEP,
     steps: int = 1,
 ) -> State:
-    """State at t1, later or earlier than t0, by equal steps without an error estimate.
+    """State at t1, before or after t0, by equal steps without an error estimate.
 
-    The default is one step, for a part of a turn. Where nothing depends on the
-    attitude, the attitude stays as it is.
+    The default is one step, which suffices for a part of a turn. If nothing depends on
+    the attitude, the attitude stays as it is.
+
+    Args:
+        system: The body.
+        state: State at t0.
+        t0: Time of the given state [s].
+        t1: Time of the result [s].
+        depends_on_attitude: Whether the attitude is integrated.
+        method: Runge-Kutta method.
+        steps: How many steps are made.
 
     Gradients: in every mode, of every order.
     """
@@ -111,7 +152,7 @@ def forced_flow(
 
 
 def needs_attitude(system: RigidBody) -> bool:
-    """Whether the torque looks at the attitude, as far as its program shows."""
+    """Whether the torque depends on the attitude, by its traced program."""
 
     def torque(q: Array) -> Array:
         state = system.with_parts(State(q, jnp.zeros(3)))

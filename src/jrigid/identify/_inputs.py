@@ -26,7 +26,7 @@ from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
-from jrigid.identify._layout import Told
+from jrigid.identify._layout import DirectReadings
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor
 from jrigid.systems import RigidBody
@@ -136,10 +136,12 @@ def refuse(
     )
 
 
-def typical_rate(told: Told | None, state: State | None, dtype: Any) -> AnyArray:
+def typical_rate(
+    readings: DirectReadings | None, state: State | None, dtype: Any
+) -> AnyArray:
     """Rms of the rates, 1 where there are none."""
-    if told is not None:
-        return rms(told.omega, told.there)
+    if readings is not None:
+        return rms(readings.omega, readings.valid)
     assert state is not None
     omega = without_gradient(state.omega.astype(dtype))
     xp = omega.__array_namespace__()
@@ -199,13 +201,15 @@ def findings_of_start(
     return findings
 
 
-def findings_of_records(records: tuple[Record, ...], told: Told | None) -> Findings:
+def findings_of_records(
+    records: tuple[Record, ...], readings: DirectReadings | None
+) -> Findings:
     """What is wrong with records, whose arrays are numpy's."""
     findings = Findings()
     check_records(findings, records)
     known = any(tells(x, "attitude") for x in records)
-    if told is not None and told.ts.shape[1] > 1 and not known:
-        findings.require(_between(told) < np.pi, RESULTS.undersampled_rates)
+    if readings is not None and readings.ts.shape[1] > 1 and not known:
+        findings.require(_between(readings) < np.pi, RESULTS.undersampled_rates)
     return findings
 
 
@@ -214,7 +218,7 @@ def judge(
     records: tuple[Record, ...],
     tensor: Any,
     state: State | None,
-    told: Told | None,
+    readings: DirectReadings | None,
     throw: bool,
     of_start: Any = None,
 ) -> Any:
@@ -225,7 +229,7 @@ def judge(
         records: With numpy arrays.
         tensor: Where to start, or None.
         state: Where each trial starts, or None.
-        told: What the records tell of the motion.
+        readings: Rates and attitudes that the records tell.
         throw: Whether to raise an error.
         of_start: `result_of_start` of these arguments, if it is known.
     """
@@ -234,7 +238,7 @@ def judge(
     if not is_good(result):
         settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
         return result
-    findings = findings_of_records(records, told)
+    findings = findings_of_records(records, readings)
     if throw and not findings.ok:
         findings.guard(None, throw)
     return findings.result
@@ -246,9 +250,9 @@ class _Judged(NamedTuple):
     result: Any
 
 
-def _between(told: Told) -> np.floating:
+def _between(readings: DirectReadings) -> np.floating:
     """Angle turned between neighbouring samples, as a median."""
-    ok = told.there[:, 1:] & told.there[:, :-1]
-    speed = np.sqrt(np.sum(told.omega[:, 1:] ** 2, axis=-1))
-    turned = np.diff(told.ts, axis=1) * speed
+    ok = readings.valid[:, 1:] & readings.valid[:, :-1]
+    speed = np.sqrt(np.sum(readings.omega[:, 1:] ** 2, axis=-1))
+    turned = np.diff(readings.ts, axis=1) * speed
     return np.nan_to_num(_median(turned[ok]))

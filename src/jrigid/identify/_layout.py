@@ -1,8 +1,8 @@
-"""Where a record is cut into segments, and the states they start from."""
+"""How a record is divided into segments, and the states at which they begin."""
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -17,9 +17,17 @@ MOST_NODES = 2000  # of a trial, where each sample has one
 
 
 class Layout(NamedTuple):
-    """Times of all samples, their nodes, and where links go: (trials, samples) and (trials, nodes).
+    """Times of the samples (trials, samples) and of the nodes (trials, nodes).
 
     An unused node has no samples and no links.
+
+    Attributes:
+        ts: Times of the samples [s].
+        node: Index of the node from which each sample is predicted.
+        start: Time of each node [s].
+        end: Time of the next node, or of the node itself where there is no link [s].
+        linked: Whether the segment of a node ends at the next node.
+        since: Fraction of the record that has passed at each sample.
     """
 
     ts: AnyArray
@@ -27,92 +35,128 @@ class Layout(NamedTuple):
     start: AnyArray
     end: AnyArray
     linked: AnyArray
-    since: AnyArray  # fraction of the record at each sample
+    since: AnyArray
 
 
-class Told(NamedTuple):
-    """Rates, and attitudes if there are any, that tell where the segments start: (trials, n)."""
+class DirectReadings(NamedTuple):
+    """Rates, and attitudes if there are any, that records give without a model.
+
+    Attributes:
+        ts: Times (trials, n) [s]; zero where there is no reading.
+        valid: Whether there is a reading (trials, n).
+        omega: Rates in body axes (trials, n, 3) [rad/s].
+        attitude: Attitudes (trials, n, 4).
+    """
 
     ts: np.ndarray
-    there: np.ndarray
+    valid: np.ndarray
     omega: np.ndarray
     attitude: np.ndarray | None
 
 
-def _before(there: np.ndarray) -> np.ndarray:
-    """Index of the last sample that is there, before each; -1 up to the first."""
-    latest = np.maximum.accumulate(
-        np.where(there, np.arange(there.shape[-1]), -1), axis=-1
-    )
-    return np.concatenate(
-        [np.full_like(latest[..., :1], -1), latest[..., :-1]], axis=-1
-    )
+class _Series(NamedTuple):
+    """What one sensor reads directly: times, whether there is a reading, values."""
+
+    ts: np.ndarray
+    valid: np.ndarray
+    values: np.ndarray
 
 
-def _after(there: np.ndarray) -> np.ndarray:
-    """Index of the first sample that is there, after each; the count from the last one on."""
-    return there.shape[-1] - 1 - _before(there[..., ::-1])[..., ::-1]
+def _index_before(valid: np.ndarray) -> np.ndarray:
+    """Index of the last valid sample before each sample; -1 up to the first one."""
+    index = np.where(valid, np.arange(valid.shape[-1]), -1)
+    latest = np.maximum.accumulate(index, axis=-1)
+    none = np.full_like(latest[..., :1], -1)
+    return np.concatenate([none, latest[..., :-1]], axis=-1)
 
 
-def _nearest_before(ts: np.ndarray, there: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Index of the last sample not after each t; of the first one if all are later."""
-    times = np.maximum.accumulate(np.where(there, ts, -np.inf))
+def _index_after(valid: np.ndarray) -> np.ndarray:
+    """Index of the first valid sample after each sample; the count from the last on."""
+    reverse = _index_before(valid[..., ::-1])[..., ::-1]
+    return valid.shape[-1] - 1 - reverse
+
+
+def _nearest_before(ts: np.ndarray, valid: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Index of the last valid sample up to each t, or of the first one."""
+    times = np.maximum.accumulate(np.where(valid, ts, -np.inf))
     after = np.searchsorted(times, t, side="right")
-    latest = _before(np.append(there, False))[after]
-    return np.where(latest < 0, np.argmax(there), latest)
+    latest = _index_before(np.append(valid, False))[after]
+    return np.where(latest < 0, np.argmax(valid), latest)
 
 
-def _slopes(ts: np.ndarray, there: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Rates of a trial from its attitudes: the mean of the turns to the samples on either side."""
-    count = ts.size
-    index = np.arange(count)
-    before = _before(there)
-    after = _after(there)
+def _mean_rates(
+    ts: np.ndarray, attitude: np.ndarray, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean rates between samples, and between which of them time passes.
 
-    def turn(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rates between samples, zero where there are none, and where there are some."""
-        known = (a >= 0) & (b < count)
-        a, b = np.where(known, a, 0), np.where(known, b, 0)
-        step = ts[b] - ts[a]
-        known = (known & (step > 0))[:, None]
-        vector = log(multiply(conjugate(attitude[a]), attitude[b]))
-        return np.where(known, vector / np.where(known, step[:, None], 1.0), 0.0), known
+    Args:
+        ts: Times.
+        attitude: At these times.
+        start: Indices of samples, -1 where there is none.
+        end: Indices of later ones, the count of samples where there is none.
 
-    left, is_left = turn(before, index)
-    right, is_right = turn(index, after)
-    return (left + right) / np.where(is_left & is_right, 2, 1).astype(ts.dtype)
+    Returns:
+        Rates (n, 3), zero where no time passes, and a mask (n, 1).
+    """
+    both = (start >= 0) & (end < ts.size)
+    start = np.where(both, start, 0)
+    end = np.where(both, end, 0)
+    step = ts[end] - ts[start]
+    passes = (both & (step > 0))[:, None]
+    turn = log(multiply(conjugate(attitude[start]), attitude[end]))
+    rates = np.where(passes, turn / np.where(passes, step[:, None], 1.0), 0.0)
+    return rates, passes
 
 
-def _turned(ts: np.ndarray, there: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Rates (n, k) of a trial by time, since the sample before: by the mean of the two."""
-    last = _before(there)
-    step = np.where(there & (last >= 0), np.maximum(ts - ts[last], 0.0), 0.0)
+def _rates_from_attitudes(
+    ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray
+) -> np.ndarray:
+    """Rates of a trial: at each sample the mean of the rates before and after it."""
+    index = np.arange(ts.size)
+    left, has_left = _mean_rates(ts, attitude, _index_before(valid), index)
+    right, has_right = _mean_rates(ts, attitude, index, _index_after(valid))
+    return (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
+
+
+def _turns(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Integral of rates (n, k) of a trial since the sample before (trapezium rule)."""
+    last = _index_before(valid)
+    step = np.where(valid & (last >= 0), np.maximum(ts - ts[last], 0.0), 0.0)
     return 0.5 * (rates[last] + rates) * step[:, None]
 
 
-def _carried(attitude: np.ndarray, rates: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """Attitudes some time later, at constant rates."""
-    return multiply(attitude, exp(rates * late[..., None]))
-
-
-def _reckoned(
-    ts: np.ndarray,
-    there: np.ndarray,
-    omega: np.ndarray,
-    q_ts: np.ndarray,
-    q_ok: np.ndarray,
-    q: np.ndarray,
+def _turned_by(
+    attitude: np.ndarray, rates: np.ndarray, duration: np.ndarray
 ) -> np.ndarray:
-    """Attitudes of a trial by dead reckoning, each from the last that was seen.
+    """Attitudes after a duration at constant rates."""
+    return multiply(attitude, exp(rates * duration[..., None]))
 
-    Products of all turns since the attitude that was seen, by doubling: after k rounds
-    each is the product of the last 2^k factors.
+
+def _dead_reckoning(
+    ts: np.ndarray,
+    valid: np.ndarray,
+    omega: np.ndarray,
+    attitude_ts: np.ndarray,
+    attitude_valid: np.ndarray,
+    attitude: np.ndarray,
+) -> np.ndarray:
+    """Attitudes of a trial at times of rates, each from the last observed attitude."""
+    latest = _nearest_before(attitude_ts, attitude_valid, ts)
+    observed = _turned_by(attitude[latest], omega, ts - attitude_ts[latest])
+    # The first rate after a new attitude starts anew; the others add their turns.
+    is_first = np.diff(latest, prepend=-1) != 0
+    factors = np.where(is_first[:, None], observed, exp(_turns(ts, valid, omega)))
+    return normalize(_running_products(factors, is_first))
+
+
+def _running_products(factors: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+    """Products of quaternions, at each index from the last first factor up to there.
+
+    They are formed by doubling: after k rounds each is the product of the last 2^k
+    factors, or of all since the first one.
     """
-    latest = _nearest_before(q_ts, q_ok, ts)
-    seen = _carried(q[latest], omega, ts - q_ts[latest])
-    fresh = np.diff(latest, prepend=-1) != 0
-    product = np.where(fresh[:, None], seen, exp(_turned(ts, there, omega)))
-    complete = fresh  # up to an attitude that was seen
+    product = factors.copy()
+    complete = is_first
     shift = 1
     while not np.all(complete):
         longer = multiply(product[:-shift], product[shift:])
@@ -121,147 +165,212 @@ def _reckoned(
             [complete[:shift], complete[shift:] | complete[:-shift]]
         )
         shift *= 2
-    return normalize(product)
+    return product
 
 
 @small_program
-def _read(sensor: AbstractSensor, name: Static, values: Any) -> Any:
-    """What a method of a sensor, "rates" or "attitude", makes of values (trials, n, k)."""
+def _apply_method(sensor: AbstractSensor, name: Static, values: AnyArray) -> jax.Array:
+    """Apply a method of a sensor, "rates" or "attitude", to values (trials, n, k)."""
     return jax.vmap(jax.vmap(getattr(sensor, name.value)))(values)
 
 
-def told_by(
+def _first_series(
+    records: tuple[Record, ...], samples: Samples, name: str
+) -> _Series | None:
+    """What the first record reads that has "rates" or "attitude"; None without one."""
+    for record, values, part in zip(
+        records, samples.values, samples.parts, strict=True
+    ):
+        if not tells(record, name):
+            continue
+        direct = np.asarray(_apply_method(record.sensor, Static(name), values))
+        # A saturated value is a bound only.
+        exact = (samples.weight[:, part] > 0) & (samples.sign[:, part] == 0)
+        valid = np.all(exact, axis=-1)
+        return _Series(np.where(valid, samples.ts[:, part], 0.0), valid, direct)
+    return None
+
+
+def direct_readings_of(
     records: tuple[Record, ...], samples: Samples, attitude0: np.ndarray | None
-) -> Told | None:
-    """What tells the state on the way: a gyro, or attitudes; None if there is neither.
+) -> DirectReadings | None:
+    """Return the rates and attitudes that records give directly, None without either.
 
     Args:
-        records: With numpy arrays.
-        samples: Of the records.
-        attitude0: At the first sample of each trial, where none was observed.
+        records: Records with numpy arrays.
+        samples: Samples of the records.
+        attitude0: Attitude at the first sample of each trial, for dead reckoning where
+            none was observed.
     """
-
-    def first(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Times, which samples tell, and what they tell."""
-        for record, values, part in zip(
-            records, samples.values, samples.parts, strict=True
-        ):
-            seen = (
-                _read(record.sensor, Static(name), values)
-                if tells(record, name)
-                else None
-            )
-            if seen is not None:
-                plain = (samples.weight[:, part] > 0) & (samples.sign[:, part] == 0)
-                there = np.all(plain, axis=-1)
-                return (
-                    np.where(there, samples.ts[:, part], 0.0),
-                    there,
-                    np.asarray(seen),
-                )
-        return None
-
-    rates, attitudes = first("rates"), first("attitude")
+    rates = _first_series(records, samples, "rates")
+    attitudes = _first_series(records, samples, "attitude")
     if rates is None:
         if attitudes is None:
             return None
-        return Told(*attitudes[:2], _of_trials(_slopes, *attitudes), attitudes[2])
-    ts, there, omega = rates
-    omega = np.where(there[..., None], omega, 0.0)
+        ts, valid, attitude = attitudes
+        omega = _for_each_trial(_rates_from_attitudes, *attitudes)
+        return DirectReadings(ts, valid, omega, attitude)
+    ts, valid, omega = rates
+    # A missing reading is not zero after the sensor's bias is subtracted.
+    omega = np.where(valid[..., None], omega, 0.0)
     if attitudes is None and attitude0 is not None:
-        start = first_and_last(ts, there)[0][:, None]
-        attitudes = start, np.ones_like(start, bool), attitude0[:, None]
+        start = first_and_last(ts, valid)[0][:, None]
+        attitudes = _Series(start, np.ones_like(start, bool), attitude0[:, None])
     if attitudes is None:
-        return Told(ts, there, omega, None)
-    return Told(ts, there, omega, _of_trials(_reckoned, ts, there, omega, *attitudes))
+        return DirectReadings(ts, valid, omega, None)
+    attitude = _for_each_trial(_dead_reckoning, ts, valid, omega, *attitudes)
+    return DirectReadings(ts, valid, omega, attitude)
 
 
-def _of_trials(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
-    """A function of a trial, of each trial."""
+def _for_each_trial(
+    function: Callable[..., np.ndarray], *arrays: np.ndarray
+) -> np.ndarray:
+    """Apply a function of a trial's arrays to each trial and stack the results."""
     return np.stack([function(*trial) for trial in zip(*arrays, strict=True)])
 
 
-def angle_turned(told: Told) -> np.ndarray:
-    """Radians turned up to each sample, from the rates there."""
-    speed = np.sqrt(np.sum(told.omega * told.omega, axis=-1, keepdims=True))
-    speed = np.where(told.there[..., None], speed, 0.0)
-    return np.cumsum(_of_trials(_turned, told.ts, told.there, speed)[..., 0], axis=1)
+def angle_turned(readings: DirectReadings) -> np.ndarray:
+    """Angle turned up to each sample (trials, n) [rad], by the trapezium rule."""
+    omega = readings.omega
+    speed = np.sqrt(np.sum(omega * omega, axis=-1, keepdims=True))
+    speed = np.where(readings.valid[..., None], speed, 0.0)
+    turns = _for_each_trial(_turns, readings.ts, readings.valid, speed)
+    return np.cumsum(turns[..., 0], axis=1)
 
 
-def longest_turn(told: Told) -> float:
-    """The most that a body turns from one sample to the next [rad]."""
-    return float(np.max(np.diff(angle_turned(told), axis=1), initial=0.0))
+def longest_turn(readings: DirectReadings) -> float:
+    """Largest angle turned from one sample to the next [rad]."""
+    return float(np.max(np.diff(angle_turned(readings), axis=1), initial=0.0))
 
 
 def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
-    """One segment a trial, in the first of so many nodes; its state at t0, or the first sample."""
+    """Return a layout with one segment a trial, which begins at the first node.
+
+    Args:
+        samples: The samples.
+        nodes: How many nodes a trial has; those after the first are unused.
+        t0: Time of the first node; by default that of the first sample.
+    """
     ts = samples.ts
     xp = ts.__array_namespace__()
     first, last = first_and_last(ts, samples.seen)
     is_first = xp.broadcast_to(xp.arange(nodes) == 0, (ts.shape[0], nodes))
     begin = xp.broadcast_to(first if t0 is None else xp.asarray(t0), first.shape)
     start = xp.where(is_first, begin[:, None], 0.0)
+    # A trial of one sample has no length.
     span = xp.where(last > first, last - first, 1.0)
-    since = (ts - first[:, None]) / span[:, None]
     return Layout(
-        ts, xp.zeros(ts.shape, int), start, start, xp.zeros_like(is_first), since
+        ts=ts,
+        node=xp.zeros(ts.shape, int),
+        start=start,
+        end=start,
+        linked=xp.zeros_like(is_first),
+        since=(ts - first[:, None]) / span[:, None],
     )
 
 
 def segments(
-    samples: Samples, told: Told, nodes: int, length: float
+    samples: Samples, readings: DirectReadings, nodes: int, length: float
 ) -> tuple[Layout, np.ndarray]:
-    """Segments of so many radians, or, of length 0, one a sample; and where each starts.
+    """Divide each trial into segments.
 
-    They are longer where the nodes do not suffice.
+    Args:
+        samples: The samples.
+        readings: Directly read rates, which say how far the body turns.
+        nodes: The most segments of a trial; they become longer where it is too few.
+        length: Length of a segment [rad]; 0 for a segment of each direct reading.
+
+    Returns:
+        The layout, and the index of the direct reading at each node (trials, nodes).
     """
-    layout = whole(samples, nodes)
-    count = np.cumsum(told.there, axis=1).astype(samples.ts.dtype)
-    most = max(nodes - 1, 1) if length else nodes
+    if length:
+        measure = angle_turned(readings)
+        most = max(nodes - 1, 1)
+    else:
+        # Half a step off the edges of segments, where rounding would decide.
+        measure = np.cumsum(readings.valid, axis=1).astype(samples.ts.dtype) - 0.5
+        most = nodes
+    size = np.maximum(length or 1.0, measure[:, -1] / most)
+    # Rounding must not start a segment at the very end of the record.
+    number = np.floor(measure / size[:, None] * (1 - 1e-12))
+    trials = zip(
+        map(Layout, *whole(samples, nodes)),
+        number,
+        readings.ts,
+        readings.valid,
+        strict=True,
+    )
+    layouts, readings_at_nodes = zip(
+        *(_segments_of_trial(*trial) for trial in trials), strict=True
+    )
+    stacked = Layout(*map(np.stack, zip(*layouts, strict=True)))
+    return stacked, np.stack(readings_at_nodes)
 
-    def trial(
-        layout: Layout, measure: np.ndarray, times: np.ndarray, ok: np.ndarray
-    ) -> tuple[Layout, np.ndarray]:
-        size = np.maximum(length or 1.0, measure[-1] / most)
-        part, last = np.floor(measure / size * (1 - 1e-12)), _before(ok)
-        new = np.flatnonzero(ok & ((last < 0) | (part != part[last])))
-        opening = np.zeros(nodes, int)
-        opening[: new.size] = new[:nodes]
-        used = np.arange(nodes) < new.size
-        start = times[opening]
-        # The first node stands at the first sample of any kind.
-        start[0] = layout.start[0]
-        node = (
-            np.searchsorted(np.where(used, start, np.inf), layout.ts, side="right") - 1
-        )
-        linked = np.append(used[1:], False)
-        end = np.where(linked, np.roll(start, -1), start)
-        node = np.clip(node, 0, nodes - 1)
-        return Layout(layout.ts, node, start, end, linked, layout.since), opening
 
-    measure = angle_turned(told) if length else count - 0.5
-    trials = zip(map(Layout, *layout), measure, told.ts, told.there, strict=True)
-    layouts, openings = zip(*(trial(*x) for x in trials), strict=True)
-    return Layout(*map(np.stack, zip(*layouts, strict=True))), np.stack(openings)
+def _segments_of_trial(
+    layout: Layout, number: np.ndarray, ts: np.ndarray, valid: np.ndarray
+) -> tuple[Layout, np.ndarray]:
+    """Divide one trial.
+
+    Args:
+        layout: The trial as one segment.
+        number: Number of the segment of each direct reading.
+        ts: Times of the direct readings.
+        valid: Which direct readings there are.
+
+    Returns:
+        The layout, and the index of the direct reading at each node (nodes,).
+    """
+    nodes = layout.start.size
+    last = _index_before(valid)
+    opens = np.flatnonzero(valid & ((last < 0) | (number != number[last])))
+    reading = np.zeros(nodes, int)
+    reading[: opens.size] = opens[:nodes]
+    used = np.arange(nodes) < opens.size
+    start = ts[reading]
+    # The first node stands at the first sample of any kind.
+    start[0] = layout.start[0]
+    node = np.searchsorted(np.where(used, start, np.inf), layout.ts, side="right") - 1
+    linked = np.append(used[1:], False)
+    divided = layout._replace(
+        node=np.clip(node, 0, nodes - 1),
+        start=start,
+        end=np.where(linked, np.roll(start, -1), start),
+        linked=linked,
+    )
+    return divided, reading
 
 
 def node_states(
-    told: Told, opening: np.ndarray, start: np.ndarray
+    readings: DirectReadings, reading: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """States at the nodes, as observed."""
-    trial = np.arange(len(opening))[:, None]
-    omega = told.omega[trial, opening]
-    if told.attitude is None:
+    """Return rates and attitudes at nodes, as read directly.
+
+    Args:
+        readings: The direct readings.
+        reading: Index of the one at each node (trials, nodes).
+        start: Time of each node (trials, nodes) [s].
+    """
+    trial = np.arange(len(reading))[:, None]
+    omega = readings.omega[trial, reading]
+    if readings.attitude is None:
         return omega, None
-    late = start - told.ts[trial, opening]
-    return omega, _carried(told.attitude[trial, opening], omega, late)
+    late = start - readings.ts[trial, reading]
+    return omega, _turned_by(readings.attitude[trial, reading], omega, late)
 
 
-def segments_needed(angle: float, n: int, length: float) -> int:
-    """How many nodes a trial needs; if the angle is not finite, for the worst case."""
+def segments_needed(angle: float, samples: int, length: float) -> int:
+    """Return how many nodes a trial needs.
+
+    Args:
+        angle: Angle turned [rad]; not finite for the worst case.
+        samples: How many samples a trial has.
+        length: Length of a segment [rad]; 0 for a segment of each sample.
+    """
     if not length:
-        return min(n, MOST_NODES)
-    most = n // 2 + 2
+        return min(samples, MOST_NODES)
+    # More segments than this would have fewer than two samples each.
+    most = samples // 2 + 2
     if not 0 <= angle < math.inf:
         return most
     # 8, 32, 128, ...: few programs serve all records.

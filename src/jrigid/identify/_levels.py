@@ -1,46 +1,48 @@
-"""The unmodelled torque that a record makes most likely: its levels and correlation times.
+"""The unmodelled torque that makes a record most likely: its levels and times.
 
-The likelihood is that of the innovations, restricted to what the states and numbers
-leave open (REML). It is smooth in the logarithms of levels and times, and little is
-asked of it: where the record was linearised once, many torques are tried without
-another evaluation of the motion.
+The likelihood is that of the innovations, restricted to what states and numbers leave
+open (REML). It is smooth in the logarithms of levels and times and needs no further
+evaluation of the motion: a record is linearised once and many torques are compared.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
 
 from jrigid.identify._disturbance import Disturbance, GaussMarkov
-from jrigid.identify._filter import likelihood
+from jrigid.identify._filter import TrialLikelihoods, likelihood
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit, columns_of_prior, linearised, weights_of
 
-FAINT = 1e-4  # of the first level: no torque at all
-_DIFFERENCE = 0.1  # in logarithms, for derivatives
-_LONGEST_MOVE = 3.0  # in logarithms
-_FINE = 0.02  # a change of a logarithm that does not matter
-_UNKNOWN = 10.0  # error of the logarithm of a level that could be any
+FAINT = 1e-4  # part of the first level below which there is no torque
+_DIFFERENCE = 0.1  # of logarithms, for second derivatives
+_LONGEST_MOVE = 3.0  # of logarithms
+_FINE = 0.02  # change of a logarithm that does not matter
 _ROUNDS = 40
-_HIGHEST = 30.0  # logarithm of a level, in units of the first, that no record asks for
-_TRIED = 2.0  # logarithm of a time to begin with, in units of the shortest
-_GAIN = 2.0  # of -2 log likelihood, for each number more (Akaike)
-_FOREIGN = (
-    30.0  # fall of -2 log likelihood, beyond one for each number, for another body
-)
-_FEWEST = 5  # trials that show which of them is of another body
-_MOST_FOREIGN = 0.25  # of all trials: beyond, nobody knows who is foreign
-_SPREAD = 0.7  # of the logarithms of trials' levels, as far as is known beforehand
+_TRIED_FRACTIONS = (1.0, 0.3, 0.1, 0.01)  # of a step
+_UNKNOWN = 10.0  # error of the logarithm of a level that could have any size
+_HIGHEST = 30.0  # logarithm of a level, in units of the first, above all real ones
+_TRIED = 2.0  # logarithm of the first time tried, in units of the shortest
+_GAIN = 2.0  # in -2 log likelihood, for each further number (Akaike)
+# A trial has another body if -2 log likelihood falls by more than this, beyond one for
+# each number, where it has numbers of its own. Few trials do not show which of them it
+# is, nor do trials of which many seem to have another body.
+_FOREIGN = 30.0
+_FEWEST = 5
+_MOST_FOREIGN = 0.25
+# Sizes of the torque in trials are known beforehand to within a factor exp(0.7).
+_PRECISION_OF_SIZES = 1 / 0.7**2
 
 
 class Form(NamedTuple):
-    """What is sought of a torque.
+    """How many numbers a torque has.
 
     Attributes:
-        levels: 1 for all axes, or 3.
-        times: 0 for white torque, 1 or 3.
+        levels: 1 for all axes together, or 3.
+        times: 0 for white torque, 1 for all axes together, or 3.
     """
 
     levels: int
@@ -48,20 +50,20 @@ class Form(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers are sought."""
+        """How many numbers there are."""
         return self.levels + self.times
 
 
 class Torque(NamedTuple):
-    """A torque as it is sought.
+    """A torque as a vector of numbers.
 
     Attributes:
-        form: Which numbers there are.
+        form: How many numbers there are.
         numbers: Logarithms of levels and of times.
-        trials: Of the size of the torque in each trial, beside that of others
+        trials: Logarithm of the size of the torque in each trial, over its level
             (trials,).
-        own_sizes: Whether these were sought, too.
-        minus_two_log_likelihood: Of the record; infinite where it was not computed.
+        own_sizes: Whether the sizes were sought.
+        minus_two_log_likelihood: Of the record; infinite if it was not computed.
     """
 
     form: Form
@@ -72,12 +74,12 @@ class Torque(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers were sought: those of its form, and of trials that differ."""
+        """How many numbers were sought, with the sizes of trials if they were."""
         return self.form.size + (self.trials.size if self.own_sizes else 0)
 
     @property
     def levels(self) -> np.ndarray:
-        """Its levels in a trial of mean size: one, or one for each axis."""
+        """Levels in a trial of mean size: one, or one for each axis."""
         return np.exp(self.numbers[: self.form.levels])
 
     def with_levels(self, levels: np.ndarray) -> "Torque":
@@ -87,7 +89,7 @@ class Torque(NamedTuple):
 
     @property
     def disturbance(self) -> Disturbance:
-        """The torque."""
+        """The torque in each trial, with all axes."""
         levels, times = np.split(np.exp(self.numbers), [self.form.levels])
         levels = np.exp(self.trials)[:, None] * np.broadcast_to(levels, 3)
         return Disturbance(levels, np.broadcast_to(times if times.size else 0.0, 3))
@@ -100,7 +102,7 @@ class Torque(NamedTuple):
 
 
 def known(level: np.ndarray, time: np.ndarray) -> Torque:
-    """A torque that was given, as if it had been sought."""
+    """A torque of given levels and times."""
     tiny = np.finfo(float).tiny
     form = Form(3, 3 if np.all(time > 0) else 0)
     numbers = np.concatenate([level, time[: form.times]])
@@ -108,15 +110,15 @@ def known(level: np.ndarray, time: np.ndarray) -> Torque:
 
 
 class Likelihood:
-    """-2 log likelihood of torques for a record that was linearised where a fit ended."""
+    """-2 log likelihood of torques for a record, linearised where a fit ended."""
 
     def __init__(self, problem: Problem, fit: Fit):
-        """Take what does not depend on the torque."""
+        """Compute what does not depend on the torque."""
         record = linearised(fit)
-        inner = record.links.gap.shape[-1]
         prior = columns_of_prior(fit)
-        trials, unknown = record.weight.shape[0], fit.minimum.point.numbers.size
-        unknown += trials * (inner + record.own.shape[-1])
+        trials = record.weight.shape[0]
+        own = record.links.gap.shape[-1] + record.own.shape[-1]
+        unknown = fit.minimum.point.numbers.size + trials * own
         freedom = max(float(np.sum(weights_of(problem, fit.kept))) - unknown, 1.0)
         self._dtype = record.tensor.dtype
         self._arguments = (
@@ -125,44 +127,54 @@ class Likelihood:
             np.asarray(freedom, self._dtype),
             np.asarray(problem.options.noise_known),
         )
-        span = fit.layout.end - fit.layout.start
-        self.kicks = 2.0 * max(3 * np.sum(fit.layout.linked), 1)
-        self._none = np.log(1e-7 * np.min(span[fit.layout.linked], initial=1.0))
+        layout = fit.layout
+        shortest = np.min((layout.end - layout.start)[layout.linked], initial=1.0)
+        # White torque has a correlation time far below all steps.
+        self._time_of_white = np.log(1e-7 * shortest)
+        self.kicks = 2.0 * max(3 * np.sum(layout.linked), 1)
 
     def __call__(
         self, form: Form, numbers: np.ndarray, trials: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """The value, and its derivatives in numbers and in the logarithms of trials' sizes."""
-        (value, _), slopes = self._found(form, numbers, trials)
+        """Return the value and its derivatives in numbers and sizes of trials."""
+        (value, _), slopes = self._evaluate(form, numbers, trials)
         of_levels, of_times, of_trials = slopes
-        slope = [np.sum(of_levels, keepdims=True) if form.levels == 1 else of_levels]
-        if form.times:
-            slope.append(
-                np.sum(of_times, keepdims=True) if form.times == 1 else of_times
-            )
+        slope = [
+            _of_form(of_levels, form.levels),
+            _of_form(of_times, form.times),
+        ]
         return float(value), np.concatenate(slope), of_trials
 
     def as_of_another_body(self, torque: Torque) -> np.ndarray:
-        """By how much -2 log likelihood of each trial falls with numbers of its own.
+        """Fall of -2 log likelihood of each trial that is given numbers of its own.
 
-        The torque in it has the size that suits the trial best in either case, so that
-        a trial with a larger torque is not taken for one of another body.
+        The torque has the size that suits the trial best in either case, so that a
+        trial with a larger torque is not taken for one of another body.
         """
         sizes = np.linspace(-2.0, 2.0, 9)[:, None] + torque.trials
-        found = [self._found(torque.form, torque.numbers, x)[0][1] for x in sizes]
-        together = np.min([x.together for x in found], axis=0)
-        return together - np.min([x.alone for x in found], axis=0)
+        of_trials = [
+            self._evaluate(torque.form, torque.numbers, size)[0][1] for size in sizes
+        ]
+        together = np.min([x.together for x in of_trials], axis=0)
+        return together - np.min([x.alone for x in of_trials], axis=0)
 
-    def _found(self, form: Form, numbers: np.ndarray, trials: np.ndarray) -> Any:
+    def _evaluate(
+        self, form: Form, numbers: np.ndarray, trials: np.ndarray
+    ) -> tuple[tuple[np.ndarray, TrialLikelihoods], tuple[np.ndarray, ...]]:
+        """Results of `likelihood` in double precision."""
         levels, times = np.split(numbers, [form.levels])
-        times = times if form.times else np.array([self._none])
-        given = (np.broadcast_to(levels, 3), np.broadcast_to(times, 3), trials)
-        found = likelihood(*self._arguments, *(x.astype(self._dtype) for x in given))
-        return jtu.tree_map(_wide, found)
+        if not form.times:
+            times = np.array([self._time_of_white])
+        torque = np.broadcast_to(levels, 3), np.broadcast_to(times, 3), trials
+        results = likelihood(*self._arguments, *(x.astype(self._dtype) for x in torque))
+        return jtu.tree_map(lambda x: np.asarray(x, float), results)
 
 
-def _wide(x: Any) -> np.ndarray:
-    return np.asarray(x, float)
+def _of_form(of_axes: np.ndarray, count: int) -> np.ndarray:
+    """Derivatives in `count` numbers: none, one for all axes, or one for each."""
+    if count == 1:
+        return np.sum(of_axes, keepdims=True)
+    return of_axes[:count]
 
 
 Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -174,20 +186,20 @@ def descend(
     low: np.ndarray,
     high: np.ndarray,
     inverse: np.ndarray,
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Minimise a smooth function within bounds: BFGS with a backtracking search along its steps.
+) -> tuple[np.ndarray, float]:
+    """Minimise a smooth function within bounds, by BFGS with a backtracking search.
 
     Args:
-        function: Gives value and slope.
+        function: Returns value and slope.
         x: Where to start.
-        low: Bounds.
-        high: Bounds.
-        inverse: Of the second derivatives, as far as it is known.
+        low: Lower bounds.
+        high: Upper bounds.
+        inverse: Approximate inverse of the matrix of second derivatives.
 
     Returns:
-        Where it ended, the value there and the inverse as it was learnt.
+        The minimum, and the value there.
     """
-    at, slope = function(x)
+    value, slope = function(x)
     for _ in range(_ROUNDS):
         # A number at its bound that would leave it stays.
         held = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
@@ -197,20 +209,32 @@ def descend(
         if not longest > 0.1 * _FINE:
             break
         move = move * min(1.0, _LONGEST_MOVE / longest)
-        for fraction in (1.0, 0.3, 0.1, 0.01):
-            point = np.clip(x + fraction * move, low, high)
-            value, new = function(point)
-            if value < at:
+        for fraction in _TRIED_FRACTIONS:
+            new = np.clip(x + fraction * move, low, high)
+            new_value, new_slope = function(new)
+            if new_value < value:
                 break
         else:
             break
-        step, change = point - x, new - slope
-        x, at, slope = point, value, new
-        along = float(change @ step)
-        if along > 1e-12:
-            left = np.eye(x.size) - np.outer(step, change) / along
-            inverse = left @ inverse @ left.T + np.outer(step, step) / along
-    return x, at, inverse
+        inverse = _bfgs_update(inverse, new - x, new_slope - slope)
+        x = new
+        value = new_value
+        slope = new_slope
+    return x, value
+
+
+def _bfgs_update(
+    inverse: np.ndarray, step: np.ndarray, change: np.ndarray
+) -> np.ndarray:
+    """The inverse of second derivatives after a step that changed the slope.
+
+    Source: Nocedal & Wright, Numerical Optimization, 2nd ed., eq. 6.17.
+    """
+    along = float(change @ step)
+    if not along > 1e-12:
+        return inverse
+    projector = np.eye(step.size) - np.outer(step, change) / along
+    return projector @ inverse @ projector.T + np.outer(step, step) / along
 
 
 class Search:
@@ -223,58 +247,59 @@ class Search:
     """
 
     def __init__(self, problem: Problem, layout: Layout, first: float):
-        """Set bounds."""
+        """Set the bounds of levels and times."""
         self._problem = problem
         span = np.where(layout.linked, layout.end - layout.start, np.inf)
         end = np.where(layout.linked, layout.end, -np.inf).max(axis=1)
         duration = np.max(end - layout.start[:, 0], initial=0.0)
         self._first = np.log(first)
-        # A memory shorter than a step is none; one longer than the record, a constant
-        # torque.
+        # A torque is white if its correlation time is shorter than a step, and constant
+        # if it is longer than the record.
         step = float(np.min(span, initial=1e9))
         self._shortest = np.log(0.2 * step)
         self._longest = np.log(max(duration, step))
 
     def start(self, level: float, trials: int) -> Torque:
-        """White torque of a level about all axes."""
+        """White torque of one level along all axes."""
         return Torque(Form(1, 0), np.log(np.full(1, level)), np.zeros(trials))
 
     def improved(self, torque: Torque, fit: Fit) -> Torque:
-        """The most likely torque of the same form at a fit; its sizes in trials stay."""
+        """The most likely torque of the same form, with the same sizes in trials."""
         return self._descended(torque, Likelihood(self._problem, fit))
 
     def _bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
-        low = [self._first + np.log(FAINT)] * form.levels + [
-            self._shortest
-        ] * form.times
-        high = [self._first + _HIGHEST] * form.levels + [self._longest] * form.times
-        return np.array(low), np.array(high)
+        """Lower and upper bounds of the numbers of a form."""
+        counts = [form.levels, form.times]
+        low = np.repeat([self._first + np.log(FAINT), self._shortest], counts)
+        high = np.repeat([self._first + _HIGHEST, self._longest], counts)
+        return low, high
 
     def _descended(self, torque: Torque, likelihood: Likelihood) -> Torque:
+        """The most likely torque of the same form, searched from a torque."""
         low, high = self._bounds(torque.form)
 
         def function(x: np.ndarray) -> tuple[float, np.ndarray]:
             return likelihood(torque.form, x, torque.trials)[:2]
 
         start = np.clip(torque.numbers, low, high)
-        # A level's logarithm is known to 1 / sqrt(2 n) by n kicks.
+        # n kicks determine the logarithm of a level to 1 / sqrt(2 n).
         inverse = np.eye(start.size) / likelihood.kicks
-        numbers, at, _ = descend(function, start, low, high, inverse)
-        return torque._replace(numbers=numbers, minus_two_log_likelihood=at)
+        numbers, value = descend(function, start, low, high, inverse)
+        return torque._replace(numbers=numbers, minus_two_log_likelihood=value)
 
     def are_faint(self, torque: Torque) -> np.ndarray:
-        """Which of the levels are too low to be seen."""
+        """Which levels are too low to be detected."""
         return torque.levels < 2 * FAINT * np.exp(self._first)
 
     def are_unbounded(self, torque: Torque, errors: np.ndarray) -> np.ndarray:
-        """Which of the levels are large and might be much larger, by the errors of logarithms."""
+        """Which levels are large and may be much larger, by errors of logarithms."""
         return (torque.levels > np.exp(self._first)) & ~(errors < _UNKNOWN)
 
     def preferred(self, torque: Torque, fit: Fit, spins: np.ndarray) -> Torque:
-        """The torque of the form that the likelihood prefers, from a white one.
+        """The most likely torque of all forms.
 
         Args:
-            torque: White, of one level.
+            torque: Where to start: white torque of one level.
             fit: Where the record is linearised.
             spins: Rms rate of each trial [rad/s].
         """
@@ -295,6 +320,7 @@ class Search:
         return best
 
     def _better(self, one: Torque, other: Torque) -> Torque:
+        """The other torque if it is more likely by more than its numbers cost."""
         cost = _GAIN * (other.form.size - one.form.size)
         gain = one.minus_two_log_likelihood - other.minus_two_log_likelihood
         return other if gain > cost else one
@@ -304,75 +330,93 @@ class Search:
         levels, times = np.split(torque.numbers, [torque.form.levels])
         levels = np.resize(levels, form.levels)
         if not times.size:
-            times = np.full(
-                1, min(self._shortest + _TRIED, 0.5 * (self._shortest + self._longest))
-            )
+            middle = 0.5 * (self._shortest + self._longest)
+            times = np.full(1, min(self._shortest + _TRIED, middle))
         times = np.resize(times, form.times)
         return torque._replace(form=form, numbers=np.concatenate([levels, times]))
 
     def _with_trials(self, torque: Torque, likelihood: Likelihood) -> Torque:
-        """With a size of its own in each trial, if that is more likely.
-
-        Sizes are known beforehand to be alike within a factor; what this costs in
-        likelihood is counted by Laplace's method.
-        """
-        size, start, precision = torque.form.size, torque.trials, 1 / _SPREAD**2
-
-        def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-            own = x[size:]
-            value, *slopes = likelihood(torque.form, x[:size], start + own)
-            slopes[1] = slopes[1] + 2 * precision * own
-            return value + precision * float(np.sum(own**2)), np.concatenate(slopes)
-
-        trials = start.size
+        """The torque with a size of its own in each trial, if that is more likely."""
+        size = torque.form.size
+        trials = torque.trials.size
+        function = _with_sizes(torque, likelihood)
         low, high = self._bounds(torque.form)
         low = np.concatenate([low, np.full(trials, -_HIGHEST)])
         high = np.concatenate([high, np.full(trials, _HIGHEST)])
-        x = np.concatenate([torque.numbers, np.zeros(trials)])
-        scale = np.concatenate([np.full(size, 1.0), np.full(trials, float(trials))])
-        x, at, _ = descend(function, x, low, high, np.diag(scale / likelihood.kicks))
-        # Trials hardly know of each other: moving all shows how each bends.
-        move = np.concatenate([np.zeros(size), np.full(trials, _DIFFERENCE)])
-        bend = (function(x + move)[1] - function(x - move)[1])[size:] / (
-            2 * _DIFFERENCE
-        )
-        cost = float(np.sum(np.log(np.maximum(bend / (2 * precision), 1.0))))
-        if torque.minus_two_log_likelihood - at < cost:
+        start = np.concatenate([torque.numbers, np.zeros(trials)])
+        # A trial has only its part of all kicks.
+        scale = np.repeat([1.0, float(trials)], [size, trials])
+        inverse = np.diag(scale / likelihood.kicks)
+        x, value = descend(function, start, low, high, inverse)
+        cost = _cost_of_sizes(function, x, trials)
+        if torque.minus_two_log_likelihood - value < cost:
             return torque
-        own = x[size:]
-        at = likelihood(torque.form, x[:size], start + own)[0]
-        return Torque(
-            torque.form,
-            x[:size],
-            start + own,
+        numbers, own = np.split(x, [size])
+        sizes = torque.trials + own
+        return torque._replace(
+            numbers=numbers,
+            trials=sizes,
             own_sizes=True,
-            minus_two_log_likelihood=at,
+            minus_two_log_likelihood=likelihood(torque.form, numbers, sizes)[0],
         )
 
     def foreign(self, torque: Torque, fit: Fit) -> np.ndarray:
-        """Which trials are of another body, as far as their likelihood shows."""
-        alive = np.any(fit.kept > 0, axis=1)
-        none, numbers = np.zeros(alive.shape, bool), fit.minimum.point.numbers.size
-        if np.sum(alive) < _FEWEST or not numbers:
+        """Which trials have another body, as far as their likelihood shows."""
+        used = np.any(fit.kept > 0, axis=1)
+        none = np.zeros(used.shape, bool)
+        numbers = fit.minimum.point.numbers.size
+        if np.sum(used) < _FEWEST or not numbers:
             return none
         fall = Likelihood(self._problem, fit).as_of_another_body(torque)
-        # A torque that is not quite of this kind lets all trials differ.
-        usual = max(float(np.median(fall[alive])) / numbers, 1.0)
-        found = alive & (fall > usual * (numbers + _FOREIGN))
-        most = alive.size * _MOST_FOREIGN
-        return found if np.sum(found | ~alive) <= most else none
+        # Under a torque that is not quite of this form all trials differ.
+        usual = max(float(np.median(fall[used])) / numbers, 1.0)
+        foreign = used & (fall > usual * (numbers + _FOREIGN))
+        most = used.size * _MOST_FOREIGN
+        return foreign if np.sum(foreign | ~used) <= most else none
 
     def errors(self, torque: Torque, fit: Fit) -> np.ndarray:
         """Standard errors of the logarithms of levels and times."""
         likelihood = Likelihood(self._problem, fit)
-        moves = _DIFFERENCE * np.eye(torque.form.size)
 
-        def slope(x: np.ndarray) -> np.ndarray:
-            return likelihood(torque.form, x, torque.trials)[1]
+        def slope(numbers: np.ndarray) -> np.ndarray:
+            return likelihood(torque.form, numbers, torque.trials)[1]
 
-        rows = [slope(torque.numbers + y) - slope(torque.numbers - y) for y in moves]
-        bend = np.array(rows) / (2 * _DIFFERENCE)
-        bend = 0.5 * (bend + bend.T)
-        values, axes = np.linalg.eigh(np.where(np.isfinite(bend), bend, 0.0))
+        changes = [
+            slope(torque.numbers + move) - slope(torque.numbers - move)
+            for move in _DIFFERENCE * np.eye(torque.form.size)
+        ]
+        curvature = np.array(changes) / (2 * _DIFFERENCE)
+        curvature = 0.5 * (curvature + curvature.T)
+        finite = np.where(np.isfinite(curvature), curvature, 0.0)
+        values, axes = np.linalg.eigh(finite)
+        # The value is twice the logarithm.
         covariance = (axes * (2 / np.maximum(values, 1e-12))) @ axes.T
         return np.sqrt(np.diagonal(covariance))
+
+
+def _with_sizes(torque: Torque, likelihood: Likelihood) -> Function:
+    """-2 log likelihood of a torque's numbers and of changes of its sizes in trials.
+
+    Prior knowledge that sizes are alike within a factor is included.
+    """
+    form = torque.form
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        numbers, own = np.split(x, [form.size])
+        value, slope, of_trials = likelihood(form, numbers, torque.trials + own)
+        value = value + _PRECISION_OF_SIZES * float(np.sum(own**2))
+        of_trials = of_trials + 2 * _PRECISION_OF_SIZES * own
+        return value, np.concatenate([slope, of_trials])
+
+    return function
+
+
+def _cost_of_sizes(function: Function, x: np.ndarray, trials: int) -> float:
+    """What sizes of trials cost in -2 log likelihood, by Laplace's method."""
+    # Trials hardly depend on each other: moving all shows the curvature of each.
+    move = np.zeros(x.size)
+    move[-trials:] = _DIFFERENCE
+    change = function(x + move)[1] - function(x - move)[1]
+    curvature = change[-trials:] / (2 * _DIFFERENCE)
+    ratio = curvature / (2 * _PRECISION_OF_SIZES)
+    return float(np.sum(np.log(np.maximum(ratio, 1.0))))

@@ -1,6 +1,6 @@
-"""The least-squares problem of a record: residuals, their derivatives, and what links may gap."""
+"""The least-squares problem of a record: residuals, gaps and their derivatives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,31 +18,53 @@ from jrigid.dynamics import State
 from jrigid.identify._flow import forced_flow, free_flow
 from jrigid.identify._layout import Layout
 from jrigid.identify._records import Samples
+from jrigid.identify._sensors import AbstractSensor
 from jrigid.identify._smoother import Links, Point, Rows
 from jrigid.identify._unknowns import Unknowns
 from jrigid.rotation import conjugate, exp, multiply, normalize
 from jrigid.simulate import simulate
+from jrigid.systems import RigidBody
 
-RTOL = {8: 1e-9, 4: 1e-5}  # of the integration of a whole record
-_SURE = 6.0  # standard deviations beyond a limit, where nothing more is learnt
+# Tolerance of the integration of a whole record, by the size of the dtype in bytes.
+RTOL = {8: 1e-9, 4: 1e-5}
+# Standard deviations beyond a limit, where a saturated reading no longer matters.
+_SURE = 6.0
 
 
 class Options(NamedTuple):
-    """What is fixed when a fit is compiled."""
+    """What is fixed when a fit is compiled.
+
+    Attributes:
+        free_motion: Whether no torque acts.
+        depends_on_attitude: Whether the torque or a sensor depends on the attitude.
+        shooting: Whether each segment has a state of its own, not only each trial.
+        nodes: How many nodes a trial has.
+        unmodelled: Whether there is a torque without a model: "none", "known" or
+            "estimate".
+        robust: Whether Cauchy's loss may be used.
+        noise_known: Whether the noise of the records is stated.
+        motion: Function (system, state, times, t0) that returns states, in place of
+            `simulate`.
+    """
 
     free_motion: bool
     depends_on_attitude: bool
-    shooting: bool = False  # from a state of each segment, or from one of each trial
+    shooting: bool = False
     nodes: int = 1
-    unmodelled: str = "none"  # a torque that no model has: or "known", "estimate"
+    unmodelled: str = "none"
     robust: bool = False
     noise_known: bool = True
-    motion: Any = None
+    motion: Callable[..., State] | None = None
 
     @property
     def dense(self) -> bool:
         """Whether each sample has a node."""
         return self.unmodelled != "none"
+
+    @property
+    def local(self) -> int:
+        """How many numbers a change of the state has: rates, and a turn if needed."""
+        return 6 if self.depends_on_attitude else 3
 
 
 class Problem(eqx.Module):
@@ -55,25 +77,48 @@ class Problem(eqx.Module):
 
     @property
     def known(self) -> int:
-        """How many samples stand for what is known beforehand, and for a fit held near its start.
+        """How many rows a trial has besides its samples.
 
-        Those of the trial come first, then, beside the first trial, those of all
-        trials.
+        First come those for prior knowledge of the trial's own numbers. Those for all
+        trials follow and count in the first trial only: prior knowledge of the numbers,
+        and a fit held near its start.
         """
-        x = self.unknowns
-        count = sum(y.base.size for y in x.sought if y.sigma is not None) + (
-            x.hold is not None
-        )
-        return count + self.held
+        unknowns = self.unknowns
+        known = sum(x.base.size for x in unknowns.sought if x.sigma is not None)
+        return known + (unknowns.hold is not None) + self.held
 
     @property
     def held(self) -> int:
-        """How many numbers hold a fit near its start while little of the record takes part."""
+        """How many rows hold a fit near its start while part of the record is used."""
         return self.unknowns.size - self.unknowns.slices["scale"].stop
 
 
+class _Trial(NamedTuple):
+    """What belongs to one trial: (nodes, ...), (samples, ...)."""
+
+    layout: Layout
+    samples: Samples
+    first: Array  # 1 for the first trial, else 0
+
+
+class _Memory(NamedTuple):
+    """The states that the readings of one sensor depend on.
+
+    A sensor without memory has a single lag of zero.
+
+    Attributes:
+        sample: Index of the sample of each state (lags x samples,).
+        lag: Time from the state to the sample (lags x samples,) [s].
+        weight: Weight of each lag (lags,).
+    """
+
+    sample: Array
+    lag: Array
+    weight: Array
+
+
 def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
-    """States of a motion that wants its times in order."""
+    """States at unordered times, of a motion that takes ordered ones."""
     order = jnp.argsort(ts)
     states = motion(ts[order])
     back = jnp.argsort(order)
@@ -81,9 +126,9 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
 
 
 def _flow(
-    options: Options, system: Any, before: State, start: Array, end: Array
+    options: Options, system: RigidBody, before: State, start: Array, end: Array
 ) -> State:
-    """States a short time later, or earlier, each of its own start."""
+    """States a short time after, or before, given states (n, ...), one each."""
     if not options.free_motion:
 
         def flow(state: State, start: Array, end: Array) -> State:
@@ -99,14 +144,16 @@ def _flow(
 
 
 def _integrated(
-    options: Options, system: Any, first: State, ts: Array, t0: Array
+    options: Options, system: RigidBody, first: State, ts: Array, t0: Array
 ) -> State:
-    """A trial from its first state, by `simulate`, or by the motion that was given."""
+    """States of a trial from its first one, by `simulate` or by the user's motion."""
     first = State(normalize(first.attitude), first.omega)
 
     def motion(times: Array) -> State:
         if options.motion is not None:
             return options.motion(system, first, times, t0)
+        # Few unknowns meet many residuals, hence forward mode. A motion that cannot be
+        # integrated is not finite, and the step that led there is rejected.
         return simulate(
             system,
             first,
@@ -121,171 +168,309 @@ def _integrated(
     return in_any_order(motion, ts)
 
 
-class _Trial(NamedTuple):
-    """What is a trial's own: (nodes, ...), (samples, ...)."""
-
-    layout: Layout
-    samples: Samples
-    first: Array  # 1 for the first trial
-
-
-def _picked(state: State, index: Any) -> State:
+def _picked(state: State, index: Array | slice | int) -> State:
+    """The states at an index."""
     return State(state.attitude[index], state.omega[index])
 
 
-def _seen(
-    options: Options, system: Any, sensors: Any, nodes: State, trial: _Trial
-) -> tuple[list[Array], State]:
-    """What each sensor shows at its times (n, k); states at the ends of the links."""
-    layout, dtype = trial.layout, trial.layout.ts.dtype
-    samples, lags, weights = [], [], []
-    for sensor, part in zip(sensors, trial.samples.parts, strict=True):
-        late, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
-        samples.append(jnp.tile(jnp.arange(part.start, part.stop), late.size))
-        lags.append(jnp.repeat(late.astype(dtype), part.stop - part.start))
-        weights.append(weight.astype(dtype))
-    sample = jnp.concatenate(samples)
-    times, node = layout.ts[sample] - jnp.concatenate(lags), layout.node[sample]
+def _memory_of(sensor: AbstractSensor, part: slice, dtype: Any) -> _Memory:
+    """The states that a sensor's readings of some samples depend on."""
+    lag, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
+    return _Memory(
+        sample=jnp.tile(jnp.arange(part.start, part.stop), lag.size),
+        lag=jnp.repeat(lag.astype(dtype), part.stop - part.start),
+        weight=weight.astype(dtype),
+    )
+
+
+def _states(
+    options: Options,
+    system: RigidBody,
+    nodes: State,
+    layout: Layout,
+    sample: Array,
+    lag: Array | None,
+) -> tuple[State, State]:
+    """States of a trial near its samples, and at the ends of its links.
+
+    Args:
+        options: Of the fit.
+        system: The body.
+        nodes: States at the nodes.
+        layout: The nodes.
+        sample: Indices of samples.
+        lag: Time from the state to the sample [s]; None if it is zero for all.
+
+    Returns:
+        States of which the first are those near the samples, and those at the ends.
+    """
+    ts = layout.ts[sample]
+    times = ts if lag is None else ts - lag
     if options.shooting or options.free_motion:
-        begin = jnp.concatenate([layout.start[node], layout.start])
+        node = layout.node[sample]
+        # One call evaluates both, which halves the size of the program.
+        start = jnp.concatenate([layout.start[node], layout.start])
         end = jnp.concatenate([times, layout.end])
         before = jtu.tree_map(lambda x: jnp.concatenate([x[node], x]), nodes)
-        states = _flow(options, system, before, begin, end)
-        ends = _picked(states, slice(sample.size, None))
-    else:
-        whole = _integrated(
-            options, system, _picked(nodes, 0), layout.ts, layout.start[0]
-        )
-        states, ends = _picked(whole, sample), nodes
-        if any(x.memory() is not None for x in sensors):
-            states = _flow(options, system, states, layout.ts[sample], times)
-    shown, first = [], 0
-    for sensor, index, weight in zip(sensors, samples, weights, strict=True):
-        part = slice(first, first + index.size)
-        first = part.stop
-        one = lambda t, q, w, sensor=sensor: sensor.predict(t, State(q, w), system)  # noqa: E731
-        values = jax.vmap(one)(
-            layout.ts[index], states.attitude[part], states.omega[part]
-        )
-        values = values.reshape(weight.size, -1, *values.shape[1:])
-        shown.append(
-            product("l,lnk->nk", weight, values) if weight.size > 1 else values[0]
-        )
-    return shown, ends
+        states = _flow(options, system, before, start, end)
+        return states, _picked(states, slice(sample.size, None))
+    first = _picked(nodes, 0)
+    whole = _integrated(options, system, first, layout.ts, layout.start[0])
+    states = _picked(whole, sample)
+    # The lags of a sensor are short, so that one step from its samples suffices.
+    if lag is not None:
+        states = _flow(options, system, states, ts, times)
+    return states, nodes
+
+
+def _reading(
+    system: RigidBody, sensor: AbstractSensor, memory: _Memory, ts: Array, states: State
+) -> Array:
+    """Values (n, k) that a sensor shows, of the states that its memory names."""
+
+    def value(t: Array, attitude: Array, omega: Array) -> Array:
+        return sensor.predict(t, State(attitude, omega), system)
+
+    values = jax.vmap(value)(ts[memory.sample], states.attitude, states.omega)
+    values = values.reshape(memory.weight.size, -1, *values.shape[1:])
+    if memory.weight.size == 1:
+        return values[0]
+    return product("l,lnk->nk", memory.weight, values)
+
+
+def _readings(
+    options: Options,
+    system: RigidBody,
+    sensors: Sequence[AbstractSensor],
+    nodes: State,
+    layout: Layout,
+    samples: Samples,
+) -> tuple[list[Array], State]:
+    """Return what the sensors show in a trial, and its states at the ends of links.
+
+    Args:
+        options: Of the fit.
+        system: The body.
+        sensors: The sensors.
+        nodes: States at the nodes.
+        layout: The nodes.
+        samples: The samples.
+
+    Returns:
+        Values of each sensor (n, k), and states (nodes, ...).
+    """
+    dtype = layout.ts.dtype
+    memories = [
+        _memory_of(sensor, part, dtype)
+        for sensor, part in zip(sensors, samples.parts, strict=True)
+    ]
+    sample = jnp.concatenate([x.sample for x in memories])
+    lag = None
+    if any(x.memory() is not None for x in sensors):
+        lag = jnp.concatenate([x.lag for x in memories])
+    states, ends = _states(options, system, nodes, layout, sample, lag)
+    values = []
+    start = 0
+    for sensor, memory in zip(sensors, memories, strict=True):
+        own = _picked(states, slice(start, start + memory.sample.size))
+        values.append(_reading(system, sensor, memory, layout.ts, own))
+        start += memory.sample.size
+    return values, ends
 
 
 def shown_by(
     options: Options,
-    system: Any,
-    sensors: Any,
+    system: RigidBody,
+    sensors: Sequence[AbstractSensor],
     start: State,
     t0: Array,
     samples: Samples,
 ) -> list[Array]:
-    """What sensors show at their times (n, k) of the motion from a state at t0."""
-    first, ts = t0[None], samples.ts
-    layout = Layout(ts, jnp.zeros(ts.shape, int), first, first, first > t0, ts)
+    """Values (n, k) that sensors show of the motion from a state at t0."""
+    first = t0[None]
+    ts = samples.ts
+    layout = Layout(
+        ts=ts,
+        node=jnp.zeros(ts.shape, int),
+        start=first,
+        end=first,
+        linked=first > t0,
+        since=ts,
+    )
     nodes = State(start.attitude[None], start.omega[None])
-    trial = _Trial(layout, samples, t0)
-    return _seen(options._replace(shooting=False), system, sensors, nodes, trial)[0]
+    options = options._replace(shooting=False)
+    return _readings(options, system, sensors, nodes, layout, samples)[0]
 
 
-def whitened(sensors: Any, samples: Samples, shown: list[Array]) -> Array:
-    """Residuals of a trial (n, D) in units of their noise; zero where nothing was seen."""
-    parts, width = [], samples.weight.shape[-1]
-    for sensor, values, predicted in zip(sensors, samples.values, shown, strict=True):
-        if predicted.shape != values.shape:
+def _unlikely(rows: Array, sign: Array) -> Array:
+    """Residuals of saturated readings, which say "at least"; others as they are.
+
+    The square of such a residual is -2 log of the probability that noise takes the
+    reading beyond the limit.
+    """
+    beyond = jnp.where(sign != 0, jnp.clip(sign * rows, -1e3, _SURE), 0.0)
+    size = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
+    return jnp.where(sign != 0, -sign * size, rows)
+
+
+def whitened(
+    sensors: Sequence[AbstractSensor], samples: Samples, predicted: list[Array]
+) -> Array:
+    """Residuals of a trial (n, D) in units of their noise, zero without a reading."""
+    width = samples.weight.shape[-1]
+    parts = []
+    for sensor, observed, values in zip(
+        sensors, samples.values, predicted, strict=True
+    ):
+        if values.shape != observed.shape:
             raise ValueError(
                 f"Argument `function` of `{type(sensor).__name__}` must return shape "
-                f"{values.shape[1:]}, but it returns {predicted.shape[1:]}."
+                f"{observed.shape[1:]}, but it returns {values.shape[1:]}."
             )
-        part = jax.vmap(sensor.difference)(values, predicted)
+        part = jax.vmap(sensor.difference)(observed, values)
         parts.append(jnp.pad(part, ((0, 0), (0, width - part.shape[1]))))
     rows = product("nij,nj->ni", samples.whitener, jnp.concatenate(parts))
     if any(x.saturation() is not None for x in sensors):
-        # A saturated number says "at least": the square is -2 log of its probability.
-        beyond = jnp.where(
-            samples.sign != 0, jnp.clip(samples.sign * rows, -1e3, _SURE), 0.0
-        )
-        likely = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
-        rows = jnp.where(samples.sign != 0, -samples.sign * likely, rows)
+        rows = _unlikely(rows, samples.sign)
+    # Missing readings have finite values, so that derivatives stay finite too.
     return rows * samples.weight
 
 
 def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
-    """Values of each record (trials, n, k) as its sensor would show them, one body for all."""
+    """Predicted values of each record (trials, n, k), with one body in all trials."""
     unknowns = problem.unknowns
     system, *sensors = unknowns.parts(
         point.numbers, point.own[0], unknowns.leaves_of(0)
     )
 
-    def trial(attitude: Array, omega: Array, data: _Trial) -> list[Array]:
-        return _seen(problem.options, system, sensors, State(attitude, omega), data)[0]
+    def trial(
+        attitude: Array, omega: Array, layout: Layout, samples: Samples
+    ) -> list[Array]:
+        nodes = State(attitude, omega)
+        return _readings(problem.options, system, sensors, nodes, layout, samples)[0]
 
-    data = _Trial(layout, problem.samples, layout.start[:, 0])
-    return jax.vmap(trial)(point.attitude, point.omega, data)
+    return jax.vmap(trial)(point.attitude, point.omega, layout, problem.samples)
 
 
-def _of_trial(
-    problem: Problem,
-    moves: tuple[Array, Array, Array],
-    point: Point,
-    leaves: Any,
-    trial: _Trial,
-) -> tuple[Array, Array]:
-    """Rows and gaps of one trial, of numbers, own numbers and states moved from those of a point.
-
-    Rows are those of the samples; then each number that is known beforehand has one;
-    last come the numbers themselves, which hold a fit near its start.
-    """
-    options, unknowns, (numbers, own, move) = problem.options, problem.unknowns, moves
-    system, *sensors = unknowns.parts(numbers, own, leaves)
-    attitude = point.attitude
-    if options.depends_on_attitude:
-        attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
-    nodes = State(attitude, point.omega + move[:, :3])
-    shown, ends = _seen(options, system, sensors, nodes, trial)
-    held = numbers[unknowns.slices["scale"].stop :]
-    shared = trial.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
-    known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
-    width = trial.samples.weight.shape[-1]
-    rows = [
-        whitened(sensors, trial.samples, shown),
-        jnp.pad(known, ((0, 0), (0, width - 1))),
-    ]
+def _gaps(options: Options, point: Point, ends: State, linked: Array) -> Array:
+    """Ends of segments less the starts of the next ones (nodes, local)."""
     gap = ends.omega - jnp.roll(point.omega, -1, axis=0)
     if options.depends_on_attitude:
         following = jnp.roll(point.attitude, -1, axis=0)
         turn = jax.vmap(lambda a, b: multiply(conjugate(a), b))(
             following, ends.attitude
         )
+        # Twice the vector part is the rotation vector of a small turn.
         side = jnp.where(turn[:, :1] < 0, -1.0, 1.0)
         gap = jnp.concatenate([gap, 2 * side * turn[:, 1:]], axis=-1)
-    return jnp.concatenate(rows), jnp.where(trial.layout.linked[:, None], gap, 0.0)
+    return jnp.where(linked[:, None], gap, 0.0)
 
 
-def _over_trials(function: Callable[..., Any], problem: Problem, layout: Layout) -> Any:
-    """A function of a trial's point, arrays and data, and of moves, over all trials."""
+def _residuals(
+    problem: Problem,
+    numbers: Array,
+    own: Array,
+    move: Array,
+    point: Point,
+    leaves: tuple[AnyArray, ...],
+    trial: _Trial,
+) -> tuple[Array, Array]:
+    """Rows (n, D) and gaps (nodes, local) of one trial.
+
+    Rows of samples come first, then one for each number that is known beforehand, then
+    the numbers that hold a fit near its start.
+
+    Args:
+        problem: The record.
+        numbers: The numbers.
+        own: The trial's own numbers.
+        move: Changes of the states at the nodes (nodes, local).
+        point: The point at which these states are. The next segments start there.
+        leaves: The trial's arrays of system and sensors.
+        trial: The trial.
+    """
+    options, unknowns = problem.options, problem.unknowns
+    system, *sensors = unknowns.parts(numbers, own, leaves)
+    attitude = point.attitude
+    if options.depends_on_attitude:
+        attitude = jax.vmap(lambda q, v: multiply(q, exp(v)))(attitude, move[:, 3:])
+    nodes = State(attitude, point.omega + move[:, :3])
+    values, ends = _readings(
+        options, system, sensors, nodes, trial.layout, trial.samples
+    )
+    # Prior knowledge of the numbers of all trials must count once.
+    held = numbers[unknowns.slices["scale"].stop :]
+    shared = trial.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
+    known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
+    width = trial.samples.weight.shape[-1]
+    rows = [
+        whitened(sensors, trial.samples, values),
+        jnp.pad(known, ((0, 0), (0, width - 1))),
+    ]
+    gap = _gaps(options, point, ends, trial.layout.linked)
+    return jnp.concatenate(rows), gap
+
+
+def _linearised(
+    problem: Problem, point: Point, leaves: tuple[AnyArray, ...], trial: _Trial
+) -> tuple[Rows, Links]:
+    """Rows and links of one trial, with derivatives in the border and the states."""
+    # Derivatives by directions, which share one evaluation of the residuals.
+    local = problem.options.local
+    still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
+
+    def residuals(numbers: Array, own: Array, move: Array) -> tuple[Array, Array]:
+        return _residuals(problem, numbers, own, move, point, leaves, trial)
+
+    border = [point.own.size, point.own.size + point.numbers.size]
+
+    def derivative(direction: Array) -> tuple[tuple[Array, Array], ...]:
+        """Rows and gaps, and their derivatives along a direction."""
+        own, numbers, state = jnp.split(direction, border)
+        # A row depends on one node only, so that all nodes can move at once.
+        change = numbers, own, jnp.broadcast_to(state, still.shape)
+        return jax.jvp(residuals, (point.numbers, point.own, still), change)
+
+    directions = jnp.eye(border[1] + local, dtype=still.dtype)
+    (rows, gap), (d_rows, d_gap) = jax.vmap(derivative, out_axes=(None, -1))(directions)
+    node = trial.layout.node
+    node = jnp.pad(node, (0, rows.shape[0] - node.size))
+    rows_of_border, rows_of_state = jnp.split(d_rows, border[1:], axis=-1)
+    gap_of_border, gap_of_state = jnp.split(d_gap, border[1:], axis=-1)
+    no_torque = jnp.zeros(0, gap.dtype)
+    links = Links(gap, gap_of_border, gap_of_state, no_torque)
+    return Rows(rows, rows_of_border, rows_of_state, node), links
+
+
+def _over_trials(
+    function: Callable[..., Any], problem: Problem, layout: Layout
+) -> Callable[..., Any]:
+    """A function of a trial's point, leaves, data and changes, over all trials."""
     stacked = tuple(0 if own else None for own in problem.unknowns.stacked)
     first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
-    data = _Trial(layout, problem.samples, first)
-    of_trials: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+    trials = _Trial(layout, problem.samples, first)
+    # All trials share the numbers.
+    axes_of_point: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
 
-    def over(point: Point, *moves: Array) -> Any:
-        axes = of_trials, stacked, 0, *(0 for _ in moves)
+    def over(point: Point, *changes: Array) -> Any:
+        axes = axes_of_point, stacked, 0, *(0 for _ in changes)
+        # `inlined` halves the time that tracing under nested vmaps takes.
         one = partial(inlined, function)
-        return jax.vmap(one, in_axes=axes)(point, problem.unknowns.leaves, data, *moves)
+        return jax.vmap(one, in_axes=axes)(
+            point, problem.unknowns.leaves, trials, *changes
+        )
 
     return over
 
 
 def rows_at(problem: Problem, layout: Layout) -> Callable[[Point, Array], Array]:
-    """Rows (trials, n, D) at a point, its states (trials, nodes, local) moved."""
+    """Rows (trials, n, D) as a function of a point and changes of its states."""
 
-    def trial(point: Point, leaves: Any, data: _Trial, move: Array) -> Array:
-        return _of_trial(
-            problem, (point.numbers, point.own, move), point, leaves, data
-        )[0]
+    def trial(
+        point: Point, leaves: tuple[AnyArray, ...], trial: _Trial, move: Array
+    ) -> Array:
+        numbers, own = point.numbers, point.own
+        return _residuals(problem, numbers, own, move, point, leaves, trial)[0]
 
     return _over_trials(trial, problem, layout)
 
@@ -293,26 +478,5 @@ def rows_at(problem: Problem, layout: Layout) -> Callable[[Point, Array], Array]
 def evaluation(
     problem: Problem, layout: Layout
 ) -> Callable[[Point], tuple[Rows, Links]]:
-    """Rows and links, with their derivatives in the border and the states of the nodes."""
-    local = 6 if problem.options.depends_on_attitude else 3
-
-    def trial(point: Point, leaves: Any, data: _Trial) -> tuple[Rows, Links]:
-        border = [point.own.size, point.own.size + point.numbers.size]
-        still = jnp.zeros((point.omega.shape[0], local), point.omega.dtype)
-        start = point.numbers, point.own, still
-
-        def along(direction: Array) -> Any:
-            own, numbers, state = jnp.split(direction, border)
-            change = numbers, own, jnp.broadcast_to(state, still.shape)
-            moved = lambda x: _of_trial(problem, x, point, leaves, data)  # noqa: E731
-            return jax.jvp(moved, (start,), (change,))
-
-        directions = jnp.eye(border[1] + local, dtype=still.dtype)
-        (rows, gap), (d_rows, d_gap) = jax.vmap(along, out_axes=(None, -1))(directions)
-        node = jnp.pad(data.layout.node, (0, rows.shape[0] - data.layout.node.size))
-        of_border, of_state = jnp.split(d_rows, border[1:], axis=-1)
-        gap_of_border, gap_of_state = jnp.split(d_gap, border[1:], -1)
-        links = Links(gap, gap_of_border, gap_of_state, jnp.zeros(0, gap.dtype))
-        return Rows(rows, of_border, of_state, node), links
-
-    return _over_trials(trial, problem, layout)
+    """Rows and links at a point, with derivatives in the border and the states."""
+    return _over_trials(partial(_linearised, problem), problem, layout)

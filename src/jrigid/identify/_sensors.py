@@ -1,5 +1,5 @@
-"""What sensors show of the motion, and the errors they make: objects with arrays to seek."""
-# ruff: noqa: ARG002 (all take what one of them needs)
+"""Sensors, which predict readings from a state. Their arrays are their errors."""
+# ruff: noqa: ARG002 (methods have the arguments that one of the classes needs)
 
 import abc
 import dataclasses
@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid import rotation
 from jrigid._checks import array_of_shape, check_option, demand
@@ -17,38 +18,62 @@ from jrigid._types import AnyArray, Readable
 from jrigid.dynamics import State, angular_momentum
 from jrigid.systems import AbstractSystem
 
-# Gauss and Laguerre's rule: the mean over a memory that fades as exp(-u), to u^5.
-_FADING = (
-    (0.4157745567834791, 2.294280360279042, 6.289945082937479),
-    (0.711093009929173, 0.2785177335692409, 0.0103892565015861),
-)
-_EYE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+# Lags and weights of a memory that fades as exp(-u): the quadrature of Gauss and
+# Laguerre with three points, exact up to u^5.
+_FADING_LAGS = (0.4157745567834791, 2.294280360279042, 6.289945082937479)
+_FADING_WEIGHTS = (0.711093009929173, 0.2785177335692409, 0.0103892565015861)
+_ZEROS = (0.0, 0.0, 0.0)
+_EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def _array(
-    name: str, unit: Any, default: Any = (0.0,) * 3, *shapes: Any, **metadata: Any
+    name: str,
+    unit: tuple[int, int] | None,
+    default: ArrayLike | tuple[float, ...] | tuple[tuple[float, ...], ...] | None,
+    *shapes: tuple[int, ...],
+    positive: bool = False,
 ) -> Any:
     """A field that holds an array of one of these shapes, or None.
 
-    The unit of its errors is in powers of the rms of the rates [rad/s] and of that of
-    the values.
+    Args:
+        name: Name of the field.
+        unit: Natural unit of the array: powers of the rms of the rates [rad/s] and of
+            that of the values. None if it is never sought.
+        default: Default value.
+        *shapes: Shapes that the array may have.
+        positive: Whether a fit keeps the array positive.
     """
-    shapes = shapes or ((3,),)
-    convert = lambda x: None if x is None else array_of_shape(name, x, *shapes)  # noqa: E731
-    return eqx.field(
-        default=default, converter=convert, metadata=metadata | {"unit": unit}
-    )
+
+    # Without annotations, which signatures of sensors would show.
+    def convert(value):
+        return None if value is None else array_of_shape(name, value, *shapes)
+
+    metadata = {"unit": unit, "positive": positive}
+    return eqx.field(default=default, converter=convert, metadata=metadata)
 
 
-def _vector(name: str) -> Any:
-    return lambda value: array_of_shape(name, value, 3)
+def _vector(name: str) -> Callable[[ArrayLike], Array]:
+    """A converter to vectors."""
+
+    def convert(value):
+        return array_of_shape(name, value, 3)
+
+    return convert
 
 
 class AbstractSensor(Readable):
-    """What a sensor makes of time, state and body; its arrays are its errors, known or sought.
+    """Predicts a reading from time, state and body; its arrays are its errors.
 
-    A subclass gives `predict`, and says more where the defaults do not hold.
-    `fit(..., free=...)` picks arrays of sensors as it does of the system.
+    A subclass defines `predict`, and other methods and class variables where their
+    defaults do not hold. `fit(..., free=...)` picks arrays of sensors as it picks those
+    of the system.
+
+    Attributes:
+        width: Length of a value; None for any.
+        degrees: Degrees of freedom of a value; None if they are as many as its width.
+        unit_length: Whether values are unit vectors, attitudes to within a thousandth
+            and others to within a half.
+        depends_on_attitude: Whether the reading depends on the attitude.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> class SpinMeter(jr.identify.AbstractSensor):
@@ -58,78 +83,80 @@ class AbstractSensor(Readable):
     ...
     ...     def predict(self, t, state, system):
     ...         return state.omega[2:] + self.offset
-    >>> record = jr.identify.Record(SpinMeter(), jnp.arange(4.0), jnp.ones((4, 1)), 0.01)
+    >>> ts = jnp.arange(4.0)
+    >>> record = jr.identify.Record(SpinMeter(), ts, jnp.ones((4, 1)), 0.01)
     """
 
-    width: ClassVar[int | None] = 3  # of a value; None: any
-    degrees: ClassVar[int | None] = None  # of freedom of a value, its width if None
-    unit_length: ClassVar[bool] = (
-        False  # of values, to within a thousandth (attitudes) or a half
-    )
+    width: ClassVar[int | None] = 3
+    degrees: ClassVar[int | None] = None
+    unit_length: ClassVar[bool] = False
     depends_on_attitude: ClassVar[bool] = True
 
     @abc.abstractmethod
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The value that a state shows."""
+        """Predict the value."""
 
     def difference(self, value: Array, predicted: Array) -> Array:
-        """Predicted less observed, one number for each degree of freedom."""
+        """Return predicted less observed, one number for each degree of freedom."""
         return predicted - value
 
     def started_at(self, t: Array) -> "AbstractSensor":
-        """The sensor of a record whose first sample is at a time."""
+        """Return the sensor of a record whose first sample is at a time."""
         return self
 
     def memory(self) -> tuple[Array, Array] | None:
-        """How long before a time the motion is shown at it [s], and with what weights."""
+        """Return lags behind the motion [s] and their weights; None without any."""
         return None
 
     def saturation(self) -> Array | None:
-        """Values of this size stand for it and anything beyond: the sensor is saturated."""
+        """Return the size at which values are saturated; None if they never are."""
         return None
 
     def units(self, rate: AnyArray, size: AnyArray) -> "AbstractSensor":
-        """Sizes of its errors [as they are], where they are zero: of a body that turns at `rate`.
+        """Return the sensor with the natural units of its arrays in their place.
 
         Args:
-            rate: Of the record, rms [rad/s].
-            size: Of the values, rms.
+            rate: Rms of the rates [rad/s].
+            size: Rms of the values.
         """
-        sizes = {}
-        for x in dataclasses.fields(self):
-            value, powers = getattr(self, x.name), x.metadata.get("unit")
+        units = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            powers = field.metadata.get("unit")
             if powers and value is not None:
                 unit = rate ** powers[0] * size ** powers[1]
                 xp = unit.__array_namespace__()
-                sizes[x.name] = jnp.asarray(xp.broadcast_to(unit, value.shape))
-        return dataclasses.replace(self, **sizes) if sizes else self
+                units[field.name] = jnp.asarray(xp.broadcast_to(unit, value.shape))
+        return dataclasses.replace(self, **units) if units else self
 
     def rates(self, value: Array) -> Array | None:
-        """The body's rates that a value tells of by itself, or None."""
+        """Return the body's rates if a value gives them by itself, else None."""
         return None
 
     def attitude(self, value: Array) -> Array | None:
-        """The attitude that a value tells of by itself, or None."""
+        """Return the attitude if a value gives it by itself, else None."""
         return None
 
 
 class Gyro(AbstractSensor):
-    """Angular velocity in the axes of the sensor, which are the body axes unless it is turned.
+    """Angular velocity in the axes of the sensor.
 
-    The reading is matrix scale R(misalignment)^-1 omega + bias + drift (t - since),
-    late by `delay` and a first-order filter, and ends at `limit`.
+    The reading is matrix scale R(misalignment)^-1 omega + bias + drift (t - since). It
+    is late by `delay` and a first-order filter, and saturates at `limit`.
 
     Attributes:
         bias: [rad/s].
-        drift: Of the bias [rad/s^2].
-        scale: One factor (), or one an axis (3,).
-        misalignment: Rotation vector, from the body's axes to the sensor's [rad].
-        matrix: Whatever else is linear (3, 3); `diag(1, 1, -1)` is a left-handed gyro.
-        delay: Of its clock behind that of the record [s]; None: none.
-        time_constant: Of a first-order filter [s], a small part of a turn; None: none.
-        limit: Readings of this size are saturated and say "at least" [rad/s], () or
-            (3,).
-        since: When the bias is `bias` [s]; None: at the first sample of the record.
+        drift: Rate of change of the bias [rad/s^2].
+        scale: One factor (), or one for each axis (3,).
+        misalignment: Rotation vector from the body axes to those of the sensor [rad].
+        matrix: Any other linear error (3, 3); `diag(1, 1, -1)` is a left-handed gyro.
+        delay: Delay of its clock behind that of the record [s]; None without one.
+        time_constant: Time constant of a first-order filter [s], which must be short
+            against a revolution; None without one.
+        limit: Size () or (3,) at which readings are saturated [rad/s], so that they are
+            lower bounds; None without one.
+        since: Time at which the bias is `bias` [s]; None for the first sample of the
+            record.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> gyro = jr.identify.Gyro(bias=jnp.array([0.1, 0.0, 0.0]))
@@ -139,10 +166,10 @@ class Gyro(AbstractSensor):
     """
 
     depends_on_attitude: ClassVar[bool] = False
-    bias: Float[Array, "3"] = _array("bias", (1, 0))
-    drift: Float[Array, "3"] = _array("drift", (2, 0))
+    bias: Float[Array, "3"] = _array("bias", (1, 0), _ZEROS, (3,))
+    drift: Float[Array, "3"] = _array("drift", (2, 0), _ZEROS, (3,))
     scale: Float[Array, "..."] = _array("scale", (0, 0), 1.0, (), (3,))
-    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0))
+    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0), _ZEROS, (3,))
     matrix: Float[Array, "3 3"] = _array("matrix", (0, 0), _EYE, (3, 3))
     delay: Float[Array, ""] | None = _array("delay", (-1, 0), None, ())
     time_constant: Float[Array, ""] | None = _array(
@@ -151,43 +178,46 @@ class Gyro(AbstractSensor):
     limit: Float[Array, "..."] | None = _array("limit", None, None, (), (3,))
     since: Float[Array, ""] | None = _array("since", None, None, ())
 
-    def _matrix(self, dtype: Any) -> Array:
+    def _matrix(self, dtype: DTypeLike) -> Array:
+        """The matrix that turns rates into a reading without bias."""
         turn = rotation.to_matrix(rotation.exp(self.misalignment.astype(dtype)))
         scale = jnp.broadcast_to(self.scale, (3,)).astype(dtype)
         return product("ij,j,kj->ik", self.matrix.astype(dtype), scale, turn)
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The reading [rad/s], without delay and limit."""
+        """Predict the reading [rad/s], without delay and limit."""
         dtype = state.omega.dtype
-        since = jnp.asarray(t - (0.0 if self.since is None else self.since), dtype)
-        offset = self.bias.astype(dtype) + self.drift.astype(dtype) * since
+        since = 0.0 if self.since is None else self.since
+        duration = jnp.asarray(t - since, dtype)
+        offset = self.bias.astype(dtype) + self.drift.astype(dtype) * duration
         return product("ij,j->i", self._matrix(dtype), state.omega) + offset
 
     def started_at(self, t: Array) -> "Gyro":
-        """With its bias at that time, unless another was given."""
+        """Return the gyro with `since` at a time, unless it was given."""
         return dataclasses.replace(self, since=t) if self.since is None else self
 
     def memory(self) -> tuple[Array, Array] | None:
-        """Its delay, and the fading memory of its filter."""
+        """Return lags and weights of the delay and of the filter's fading memory."""
         if self.delay is None and self.time_constant is None:
             return None
-        lags, weights = jnp.zeros(1), jnp.ones(1)
+        lags = jnp.zeros(1)
+        weights = jnp.ones(1)
         if self.time_constant is not None:
-            lags, weights = jnp.asarray(_FADING, self.time_constant.dtype)
-            lags = lags * self.time_constant
+            dtype = self.time_constant.dtype
+            lags = jnp.asarray(_FADING_LAGS, dtype) * self.time_constant
+            weights = jnp.asarray(_FADING_WEIGHTS, dtype)
         if self.delay is not None:
             lags = lags.astype(self.delay.dtype) + self.delay
         return lags, weights.astype(lags.dtype)
 
     def saturation(self) -> Array | None:
-        """The limit."""
+        """Return the limit of each axis."""
         return None if self.limit is None else jnp.broadcast_to(self.limit, (3,))
 
     def rates(self, value: Array) -> Array:
-        """The reading, less what is known of the errors."""
+        """Return the rates by the matrix and the bias; drift and delay are ignored."""
         first, second, third = self._matrix(value.dtype)
-        # Columns of the inverse, but for the determinant: a third of the time that LU
-        # compiles.
+        # The inverse by cross products compiles three times as fast as by LU.
         columns = (
             jnp.cross(second, third),
             jnp.cross(third, first),
@@ -198,12 +228,13 @@ class Gyro(AbstractSensor):
 
 
 class Accelerometer(AbstractSensor):
-    """Specific force at a lever from the centre of mass of a thrown body.
+    """Specific force at a lever from the centre of mass of a body in free fall.
 
-    In free fall nothing else is felt: alpha x r + omega x (omega x r) + bias.
+    The reading is alpha x r + omega x (omega x r) + bias, with the angular acceleration
+    alpha and the lever r.
 
     Attributes:
-        lever: r, from the centre of mass to the sensor, body components [m].
+        lever: Vector from the centre of mass to the sensor, body components [m].
         bias: [m/s^2].
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -214,23 +245,24 @@ class Accelerometer(AbstractSensor):
     """
 
     depends_on_attitude: ClassVar[bool] = False
-    lever: Float[Array, "3"] = _array("lever", (-2, 1))
-    bias: Float[Array, "3"] = _array("bias", (0, 1))
+    lever: Float[Array, "3"] = _array("lever", (-2, 1), _ZEROS, (3,))
+    bias: Float[Array, "3"] = _array("bias", (0, 1), _ZEROS, (3,))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The specific force [m/s^2]."""
+        """Predict the specific force [m/s^2]."""
         omega = state.omega
-        lever, bias = self.lever.astype(omega.dtype), self.bias.astype(omega.dtype)
+        lever = self.lever.astype(omega.dtype)
+        bias = self.bias.astype(omega.dtype)
         rate = system.vector_field(t, system.with_parts(state), None).omega
         return jnp.cross(rate, lever) + jnp.cross(omega, jnp.cross(omega, lever)) + bias
 
 
 class Magnetometer(AbstractSensor):
-    """A field that is the same everywhere in space, seen in body axes: R^T field + bias.
+    """A uniform field in body axes: R^T field + bias.
 
     Attributes:
-        field: Space components, in whatever unit the values have.
-        bias: In the same unit, body components: of what turns with the body.
+        field: Space components, in the unit of the values.
+        bias: Field of the body itself, body components in the same unit.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> north = jr.identify.Magnetometer(jnp.array([20.0, 0.0, -40.0]))
@@ -239,63 +271,63 @@ class Magnetometer(AbstractSensor):
     field: Float[Array, "3"] = eqx.field(
         converter=_vector("field"), metadata={"unit": (0, 1)}
     )
-    bias: Float[Array, "3"] = _array("bias", (0, 1))
+    bias: Float[Array, "3"] = _array("bias", (0, 1), _ZEROS, (3,))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The field in the body, in its own unit."""
+        """Predict the field in body axes."""
         dtype = state.omega.dtype
         field = rotation.rotate_inverse(state.attitude, self.field.astype(dtype))
         return field + self.bias.astype(dtype)
 
 
 class AttitudeSensor(AbstractSensor):
-    """Attitudes, unit quaternions from body to space: a star tracker, or pictures.
+    """Attitudes, unit quaternions from body to space, as of a star tracker.
 
     The residual is the rotation vector from the observed to the predicted attitude,
-    about the body axes; q and -q are the same.
+    about the body axes. It is the same for q and -q.
 
     Attributes:
-        misalignment: Rotation vector, from the body's axes to those whose attitude is
-            seen [rad].
+        misalignment: Rotation vector from the body axes to those of the sensor, whose
+            attitude is observed [rad].
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> tracker = jr.identify.AttitudeSensor(misalignment=jnp.array([0.0, 0.0, 0.1]))
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
-    >>> seen = tracker.predict(0.0, start, jr.RigidBody(jnp.ones(3)))
-    >>> print(tracker.difference(start.attitude, seen))
+    >>> predicted = tracker.predict(0.0, start, jr.RigidBody(jnp.ones(3)))
+    >>> print(tracker.difference(start.attitude, predicted))
     [0.  0.  0.1]
     """
 
     width: ClassVar[int | None] = 4
     degrees: ClassVar[int | None] = 3
     unit_length: ClassVar[bool] = True
-    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0))
+    misalignment: Float[Array, "3"] = _array("misalignment", (0, 0), _ZEROS, (3,))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The attitude."""
+        """Predict the attitude of the sensor."""
         q = state.attitude
         return rotation.multiply(q, rotation.exp(self.misalignment.astype(q.dtype)))
 
     def difference(self, value: Array, predicted: Array) -> Array:
-        """Rotation vector from the observed to the predicted attitude, body axes."""
+        """Return the rotation vector from the observed to the predicted attitude."""
         return rotation.log(rotation.multiply(rotation.conjugate(value), predicted))
 
     def attitude(self, value: Array) -> Array:
-        """The attitude, less the misalignment."""
+        """Return the attitude of the body, by the misalignment."""
         turn = rotation.exp(-self.misalignment.astype(value.dtype))
         return rotation.normalize(rotation.multiply(value, turn))
 
 
 class DirectionSensor(AbstractSensor):
-    """Unit vectors: of something at rest in space seen from the body, or the other way round.
+    """Unit vectors: a direction fixed in space in body axes, or the reverse.
 
-    The residual is along two axes across the observed direction; its length is the
-    chord.
+    The residual has components along two axes perpendicular to the observed direction.
+    Its length is the chord between the two directions.
 
     Attributes:
-        of: What is seen: a vector in space axes (a star, the Sun), or, with
+        of: The observed direction: a vector in space axes (a star, the Sun), or, with
             `frame="space"`, a vector in body axes (a mark on the body).
-        frame: "body" or "space": the axes of the values.
+        frame: The axes of the values, "body" or "space".
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> sun = jr.identify.DirectionSensor(jnp.array([2.0, 0.0, 0.0]))
@@ -310,18 +342,20 @@ class DirectionSensor(AbstractSensor):
     frame: str = eqx.field(static=True, default="body")
 
     def __check_init__(self) -> None:
-        """Raise ValueError for axes that are none."""
+        """Raise ValueError for another frame."""
         check_option("frame", self.frame, ("body", "space"))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The direction."""
+        """Predict the direction."""
         of = self.of.astype(state.omega.dtype)
         turn = rotation.rotate_inverse if self.frame == "body" else rotation.rotate
         return turn(state.attitude, of / safe_norm(of))
 
     def difference(self, value: Array, predicted: Array) -> Array:
-        """Chord from the observed to the predicted direction, along two axes across the former."""
+        """Return the chord along two axes perpendicular to the observed direction."""
         value = value / safe_norm(value)
+        # Source of the two axes: T. Duff et al., "Building an Orthonormal Basis,
+        # Revisited", Journal of Computer Graphics Techniques 6 (2017) 1.
         x, y, z = value
         sign = jnp.where(z < 0, -1.0, 1.0)
         a = -1 / (sign + z)
@@ -333,10 +367,12 @@ class DirectionSensor(AbstractSensor):
 
 
 class MomentumSensor(AbstractSensor):
-    """Angular momenta [kg m^2/s], internal parts included; they set the scale of the inertia.
+    """Angular momenta [kg m^2/s], with those of internal parts.
+
+    They determine the scale of the inertia.
 
     Attributes:
-        frame: "space" or "body": the axes of the values.
+        frame: The axes of the values, "space" or "body".
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> start = jr.State(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0]))
@@ -348,30 +384,29 @@ class MomentumSensor(AbstractSensor):
     frame: str = eqx.field(static=True, default="space")
 
     def __check_init__(self) -> None:
-        """Raise ValueError for axes that are none."""
+        """Raise ValueError for another frame."""
         check_option("frame", self.frame, ("space", "body"))
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """The momentum."""
+        """Predict the angular momentum."""
         if self.frame == "space":
             return system.angular_momentum(t, state, None)
-        inner = system.torque.internal_momentum(t, state, None)
-        return (
-            angular_momentum(system.inertia.astype(state.omega.dtype), state.omega)
-            + inner
-        )
+        internal = system.torque.internal_momentum(t, state, None)
+        inertia = system.inertia.astype(state.omega.dtype)
+        return angular_momentum(inertia, state.omega) + internal
 
 
 class FunctionSensor(AbstractSensor):
     """Any function of time, state and system.
 
     Attributes:
-        function: `(t, state, system) -> (k,)`. Define it once: a new function is
-            compiled anew.
-        depends_on_attitude: Whether the function looks at the attitude.
+        function: `(t, state, system) -> (k,)`. Define it once, because each new
+            function object is compiled.
+        depends_on_attitude: Whether the result depends on the attitude.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> rpm = jr.identify.FunctionSensor(lambda t, state, system: 9.549297 * state.omega[2:], False)
+    >>> rpm = jr.identify.FunctionSensor(
+    ...     lambda t, state, system: 9.549297 * state.omega[2:], False)
     >>> start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
     >>> print(rpm.predict(0.0, start, jr.RigidBody(jnp.ones(3))))
     [19.098594]
@@ -379,7 +414,7 @@ class FunctionSensor(AbstractSensor):
 
     width: ClassVar[int | None] = None
     function: Callable[[Any, Any, Any], Any]
-    # Of an instance here, of the class elsewhere.
+    # A field here and a class variable in other sensors.
     depends_on_attitude: bool = eqx.field(  # pyright: ignore
         static=True
     )
@@ -389,12 +424,15 @@ class FunctionSensor(AbstractSensor):
         function: Callable[[Any, Any, Any], Any],
         depends_on_attitude: bool = True,
     ):
-        """Raise ValueError for what is not a function."""
-        text = f"a callable (t, state, system) -> (k,), but it is {function!r}."
-        demand(callable(function), f"Argument `function` must be {text}")
+        """Raise ValueError for what is not callable."""
+        demand(
+            callable(function),
+            "Argument `function` must be a callable (t, state, system) -> (k,), but it "
+            f"is {function!r}.",
+        )
         self.function = function
         self.depends_on_attitude = depends_on_attitude
 
     def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
-        """What the function gives."""
+        """Return the result of the function."""
         return jnp.asarray(self.function(t, state, system), state.omega.dtype)

@@ -1,18 +1,19 @@
-"""Least squares over a chain of states with links between: Levenberg-Marquardt, and a smoother.
+"""Least squares over chains of states with links: Levenberg-Marquardt and a smoother.
 
-A wobble of n turns pins its rate so well that the sum of squares over the whole record
-has a valley only 0.3 / n wide. Multiple shooting gives each segment a state of its own
-and links that ask, more and more strongly, that the end of each be the start of the
-next. Links kept at a finite weight are a statement about physics: an unknown torque
-pushed the body between the nodes, and what is minimised is then the smoother of Rauch,
-Tung and Striebel with unknown parameters.
+A wobble of n turns fixes its rate so well that the sum of squares over the whole record
+has a valley only 0.3 / n wide. Multiple shooting gives each segment a state of its own.
+Links ask, more and more strongly, that the end of each segment be the start of the
+next. Links of finite weight are a statement about physics: an unknown torque acted
+between the nodes. The minimum is then that of the smoother of Rauch, Tung and Striebel
+with unknown parameters.
 
 The normal equations are block-tridiagonal with a border (Bock 1983; Nocedal & Wright,
 Numerical Optimization, 2nd ed., section 10.3, for the damping), so that a step costs a
-time proportional to the record. The border of a trial holds its own numbers first, then
-those of all trials.
+time proportional to the length of the record. The border of a trial holds its own
+numbers first, then those of all trials.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -25,18 +26,48 @@ from jrigid.rotation import exp, multiply, normalize
 
 
 class Point(NamedTuple):
-    """Where a fit stands: numbers of all trials, of each, and the state at each node."""
+    """Values of all unknowns.
+
+    Attributes:
+        numbers: Numbers of all trials.
+        own: Numbers of each trial (trials, n).
+        attitude: Attitude at each node (trials, nodes, 4).
+        omega: Rates at each node (trials, nodes, 3).
+        torque: Unmodelled torque at each node in units of its rms (trials, nodes, 3),
+            or (trials, nodes, 0) without one.
+    """
 
     numbers: AnyArray
-    own: AnyArray  # (trials, n)
-    attitude: AnyArray  # (trials, nodes, 4)
+    own: AnyArray
+    attitude: AnyArray
     omega: AnyArray
-    # (trials, nodes, 3) in units of its rms, or (trials, nodes, 0) without one
     torque: AnyArray
 
 
+class Move(NamedTuple):
+    """Change of a point.
+
+    Attributes:
+        numbers: Of the numbers of all trials.
+        own: Of the numbers of each trial (trials, n).
+        states: Of the states (trials, nodes, local): rates, then turns about the body
+            axes if the state has an attitude, then the unmodelled torque if it has one.
+    """
+
+    numbers: Array
+    own: Array
+    states: Array
+
+
 class Rows(NamedTuple):
-    """Whitened residuals (trials, n, D), and derivatives in the border and the state of a node."""
+    """Whitened residuals and their derivatives.
+
+    Attributes:
+        residual: (trials, n, D).
+        of_border: Derivatives in the border (trials, n, D, border).
+        of_state: Derivatives in the state at the row's node (trials, n, D, local).
+        node: Index of that node (trials, n).
+    """
 
     residual: AnyArray
     of_border: AnyArray
@@ -45,10 +76,15 @@ class Rows(NamedTuple):
 
 
 class Links(NamedTuple):
-    """End of a segment less the next one's start, (trials, nodes, local), and derivatives.
+    """Gaps between segments and their derivatives.
 
-    `torque` is the unmodelled torque at the first node, (trials, 3), whose size is
-    known: it is 1 in units of its rms. Without such a torque it is (trials, 0).
+    Attributes:
+        gap: End of a segment less the start of the next (trials, nodes, local).
+        of_border: Derivatives in the border (trials, nodes, local, border).
+        of_state: Derivatives in the state at the segment's start (trials, nodes, local,
+            local).
+        torque: Unmodelled torque at the first node (trials, 3). Its size is known: it
+            is 1 in units of its rms. Without such a torque it is (trials, 0).
     """
 
     gap: AnyArray
@@ -57,88 +93,144 @@ class Links(NamedTuple):
     torque: AnyArray
 
 
-class Blocks(NamedTuple):
-    """Normal equations: of the states, of each with the next, of the border, and right sides."""
+class NormalEquations(NamedTuple):
+    """Matrix J^T W J and right side J^T W r of least squares, in blocks of each trial.
+
+    Attributes:
+        state: Of each state (trials, nodes, local, local).
+        coupling: Of each state with the next (trials, nodes, local, local).
+        side: Of each state with the border (trials, nodes, local, border).
+        border: Of the border (trials, border, border).
+        state_right: Right side of each state (trials, nodes, local).
+        border_right: Right side of the border (trials, border).
+    """
 
     state: Array
-    next: Array
+    coupling: Array
     side: Array
     border: Array
-    of_state: Array
-    of_border: Array
+    state_right: Array
+    border_right: Array
 
 
-class Reduced(NamedTuple):
-    """The equations of first states, trials' own numbers and numbers, (trials, l + m + g, ...)."""
+class _StateBlocks(NamedTuple):
+    """Blocks of one state, or what eliminating the next state takes from them."""
+
+    state: Array
+    side: Array
+    right: Array
+
+
+class FirstStates(NamedTuple):
+    """Equations of the first states, the trials' own numbers and the numbers.
+
+    Attributes:
+        matrix: (trials, local + border, local + border).
+        right: (trials, local + border).
+        solved: How each later state depends on the one before, on the border, and its
+            constant part (trials, nodes - 1, local, local + border + 1).
+        log_determinant: Of the matrix of the eliminated states.
+    """
 
     matrix: Array
     right: Array
-    solved: Array  # of the later states
-    log_determinant: Array  # of what was eliminated
+    solved: Array
+    log_determinant: Array
 
 
-def blocks_of(rows: Rows, links: Links, weight: Array, whitener: Array) -> Blocks:
+class SharedNumbers(NamedTuple):
+    """Equations of the numbers of all trials, and how the rest depends on them.
+
+    Attributes:
+        matrix: (numbers, numbers), without damping.
+        right: What each trial adds to the right side (trials, numbers).
+        slope: How the first state and the own numbers of a trial depend on the numbers
+            (trials, local + own, numbers).
+        constant: Their constant part (trials, local + own).
+        log_determinant: Of the matrix of all that was eliminated.
+    """
+
+    matrix: Array
+    right: Array
+    slope: Array
+    constant: Array
+    log_determinant: Array
+
+
+def _sums_over_rows(nodes: int, rows: Rows, weight: Array) -> tuple[Array, ...]:
+    """Blocks of one trial's normal equations from its rows, without those of links."""
+    residual, of_border, of_state, node = rows
+
+    def at_nodes(of_rows: Array) -> Array:
+        return jax.ops.segment_sum(of_rows, node, nodes)
+
+    # Samples of one node are added; those of different nodes have no product.
+    state = product("n,ndi->ndi", weight, of_state)
+    border = product("n,ndi->ndi", weight, of_border)
+    return (
+        at_nodes(product("ndi,ndj->nij", state, of_state)),
+        at_nodes(product("ndi,ndj->nij", state, of_border)),
+        product("ndi,ndj->ij", border, of_border),
+        at_nodes(product("ndi,nd->ni", state, residual)),
+        product("ndi,nd->i", border, residual),
+    )
+
+
+def _from_link_before(blocks: Array) -> Array:
+    """Blocks of links (trials, nodes, ...), each moved to the node at which it ends."""
+    return jnp.concatenate([jnp.zeros_like(blocks[:, :1]), blocks[:, :-1]], axis=1)
+
+
+def normal_equations(
+    rows: Rows, links: Links, weight: Array, whitener: Array
+) -> NormalEquations:
     """Normal equations of weighted rows and whitened links.
 
     Args:
-        rows: Of the record.
-        links: Between the segments; the next state enters with minus one.
-        weight: Of each sample (trials, n).
-        whitener: Of each link (trials, nodes, local, local), zero where there is none.
+        rows: Rows of the record.
+        links: Links between its segments.
+        weight: Weight of each row (trials, n).
+        whitener: Matrix that whitens the gap of each link (trials, nodes, local,
+            local), zero where there is no link.
     """
     nodes = links.gap.shape[1]
-
-    def trial(rows: Rows, w: Array) -> tuple[Array, ...]:
-        r, jb, js, node = rows
-        at_nodes = lambda x: jax.ops.segment_sum(x, node, nodes)  # noqa: E731
-        ws, wb = (product("n,ndi->ndi", w, x) for x in (js, jb))
-        return (
-            at_nodes(product("ndi,ndj->nij", ws, js)),
-            at_nodes(product("ndi,ndj->nij", ws, jb)),
-            product("ndi,ndj->ij", wb, jb),
-            at_nodes(product("ndi,nd->ni", ws, r)),
-            product("ndi,nd->i", wb, r),
-        )
-
-    h, hb, bb, b, cb = jax.vmap(trial)(rows, weight)
-
-    def white(x: Array) -> Array:
-        return product("tsij,tsjk->tsik", whitener, x)
-
-    def later(x: Array) -> Array:
-        """What the link before adds to a node."""
-        return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
-
-    c, g, f = (
-        white(links.gap[..., None])[..., 0],
-        white(links.of_border),
-        white(links.of_state),
+    sums = jax.vmap(partial(_sums_over_rows, nodes))(rows, weight)
+    state, side, border, state_right, border_right = sums
+    gap = product("tsij,tsj->tsi", whitener, links.gap)
+    of_border = product("tsij,tsjk->tsik", whitener, links.of_border)
+    of_state = product("tsij,tsjk->tsik", whitener, links.of_state)
+    # The derivative of a whitened gap in the next state is minus the whitener.
+    state = (
+        state
+        + product("tsai,tsaj->tsij", of_state, of_state)
+        + _from_link_before(product("tsai,tsaj->tsij", whitener, whitener))
     )
-    h = (
-        h
-        + product("tsai,tsaj->tsij", f, f)
-        + later(product("tsai,tsaj->tsij", whitener, whitener))
+    side = (
+        side
+        + product("tsai,tsaj->tsij", of_state, of_border)
+        - _from_link_before(product("tsai,tsaj->tsij", whitener, of_border))
     )
-    hb = (
-        hb
-        + product("tsai,tsaj->tsij", f, g)
-        - later(product("tsai,tsaj->tsij", whitener, g))
+    border = border + product("tsai,tsaj->tij", of_border, of_border)
+    state_right = (
+        state_right
+        + product("tsai,tsa->tsi", of_state, gap)
+        - _from_link_before(product("tsai,tsa->tsi", whitener, gap))
     )
-    bb = bb + product("tsai,tsaj->tij", g, g)
-    b = (
-        b
-        + product("tsai,tsa->tsi", f, c)
-        - later(product("tsai,tsa->tsi", whitener, c))
-    )
-    cb = cb + product("tsai,tsa->ti", g, c)
-    if links.torque.shape[-1]:
-        last = slice(-links.torque.shape[-1], None)
-        h = h.at[:, 0, last, last].add(jnp.eye(links.torque.shape[-1], dtype=h.dtype))
-        b = b.at[:, 0, last].add(links.torque)
-    return Blocks(h, -product("tsai,tsaj->tsij", f, whitener), hb, bb, b, cb)
+    border_right = border_right + product("tsai,tsa->ti", of_border, gap)
+    torques = links.torque.shape[-1]
+    if torques:
+        # The torque at the first node has the variance 1 beforehand.
+        last = slice(-torques, None)
+        state = state.at[:, 0, last, last].add(jnp.eye(torques, dtype=state.dtype))
+        state_right = state_right.at[:, 0, last].add(links.torque)
+    coupling = -product("tsai,tsaj->tsij", of_state, whitener)
+    return NormalEquations(state, coupling, side, border, state_right, border_right)
 
 
 def _damped(matrix: Array, damping: Array) -> Array:
+    """Matrices with a part of their diagonals added, and 1 where these are zero."""
+    # Marquardt's scaling makes the damping independent of units. A zero belongs to a
+    # state without samples, which stays where it is.
     diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
     more = jnp.where(diagonal > 0, damping * diagonal, 1.0)
     eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
@@ -146,127 +238,169 @@ def _damped(matrix: Array, damping: Array) -> Array:
 
 
 def solve_positive(matrix: Array, columns: Array) -> tuple[Array, Array]:
-    """Of a matrix positive definite but for rounding, of any scale; and its log determinant."""
+    """Solve linear equations whose matrix is positive definite except for rounding.
+
+    Args:
+        matrix: Matrix (n, n), whose rows may have any scale.
+        columns: Right sides (n, k).
+
+    Returns:
+        Solutions (n, k), and the logarithm of the determinant.
+    """
+    # Unit diagonal, since rates, turns and numbers have different units.
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     size = jnp.where(size > 0, size, 1.0)
     scaled = matrix / size[:, None] / size[None, :]
     eye = jnp.eye(size.size, dtype=size.dtype)
+    # Rounding must not make a nearly singular matrix indefinite.
     lower = jnp.linalg.cholesky(scaled + 4 * jnp.finfo(size.dtype).eps * eye)
     solved = jax.scipy.linalg.cho_solve((lower, True), columns / size[:, None])
     return solved / size[:, None], 2 * jnp.sum(jnp.log(size * jnp.diagonal(lower)))
 
 
-def reduced(blocks: Blocks, damping: Array) -> Reduced:
-    """Eliminate all states but the first, from the last one on."""
-    h, u, hb, bb, b, cb = blocks
-    local, h = h.shape[-1], _damped(h, damping)
+def _eliminate_state(
+    after: _StateBlocks, node: tuple[_StateBlocks, Array]
+) -> tuple[_StateBlocks, tuple[Array, Array, Array]]:
+    """Eliminate one state.
 
-    def backward(carry: tuple, node: tuple) -> tuple[tuple, tuple]:
-        less, border, right = carry
-        h, u, hb, b = node
-        columns = jnp.concatenate([u.T, hb - border, (b - right)[:, None]], axis=1)
-        solved, log_determinant = solve_positive(h - less, columns)
-        down = product("ji,jk->ik", columns[:, :local], solved)
-        schur = product("ij,ik->jk", columns[:, local:-1], solved[:, local:])
-        carry = down[:, :local], down[:, local:-1], down[:, -1]
-        return carry, (solved, schur, log_determinant)
+    Args:
+        after: What the elimination of the next state takes from this one's blocks.
+        node: Blocks of this state, and of the one before with this one.
 
-    def trial(
-        h: Array, u: Array, hb: Array, bb: Array, b: Array, cb: Array
-    ) -> tuple[Array, ...]:
-        empty = jnp.zeros_like(h[0]), jnp.zeros_like(hb[0]), jnp.zeros_like(b[0])
-        later = h[1:], u[:-1], hb[1:], b[1:]
-        (less, border, right), (solved, schur, logs) = jax.lax.scan(
-            backward, empty, later, reverse=True
-        )
-        side, schur = hb[0] - border, jnp.sum(schur, axis=0)
-        matrix = jnp.block([[h[0] - less, side], [side.T, bb - schur[:, :-1]]])
-        return (
-            matrix,
-            jnp.concatenate([b[0] - right, cb - schur[:, -1]]),
-            solved,
-            jnp.sum(logs),
-        )
-
-    matrix, right, solved, logs = jax.vmap(trial)(h, u, hb, bb, b, cb)
-    return Reduced(matrix, right, solved, jnp.sum(logs))
+    Returns:
+        What is taken from the blocks of the state before; and the solution, what is
+        taken from the border with its right side, and the logarithm of the determinant.
+    """
+    blocks, coupling = node
+    local = blocks.right.size
+    side = blocks.side - after.side
+    right = (blocks.right - after.right)[:, None]
+    columns = jnp.concatenate([coupling.T, side, right], axis=1)
+    solved, log_determinant = solve_positive(blocks.state - after.state, columns)
+    before = product("ji,jk->ik", columns[:, :local], solved)
+    border = product("ij,ik->jk", columns[:, local:-1], solved[:, local:])
+    taken = _StateBlocks(before[:, :local], before[:, local:-1], before[:, -1])
+    return taken, (solved, border, log_determinant)
 
 
-class Eliminated(NamedTuple):
-    """What is left for the numbers, and how a trial's first state and own numbers follow them."""
-
-    numbers: Array  # (g, g), without damping
-    right: Array  # (trials, g): what each trial adds to the right side
-    follow: Array  # (trials, l + m, g)
-    still: Array  # (trials, l + m), where the numbers stay
-    log_determinant: Array
-
-
-def eliminated(left: Reduced, count: int) -> Eliminated:
-    """Eliminate the first states and trials' own numbers, `count` of them."""
-
-    def trial(matrix: Array, right: Array) -> tuple[Array, ...]:
-        columns = jnp.concatenate([matrix[:count, count:], right[:count, None]], axis=1)
-        solved, log_determinant = solve_positive(matrix[:count, :count], columns)
-        schur = product("ij,ik->jk", matrix[:count, count:], solved)
-        numbers = matrix[count:, count:] - schur[:, :-1]
-        return (
-            numbers,
-            right[count:] - schur[:, -1],
-            solved[:, :-1],
-            solved[:, -1],
-            log_determinant,
-        )
-
-    numbers, right, follow, still, logs = jax.vmap(trial)(left.matrix, left.right)
-    logs = jnp.sum(logs) + left.log_determinant
-    return Eliminated(jnp.sum(numbers, axis=0), right, follow, still, logs)
+def _eliminate_later_states(equations: NormalEquations) -> tuple[Array, ...]:
+    """Fields of `FirstStates` for one trial."""
+    states = _StateBlocks(equations.state, equations.side, equations.state_right)
+    # The first state stays, since the trial's own numbers are eliminated with it.
+    first = _StateBlocks(*(x[0] for x in states))
+    later = _StateBlocks(*(x[1:] for x in states)), equations.coupling[:-1]
+    nothing = _StateBlocks(*map(jnp.zeros_like, first))
+    taken, (solved, border, log_determinants) = jax.lax.scan(
+        _eliminate_state, nothing, later, reverse=True
+    )
+    border = jnp.sum(border, axis=0)
+    side = first.side - taken.side
+    matrix = jnp.block(
+        [
+            [first.state - taken.state, side],
+            [side.T, equations.border - border[:, :-1]],
+        ]
+    )
+    right = [first.right - taken.right, equations.border_right - border[:, -1]]
+    return matrix, jnp.concatenate(right), solved, jnp.sum(log_determinants)
 
 
-def step_of(
-    blocks: Blocks, own: int, damping: Array
-) -> tuple[tuple[Array, Array, Array], Array]:
-    """Move of the numbers, the trials' own, and the states; and what it gains, -gradient . move."""
-    local = blocks.state.shape[-1]
-    damped = blocks._replace(border=_damped(blocks.border, damping))
-    left = reduced(damped, damping)
-    rest = eliminated(left, local + own)
-    right = jnp.sum(rest.right, axis=0)
+def first_states(equations: NormalEquations) -> FirstStates:
+    """Eliminate all states but the first of each trial, from the last one on."""
+    results = jax.vmap(_eliminate_later_states)(equations)
+    matrix, right, solved, log_determinants = results
+    return FirstStates(matrix, right, solved, jnp.sum(log_determinants))
+
+
+def _eliminate_own(count: int, matrix: Array, right: Array) -> tuple[Array, ...]:
+    """Fields of `SharedNumbers` for one trial, without its first `count` unknowns."""
+    columns = jnp.concatenate([matrix[:count, count:], right[:count, None]], axis=1)
+    solved, log_determinant = solve_positive(matrix[:count, :count], columns)
+    schur = product("ij,ik->jk", matrix[:count, count:], solved)
+    return (
+        matrix[count:, count:] - schur[:, :-1],
+        right[count:] - schur[:, -1],
+        solved[:, :-1],
+        solved[:, -1],
+        log_determinant,
+    )
+
+
+def shared_numbers(first: FirstStates, count: int) -> SharedNumbers:
+    """Eliminate the first states and the trials' own numbers, `count` of each trial."""
+    results = jax.vmap(partial(_eliminate_own, count))(first.matrix, first.right)
+    matrix, right, slope, constant, log_determinants = results
+    log_determinant = jnp.sum(log_determinants) + first.log_determinant
+    return SharedNumbers(
+        jnp.sum(matrix, axis=0), right, slope, constant, log_determinant
+    )
+
+
+def _moves_of_states(solved: Array, first: Array, border: Array) -> Array:
+    """Moves of a trial's states, from that of the first state and of the border."""
+    local = first.size
+
+    # Back substitution, from the first state on.
+    def forward(before: Array, node: Array) -> tuple[Array, Array]:
+        move = -node[:, -1] - product("ij,j->i", node[:, :local], before)
+        move = move - product("ij,j->i", node[:, local:-1], border)
+        return move, move
+
+    later = jax.lax.scan(forward, first, solved)[1]
+    return jnp.concatenate([first[None], later])
+
+
+def step_of(equations: NormalEquations, own: int, damping: Array) -> tuple[Move, Array]:
+    """Solve the damped normal equations.
+
+    Args:
+        equations: The equations, without damping.
+        own: How many numbers of its own a trial has.
+        damping: Part of the diagonals that is added to them.
+
+    Returns:
+        The step, and minus its product with the gradient.
+    """
+    local = equations.state.shape[-1]
+    damped = equations._replace(
+        state=_damped(equations.state, damping),
+        border=_damped(equations.border, damping),
+    )
+    first = first_states(damped)
+    shared = shared_numbers(first, local + own)
+    right = jnp.sum(shared.right, axis=0)
+    # There may be no numbers for all trials.
     numbers = -right
     if right.size:
-        numbers = -solve_positive(rest.numbers, right[:, None])[0][:, 0]
-    firsts = -rest.still - product("tij,j->ti", rest.follow, numbers)
+        numbers = -solve_positive(shared.matrix, right[:, None])[0][:, 0]
+    firsts = -shared.constant - product("tij,j->ti", shared.slope, numbers)
 
-    def moves(solved: Array, first: Array) -> Array:
+    def states_of_trial(solved: Array, first: Array) -> Array:
         border = jnp.concatenate([first[local:], numbers])
+        return _moves_of_states(solved, first[:local], border)
 
-        def forward(before: Array, node: Array) -> tuple[Array, Array]:
-            move = -node[:, -1] - product("ij,j->i", node[:, :local], before)
-            move = move - product("ij,j->i", node[:, local:-1], border)
-            return move, move
-
-        later = jax.lax.scan(forward, first[:local], solved)[1]
-        return jnp.concatenate([first[None, :local], later])
-
-    states, owns = jax.vmap(moves)(left.solved, firsts), firsts[:, local:]
-    gain = -jnp.sum(blocks.of_state * states) - jnp.sum(
-        blocks.of_border[:, :own] * owns
-    )
-    gain = gain - jnp.sum(jnp.sum(blocks.of_border[:, own:], axis=0) * numbers)
-    return (numbers, owns, states), gain
+    states = jax.vmap(states_of_trial)(first.solved, firsts)
+    owns = firsts[:, local:]
+    of_own = equations.border_right[:, :own]
+    of_numbers = jnp.sum(equations.border_right[:, own:], axis=0)
+    # With the damped part, which is not counted, the linear model gains more.
+    gain = -jnp.sum(equations.state_right * states) - jnp.sum(of_own * owns)
+    gain = gain - jnp.sum(of_numbers * numbers)
+    return Move(numbers, owns, states), gain
 
 
-def moved(point: Point, move: tuple[Array, Array, Array]) -> Point:
-    """A point after a move; turns are about the body's axes."""
-    numbers, own, states = move
+def moved(point: Point, move: Move) -> Point:
+    """Return a point after a move."""
+    states = move.states
     attitude = point.attitude
     local = states.shape[-1] - point.torque.shape[-1]
     if local == 6:
+        # Turns about body axes multiply from the right.
         turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
         attitude = turn(attitude, states[..., 3:6])
     return Point(
-        numbers=point.numbers + numbers,
-        own=point.own + own,
+        numbers=point.numbers + move.numbers,
+        own=point.own + move.own,
         attitude=attitude,
         omega=point.omega + states[..., :3],
         torque=point.torque + states[..., local:],

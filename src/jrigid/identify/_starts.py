@@ -22,7 +22,7 @@ from jrigid.dynamics import State
 from jrigid.identify import _host as host
 from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import LogCholesky
-from jrigid.identify._layout import Told
+from jrigid.identify._layout import DirectReadings
 from jrigid.identify._problem import Options
 from jrigid.identify._records import first_and_last
 from jrigid.identify._unknowns import Unknowns
@@ -399,7 +399,10 @@ def _singular(rows: AnyArray) -> tuple[AnyArray, ...]:
 
 
 def linear_starts(
-    options: Options, unknowns: Unknowns, told: Told | None, given: np.ndarray | None
+    options: Options,
+    unknowns: Unknowns,
+    readings: DirectReadings | None,
+    given: np.ndarray | None,
 ) -> np.ndarray:
     """Tensors to start from (attempts, 3, 3), one attempt after the other.
 
@@ -409,48 +412,55 @@ def linear_starts(
     Args:
         options: Of the fit.
         unknowns: What is sought.
-        told: Rates, and attitudes if there are any, that the record tells.
+        readings: Rates, and attitudes if there are any, that the record tells.
         given: A tensor to start from, if there is one.
     """
     dtype = unknowns.rate.dtype
     known = unknowns.known_tensor.astype(dtype)
     model = unknowns.inertia_model
     linear = bool(model.names) and not isinstance(model, LogCholesky)
-    if given is not None or told is None or not linear or options.motion is not None:
+    if (
+        given is not None
+        or readings is None
+        or not linear
+        or options.motion is not None
+    ):
         first = known if given is None else given.astype(dtype)
         return np.stack([first, _rounder(first)])
     free = options.free_motion
-    if free and told.attitude is not None and told.ts.shape[1] < _FEW_ATTITUDES:
-        rows = _rows_of_attitudes(told)
+    if free and readings.attitude is not None and readings.ts.shape[1] < _FEW_ATTITUDES:
+        rows = _rows_of_attitudes(readings)
     else:
-        rows = _rows_of_rates(told, None if free else _torques_at(unknowns, told))
+        rows = _rows_of_rates(
+            readings, None if free else _torques_at(unknowns, readings)
+        )
     # A torque or a square may be out of range.
     rows = np.where(np.isfinite(rows), rows, 0.0)
     trace = None if unknowns.scaled and not free else np.trace(known)
     plain, leaning = _least_squares(rows, trace, np.trace(known))
     both = [plain, leaning] if trace is None else [leaning, _rounder(leaning)]
-    return np.concatenate([np.stack(both), _plain_bodies(told, leaning)])
+    return np.concatenate([np.stack(both), _plain_bodies(readings, leaning)])
 
 
-def _rows_of_rates(told: Told, torques: np.ndarray | None) -> np.ndarray:
+def _rows_of_rates(readings: DirectReadings, torques: np.ndarray | None) -> np.ndarray:
     """Equations (n, 7) of the weak form, of all trials."""
-    is_known = told.there[..., None]
-    zero = np.zeros_like(told.omega)
-    omegas = np.where(is_known, told.omega, zero)
+    is_known = readings.valid[..., None]
+    zero = np.zeros_like(readings.omega)
+    omegas = np.where(is_known, readings.omega, zero)
     torques = zero if torques is None else np.where(is_known, torques, zero)
     # Times of samples that are not known repeat one.
-    first = first_and_last(told.ts, told.there)[0]
-    times = np.where(told.there, told.ts, first[:, None])
+    first = first_and_last(readings.ts, readings.valid)[0]
+    times = np.where(readings.valid, readings.ts, first[:, None])
     times = np.maximum.accumulate(times, axis=1)
-    trials = zip(times, told.there, omegas, zero, torques, strict=True)
+    trials = zip(times, readings.valid, omegas, zero, torques, strict=True)
     return np.concatenate([_weak_rows(_WINDOWS, _RADIANS, *x) for x in trials])
 
 
-def _rows_of_attitudes(told: Told) -> np.ndarray:
+def _rows_of_attitudes(readings: DirectReadings) -> np.ndarray:
     """Equations (n, 7): the momentum in space at a sample is the trial's mean one."""
-    assert told.attitude is not None
-    weight = told.there[..., None, None].astype(told.omega.dtype)
-    turned = weight * _momenta(told.omega, host.to_matrix(told.attitude))
+    assert readings.attitude is not None
+    weight = readings.valid[..., None, None].astype(readings.omega.dtype)
+    turned = weight * _momenta(readings.omega, host.to_matrix(readings.attitude))
     count = np.maximum(np.sum(weight, axis=1, keepdims=True), 1.0)
     mean = np.sum(turned, axis=1, keepdims=True) / count
     rows = np.pad(turned - weight * mean, [(0, 0)] * 3 + [(0, 1)])
@@ -463,25 +473,25 @@ def _rounder(tensor: np.ndarray) -> np.ndarray:
     return 0.5 * (tensor + third * np.eye(3, dtype=tensor.dtype))
 
 
-def _plain_bodies(told: Told, like: np.ndarray) -> np.ndarray:
+def _plain_bodies(readings: DirectReadings, like: np.ndarray) -> np.ndarray:
     """A sphere, and bodies of revolution along the axes of the rates.
 
     They are as large as the body whose tensor is given.
     """
-    shown = np.where(told.there[..., None], told.omega, 0.0).reshape(-1, 3)
+    shown = np.where(readings.valid[..., None], readings.omega, 0.0).reshape(-1, 3)
     axes = np.linalg.eigh(shown.T @ shown)[1]
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
     shapes = (shapes / shapes.sum(axis=1, keepdims=True)).astype(axes.dtype)
     return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
 
 
-def _torques_at(unknowns: Unknowns, told: Told) -> np.ndarray:
+def _torques_at(unknowns: Unknowns, readings: DirectReadings) -> np.ndarray:
     """Torques at the samples; where attitudes are not known, at the unit quaternion."""
-    attitude = told.attitude
+    attitude = readings.attitude
     if attitude is None:
-        unit = np.eye(1, 4, dtype=told.ts.dtype)[0]
-        attitude = np.broadcast_to(unit, (*told.ts.shape, 4))
-    return np.asarray(_torques(unknowns, told.ts, attitude, told.omega))
+        unit = np.eye(1, 4, dtype=readings.ts.dtype)[0]
+        attitude = np.broadcast_to(unit, (*readings.ts.shape, 4))
+    return np.asarray(_torques(unknowns, readings.ts, attitude, readings.omega))
 
 
 @small_program

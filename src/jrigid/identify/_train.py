@@ -22,7 +22,7 @@ from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import forced_flow, needs_attitude
 from jrigid.identify._host import on_host
 from jrigid.identify._inputs import judge
-from jrigid.identify._layout import longest_turn, told_by
+from jrigid.identify._layout import direct_readings_of, longest_turn
 from jrigid.identify._problem import Options, shown_by, whitened
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.identify._sensors import AbstractSensor
@@ -366,12 +366,12 @@ class _Observed(NamedTuple):
 def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     records = on_host(records)
     samples = samples_of(records, np.ones((), records[0].values.dtype))
-    readings = told_by(records, samples, None)
+    readings = direct_readings_of(records, samples, None)
     judge((system,), records, None, None, readings, throw=True)
     if readings is None:
         return _Observed(None, False, 0.0)
     trial = np.arange(len(readings.ts))
-    first = np.argmax(readings.there, axis=1)
+    first = np.argmax(readings.valid, axis=1)
     if readings.attitude is None:
         attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(trial), 1))
     else:

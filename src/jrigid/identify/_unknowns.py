@@ -1,72 +1,87 @@
-"""The numbers a fit seeks: of the model and scale of the inertia, and arrays picked by `free`.
+"""The unknowns of a fit: the inertia, its scale and the arrays picked by `free`.
 
-They are one flat vector for all trials, and one more for each trial; `Unknowns.parts`
-turns them into a system and sensors.
+They are one vector of numbers for all trials and one more for each trial.
+`Unknowns.parts` turns them into a system and sensors.
 """
 
 import abc
 import dataclasses
 import inspect
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from jrigid._checks import demand, is_concrete
 from jrigid._numerics import or_one, product, without_gradient
-from jrigid._types import AnyArray, Readable
+from jrigid._types import AnyArray, Readable, Real
 from jrigid.identify._host import cholesky
 from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
 from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
+from jrigid.identify._sensors import AbstractSensor
 from jrigid.mass import MassProperties
-from jrigid.torques import Sum, UniformGravity
+from jrigid.systems import RigidBody
+from jrigid.torques import AbstractTorque, Sum, UniformGravity
 
-_LEAST = 1e-3  # of its unit, for a positive number to start from
+_LEAST = 1e-3  # smallest initial value of a positive number, in its unit
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pick:
-    """In the place of an array, for `free`: which it is, and how it is sought."""
+    """What `free` is given in the place of an array: its index and how it is sought.
+
+    Attributes:
+        index: Index among the arrays of the system and the sensors.
+        sigma: Standard deviation of prior knowledge, if there is any.
+        own: Whether each trial has a value of its own.
+        groups: For each trial the number of its group, where groups have values.
+    """
 
     index: int
-    sigma: Any = None
+    sigma: ArrayLike | None = None
     own: bool = False
     groups: tuple[int, ...] | None = None
 
 
-def prior(array: Any, sigma: Any) -> Any:
-    """Within `free`: an array that is sought, known beforehand to within `sigma` of its value.
+def prior(array: PyTree, sigma: Real[ArrayLike, "..."]) -> PyTree:
+    """State prior knowledge of an array that `free` picks: its value within `sigma`.
+
+    Args:
+        array: What is sought, an array or several in a pytree.
+        sigma: One standard deviation, in the unit of the array.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
-    >>> found = jr.identify.fit(
+    >>> result = jr.identify.fit(
     ...     jr.RigidBody(jnp.ones(3)), readings,
     ...     free=lambda body, gyro: jr.identify.prior(gyro.bias, 1e-3))
-    >>> print(found.names[5:])
+    >>> print(result.names[5:])
     ('gyro.bias[0]', 'gyro.bias[1]', 'gyro.bias[2]')
     """
     return jtu.tree_map(lambda x: dataclasses.replace(x, sigma=sigma), array)
 
 
-def each(array: Any, groups: Sequence[int] | None = None) -> Any:
-    """Within `free`: an array that is sought anew in each trial, or in each group of trials.
+def each(array: PyTree, groups: Sequence[int] | None = None) -> PyTree:
+    """Seek an array that `free` picks anew in each trial, or in each group of trials.
 
-    A group is a session at a table: between two of them a gyro was taken off and put
-    back, and sits a few degrees off. Nothing tells the turn that all share from that of
-    the body, so one group keeps the misalignment that was given, and the axes are those
-    of its gyro.
+    A group can be a session: between two of them a gyro was removed and mounted again,
+    a few degrees off. A turn that all sessions share cannot be distinguished from a
+    turn of the body. So one session keeps the misalignment that was given, and the body
+    axes are those of its gyro.
 
     Args:
         array: What is sought, or `prior(array, sigma)`.
         groups: For each trial the number of its group, from 0 on; -1 for trials in
-            which the array is as it was given. None: each trial is a group.
+            which the array keeps the value that was given. None: each trial is a group.
 
     >>> import jrigid as jr
     >>> free = lambda body, gyro: jr.identify.each(gyro.bias)
@@ -79,58 +94,69 @@ def each(array: Any, groups: Sequence[int] | None = None) -> Any:
 
 
 class AbstractSought(Readable):
-    """An array that is sought, by numbers without bounds; `unit` is its natural size."""
+    """An array that is sought, as a function of numbers without bounds.
+
+    Attributes:
+        index: Index among the arrays of the system and the sensors.
+        name: Name, as `torque.coefficient` or `gyro.bias`.
+        own: Whether each trial has a value of its own.
+        base: The value that was given, with an axis of groups in front if groups have
+            values of their own.
+        unit: Natural size of each entry.
+        sigma: Standard deviation of prior knowledge, if there is any.
+    """
 
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
     own: bool = eqx.field(static=True)
-    base: AnyArray  # as it was given; sought by groups, with an axis of groups in front
+    base: AnyArray
     unit: AnyArray
     sigma: AnyArray | None
 
     @property
     def size(self) -> int:
-        """Of the numbers."""
+        """How many numbers there are."""
         return self.base.size
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One for each number."""
+        """A name for each number."""
         indices = np.ndindex(*self.base.shape)
         return tuple(self.name + "".join(f"[{j}]" for j in index) for index in indices)
 
     @abc.abstractmethod
     def start(self) -> AnyArray:
-        """The numbers at the start."""
+        """Initial values of the numbers."""
 
     @abc.abstractmethod
     def value(self, x: Array) -> Array:
-        """The array."""
+        """The array that numbers stand for."""
 
     def natural_units(self, x: Array) -> Array:
-        """Units in which an error is large or small."""
+        """Natural units of the numbers."""
         return jnp.ones_like(x)
 
     def with_errors(self, x: Array, covariance: Array) -> tuple[Array, Array]:
         """The array and its standard errors."""
         slopes = jax.jacfwd(self.value)(x)
+        # Linear propagation of errors.
         square = jnp.einsum("...n,nm,...m->...", slopes, covariance, slopes)
         return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
 
     def log_volume(self, x: Array) -> Array:
-        """Logarithm of the volume of arrays that a volume of numbers makes."""
+        """Logarithm of the volume of arrays over that of the numbers they stand for."""
         slopes = jax.jacfwd(self.value)(x).reshape(self.base.size, self.size)
         return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
 
     def prior_rows(self, x: Array) -> Array:
-        """What is known of it beforehand, as residuals."""
+        """Residuals of prior knowledge of the array, none without any."""
         if self.sigma is None:
             return jnp.zeros(0, x.dtype)
         return ((self.value(x) - self.base) / self.sigma).reshape(-1)
 
 
-class _Any(AbstractSought):
-    """Of either sign."""
+class _Real(AbstractSought):
+    """An array of either sign: the base, and a number of units more."""
 
     def start(self) -> AnyArray:
         return self.unit.__array_namespace__().zeros(self.size, self.unit.dtype)
@@ -143,9 +169,10 @@ class _Any(AbstractSought):
 
 
 class _Positive(AbstractSought):
-    """Positive: linear in the number where it is large, exponential where it is small."""
+    """A positive array: linear in large numbers, exponential in small ones."""
 
     def start(self) -> AnyArray:
+        # The inverse of softplus.
         xp = self.base.__array_namespace__()
         return xp.log(xp.expm1(xp.maximum(self.base / self.unit, _LEAST))).reshape(-1)
 
@@ -154,7 +181,10 @@ class _Positive(AbstractSought):
 
 
 class _Definite(AbstractSought):
-    """A symmetric, positive definite tensor: L L^T, the logarithms of L's diagonal first."""
+    """A symmetric, positive definite tensor L L^T.
+
+    The numbers are the logarithms of L's diagonal, then its other entries.
+    """
 
     @property
     def size(self) -> int:
@@ -166,6 +196,7 @@ class _Definite(AbstractSought):
 
     def start(self) -> AnyArray:
         xp = self.base.__array_namespace__()
+        # Zero, a frequent initial value, has no logarithm.
         eye = _LEAST * xp.eye(3, dtype=self.unit.dtype)
         lower = cholesky(self.base / xp.max(self.unit) + eye)
         return xp.concatenate([xp.log(xp.diagonal(lower)), lower[SIDES]])
@@ -174,104 +205,181 @@ class _Definite(AbstractSought):
         return jnp.max(self.unit) * squared(jnp.exp(x[:3]), x[3:])
 
 
-def _field(tree: Any, path: Sequence[Any]) -> Any:
+class _Arrays(NamedTuple):
+    """The floating point arrays of the systems and the sensors.
+
+    Attributes:
+        parts: The first system, and the sensors.
+        rest: The same without arrays.
+        structure: Structure of their arrays.
+        paths: Where each array is in `parts`.
+        values: Each array of `parts`.
+        leaves: The same, with an axis of trials in front where trials differ.
+        stacked: Which of `leaves` have that axis.
+    """
+
+    parts: tuple[RigidBody | AbstractSensor, ...]
+    rest: tuple[Any, ...]
+    structure: Any  # a PyTreeDef, which is no type to pyright
+    paths: list[tuple[Any, ...]]
+    values: list[AnyArray]
+    leaves: list[AnyArray]
+    stacked: tuple[bool, ...]
+
+
+def _arrays_of(
+    systems: Sequence[RigidBody], sensors: Sequence[AbstractSensor], xp: ModuleType
+) -> _Arrays:
+    """Find the arrays of the systems and the sensors; xp stacks those of trials."""
+    parts = (systems[0], *sensors)
+    arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
+    paths_and_values, structure = jtu.tree_flatten_with_path(arrays)
+    paths = [path for path, _ in paths_and_values]
+    of_trials = [_float_leaves((system, *sensors)) for system in systems]
+    demand(
+        all(len(leaves) == len(paths) for leaves in of_trials),
+        "Argument `system` must hold bodies of the same kind for all trials, but it "
+        "does not.",
+    )
+    leaves = []
+    stacked = []
+    for values in zip(*of_trials, strict=True):
+        # Only the identical array counts as shared: values may be traced.
+        differs = any(x is not values[0] for x in values)
+        leaves.append(xp.stack(values) if differs else values[0])
+        stacked.append(differs)
+    return _Arrays(
+        parts=parts,
+        rest=rest,
+        structure=structure,
+        paths=paths,
+        values=[value for _, value in paths_and_values],
+        leaves=leaves,
+        stacked=tuple(stacked),
+    )
+
+
+def _float_leaves(parts: tuple[Any, ...]) -> list[AnyArray]:
+    """The floating point arrays of a system and sensors."""
+    return jtu.tree_leaves(eqx.filter(parts, eqx.is_inexact_array))
+
+
+def _field_metadata(parts: Any, path: Sequence[Any]) -> Mapping[str, Any]:
     """The metadata of the field where a path ends."""
-    metadata: Any = {}
+    metadata: Mapping[str, Any] = {}
     for key in path:
+        # Only fields have metadata: below tuples and dictionaries it stays the same.
         if isinstance(key, jtu.GetAttrKey):
-            metadata = type(tree).__dataclass_fields__[key.name].metadata
-            tree = getattr(tree, key.name)
+            metadata = type(parts).__dataclass_fields__[key.name].metadata
+            parts = getattr(parts, key.name)
         else:
-            tree = tree[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
+            parts = parts[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
     return metadata
 
 
-def _named(tree: Any, path: Sequence[Any]) -> str:
-    """`torque.coefficient` of a system, `gyro.bias` of a sensor."""
-    text, index = jtu.keystr(tuple(path[1:])).lstrip("."), path[0].idx
+def _name(parts: Sequence[RigidBody | AbstractSensor], path: Sequence[Any]) -> str:
+    """Name of an array: `torque.coefficient` of a system, `gyro.bias` of a sensor."""
+    field = jtu.keystr(tuple(path[1:])).lstrip(".")
+    index = path[0].idx
     if index == 0:
-        return text
-    kinds = [type(x).__name__.lower() for x in tree]
-    name = kinds[index]
-    return f"{name if kinds[1:].count(name) == 1 else f'{name}{index}'}.{text}"
+        return field
+    kinds = [type(x).__name__.lower() for x in parts]
+    kind = kinds[index]
+    if kinds[1:].count(kind) > 1:
+        kind = f"{kind}{index}"
+    return f"{kind}.{field}"
 
 
-def _picks(
-    paths: Any, tree: Any, rest: Any, free: Callable[..., Any] | None
-) -> list[_Pick]:
-    """What `free` picks among the arrays of the system and the sensors, in their order."""
+def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
+    """What `free` picks among the arrays, in their order."""
     if free is None:
         return []
-    marked = eqx.combine(tree.unflatten(map(_Pick, range(len(paths)))), rest)
+    indices = range(len(arrays.paths))
+    # `free` is called with objects that have marks in place of their arrays.
+    marked = eqx.combine(arrays.structure.unflatten(map(_Pick, indices)), arrays.rest)
     accepts = inspect.signature(free).parameters.values()
-    several = any(x.kind == x.VAR_POSITIONAL for x in accepts)
-    chosen = jtu.tree_leaves(free(*marked[: None if several else len(accepts)]))
-    known = {x.index: x for x in chosen if isinstance(x, _Pick)}
-    known = {
-        i: x for i, x in known.items() if jtu.keystr(paths[i][0][:2]) != "[0].inertia"
+    takes_all = any(x.kind == x.VAR_POSITIONAL for x in accepts)
+    chosen = jtu.tree_leaves(free(*marked[: None if takes_all else len(accepts)]))
+    picks = {
+        pick.index: pick
+        for pick in chosen
+        if isinstance(pick, _Pick)
+        and jtu.keystr(arrays.paths[pick.index][:2]) != "[0].inertia"
     }
     demand(
-        bool(known) and all(isinstance(x, _Pick) for x in chosen),
-        "Argument `free` must be a function of the system and the sensors that picks floating "
-        "point arrays of theirs, beside the inertia, which is always sought, but it is not.",
+        bool(picks) and all(isinstance(x, _Pick) for x in chosen),
+        "Argument `free` must be a function of the system and the sensors that picks "
+        "floating point arrays of theirs, beside the inertia, which is always sought, "
+        "but it is not.",
     )
-    return [known[i] for i in sorted(known)]
+    return [picks[index] for index in sorted(picks)]
 
 
 class Unknowns(eqx.Module):
-    """What is sought, in what numbers, around what system and sensors."""
+    """What is sought, in what numbers, around what system and sensors.
 
-    given: tuple[
-        Any, ...
-    ]  # arrays of system and sensors, some with an axis of trials in front
-    rest: tuple[Any, ...] = eqx.field(static=True)  # what is no array
-    stacked: tuple[bool, ...] = eqx.field(static=True)  # which of `leaves` have
+    Attributes:
+        given: Arrays of the system and the sensors, some with an axis of trials in
+            front.
+        rest: The system and the sensors without arrays.
+        stacked: Which of `leaves` have an axis of trials.
+        sought: Arrays that are sought.
+        groups: By name, of arrays that are sought by groups: 1 for each trial in its
+            group, else 0 (trials, groups).
+        inertia_model: What is known of the tensor.
+        scaled: Whether the tensor's scale is sought.
+        trace: Trace of the tensor, unless its scale is sought or the model sets it.
+        rate: Rms of the rates [rad/s].
+        hold: Pytree that is called with these unknowns and the numbers for a residual,
+            which holds a fit in one direction; None without one.
+    """
+
+    given: tuple[Any, ...]
+    rest: tuple[Any, ...] = eqx.field(static=True)
+    stacked: tuple[bool, ...] = eqx.field(static=True)
     sought: tuple[AbstractSought, ...]
-    # Of what is sought by groups, by name: 1 for each trial in its group, else 0.
     groups: dict[str, AnyArray]
     inertia_model: AbstractInertiaModel
     scaled: bool = eqx.field(static=True)
     trace: AnyArray
-    rate: AnyArray  # rms of the rates [rad/s]
-    hold: Any = (
-        None  # held at zero: a pytree that is called with these unknowns and numbers
-    )
+    rate: AnyArray
+    hold: Callable[["Unknowns", Array], Array] | None = None
 
     @property
     def shared(self) -> tuple[AbstractSought, ...]:
-        """What is sought for all trials."""
+        """Arrays that all trials share."""
         return tuple(x for x in self.sought if not x.own)
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where each part is in the vector for all trials."""
+        """Position of each part in the vector for all trials."""
         sizes = {"inertia": len(self.inertia_model.names), "scale": int(self.scaled)}
         sizes |= {x.name: x.size for x in self.shared}
         return dict(zip(sizes, one_after_another(sizes.values()), strict=True))
 
     @property
     def of_inertia(self) -> slice:
-        """Where the numbers are that move the tensor."""
+        """Position of the numbers of the tensor."""
         return slice(self.slices["scale"].stop)
 
     @property
     def judged(self) -> slice:
-        """Where the numbers are by which a fit is judged: of the inertia; all if that is known."""
+        """Position of the numbers that judge a fit: of the inertia, or all if known."""
         return self.of_inertia if self.of_inertia.stop else slice(self.size)
 
     @property
     def size(self) -> int:
-        """Of the vector for all trials."""
+        """Length of the vector for all trials."""
         return max(s.stop for s in self.slices.values())
 
     @property
     def own_slices(self) -> list[tuple[AbstractSought, slice]]:
-        """What is sought in each trial, and where it is in that trial's vector."""
+        """Arrays of each trial, and their positions in that trial's vector."""
         own = [x for x in self.sought if x.own]
         return list(zip(own, one_after_another(x.size for x in own), strict=True))
 
     def names(self) -> tuple[str, ...]:
-        """One for each number."""
+        """A name for each number of all trials."""
         scale = ("scale",) * self.scaled
         return (
             *self.inertia_model.names,
@@ -281,69 +389,75 @@ class Unknowns(eqx.Module):
 
     def inertia(self, numbers: AnyArray) -> Array:
         """The tensor."""
-        tensor = self.inertia_model.inertia(numbers[self.slices["inertia"]]).astype(
-            numbers.dtype
-        )
+        tensor = self.inertia_model.inertia(numbers[self.slices["inertia"]])
+        tensor = tensor.astype(numbers.dtype)
+        # Free motion determines the tensor up to a factor only.
         if not self.inertia_model.absolute:
             tensor = self.trace * tensor / jnp.trace(tensor)
-        return (
-            tensor * jnp.exp(numbers[self.slices["scale"].start])
-            if self.scaled
-            else tensor
-        )
+        if self.scaled:
+            tensor = tensor * jnp.exp(numbers[self.slices["scale"].start])
+        return tensor
 
     @property
     def known_tensor(self) -> AnyArray:
-        """The system's own tensor, of the first trial."""
+        """The tensor of the system that was given, in the first trial."""
         return as_tensor(self.original(0)[0].inertia)
 
     def start(
         self, tensor: AnyArray, flattest: AnyArray | float = 1e-3
     ) -> tuple["Unknowns", AnyArray]:
-        """Numbers for a tensor; the frame of the model is chosen for it."""
+        """Initial numbers for a tensor, for which the model's frame is chosen."""
         unknowns, numbers = self.starts(tensor[None], [flattest])
         return unknowns, numbers[0]
 
     def starts(
         self, tensors: AnyArray, flattest: Sequence[AnyArray | float]
     ) -> tuple["Unknowns", AnyArray]:
-        """Numbers for each of several tensors; the frame of the model is chosen for the first."""
+        """Initial numbers for several tensors.
+
+        Args:
+            tensors: The tensors (n, 3, 3); the model's frame is chosen for the first.
+            flattest: For each, the least second moment of the body to start from.
+
+        Returns:
+            Unknowns with the model in that frame, and numbers (n, numbers).
+        """
         xp = tensors.__array_namespace__()
         known = self.known_tensor.astype(tensors.dtype)
-        pairs = zip(tensors, flattest, strict=True)
-        models = [
-            self.inertia_model.start(tensor, known, least) for tensor, least in pairs
+        starts = [
+            self.inertia_model.start(tensor, known, least)
+            for tensor, least in zip(tensors, flattest, strict=True)
         ]
         factors = xp.trace(tensors, axis1=1, axis2=2) / self.trace
         scales = xp.log(xp.where(factors > 0, factors, 1.0))
         others = [x.start() for x in self.shared]
         rows = []
-        for (_, of_model), scale in zip(models, scales, strict=True):
-            parts = [of_model, scale[None][: int(self.scaled)], *others]
+        for (_, of_model), scale in zip(starts, scales, strict=True):
+            of_scale = scale[None] if self.scaled else scale[None][:0]
+            parts = [of_model, of_scale, *others]
             rows.append(xp.concatenate([xp.asarray(x, tensors.dtype) for x in parts]))
-        return dataclasses.replace(self, inertia_model=models[0][0]), xp.stack(rows)
+        first_model, _ = starts[0]
+        return dataclasses.replace(self, inertia_model=first_model), xp.stack(rows)
 
-    def own_start(self, trials: int, dtype: Any) -> AnyArray:
-        """Numbers of each trial."""
+    def own_start(self, trials: int, dtype: DTypeLike) -> AnyArray:
+        """Initial numbers of each trial (trials, own)."""
         xp = self.rate.__array_namespace__()
-        parts = [
-            xp.zeros(0, dtype),
-            *(x.start().astype(dtype) for x, _ in self.own_slices),
-        ]
-        return xp.tile(xp.concatenate(parts), (trials, 1))
+        parts = [x.start().astype(dtype) for x, _ in self.own_slices]
+        numbers = xp.concatenate([xp.zeros(0, dtype), *parts])
+        return xp.tile(numbers, (trials, 1))
 
     @property
     def leaves(self) -> tuple[AnyArray, ...]:
-        """The arrays of the system and the sensors, then those of `groups`."""
+        """Arrays of the system and the sensors, then those of `groups`."""
         return (*jtu.tree_leaves(self.given), *self.groups.values())
 
     def leaves_of(self, trial: int | AnyArray) -> tuple[AnyArray, ...]:
-        """The same of one trial."""
+        """The leaves of one trial."""
         pairs = zip(self.leaves, self.stacked, strict=True)
         return tuple(x[trial] if own else x for x, own in pairs)
 
     def original(self, trial: int | AnyArray) -> tuple[Any, ...]:
-        """System and sensors of a trial as they were given."""
+        """System and sensors of a trial, with the arrays that were given."""
         return self._built(self.leaves_of(trial)[: self._arrays])
 
     @property
@@ -352,64 +466,83 @@ class Unknowns(eqx.Module):
         return len(self.stacked) - len(self.groups)
 
     def _built(self, leaves: Sequence[AnyArray]) -> tuple[Any, ...]:
+        """System and sensors with these arrays."""
         return eqx.combine(jtu.tree_structure(self.given).unflatten(leaves), self.rest)
 
     def parts(
         self, numbers: AnyArray, own: AnyArray, leaves: tuple[AnyArray, ...]
     ) -> tuple[Any, ...]:
-        """System and sensors of a trial: of its own numbers and the arrays given for it."""
-        arrays, slices = list(leaves[: self._arrays]), self.slices
-        member = dict(zip(self.groups, leaves[self._arrays :], strict=True))
-        found = [(x, numbers[slices[x.name]]) for x in self.shared]
-        for x, part in found + [(x, own[s]) for x, s in self.own_slices]:
+        """System and sensors of one trial.
+
+        Args:
+            numbers: Numbers of all trials.
+            own: Numbers of the trial.
+            leaves: Leaves of the trial.
+        """
+        slices = self.slices
+        sought = [(x, numbers[slices[x.name]]) for x in self.shared]
+        sought += [(x, own[part]) for x, part in self.own_slices]
+        members = dict(zip(self.groups, leaves[self._arrays :], strict=True))
+        arrays = list(leaves[: self._arrays])
+        for x, part in sought:
             value = x.value(part).astype(numbers.dtype)
-            if x.name in member:  # as it was given in a trial that is in no group
-                given, weights = arrays[x.index].astype(numbers.dtype), member[x.name]
-                value = (
-                    product("g,g...->...", weights, value)
-                    + (1 - jnp.sum(weights)) * given
-                )
+            if x.name in members:
+                given = arrays[x.index].astype(numbers.dtype)
+                value = _of_group(value, members[x.name], given)
             arrays[x.index] = value
         system, *sensors = self._built(arrays)
+        # Some models determine the mass and the lever of the weight, too.
         mass = self.inertia_model.body(numbers[slices["inertia"]])
-        changed = self.inertia(numbers), _of_body(system.torque, mass)
+        changed = self.inertia(numbers), _with_mass(system.torque, mass)
         return eqx.tree_at(lambda x: (x.inertia, x.torque), system, changed), *sensors
 
     def natural_units(self, numbers: AnyArray) -> Array:
-        """Units in which an error is large or small: for what is picked, its size."""
+        """Natural units of the numbers of all trials."""
         units = [self.inertia_model.units(), jnp.ones(int(self.scaled))]
         units += [x.natural_units(numbers[self.slices[x.name]]) for x in self.shared]
         return jnp.concatenate([x.astype(numbers.dtype) for x in units])
 
     def prior_rows(self, numbers: AnyArray) -> Array:
-        """What is known beforehand of the numbers for all trials, as residuals."""
+        """Residuals of prior knowledge of the numbers of all trials."""
         rows = [jnp.zeros(0, numbers.dtype)]
         rows += [x.prior_rows(numbers[self.slices[x.name]]) for x in self.shared]
-        rows += [] if self.hold is None else [self.hold(self, numbers)[None]]
+        if self.hold is not None:
+            rows.append(self.hold(self, numbers)[None])
         return jnp.concatenate(rows)
 
     def own_prior_rows(self, own: AnyArray) -> Array:
-        """What is known beforehand of a trial's own numbers."""
-        rows = [x.prior_rows(own[s]) for x, s in self.own_slices]
+        """Residuals of prior knowledge of a trial's own numbers."""
+        rows = [x.prior_rows(own[part]) for x, part in self.own_slices]
         return jnp.concatenate([jnp.zeros(0, own.dtype), *rows])
 
-    def holding(self, hold: Any) -> "Unknowns":
-        """The same, with something held."""
+    def holding(self, hold: Callable[["Unknowns", Array], Array]) -> "Unknowns":
+        """The same unknowns with another `hold`."""
         return dataclasses.replace(self, hold=hold)
 
 
-def _of_body(torque: Any, body: MassProperties | None) -> Any:
-    """The torque, with the body's mass and lever where it has some of its own."""
+def _of_group(values: Array, member: AnyArray, given: AnyArray) -> Array:
+    """The value of the group of a trial, or the given one in a trial of no group.
+
+    Args:
+        values: Of each group (groups, ...).
+        member: 1 for the group of the trial, else 0 (groups,).
+        given: The given value.
+    """
+    return product("g,g...->...", member, values) + (1 - jnp.sum(member)) * given
+
+
+def _with_mass(torque: AbstractTorque, body: MassProperties | None) -> AbstractTorque:
+    """A torque whose weights, if it has some, have the mass and lever of a body."""
     if isinstance(torque, Sum):
-        return Sum(tuple(_of_body(term, body) for term in torque.terms))
+        return Sum(tuple(_with_mass(term, body) for term in torque.terms))
     if isinstance(torque, UniformGravity) and body is not None:
         return UniformGravity(body.mass, body.center_of_mass, torque.gravity)
     return torque
 
 
 def unknowns_of(
-    systems: Sequence[Any],
-    sensors: tuple[Any, ...],
+    systems: Sequence[RigidBody],
+    sensors: Sequence[AbstractSensor],
     sizes: Sequence[AnyArray],
     free: Callable[..., Any] | None,
     inertia_model: AbstractInertiaModel,
@@ -417,78 +550,111 @@ def unknowns_of(
     rate: AnyArray,
     trials: int,
 ) -> Unknowns:
-    """Set up the numbers.
+    """Return the unknowns of a fit.
 
     Args:
-        systems: One, or one for each trial.
-        sensors: Those of the records.
-        sizes: Rms of the values of each.
+        systems: One for all trials, or one for each.
+        sensors: Sensors of the records.
+        sizes: Rms of the values of each record.
         free: What is sought beside the inertia.
         inertia_model: What is known of the tensor.
         scaled: Whether the tensor's scale is sought.
-        rate: Rms of the rates.
-        trials: How many there are.
+        rate: Rms of the rates [rad/s].
+        trials: How many trials there are.
+
+    Raises:
+        ValueError: Systems of different kinds, `free` picks what is no array, or groups
+            that are not numbered from 0 on.
     """
-    dtype, parts = rate.dtype, (systems[0], *sensors)
-    arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
-    paths, tree = jtu.tree_flatten_with_path(arrays)
-    rows = [
-        jtu.tree_leaves(eqx.filter((x, *sensors), eqx.is_inexact_array))
-        for x in systems
-    ]
-    text = "must hold bodies of the same kind for all trials, but it does not."
-    demand(all(len(x) == len(paths) for x in rows), f"Argument `system` {text}")
-    columns = list(zip(*rows, strict=True))  # of each array
-    stacked = tuple(any(x is not column[0] for x in column) for column in columns)
-    xp = rate.__array_namespace__()
-    leaves = [
-        xp.stack(x) if own else x[0] for x, own in zip(columns, stacked, strict=True)
-    ]
-    picks = _picks(paths, tree, rest, free)
+    arrays = _arrays_of(systems, sensors, rate.__array_namespace__())
+    picks = _picks(arrays, free)
+    units = []
     if picks:
-        units = [x.units(rate, size) for x, size in zip(sensors, sizes, strict=True)]
-        units = jtu.tree_leaves(eqx.filter((systems[0], *units), eqx.is_inexact_array))
-    sought, groups = [], {}
+        # Errors of sensors may be zero: their units come from the motion.
+        of_sensors = [x.units(rate, y) for x, y in zip(sensors, sizes, strict=True)]
+        units = _float_leaves((systems[0], *of_sensors))
+    sought = []
+    groups = {}
     for pick in picks:
-        path, base = paths[pick.index]
-        base, largest = base.astype(dtype), xp.max(xp.abs(base)).astype(dtype)
-        of_system = path[0].idx == 0  # type: ignore[union-attr]
-        unit = or_one(largest) if of_system else xp.asarray(units[pick.index], dtype)
-        unit = without_gradient(xp.broadcast_to(unit, base.shape).astype(dtype))
-        sigma = None if pick.sigma is None else xp.asarray(pick.sigma, dtype)
-        positive = _Definite if base.shape == (3, 3) else _Positive
-        kind = positive if _field(parts, path).get("positive") else _Any
-        name = _named(parts, path)
+        x = _sought(pick, arrays, units[pick.index], rate)
         if pick.groups is not None:
-            groups[name] = member = _members(pick.groups, trials, dtype)
-            demand(
-                kind is not _Definite,
-                f"Argument `free` must not seek the tensor {name} by groups, but it does.",
-            )
-            base, unit = (
-                np.tile(x, (member.shape[1],) + (1,) * x.ndim) for x in (base, unit)
-            )
-        sought.append(kind(pick.index, name, pick.own, base, unit, sigma))
+            groups[x.name] = _members(pick.groups, trials, rate.dtype)
+            x = _by_groups(x, groups[x.name].shape[1])
+        sought.append(x)
     inertia = systems[0].inertia
-    inertia = (
-        np.asarray(inertia, dtype) if is_concrete(inertia) else inertia.astype(dtype)
-    )
-    trace = inertia.sum() if inertia.ndim == 1 else inertia.trace()
-    given = tree.unflatten(leaves)
-    stacked = (*stacked, *(True for _ in groups))
+    if is_concrete(inertia):
+        inertia = np.asarray(inertia, rate.dtype)
+    inertia = inertia.astype(rate.dtype)
     return Unknowns(
-        given, rest, stacked, tuple(sought), groups, inertia_model, scaled, trace, rate
+        given=arrays.structure.unflatten(arrays.leaves),
+        rest=arrays.rest,
+        stacked=(*arrays.stacked, *(True for _ in groups)),
+        sought=tuple(sought),
+        groups=groups,
+        inertia_model=inertia_model,
+        scaled=scaled,
+        trace=inertia.sum() if inertia.ndim == 1 else inertia.trace(),
+        rate=rate,
     )
 
 
-def _members(groups: tuple[int, ...], trials: int, dtype: Any) -> np.ndarray:
+def _sought(
+    pick: _Pick, arrays: _Arrays, unit: AnyArray, rate: AnyArray
+) -> AbstractSought:
+    """The array that was picked.
+
+    Args:
+        pick: Which it is.
+        arrays: All arrays.
+        unit: Its natural size, if it is a sensor's.
+        rate: Rms of the rates.
+    """
+    xp = rate.__array_namespace__()
+    dtype = rate.dtype
+    path = arrays.paths[pick.index]
+    base = arrays.values[pick.index].astype(dtype)
+    is_of_system = path[0].idx == 0
+    if is_of_system:
+        # An array of zeros has no size to be measured by.
+        unit = or_one(xp.max(xp.abs(base)).astype(dtype))
+    unit = xp.broadcast_to(xp.asarray(unit, dtype), base.shape).astype(dtype)
+    kind = _Real
+    if _field_metadata(arrays.parts, path).get("positive"):
+        kind = _Definite if base.shape == (3, 3) else _Positive
+    return kind(
+        index=pick.index,
+        name=_name(arrays.parts, path),
+        own=pick.own,
+        base=base,
+        unit=without_gradient(unit),  # its choice must not change a derivative
+        sigma=None if pick.sigma is None else xp.asarray(pick.sigma, dtype),
+    )
+
+
+def _by_groups(sought: AbstractSought, groups: int) -> AbstractSought:
+    """The same array with a value for each group."""
+    demand(
+        not isinstance(sought, _Definite),
+        f"Argument `free` must not seek the tensor {sought.name} by groups, but it "
+        "does.",
+    )
+
+    def repeated(x: AnyArray) -> np.ndarray:
+        return np.tile(x, (groups,) + (1,) * x.ndim)
+
+    return dataclasses.replace(
+        sought, base=repeated(sought.base), unit=repeated(sought.unit)
+    )
+
+
+def _members(groups: tuple[int, ...], trials: int, dtype: DTypeLike) -> np.ndarray:
     """1 for each trial in its group, else 0 (trials, groups)."""
     count = max(groups, default=-1) + 1
     demand(
         len(groups) == trials
         and count > 0
         and set(range(count)) <= set(groups) <= {-1, *range(count)},
-        f"Argument `groups` of `each` must number the groups of {trials} trials from 0 on, with -1 "
-        f"for trials in none, but it is {groups}.",
+        f"Argument `groups` of `each` must number the groups of {trials} trials from 0 "
+        f"on, with -1 for trials in none, but it is {groups}.",
     )
     return (np.asarray(groups)[:, None] == np.arange(count)).astype(dtype)
