@@ -11,13 +11,13 @@ from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
-from jrigid.free._flow import invariants
-from jrigid.free._motion import (
+from jrigid.free._free_rotation import (
     free_rotation,
     in_principal_axes,
     relative_rotation,
     where_moving,
 )
+from jrigid.free._jacobi_solution import invariants
 from jrigid.rotation import rotate
 
 # Phase on either side of the start within which the polhode of an endless motion is

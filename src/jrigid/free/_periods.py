@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jrigid._checks import Enumeration
 from jrigid._numerics import root_of_positive, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
-from jrigid.free._flow import Invariants
-from jrigid.free._motion import from_invariants
+from jrigid.free._free_rotation import from_invariants
+from jrigid.free._jacobi_solution import Invariants
 
 # Below this many eps, relative, two moments are one and a motion is on the separatrix.
 _ROUNDING = 64

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from jrigid._checks import where_defined
 from jrigid._numerics import safe_arctan2, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
-from jrigid.free._motion import where_moving
+from jrigid.free._free_rotation import where_moving
 
 Tree = TypeVar("Tree")
 

@@ -25,7 +25,7 @@ from jrigid._types import Readable, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.rotation import exp, multiply, rotate, rotate_inverse
 from jrigid.stability._eigen import eigensystem, margin, null_directions, pairs
-from jrigid.stability._steps import Motion, findings_of, motion_of
+from jrigid.stability._stepped_motion import Motion, findings_of, motion_of
 from jrigid.systems import RigidBody
 
 # Times, in units of the motion, at which the system is looked at again.

@@ -19,7 +19,7 @@ from jrigid._checks import (
 from jrigid._core.lanes import in_blocks
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.stability._steps import (
+from jrigid.stability._stepped_motion import (
     Motion,
     Walk,
     findings_of,

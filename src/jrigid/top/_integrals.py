@@ -22,7 +22,7 @@ from jrigid._types import Scalar
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.rotation import rotate_inverse
 from jrigid.systems import RigidBody
-from jrigid.top._flow import square_of
+from jrigid.top._lame_solution import square_of
 from jrigid.torques import UniformGravity
 
 Case = Literal["euler", "lagrange", "kovalevskaya", "goryachev-chaplygin"]

@@ -11,8 +11,8 @@ from jrigid._checks import Enumeration
 from jrigid._numerics import root_of_positive, safe_arctan2, safe_norm
 from jrigid._types import Scalar
 from jrigid.dynamics import State
-from jrigid.top._flow import Invariants, invariants, square_of
-from jrigid.top._top import Answer, SymmetricTop, of_motion
+from jrigid.top._lame_solution import Invariants, invariants, square_of
+from jrigid.top._symmetric_top import Answer, SymmetricTop, of_motion
 
 
 class CLASSES(Enumeration):

@@ -11,7 +11,7 @@ from jrigid._numerics import product
 from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import rotate_inverse
-from jrigid.top._top import SymmetricTop, of_motion, where_valid
+from jrigid.top._symmetric_top import SymmetricTop, of_motion, where_valid
 
 
 class Conserved(NamedTuple):

@@ -20,7 +20,7 @@ from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import euler_rates_to_omega, from_euler
-from jrigid.top._top import SymmetricTop, where_valid
+from jrigid.top._symmetric_top import SymmetricTop, where_valid
 
 _ROUNDING = 1e-6  # [rad], of 180 degrees in float32
 _BAD_TILT = (

@@ -43,7 +43,7 @@ from jrigid._numerics import (
 from jrigid._types import Quaternion, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.rotation import normalize
-from jrigid.top._top import SymmetricTop
+from jrigid.top._symmetric_top import SymmetricTop
 
 _DOUBLINGS = 11
 # Quadratures over a short time: 5 nodes are enough where poles are not nearer than mu

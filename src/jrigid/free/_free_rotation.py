@@ -25,7 +25,7 @@ from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, Real, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import ExactStates, State
-from jrigid.free._flow import Invariants, after, invariants
+from jrigid.free._jacobi_solution import Invariants, after, invariants
 from jrigid.rotation import multiply, normalize
 
 Tree = TypeVar("Tree")
