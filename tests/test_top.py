@@ -535,6 +535,6 @@ def test_wrong_shapes_and_types_are_value_errors(arguments, message, untyped):
         jr.top_motion(*arguments)
 
 
-def test_a_top_of_arrays_is_a_value_error():
+def test_a_top_of_arrays_is_a_value_error(untyped):
     with pytest.raises(ValueError, match="`I1` must have shape"):
         jr.SymmetricTop(np.ones(2), 0.5, 1.0)

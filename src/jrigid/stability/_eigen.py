@@ -1,4 +1,4 @@
-"""Eigenvalues with finite derivatives, also where two meet, and the stability margin."""
+"""Eigenvalues with finite derivatives also where two meet; the stability margin."""
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +95,7 @@ def _slopes(matrix: Array, values: Array, change: Array) -> Array:
 
 
 def _clusters(values: Array, distance: Array) -> Array:
-    """Matrix of which eigenvalues count as one; neighbours of neighbours belong together."""
+    """Which eigenvalues count as one; neighbours of neighbours belong together."""
     close = jnp.abs(values[:, None] - values[None, :]) <= distance
     for _ in range(max(values.size - 1, 1).bit_length()):
         close = jnp.any(close[:, :, None] & close[None, :, :], axis=1)

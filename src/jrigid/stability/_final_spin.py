@@ -127,7 +127,7 @@ def _final_spin(motion: Motion, steps: int) -> FinalSpin:
 
 
 def _alignment(inertia: Array, omega: Array) -> Scalar:
-    """Cosine of the angle between the spin and the axis of largest moment; 0 at rest."""
+    """Cosine of the angle between spin and axis of largest moment; 0 at rest."""
     if inertia.ndim == 1:
         axis = jnp.eye(3, dtype=omega.dtype)[jnp.argmax(inertia)]
     else:
