@@ -19,7 +19,7 @@ _CLOSE = 0.1
 _NODES = 8
 
 
-def _rotate(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
+def _rotate(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
     """One Jacobi rotation in the plane (1, 2); then axes 2, 3, 1 are called 1, 2, 3.
 
     Source: Golub and Van Loan, Matrix Computations, 4th ed., 8.5.2; Numerical Recipes

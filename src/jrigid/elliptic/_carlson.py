@@ -82,7 +82,7 @@ def _rj_series(x: Array, y: Array, z: Array, p: Array) -> Array:
 def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     """R_F and c R_D / 3 of the squares, of which at most one may be zero."""
 
-    def step(_: int, carry: Arrays) -> Arrays:
+    def step(_: Array, carry: Arrays) -> Arrays:
         a, b, c, weight, total = carry
         total = total + weight / (c * (c + a) * (c + b))
         return *_next_roots(a, b, c), 0.25 * weight, total
@@ -108,7 +108,7 @@ def _rc_of_one(root: Array) -> Array:
 def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
     """R_F and R_J of the squares; q > 0 and not much larger than the others."""
 
-    def step(_: int, carry: Arrays) -> Arrays:
+    def step(_: Array, carry: Arrays) -> Arrays:
         a, b, c, q, weight, total = carry
         sides = q * q + a * b + a * c + b * c
         # DLMF 19.26.22 with alpha, beta there as sums of positive terms

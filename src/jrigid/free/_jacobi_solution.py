@@ -111,7 +111,7 @@ def quarter_period(kap: Array, u: Array, v: Array) -> Components:
     complement = jnp.sqrt((u + v) / square)
 
     # The letters are Bulirsch's.
-    def body(_: int, x: Components) -> Components:
+    def body(_: Array, x: Components) -> Components:
         kc, e, m, p, a, b = x
         next_a = a + b / p
         next_b = 2 * (b + a * (e / p))

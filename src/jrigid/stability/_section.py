@@ -227,11 +227,11 @@ def _section(
     """The section of a motion whose step is its `duration`."""
     findings = _section_findings(motion, condition)
     search = _Search(walk(motion, 1, findings.ok), condition, direction, steps)
-    last, found = jax.lax.scan(
+    last, each = jax.lax.scan(
         search.next_crossing, search.start(findings.ok), None, length=crossings
     )
-    ts, states = verdict(findings, last.error, (found.t, found.state))
-    valid = found.valid & findings.ok
+    ts, states = verdict(findings, last.error, (each.t, each.state))
+    valid = each.valid & findings.ok
     ts, states = jax.vmap(nan_where)(~valid, (ts, states))
-    error = jnp.max(jnp.where(valid, found.distance, 0))
+    error = jnp.max(jnp.where(valid, each.distance, 0))
     return Section(states, ts, valid, error, findings.result)

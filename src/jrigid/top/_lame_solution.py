@@ -101,7 +101,7 @@ def _elapsed(
 ) -> Components:
     """Functions s (of beta) and w of alpha and beta, up to a quarter of a nutation."""
 
-    def twice(_: int, at_half: Components) -> Components:
+    def twice(_: Array, at_half: Components) -> Components:
         s, w_alpha, w_beta = at_half
         z = s * s
         rise = z * (b * z)
@@ -146,7 +146,7 @@ def _nutation(root: Array, a: Array, b: Array, g: Array) -> Components:
         x = x - (x * (b + x * (a + x)) - g * g) / (b + x * (2 * a + 3 * x))
     q = jnp.sqrt(b + x * (2 * a + 3 * x))
 
-    def mean(_: int, pair: Components) -> Components:
+    def mean(_: Array, pair: Components) -> Components:
         arithmetic, geometric = pair
         return 0.5 * (arithmetic + geometric), jnp.sqrt(arithmetic * geometric)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from jrigid._checks import Enumeration
 from jrigid._numerics import root_of_positive, safe_arctan2, safe_norm
-from jrigid._types import Scalar
+from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.top._lame_solution import Invariants, invariants, square_of
 from jrigid.top._symmetric_top import Answer, SymmetricTop, of_motion
@@ -298,7 +298,7 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     return kind
 
 
-def _turns(motion: Invariants, bounds: _Bounds, tolerance: float) -> Array:
+def _turns(motion: Invariants, bounds: _Bounds, tolerance: ScalarLike) -> Array:
     """Sign of phi' at the least tilt times that at the largest; 0 within rounding."""
     momentum_alpha, momentum_beta = motion.momenta
     # phi' sin^2 / 4 at both bounds
