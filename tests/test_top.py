@@ -6,7 +6,6 @@ variational equations in 80-bit arithmetic (tests/data/make_top_motion.py).
 
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -446,9 +445,7 @@ BAD = {
 
 
 def motion_of(I1, I3, mgl, q, w, t, t0, throw=False):
-    # A top whose numbers are replaced later is not checked by `SymmetricTop` itself.
-    numbers = tuple(jnp.asarray(x, float) for x in (I1, I3, mgl))
-    top = eqx.tree_at(jax.tree.leaves, jr.SymmetricTop(1.0, 1.0, 1.0), numbers)
+    top = jr.SymmetricTop.unchecked(I1, I3, mgl)
     return jr.top_motion(top, jr.State(q, w), t, t0=t0, throw=throw)
 
 

@@ -13,6 +13,7 @@ from jrigid._checks import (
     all_positive,
     check_option,
     check_shape,
+    check_type,
     float_arrays,
     shaped,
     where_defined,
@@ -20,7 +21,6 @@ from jrigid._checks import (
 from jrigid._numerics import cosh_sqrt, root_of_positive, sinhc_sqrt
 from jrigid._types import Real, Scalar, ScalarLike, VectorLike
 from jrigid.top import SymmetricTop, steady_precession
-from jrigid.top._symmetric_top import where_valid, with_numbers
 
 Answer = TypeVar("Answer")
 # Moments of a flat body, of which one is the sum of the others, pass with an error of
@@ -286,6 +286,16 @@ class TopStability(NamedTuple):
     frequencies: Float[Array, "2"]
 
 
+def _of_top(
+    formula: Callable[..., Answer], top: SymmetricTop, **numbers: ScalarLike
+) -> Answer:
+    """Apply a formula of I1, I3, mgl and numbers; NaN outside its domain."""
+    check_type("top", top, SymmetricTop)
+    arguments = {name: (value,) for name, value in (vars(top) | numbers).items()}
+    arrays = shaped(**arguments)
+    return where_defined(top.is_valid & all_finite(arrays), formula, *arrays)
+
+
 def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
     """Stability of a vertical top: sleeping (mgl > 0) or hanging (mgl < 0).
 
@@ -318,7 +328,7 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
         frequencies = jnp.stack([half + split, half - split])
         return TopStability(square, root_of_positive(square), frequencies)
 
-    return where_valid(formula, top, omega3=omega3)
+    return _of_top(formula, top, omega3=omega3)
 
 
 class PrecessionStability(NamedTuple):
@@ -364,13 +374,13 @@ def precession_stability(
     def formula(
         i1: Array, i3: Array, mgl: Array, tilt: Array, spin: Array
     ) -> tuple[Array, Array]:
-        steady = steady_precession(with_numbers(i1, i3, mgl), tilt, spin)
+        steady = steady_precession(SymmetricTop.unchecked(i1, i3, mgl), tilt, spin)
         rates = jnp.stack([steady.slow, steady.fast])
         azimuthal = rates * jnp.sin(tilt)
         polar = i3 * spin / i1 - 2 * rates * jnp.cos(tilt)
         return rates, -(azimuthal**2) - polar**2
 
-    rates, squares = where_valid(formula, top, theta=theta, omega3=omega3)
+    rates, squares = _of_top(formula, top, theta=theta, omega3=omega3)
     return PrecessionStability(rates, squares, ~jnp.isnan(rates[0]))
 
 

@@ -64,27 +64,53 @@ class SymmetricTop(Readable):
     I3: Float[Array, ""]
     mgl: Float[Array, ""]
 
-    def __init__(
-        self, I1: ScalarLike, I3: ScalarLike, mgl: ScalarLike, *, throw: bool = True
-    ) -> None:
+    def __init__(self, I1: ScalarLike, I3: ScalarLike, mgl: ScalarLike) -> None:
         """Check and store the three numbers, in one dtype.
 
         Args:
             I1: Moment about a transverse axis, positive and finite [kg m^2].
             I3: Moment about the axis of symmetry, positive and finite [kg m^2].
             mgl: Weight times distance, finite and of any sign [N m].
-            throw: With False, a bad value makes the top of its lane NaN instead of
-                raising an error.
 
         Raises:
-            RuntimeError: A moment is not positive, or a value is not finite.
+            RuntimeError: A moment is not positive, or a value is not finite. Use
+                `unchecked` where bad lanes of a batch shall give NaN instead.
 
         Gradients: the identity.
         """
         values = shaped(I1=(I1,), I3=(I3,), mgl=(mgl,))
         findings = Findings()
         _require_valid(findings, *jax.lax.stop_gradient(values))
-        self.I1, self.I3, self.mgl = findings.guard(values, throw)
+        self.I1, self.I3, self.mgl = findings.guard(values, throw=True)
+
+    @classmethod
+    def unchecked(
+        cls, I1: ScalarLike, I3: ScalarLike, mgl: ScalarLike
+    ) -> "SymmetricTop":
+        """The top of three numbers that are not checked, for batches with bad lanes.
+
+        Every formula checks its top: it gives NaN where `is_valid` is False.
+
+        Args:
+            I1: Moment about a transverse axis [kg m^2].
+            I3: Moment about the axis of symmetry [kg m^2].
+            mgl: Weight times distance [N m].
+
+        Returns:
+            The top.
+
+        Gradients: the identity.
+
+        >>> import jax, jax.numpy as jnp, jrigid as jr
+        >>> tops = jax.vmap(lambda I1: jr.SymmetricTop.unchecked(I1, 0.5, 1.0))
+        >>> print(jax.vmap(jr.top.sleeping_spin)(tops(jnp.array([1.0, -1.0]))))
+        [ 4. nan]
+        """
+        top = object.__new__(cls)
+        values = shaped(I1=(I1,), I3=(I3,), mgl=(mgl,))
+        for name, value in zip(("I1", "I3", "mgl"), values, strict=True):
+            object.__setattr__(top, name, value)
+        return top
 
     @classmethod
     def from_mass_properties(
@@ -140,7 +166,7 @@ class SymmetricTop(Readable):
         )
         numbers = transverse + mass * length * length, axial, -mass * pull * length
         _require_valid(findings, *jax.lax.stop_gradient(numbers))
-        return findings.guard(with_numbers(*numbers), throw)
+        return findings.guard(cls.unchecked(*numbers), throw)
 
     def as_rigid_body(self) -> RigidBody:
         """The same top for `jrigid.simulate`: a `RigidBody` under `UniformGravity`.
@@ -158,18 +184,10 @@ class SymmetricTop(Readable):
     def is_valid(self) -> Bool[Array, ""]:
         """True where all numbers are finite and the moments are positive.
 
-        That is the domain of every formula of a top. Only a top that was built with
-        `throw=False`, or whose arrays were replaced later, can be outside.
+        That is the domain of every formula of a top. Only a top that is `unchecked`, or
+        whose arrays were replaced later, can be outside of it.
         """
         return all_positive((self.I1, self.I3)) & all_finite(self.mgl)
-
-
-def with_numbers(i1: Array, i3: Array, mgl: Array) -> SymmetricTop:
-    """A top of arrays that are not checked, for use where formulas take a top apart."""
-    top = object.__new__(SymmetricTop)
-    for name, value in (("I1", i1), ("I3", i3), ("mgl", mgl)):
-        object.__setattr__(top, name, value)
-    return top
 
 
 def _require_valid(findings: Findings, i1: Array, i3: Array, mgl: Array) -> None:
@@ -213,6 +231,6 @@ def of_motion(
     """Apply a formula of a top and its state; NaN where one of them is not valid."""
     check_type("top", top, SymmetricTop)
     state, numbers = plain_state("state", state, top.I1, top.I3, top.mgl)
-    top = with_numbers(*numbers)
+    top = SymmetricTop.unchecked(*numbers)
     ok = top.is_valid & all_finite(state) & is_unit(state.attitude)
     return where_defined(ok, formula, top, state)

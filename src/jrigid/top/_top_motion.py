@@ -9,7 +9,7 @@ from jrigid._motion import exact_motion, plain_state
 from jrigid._types import Quaternion, Real, Scalar, ScalarLike, Vector
 from jrigid.dynamics import ExactStates, State
 from jrigid.top._lame_solution import invariants, state_after
-from jrigid.top._symmetric_top import SymmetricTop, with_numbers
+from jrigid.top._symmetric_top import SymmetricTop
 
 
 def top_motion(
@@ -57,7 +57,7 @@ def top_motion(
     check_type("top", top, SymmetricTop)
     numbers = top.I1, top.I3, top.mgl, ts, t0
     state0, (i1, i3, mgl, ts, t0) = plain_state("state0", state0, *numbers)
-    top = with_numbers(i1, i3, mgl)
+    top = SymmetricTop.unchecked(i1, i3, mgl)
     return exact_motion(_check, _flow, throw, top, state0, ts, t0)
 
 
