@@ -170,14 +170,14 @@ def _of_any_roots(kernel: Kernel, degree: int) -> Kernel:
 def _unscaled(
     value: Array, size: Array, degree: int, regular: Array, pole: Array
 ) -> Array:
-    """A value in the units of its arguments; infinite at a pole, else 0 if not regular."""
+    """A value in the units of its arguments; at a pole infinite, else 0 at infinity."""
     for _ in range(degree):
         value = value * (1 / size)
     return jnp.where(regular, value, jnp.where(pole, jnp.inf, 0.0))
 
 
 def _along_axes(kernel: Kernel) -> Kernel:
-    """A kernel with its partial derivatives in one loop, which the tangents do not enter.
+    """A kernel with its partial derivatives, in one loop without the tangents.
 
     An argument without a tangent costs nothing, and its infinite derivative does no
     harm.
@@ -241,7 +241,7 @@ def rc_of(a: Array, b: Array) -> Array:
 
 
 def _by_slopes(function: jax.custom_jvp[Array], *slopes: Callable[..., Array]) -> None:
-    """Give a function its partial derivatives; only those with a tangent are computed."""
+    """Give a function its partial derivatives, computed only for varied arguments."""
 
     def rule(
         primals: Arrays, tangents: tuple[Array | SymbolicZero, ...]
@@ -275,11 +275,11 @@ def _ordered(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
-    """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p), for p < 0 its Cauchy principal value.
+    """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p).
 
-    A negative and a very large p are replaced by the q of DLMF 19.21.12,
-    (p - x)(q - x) = (y - x)(z - x), where x is the middle, or the largest, of the three
-    arguments.
+    For p < 0 the latter is its Cauchy principal value. A negative or a very large p is
+    replaced by the q of DLMF 19.21.12, (p - x)(q - x) = (y - x)(z - x), where x is the
+    middle, or the largest, of the three arguments.
     """
     size = _scale(a, b, c, 1e-10 * jnp.sqrt(jnp.abs(p)))
     size = jnp.where(jnp.isinf(size), 1.0, size)

@@ -1,4 +1,4 @@
-"""Free rotation: the exact flow, and what a physicist asks of it."""
+"""Free rotation: the exact flow, its periods, curves and cones."""
 
 from jrigid.free._curves import Poinsot as Poinsot
 from jrigid.free._curves import Separatrix as Separatrix

@@ -189,7 +189,9 @@ def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> 
 def _nearest(
     values: Array, vectors: Array, free: Array, tiny: Array
 ) -> tuple[Array, Array]:
-    """The two eigenvalues of an undamped motion that are nearest to growth, or grow most.
+    """The two eigenvalues of an undamped motion that are nearest to growth.
+
+    If there is growth, they are those that grow most.
 
     Two of one rate that have directions of their own do not count, nor does one with a
     zero that stays where it is.

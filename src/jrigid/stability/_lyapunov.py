@@ -111,7 +111,7 @@ class _Schedule(NamedTuple):
 
 
 def _schedule(steps: int, every: int, samples: int) -> _Schedule:
-    """Divide the steps into samples of one length; the number of steps is rounded up."""
+    """Divide the steps into samples of one length, rounding their number up."""
     steps = whole_number("steps", steps)
     every = whole_number("every", every)
     samples = min(whole_number("samples", samples), steps)

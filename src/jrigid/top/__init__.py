@@ -1,4 +1,4 @@
-"""The heavy top: Lagrange's in closed form, and what a textbook asks of it."""
+"""The heavy top: Lagrange's in closed form, its nutation and special motions."""
 
 from jrigid.top._integrals import Integrals as Integrals
 from jrigid.top._integrals import integrals as integrals

@@ -88,8 +88,8 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
     check_option("case", case, (None, *get_args(Case)))
     if case is not None and body.inertia.ndim != 1:
         raise ValueError(
-            "Argument `body` must have principal moments where a case is requested, but "
-            "it has a tensor."
+            "Argument `body` must have principal moments where a case is requested, "
+            "but it has a tensor."
         )
     pull, structure = jtu.tree_flatten(body.torque)
     state, (inertia, *pull) = plain_state("state", state, body.inertia, *pull)

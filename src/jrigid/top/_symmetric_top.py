@@ -124,7 +124,7 @@ class SymmetricTop(Readable):
         """Build the top that a body becomes when one of its points is held.
 
         Args:
-            body: Mass properties, about the centre of mass; symmetric about body axis 3.
+            body: Mass properties of a body that is symmetric about body axis 3.
             lever: Vector from the fixed point to the centre of mass, along axis 3,
                 in body components [m].
             gravity: Acceleration of gravity, along z, in space components [m/s^2]. The
@@ -200,7 +200,7 @@ def _require_valid(findings: Findings, i1: Array, i3: Array, mgl: Array) -> None
 def _require_symmetry(
     findings: Findings, mass: Array, inertia: Array, lever: Array, gravity: Array
 ) -> None:
-    """Note whether the body is symmetric about axis 3, with lever and gravity along 3."""
+    """Note whether the body is symmetric about axis 3, and lever and gravity fit it."""
     (a, d, e), (_, b, f), (_, _, c) = inertia
     tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
     size = jnp.maximum(a + b + c, mass * lever[2] ** 2)
