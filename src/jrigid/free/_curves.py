@@ -40,8 +40,8 @@ def polhode(
 
     Returns:
         Body components [rad/s]. An endless motion (the separatrix) is drawn over 20
-        e-folding times before and after the given point. NaN outside positive definite inertia and
-        finite rates.
+        e-folding times before and after the given point. NaN outside positive definite
+        inertia and finite rates.
 
     Gradients: of the points at fixed fractions of the period.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -92,8 +92,8 @@ def herpolhode(
 
     Returns:
         Space components [rad/s], with the shape of `ts` in front. The component along
-        the momentum is always 2 E / |L|. NaN outside positive definite inertia, unit attitude
-        and finite values.
+        the momentum is always 2 E / |L|. NaN outside positive definite inertia, unit
+        attitude and finite values.
 
     Gradients: as those of `free_rotation`.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.

@@ -287,7 +287,7 @@ def _evaluate(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _slopes_at(moments: Array, omega: Array, t: Array) -> tuple[Array, Array, Array]:
-    """The motion, its derivatives in moments, rates and t, and those in the elements."""
+    """The motion, and its derivatives in (moments, rates, t) and in the elements."""
 
     def motion(x: Array) -> Array:
         return jnp.concatenate(_of_moments(x[:3], x[3:6], x[6]))

@@ -1,4 +1,4 @@
-"""Other forms of an attitude: matrices, Euler angles, roll, pitch and yaw, scipy's rotations."""
+"""Other forms of an attitude: matrices, Euler angles, roll-pitch-yaw, scipy."""
 
 from typing import Any, Protocol, runtime_checkable
 

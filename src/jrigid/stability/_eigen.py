@@ -122,7 +122,7 @@ def pairs(values: Array, vectors: Array) -> tuple[Array, Array]:
 
 
 def null_directions(vectors: Array, operator: Array, tiny: Array) -> Array:
-    """Rows that an operator maps to zero, made orthonormal; zeros in place of others."""
+    """Rows that an operator maps to zero, made orthonormal; zeros replace others."""
     rows: list[Array] = []
     for vector in vectors:
         length = safe_norm(vector)
