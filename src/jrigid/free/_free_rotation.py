@@ -234,6 +234,7 @@ class _Interpolation(NamedTuple):
     quotients: Array  # interpolated
 
 
+# Long: a scan with its body, whose pieces all belong to one interpolation.
 def _evaluate(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     """The motion with a diagonal tensor, as seven numbers, and its derivatives (10, 7).
 

@@ -60,6 +60,7 @@ class _Bounds(NamedTuple):
     spread: Array  # difference of |beta|^2 at the two
 
 
+# Long: one formula from the state to both bounds, where each line needs those above.
 def _bounds(motion: Invariants) -> _Bounds:
     """The squares |alpha|^2 and |beta|^2 at the bounds of the tilt.
 

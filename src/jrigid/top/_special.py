@@ -204,6 +204,7 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
     return where_valid(fast_if_spinning, top, theta=theta, omega3=omega3)
 
 
+# Long: eight arguments, of which two say the same and one may be a word.
 def initial_state(
     top: SymmetricTop,
     theta: ScalarLike,
