@@ -257,6 +257,47 @@ def test_a_matrix_at_a_half_turn_gives_a_positive_largest_component():
         )
 
 
+NO_ROTATIONS = {
+    "reflection": np.diag([1.0, 1.0, -1.0]),
+    "inversion": -np.eye(3),
+    "zero": np.zeros((3, 3)),
+    "stretched": 1.01 * np.eye(3),
+    "sheared": np.eye(3) + 0.01 * np.eye(3, k=1),
+    "NaN": np.full((3, 3), np.nan),
+    "infinite": np.diag([np.inf, 1.0, 1.0]),
+}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", NO_ROTATIONS)
+def test_a_matrix_that_is_no_rotation_gives_nan(name, dtype):
+    assert np.all(np.isnan(ro.from_matrix(NO_ROTATIONS[name].astype(dtype))))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_matrix_typed_with_four_digits_is_a_rotation(dtype):
+    matrix = np.round(np.asarray(ro.to_matrix(ATTITUDE)), 4).astype(dtype)
+    np.testing.assert_allclose(ro.from_matrix(matrix), ATTITUDE, atol=2e-4)
+
+
+def test_matrices_that_are_no_rotations_leave_other_lanes_and_shared_slopes_alone():
+    good = np.asarray(ro.to_matrix(ATTITUDE))
+    lanes = jnp.stack([good, *NO_ROTATIONS.values(), good])
+    alone = [0, len(lanes) - 1]
+
+    def total(vector, lanes):
+        attitudes = jax.vmap(lambda x: ro.from_matrix(x + ro.hat(vector)))(lanes)
+        return jnp.nansum(attitudes), attitudes
+
+    slopes = quick_jit(jax.grad(total, has_aux=True))
+    found, attitudes = slopes(jnp.zeros(3), lanes)
+    expected, of_good = slopes(jnp.zeros(3), lanes[np.array(alone)])
+    bad = np.delete(np.arange(len(lanes)), alone)
+    assert np.all(np.isnan(attitudes[bad]))
+    np.testing.assert_allclose(attitudes[np.array(alone)], of_good, atol=1e-15)
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_normalize_and_the_zero_quaternion(dtype):
     tiny, large = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)

@@ -605,10 +605,11 @@ def test_starts_mean_what_they_say(untyped):
             RuntimeError, match=f"`{name}` must be finite, but it is not: inf"
         ):
             top.initial_state(TOP, 0.7, **{name: np.inf})
+    no_top = jr.SymmetricTop.unchecked(1.0, -0.5, 1.0)
     with pytest.raises(
         RuntimeError, match=r"`top` must have I1 > 0, .* not: \[ 1\. +-0\.5 +1\. \]"
     ):
-        top.initial_state(jr.SymmetricTop(1.0, -0.5, 1.0), 0.7)
+        top.initial_state(no_top, 0.7)
 
 
 @pytest.mark.parametrize("theta", [30.0, -0.1, 3.2, np.nan, np.inf])
@@ -713,6 +714,53 @@ def test_a_cone_on_its_tip_is_the_top_of_the_example():
     zs = (np.arange(1000) + 0.5) / 1000 * height
     mean = np.sum(zs * zs**2) / np.sum(zs**2)
     np.testing.assert_allclose(one.mgl, 0.5 * 9.80665 * mean, rtol=1e-6)
+
+
+BAD_TOPS = {
+    "no I1": ((0.0, 0.5, 1.0), "`I1` must be positive and finite, but it is not", "0"),
+    "negative I1": ((-1.0, 0.5, 1.0), "`I1` must be positive and finite", "-1.0"),
+    "negative I3": ((1.0, -0.5, 1.0), "`I3` must be positive and finite", "-0.5"),
+    "infinite I3": ((1.0, np.inf, 1.0), "`I3` must be positive and finite", "inf"),
+    "no mgl": ((1.0, 0.5, np.nan), "`mgl` must be finite, but it is not", "nan"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TOPS)
+def test_numbers_that_no_top_has_are_refused(name):
+    numbers, message, value = BAD_TOPS[name]
+    with pytest.raises(RuntimeError, match=f"{message}.*: {value}"):
+        jr.SymmetricTop(*numbers)
+    with pytest.raises(RuntimeError, match=message):
+        quick_jit(lambda x: jr.SymmetricTop(*x).I1)(jnp.asarray(numbers))
+    with pytest.raises(RuntimeError, match=f"{message}.*: {value}.* in lane 1"):
+        jax.vmap(lambda x: jr.SymmetricTop(*x))(jnp.array([[1.0, 0.5, 1.0], numbers]))
+
+
+def test_an_unchecked_lane_of_numbers_that_no_top_has_is_nan():
+    lanes = jnp.array([(1.0, 0.5, 1.0), *(x for x, *_ in BAD_TOPS.values())])
+
+    def total(shared):
+        tops = jax.vmap(lambda x: jr.SymmetricTop.unchecked(*(shared + x)))(lanes)
+        spins = jax.vmap(top.sleeping_spin)(tops)
+        return jnp.nansum(spins), (tops, spins)
+
+    slope, (tops, spins) = quick_jit(jax.grad(total, has_aux=True))(0.0)
+    np.testing.assert_array_equal(np.isnan(spins), [False] + [True] * len(BAD_TOPS))
+    assert slope == pytest.approx(-4.0, rel=1e-13)  # of 2 sqrt(mgl I1) / I3
+    np.testing.assert_array_equal(
+        jax.vmap(lambda x: x.is_valid)(tops), [True] + [False] * len(BAD_TOPS)
+    )
+
+
+@pytest.mark.parametrize("mgl", [-1.0, 0.0, 1.0])
+def test_the_weight_of_a_top_may_have_any_sign(mgl):
+    assert jr.SymmetricTop(1.0, 0.5, mgl).is_valid
+
+
+def test_a_body_without_a_moment_about_its_axis_is_no_top():
+    needle = jr.MassProperties(1.0, np.zeros(3), np.array([1.0, 1.0, 0.0]))
+    with pytest.raises(RuntimeError, match="`I3` must be positive"):
+        jr.SymmetricTop.from_mass_properties(needle, np.array([0.0, 0.0, 1.0]))
 
 
 def test_a_top_prints_its_numbers():
@@ -1040,7 +1088,9 @@ def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_
 
     def total(shared, i1, attitudes, omegas):
         def one(i1, attitude, omega):
-            own = jr.SymmetricTop(i1 + shared[0], 0.5 + shared[1], 1 + shared[2])
+            own = jr.SymmetricTop.unchecked(
+                i1 + shared[0], 0.5 + shared[1], 1 + shared[2]
+            )
             return FORMULAS[name](
                 own, jr.State(attitude + shared[3], omega + shared[4])
             )
@@ -1099,7 +1149,9 @@ def test_an_attitude_that_is_none_is_outside_of_every_formula(attitude):
 def test_kinds_of_bad_lanes_are_undefined():
     i1 = jnp.array([1.0, -1.0, np.nan])
     kinds = jax.vmap(
-        lambda x: top.motion_class(jr.SymmetricTop(x, 0.5, 1.0), start("wave"))
+        lambda x: top.motion_class(
+            jr.SymmetricTop.unchecked(x, 0.5, 1.0), start("wave")
+        )
     )(i1)
     np.testing.assert_array_equal(kinds == top.CLASSES.undefined, [False, True, True])
     np.testing.assert_array_equal(kinds == top.CLASSES.wave, [True, False, False])
@@ -1132,12 +1184,13 @@ def test_no_spin_is_nan_of_the_fast_top_alone():
 
 
 def test_special_motions_outside_their_domain():
-    assert np.isnan(top.sleeping_spin(jr.SymmetricTop(0.0, 0.5, 1.0)))
+    assert np.isnan(top.sleeping_spin(jr.SymmetricTop.unchecked(0.0, 0.5, 1.0)))
     rates = top.steady_precession(TOP, np.nan, 1.0)
     assert np.isnan(rates.slow)
     assert np.isnan(rates.fast)
     assert not rates.exists
-    assert not top.steady_precession(jr.SymmetricTop(1.0, 0.0, 1.0), 0.5, 1.0).exists
+    flat = jr.SymmetricTop.unchecked(1.0, 0.0, 1.0)
+    assert not top.steady_precession(flat, 0.5, 1.0).exists
     with pytest.raises(ValueError, match="must be given, and one only"):
         top.steady_precession(TOP, 0.5)
     assert top.sleeping_spin(jr.SymmetricTop(1.0, 0.5, -1.0)) == 0

@@ -1,15 +1,15 @@
-"""Carlson's symmetric elliptic integrals, and the kernels that the other functions are made of.
+"""Carlson's symmetric elliptic integrals, and the kernels of all other functions.
 
-The kernels take the square roots a, b, c, q of the arguments x, y, z, p. In them the
-duplication step is a' = sqrt((a + b)(a + c)) / 2: free of subtractions, smooth where an
-argument is zero, and never out of range. Every tangent of that step is positive, so
-differentiating it along an axis is as stable as the step itself, also where arguments
-coincide.
+The kernels take the square roots a, b, c, q of the arguments x, y, z, p. In the roots
+the duplication step is a' = sqrt((a + b)(a + c)) / 2. It has no subtractions, is smooth
+where an argument is zero, and is never out of range. Every tangent of that step is
+positive, so its derivative along an axis is as stable as the step itself, also where
+arguments coincide.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -22,27 +22,30 @@ from jrigid._types import Real
 
 Values: TypeAlias = Float[Array, "..."]
 ValuesLike: TypeAlias = Real[ArrayLike, "..."]
+Arrays: TypeAlias = tuple[Array, ...]
+# A kernel of roots, with two values.
+Kernel: TypeAlias = Callable[..., tuple[Array, Array]]
 
 
-def elementwise(*values: Any) -> list[Array] | tuple[Array, ...]:
+def elementwise(*values: ValuesLike | None) -> list[Array] | Arrays:
     """Arrays of one floating point dtype and one shape."""
-    return jnp.broadcast_arrays(
-        *float_arrays(*values)
-    )  # a list or, of newer jax, a tuple
+    # A list or, in newer versions of JAX, a tuple.
+    return jnp.broadcast_arrays(*float_arrays(*values))
 
 
 def _steps(x: Array) -> int:
-    """In so many a root quotient of 1e-300 (float64) or 1e-38 (float32) is down to 1e-3."""
+    """Steps that bring a quotient of roots of 1e-300 (float32: 1e-38) to 1e-3 of 1."""
     return 15 if x.dtype == jnp.float64 else 11
 
 
-# --- kernels of roots of order one
-# -------------------------------------------------------------
+# Kernels of roots of order one
 
 
 def _next_roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
     """One duplication, x' = (x + lambda) / 4 (DLMF 19.26.18), in the roots."""
-    ab, ac, bc = jnp.sqrt(a + b), jnp.sqrt(a + c), jnp.sqrt(b + c)
+    ab = jnp.sqrt(a + b)
+    ac = jnp.sqrt(a + c)
+    bc = jnp.sqrt(b + c)
     return 0.5 * ab * ac, 0.5 * ab * bc, 0.5 * ac * bc
 
 
@@ -50,9 +53,11 @@ def _rf_series(a: Array, b: Array, c: Array) -> Array:
     """R_F of nearly equal arguments, DLMF 19.36.1."""
     x, y, z = a * a, b * b, c * c
     mean = (x + y + z) / 3
-    dx, dy = (mean - x) / mean, (mean - y) / mean
+    dx = (mean - x) / mean
+    dy = (mean - y) / mean
     dz = -dx - dy
-    e2, e3 = dx * dy - dz * dz, dx * dy * dz
+    e2 = dx * dy - dz * dz
+    e3 = dx * dy * dz
     series = e2 * (-1 / 10 + e2 * (1 / 24 - 5 / 208 * e2) + e3 * (-3 / 44 + e2 / 16))
     return (1 + (series + e3 * (1 / 14 + 3 / 104 * e3))) / jnp.sqrt(mean)
 
@@ -62,10 +67,12 @@ def _rj_series(x: Array, y: Array, z: Array, p: Array) -> Array:
     mean = (x + y + z + 2 * p) / 5
     dx, dy, dz = (mean - x) / mean, (mean - y) / mean, (mean - z) / mean
     dp = -(dx + dy + dz) / 2
-    pp, xyz = dp * dp, dx * dy * dz
+    pp = dp * dp
+    xyz = dx * dy * dz
     e2 = dx * dy + dx * dz + dy * dz - 3 * pp
     e3 = xyz + dp * (2 * e2 + 4 * pp)
-    e4, e5 = (2 * xyz + dp * (e2 + 3 * pp)) * dp, xyz * pp
+    e4 = (2 * xyz + dp * (e2 + 3 * pp)) * dp
+    e5 = xyz * pp
     series = e2 * (-3 / 14 + e2 * (9 / 88 - e2 / 16) + e3 * (-9 / 52 + 45 / 272 * e2))
     series = series + e3 * (1 / 6 + 3 / 40 * e3) + e4 * (-3 / 22 + 3 / 20 * e2)
     series = series + 3 / 26 * e5 - 9 / 68 * (e3 * e4 + e2 * e5)
@@ -73,9 +80,9 @@ def _rj_series(x: Array, y: Array, z: Array, p: Array) -> Array:
 
 
 def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """R_F and c R_D / 3 of the squares; at most one root zero (a double zero gives nonsense)."""
+    """R_F and c R_D / 3 of the squares, of which at most one may be zero."""
 
-    def step(_: Any, carry: Any) -> Any:
+    def step(_: Array, carry: Arrays) -> Arrays:
         a, b, c, weight, total = carry
         total = total + weight / (c * (c + a) * (c + b))
         return *_next_roots(a, b, c), 0.25 * weight, total
@@ -84,24 +91,24 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     total = 1 / ((c + a) * (c + b))
     start = (*_next_roots(a, b, c), 0.25 * c, total)
     a, b, c, weight, total = jax.lax.fori_loop(1, _steps(a), step, start)
-    return _rf_series(a, b, c), total + weight * _rj_series(
-        a * a, b * b, c * c, c * c
-    ) / 3
+    remainder = weight * _rj_series(a * a, b * b, c * c, c * c) / 3
+    return _rf_series(a, b, c), total + remainder
 
 
 def _rc_of_one(root: Array) -> Array:
     """R_C(1, root^2), differentiable as it stands; DLMF 19.2.17, 19.2.18."""
     e = (root - 1) * (root + 1)
     low = e < -0.5
-    down, root = jnp.sqrt(jnp.where(low, -e, 0.75)), jnp.where(low, root, 0.5)
+    down = jnp.sqrt(jnp.where(low, -e, 0.75))
+    root = jnp.where(low, root, 0.5)
     logarithm = jnp.log1p((1 - root + down) / root) / down
     return jnp.where(low, logarithm, arctanc_sqrt(jnp.where(low, 0.0, e)))
 
 
 def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]:
-    """R_F and R_J of the squares; q > 0 and not many times the largest of the others."""
+    """R_F and R_J of the squares; q > 0 and not much larger than the others."""
 
-    def step(_: Any, carry: Any) -> Any:
+    def step(_: Array, carry: Arrays) -> Arrays:
         a, b, c, q, weight, total = carry
         sides = q * q + a * b + a * c + b * c
         # DLMF 19.26.22 with alpha, beta there as sums of positive terms
@@ -114,61 +121,72 @@ def _rf_rj_kernel(a: Array, b: Array, c: Array, q: Array) -> tuple[Array, Array]
     return _rf_series(a, b, c), total + weight * _rj_series(a * a, b * b, c * c, q * q)
 
 
-# --- kernels of any roots, with their derivatives
-# ----------------------------------------------
+# Kernels of any roots, with their derivatives
 
 
-def _varied(tangents: Any) -> list[int]:
+def _varied(tangents: tuple[Array | SymbolicZero, ...]) -> list[int]:
+    """Indices of the arguments along which a derivative is taken."""
     return [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
 
 
 def _two_zero(a: Array, b: Array, c: Array) -> Array:
+    """Whether two of the three are zero."""
     return ((a == 0) & (b == 0)) | ((a == 0) & (c == 0)) | ((b == 0) & (c == 0))
 
 
 def _scale(*roots: Array) -> Array:
-    """The largest root, by which all are divided; NaN where one is NaN, 1 where all are 0."""
+    """The largest root, as a unit; NaN where one is NaN, 1 where all are 0."""
     largest = functools.reduce(jnp.maximum, roots)
-    return jax.lax.stop_gradient(
-        jnp.where(largest == 0, jnp.ones_like(largest), largest)
-    )
+    scale = jnp.where(largest == 0, jnp.ones_like(largest), largest)
+    return jax.lax.stop_gradient(scale)
 
 
-def _of_any_roots(kernel: Callable[..., Any], degree: int) -> Callable[..., Any]:
-    """A kernel of roots of any size; its second value is of that degree in their reciprocals."""
+def _of_any_roots(kernel: Kernel, degree: int) -> Kernel:
+    """A kernel of roots of any size.
+
+    Its second value is of the given degree in the reciprocals of the roots.
+    """
 
     def scaled(a: Array, b: Array, c: Array, *q: Array) -> tuple[Array, Array]:
         scale = _scale(a, b, c, *q)
-        nan, two = jnp.isnan(scale), _two_zero(a, b, c)
-        pole = functools.reduce(
-            jnp.logical_or, [x == 0 for x in q], two
-        )  # of the second alone
-        # Where the answer is infinite or zero the loop runs on ones.
+        is_nan = jnp.isnan(scale)
+        pole = _two_zero(a, b, c)
+        # The second value has more poles than the first.
+        pole_of_second = functools.reduce(jnp.logical_or, [x == 0 for x in q], pole)
         size = jnp.where(jnp.isinf(scale), 1.0, scale)
-        plain = [~bad & (scale < jnp.inf) | nan for bad in (two, pole)]
-        roots = [jnp.where(plain[0], x / size, 1.0) for x in (a, b, c)]
-        values = kernel(*roots, *(jnp.where(plain[1], x / size, 1.0) for x in q))
-        answers = []
-        for value, fine, bad, power in zip(
-            values, plain, (two, pole), (1, degree), strict=True
-        ):
-            for _ in range(power):
-                value = value * (1 / size)
-            answers.append(jnp.where(fine, value, jnp.where(bad, jnp.inf, 0.0)))
-        return tuple(answers)
+        # Where a value is infinite or zero the loop runs on ones.
+        regular = ~pole & (scale < jnp.inf) | is_nan
+        regular_second = ~pole_of_second & (scale < jnp.inf) | is_nan
+        roots = [jnp.where(regular, x / size, 1.0) for x in (a, b, c)]
+        values = kernel(*roots, *(jnp.where(regular_second, x / size, 1.0) for x in q))
+        return (
+            _unscaled(values[0], size, 1, regular, pole),
+            _unscaled(values[1], size, degree, regular_second, pole_of_second),
+        )
 
     return scaled
 
 
-def _along_axes(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A kernel with its partial derivatives in one loop, which the tangents do not enter.
+def _unscaled(
+    value: Array, size: Array, degree: int, regular: Array, pole: Array
+) -> Array:
+    """A value in the units of its arguments; at a pole infinite, else 0 at infinity."""
+    for _ in range(degree):
+        value = value * (1 / size)
+    return jnp.where(regular, value, jnp.where(pole, jnp.inf, 0.0))
 
-    An argument that is not varied costs nothing, and its infinite derivative does no
+
+def _along_axes(kernel: Kernel) -> Kernel:
+    """A kernel with its partial derivatives, in one loop without the tangents.
+
+    An argument without a tangent costs nothing, and its infinite derivative does no
     harm.
     """
     function = jax.custom_jvp(kernel)
 
-    def rule(roots: Any, tangents: Any) -> Any:
+    def rule(
+        roots: Arrays, tangents: tuple[Array | SymbolicZero, ...]
+    ) -> tuple[Arrays, Arrays]:
         varied = _varied(tangents)
         axes = [
             jnp.stack([jnp.full_like(x, i == k) for i in varied])
@@ -217,16 +235,17 @@ def rc_of(a: Array, b: Array) -> Array:
     circular = jnp.arctan2(root, a) / root
     hyperbolic = jnp.log1p((a - b + root) / jnp.where(b > 0, b, 1.0)) / root
     value = jnp.where(b > a, circular, hyperbolic)
-    edge = jnp.where(
-        b == 0, jnp.inf, jnp.where(jnp.isinf(a + b), 0.0, 1 / jnp.where(b > 0, b, 1))
-    )
+    finite_edge = jnp.where(jnp.isinf(a + b), 0.0, 1 / jnp.where(b > 0, b, 1))
+    edge = jnp.where(b == 0, jnp.inf, finite_edge)
     return jnp.where(safe | jnp.isnan(a + b), value, edge)
 
 
 def _by_slopes(function: jax.custom_jvp[Array], *slopes: Callable[..., Array]) -> None:
-    """A rule of the partial derivatives, of which those that are not varied are not computed."""
+    """Give a function its partial derivatives, computed only for varied arguments."""
 
-    def rule(primals: Any, tangents: Any) -> Any:
+    def rule(
+        primals: Arrays, tangents: tuple[Array | SymbolicZero, ...]
+    ) -> tuple[Array, Array]:
         total = sum(slopes[i](*primals) * tangents[i] for i in _varied(tangents))
         return function(*primals), -total
 
@@ -237,8 +256,7 @@ _by_slopes(rf_of, lambda a, b, c: g_of(b, c, a), lambda a, b, c: g_of(a, c, b), 
 _by_slopes(rc_of, lambda a, b: g_of(b, b, a), lambda a, b: 2 * g_of(a, b, b))
 
 
-# --- principal values
-# --------------------------------------------------------------------------
+# Principal values
 
 
 def rc_signed(a: Array, y: Array) -> Array:
@@ -252,15 +270,16 @@ def rc_signed(a: Array, y: Array) -> Array:
 
 
 def _ordered(a: Array, b: Array) -> tuple[Array, Array]:
+    """The smaller and the larger."""
     return jnp.where(a > b, b, a), jnp.where(a > b, a, b)
 
 
 def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
-    """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p), for p < 0 its Cauchy principal value.
+    """R_F(a^2, b^2, c^2) and R_J(a^2, b^2, c^2, p).
 
-    A negative and a very large p are replaced by the q of DLMF 19.21.12,
-    (p - x)(q - x) = (y - x)(z - x), where x is the middle, or the largest, of the three
-    arguments.
+    For p < 0 the latter is its Cauchy principal value. A negative or a very large p is
+    replaced by the q of DLMF 19.21.12, (p - x)(q - x) = (y - x)(z - x), where x is the
+    middle, or the largest, of the three arguments.
     """
     size = _scale(a, b, c, 1e-10 * jnp.sqrt(jnp.abs(p)))
     size = jnp.where(jnp.isinf(size), 1.0, size)
@@ -272,7 +291,8 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     low, middle = _ordered(low, middle)
     large = p > 16 * high * high
     other = (p < 0) | large
-    base, second = jnp.where(large, high, middle), jnp.where(large, middle, high)
+    base = jnp.where(large, high, middle)
+    second = jnp.where(large, middle, high)
     base = jnp.where(base > 0, base, 1.0)
     distance = jnp.where(other, p - base * base, 1.0)
     gap = (low - base) * (low + base) * (second - base) * (second + base) / distance
@@ -287,8 +307,7 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     return rf * per, jnp.where(other, moved, rj) * per * per * per
 
 
-# --- the public face
-# ---------------------------------------------------------------------------
+# Public functions
 
 # Compiled, so that a call outside of jit does not compile its loop anew.
 
@@ -340,7 +359,9 @@ def rf(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
 
 
 def rc(x: ValuesLike, y: ValuesLike) -> Values:
-    r"""Carlson's degenerate elliptic integral, $R_C(x, y) = R_F(x, y, y)$, an elementary function.
+    r"""Carlson's degenerate elliptic integral, $R_C(x, y) = R_F(x, y, y)$.
+
+    It is an elementary function.
 
     Args:
         x: Non-negative.
@@ -361,8 +382,9 @@ def rc(x: ValuesLike, y: ValuesLike) -> Values:
 
 
 def rd(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
-    r"""Carlson's symmetric elliptic integral of the second kind, $R_D(x, y, z) = R_J(x, y, z, z)$.
+    r"""Carlson's symmetric elliptic integral of the second kind.
 
+    $R_D(x, y, z) = R_J(x, y, z, z)$ and
     $R_D(x, y, z) = \frac32 \int_0^\infty dt / ((t + z) \sqrt{(t + x)(t + y)(t + z)})$.
 
     Args:

@@ -1,23 +1,25 @@
 """Jacobi's elliptic functions and the amplitude."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid.elliptic._carlson import Values, ValuesLike, g_of
+from jrigid.elliptic._carlson import Arrays, Values, ValuesLike, g_of
 from jrigid.elliptic._legendre import with_parameters
 
-# Landen steps that take mc = 1e-300 (float64) or 1e-37 (float32) to 1 within rounding.
-_LANDEN_STEPS, _LANDEN_STEPS_OTHERS = {"float64": 13}, 9
-# pi in two parts, the first of 33 (float64) or 12 bits: its multiples are exact.
-_PI_PARTS = {"float64": (3.1415926534682512, 1.2154201013012384e-10)}
+# Landen steps that take mc = 1e-300 (float32: 1e-37) to 1 within rounding.
+_LANDEN_STEPS = 13
+_LANDEN_STEPS_FLOAT32 = 9
+# pi in two parts, the first of 33 (float32: 12) bits: its multiples are exact.
+_PI_PARTS = (3.1415926534682512, 1.2154201013012384e-10)
+_PI_PARTS_FLOAT32 = (3.140625, 9.67653589793e-4)
 
 
 class JacobiFunctions(NamedTuple):
-    """What `ellipj` returns.
+    """Jacobi's functions and the amplitude, as `ellipj` returns them.
 
     Attributes:
         sn: Sine of the amplitude.
@@ -41,21 +43,22 @@ def _hyperbolic(u: Array) -> tuple[Array, Array]:
 
 
 def _sides(cotangent: Array) -> tuple[Array, Array]:
-    """Sine and cosine over the larger one of them."""
+    """Sine and cosine, divided by the larger one of them."""
     flat = jnp.abs(cotangent) <= 1
     tangent = 1 / jnp.where(flat, 1.0, cotangent)
     return jnp.where(flat, 1.0, tangent), jnp.where(flat, cotangent, 1.0)
 
 
 def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
-    """Sn, |cn|, dn of u - 2 j K and the half turns j, for 0 < mc; Bulirsch (1965), `sncndn`.
+    """Sn, |cn|, dn of u - 2 j K and the half turns j, for 0 < mc.
 
-    His arithmetic-geometric means a, b enter as their quotients b / a, which stay in
-    range.
+    Source: Bulirsch (1965), `sncndn`. His arithmetic-geometric means a, b enter as
+    their quotients b / a, which stay in range.
     """
-    steps = _LANDEN_STEPS.get(u.dtype.name, _LANDEN_STEPS_OTHERS)
+    is_double = u.dtype == jnp.float64
+    steps = _LANDEN_STEPS if is_double else _LANDEN_STEPS_FLOAT32
 
-    def down(carry: Any, _: Any) -> Any:
+    def down(carry: Arrays, _: None) -> tuple[Arrays, Array]:
         quotient, mean = carry
         half = 0.5 * (1 + quotient)
         return (jnp.sqrt(quotient) / half, mean * half), quotient
@@ -65,14 +68,15 @@ def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
     # K = pi / (2 mean)
     angle = mean * u
     turns = jnp.round(angle / jnp.pi)
-    first, second = _PI_PARTS.get(u.dtype.name, (3.140625, 9.67653589793e-4))
+    first, second = _PI_PARTS if is_double else _PI_PARTS_FLOAT32
     angle = (angle - turns * first) - turns * second
 
-    def up(carry: Any, quotient: Any) -> Any:
+    def up(carry: Arrays, quotient: Array) -> tuple[Arrays, None]:
         cotangent, dn = carry
         half = 0.5 * (1 + quotient)
         sine, cosine = _sides(cotangent)
-        ss, cc = sine * sine, half * (cosine * cosine)
+        ss = sine * sine
+        cc = half * (cosine * cosine)
         return (cotangent * half * dn, (quotient * ss + cc) / (ss + cc)), None
 
     start = (jnp.cos(angle) / jnp.abs(jnp.sin(angle)), jnp.ones_like(angle))
@@ -94,16 +98,15 @@ def _reduced(u: Array, m: Array, mc: Array) -> tuple[Array, Array, Array, Array]
 
 
 @_reduced.defjvp
-def _reduced_rule(primals: Any, tangents: Any) -> Any:
+def _reduced_rule(primals: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
     u, m, mc = primals
     d_u, _, d_mc = tangents
     values = s, c, dn, turns = _reduced(u, m, mc)
     turns = jax.lax.stop_gradient(turns)
     # d am / d mc = dn dF/dm, dF/dm = s^3 R_D(c^2, 1, dn^2) / 6 + 2 j K'(m)
     one = jnp.ones_like(s)
-    root = jnp.sqrt(
-        jnp.where(turns == 0, 1.0, mc)
-    )  # no infinite slopes where nothing is turned
+    # Without turns a harmless value replaces the infinite slopes of K.
+    root = jnp.sqrt(jnp.where(turns == 0, 1.0, mc))
     tiny = jnp.finfo(s.dtype).tiny
     low = jnp.maximum(dn, 4 * tiny)
     reduced = 0.5 * s * s * s * g_of(jnp.maximum(c, 4 * tiny), one, low)
@@ -129,7 +132,8 @@ def _ellipj(u: Array, m: Array, mc: Array) -> JacobiFunctions:
     turns = jax.lax.stop_gradient(turns)
     sign = 1 - 2 * jnp.mod(turns, 2.0)
     sn = sign * s / k
-    cn, dn = jnp.where(above, d, sign * c), jnp.where(above, sign * c, d)
+    cn = jnp.where(above, d, sign * c)
+    dn = jnp.where(above, sign * c, d)
     am = jnp.arctan2(jnp.where(above, sn, s), jnp.where(above, d, c))
     return JacobiFunctions(sn, cn, dn, am + jnp.where(above, 0.0, turns * jnp.pi))
 
@@ -137,10 +141,10 @@ def _ellipj(u: Array, m: Array, mc: Array) -> JacobiFunctions:
 def ellipj(
     u: ValuesLike, m: ValuesLike | None, *, mc: ValuesLike | None = None
 ) -> JacobiFunctions:
-    r"""Jacobi's elliptic functions sn, cn, dn and the amplitude, as `scipy.special.ellipj`.
+    r"""Jacobi's elliptic functions and the amplitude, as `scipy.special.ellipj`.
 
-    am is defined by $u = F(am, m)$, or for all m by am' = dn: then sn = sin(am), cn =
-    cos(am).
+    The amplitude am is defined by $u = F(am, m)$, or for all m by am' = dn. Then sn =
+    sin(am) and cn = cos(am).
 
     Args:
         u: Argument, any.
@@ -154,11 +158,12 @@ def ellipj(
         units of 1 + |u| sqrt(|m|) and, for dn, sqrt(|m|) times as large. NaN where u or
         m is NaN or infinite. Arguments broadcast.
 
-    Gradients: by u closed; by m dn dF/dm, with F's derivative in R_D: right at m = 0, m
-        = 1 and across it, in every mode and to any order. At m = 1 they grow as
-        sinh(u); the second one by m there loses a factor of cosh(u)^2 to cancellation.
+    Gradients: in u closed forms; in m dn dF/dm, with F's derivative in R_D. They are
+    right at m = 0, m = 1 and across it, in every mode and to any order. At m = 1 they
+    grow as sinh(u), and the second one in m loses a factor of cosh(u)^2 to
+    cancellation.
     Source: DLMF 22.16.1, 22.20(ii), 22.17.2-22.17.4; Bulirsch, Numer. Math. 7 (1965)
-        78.
+    78.
 
     >>> import jrigid.elliptic
     >>> sn, cn, dn, am = jrigid.elliptic.ellipj(1.0, 0.5)

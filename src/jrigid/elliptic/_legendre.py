@@ -1,19 +1,19 @@
 """Legendre's elliptic integrals, as sums of positive terms in Carlson's.
 
-Inside, m and mc = 1 - m travel together: each is exact where the other is rounded. A
+Kernels take both m and mc = 1 - m, since each is exact where the other is rounded. A
 derivative with respect to the parameter is taken along mc, whose tangent is minus that
 of m.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid.elliptic._carlson import (
+    Arrays,
     Values,
     ValuesLike,
     elementwise,
@@ -25,19 +25,24 @@ from jrigid.elliptic._carlson import (
 )
 
 
-def with_parameters(m: Any, mc: Any, *others: Any) -> tuple[Array, ...]:
-    """The other arguments, m and mc, of one dtype and shape."""
+def with_parameters(
+    m: ValuesLike | None, mc: ValuesLike | None, *others: ValuesLike
+) -> tuple[Array, ...]:
+    """The other arguments, m and mc, in one dtype and shape."""
     if m is None and mc is None:
         raise ValueError("Argument `m` must be given, or else `mc`, but neither is.")
-    *arrays, given = elementwise(*others, m if mc is None else mc)
-    return (*arrays, given, 1 - given) if mc is None else (*arrays, 1 - given, given)
+    *arrays, parameter = elementwise(*others, m if mc is None else mc)
+    if mc is None:
+        return (*arrays, parameter, 1 - parameter)
+    return (*arrays, 1 - parameter, parameter)
 
 
 def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
-    """Half turns j, and sine and cosine (not negative) of phi - j pi."""
+    """Half turns j, and sine and non-negative cosine of phi - j pi."""
     turns = jax.lax.stop_gradient(jnp.round(phi / jnp.pi))
     sign = 1 - 2 * jnp.mod(turns, 2.0)
-    sine, cosine = sign * jnp.sin(phi), sign * jnp.cos(phi)
+    sine = sign * jnp.sin(phi)
+    cosine = sign * jnp.cos(phi)
     beyond = cosine < 0  # the quotient was rounded to the wrong side of a half
     turns = turns + jnp.where(beyond, jnp.where(sine > 0, 1.0, -1.0), 0.0)
     return turns, jnp.where(beyond, -sine, sine), jnp.where(beyond, -cosine, cosine)
@@ -52,17 +57,19 @@ def _complete(integral: Callable[..., Array], *parameters: Array) -> Array:
 def _of_any_turns(
     integral: Callable[..., Array], phi: Array, *parameters: Array
 ) -> Array:
-    """An integral `(sine, cosine, *parameters)` up to any amplitude; the last parameter is mc."""
+    """An integral `(sine, cosine, *parameters)` up to any amplitude.
+
+    The last parameter is mc.
+    """
     turns, sine, cosine = reduce_amplitude(phi)
-    # Where there are no turns, the complete one is asked at m = 0, far from its
-    # infinite slopes.
+    # Where there are no turns, the complete integral is evaluated at m = 0, far from
+    # its infinite slopes.
     *others, mc = (jnp.where(turns == 0, 0.0, x) for x in parameters)
     whole = _complete(integral, *others, jnp.where(turns == 0, 1.0, mc))
     return integral(sine, cosine, *parameters) + 2 * turns * whole
 
 
-# --- within a quarter turn
-# ---------------------------------------------------------------------
+# Within a quarter turn
 
 
 def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
@@ -71,22 +78,30 @@ def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
 
 
 def _delta_of(phi: Array, mc: Array) -> Array:
+    """sqrt(1 - m sin^2 phi) of an amplitude."""
     return _delta(*reduce_amplitude(phi)[1:], mc)
 
 
 def _f(sine: Array, cosine: Array, mc: Array) -> Array:
+    """F for |phi| <= pi/2, DLMF 19.25.5."""
     return sine * rf_of(cosine, _delta(sine, cosine, mc), jnp.ones_like(sine))
 
 
 def _f_by_m(sine: Array, cosine: Array, mc: Array) -> Array:
+    """Derivative of F in m."""
     delta = _delta(sine, cosine, mc)
     return sine * sine * sine / (2 * delta) * g_of(cosine, jnp.ones_like(sine), delta)
 
 
 def _e(s: Array, c: Array, m: Array, mc: Array) -> Array:
-    """DLMF 19.25.9 for m <= 0, 19.25.10 for 0 < m <= 1, 19.25.11 above: positive terms each."""
-    d, one = _delta(s, c, mc), jnp.ones_like(s)
-    low, high = m <= 0, mc < 0
+    """E for |phi| <= pi/2 by DLMF 19.25.9 (m <= 0), 19.25.10 (m <= 1) or 19.25.11.
+
+    All of their terms are positive.
+    """
+    d = _delta(s, c, mc)
+    one = jnp.ones_like(s)
+    low = m <= 0
+    high = mc < 0
     last = jnp.where(low, one, jnp.where(high, c, d))
     rf, g = rf_g(jnp.where(high, d, c), jnp.where(low, d, one), last)
     cube = s * s * s
@@ -97,6 +112,7 @@ def _e(s: Array, c: Array, m: Array, mc: Array) -> Array:
 
 
 def _e_by_mc(sine: Array, cosine: Array, mc: Array) -> Array:
+    """Derivative of E in mc."""
     delta = _delta(sine, cosine, mc)
     return 0.5 * sine * sine * sine * g_of(cosine, delta, jnp.ones_like(sine))
 
@@ -108,21 +124,32 @@ def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     above = mc < 0
     k = jnp.sqrt(jnp.where(above, m, 1.0))
     s = k * sine
-    c, d = jnp.where(above, delta, cosine), jnp.where(above, cosine, delta)
-    n, mc = n / (k * k), jnp.where(above, -mc / (k * k), mc)
-    # DLMF 19.25.14; for n far below 0, where its terms cancel, (t + 1) / (t + p) is
-    # split into 1 / (1 - n) and a part to which 19.21.12 is applied: q - c^2 = s^2 mc /
-    # (1 - n)
+    c = jnp.where(above, delta, cosine)
+    d = jnp.where(above, cosine, delta)
+    n = n / (k * k)
+    mc = jnp.where(above, -mc / (k * k), mc)
+    value = _pi_over_sine(s, c, d, n, mc)
+    infinite = jnp.where(n > 1, 0.5, -0.5) * jnp.log(jnp.where(end, mc, 1.0))
+    return jnp.where(end, infinite, s / k * value)
+
+
+def _pi_over_sine(s: Array, c: Array, d: Array, n: Array, mc: Array) -> Array:
+    """Pi / sin(phi) for m <= 1, from sine, cosine and delta.
+
+    DLMF 19.25.14, whose terms cancel for n far below 0. There (t + 1) / (t + p) is
+    split into 1 / (1 - n) and a part to which 19.21.12 is applied, with q - c^2 = s^2
+    mc / (1 - n).
+    """
     negative = n * s * s < -0.5
     share = jnp.where(negative, 1 / (1 - n), 1.0)
     p = c * c + (1 - n) * s * s
     step = s * s * mc * share
-    # Complete and mc out of range or 0: what tends to a limit has reached it, what else
-    # there is diverges at 0.
+    # Complete, and mc is out of range or 0: a term with a limit has reached it, and any
+    # other diverges at 0.
     limit = (c == 0) & (step < 64 * jnp.finfo(s.dtype).tiny)
     split = negative & ~limit
     q = jnp.where(split, c * c + step, 1.0)
-    # In units in which d is 1, where R_J itself can be out of range below.
+    # In units in which d is 1, since R_J itself can be below the range.
     unit = jax.lax.stop_gradient(jnp.where(split, 1 / jnp.maximum(d, 1.0), 1.0))
     rf, rj = rf_rj_signed(
         c * unit, d * unit, unit, jnp.where(negative, (q * unit) * unit, p)
@@ -131,13 +158,10 @@ def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     of_n = jnp.where(limit, jnp.where(negative, p, 1.0), p * q)
     rc = rc_of(jnp.where(limit, 1.0, d), jnp.sqrt(jnp.where(negative, of_n, 1.0)))
     split_off = jnp.where(limit, rc, c * rc + ((step / 3 * unit) * unit) * (rj * unit))
-    value = jnp.where(negative, share * (rf - n * split_off), rf + n * s * s / 3 * rj)
-    infinite = jnp.where(n > 1, 0.5, -0.5) * jnp.log(jnp.where(end, mc, 1.0))
-    return jnp.where(end, infinite, s / k * value)
+    return jnp.where(negative, share * (rf - n * split_off), rf + n * s * s / 3 * rj)
 
 
-# --- complete
-# ----------------------------------------------------------------------------------
+# Complete
 
 
 @jax.custom_jvp
@@ -146,7 +170,7 @@ def _e_complete(m: Array, mc: Array) -> Array:
 
 
 @_e_complete.defjvp
-def _e_complete_rule(primals: Any, tangents: Any) -> Any:
+def _e_complete_rule(primals: Arrays, tangents: Arrays) -> tuple[Array, Array]:
     return _e_complete(*primals), _complete(_e_by_mc, primals[1]) * tangents[1]
 
 
@@ -234,8 +258,7 @@ def ellippi(
     return _pi_compiled(*with_parameters(m, mc, n))
 
 
-# --- incomplete
-# --------------------------------------------------------------------------------
+# Incomplete
 
 
 @jax.custom_jvp
@@ -244,12 +267,12 @@ def _f_incomplete(phi: Array, mc: Array) -> Array:
 
 
 @_f_incomplete.defjvp
-def _f_incomplete_rule(primals: Any, tangents: Any) -> Any:
+def _f_incomplete_rule(primals: Arrays, tangents: Arrays) -> tuple[Array, Array]:
     phi, mc = primals
+    d_phi, d_mc = tangents
     slope = _of_any_turns(_f_by_m, phi, mc)
-    return _f_incomplete(phi, mc), tangents[0] / _delta_of(phi, mc) - slope * tangents[
-        1
-    ]
+    change = d_phi / _delta_of(phi, mc) - slope * d_mc
+    return _f_incomplete(phi, mc), change
 
 
 @jax.custom_jvp
@@ -258,12 +281,12 @@ def _e_incomplete(phi: Array, m: Array, mc: Array) -> Array:
 
 
 @_e_incomplete.defjvp
-def _e_incomplete_rule(primals: Any, tangents: Any) -> Any:
+def _e_incomplete_rule(primals: Arrays, tangents: Arrays) -> tuple[Array, Array]:
     phi, m, mc = primals
+    d_phi, _, d_mc = tangents
     slope = _of_any_turns(_e_by_mc, phi, mc)
-    return _e_incomplete(phi, m, mc), _delta_of(phi, mc) * tangents[
-        0
-    ] + slope * tangents[2]
+    change = _delta_of(phi, mc) * d_phi + slope * d_mc
+    return _e_incomplete(phi, m, mc), change
 
 
 @jax.custom_jvp
@@ -272,7 +295,7 @@ def _pi_incomplete(phi: Array, n: Array, m: Array, mc: Array) -> Array:
 
 
 @_pi_incomplete.defjvp
-def _pi_incomplete_rule(primals: Any, tangents: Any) -> Any:
+def _pi_incomplete_rule(primals: Arrays, tangents: Arrays) -> tuple[Array, Array]:
     phi, n, m, mc = primals
     d_phi, d_n, _, d_mc = tangents
     _, sine, cosine = reduce_amplitude(phi)
@@ -283,9 +306,9 @@ def _pi_incomplete_rule(primals: Any, tangents: Any) -> Any:
     return _pi_incomplete(phi, n, m, mc), d_phi / pole + by_parameters
 
 
-_f_of_phi, _e_of_phi, _pi_of_phi = map(
-    jax.jit, (_f_incomplete, _e_incomplete, _pi_incomplete)
-)
+_f_of_phi = jax.jit(_f_incomplete)
+_e_of_phi = jax.jit(_e_incomplete)
+_pi_of_phi = jax.jit(_pi_incomplete)
 
 
 def ellipkinc(
@@ -303,8 +326,7 @@ def ellipkinc(
 
     Returns:
         F to 8 ulps (8 ulps of the amplitude where F itself is steep); +-inf at m = 1
-        beyond
-        |phi| = pi/2, NaN outside the domain. Arguments broadcast.
+        beyond |phi| = pi/2, NaN outside the domain. Arguments broadcast.
 
     Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; infinite
         where m sin^2 phi = 1.

@@ -1,4 +1,4 @@
-"""Free rotation: the exact flow, and what a physicist asks of it."""
+"""Free rotation: the exact flow, its periods, curves and cones."""
 
 from jrigid.free._curves import Poinsot as Poinsot
 from jrigid.free._curves import Separatrix as Separatrix
@@ -6,8 +6,8 @@ from jrigid.free._curves import herpolhode as herpolhode
 from jrigid.free._curves import poinsot as poinsot
 from jrigid.free._curves import polhode as polhode
 from jrigid.free._curves import separatrix as separatrix
-from jrigid.free._motion import free_rotation as free_rotation
-from jrigid.free._motion import relative_rotation as relative_rotation
+from jrigid.free._free_rotation import free_rotation as free_rotation
+from jrigid.free._free_rotation import relative_rotation as relative_rotation
 from jrigid.free._periods import REGIMES as REGIMES
 from jrigid.free._periods import geometric_phase as geometric_phase
 from jrigid.free._periods import mean_precession_rate as mean_precession_rate

@@ -11,28 +11,27 @@ from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
-from jrigid.free._flow import invariants
-from jrigid.free._motion import (
+from jrigid.free._free_rotation import (
     free_rotation,
     in_principal_axes,
     relative_rotation,
     where_moving,
 )
+from jrigid.free._jacobi_solution import invariants
 from jrigid.rotation import rotate
 
-# Phase on either side of the start within which the polhode of an endless motion is
-# drawn.
+# The polhode of an endless motion is drawn within this phase of the start.
 _ENDLESS_PHASE = 20.0
 
 
 def polhode(
     inertia: InertiaLike, omega: VectorLike, points: int = 200
 ) -> Float[Array, "{points} 3"]:
-    """The curve of the angular velocity in the body, over one period from the given point.
+    """Curve of the angular velocity in the body, over one period.
 
-    It is closed and the attitude plays no part in it: inertia and one of its points say
-    which it is, and no times are asked for. At given times the points are
-    `free_rotation(...).omega`, and as seen from space `herpolhode`.
+    The curve is closed and does not depend on the attitude, so inertia and one of its
+    points define it. The points at given times are `free_rotation(...).omega`. In space
+    the curve is `herpolhode`.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -41,14 +40,15 @@ def polhode(
 
     Returns:
         Body components [rad/s]. An endless motion (the separatrix) is drawn over 20
-        e-folding times before and after. NaN outside positive definite inertia and
-        finite rates.
+        e-folding times before and after the given point. NaN outside positive definite
+        inertia and finite rates.
 
     Gradients: of the points at fixed fractions of the period.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> curve = jr.free.polhode(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0]), 5)
+    >>> moments, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> curve = jr.free.polhode(moments, omega, 5)
     >>> print(curve[2].round(6))
     [-0.1  0.   1. ]
     """
@@ -61,7 +61,12 @@ def polhode(
         end = jnp.where(motion.circles, 4 * motion.quarter, endless)
         start = jnp.where(motion.circles, 0.0, -end)
         times = jnp.linspace(start, end, count) / motion.unit
-        return jax.vmap(lambda t: relative_rotation(inertia, omega, t)[1])(times)
+
+        def at_time(t: Array) -> Array:
+            _, omega_then = relative_rotation(inertia, omega, t)
+            return omega_then
+
+        return jax.vmap(at_time)(times)
 
     return where_moving(curve, inertia, omega=omega)
 
@@ -73,11 +78,11 @@ def herpolhode(
     *,
     t0: ScalarLike = 0.0,
 ) -> Float[Array, "... 3"]:
-    """The curve of the angular velocity in space, in a plane at right angles to the momentum.
+    """Curve of the angular velocity in space, in a plane normal to the momentum.
 
-    In general it never closes, and its pace is that of the precession, not of the
-    polhode (the Earth's goes round in a day, its polhode in 305), so that the times are
-    asked for; the attitude places it in space.
+    In general the curve never closes, so the times are arguments. Its rate is that of
+    the precession and not of the polhode: the Earth's herpolhode goes round in a day,
+    its polhode in 305 days. The attitude defines where it lies in space.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -86,9 +91,9 @@ def herpolhode(
         t0: Time of `state0` [s].
 
     Returns:
-        Space components [rad/s], with the shape of `ts` in front. Along the momentum
-        they are 2 E / |L|, always. NaN outside positive definite inertia, unit attitude
-        and finite values.
+        Space components [rad/s], with the shape of `ts` in front. The component along
+        the momentum is always 2 E / |L|. NaN outside positive definite inertia, unit
+        attitude and finite values.
 
     Gradients: as those of `free_rotation`.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
@@ -105,9 +110,9 @@ def herpolhode(
 
 
 class Separatrix(NamedTuple):
-    """The planes through the middle axis that part the motions about the outer two.
+    """Planes through the intermediate axis that divide the motions about the other two.
 
-    I1 < I2 < I3, and L and omega are numbered likewise.
+    I1 < I2 < I3, and the components of L and omega are in the same order.
 
     Attributes:
         momentum_ratio: |L3 / L1| on them, sqrt((I2/I1 - 1) / (1 - I2/I3)).
@@ -123,7 +128,7 @@ class Separatrix(NamedTuple):
 
 
 def separatrix(inertia: InertiaLike) -> Separatrix:
-    """Where the separatrix lies; I1 < I2 < I3 are the ascending moments.
+    """Position of the separatrix; I1 < I2 < I3 are the ascending moments.
 
     Args:
         inertia: Principal moments in any order, or a tensor [kg m^2].
@@ -133,7 +138,7 @@ def separatrix(inertia: InertiaLike) -> Separatrix:
         90 degrees. NaN for a sphere, which has none, and outside positive definite
         inertia.
 
-    Gradients: infinite in two equal moments, as the truth is.
+    Gradients: infinite at two equal moments, where the derivative is infinite.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -149,16 +154,22 @@ def separatrix(inertia: InertiaLike) -> Separatrix:
 
 
 def _planes(i1: Array, i2: Array, i3: Array) -> Separatrix:
+    """The planes of a body that is no sphere."""
     # Roots of products would have NaN slopes in the third moment where two are equal.
-    low, high = jnp.sqrt(i2 - i1), jnp.sqrt(i3 - i2)
-    up, across = low * jnp.sqrt(i3), high * jnp.sqrt(i1)
-    omega_up, omega_across = low * jnp.sqrt(i1), high * jnp.sqrt(i3)
+    low = jnp.sqrt(i2 - i1)
+    high = jnp.sqrt(i3 - i2)
+    up = low * jnp.sqrt(i3)
+    across = high * jnp.sqrt(i1)
+    omega_up = low * jnp.sqrt(i1)
+    omega_across = high * jnp.sqrt(i3)
     angles = jnp.arctan2(up, across), jnp.arctan2(omega_up, omega_across)
     return Separatrix(up / across, omega_up / omega_across, *angles)
 
 
 class Poinsot(NamedTuple):
-    """Poinsot's surfaces: the momentum stays on a sphere and on an ellipsoid, in the body.
+    """Poinsot's surfaces: the sphere and the ellipsoids of a motion, in the body.
+
+    The momentum stays on a sphere and on an ellipsoid.
 
     Attributes:
         sphere_radius: |L| [kg m^2/s].
@@ -190,7 +201,8 @@ def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> surfaces = jr.free.poinsot(jnp.array([1.0, 1.0, 4.0]), jnp.array([0.0, 0.0, 2.0]))
+    >>> moments, omega = jnp.array([1.0, 1.0, 4.0]), jnp.array([0.0, 0.0, 2.0])
+    >>> surfaces = jr.free.poinsot(moments, omega)
     >>> print(surfaces.sphere_radius, surfaces.momentum_ellipsoid)
     8.0 [4. 4. 8.]
     """

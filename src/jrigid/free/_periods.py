@@ -5,15 +5,15 @@ import jax.numpy as jnp
 from jrigid._checks import Enumeration
 from jrigid._numerics import root_of_positive, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
-from jrigid.free._flow import Invariants
-from jrigid.free._motion import from_invariants
+from jrigid.free._free_rotation import from_invariants
+from jrigid.free._jacobi_solution import Invariants
 
 # Below this many eps, relative, two moments are one and a motion is on the separatrix.
 _ROUNDING = 64
 
 
 class REGIMES(Enumeration):
-    """Kinds of free motion: `REGIMES[code]` is the text of what `regime` answers."""
+    """Kinds of free rotation, as `regime` returns them; `REGIMES[code]` is the text."""
 
     at_rest = "at rest"
     sphere = "sphere"
@@ -27,12 +27,12 @@ class REGIMES(Enumeration):
 
 
 def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
-    """Time after which the angular velocity of a free body comes back, in the body.
+    """Period of the angular velocity of a free body, in the body.
 
-    4 K(m) / lam of Jacobi's solution; 2 pi / |wobble rate| for a symmetric body; of
-    spin about a stable axis the limit of small wobbles. Infinite where nothing comes
-    round: sphere, separatrix, spin about the middle axis or an axis of no distinction,
-        rest.
+    It is 4 K(m) / lam of Jacobi's solution, and 2 pi / |wobble rate| for a symmetric
+    body. For spin about a stable axis it is the limit of small wobbles. It is infinite
+    for a sphere, on the separatrix, for spin about the intermediate axis or about any
+    axis in a plane of equal moments, and at rest.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -45,18 +45,23 @@ def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.12.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.free.polhode_period(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0])).round(4))
+    >>> moments, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> print(jr.free.polhode_period(moments, omega).round(4))
     6.2884
     """
-    return from_invariants(
-        lambda x: jnp.where(x.circles, 4 * x.quarter / x.unit, jnp.inf), inertia, omega
-    )
+
+    def period(motion: Invariants) -> Scalar:
+        return jnp.where(motion.circles, 4 * motion.quarter / motion.unit, jnp.inf)
+
+    return from_invariants(period, inertia, omega)
 
 
 def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
-    """Mean rate at which the axis that the momentum circles turns about the momentum in space.
+    """Mean rate at which a free body precesses about its momentum in space.
 
-    |L| / I1 for a symmetric body; |L| / I2 on the separatrix and about an axis of no distinction.
+    It is the rate of the axis that the momentum circles. It equals |L| / I1 for a
+    symmetric body, and |L| / I2 on the separatrix and for spin about an axis in a plane
+    of equal moments.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -65,22 +70,24 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     Returns:
         Rate [rad/s]; NaN outside positive definite inertia and finite rates.
 
-    Gradients: right off the separatrix; there the rate has infinite slope, and |L| /
-        I2's is given.
+    Gradients: right off the separatrix. On it the rate has infinite slope, and the
+    gradient is that of |L| / I2.
     Source: the complete integral of the third kind in docs/free_rotation.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> rate = jr.free.mean_precession_rate(jnp.array([1., 2., 3.]), jnp.array([0.1, 0.0, 1.0]))
-    >>> print(rate.round(4))
+    >>> moments, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> print(jr.free.mean_precession_rate(moments, omega).round(4))
     2.0008
     """
-    return from_invariants(
-        lambda motion: motion.unit * _mean_rate(motion), inertia, omega
-    )
+
+    def rate(motion: Invariants) -> Scalar:
+        return motion.unit * _mean_rate(motion)
+
+    return from_invariants(rate, inertia, omega)
 
 
 def _mean_rate(motion: Invariants) -> Scalar:
-    """Mean precession rate, in units of the motion's."""
+    """Mean precession rate in units of the motion."""
     quarter = jnp.where(motion.circles, motion.quarter, 1.0)
     extra = motion.al * motion.v * motion.quarter_w / quarter
     over_momentum = 1 / motion.moments[1] + jnp.where(motion.circles, extra, 0.0)
@@ -88,7 +95,7 @@ def _mean_rate(motion: Invariants) -> Scalar:
 
 
 def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
-    """Angle about the momentum by which a free body has turned after one polhode period.
+    """Angle by which a free body turns about its momentum in one polhode period.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -107,19 +114,20 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     >>> print(jr.free.precession_per_period(body, omega).round(4))
     12.5821
     """
-    return from_invariants(
-        lambda x: jnp.where(x.circles, 4 * x.quarter * _mean_rate(x), jnp.inf),
-        inertia,
-        omega,
-    )
+
+    def angle(motion: Invariants) -> Scalar:
+        turned = 4 * motion.quarter * _mean_rate(motion)
+        return jnp.where(motion.circles, turned, jnp.inf)
+
+    return from_invariants(angle, inertia, omega)
 
 
 def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Part of `precession_per_period` beyond the dynamic phase 2 E T / |L|.
 
-    Up to whole turns it is minus the solid angle that the momentum circles in the body
-    (positive where it goes round the axis in the right-handed sense): it depends on the
-    shape of the polhode and not on the pace.
+    Up to whole turns it is minus the solid angle that the momentum encloses in the body
+    (positive where it goes round the axis in the right-handed sense). It depends on the
+    shape of the polhode and not on the rate.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -141,6 +149,7 @@ def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
 
 
 def _geometric_phase(motion: Invariants) -> Scalar:
+    """Geometric phase in one period; 0 where there is none."""
     square = motion.momentum_square
     size = safe_norm(jnp.stack(motion.momentum))
     # 1 / I2 - 2 E / |L|^2, without the difference: al be (2 E - |L|^2 / I2) is -al v
@@ -154,7 +163,7 @@ def _geometric_phase(motion: Invariants) -> Scalar:
 
 
 def parameter(inertia: InertiaLike, omega: VectorLike) -> Scalar:
-    """Parameter m = k^2 of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
+    """Parameter m = k^2 of the Jacobi functions of the motion; 1 on the separatrix.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].
@@ -164,18 +173,20 @@ def parameter(inertia: InertiaLike, omega: VectorLike) -> Scalar:
         m; 0 for symmetric bodies, spheres, spin about a stable axis, and at rest. NaN
         outside positive definite inertia and finite rates.
 
-    Gradients: right where no two moments are equal; where two are, m has a kink at 0
-    and the slope of one side is given; zero for a sphere and at rest.
+    Gradients: right where no two moments are equal. Where two are equal m has a kink at
+    0, and the gradient is that of one side. Zero for a sphere and at rest.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.free.parameter(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])).round(6))
+    >>> moments, omega = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.1, 0.0, 1.0])
+    >>> print(jr.free.parameter(moments, omega).round(6))
     0.003333
     """
     return from_invariants(_parameter, inertia, omega)
 
 
 def _parameter(motion: Invariants) -> Scalar:
+    """P / Q, without the cancellation in either."""
     al, be = motion.al, motion.be
     l1, l2, _ = motion.momentum
     p = al * ((al + be) * l1 * l1 + be * l2 * l2)
@@ -206,7 +217,7 @@ def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
 
 
 def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
-    """Which kind of motion it is.
+    """Kind of a free rotation.
 
     Args:
         inertia: Principal moments or tensor [kg m^2].

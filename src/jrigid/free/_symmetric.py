@@ -1,7 +1,7 @@
 """The free symmetric body: its wobble, its precession and their cones."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxtyping import Array
 from jrigid._checks import where_defined
 from jrigid._numerics import safe_arctan2, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
-from jrigid.free._motion import where_moving
+from jrigid.free._free_rotation import where_moving
 
 Tree = TypeVar("Tree")
 
@@ -19,13 +19,14 @@ class ConeAngles(NamedTuple):
     """Angles of the cones that a symmetric body's motion draws [rad].
 
     Attributes:
-        omega: Between angular velocity and the axis of symmetry, the half-angle of the body cone
-            (alpha).
-        momentum: Between angular momentum and that axis (theta): tan theta = (I1/I3) tan alpha.
-        space: Between angular velocity and momentum, the half-angle of the space cone,
-            |alpha - theta|. The three lines lie in a plane: the momentum between the axis and the
-            angular velocity for an oblate body, the angular velocity between the two for a
-            prolate one.
+        omega: Angle alpha between angular velocity and axis of symmetry, the half-angle
+            of the body cone.
+        momentum: Angle theta between angular momentum and axis of symmetry, with
+            tan theta = (I1/I3) tan alpha.
+        space: Angle |alpha - theta| between angular velocity and momentum, the
+            half-angle of the space cone. The three lines lie in a plane. For an oblate
+            body the momentum lies between axis and angular velocity, and for a prolate
+            one the angular velocity lies between axis and momentum.
     """
 
     omega: Scalar
@@ -34,9 +35,11 @@ class ConeAngles(NamedTuple):
 
 
 def _where_symmetric(
-    formula: Callable[[Array, Array, Array], Tree], inertia: Any, omega: Any
+    formula: Callable[[Array, Array, Array], Tree],
+    inertia: InertiaLike,
+    omega: VectorLike,
 ) -> Tree:
-    """A formula of I1, I3 and the rates; NaN for bodies not symmetric about the third axis."""
+    """Apply a formula of I1, I3 and the rates; NaN if axis 3 is no axis of symmetry."""
 
     def of_body(inertia: Array, omega: Array) -> Tree:
         tensor = inertia if inertia.ndim == 2 else jnp.diag(inertia)
@@ -56,41 +59,45 @@ def wobble_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Rate at which the pole of a symmetric body turns in the body, (I3/I1 - 1) omega3.
 
     Args:
-        inertia: Moments (I1, I1, I3) or tensor symmetric about the third axis (index 2) [kg m^2].
+        inertia: Moments (I1, I1, I3) or a tensor that is symmetric about the third axis
+            (index 2) [kg m^2].
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        The rate [rad/s], positive when the pole turns about the third axis in the right-handed
-        sense, as seen in the body. NaN for any other body (ask for `polhode_period`), and outside
-        positive moments and finite rates.
+        The rate [rad/s], positive if the pole turns about the third axis in the
+        right-handed sense, as seen in the body. NaN for any other body (use
+        `polhode_period`), and outside positive moments and finite rates.
 
     Gradients: in I1 and I2 those of the linearised wobble of a body with I1 near I2.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 36.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> earth = jnp.array([1.0, 1.0, 1.00327])
-    >>> print((1 / jr.free.wobble_rate(earth, jnp.array([0.0, 0.0, 1.0]))).round(1))  # days
+    >>> rate = jr.free.wobble_rate(earth, jnp.array([0.0, 0.0, 1.0]))  # [1/day]
+    >>> print((1 / rate).round(1))
     305.8
     """
     return _where_symmetric(lambda i1, i3, w: (i3 - i1) / i1 * w[2], inertia, omega)
 
 
 def precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
-    """Rate at which the axis of a symmetric body turns about its momentum in space, |L| / I1.
+    """Rate |L| / I1 at which the axis of a symmetric body precesses in space.
 
     Args:
-        inertia: Moments (I1, I1, I3) or tensor symmetric about the third axis (index 2) [kg m^2].
+        inertia: Moments (I1, I1, I3) or a tensor that is symmetric about the third axis
+            (index 2) [kg m^2].
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        The rate [rad/s]. NaN for any other body (`mean_precession_rate` is the mean), and outside
-        positive moments and finite rates.
+        The rate [rad/s]. NaN for any other body (`mean_precession_rate` is the mean),
+        and outside positive moments and finite rates.
 
     Gradients: finite; zero at rest.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 33.5.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.free.precession_rate(jnp.array([1.0, 1.0, 1.5]), jnp.array([0.0, 0.0, 2.0])))
+    >>> moments, omega = jnp.array([1.0, 1.0, 1.5]), jnp.array([0.0, 0.0, 2.0])
+    >>> print(jr.free.precession_rate(moments, omega))
     3.0
     """
 
@@ -104,25 +111,28 @@ def cone_angles(inertia: InertiaLike, omega: VectorLike) -> ConeAngles:
     """Angles between axis, angular velocity and momentum of a symmetric body.
 
     Args:
-        inertia: Moments (I1, I1, I3) or tensor symmetric about the third axis (index 2) [kg m^2].
+        inertia: Moments (I1, I1, I3) or a tensor that is symmetric about the third axis
+            (index 2) [kg m^2].
         omega: Angular velocity, body components [rad/s].
 
     Returns:
-        Half-angles of body and space cone, and the angle of the momentum [rad]. NaN for any other
-        body, and outside positive moments and finite rates.
+        Half-angles of body and space cone, and the angle of the momentum [rad]. NaN for
+        any other body, and outside positive moments and finite rates.
 
-    Gradients: finite; right where no angle is zero and omega3 is not. At zero wobble, where the
-    angles have a kink, zero.
+    Gradients: finite, and right where neither an angle nor omega3 is zero. At zero
+    wobble, where the angles have a kink, zero.
     Source: Goldstein, Classical Mechanics, 3rd ed., 5.6.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> angles = jr.free.cone_angles(jnp.array([1.0, 1.0, 2.0]), jnp.array([1.0, 0.0, 1.0]))
+    >>> moments, omega = jnp.array([1.0, 1.0, 2.0]), jnp.array([1.0, 0.0, 1.0])
+    >>> angles = jr.free.cone_angles(moments, omega)
     >>> print(jnp.degrees(jnp.stack(angles)).round(3))
     [45.    26.565 18.435]
     """
 
     def angles(i1: Array, i3: Array, w: Array) -> ConeAngles:
-        across, along = safe_norm(w[:2]), w[2]
+        across = safe_norm(w[:2])
+        along = w[2]
         # tan(alpha - theta), without the difference of two angles
         space = safe_arctan2(
             jnp.abs(i3 - i1) * across * jnp.abs(along),

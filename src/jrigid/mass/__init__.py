@@ -1,4 +1,4 @@
-"""Mass properties: point clouds, densities and meshes; parallel axis; principal axes; composition.
+"""Mass properties of points, densities and meshes; parallel and principal axes.
 
 Positions, centres of mass and tensors are components in one set of body axes [m, kg, kg
 m^2]. `MassProperties` holds its tensor about the centre of mass. Where moments repeat,

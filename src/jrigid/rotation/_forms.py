@@ -1,13 +1,13 @@
-"""Other forms of an attitude: matrices, Euler angles, roll, pitch and yaw, scipy's rotations."""
+"""Other forms of an attitude: matrices, Euler angles, roll-pitch-yaw, scipy."""
 
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
-from jrigid._checks import array_of_shape
-from jrigid._numerics import safe_arctan2, safe_norm
+from jrigid._checks import array_of_shape, where_defined
+from jrigid._numerics import product, safe_arctan2, safe_norm
 from jrigid._types import (
     Matrix,
     MatrixLike,
@@ -17,6 +17,9 @@ from jrigid._types import (
     VectorLike,
 )
 from jrigid.rotation._quaternion import multiply, normalize, rescaled, rotate
+
+# A matrix that is typed with four digits passes as a rotation.
+_ORTHOGONAL = 1e-3
 
 
 def hat(vector: VectorLike) -> Matrix:
@@ -83,27 +86,40 @@ def to_matrix(attitude: QuaternionLike) -> Matrix:
 
 
 def from_matrix(matrix: MatrixLike) -> Quaternion:
-    """Unit quaternion, w >= 0, of a rotation matrix.
+    """Unit quaternion, with w >= 0, of a rotation matrix.
 
     Args:
-        matrix: Rotation matrix, body to space. It is not checked; the result is
-            normalised.
+        matrix: Rotation matrix R, body to space.
 
     Returns:
         Unit quaternion. Where w = 0 (half turns) the sign makes the largest component
-        positive.
+        positive. NaN where the matrix is no rotation: where an element of R^T R - 1 is
+        larger than 1e-3, or where the determinant is negative (a reflection).
 
-    Gradients: those of a smooth extension off the rotation group; exact along it,
-        everywhere.
+    Gradients: those of a smooth extension off the rotation group. They are exact along
+    the group, everywhere.
     Source: S. W. Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1
-        (1978) 223.
+    (1978) 223.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.rotation.from_matrix(jnp.diag(jnp.array([1.0, -1.0, -1.0]))))
     [0. 1. 0. 0.]
     """
     m = array_of_shape("matrix", matrix, 3, 3)
-    a, b, c = m[0, 0], m[1, 1], m[2, 2]
+    return where_defined(_is_rotation(jax.lax.stop_gradient(m)), _from_rotation, m)
+
+
+def _is_rotation(matrix: Array) -> Bool[Array, ""]:
+    """Whether a matrix is orthogonal to `_ORTHOGONAL` and right-handed."""
+    excess = product("ki,kj->ij", matrix, matrix) - jnp.eye(3, dtype=matrix.dtype)
+    first, second, third = matrix
+    determinant = jnp.sum(jnp.cross(first, second) * third)
+    return jnp.all(jnp.abs(excess) <= _ORTHOGONAL) & (determinant > 0)
+
+
+def _from_rotation(m: Array) -> Quaternion:
+    """Shepperd's formula: the row of 4 q q^T with the largest diagonal element."""
+    a, b, c = jnp.diagonal(m)
     p, q, r = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     s, t, u = m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2]
     # Each row is 4 q_k q; the one with the largest q_k is the accurate one.

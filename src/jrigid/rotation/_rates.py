@@ -1,4 +1,4 @@
-"""Rates: between attitude and angular velocity, and from gyro samples back to an attitude."""
+"""Rates of an attitude, angular velocity, and dead reckoning from gyro samples."""
 
 import jax
 import jax.numpy as jnp

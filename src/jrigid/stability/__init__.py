@@ -1,4 +1,4 @@
-"""Stability: growth rates, linearisation, maps, chaos, and where a damped body ends."""
+"""Stability: growth rates, linearisation, maps, chaos, sections, final spin."""
 
 from jrigid.stability._closed import REGIONS as REGIONS
 from jrigid.stability._closed import Modes as Modes
@@ -14,6 +14,10 @@ from jrigid.stability._closed import precession_stability as precession_stabilit
 from jrigid.stability._closed import satellite_stability as satellite_stability
 from jrigid.stability._closed import top_stability as top_stability
 from jrigid.stability._eigen import eigenvalues as eigenvalues
+from jrigid.stability._final_spin import SIDES as SIDES
+from jrigid.stability._final_spin import FinalSpin as FinalSpin
+from jrigid.stability._final_spin import final_spin as final_spin
+from jrigid.stability._flip_time import flip_time as flip_time
 from jrigid.stability._linearize import STABILITY as STABILITY
 from jrigid.stability._linearize import Linearization as Linearization
 from jrigid.stability._linearize import linearize as linearize
@@ -24,9 +28,5 @@ from jrigid.stability._lyapunov import lyapunov_spectrum as lyapunov_spectrum
 from jrigid.stability._lyapunov import megno as megno
 from jrigid.stability._maps import boundary as boundary
 from jrigid.stability._maps import stability_map as stability_map
-from jrigid.stability._tumbling import SIDES as SIDES
-from jrigid.stability._tumbling import FinalSpin as FinalSpin
-from jrigid.stability._tumbling import Section as Section
-from jrigid.stability._tumbling import final_spin as final_spin
-from jrigid.stability._tumbling import flip_time as flip_time
-from jrigid.stability._tumbling import poincare_section as poincare_section
+from jrigid.stability._section import Section as Section
+from jrigid.stability._section import poincare_section as poincare_section

@@ -1,7 +1,7 @@
-"""Closed forms: small wobbles about a principal axis, sleeping and precessing tops, satellites."""
+"""Closed forms of stability: spin about a principal axis, tops, satellites."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,22 +23,22 @@ from jrigid._types import Real, Scalar, ScalarLike, VectorLike
 from jrigid.top import SymmetricTop, steady_precession
 
 Answer = TypeVar("Answer")
-# Moments of a flat body, of which one is the sum of the others, pass with this many
-# eps.
+# Moments of a flat body, of which one is the sum of the others, pass with an error of
+# this many eps.
 _FLAT = 8
 
 
 class Modes(NamedTuple):
-    """The two small motions about a principal axis, each in proportion to exp(rate t).
+    """The two small motions about a principal axis, proportional to exp(rate t).
 
     Attributes:
-        rates: Growing or turning, and its opposite [1/s].
-        shapes: For each the two small components of the angular velocity, those of the
-            axes that follow the spin axis in cyclic order; of unit length. Both the
-            same, at rates of 0, where the motion drifts; zero where nothing couples the
-            two.
-        amplitude_ratio: |second component / first|; infinite or NaN, and its slopes,
-            where a coupling is zero.
+        rates: A rate that grows or oscillates, and its opposite [1/s].
+        shapes: For each rate the two small components of the angular velocity, of unit
+            length. They belong to the axes that follow the spin axis in cyclic order.
+            At zero rates, where the motion drifts, both shapes are the same. They are
+            zero where the two components are not coupled.
+        amplitude_ratio: |second component / first|. It and its slopes are infinite or
+            NaN where a coupling is zero.
     """
 
     rates: Complex[Array, "2"]
@@ -54,9 +54,10 @@ def _of_couplings(
     rotor: ScalarLike,
     *others: ArrayLike,
 ) -> Answer:
-    """A formula of what couples the two small components j and k, and of others.
+    """Apply a formula of the couplings of the two small components, and of others.
 
-    w_j' = towards w_k, w_k' = back w_j. NaN outside the domain of the arguments.
+    The components j and k obey w_j' = towards w_k and w_k' = back w_j. NaN outside the
+    domain of the arguments.
     """
     check_option("axis", axis, (0, 1, 2))
     moments, spin, rotor = shaped(moments=(moments, 3), spin=(spin,), rotor=(rotor,))
@@ -65,59 +66,73 @@ def _of_couplings(
     def of_arrays(moments: Array, spin: Array, rotor: Array, *others: Array) -> Answer:
         own, first, second = jnp.roll(moments, -axis)
         towards = ((second - own) * spin - rotor) / first
-        return formula(towards, ((own - first) * spin + rotor) / second, *others)
+        back = ((own - first) * spin + rotor) / second
+        return formula(towards, back, *others)
 
     ok = all_positive(moments) & all_finite((spin, rotor, arrays))
     return where_defined(ok, of_arrays, moments, spin, rotor, *arrays)
 
 
+class _Wobble(NamedTuple):
+    """Growth and frequency of a small wobble."""
+
+    growth_rate_squared: Array
+    growth_rate: Array
+    frequency: Array
+
+
+def _wobble(towards: Array, back: Array) -> _Wobble:
+    """The wobble w'' = towards back w."""
+    square = towards * back
+    return _Wobble(square, root_of_positive(square), root_of_positive(-square))
+
+
 def growth_rate_squared(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Scalar:
-    """Square of the rate at which a small wobble grows about a principal axis.
+    """Square of the rate at which a small wobble about a principal axis grows.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
+        spin: Angular velocity about the axis [rad/s].
         rotor: Angular momentum of a rotor along the axis, relative to the body [kg
             m^2/s].
 
     Returns:
-        Square of the growth rate [1/s^2]; where negative, minus the square of the
-        frequency. NaN outside positive, finite moments and finite rates.
+        Square of the growth rate [1/s^2]. Where it is negative it is minus the square
+        of the frequency. NaN outside positive, finite moments and finite rates.
 
-    Gradients: polynomial over moments, finite everywhere.
+    Gradients: finite everywhere. The square is a polynomial over moments.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 37; with a rotor, Hughes,
     Spacecraft Attitude Dynamics (1986), section 6.3.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> moments = jnp.array([1.0, 2.0, 3.0])
-    >>> print([jr.stability.growth_rate_squared(moments, n, 1.0).item() for n in range(3)])
+    >>> square = jr.stability.growth_rate_squared
+    >>> print([square(moments, axis, 1.0).item() for axis in range(3)])
     [-0.3333333333333333, 0.3333333333333333, -1.0]
     """
-    return _of_couplings(
-        lambda towards, back: towards * back, moments, axis, spin, rotor
-    )
+    return _of_couplings(_wobble, moments, axis, spin, rotor).growth_rate_squared
 
 
 def growth_rate(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Scalar:
-    """Rate at which a small wobble grows about a principal axis; 0 where it does not.
+    """Rate at which a small wobble about a principal axis grows; 0 if it does not.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
+        spin: Angular velocity about the axis [rad/s].
         rotor: Angular momentum of a rotor along the axis, relative to the body [kg
             m^2/s].
 
     Returns:
-        Growth rate [1/s]. Where it is 0 the wobble turns: see `frequency`. NaN outside
-        positive, finite moments and finite rates.
+        Growth rate [1/s]. Where it is 0 the wobble oscillates: see `frequency`. NaN
+        outside positive, finite moments and finite rates.
 
-    Gradients: exact where it is positive; at the threshold itself, where they are
+    Gradients: exact where the rate is positive. At the threshold, where they are
     infinite, 0. Use `growth_rate_squared`, which is smooth there, to find thresholds.
     Source: as `growth_rate_squared`.
 
@@ -125,13 +140,7 @@ def growth_rate(
     >>> print(jr.stability.growth_rate(jnp.array([1.0, 2.0, 3.0]), 1, 2.0).round(6))
     1.154701
     """
-    return _of_couplings(
-        lambda towards, back: root_of_positive(towards * back),
-        moments,
-        axis,
-        spin,
-        rotor,
-    )
+    return _of_couplings(_wobble, moments, axis, spin, rotor).growth_rate
 
 
 def frequency(
@@ -142,12 +151,12 @@ def frequency(
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
+        spin: Angular velocity about the axis [rad/s].
         rotor: Angular momentum of a rotor along the axis, relative to the body [kg
             m^2/s].
 
     Returns:
-        Angular frequency [rad/s]; NaN outside positive, finite moments and finite
+        Angular frequency [rad/s]. NaN outside positive, finite moments and finite
         rates.
 
     Gradients: as `growth_rate`.
@@ -157,24 +166,18 @@ def frequency(
     >>> print(jr.stability.frequency(jnp.array([1.0, 2.0, 3.0]), 2, 2.0))
     2.0
     """
-    return _of_couplings(
-        lambda towards, back: root_of_positive(-towards * back),
-        moments,
-        axis,
-        spin,
-        rotor,
-    )
+    return _of_couplings(_wobble, moments, axis, spin, rotor).frequency
 
 
 def modes(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Modes:
-    """The two small motions about spin on a principal axis.
+    """The two small motions about a spin on a principal axis.
 
     Args:
         moments: Principal moments [kg m^2].
         axis: 0, 1 or 2.
-        spin: Rate of the rotation about it [rad/s].
+        spin: Angular velocity about the axis [rad/s].
         rotor: Angular momentum of a rotor along the axis, relative to the body [kg
             m^2/s].
 
@@ -193,14 +196,15 @@ def modes(
 
 
 def _modes(towards: Array, back: Array) -> Modes:
-    square = towards * back
-    rate = jax.lax.complex(root_of_positive(square), root_of_positive(-square))
+    wobble = _wobble(towards, back)
+    rate = jax.lax.complex(wobble.growth_rate, wobble.frequency)
     rates = jnp.stack([rate, -rate])
-    # (towards, rate) and (rate, back) are parallel: the longer one is the better one.
+    # (towards, rate) and (rate, back) are parallel: the longer one is more accurate.
     of_first = jnp.abs(towards) >= jnp.abs(back)
     upper = jnp.where(of_first, towards.astype(rates.dtype), rates)
     lower = jnp.where(of_first, rates, back.astype(rates.dtype))
-    length = root_of_positive(jnp.abs(square) + jnp.maximum(towards**2, back**2))
+    square = jnp.abs(wobble.growth_rate_squared)
+    length = root_of_positive(square + jnp.maximum(towards**2, back**2))
     length = jnp.where(length > 0, length, 1.0).astype(rates.dtype)
     shapes = jnp.stack([upper, lower], axis=1) / length
     return Modes(rates, shapes, jnp.sqrt(jnp.abs(back / towards)))
@@ -209,17 +213,17 @@ def _modes(towards: Array, back: Array) -> Modes:
 def linearized(
     moments: VectorLike, axis: int, omega0: VectorLike, ts: Real[ArrayLike, "..."]
 ) -> Float[Array, "... 3"]:
-    """Angular velocity of a small wobble about a principal axis, by the linearised equations.
+    """Angular velocity of a small wobble about a principal axis, linearised.
 
     Args:
         moments: Principal moments [kg m^2].
-        axis: 0, 1 or 2: the axis that `omega0` is near.
+        axis: The axis that `omega0` is near: 0, 1 or 2.
         omega0: Angular velocity at time 0, body components [rad/s].
         ts: Times [s] of any shape.
 
     Returns:
-        Body components [rad/s]; the error is of the order of the wobble squared, while
-        it is small. NaN outside positive, finite moments, and at a time that is not
+        Body components [rad/s]. While the wobble is small the error is of the order of
+        its square. NaN outside positive, finite moments, and at a time that is not
         finite.
 
     Gradients: finite everywhere, equal moments included.
@@ -234,23 +238,29 @@ def linearized(
     check_shape("omega0", omega0, (3,))
     check_option("axis", axis, (0, 1, 2))
 
-    def wave(towards: Array, back: Array, omega0: Array, t: Array) -> Array:
+    def at_time(t: Array) -> Array:
+        spin = omega0[axis]
+        return _of_couplings(small_wobble, moments, axis, spin, 0.0, omega0, t)
+
+    def small_wobble(towards: Array, back: Array, omega0: Array, t: Array) -> Array:
         spin, first, second = jnp.roll(omega0, -axis)
         square = towards * back * t * t
-        even, odd = cosh_sqrt(square), t * sinhc_sqrt(square)
-        turned = first * even + towards * odd * second
-        return jnp.roll(
-            jnp.stack([spin, turned, second * even + back * odd * first]), axis
+        even = cosh_sqrt(square)
+        odd = t * sinhc_sqrt(square)
+        components = jnp.stack(
+            [
+                spin,
+                first * even + towards * odd * second,
+                second * even + back * odd * first,
+            ]
         )
+        return jnp.roll(components, axis)
 
-    each = jax.vmap(
-        lambda t: _of_couplings(wave, moments, axis, omega0[axis], 0.0, omega0, t)
-    )
-    return each(ts.reshape(-1)).reshape(*ts.shape, 3)
+    return jax.vmap(at_time)(ts.reshape(-1)).reshape(*ts.shape, 3)
 
 
 class REGIONS(Enumeration):
-    """Where in DeBra and Delp's plane the moments of a satellite lie."""
+    """Regions of DeBra and Delp's plane of the moments of a satellite."""
 
     unstable = "unstable"
     Lagrange = "Lagrange"
@@ -260,15 +270,15 @@ class REGIONS(Enumeration):
 
 
 class TopStability(NamedTuple):
-    """A vertical top.
+    """Stability of a vertical top.
 
     Attributes:
-        growth_rate_squared: Smooth through 0: where positive, the square of the rate at
-            which the tilt grows; where negative, minus the square of half the
-            difference of `frequencies` [1/s^2].
-        growth_rate: Its root, or 0 [1/s].
-        frequencies: At which the tilt goes round the vertical, the nutation and the
-            slow precession; both the same where it grows [rad/s].
+        growth_rate_squared: Square of the rate at which the tilt grows [1/s^2]. It is
+            smooth through 0. Where it is negative it is minus the square of half the
+            difference of `frequencies`.
+        growth_rate: Its root, or 0 where it is negative [1/s].
+        frequencies: Rates at which the tilt goes round the vertical: the nutation and
+            the slow precession. Both are the same where the tilt grows [rad/s].
     """
 
     growth_rate_squared: Scalar
@@ -276,33 +286,38 @@ class TopStability(NamedTuple):
     frequencies: Float[Array, "2"]
 
 
-def _of_top(formula: Callable[..., Answer], top: Any, **numbers: Any) -> Answer:
-    """A formula of I1, I3, mgl and the numbers, NaN outside its domain."""
+def _of_top(
+    formula: Callable[..., Answer], top: SymmetricTop, **numbers: ScalarLike
+) -> Answer:
+    """Apply a formula of I1, I3, mgl and numbers; NaN outside its domain."""
     check_type("top", top, SymmetricTop)
-    arrays = shaped(**{name: (value,) for name, value in (vars(top) | numbers).items()})
+    arguments = {name: (value,) for name, value in (vars(top) | numbers).items()}
+    arrays = shaped(**arguments)
     return where_defined(top.is_valid & all_finite(arrays), formula, *arrays)
 
 
 def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
-    """Stability of a vertical top: sleeping (mgl > 0), or hanging (mgl < 0).
+    """Stability of a vertical top: sleeping (mgl > 0) or hanging (mgl < 0).
 
-    The tilt, as a complex number in the plane, obeys I1 z'' - i I3 omega3 z' - mgl z =
-    0.
+    The tilt, written as a complex number in the horizontal plane, obeys
+    I1 z'' - i I3 omega3 z' - mgl z = 0.
 
     Args:
         top: The top.
         omega3: Its spin [rad/s].
 
     Returns:
-        Growth rate or frequencies; NaN outside positive, finite moments, finite mgl and
-        spin.
+        Growth rate and frequencies. NaN outside positive, finite moments, finite mgl
+        and spin.
 
-    Gradients: of the square exact everywhere; of its root as `growth_rate`.
+    Gradients: those of the square are exact everywhere; those of its root are as for
+    `growth_rate`.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)  # falls asleep at omega3 = 4
-    >>> print([jr.stability.top_stability(top, w).growth_rate.item() for w in (0.0, 4.0, 5.0)])
+    >>> stability = [jr.stability.top_stability(top, w) for w in (0.0, 4.0, 5.0)]
+    >>> print([x.growth_rate.item() for x in stability])
     [1.0, 0.0, 0.0]
     """
 
@@ -317,7 +332,7 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
 
 
 class PrecessionStability(NamedTuple):
-    """Both steady precessions of a top at a tilt, slow and fast.
+    """Stability of the slow and the fast steady precession of a top at a tilt.
 
     Attributes:
         precession: Rates [rad/s]; the fast one is infinite for a level top.
@@ -334,7 +349,7 @@ class PrecessionStability(NamedTuple):
 def precession_stability(
     top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike
 ) -> PrecessionStability:
-    """Stability of steady precession: a small nutation turns and never grows, while there is one.
+    """Stability of steady precession: a small nutation oscillates and never grows.
 
     Args:
         top: The top.
@@ -342,47 +357,47 @@ def precession_stability(
         omega3: Third component of the angular velocity [rad/s].
 
     Returns:
-        For the slow and the fast precession p the square -(p^2 sin^2 theta + (I3 omega3
-        / I1 - 2 p cos theta)^2); NaN outside positive, finite moments, finite mgl, tilt
-        and spin.
+        The square -(p^2 sin^2 theta + (I3 omega3 / I1 - 2 p cos theta)^2) of the slow
+        and of the fast precession p. NaN outside positive, finite moments, finite mgl,
+        tilt and spin.
 
     Gradients: as those of `top.steady_precession`.
     Source: from the second derivative of `top.effective_potential`; docs/stability.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
-    >>> print(jr.stability.precession_stability(top, jnp.pi / 3, 6.0).growth_rate_squared.round(4))
+    >>> stability = jr.stability.precession_stability(top, jnp.pi / 3, 6.0)
+    >>> print(stability.growth_rate_squared.round(4))
     [ -7.0941 -30.9059]
     """
 
     def formula(
         i1: Array, i3: Array, mgl: Array, tilt: Array, spin: Array
     ) -> tuple[Array, Array]:
-        steady = steady_precession(SymmetricTop(i1, i3, mgl), tilt, spin)
+        steady = steady_precession(SymmetricTop.unchecked(i1, i3, mgl), tilt, spin)
         rates = jnp.stack([steady.slow, steady.fast])
-        sine, cosine = jnp.sin(tilt), jnp.cos(tilt)
-        return rates, -((rates * sine) ** 2) - (
-            i3 * spin / i1 - 2 * rates * cosine
-        ) ** 2
+        azimuthal = rates * jnp.sin(tilt)
+        polar = i3 * spin / i1 - 2 * rates * jnp.cos(tilt)
+        return rates, -(azimuthal**2) - polar**2
 
     rates, squares = _of_top(formula, top, theta=theta, omega3=omega3)
     return PrecessionStability(rates, squares, ~jnp.isnan(rates[0]))
 
 
 class SatelliteStability(NamedTuple):
-    """A satellite that keeps its face to the attractor.
+    """Stability of a satellite that keeps one side to the attractor.
 
     Attributes:
         pitch_squared: Square of the growth rate of pitch, smooth through 0 [1/s^2].
         roll_yaw_squared: Squares of the two growth rates of roll and yaw, complex where
             they form two growing and two falling spirals [1/s^2].
         growth_rate: The largest [1/s].
-        margins: Four numbers that are all positive where it is stable, each smooth
-            through 0, of the moments (A, B, C) with k_R = (C - A)/B, k_Y = (C - B)/A:
-            (B - A)/C (pitch), k_R k_Y, 1 + 3 k_R + k_R k_Y, and its square less 16 k_R
-            k_Y.
-        region: One of `REGIONS`; "marginal" where nothing grows but a margin is not
-            positive, "undefined" for moments of no real body.
+        margins: Four numbers that are all positive where the satellite is stable, each
+            smooth through 0. With moments (A, B, C), k_R = (C - A)/B and k_Y = (C -
+            B)/A they are (B - A)/C (pitch), k_R k_Y, 1 + 3 k_R + k_R k_Y, and the
+            square of the latter less 16 k_R k_Y.
+        region: One of `REGIONS`. It is "marginal" where nothing grows but a margin is
+            not positive, and "undefined" for moments of no real body.
     """
 
     pitch_squared: Scalar
@@ -400,17 +415,17 @@ def satellite_stability(
     Args:
         moments: Principal moments about the axes that point along the radius (yaw),
             along the flight (roll) and along the normal of the orbit (pitch) [kg m^2].
-        orbital_rate: n [rad/s].
+        orbital_rate: Rate of the orbit, n [rad/s].
 
     Returns:
-        Growth rates, margins, and the region: Lagrange's (largest moment along the
-        normal, smallest along the radius), DeBra and Delp's, stable in the linear sense
-        only, or unstable. NaN outside positive, finite moments and a finite rate. A
-        region is of a real body: it is "undefined" where one moment exceeds the sum of
-            the others, which the equations allow.
+        Growth rates, margins, and the region. Lagrange's region has the largest moment
+        along the normal and the smallest along the radius; DeBra and Delp's is stable
+        in the linear sense only. NaN outside positive, finite moments and a finite
+        rate. The region is "undefined" where one moment exceeds the sum of the others:
+        the equations allow it, but no real body has such moments.
 
-    Gradients: of squares and margins exact where roll and yaw have different rates; of
-    the growth rate as `growth_rate`.
+    Gradients: those of squares and margins are exact where roll and yaw have different
+    rates; those of the growth rate are as for `growth_rate`.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), section 9.2; D. B. DeBra, R. H.
     Delp, Journal of the Astronautical Sciences 8 (1961) 14; derived in
     docs/stability.md.
@@ -432,27 +447,15 @@ def satellite_stability(
 
 def _satellite(moments: Array, n: Array) -> SatelliteStability:
     a, b, c = moments
-    roll, yaw = (c - a) / b, (c - b) / a
-    both, middle = roll * yaw, 1 + 3 * roll + roll * yaw
-    inside = middle * middle - 16 * both
+    roll = (c - a) / b
+    yaw = (c - b) / a
+    product = roll * yaw
+    middle = 1 + 3 * roll + roll * yaw
+    discriminant = middle * middle - 16 * product
     pitch = 3 * (a - b) / c
-    # s^4 + middle s^2 + 4 both = 0, for s^2, in units of n
-    root = root_of_positive(inside)
-    first = -0.5 * (middle + jnp.where(middle < 0, -root, root))
-    second = jnp.where(
-        first != 0, 4 * both / jnp.where(first != 0, first, 1.0), -middle - first
-    )
-    apart, spiral = inside < 0, 0.5 * root_of_positive(-inside)
-    squares = jax.lax.complex(
-        jnp.where(apart, -0.5 * middle, jnp.stack([first, second])),
-        jnp.stack([spiral, -spiral]),
-    )
-    # Re sqrt(z) = sqrt((|z| + Re z) / 2), and |z| is 2 sqrt(both) for both of a complex
-    # pair.
-    of_spiral = root_of_positive(root_of_positive(both) - 0.25 * middle)
-    of_real = root_of_positive(jnp.maximum(first, second))
-    growth = jnp.maximum(root_of_positive(pitch), jnp.where(apart, of_spiral, of_real))
-    margins = jnp.stack([(b - a) / c, both, middle, inside])
+    squares, growth = _roll_and_yaw(product, middle, discriminant)
+    growth = jnp.maximum(root_of_positive(pitch), growth)
+    margins = jnp.stack([(b - a) / c, product, middle, discriminant])
     stable = REGIONS.where(yaw > 0, REGIONS.Lagrange, REGIONS.DeBra_Delp)
     others = REGIONS.where(growth > 0, REGIONS.unstable, REGIONS.marginal)
     region = REGIONS.where(jnp.all(margins > 0), stable, others)
@@ -460,3 +463,26 @@ def _satellite(moments: Array, n: Array) -> SatelliteStability:
     return SatelliteStability(
         n * n * pitch, squares, jnp.abs(n) * growth, margins, region
     )
+
+
+def _roll_and_yaw(
+    product: Array, middle: Array, discriminant: Array
+) -> tuple[Array, Array]:
+    """Both roots s^2 of s^4 + middle s^2 + 4 product = 0, and the largest Re s."""
+    root = root_of_positive(discriminant)
+    # The root of larger magnitude first: the other one follows without cancellation.
+    first = -0.5 * (middle + jnp.where(middle < 0, -root, root))
+    second = jnp.where(
+        first != 0, 4 * product / jnp.where(first != 0, first, 1.0), -middle - first
+    )
+    is_complex = discriminant < 0
+    imaginary = 0.5 * root_of_positive(-discriminant)
+    squares = jax.lax.complex(
+        jnp.where(is_complex, -0.5 * middle, jnp.stack([first, second])),
+        jnp.stack([imaginary, -imaginary]),
+    )
+    # Re sqrt(z) = sqrt((|z| + Re z) / 2), and |z| is 2 sqrt(product) for both of a
+    # complex pair.
+    of_complex = root_of_positive(root_of_positive(product) - 0.25 * middle)
+    of_real = root_of_positive(jnp.maximum(first, second))
+    return squares, jnp.where(is_complex, of_complex, of_real)

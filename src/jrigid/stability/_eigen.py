@@ -1,7 +1,4 @@
-"""Eigenvalues of a small matrix whose derivatives are finite, also where two of them meet.
-
-And how far they are from the edge of stability, smooth through it.
-"""
+"""Eigenvalues with finite derivatives also where two meet; the stability margin."""
 
 import jax
 import jax.numpy as jnp
@@ -11,26 +8,29 @@ from jrigid._checks import all_finite, check_shape, float_arrays, where_defined
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
 
-_POINTS = 48  # of the contour: its error is 2^-48 for an eigenvalue by itself
-_SHARED = 0.999  # cosine of the angle below which two eigenvectors count as one
-_TOGETHER = 8.0  # sqrt(eps) of the matrix: eigenvalues nearer than that count as one
+# Points of the contour. The error is 2^-48 for an isolated eigenvalue.
+_POINTS = 48
+# Two eigenvectors whose angle has a larger cosine than this count as one.
+_SHARED = 0.999
+# Eigenvalues that are closer than this times sqrt(eps) of the matrix count as one.
+_TOGETHER = 8.0
 
 
 def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
-    """Eigenvalues of a square matrix, in the order of their real parts, the largest first.
+    """Eigenvalues of a square matrix, by descending real part.
 
     Args:
         matrix: Any square matrix, whose entries are of comparable size.
 
     Returns:
-        Its eigenvalues; real parts closer than 1e-5 of the matrix's norm count as
-        equal, and there the larger imaginary part comes first. NaN of a matrix that is
+        Its eigenvalues. Real parts closer than 1e-5 of the matrix's norm count as
+        equal, and there the larger imaginary part comes first. NaN for a matrix that is
         not finite.
 
-    Gradients: exact where an eigenvalue is by itself. Eigenvalues that are nearer than
-    8 sqrt(eps) of the matrix's norm (1e-7 in float64) count as one, and each gets the
-    derivative of their mean, which is smooth where they meet; its own may be infinite
-    there. Never NaN, in all orders.
+    Gradients: exact for an isolated eigenvalue. Eigenvalues closer than 8 sqrt(eps) of
+    the matrix's norm (1e-7 in float64) count as one. Each gets the derivative of their
+    mean, which is smooth where they meet; its own may be infinite there. No order of
+    derivative is NaN.
     Source: T. Kato, Perturbation Theory for Linear Operators, section II.2: derivatives
     by the projector (1 / 2 pi i) times the contour integral of the resolvent.
 
@@ -47,7 +47,7 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
 
 @jax.custom_jvp
 def eigensystem(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues in their order, and eigenvectors, columns without derivatives."""
+    """Eigenvalues in order, and eigenvectors: columns without derivatives."""
     values, vectors = jnp.linalg.eig(matrix)
     # Real parts that differ by rounding do not decide the order.
     rounded = jnp.round(values.real / _size(matrix) * 1e5)
@@ -56,7 +56,7 @@ def eigensystem(matrix: Array) -> tuple[Array, Array]:
 
 
 def _size(matrix: Array) -> Float[Array, ""]:
-    """Its norm; 1 of zeros."""
+    """Norm of a matrix; 1 for a matrix of zeros."""
     size = jnp.sqrt(jnp.sum(jnp.abs(matrix) ** 2))
     return jnp.where(size > 0, size, 1.0)
 
@@ -71,42 +71,58 @@ def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
 
 @jax.numpy_dtype_promotion("standard")
 def _slopes(matrix: Array, values: Array, change: Array) -> Array:
-    n, real = values.size, values.real.dtype
+    """Derivatives of the eigenvalues, of which those that are close get their mean.
+
+    The sum of the eigenvalues inside a contour changes by the trace of the projector
+    times the change of the matrix. A projector is an integral of the resolvent over a
+    circle, by the trapezoidal rule.
+    """
+    n = values.size
+    real = values.real.dtype
     size = jax.lax.stop_gradient(_size(matrix))
-    gaps = jnp.abs(values[:, None] - values[None, :])
-    near = gaps <= _TOGETHER * jnp.sqrt(jnp.finfo(real).eps) * size
-    # Neighbours of neighbours belong together too.
-    for _ in range(max(n - 1, 1).bit_length()):
-        near = jnp.any(near[:, :, None] & near[None, :, :], axis=1)
-    count = jnp.sum(near, axis=1)
-    centre = jnp.sum(jnp.where(near, values[None, :], 0.0), axis=1) / count
-    away = jnp.abs(values[None, :] - centre[:, None])
-    inner = jnp.max(away, axis=1, initial=0.0, where=near)
-    outer = jnp.min(away, axis=1, initial=4 * size, where=~near)  # none is so far
-    radius = jnp.where(inner < 0.25 * outer, 0.5 * outer, jnp.sqrt(inner * outer))
+    close = _clusters(values, _TOGETHER * jnp.sqrt(jnp.finfo(real).eps) * size)
+    count = jnp.sum(close, axis=1)
+    centre = jnp.sum(jnp.where(close, values[None, :], 0.0), axis=1) / count
+    radius = _contour_radius(values, centre, close, size)
     angles = 2 * jnp.pi * (jnp.arange(_POINTS).astype(real) + 0.5) / _POINTS
-    spokes = (
-        radius[:, None] * jax.lax.complex(jnp.cos(angles), jnp.sin(angles))[None, :]
-    )
-    points = (centre[:, None] + spokes)[:, :, None, None] * jnp.eye(n, dtype=real)[
-        None, None
-    ]
-    # The sum of the eigenvalues inside changes by the trace of the projector times the
-    # change.
-    resolvents = jnp.linalg.inv(points - matrix[None, None])
-    spread = product("ipjk,kj->ip", resolvents, change.astype(values.dtype))
-    return jnp.sum(spokes * spread, axis=1) / (_POINTS * count)
+    circle = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
+    spokes = radius[:, None] * circle[None, :]
+    points = (centre[:, None] + spokes)[:, :, None, None]
+    identity = jnp.eye(n, dtype=real)[None, None]
+    resolvents = jnp.linalg.inv(points * identity - matrix[None, None])
+    traces = product("ipjk,kj->ip", resolvents, change.astype(values.dtype))
+    return jnp.sum(spokes * traces, axis=1) / (_POINTS * count)
+
+
+def _clusters(values: Array, distance: Array) -> Array:
+    """Which eigenvalues count as one; neighbours of neighbours belong together."""
+    close = jnp.abs(values[:, None] - values[None, :]) <= distance
+    for _ in range(max(values.size - 1, 1).bit_length()):
+        close = jnp.any(close[:, :, None] & close[None, :, :], axis=1)
+    return close
+
+
+def _contour_radius(values: Array, centre: Array, close: Array, size: Array) -> Array:
+    """Radius of a circle round each cluster, with all other eigenvalues outside."""
+    distance = jnp.abs(values[None, :] - centre[:, None])
+    inner = jnp.max(distance, axis=1, initial=0.0, where=close)
+    # No eigenvalue is as far as the initial value.
+    outer = jnp.min(distance, axis=1, initial=4 * size, where=~close)
+    return jnp.where(inner < 0.25 * outer, 0.5 * outer, jnp.sqrt(inner * outer))
 
 
 def pairs(values: Array, vectors: Array) -> tuple[Array, Array]:
-    """Distances of each two eigenvalues, and whether they share a direction; infinite to itself."""
+    """Distances of all pairs of eigenvalues, and whether they share a direction.
+
+    The distance of an eigenvalue to itself is infinite.
+    """
     gaps = jnp.abs(values[:, None] - values[None, :])
     overlap = jnp.abs(product("ki,kj->ij", jnp.conj(vectors), vectors))
     return jnp.where(jnp.eye(values.size, dtype=bool), jnp.inf, gaps), overlap > _SHARED
 
 
 def null_directions(vectors: Array, operator: Array, tiny: Array) -> Array:
-    """Those of some rows that an operator takes to zero, orthonormal; zeros in place of others."""
+    """Rows that an operator maps to zero, made orthonormal; zeros replace others."""
     rows: list[Array] = []
     for vector in vectors:
         length = safe_norm(vector)
@@ -173,7 +189,9 @@ def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> 
 def _nearest(
     values: Array, vectors: Array, free: Array, tiny: Array
 ) -> tuple[Array, Array]:
-    """The two eigenvalues of an undamped motion that are nearest to growth, or grow most.
+    """The two eigenvalues of an undamped motion that are nearest to growth.
+
+    If there is growth, they are those that grow most.
 
     Two of one rate that have directions of their own do not count, nor does one with a
     zero that stays where it is.

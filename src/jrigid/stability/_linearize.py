@@ -1,4 +1,4 @@
-"""Linearisation about an equilibrium, or a motion that is one in a turning frame."""
+"""Linearisation about an equilibrium, at rest or in a turning frame."""
 
 from typing import Any, NamedTuple
 
@@ -25,23 +25,23 @@ from jrigid._types import Readable, Scalar, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.rotation import exp, multiply, rotate, rotate_inverse
 from jrigid.stability._eigen import eigensystem, margin, null_directions, pairs
-from jrigid.stability._steps import Motion, findings_of, motion_of
+from jrigid.stability._stepped_motion import Motion, findings_of, motion_of
 from jrigid.systems import RigidBody
 
 # Times, in units of the motion, at which the system is looked at again.
 _LATER = (0.7, 1.9)
 _NO_EQUILIBRIUM = (
-    "Argument `state0` must be an equilibrium, at rest or in the frame that turns with `body_rate` "
-    "and with the motion, but it is not: the state changes there."
+    "Argument `state0` must be an equilibrium, at rest or in the frame that turns with "
+    "`body_rate` and with the motion, but it is not: the state changes there."
 )
 _NOT_STATIONARY = (
-    "The system must look the same at all times in the frame that turns with the motion, but it "
-    "does not: what is linear about `state0` has no constant matrix."
+    "The system must look the same at all times in the frame that turns with the "
+    "motion, but it does not: what is linear about `state0` has no constant matrix."
 )
 
 
 class STABILITY(Enumeration):
-    """What the linearisation says of an equilibrium."""
+    """Stability of an equilibrium according to its linearisation."""
 
     unstable = "unstable"
     marginal = "marginal"
@@ -100,13 +100,13 @@ def linearize(
     space_axis: VectorLike | None = None,
     throw: bool = True,
 ) -> Linearization:
-    """Linearise a system about an equilibrium, or about a motion that is one in a turning frame.
+    """Linearise a system about an equilibrium, at rest or in a turning frame.
 
-    Without `body_rate` the frame turns with the body: right for rest, for the spin of a
-    free body or of a gyrostat, for a sleeping or hanging top, for a satellite that
-    keeps its face to the Earth on a circular orbit. A top in steady precession also
-    turns about its own axis, as seen by one who precesses with it: `body_rate` is that
-        turning.
+    Without `body_rate` the frame turns with the body. This is right for rest, for the
+    spin of a free body or of a gyrostat, for a sleeping or hanging top, and for a
+    satellite that keeps one side to the Earth on a circular orbit. A top in steady
+    precession also turns about its own axis relative to the precessing frame. That
+    rate is `body_rate`.
 
     Args:
         system: The body and its torque.
@@ -147,8 +147,8 @@ def linearize(
     frame = _Frame(motion, *(x.astype(none.dtype) for x in turns))
     if body_rate is not None and motion.dimension > 6:
         raise ValueError(
-            "Argument `body_rate` must be None for a body with internal parts, which turn with it, "
-            "but it is not."
+            "Argument `body_rate` must be None for a body with internal parts, which "
+            "turn with it, but it is not."
         )
     return settle(_linearize(frame), throw, _findings, frame)
 
@@ -203,9 +203,8 @@ class _Frame(NamedTuple):
         """
         system, state, args, t0, *_ = self.motion
         own, none = self.own, jnp.zeros(self.motion.dimension, rate.dtype)
-        along = jnp.where(
-            safe_norm(self.up) > 0, self.up, self.across
-        )  # the system's own axis
+        # The axis of symmetry of the system in space.
+        along = jnp.where(safe_norm(self.up) > 0, self.up, self.across)
         turned = none.at[:3].set(rotate_inverse(state.attitude, along))
         slewed = none.at[:6].set(
             jnp.concatenate([own, jnp.cross(state.omega, own) / rate])
@@ -231,9 +230,8 @@ class _Frame(NamedTuple):
     def units(self, rate: Scalar) -> Array:
         """Size of each component of x for an angle of 1."""
         system, state, *_ = self.motion
-        return spread(system, state, rate)[
-            1:
-        ]  # a turn has a component less than a quaternion
+        # A small rotation has one component less than a quaternion.
+        return spread(system, state, rate)[1:]
 
 
 def _accuracy(dtype: Any) -> Scalar:
@@ -246,7 +244,7 @@ def _findings(frame: _Frame) -> Findings:
 
 
 def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
-    """What is wrong; the frame, harmless where it is, the matrix in it, and the rate."""
+    """Findings; the frame, harmless in a bad lane; the matrix in it; and the rate."""
     findings = findings_of(frame.motion)
     for name, value in (("body_rate", frame.own), ("space_axis", frame.up)):
         message = f"Argument `{name}` must be finite, but it is not."

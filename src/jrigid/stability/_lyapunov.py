@@ -1,7 +1,8 @@
-"""Order and chaos: the spectrum of Lyapunov exponents, and an indicator that tells early."""
+"""Order and chaos: Lyapunov exponents, and MEGNO, a fast indicator of chaos."""
 
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jrigid._checks import (
 from jrigid._core.lanes import in_blocks
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.stability._steps import (
+from jrigid.stability._stepped_motion import (
     Motion,
     Walk,
     findings_of,
@@ -30,14 +31,16 @@ from jrigid.stability._steps import (
 )
 from jrigid.systems import RigidBody
 
-_REGULAR, _CHAOTIC = 3.0, 5.0  # between them MEGNO has not decided
-_INDEPENDENT = (
-    1e3  # eps that must be left of a small motion once those before it are taken off
-)
+# A MEGNO below the first is regular and above the second chaotic.
+_REGULAR = 3.0
+_CHAOTIC = 5.0
+# A small motion is independent of those before it if its part orthogonal to them has a
+# length of this many eps.
+_INDEPENDENT = 1e3
 
 
 class ORDER(Enumeration):
-    """What MEGNO says of a motion."""
+    """Kind of a motion according to MEGNO."""
 
     regular = "regular"
     undecided = "undecided"
@@ -46,13 +49,13 @@ class ORDER(Enumeration):
 
 
 class LyapunovSpectrum(NamedTuple):
-    """Lyapunov exponents, and how they settled.
+    """Lyapunov exponents and their convergence.
 
     Attributes:
         exponents: Mean rates of growth over the whole time, the largest first [1/s].
         ts: Times since the start [s].
         history: Exponents up to each of these times [1/s].
-        final_state: Where the motion ended.
+        final_state: State at the end.
         error: Largest local error of a step, in the scales of the variables.
         result: `jrigid.RESULTS`.
     """
@@ -62,23 +65,24 @@ class LyapunovSpectrum(NamedTuple):
     history: Float[Array, "samples count"]
     final_state: State
     error: Scalar
-    result: Any
+    result: RESULTS
 
 
 class Megno(NamedTuple):
     """Mean exponential growth of nearby orbits.
 
     Attributes:
-        megno: Mean Y over the whole time: tends to 2 for a regular motion (less for one
-            near a periodic orbit), and to half the exponent times the time for a
-            chaotic one.
-        exponent: 2 / time of it: an estimate of the largest exponent [1/s].
-        order: One of `ORDER`: "regular" below 3, "chaotic" above 5, between
-            "undecided". It starts at "regular" and needs some ten e-folding times to
-            leave it.
+        megno: Mean Y over the whole time. It tends to 2 for a regular motion (less near
+            a periodic orbit), and to half the exponent times the time for a chaotic
+            one.
+        exponent: Twice `megno` over the time: an estimate of the largest exponent
+            [1/s].
+        order: One of `ORDER`: "regular" below 3, "chaotic" above 5, "undecided"
+            between. A chaotic motion counts as regular for the first ten or so
+            e-folding times.
         ts: Times since the start [s].
         history: `megno` up to each of these times.
-        final_state: Where the motion ended.
+        final_state: State at the end.
         error: Largest local error of a step, in the scales of the variables.
         result: `jrigid.RESULTS`.
     """
@@ -90,11 +94,35 @@ class Megno(NamedTuple):
     history: Float[Array, " samples"]
     final_state: State
     error: Scalar
-    result: Any
+    result: RESULTS
 
 
-def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
-    """Rows to start from: those given, or some that lie along no axis."""
+class _Schedule(NamedTuple):
+    """How the steps of a motion are divided."""
+
+    samples: int
+    intervals: int  # in each sample; the tangents are orthonormalised after each
+    steps: int  # in each interval
+
+    @property
+    def total(self) -> int:
+        """Number of steps."""
+        return self.samples * self.intervals * self.steps
+
+
+def _schedule(steps: int, every: int, samples: int) -> _Schedule:
+    """Divide the steps into samples of one length, rounding their number up."""
+    steps = whole_number("steps", steps)
+    every = whole_number("every", every)
+    samples = min(whole_number("samples", samples), steps)
+    every = min(every, -(-steps // samples))
+    return _Schedule(samples, -(-steps // (samples * every)), every)
+
+
+def _starting_vectors(
+    motion: Motion, vectors: ArrayLike | None, count: int | None
+) -> Array:
+    """Small motions to start from: the given rows, or generic ones along no axis."""
     dimension = motion.dimension
     if vectors is None:
         count = dimension if count is None else whole_number("count", count)
@@ -103,80 +131,118 @@ def _starting_vectors(motion: Motion, vectors: Any, count: int | None) -> Array:
     rows = array_of_shape("vectors", vectors, count, dimension).astype(motion.t0.dtype)
     if len(rows) > dimension:
         raise ValueError(
-            f"Arguments `count` and `vectors` must name at most {dimension} small motions, but "
-            f"they name {len(rows)}."
+            f"Arguments `count` and `vectors` must name at most {dimension} small "
+            f"motions, but they name {len(rows)}."
         )
     return rows
 
 
 def _findings(motion: Motion, rows: Array) -> Findings:
+    """What is wrong with the values of a motion and of its starting vectors."""
     findings = findings_of(motion)
-    least = (
-        _INDEPENDENT * jnp.finfo(rows.dtype).eps * jnp.sqrt(jnp.sum(rows**2, axis=1))
+    lengths = jnp.sqrt(jnp.sum(rows**2, axis=1))
+    least = _INDEPENDENT * jnp.finfo(rows.dtype).eps * lengths
+    message = (
+        "Arguments `vector(s)` must be finite and linearly independent, but they are "
+        "not."
     )
-    message = "Arguments `vector(s)` must be finite and linearly independent, but they are not."
-    findings.require(
-        jnp.all(orthonormal(rows)[1] > least), RESULTS.invalid_state, message
-    )
+    independent = jnp.all(orthonormal(rows)[1] > least)
+    findings.require(independent, RESULTS.invalid_state, message)
     return findings
 
 
-def _plan(steps: Any, every: Any, samples: Any) -> tuple[int, int, int]:
-    """Samples, all of one length; intervals between renormalisations in each; steps in each."""
-    steps, every = whole_number("steps", steps), whole_number("every", every)
-    samples = min(whole_number("samples", samples), steps)
-    every = min(every, -(-steps // samples))
-    return samples, -(-steps // (samples * every)), every
+class _Growth(NamedTuple):
+    """Growth of the small motions up to a time."""
+
+    logarithms: Array  # of the growth of each, summed over the intervals
+    weighted: Array  # the same of the first, each interval times its number
+    indicator: Array  # sum of 2 weighted / number: MEGNO times the number
 
 
-def _followed(path: Walk, y: Array, plan: tuple[int, int, int]) -> tuple[Array, ...]:
-    """Where the motion ends, sums of the growth up to each sample, the largest local error.
+def _follow(
+    path: Walk, y: Array, schedule: _Schedule
+) -> tuple[Array, Array, Array, Array]:
+    """State at the end, logarithms and indicator at each sample, largest local error.
 
-    Orthonormal again after each interval; the indicator is that of the first one.
+    The sum of 2 weighted / number is the discrete MEGNO of Cincotta, Giordano and Simo.
     """
-    samples, each, every = plan
-    none = jnp.zeros((), y.dtype)
 
-    def interval(carry: tuple, index: Array) -> tuple[tuple, None]:
-        y, (totals, weighted, indicator), error = carry
-        y, local = path.follow(index * every, every, y)
+    def interval(
+        carry: tuple[Array, _Growth, Array], index: Array
+    ) -> tuple[tuple[Array, _Growth, Array], None]:
+        y, growth, error = carry
+        y, local = path.follow(index * schedule.steps, schedule.steps, y)
         rows, lengths = orthonormal(path.tangents(y))
-        logs, number = jnp.log(lengths), (1 + index).astype(y.dtype)
-        weighted = weighted + number * logs[0]
-        tally = (totals + logs, weighted, indicator + 2 * weighted / number)
-        return (path.with_tangents(y, rows), tally, jnp.maximum(error, local)), None
+        logs = jnp.log(lengths)
+        number = (1 + index).astype(y.dtype)
+        weighted = growth.weighted + number * logs[0]
+        growth = _Growth(
+            growth.logarithms + logs,
+            weighted,
+            growth.indicator + 2 * weighted / number,
+        )
+        return (path.with_tangents(y, rows), growth, jnp.maximum(error, local)), None
 
-    def sample(carry: tuple, first: Array) -> tuple[tuple, Any]:
-        carry, _ = jax.lax.scan(interval, carry, first + jnp.arange(each))
+    def sample(
+        carry: tuple[Array, _Growth, Array], first: Array
+    ) -> tuple[tuple[Array, _Growth, Array], _Growth]:
+        indices = first + jnp.arange(schedule.intervals)
+        carry, _ = jax.lax.scan(interval, carry, indices)
         return carry, carry[1]
 
-    begin = (y, (jnp.zeros(len(path.tangents(y)), y.dtype), none, none), none)
-    (y, _, error), (totals, _, indicator) = jax.lax.scan(
-        sample, begin, each * jnp.arange(samples)
-    )
-    return y, totals, indicator, error
+    zero = jnp.zeros((), y.dtype)
+    no_growth = _Growth(jnp.zeros(len(path.tangents(y)), y.dtype), zero, zero)
+    firsts = schedule.intervals * jnp.arange(schedule.samples)
+    (y, _, error), growth = jax.lax.scan(sample, (y, no_growth, zero), firsts)
+    return y, growth.logarithms, growth.indicator, error
+
+
+class _Indicators(NamedTuple):
+    """Both indicators, which one pass over the motion gives."""
+
+    spectrum: LyapunovSpectrum
+    megno: Megno
+    result: RESULTS
 
 
 @eqx.filter_jit
-def _growth(
-    motion: Motion, plan: tuple[int, int, int], rows: Array
-) -> tuple[LyapunovSpectrum, Megno]:
-    findings, (samples, each, every) = _findings(motion, rows), plan
-    path = walk(motion, samples * each * every, findings.ok)
+def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators:
+    findings = _findings(motion, rows)
+    path = walk(motion, schedule.total, findings.ok)
     y = path.with_tangents(path.start, orthonormal(rows)[0])
-    y, totals, indicator, error = in_blocks(
-        lambda path, y: _followed(path, y, plan), path, y
-    )
-    counts = (each * (1 + jnp.arange(samples))).astype(rows.dtype)
-    ts = path.step * every * counts
-    answer = (ts, totals / ts[:, None], indicator / counts, path.state(y))
-    ts, exponents, means, state = verdict(findings, error, answer)
-    mean, end = means[-1], (state, error, findings.result)
+
+    def follow(path: Walk, y: Array) -> tuple[Array, Array, Array, Array]:
+        return _follow(path, y, schedule)
+
+    y, logarithms, indicator, error = in_blocks(follow, path, y)
+    samples = 1 + jnp.arange(schedule.samples)
+    counts = (schedule.intervals * samples).astype(rows.dtype)
+    ts = path.step * schedule.steps * counts
+    values = (ts, logarithms / ts[:, None], indicator / counts, path.state(y))
+    ts, exponents, means, state = verdict(findings, error, values)
+    mean = means[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)
     order = ORDER.where(jnp.isnan(mean), ORDER.undefined, order)
-    spectrum = LyapunovSpectrum(exponents[-1], ts, exponents, *end)
-    return spectrum, Megno(mean, 2 * mean / ts[-1], order, ts, means, *end)
+    end = (state, error, findings.result)
+    return _Indicators(
+        LyapunovSpectrum(exponents[-1], ts, exponents, *end),
+        Megno(mean, 2 * mean / ts[-1], order, ts, means, *end),
+        findings.result,
+    )
+
+
+def _settled_indicators(
+    motion: Motion,
+    schedule: _Schedule,
+    vectors: ArrayLike | None,
+    count: int | None,
+    throw: bool,
+) -> _Indicators:
+    """Both indicators of a motion, or an error."""
+    rows = _starting_vectors(motion, vectors, count)
+    indicators = _indicators(motion, schedule, rows)
+    return settle(indicators, throw, _findings, motion, rows)
 
 
 def lyapunov_spectrum(
@@ -191,44 +257,44 @@ def lyapunov_spectrum(
     vectors: Real[ArrayLike, "count n"] | None = None,
     every: int = 10,
     samples: int = 50,
-    solver: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
     throw: bool = True,
 ) -> LyapunovSpectrum:
-    """Lyapunov exponents of a motion, by small motions beside it that are kept orthogonal.
+    """Lyapunov exponents of a motion, from small motions that are kept orthogonal.
 
-    The small motions live where they belong, a turn of the attitude and a change of the
-    angular velocity (and of internal parts): six exponents for a plain body, none of
-    the quaternion's norm. The steps are equal and their number is given, so that every
+    A small motion is a rotation of the attitude and a change of the angular velocity
+    (and of internal parts). A body without internal parts has six exponents; the norm
+    of the quaternion has none. The steps are equal and their number is given, so every
     lane of a map costs the same.
 
     Args:
         system: The body and its torque.
-        state0: Where the motion starts.
-        duration: How long it is followed [s]: an exponent is uncertain by a few over
-            the duration.
-        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step
-            too coarse is an error, not a wrong number.
+        state0: State at which the motion starts.
+        duration: Length of the motion [s]. The error of an exponent is a few over the
+            duration.
+        steps: Number of steps. Each turn of the fastest part needs some 20 to 60. Steps
+            that are too coarse raise an error.
         args: Passed to the torque.
         t0: Time at the start [s].
-        count: How many exponents, from the largest; all by default.
-        vectors: Small motions to start from, rows of (turn about the body axes, change
-            of the rate over the initial one, ...); they stay in any set that the motion
-            keeps invariant, such as that of a planar motion. Gives `count`.
-        every: Steps between two orthogonalisations.
-        samples: How many times of `history`.
+        count: Number of exponents, from the largest; all by default.
+        vectors: Small motions to start from: rows of (rotation vector in body axes,
+            change of the rate over the initial one, ...). They stay in any set that the
+            motion keeps invariant, such as that of a planar motion. Gives `count`.
+        every: Number of steps between two orthogonalisations.
+        samples: Number of times in `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
-        throw: False: a bad or an inaccurate lane is a result code and NaN.
+        throw: With False, a bad or an inaccurate lane gives a result code and NaN.
 
     Returns:
-        The exponents, and their means up to each of the times. (`steps` is rounded up
-        to fill all intervals.)
+        The exponents, and their means up to each of the times. `steps` is rounded up to
+        fill all intervals.
 
     Raises:
-        RuntimeError: Bad value, steps too coarse.
+        RuntimeError: A value is bad, or the steps are too coarse.
 
-    Gradients: none to be relied on: those of a chaotic motion grow as fast as it does.
+    Gradients: none to be relied on. Those of a chaotic motion grow as fast as it does.
     Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980)
-        9.
+    9.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))  # integrable: none grows
@@ -238,8 +304,8 @@ def lyapunov_spectrum(
     True (50, 6)
     """
     motion = motion_of(system, state0, args, t0, duration, solver)
-    plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vectors, count)
-    return settle(_growth(motion, plan, rows)[0], throw, _findings, motion, rows)
+    schedule = _schedule(steps, every, samples)
+    return _settled_indicators(motion, schedule, vectors, count, throw).spectrum
 
 
 def megno(
@@ -253,35 +319,35 @@ def megno(
     vector: Real[ArrayLike, " n"] | None = None,
     every: int = 10,
     samples: int = 50,
-    solver: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
     throw: bool = True,
 ) -> Megno:
-    """Mean exponential growth of nearby orbits: tells order from chaos long before an exponent.
+    """Mean exponential growth of nearby orbits (MEGNO), a fast indicator of chaos.
 
-    One small motion beside the motion is enough, and 2 is what it tends to for order of
-    any kind, without a constant of the system's own: that is why this one of the fast
-    indicators is here. It also gives the exponent of what is chaotic, in the same pass.
+    It separates order from chaos long before an exponent converges. It needs one small
+    motion, and tends to 2 for regular motion of any kind, without a constant that
+    depends on the system. The same pass gives the exponent of a chaotic motion.
 
     Args:
         system: The body and its torque.
-        state0: Where the motion starts.
-        duration: How long it is followed [s].
-        steps: Number of steps; some 20 to 60 for each turn of the fastest part. A step
-            too coarse is an error, not a wrong number.
+        state0: State at which the motion starts.
+        duration: Length of the motion [s].
+        steps: Number of steps. Each turn of the fastest part needs some 20 to 60. Steps
+            that are too coarse raise an error.
         args: Passed to the torque.
         t0: Time at the start [s].
         vector: The small motion to start from, as for `lyapunov_spectrum`.
-        every: Steps between two looks at its growth.
-        samples: How many times of `history`.
+        every: Number of steps between two measurements of its growth.
+        samples: Number of times in `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
-        throw: False: a bad or an inaccurate lane is a result code and NaN.
+        throw: With False, a bad or an inaccurate lane gives a result code and NaN.
 
     Returns:
-        The mean, the exponent it stands for, and the verdict. (`steps` is rounded up to
-        fill all intervals.)
+        The mean, the exponent it corresponds to, and the kind of motion. `steps` is
+        rounded up to fill all intervals.
 
     Raises:
-        RuntimeError: Bad value, steps too coarse.
+        RuntimeError: A value is bad, or the steps are too coarse.
 
     Gradients: none to be relied on.
     Source: P. M. Cincotta, C. Simo, Astronomy & Astrophysics Supplement 147 (2000) 205;
@@ -297,5 +363,5 @@ def megno(
     motion = motion_of(system, state0, args, t0, duration, solver)
     if vector is not None:
         vector = array_of_shape("vector", vector, motion.dimension)[None]
-    plan, rows = _plan(steps, every, samples), _starting_vectors(motion, vector, 1)
-    return settle(_growth(motion, plan, rows)[1], throw, _findings, motion, rows)
+    schedule = _schedule(steps, every, samples)
+    return _settled_indicators(motion, schedule, vector, 1, throw).megno

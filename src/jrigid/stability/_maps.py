@@ -1,4 +1,4 @@
-"""Maps of stability over any parameters, in blocks, and the boundaries between their regions."""
+"""Maps of stability over parameters, and the boundaries between their regions."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -55,7 +55,8 @@ def stability_map(
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> def square(second, third):
-    ...     return jr.stability.growth_rate_squared(jnp.stack([1.0, second, third]), 2, 1.0)
+    ...     moments = jnp.stack([1.0, second, third])
+    ...     return jr.stability.growth_rate_squared(moments, 2, 1.0)
     >>> ratios = jnp.linspace(0.5, 2.0, 4)
     >>> grid = jr.stability.stability_map(square, {"second": ratios, "third": ratios})
     >>> print(grid.values.shape, grid.labels, (grid.values > 0).sum())
@@ -69,9 +70,9 @@ def place_of_root(
 ) -> Scalar:
     """Place between 0 and 1 at which `rising(x, args)` goes from negative to positive.
 
-    So many halvings as the place asks for, and no look at the size of the values. A
-    function that is known to rise (`flip=False`) needs no check of its ends, which
-    would raise in a lane of vmap that looks for no root.
+    The number of bisections follows from the tolerance of the place alone. A function
+    that is known to rise (`flip=False`) needs no check of its ends, which would raise
+    an error in a lane of vmap that has no root.
 
     Gradients: by the implicit function theorem in `args`.
     """
@@ -96,17 +97,16 @@ def boundary(
     rtol: float | None = None,
     throw: bool = True,
 ) -> Scalar:
-    """Where a function of one parameter changes its sign: the edge of a region of stability.
+    """Parameter at which a function changes its sign: the edge of a stable region.
 
     Args:
-        function: `function(parameter, *args)`, a number that is positive on one side
-            and negative on the other, smooth between: a `growth_rate_squared`, one of
-                the margins.
-        lower: An end of the interval to look in, where the function has one sign.
-        upper: The other end, where it has the other.
-        *args: Passed to the function: what the boundary depends on.
-        rtol: Accuracy, as a part of the interval; by default 64 eps.
-        throw: False: NaN where there is no change of sign.
+        function: `function(parameter, *args)`, positive on one side, negative on the
+            other and smooth between, such as a `growth_rate_squared` or a margin.
+        lower: One end of the interval.
+        upper: The other end, where the function has the other sign.
+        *args: Passed to the function: parameters that the boundary depends on.
+        rtol: Accuracy, as a fraction of the interval; by default 64 eps.
+        throw: With False, NaN where there is no change of sign.
 
     Returns:
         The parameter at the boundary.
@@ -125,7 +125,8 @@ def boundary(
     ...     return jr.stability.top_stability(top, omega3).growth_rate_squared
     >>> print(jr.stability.boundary(upright, 1.0, 9.0, 1.0).round(9))
     4.0
-    >>> print(jax.grad(lambda mgl: jr.stability.boundary(upright, 1.0, 9.0, mgl))(1.0).round(9))
+    >>> threshold = lambda mgl: jr.stability.boundary(upright, 1.0, 9.0, mgl)
+    >>> print(jax.grad(threshold)(1.0).round(9))
     2.0
     """
     lower, upper = shaped(lower=(lower,), upper=(upper,))
@@ -148,8 +149,8 @@ def boundary(
     left = jnp.abs(jax.lax.stop_gradient(at_root))
     findings = Findings()
     message = (
-        "Arguments `lower` and `upper` must be on either side of a change of sign of the function, "
-        "which must be continuous there, but they are not."
+        "Arguments `lower` and `upper` must be on either side of a change of sign of "
+        "the function, which must be continuous there, but they are not."
     )
     findings.require(
         ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends

@@ -1,8 +1,7 @@
-"""The heavy top: Lagrange's in closed form, and what a textbook asks of it."""
+"""The heavy top: Lagrange's in closed form, its nutation and special motions."""
 
 from jrigid.top._integrals import Integrals as Integrals
 from jrigid.top._integrals import integrals as integrals
-from jrigid.top._motion import top_motion as top_motion
 from jrigid.top._nutation import CLASSES as CLASSES
 from jrigid.top._nutation import Advance as Advance
 from jrigid.top._nutation import NutationBounds as NutationBounds
@@ -25,4 +24,5 @@ from jrigid.top._special import gyroscopic as gyroscopic
 from jrigid.top._special import initial_state as initial_state
 from jrigid.top._special import sleeping_spin as sleeping_spin
 from jrigid.top._special import steady_precession as steady_precession
-from jrigid.top._top import SymmetricTop as SymmetricTop
+from jrigid.top._symmetric_top import SymmetricTop as SymmetricTop
+from jrigid.top._top_motion import top_motion as top_motion

@@ -1,4 +1,4 @@
-"""What heavy bodies keep, in the four cases in which they keep more than two things."""
+"""Integrals of motion of a heavy body, with the extra one of the integrable cases."""
 
 from functools import partial
 from typing import Literal, NamedTuple, get_args
@@ -22,7 +22,7 @@ from jrigid._types import Scalar
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
 from jrigid.rotation import rotate_inverse
 from jrigid.systems import RigidBody
-from jrigid.top._flow import square_of
+from jrigid.top._lame_solution import square_of
 from jrigid.torques import UniformGravity
 
 Case = Literal["euler", "lagrange", "kovalevskaya", "goryachev-chaplygin"]
@@ -30,14 +30,14 @@ _RATIOS = {"kovalevskaya": 2.0, "goryachev-chaplygin": 4.0}  # I1 / I3
 
 
 class Integrals(NamedTuple):
-    """What a heavy body with a fixed point keeps.
+    """Integrals of motion of a heavy body with a fixed point.
 
     Attributes:
-        energy: Kinetic and potential, the latter zero with the centre of mass level
-            [J].
+        energy: Kinetic plus potential energy; the latter is zero with the centre of
+            mass level with the fixed point [J].
         vertical_momentum: Angular momentum along the vertical, against gravity [kg
             m^2/s].
-        extra: The third integral of the case asked for, None without one: Euler's |L|^2
+        extra: The third integral of the requested case, or None: Euler's |L|^2
             [kg^2 m^4/s^2], Lagrange's I3 omega3 [kg m^2/s], Kovalevskaya's [1/s^4],
             that of Goryachev and Chaplygin [1/s^3].
     """
@@ -56,7 +56,7 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
 
     Args:
         body: A body under `torques.UniformGravity` alone; moments, not a tensor, where
-            a case is asked for.
+            a case is requested.
         state: Any state of the motion.
         case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3),
             "kovalevskaya" (I1 = I2 = 2 I3, lever across axis 3), "goryachev-chaplygin"
@@ -64,13 +64,14 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
             None.
 
     Returns:
-        What the motion keeps. NaN of a body that is not of the case to 1e-8 (float32:
-        3e-4), nor a body at all, or of a state that is none.
+        The integrals. NaN for a body that is not of the case to 1e-8 (float32: 3e-4),
+        and where the inertia or the state is not valid.
 
     Raises:
-        ValueError: Another torque, another case, a tensor with a case.
+        ValueError: The torque is another one, the case is unknown, or the inertia is a
+            tensor and a case is requested.
 
-    Gradients: analytic; without gravity those of the vertical momentum are zero.
+    Gradients: analytic. Without gravity those of the vertical momentum are zero.
     Source: V. V. Golubev, Lectures on the Integration of the Equations of Motion of a
     Rigid Body about a Fixed Point (1960); signs from Euler's and Poisson's equations.
 
@@ -87,8 +88,8 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
     check_option("case", case, (None, *get_args(Case)))
     if case is not None and body.inertia.ndim != 1:
         raise ValueError(
-            "Argument `body` must have principal moments where a case is asked for, but it has a "
-            "tensor."
+            "Argument `body` must have principal moments where a case is requested, "
+            "but it has a tensor."
         )
     pull, structure = jtu.tree_flatten(body.torque)
     state, (inertia, *pull) = plain_state("state", state, body.inertia, *pull)
@@ -101,6 +102,7 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
 def _integrals(
     case: Case | None, inertia: Array, gravity: UniformGravity, state: State
 ) -> Integrals:
+    """The integrals of a body that is of the case."""
     strength = safe_norm(gravity.gravity)
     pulls = strength > 0
     down = rotate_inverse(
@@ -110,7 +112,9 @@ def _integrals(
     momentum = angular_momentum(inertia, state.omega)
     energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
     rate = gravity.mass * strength / inertia[2]
-    w, c, g = (jax.lax.complex(*x[:2]) for x in (state.omega, rate * gravity.lever, up))
+    w = jax.lax.complex(*state.omega[:2])
+    c = jax.lax.complex(*(rate * gravity.lever)[:2])
+    g = jax.lax.complex(*up[:2])
     extra = None
     if case == "euler":
         extra = product("i,i->", momentum, momentum)
@@ -126,6 +130,8 @@ def _integrals(
 def _is_of_case(
     case: Case | None, inertia: Array, gravity: UniformGravity, state: State
 ) -> Array:
+    """Whether a body and its state are of the case."""
+
     def vanishes(x: Array, beside: Array) -> Array:
         tolerance = jnp.sqrt(jnp.finfo(inertia.dtype).eps)
         return jnp.max(jnp.abs(x)) <= tolerance * jnp.max(jnp.abs(beside))

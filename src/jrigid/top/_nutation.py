@@ -1,4 +1,4 @@
-"""What a symmetric top's motion looks like: bounds and period of nutation, precession, kind."""
+"""Nutation and precession of a symmetric top: bounds, period, mean rate, kind."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from jaxtyping import Array
 
 from jrigid._checks import Enumeration
 from jrigid._numerics import root_of_positive, safe_arctan2, safe_norm
-from jrigid._types import Scalar
+from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
-from jrigid.top._flow import Invariants, invariants, square_of
-from jrigid.top._top import Answer, SymmetricTop, of_motion
+from jrigid.top._lame_solution import Invariants, invariants, square_of
+from jrigid.top._symmetric_top import Answer, SymmetricTop, of_motion
 
 
 class CLASSES(Enumeration):
-    """The kinds of motion that `motion_class` tells apart; `CLASSES[kind]` is the text."""
+    """Kinds of motion that `motion_class` returns; `CLASSES[kind]` is the text."""
 
     wave = "wave"
     cusp = "cusp"
@@ -36,7 +36,7 @@ class NutationBounds(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """By how much the angles of precession and spin grow in one nutation [rad]."""
+    """Growth of the angles of precession and spin in one nutation [rad]."""
 
     phi: Scalar
     psi: Scalar
@@ -45,54 +45,78 @@ class Advance(NamedTuple):
 def _of_invariants(
     formula: Callable[[Invariants], Answer], top: SymmetricTop, state: State
 ) -> Answer:
-    """A formula of the invariants; NaN where the top or the state is not valid."""
+    """Apply a formula of the invariants; NaN where top or state are not valid."""
     return of_motion(lambda top, state: formula(invariants(top, state)), top, state)
 
 
-def _bounds(motion: Invariants) -> tuple[Array, Array, Array]:
-    """At the least and at the largest tilt |beta|^2 = (1 - cos tilt) / 2 and |alpha|^2; the spread.
+class _Bounds(NamedTuple):
+    """Squares at the least and at the largest tilt, of a motion with mgl >= 0.
 
-    For mgl < 0 of the motion upside down. From the smaller of the two squares, x, which
-    keeps its relative accuracy: (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0),
-    with the root X of the exact flow.
+    A motion with mgl < 0 is described upside down.
+    """
+
+    of_beta: Array  # |beta|^2 = (1 - cos tilt) / 2
+    of_alpha: Array  # |alpha|^2
+    spread: Array  # difference of |beta|^2 at the two
+
+
+# Long: one formula from the state to both bounds, where each line needs those above.
+def _bounds(motion: Invariants) -> _Bounds:
+    """The squares |alpha|^2 and |beta|^2 at the bounds of the tilt.
+
+    They follow from the smaller of the two squares, x, which keeps its relative
+    accuracy: (dx/dt)^2 / 4 = (X + mu |beta|^2) (-x^2 + c1 x + c0), with the root X of
+    the exact flow.
     """
     alpha, d_alpha, beta, d_beta = motion.start
-    mu, a, *_ = motion.kept
+    mu, a, *_ = motion.constants
     hanging = square_of(alpha) < square_of(beta)
-    x, dx = jnp.where(hanging, alpha, beta), jnp.where(hanging, d_alpha, d_beta)
-    m, c = jnp.where(hanging, mu, -mu), jnp.where(hanging, a - 3 * mu, a)
+    x = jnp.where(hanging, alpha, beta)
+    dx = jnp.where(hanging, d_alpha, d_beta)
+    m = jnp.where(hanging, mu, -mu)
+    c = jnp.where(hanging, a - 3 * mu, a)
     now = square_of(x)
     slope = square_of(dx) + now * (c + 2 * m * now)  # zero in steady motion
     root = jnp.where(motion.nutates, motion.root, 0.0)
     front = mu * square_of(beta) + root
-    # Upright at the separatrix: from there to -mu x^2 + a x = 0.
+    # Upright on the separatrix: from there to the other root of -mu x^2 + a x = 0.
     plain = front > 0
     front = jnp.where(plain, front, 1.0)
     speed = jnp.where(plain, (jnp.conj(x) * dx).real / jnp.sqrt(front), 0.0)
     fall = jnp.maximum(a, 0.0) / jnp.where(mu > 0, mu, 1.0)
     skew = jnp.where(plain, slope / front + m * (speed * (speed / front)), fall)
     spread = safe_norm(jnp.stack([skew, 2 * speed]))
-    # Without cancellation at the near end.
+    # The nearer bound is formed without cancellation.
     far = 0.5 * (jnp.abs(skew) + spread)
     near = speed * (speed / jnp.where(spread > 0, far, 1.0))
-    low = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
-    high = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
-    low, high = jnp.stack([low, 1 - high]), jnp.stack([high, 1 - low])
-    low, high = (
-        jnp.where(hanging, y[::-1], y) for y in (low, high)
-    )  # of beta and of alpha
-    # Where the lower bound is far below the upper one, with its relative accuracy: at x
-    # = 0 the slope's square is -J^2, of the constant momentum J. Roots of a smaller
-    # size carry rounding of the larger numbers they come from.
-    front, momenta = jnp.stack([root, root + mu]), jnp.stack(motion.momenta[::-1])
-    sound = motion.nutates & (front > 0.01 * mu) & (front > 0) & (low < 0.25 * high)
-    of_root = momenta * (momenta / jnp.where(sound, front, 1.0))
-    low = jnp.where(sound, of_root / jnp.where(sound, high, 1.0), low)
-    return jnp.stack([low[0], high[0]]), jnp.stack([high[1], low[1]]), spread
+    least = jnp.maximum(now - jnp.where(skew > 0, near, far), 0.0)
+    most = jnp.minimum(now + jnp.where(skew > 0, far, near), 1.0)
+    low = jnp.stack([least, 1 - most])
+    high = jnp.stack([most, 1 - least])
+    # In the order (of beta, of alpha).
+    low = jnp.where(hanging, low[::-1], low)
+    high = jnp.where(hanging, high[::-1], high)
+    low = _accurate_low(motion, root, low, high)
+    return _Bounds(jnp.stack([low[0], high[0]]), jnp.stack([high[1], low[1]]), spread)
+
+
+def _accurate_low(motion: Invariants, root: Array, low: Array, high: Array) -> Array:
+    """Lower bounds with full relative accuracy where they are far below the upper ones.
+
+    At x = 0 the square of the slope is -J^2, with J the constant momentum, so the
+    product of both bounds is known. Roots of a smaller size carry the rounding of the
+    larger numbers they come from, and are not used.
+    """
+    mu, *_ = motion.constants
+    front = jnp.stack([root, root + mu])
+    momenta = jnp.stack(motion.momenta[::-1])
+    usable = motion.nutates & (front > 0.01 * mu) & (front > 0) & (low < 0.25 * high)
+    both = momenta * (momenta / jnp.where(usable, front, 1.0))
+    return jnp.where(usable, both / jnp.where(usable, high, 1.0), low)
 
 
 def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
-    """The tilts between which the axis nods.
+    """Least and largest tilt of a motion.
 
     Args:
         top: The top.
@@ -102,8 +126,8 @@ def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
         Least and largest angle between the axis and the vertical; equal in steady
         precession.
 
-    Gradients: right where the two differ and neither is vertical; finite everywhere:
-    without the infinite part where they meet, zero at the vertical.
+    Gradients: right where the two differ and neither is vertical. Where the two meet
+    the infinite part is left out; at the vertical they are zero.
     Source: the roots of `cubic`, from the state rather than from its coefficients.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -129,9 +153,9 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
         state: Any state of the motion.
 
     Returns:
-        The period [s]; in steady precession that of small nutations; of a pendulum half
-        a swing, or a whole turn; infinite on the separatrix and for a top without
-        weight at rest.
+        The period [s]. In steady precession it is that of small nutations, and for a
+        pendulum it is half a swing, or a whole turn. It is infinite on the separatrix
+        and for a top without weight at rest.
 
     Gradients: analytic, also in steady precession; zero where the period is infinite.
     Source: docs/top.md, an arithmetic-geometric mean.
@@ -142,20 +166,24 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     >>> print(jr.top.nutation_period(top, state).round(5))
     3.51772
     """
-    return _of_invariants(
-        lambda x: jnp.where(x.nutates, x.period / x.unit, jnp.inf), top, state
-    )
+
+    def period(motion: Invariants) -> Array:
+        return jnp.where(motion.nutates, motion.period / motion.unit, jnp.inf)
+
+    return _of_invariants(period, top, state)
 
 
 def _advance(motion: Invariants) -> Advance:
-    plus, less = motion.momenta
-    of_alpha = motion.advance_alpha + jnp.pi * jnp.sign(plus)
-    of_beta = motion.advance_beta + motion.half_turn * jnp.sign(less)
+    """Advance in one nutation; zero where no nutation ends."""
+    momentum_alpha, momentum_beta = motion.momenta
+    of_alpha = motion.advance_alpha + jnp.pi * jnp.sign(momentum_alpha)
+    of_beta = motion.advance_beta + motion.half_turn * jnp.sign(momentum_beta)
     phi = jnp.where(motion.hangs, -1.0, 1.0) * (of_alpha + of_beta)
-    psi = (
-        of_alpha - of_beta + (motion.omega3 - motion.spin) / motion.unit * motion.period
+    slip = (motion.omega3 - motion.spin) / motion.unit * motion.period
+    psi = of_alpha - of_beta + slip
+    return Advance(
+        jnp.where(motion.nutates, phi, 0.0), jnp.where(motion.nutates, psi, 0.0)
     )
-    return Advance(*(jnp.where(motion.nutates, x, 0.0) for x in (phi, psi)))
 
 
 def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
@@ -166,9 +194,9 @@ def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
         state: Any state of the motion.
 
     Returns:
-        Growth of phi and psi [rad]. In a motion through the vertical, where phi jumps
-        by half a turn to either side, the mean of the two. Zero where the period is
-        infinite.
+        Growth of phi and psi [rad]. In a motion through the vertical phi jumps by half
+        a turn to either side, and the mean of the two is returned. Zero where the
+        period is infinite.
 
     Gradients: those of the branch, also in steady precession and through the vertical.
     Source: docs/top.md.
@@ -190,17 +218,18 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
         state: Any state of the motion.
 
     Returns:
-        The rate [rad/s]; in steady precession the rate of that; where the period is
-        infinite that with which the axis comes upright, I3 omega3 / (2 I1) (mgl < 0:
-        upside down, the opposite).
+        The rate [rad/s]. In steady precession it is the rate of that. Where the period
+        is infinite it is the rate at which the axis comes upright, I3 omega3 / (2 I1)
+        (for mgl < 0 the opposite, at which it comes upside down).
 
-    Gradients: analytic, also in steady precession; it jumps where the axis passes the
-        vertical.
+    Gradients: analytic, also in steady precession. The rate jumps where the axis passes
+    the vertical.
     Source: docs/top.md.
 
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
-    >>> print(jr.top.mean_precession(top, jr.top.initial_state(top, 0.5, omega3=100.0)).round(8))
+    >>> state = jr.top.initial_state(top, 0.5, omega3=100.0)
+    >>> print(jr.top.mean_precession(top, state).round(8))
     0.02000702
     """
 
@@ -213,21 +242,21 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
 
 
 def motion_class(top: SymmetricTop, state: State) -> CLASSES:
-    """What kind of motion it is, a member of `CLASSES`.
+    """Kind of a motion, a member of `CLASSES`.
 
-    The path of the axis on the sphere is a wave where it precesses one way throughout,
-    a loop where it turns back in each nutation, and has cusps between the two. Steady:
-    at a constant tilt. Sleeping: at the vertical, upright or hanging. Pendulum: in a
-    plane through the vertical, without spin. Through the vertical: spinning, and
-        upright or hanging at times.
+    The path of the axis on the sphere is a wave if the axis always precesses the same
+    way, a loop if it turns back in each nutation, and has cusps between the two. A
+    steady motion has a constant tilt. A sleeping top is vertical, upright or hanging. A
+    pendulum moves in a plane through the vertical, without spin. A motion through the
+    vertical has spin, and is upright or hanging at times.
 
     Args:
         top: The top.
         state: Any state of the motion.
 
     Returns:
-        The kind; `CLASSES.undefined` where the top or the state is not valid. Two sides
-        are told apart to some 1e-12 (float32: 5e-4) of their size.
+        The kind; `CLASSES.undefined` where the top or the state is not valid. Numbers
+        within some 1e-12 (float32: 5e-4) of their size count as equal.
 
     Gradients: none, it is an integer.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., section 35, problem 1.
@@ -241,24 +270,22 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     """
     motion = jax.lax.stop_gradient(_of_invariants(lambda motion: motion, top, state))
     alpha, d_alpha, beta, d_beta = motion.start
-    plus, less = motion.momenta  # about the vertical and the axis, added and subtracted
-    of_beta, of_alpha, spread = _bounds(motion)
+    bounds = _bounds(motion)
+    of_beta, of_alpha, spread = bounds
     eps = jnp.finfo(spread.dtype).eps
     tolerance = 4096 * eps
-    rate = jnp.sqrt(motion.kept[0] + square_of(d_alpha) + square_of(d_beta))
+    mu, *_ = motion.constants
+    rate = jnp.sqrt(mu + square_of(d_alpha) + square_of(d_beta))
     rate = jnp.where(rate > 0, rate, 1.0)
     pairs = (alpha, d_alpha), (beta, d_beta)
     away = jnp.minimum(*(rate**2 * square_of(x) + square_of(dx) for x, dx in pairs))
-    # phi' sin^2 / 4 at both bounds, 0 to rounding
-    turning = plus * of_beta + less * of_alpha
-    rounding = tolerance * (jnp.abs(plus * of_beta) + jnp.abs(less * of_alpha))
-    turns = jnp.prod(jnp.where(jnp.abs(turning) <= rounding, 0.0, jnp.sign(turning)))
-    vertical = (of_beta[0] <= tolerance * of_beta[1]) | (
-        of_alpha[1] <= tolerance * of_alpha[0]
-    )
+    turns = _turns(motion, bounds, tolerance)
+    upright = of_beta[0] <= tolerance * of_beta[1]
+    vertical = upright | (of_alpha[1] <= tolerance * of_alpha[0])
     widest = of_beta[1] * of_alpha[0]
-    momentum = jnp.maximum(jnp.abs(plus), jnp.abs(less))
+    momentum = jnp.maximum(*(jnp.abs(x) for x in motion.momenta))
     kind = CLASSES.wave
+    # A later kind overrides an earlier one.
     for holds, other in (
         (turns < 0, CLASSES.loop),
         (turns == 0, CLASSES.cusp),
@@ -270,3 +297,14 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     ):
         kind = CLASSES.where(holds, other, kind)
     return kind
+
+
+def _turns(motion: Invariants, bounds: _Bounds, tolerance: ScalarLike) -> Array:
+    """Sign of phi' at the least tilt times that at the largest; 0 within rounding."""
+    momentum_alpha, momentum_beta = motion.momenta
+    # phi' sin^2 / 4 at both bounds
+    of_alpha = momentum_alpha * bounds.of_beta
+    of_beta = momentum_beta * bounds.of_alpha
+    turning = of_alpha + of_beta
+    rounding = tolerance * (jnp.abs(of_alpha) + jnp.abs(of_beta))
+    return jnp.prod(jnp.where(jnp.abs(turning) <= rounding, 0.0, jnp.sign(turning)))

@@ -1,4 +1,4 @@
-"""The symmetric top in Euler angles: Lagrangian, momenta, and the motion reduced to the tilt."""
+"""The symmetric top in Euler angles: Lagrangian, momenta, reduced motion."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,16 +11,16 @@ from jrigid._numerics import product
 from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import rotate_inverse
-from jrigid.top._top import SymmetricTop, of_motion, where_valid
+from jrigid.top._symmetric_top import SymmetricTop, of_motion, where_valid
 
 
 class Conserved(NamedTuple):
-    """What a symmetric top's motion keeps.
+    """Constants of a symmetric top's motion.
 
     Attributes:
         p_phi: Angular momentum about the vertical [kg m^2/s].
         p_psi: Angular momentum about the axis, I3 omega3 [kg m^2/s].
-        energy: Kinetic and potential, the latter zero with the axis level [J].
+        energy: Kinetic plus potential energy, the latter zero with the axis level [J].
     """
 
     p_phi: Scalar
@@ -29,7 +29,7 @@ class Conserved(NamedTuple):
 
 
 class AngleRates(NamedTuple):
-    """Rates of the Euler angles that turn about the vertical and about the axis [rad/s]."""
+    """Rates of the angles about the vertical and about the axis [rad/s]."""
 
     phi: Scalar
     psi: Scalar
@@ -60,7 +60,8 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     i1, i3, mgl, q, q_dot = shaped(**own, q=(q, 3), q_dot=(q_dot, 3))
     _, theta, _ = q
     phi_dot, theta_dot, psi_dot = q_dot
-    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    cos = jnp.cos(theta)
+    sin = jnp.sin(theta)
     spin = psi_dot + phi_dot * cos
     across = theta_dot * theta_dot + (phi_dot * sin) ** 2
     return 0.5 * (i1 * across + i3 * spin * spin) - mgl * cos
@@ -97,16 +98,19 @@ def conserved(top: SymmetricTop, state: State) -> Conserved:
 
 
 def _over(momentum: Array, side: Array) -> Array:
-    """Half the quotient; 0 / 0, at the vertical and allowed to be there, is 0."""
+    """Half the quotient, with 0 / 0 = 0 for an axis that can pass the vertical."""
     zero = (momentum == 0) & (side == 0)
     return jnp.where(zero, 0.0, 0.5 * momentum / jnp.where(zero, 1.0, side))
 
 
-def _angle_rates(*numbers: Array) -> AngleRates:
-    i1, i3, _, theta, p_phi, p_psi = numbers
-    # The parts that are large near upright and near upside down, by half the angle.
-    sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
-    upper, lower = _over(p_phi - p_psi, sin * sin), _over(p_phi + p_psi, cos * cos)
+def _angle_rates(
+    i1: Array, i3: Array, _mgl: Array, theta: Array, p_phi: Array, p_psi: Array
+) -> AngleRates:
+    sin = jnp.sin(0.5 * theta)
+    cos = jnp.cos(0.5 * theta)
+    # The part that is large near upright, and the part that is large near upside down.
+    upper = _over(p_phi - p_psi, sin * sin)
+    lower = _over(p_phi + p_psi, cos * cos)
     phi = 0.5 * (upper + lower) / i1
     return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
 
@@ -124,13 +128,13 @@ def angle_rates(
 
     Returns:
         phi' = (p_phi - p_psi cos theta) / (I1 sin^2 theta) and psi' = p_psi / I3 - phi'
-        cos theta [rad/s]. Infinite at the vertical, unless the momenta let the axis
-        pass: then the mean of the two sides. At theta = pi, which no floating point
-        number is, large in place of infinite. NaN where the top is not valid or a
-        number not finite.
+        cos theta [rad/s]. At the vertical they are infinite, unless the momenta let the
+        axis pass: then they are the mean of the two sides. No floating point number
+        equals pi, so they are large there in place of infinite. NaN where the top is
+        not valid or a number is not finite.
 
-    Gradients: right inside 0 < theta < pi; in the momenta at the vertical without the
-    singular part.
+    Gradients: right inside 0 < theta < pi. Those in the momenta at the vertical leave
+    out the singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -156,12 +160,12 @@ def effective_potential(
         p_psi: Angular momentum about the axis [kg m^2/s].
 
     Returns:
-        V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J];
-        infinite at the vertical unless the momenta let the axis pass; NaN where the top
-        is not valid or a number not finite.
+        V = (p_phi - p_psi cos theta)^2 / (2 I1 sin^2 theta) + mgl cos theta [J]. It is
+        infinite at the vertical unless the momenta let the axis pass. NaN where the top
+        is not valid or a number is not finite.
 
-    Gradients: right where V is finite; in the momenta at the vertical without the
-        singular part.
+    Gradients: right where V is finite. Those in the momenta at the vertical leave out
+    the singular part.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -170,17 +174,19 @@ def effective_potential(
     0.5
     """
 
-    def potential(*numbers: Array) -> Array:
-        i1, _, mgl, theta, p_phi, p_psi = numbers
-        sin, cos = jnp.sin(0.5 * theta), jnp.cos(0.5 * theta)
+    def potential(
+        i1: Array, _i3: Array, mgl: Array, theta: Array, p_phi: Array, p_psi: Array
+    ) -> Array:
+        sin = jnp.sin(0.5 * theta)
+        cos = jnp.cos(0.5 * theta)
         # (p_phi - p_psi cos theta) / sin theta
         across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
         return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
 
-    momenta = {"p_phi": p_phi, "p_psi": p_psi}
-    return jnp.vectorize(
-        lambda theta: where_valid(potential, top, theta=theta, **momenta)
-    )(theta)
+    def at_tilt(theta: Array) -> Array:
+        return where_valid(potential, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
+
+    return jnp.vectorize(at_tilt)(theta)
 
 
 def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
@@ -193,7 +199,7 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
     Returns:
         Coefficients of f [1/s^2], the highest power first, as `jnp.polyval` takes them:
         f = (1 - u^2) (2 E - p_psi^2 / I3 - 2 mgl u) / I1 - ((p_phi - p_psi u) / I1)^2.
-        NaN where the top is not valid or a constant not finite.
+        NaN where the top is not valid or a constant is not finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -204,10 +210,14 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
     [ 4. -6.  0.  1.]
     """
 
-    def coefficients(*numbers: Array) -> Array:
-        i1, i3, mgl, p_phi, p_psi, energy = numbers
+    # The letters are Goldstein's.
+    def coefficients(
+        i1: Array, i3: Array, mgl: Array, p_phi: Array, p_psi: Array, energy: Array
+    ) -> Array:
         alpha = (2 * energy - p_psi * p_psi / i3) / i1
-        beta, a, b = 2 * mgl / i1, p_psi / i1, p_phi / i1
+        beta = 2 * mgl / i1
+        a = p_psi / i1
+        b = p_phi / i1
         return jnp.stack([beta, -alpha - a * a, 2 * a * b - beta, alpha - b * b])
 
     return where_valid(coefficients, top, **Conserved(*conserved)._asdict())
@@ -215,8 +225,8 @@ def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
 
 def reduced_vector_field(
     top: SymmetricTop, conserved: Conserved
-) -> Callable[[Any, Float[Array, "4"], Any], Float[Array, "4"]]:
-    """The one-dimensional motion of the tilt, with the angles that follow from it, for diffrax.
+) -> Callable[[ScalarLike, Float[Array, "4"], object], Float[Array, "4"]]:
+    """Vector field of the tilt, and of the angles that follow from it, for diffrax.
 
     Args:
         top: The top.
@@ -224,9 +234,9 @@ def reduced_vector_field(
 
     Returns:
         The rates `(t, y, args) -> y'` of y = (phi, theta, psi, theta') [rad, rad/s]:
-        theta'' = -V'(theta) / I1, and phi', psi' of `angle_rates`. Singular at the
-        vertical; an axis that may pass there (p_phi = +-p_psi) does pass, theta
-        changing its sign (or beyond pi).
+        theta'' = -V'(theta) / I1, and phi', psi' of `angle_rates`. They are singular at
+        the vertical. An axis that can pass there (p_phi = +-p_psi) does pass: theta
+        changes its sign (or exceeds pi).
 
     Gradients: analytic inside 0 < theta < pi.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -240,15 +250,12 @@ def reduced_vector_field(
     check_type("top", top, SymmetricTop)
     i1, i3, mgl, p_phi, p_psi, _ = float_arrays(top.I1, top.I3, top.mgl, *conserved)
 
-    def rates(t: Any, y: Float[Array, "4"], args: Any) -> Float[Array, "4"]:
+    def rates(t: ScalarLike, y: Float[Array, "4"], args: object) -> Float[Array, "4"]:
         del t, args
         _, theta, _, theta_dot = y
         phi_dot, psi_dot = _angle_rates(i1, i3, mgl, theta, p_phi, p_psi)
-        pull = (
-            (mgl + phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi))
-            * jnp.sin(theta)
-            / i1
-        )
-        return jnp.stack([phi_dot, theta_dot, psi_dot, pull])
+        centrifugal = phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi)
+        theta_ddot = (mgl + centrifugal) * jnp.sin(theta) / i1
+        return jnp.stack([phi_dot, theta_dot, psi_dot, theta_ddot])
 
     return rates

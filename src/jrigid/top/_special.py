@@ -1,4 +1,4 @@
-"""Starts and special motions of the symmetric top: steady, sleeping, fast."""
+"""Initial states and special motions of the symmetric top: steady, sleeping, fast."""
 
 from functools import partial
 from typing import Literal, NamedTuple
@@ -20,28 +20,31 @@ from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import euler_rates_to_omega, from_euler
-from jrigid.top._top import SymmetricTop, where_valid
+from jrigid.top._symmetric_top import SymmetricTop, where_valid
 
 _ROUNDING = 1e-6  # [rad], of 180 degrees in float32
 _BAD_TILT = (
-    "Argument `theta` must be from 0 to pi, but it is not. (Angles are in radians: `jnp.radians` "
-    "takes degrees.)"
+    "Argument `theta` must be from 0 to pi, but it is not. (Angles are in radians: "
+    "`jnp.radians` takes degrees.)"
 )
 _TOO_SLOW = (
-    "Argument `{}` must be large enough for steady precession at `theta`, but it is not. (See "
-    "`steady_precession`.)"
+    "Argument `{}` must be large enough for steady precession at `theta`, but it is "
+    "not. (See `steady_precession`.)"
 )
-_LEVEL = "Argument `theta` must not be level for the fast precession, which is infinite, but it is."
+_LEVEL = (
+    "Argument `theta` must not be level for the fast precession, which is infinite, "
+    "but it is."
+)
 
 
 class SteadyPrecession(NamedTuple):
-    """The two rates at which a top precesses at a constant tilt.
+    """Both rates at which a top precesses at a constant tilt.
 
     Attributes:
-        slow: The one of smaller magnitude [rad/s], mgl / (I3 omega3) for fast spin.
-        fast: The other [rad/s], I3 omega3 / (I1 cos theta) for fast spin; infinite with
-            the axis level, where there is one rate only.
-        exists: Whether the spin is fast enough; the rates are NaN where not.
+        slow: The rate of smaller magnitude [rad/s]; mgl / (I3 omega3) for fast spin.
+        fast: The other rate [rad/s]; I3 omega3 / (I1 cos theta) for fast spin. It is
+            infinite for a level axis, where there is one rate only.
+        exists: Whether the spin is fast enough. The rates are NaN where it is not.
     """
 
     slow: Scalar
@@ -55,8 +58,8 @@ class Gyroscopic(NamedTuple):
     Attributes:
         precession: Mean rate of precession mgl / (I3 omega3) [rad/s].
         nutation: Angular frequency of nutation I3 omega3 / I1 [rad/s].
-        amplitude: By how much a top released from rest falls before it rises again
-            [rad], 2 mgl I1 sin theta / (I3 omega3)^2.
+        amplitude: Angle by which a top released from rest falls before it rises again,
+            2 mgl I1 sin theta / (I3 omega3)^2 [rad].
     """
 
     precession: Scalar
@@ -67,13 +70,16 @@ class Gyroscopic(NamedTuple):
 def _steady(
     i1: Array, i3: Array, mgl: Array, theta: Array, spin: Array, *, of_psi: bool
 ) -> tuple[Array, Array]:
-    """The slow and the fast rate, NaN where there is none."""
+    """The slow and the fast rate; NaN where there is none.
+
+    `spin` is omega3, or psi' if `of_psi`.
+    """
     momentum = i3 * spin
-    # psi' = omega3 - p cos(theta) in place of omega3 takes I3 off I1.
+    # With psi' = omega3 - p cos(theta) in place of omega3, I1 - I3 replaces I1.
     i1 = i1 - i3 if of_psi else i1
     eps = jnp.finfo(theta.dtype).eps
     cos = jnp.cos(theta)
-    # Level within rounding there is one rate.
+    # A level axis has one rate only.
     level = (jnp.abs(cos) <= 4 * eps) | (i1 == 0)
     slant = jnp.where(level, 0.0, i1 * cos)
     square = momentum * momentum - 4 * slant * mgl
@@ -95,33 +101,33 @@ def steady_precession(
     *,
     psi_dot: ScalarLike | None = None,
 ) -> SteadyPrecession:
-    """The rates at which a top may precess at a constant tilt.
+    """Rates at which a top can precess at a constant tilt.
 
-    They solve I1 cos(theta) p^2 - I3 omega3 p + mgl = 0, which has solutions if (I3
-    omega3)^2 >= 4 I1 mgl cos theta: above the horizontal a top needs spin, below it
-    none.
+    They solve I1 cos(theta) p^2 - I3 omega3 p + mgl = 0. Solutions exist if
+    (I3 omega3)^2 >= 4 I1 mgl cos theta, so a top above the horizontal needs spin, and
+    one below it does not. Pass either `omega3` or `psi_dot`.
 
     Args:
         top: The top.
         theta: Tilt of the axis from the vertical [rad].
-        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s];
-            or
-        psi_dot: spin about the axis, as seen by one who precesses with it [rad/s]; one
-            of the two. Then I1 - I3 takes the place of I1.
+        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s].
+        psi_dot: Spin about the axis relative to the precession [rad/s]. With it I1 - I3
+            replaces I1 in the equation.
 
     Returns:
-        Both rates, and whether there are any: not with too little spin, nor where the
-        top is not valid or a number not finite.
+        Both rates, and whether they exist. They do not exist with too little spin, and
+        where the top is not valid or a number is not finite.
 
     Raises:
-        ValueError: omega3 and psi_dot both given, or neither.
+        ValueError: omega3 and psi_dot are both given, or neither.
 
-    Gradients: right where the two rates differ; where they meet, without the infinite
-        part.
+    Gradients: right where the two rates differ. Where they meet the infinite part is
+    left out.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> rates = jr.top.steady_precession(jr.SymmetricTop(1.0, 0.5, 1.0), jnp.pi / 3, 6.0)
+    >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
+    >>> rates = jr.top.steady_precession(top, jnp.pi / 3, 6.0)
     >>> print(rates.slow.round(6), rates.fast.round(6), rates.exists)
     0.354249 5.645751 True
     """
@@ -137,14 +143,14 @@ def steady_precession(
 
 
 def sleeping_spin(top: SymmetricTop) -> Scalar:
-    """Spin above which a top stands upright stably, 2 sqrt(mgl I1) / I3.
+    """Least spin of a stable upright top, 2 sqrt(mgl I1) / I3.
 
     Args:
         top: The top.
 
     Returns:
-        |omega3| at the threshold [rad/s]; 0 if mgl <= 0: such a top hangs. NaN where the top is
-        not valid.
+        |omega3| at the threshold [rad/s]; 0 if mgl <= 0, where such a top hangs. NaN
+        where the top is not valid.
 
     Gradients: right for mgl > 0; zero at mgl <= 0.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -161,7 +167,7 @@ def sleeping_spin(top: SymmetricTop) -> Scalar:
 
 
 def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyroscopic:
-    """The textbook's fast top, to compare with the exact one.
+    """Approximate motion of a fast top, as in textbooks.
 
     The exact values are `mean_precession`, `nutation_period` and `nutation_bounds`.
 
@@ -173,7 +179,7 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
     Returns:
         Precession, nutation and the amplitude of nutation, with relative errors of the
         order of mgl I1 / (I3 omega3)^2. NaN without spin, and where the top is not
-        valid or a number not finite.
+        valid or a number is not finite.
 
     Gradients: analytic.
     Source: Goldstein, Classical Mechanics, 3rd ed., section 5.7.
@@ -191,11 +197,14 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
         fall = 2 * mgl * i1 * jnp.sin(theta) / (momentum * momentum)
         return Gyroscopic(mgl / momentum, momentum / i1, fall)
 
-    return where_valid(
-        lambda *x: where_defined(x[-1] != 0, fast, *x), top, theta=theta, omega3=omega3
-    )
+    def fast_if_spinning(*numbers: Array) -> Gyroscopic:
+        *_, omega3 = numbers
+        return where_defined(omega3 != 0, fast, *numbers)
+
+    return where_valid(fast_if_spinning, top, theta=theta, omega3=omega3)
 
 
+# Long: eight arguments, of which two say the same and one may be a word.
 def initial_state(
     top: SymmetricTop,
     theta: ScalarLike,
@@ -208,33 +217,33 @@ def initial_state(
     psi: ScalarLike = 0.0,
     throw: bool = True,
 ) -> State:
-    """A state from what people say of a top: its angles and their rates.
+    """State of a top from its Euler angles and their rates.
 
-    With the defaults, released from rest at a tilt with a spin psi' = omega3.
+    By default the axis is released from rest, with a spin psi' = omega3. Pass either
+    `psi_dot` or `omega3`, or neither for no spin (omega3 = 0).
 
     Args:
         top: The top.
         theta: Tilt of the axis from the vertical, from 0 to pi [rad].
-        psi_dot: Spin about the axis, as seen by one who precesses with it [rad/s]; or
-        omega3: third component of the angular velocity, psi' + phi' cos theta [rad/s];
-            one of the two, or neither for no spin (omega3 = 0).
+        psi_dot: Spin about the axis relative to the precession [rad/s].
+        omega3: Third component of the angular velocity, psi' + phi' cos theta [rad/s].
         phi_dot: Precession [rad/s], or "slow" or "fast" for that of steady precession
             with the given spin (see `steady_precession`).
         theta_dot: Rate of the tilt [rad/s].
         phi: Azimuth of the axis, from -y towards +x [rad].
         psi: Angle about the axis [rad].
-        throw: False: bad values give NaN instead of an error.
+        throw: With False, bad values give NaN instead of an error.
 
     Returns:
         Attitude and angular velocity.
 
     Raises:
-        ValueError: psi_dot and omega3 both given.
-        RuntimeError: A tilt outside of its range, a value that is not finite, too
-            little spin for steady precession, or the fast one of a level axis, which is
-            infinite.
+        ValueError: psi_dot and omega3 are both given.
+        RuntimeError: The tilt is outside of its range, a value is not finite, the spin
+            is too small for steady precession, or the fast precession of a level axis
+            is requested, which is infinite.
 
-    Gradients: analytic; of a steady precession those of its rate.
+    Gradients: analytic. For a steady precession they include those of its rate.
 
     >>> import jrigid as jr
     >>> top = jr.SymmetricTop(1.0, 0.5, 1.0)
@@ -248,32 +257,27 @@ def initial_state(
             "Argument `psi_dot` must be None where `omega3` is given, but it is not."
         )
     spin_name, spin = ("omega3", omega3) if psi_dot is None else ("psi_dot", psi_dot)
-    spin = 0.0 if spin is None else spin
     steady = isinstance(phi_dot, str)
-    given = {"theta": theta, spin_name: spin, "phi_dot": 0.0 if steady else phi_dot}
-    given |= {"theta_dot": theta_dot, "phi": phi, "psi": psi}
-    numbers = shaped(**{name: (value,) for name, value in (vars(top) | given).items()})
+    arguments = {
+        "theta": theta,
+        spin_name: 0.0 if spin is None else spin,
+        "phi_dot": 0.0 if steady else phi_dot,
+        "theta_dot": theta_dot,
+        "phi": phi,
+        "psi": psi,
+    }
+    by_name = {name: (x,) for name, x in (vars(top) | arguments).items()}
+    numbers = shaped(**by_name)
     findings = Findings()
     findings.require(top.is_valid, RESULTS.invalid_top, value=jnp.stack(numbers[:3]))
-    for name, value in zip(given, numbers[3:], strict=True):
-        good, message = (
-            jnp.isfinite(value),
-            f"Argument `{name}` must be finite, but it is not.",
-        )
-        if name == "theta":
-            good, message = (
-                (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING),
-                _BAD_TILT,
-            )
-        findings.require(good, RESULTS.invalid_state, message, value)
+    for name, value in zip(arguments, numbers[3:], strict=True):
+        _require_in_domain(findings, name, value)
     i1, i3, mgl, theta, spin, rate, theta_dot, phi, psi = harmless(findings.ok, numbers)
     if steady:
         check_option("phi_dot", phi_dot, ("slow", "fast"))
         slow, fast = _steady(i1, i3, mgl, theta, spin, of_psi=psi_dot is not None)
-        rate, too_slow = (
-            slow if phi_dot == "slow" else fast,
-            _TOO_SLOW.format(spin_name),
-        )
+        rate = slow if phi_dot == "slow" else fast
+        too_slow = _TOO_SLOW.format(spin_name)
         findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
         findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
         rate = harmless(findings.ok, rate)
@@ -282,3 +286,14 @@ def initial_state(
     if psi_dot is None:
         omega = omega.at[2].set(spin)
     return findings.guard(State(from_euler(angles), omega), throw)
+
+
+def _require_in_domain(findings: Findings, name: str, value: Array) -> None:
+    """Note whether an argument of `initial_state` is out of its domain."""
+    if name == "theta":
+        in_domain = (value >= -_ROUNDING) & (value <= jnp.pi + _ROUNDING)
+        message = _BAD_TILT
+    else:
+        in_domain = jnp.isfinite(value)
+        message = f"Argument `{name}` must be finite, but it is not."
+    findings.require(in_domain, RESULTS.invalid_state, message, value)

@@ -1,4 +1,4 @@
-"""A motion, and small motions beside it, in a fixed number of equal steps: a fixed cost a lane."""
+"""A motion and small motions beside it, in a fixed number of equal steps."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ _LARGEST_ERROR = {8: 1e-6, 4: 1e-3}
 
 
 class Motion(NamedTuple):
-    """A motion that is asked for."""
+    """The arguments that define a motion."""
 
     system: RigidBody
     state0: State
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
 
     @property
     def dimension(self) -> int:
-        """How many numbers a small motion beside it has."""
+        """Number of components of a small motion."""
         return 6 + sum(x.size for x in jtu.tree_leaves(self.state0.internal))
 
 
@@ -47,7 +47,7 @@ def motion_of(
     duration: Any = 1.0,
     solver: Any = None,
 ) -> Motion:
-    """A motion with shapes checked and internal parts, its times in the precision of the state."""
+    """A motion with checked shapes and internal parts, in the dtype of its state."""
     system, state0, times = motion_arguments(
         system, state0, RigidBody, t0=t0, duration=duration
     )
@@ -100,7 +100,7 @@ class Walk(NamedTuple):
         return jnp.concatenate([y[: self.scales.size], rows.reshape(-1)])
 
     def on_sphere(self, y: Array) -> Array:
-        """The same with a quaternion of norm 1."""
+        """The state with a quaternion of norm 1."""
         return jnp.concatenate([normalize(y[:4]), y[4:]])
 
     def rates(self, t: Array, y: Array) -> Array:
@@ -128,9 +128,9 @@ class Walk(NamedTuple):
         return self.with_tangents(*jax.vmap(beside, out_axes=(None, 0))(tangents))
 
     def _by_solver(self, t: Array, y: Array) -> tuple[Array, Array, Any]:
-        """One step of a solver that is no explicit Runge-Kutta method.
+        """End, error and interpolation of a step by another kind of solver.
 
-        Its end, its error, and what interpolates it.
+        Such a solver is no explicit Runge-Kutta method.
         """
         term = diffrax.ODETerm(lambda t, y, _: self._together(t, y))  # pyright: ignore
         solver, end = self.motion.solver, t + self.step
@@ -140,7 +140,7 @@ class Walk(NamedTuple):
     def _step(
         self, t: Array, y: Array, in_lanes: bool = False
     ) -> tuple[Array, Array, Any]:
-        """One step: its end, its error, and what interpolates it."""
+        """End, error and interpolation of one step."""
         if not isinstance(self.motion.solver, diffrax.AbstractERK):
             return self._by_solver(t, y)
         method = method_of(self.motion.solver)
@@ -155,21 +155,21 @@ class Walk(NamedTuple):
     def advance(
         self, t: Array, y: Array, in_lanes: bool = False
     ) -> tuple[Array, Array]:
-        """One step, and the local error of the state."""
+        """State after one step, and its local error."""
         after, error, _ = self._step(t, y, in_lanes)
         return self.on_sphere(after), jnp.max(
             jnp.abs(error[: self.scales.size]) / self.scales
         )
 
     def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
-        """States within one step, by the fraction of it that has passed."""
+        """States within one step, as a function of the fraction of it."""
         *_, dense = self._step(t, y)
         zero = jnp.zeros_like(t)
         curve = self.motion.solver.interpolation_cls(t0=zero, t1=zero + 1, **dense)
         return lambda fraction: self.on_sphere(curve.evaluate(fraction))
 
     def follow(self, first: Any, count: int, y: Array) -> tuple[Array, Array]:
-        """Steps from the one of a number on, and the largest local error."""
+        """State after `count` steps from step `first`, and the largest local error."""
 
         def step(carry: tuple, i: Array) -> tuple[tuple, None]:
             y, error = carry
@@ -182,7 +182,10 @@ class Walk(NamedTuple):
 
 
 def walk(motion: Motion, steps: int, ok: Array) -> Walk:
-    """Set up `steps` equal steps over the duration, harmless where the arguments are not ok."""
+    """Set up `steps` equal steps over the duration.
+
+    Where the arguments are not ok the steps are harmless.
+    """
     motion = harmless_motion(ok, motion)
     system, state0, args, t0, duration, _ = motion
     _, scales = jax.lax.stop_gradient(units(system, state0, duration, t0, args))
@@ -190,9 +193,9 @@ def walk(motion: Motion, steps: int, ok: Array) -> Walk:
 
 
 def verdict(findings: Findings, error: Array, values: Any) -> Any:
-    """The values, NaN if not good, which is found out too.
+    """The values, or NaN where something is wrong.
 
-    Beside bad arguments that is a motion that left its accuracy, or the numbers.
+    It notes two more findings: a motion that is inaccurate, and one that is not finite.
     """
     findings.require(error <= _LARGEST_ERROR[error.dtype.itemsize], RESULTS.inaccurate)
     findings.require(all_finite(values), RESULTS.nonfinite_state)
@@ -200,7 +203,7 @@ def verdict(findings: Findings, error: Array, values: Any) -> Any:
 
 
 def orthonormal(rows: Array) -> tuple[Array, Array]:
-    """Rows made orthogonal one after the other, and the lengths that were left of them."""
+    """Rows made orthonormal in turn, and the length of each before normalisation."""
     done: list[Array] = []
     lengths = []
     for row in rows:

@@ -1,4 +1,4 @@
-"""top_motion(): the state of Lagrange's top at any times."""
+"""The function `top_motion`: the exact state of Lagrange's top at any times."""
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -8,8 +8,8 @@ from jrigid._checks import RESULTS, Findings, check_type
 from jrigid._motion import exact_motion, plain_state
 from jrigid._types import Quaternion, Real, Scalar, ScalarLike, Vector
 from jrigid.dynamics import ExactStates, State
-from jrigid.top._flow import invariants, state_after
-from jrigid.top._top import SymmetricTop
+from jrigid.top._lame_solution import invariants, state_after
+from jrigid.top._symmetric_top import SymmetricTop
 
 
 def top_motion(
@@ -20,30 +20,31 @@ def top_motion(
     t0: ScalarLike = 0.0,
     throw: bool = True,
 ) -> ExactStates:
-    r"""Exact state of Lagrange's top at any times, at a cost that does not depend on the time.
+    r"""Exact state of Lagrange's top at any times.
 
-    One formula serves every motion: waves, cusps and loops, steady and sleeping tops,
-    pendulums, passages through the vertical, no gravity; without Euler angles.
+    The cost does not depend on the time. One formula without Euler angles serves every
+    motion: waves, cusps and loops, steady and sleeping tops, pendulums, passages
+    through the vertical, and tops without weight.
 
     Args:
-        top: Moments about the fixed point and mgl of any sign.
-        state0: State at `t0`, without internal parts; gravity pulls along -z in space.
+        top: The top. Its mgl may have any sign.
+        state0: State at `t0`, without internal parts. Gravity acts along -z in space.
         ts: Times [s], in any order, before or after `t0`, of any shape.
         t0: Time of `state0` [s].
-        throw: False: a bad value gives NaN and its code in `result` instead of an
-            error, in its lane alone.
+        throw: With False, a bad value gives NaN in its lane and a code in `result`
+            instead of an error.
 
     Returns:
         Attitude and angular velocity (`.states`, or `.attitude` and `.omega`), with the
-        shape of `ts` in front, and `result`. The error is below 1e-13 (1 + radians
-        turned) in float64, plus what the last bits of the arguments do.
+        shape of `ts` in front, and `result`. In float64 the error is below
+        1e-13 (1 + radians turned), plus the effect of rounding in the arguments.
 
     Raises:
-        RuntimeError: Bad value, or angles turned that overflow.
+        RuntimeError: A value is bad, or the angles turned overflow.
 
-    Gradients: of any order and in every mode those of the motion, also for a sleeping,
-    steady, weightless or hanging top and through the vertical; reverse mode costs a few
-    values.
+    Gradients: those of the motion, of any order and in every mode. This holds also for
+    a sleeping, steady, weightless or hanging top and through the vertical. Reverse mode
+    costs a few values.
     Source: Lagrange's solution in the form derived in docs/top.md.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -56,14 +57,17 @@ def top_motion(
     check_type("top", top, SymmetricTop)
     numbers = top.I1, top.I3, top.mgl, ts, t0
     state0, (i1, i3, mgl, ts, t0) = plain_state("state0", state0, *numbers)
-    return exact_motion(_check, _flow, throw, SymmetricTop(i1, i3, mgl), state0, ts, t0)
+    top = SymmetricTop.unchecked(i1, i3, mgl)
+    return exact_motion(_check, _flow, throw, top, state0, ts, t0)
 
 
 def _check(findings: Findings, top: SymmetricTop) -> None:
+    """Note whether the top is not valid."""
     findings.require(
         top.is_valid, RESULTS.invalid_top, value=jnp.stack(jtu.tree_leaves(top))
     )
 
 
 def _flow(top: SymmetricTop, state0: State, t: Scalar) -> tuple[Quaternion, Vector]:
+    """Attitude and angular velocity at a time t after `state0`."""
     return state_after(invariants(top, state0), t)
