@@ -110,10 +110,6 @@ def sweep(
     (5, 2) True
     """
     grid = grid_of(axes, points)
-    if refine is not None and grid.names is None:
-        raise ValueError(
-            "Argument `refine` is for a grid of `axes`, not for a list of points."
-        )
     path = None if store is None else Path(store).absolute()
     values, about = traced(function, grid.names, grid.cut(1).part(0))
     leaves = leaves_of(values, grid.axes)
@@ -128,11 +124,7 @@ def sweep(
         if refine is None:
             failures = run.compute(range(math.prod(grid.blocks)))
         else:
-            corners = _corners(function, grid, executor)
-            refined = RefinedMap(grid, kept, structure, refine, corners)
-            failures = refined.refine(run.compute)
-            classes = refined.classes
-            run.valid += int(np.sum(corners.valid))
+            failures, classes = run.refine(refine, structure)
         kept.tell(failures)
     _warn(failures, run.valid, grid)
     *arrays, valid = kept.arrays.values()
@@ -191,6 +183,10 @@ def _cut(
     grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]
 ) -> Grid:
     """The points in blocks, those of a store if there is one and nothing else was asked for."""
+    if refine is not None and grid.names is None:
+        raise ValueError(
+            "Argument `refine` is for a grid of `axes`, not for a list of points."
+        )
     if size is None:
         block = path and known_block(path)
         if block and len(block) == len(grid.shape):
@@ -258,6 +254,17 @@ class _Run:
                     kept.leave(outcome.number)
                     failures.append(_failure(grid, outcome.number, outcome.error))
         return tuple(failures)
+
+    def refine(
+        self, classify: Callable[[Any], Any], structure: Any
+    ) -> tuple[tuple[Failure, ...], np.ndarray]:
+        """Compute the tiles with a change of class; return failures and all classes."""
+        grid = self._work.grid
+        corners = _corners(self._work.function, grid, self._executor)
+        refined = RefinedMap(grid, self._kept, structure, classify, corners)
+        failures = refined.refine(self.compute)
+        self.valid += int(np.sum(corners.valid))
+        return failures, refined.classes
 
 
 def _failure(grid: Grid, number: int, error: str) -> Failure:
