@@ -81,6 +81,23 @@ def test_points_may_be_a_list_of_any_tree():
     assert found.labels == ("point",)
 
 
+@pytest.mark.parametrize("kind", [">f8", ">f4", ">i4"])
+def test_numbers_of_another_byte_order_are_as_those_of_this_machine(kind, tmp_path):
+    x = np.arange(9)
+    function = lambda x: 2.0 * x  # noqa: E731
+    for more in ({}, {"store": tmp_path / "s"}):
+        swept = quiet(function, {"x": x.astype(kind)}, **more)
+        np.testing.assert_array_equal(swept.values[...], 2 * x)
+        assert swept.axes["x"].dtype.isnative
+    as_float = lambda x: 2.0 * x.astype(float)  # noqa: E731
+    assert np.all(quiet(as_float, points=x.astype(kind)).values == 2 * x)
+
+
+def test_valid_is_a_numpy_array_with_a_store_and_without(tmp_path):
+    for more in ({}, {"store": tmp_path / "s"}):
+        assert type(quiet(tree, AXES, **more).valid) is np.ndarray
+
+
 def test_a_second_sweep_of_the_same_function_traces_nothing():
     traces = []
 

@@ -95,7 +95,7 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
         raise ValueError("Give one of the arguments `axes` and `points`, but not both.")
     if axes is None:
         return _list_of(points)
-    arrays = {name: np.asarray(x) for name, x in axes.items()}
+    arrays = {name: _native(x) for name, x in axes.items()}
     for name, x in arrays.items():
         if not name.isidentifier() or name == VALID.name:
             raise ValueError(
@@ -116,8 +116,17 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
     return Grid(dict(zip(arrays, values, strict=True)), tuple(arrays), shape, shape)
 
 
+def _native(values: Any) -> np.ndarray:
+    """Return numbers in the byte order of this machine, the only one that JAX takes."""
+    array = np.asarray(values)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
 def _list_of(points: Any) -> Grid:
-    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(points)]
+    leaves = [
+        jnp.asarray(_native(x) if isinstance(x, np.ndarray) else x)
+        for x in jtu.tree_leaves(points)
+    ]
     if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in leaves):
         raise ValueError(
             "Argument `points` must hold numbers, but it has keys. (Pass integers, and call "

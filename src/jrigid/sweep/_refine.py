@@ -1,4 +1,4 @@
-"""Which blocks of a map hold a boundary between two classes."""
+"""Refined maps: which tiles hold a boundary between two classes."""
 
 import itertools
 import math
@@ -11,10 +11,11 @@ import numpy as np
 
 from jrigid.sweep._grid import Grid
 from jrigid.sweep._result import Failure, SweepResult
+from jrigid.sweep._store import Memory, Store
 
 
 def corners_of(grid: Grid) -> dict[str, np.ndarray]:
-    """Axes of the first points of all blocks, and of the last points of all."""
+    """Axes through the first points of all tiles, and through the last points."""
     lattice = {}
     for (name, x), width in zip(grid.axes.items(), grid.block, strict=True):
         lattice[name] = x[np.minimum(np.arange(0, x.size + width, width), x.size - 1)]
@@ -24,76 +25,110 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
 def _classes(
     classify: Callable[[Any], Any], values: Any, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Classes of values with axes of this shape in front."""
+    """Return the classes of values that have axes of this shape in front."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
-    found = jtu.tree_leaves(classify(flat))
-    if len(found) != 1 or found[0].ndim != 1 or found[0].dtype.kind not in "iub":
+    leaves = jtu.tree_leaves(classify(flat))
+    if len(leaves) != 1 or leaves[0].ndim != 1 or leaves[0].dtype.kind not in "iub":
         raise ValueError(
-            "Argument `refine` must return one integer, boolean or code for a point, but it "
-            f"returns {[(x.shape[1:], str(x.dtype)) for x in found]}."
+            "Argument `refine` must return one integer, boolean or code for a point, "
+            f"but it returns {[(x.shape[1:], str(x.dtype)) for x in leaves]}."
         )
-    return np.asarray(found[0]).reshape(shape)
+    return np.asarray(leaves[0]).reshape(shape)
 
 
 def _changes(corners: SweepResult, lattice: np.ndarray) -> np.ndarray:
-    """Which blocks have corners of several classes, or one whose class is not known."""
-    lost = np.zeros(lattice.shape, bool)
+    """Say which tiles have corners of several classes, or of an unknown class."""
+    failed = np.zeros(lattice.shape, bool)
     for failure in corners.failures:
         ends = zip(failure.first, failure.last, strict=True)
-        lost[tuple(slice(first, last + 1) for first, last in ends)] = True
-    within = [*itertools.product(*[(slice(0, -1), slice(1, None))] * lattice.ndim)]
-    ends = np.stack([lattice[x] for x in within])
-    return np.any(ends != ends[0], axis=0) | np.any([lost[x] for x in within], axis=0)
+        failed[tuple(slice(first, last + 1) for first, last in ends)] = True
+    sides = (slice(0, -1), slice(1, None))
+    of_tile = [*itertools.product(*[sides] * lattice.ndim)]
+    ends = np.stack([lattice[x] for x in of_tile])
+    differ = np.any(ends != ends[0], axis=0)
+    return differ | np.any([failed[x] for x in of_tile], axis=0)
 
 
-def refined(
-    grid: Grid,
-    kept: Any,
-    structure: Any,
-    classify: Callable[[Any], Any],
-    corners: SweepResult,
-    compute: Callable[[Iterable[int]], tuple[Failure, ...]],
-) -> tuple[tuple[Failure, ...], np.ndarray]:
-    """Compute all blocks that hold a change of class.
+class RefinedMap:
+    """The classes of all points, refined tile by tile.
 
-    Returns:
-        The blocks that failed; classes of all points, in blocks that were not computed,
-        or failed, that of the first corner.
+    Attributes:
+        classes: Class of every point. In a tile that was not computed, or failed, it is
+            that of the first corner.
     """
-    classify = jax.jit(jax.vmap(classify))
-    lattice = _classes(classify, corners.values, tuple(n + 1 for n in grid.blocks))
-    place = [
-        np.arange(n) // width for n, width in zip(grid.shape, grid.block, strict=True)
-    ]
-    classes = lattice[np.ix_(*place)]
-    numbers = np.arange(math.prod(grid.blocks)).reshape(grid.blocks)
-    todo = {
-        *numbers[_changes(corners, lattice)].tolist(),
-        *filter(kept.has, range(numbers.size)),
-    }
-    for number in range(numbers.size):
-        kept.leave(number)
 
-    def is_entered(number: int) -> bool:
-        """Whether a change of class comes in from beside a block."""
-        region = grid.region(number)
+    def __init__(
+        self,
+        grid: Grid,
+        kept: Memory | Store,
+        structure: Any,
+        classify: Callable[[Any], Any],
+        corners: SweepResult,
+    ):
+        """Give all points the class of the first corner of their tile.
+
+        Args:
+            grid: The points, in tiles.
+            kept: Where finished tiles are.
+            structure: Of the values of the function.
+            classify: The class of the values of one point.
+            corners: Values at the corners of all tiles.
+        """
+        self._grid = grid
+        self._kept = kept
+        self._structure = structure
+        self._classify = jax.jit(jax.vmap(classify))
+        lattice_shape = tuple(n + 1 for n in grid.blocks)
+        lattice = _classes(self._classify, corners.values, lattice_shape)
+        tile = [
+            np.arange(n) // width
+            for n, width in zip(grid.shape, grid.block, strict=True)
+        ]
+        self.classes = lattice[np.ix_(*tile)]
+        self._numbers = np.arange(math.prod(grid.blocks)).reshape(grid.blocks)
+        self._with_change = self._numbers[_changes(corners, lattice)].tolist()
+
+    def refine(
+        self, compute: Callable[[Iterable[int]], tuple[Failure, ...]]
+    ) -> tuple[Failure, ...]:
+        """Compute all tiles that hold a change of class, and return those that failed."""
+        all_tiles = range(self._numbers.size)
+        finished = filter(self._kept.has, all_tiles)
+        waiting = {*self._with_change, *finished}
+        for number in all_tiles:
+            self._kept.leave(number)
+        computed: set[int] = set()
+        failures: tuple[Failure, ...] = ()
+        while waiting:
+            new = compute(sorted(waiting))
+            failures += new
+            failed = {x.first for x in new}
+            for number in waiting:
+                if self._grid.corner(number) not in failed:
+                    self._classify_tile(number)
+            computed |= waiting
+            beside = self._neighbours(waiting) - computed
+            waiting = set(filter(self._is_entered, beside))
+        return failures
+
+    def _classify_tile(self, number: int) -> None:
+        """Replace the classes of a tile by those of its own values."""
+        region = self._grid.region(number)
+        *arrays, valid = (x[region] for x in self._kept.arrays.values())
+        values = jtu.tree_unflatten(self._structure, arrays)
+        self.classes[region] = _classes(self._classify, values, valid.shape)
+
+    def _neighbours(self, tiles: Iterable[int]) -> set[int]:
+        """Return the tiles that share a face, an edge or a corner with one of these."""
+        beside: set[int] = set()
+        places = np.unravel_index(sorted(tiles), self._grid.blocks)
+        for place in zip(*places, strict=True):
+            around = tuple(slice(max(x - 1, 0), x + 2) for x in place)
+            beside.update(self._numbers[around].ravel().tolist())
+        return beside
+
+    def _is_entered(self, number: int) -> bool:
+        """Say whether a point beside a tile has another class than its first corner."""
+        region = self._grid.region(number)
         wider = tuple(slice(max(x.start - 1, 0), x.stop + 1) for x in region)
-        return bool(np.any(classes[wider] != classes[region].flat[0]))
-
-    seen, failures = set(), ()
-    while todo:
-        new = compute(sorted(todo))
-        failures += new
-        lost = {x.first for x in new}
-        for number in todo:
-            if grid.corner(number) not in lost:
-                region = grid.region(number)
-                *arrays, valid = (x[region] for x in kept.arrays.values())
-                values = jtu.tree_unflatten(structure, arrays)
-                classes[region] = _classes(classify, values, valid.shape)
-        seen |= todo
-        places = zip(*np.unravel_index(sorted(todo), grid.blocks), strict=True)
-        around = [tuple(slice(max(x - 1, 0), x + 2) for x in place) for place in places]
-        beside = {number for x in around for number in numbers[x].ravel().tolist()}
-        todo = set(filter(is_entered, beside - seen))
-    return failures, classes
+        return bool(np.any(self.classes[wider] != self.classes[region].flat[0]))

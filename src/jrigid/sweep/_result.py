@@ -30,7 +30,7 @@ class SweepResult(NamedTuple):
         values: As the function returned them, with the axes of the grid in front: numpy
             arrays, or of a store zarr arrays, which are read where they are indexed.
         valid: Where all numbers are finite and no code is `undefined`: a mask of the
-            shape of the grid.
+            shape of the grid, a numpy array.
         axes: Names and points of the axes, in their order; of a list `point`, its
             numbers.
         failures: The blocks that failed thrice, whose points are not valid.
@@ -40,12 +40,12 @@ class SweepResult(NamedTuple):
     """
 
     values: Any
-    valid: Any
+    valid: np.ndarray
     axes: dict[str, np.ndarray]
     failures: tuple[Failure, ...] = ()
     attributes: dict[str, dict] = {}  # noqa: RUF012
     store: str | None = None
-    classes: Any = None
+    classes: np.ndarray | None = None
 
     @property
     def labels(self) -> tuple[str, ...]:

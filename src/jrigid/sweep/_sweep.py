@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 from jrigid._checks import whole_number
 from jrigid.sweep._drive import meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
-from jrigid.sweep._refine import corners_of, refined
+from jrigid.sweep._refine import RefinedMap, corners_of
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
 from jrigid.sweep._work import (
@@ -110,65 +110,83 @@ def sweep(
     (5, 2) True
     """
     grid = grid_of(axes, points)
-    if refine is not None and grid.names is None:
-        raise ValueError(
-            "Argument `refine` is for a grid of `axes`, not for a list of points."
-        )
     path = None if store is None else Path(store).absolute()
     values, about = traced(function, grid.names, grid.cut(1).part(0))
     leaves = leaves_of(values, grid.axes)
     grid = _cut(grid, block_size, path, refine, leaves)
-    said = {name: dict(x) for name, x in (attributes or {}).items()}
-    unknown = said.keys() - {*grid.axes, *(x.name for x in leaves)}
+    descriptions = _descriptions(attributes, grid, leaves)
+    work = Work(function, grid, leaves, path, about, settings())
+    kept = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
+    run = _Run(work, kept, executor, progress)
+    structure = jtu.tree_structure(values)
+    classes = None
+    with kept.opened(about | identity(grid, leaves), descriptions):
+        if refine is None:
+            failures = run.compute(range(math.prod(grid.blocks)))
+        else:
+            failures, classes = run.refine(refine, structure)
+        kept.tell(failures)
+    _warn(failures, run.valid, grid)
+    *arrays, valid = kept.arrays.values()
+    return SweepResult(
+        values=jtu.tree_unflatten(structure, arrays),
+        valid=np.asarray(valid[...]),
+        axes=grid.axes,
+        failures=failures,
+        attributes=descriptions,
+        store=None if path is None else str(path),
+        classes=classes,
+    )
+
+
+def _descriptions(
+    attributes: Mapping[str, Mapping[str, Any]] | None, grid: Grid, leaves: list[Leaf]
+) -> dict[str, dict[str, Any]]:
+    """Return the attributes, after a check that they belong to axes or values."""
+    descriptions = {name: dict(x) for name, x in (attributes or {}).items()}
+    unknown = descriptions.keys() - {*grid.axes, *(x.name for x in leaves)}
     if unknown:
         raise ValueError(
-            f"Argument `attributes` must name axes or values, but {sorted(unknown)} are neither."
+            "Argument `attributes` must name axes or values, but "
+            f"{sorted(unknown)} are neither."
         )
-    work = Work(function, grid, leaves, path, about, settings())
-    kept: Any = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
-    structure, classes, valid = jtu.tree_structure(values), None, 0
+    return descriptions
 
-    def done(numbers: Iterable[int]) -> tuple[Failure, ...]:
-        nonlocal valid
-        failures, count = _compute(work, kept, numbers, executor, progress)
-        valid += count
-        return failures
 
-    with kept.opened(about | identity(grid, leaves), said):
-        if refine is None:
-            failures = done(range(math.prod(grid.blocks)))
-        else:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                corners = sweep(
-                    function, corners_of(grid), executor=executor, progress=False
-                )
-            failures, classes = refined(grid, kept, structure, refine, corners, done)
-            valid += int(np.sum(corners.valid))
-        kept.tell(failures)
+def _corners(
+    function: Callable[..., Any], grid: Grid, executor: Executor | None
+) -> SweepResult:
+    """Evaluate a function at the corners of all tiles, without warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return sweep(function, corners_of(grid), executor=executor, progress=False)
+
+
+def _warn(failures: tuple[Failure, ...], valid: int, grid: Grid) -> None:
+    """Warn the caller of `sweep` of failed blocks, or if no point is valid."""
     if failures:
         warnings.warn(
-            f"{len(failures)} of {math.prod(grid.blocks)} blocks failed three times, and their "
-            f"points are not valid; see `failures`. The last of them: {failures[-1].error}",
-            stacklevel=2,
+            f"{len(failures)} of {math.prod(grid.blocks)} blocks failed three times, "
+            "and their points are not valid; see `failures`. The last of them: "
+            f"{failures[-1].error}",
+            stacklevel=3,
         )
     elif not valid:
         warnings.warn(
-            f"None of the {math.prod(grid.shape)} points is valid: the function returned NaN, "
-            "infinity or an undefined code at each.",
-            stacklevel=2,
+            f"None of the {math.prod(grid.shape)} points is valid: the function "
+            "returned NaN, infinity or an undefined code at each.",
+            stacklevel=3,
         )
-    *arrays, valid = kept.arrays.values()
-    filled = jtu.tree_unflatten(structure, arrays)
-    return SweepResult(
-        filled, valid, grid.axes, failures, said, path and str(path), classes
-    )
 
 
 def _cut(
     grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]
 ) -> Grid:
     """The points in blocks, those of a store if there is one and nothing else was asked for."""
+    if refine is not None and grid.names is None:
+        raise ValueError(
+            "Argument `refine` is for a grid of `axes`, not for a list of points."
+        )
     if size is None:
         block = path and known_block(path)
         if block and len(block) == len(grid.shape):
@@ -190,40 +208,76 @@ def _cut(
     return grid.cut(whole_number("block_size", size))
 
 
-def _compute(
-    work: Work,
-    kept: Any,
-    numbers: Iterable[int],
-    executor: Executor | None,
-    progress: bool,
-) -> tuple[tuple[Failure, ...], int]:
-    """Compute the blocks that are not kept yet; say which failed, and how many points are valid."""
-    grid, failures = work.grid, []
-    known = {number: kept.count(number) for number in numbers}
-    sizes = {n: math.prod(x.stop - x.start for x in grid.region(n)) for n in known}
-    waiting = [number for number, count in known.items() if count is None]
-    valid, total = sum(count or 0 for count in known.values()), sum(sizes.values())
-    done = total - sum(sizes[number] for number in waiting)
-    with (
-        meter(total, done, progress and bool(waiting)) as advance,
-        _submitting(work, kept, executor) as (submit, ahead),
+class _Run:
+    """Blocks that are computed and kept.
+
+    Attributes:
+        valid: How many points of all blocks so far are valid.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        kept: Memory | Store,
+        executor: Executor | None,
+        progress: bool,
     ):
-        for outcome in outcomes(submit, waiting, ahead):
-            valid += outcome.count
-            advance(sizes[outcome.number])
-            if outcome.values is not None:
-                kept.write(outcome.number, outcome.values)
-            if outcome.error is not None:
-                kept.leave(outcome.number)
-                region = grid.region(outcome.number)
-                first, last = zip(*((x.start, x.stop - 1) for x in region), strict=True)
-                failures.append(Failure(first, last, outcome.error))
-    return tuple(failures), valid
+        self._work = work
+        self._kept = kept
+        self._executor = executor
+        self._progress = progress
+        self.valid = 0
+
+    def compute(self, numbers: Iterable[int]) -> tuple[Failure, ...]:
+        """Compute the blocks that are not kept yet, and return those that failed."""
+        grid, kept = self._work.grid, self._kept
+        counts = {number: kept.count(number) for number in numbers}
+        sizes = {
+            number: math.prod(x.stop - x.start for x in grid.region(number))
+            for number in counts
+        }
+        waiting = [number for number, count in counts.items() if count is None]
+        self.valid += sum(count or 0 for count in counts.values())
+        total = sum(sizes.values())
+        done = total - sum(sizes[number] for number in waiting)
+        failures = []
+        with (
+            meter(total, done, self._progress and bool(waiting)) as advance,
+            _submitting(self._work, kept, self._executor) as (submit, ahead),
+        ):
+            for outcome in outcomes(submit, waiting, ahead):
+                self.valid += outcome.count
+                advance(sizes[outcome.number])
+                if outcome.values is not None:
+                    kept.write(outcome.number, outcome.values)
+                if outcome.error is not None:
+                    kept.leave(outcome.number)
+                    failures.append(_failure(grid, outcome.number, outcome.error))
+        return tuple(failures)
+
+    def refine(
+        self, classify: Callable[[Any], Any], structure: Any
+    ) -> tuple[tuple[Failure, ...], np.ndarray]:
+        """Compute the tiles with a change of class; return failures and all classes."""
+        grid = self._work.grid
+        corners = _corners(self._work.function, grid, self._executor)
+        refined = RefinedMap(grid, self._kept, structure, classify, corners)
+        failures = refined.refine(self.compute)
+        self.valid += int(np.sum(corners.valid))
+        return failures, refined.classes
+
+
+def _failure(grid: Grid, number: int, error: str) -> Failure:
+    """Describe a block that failed by its first and last points."""
+    region = grid.region(number)
+    first = tuple(x.start for x in region)
+    last = tuple(x.stop - 1 for x in region)
+    return Failure(first, last, error)
 
 
 @contextmanager
 def _submitting(
-    work: Work, kept: Any, executor: Executor | None
+    work: Work, kept: Memory | Store, executor: Executor | None
 ) -> Iterator[tuple[Callable, int]]:
     """How to have a block computed, and how many may wait for it."""
     if executor is None:
@@ -242,12 +296,8 @@ def _submitting(
     if getattr(pool, "_initializer", end_with_driver) is None:
         # A pool's worker that has no block yet would outlive a driver that is killed.
         pool._initializer = end_with_driver
-    share = getattr(executor, "_max_workers", None)  # of a pool on this machine
-    cores = share and max(1, (os.cpu_count() or 1) // share)
-    surroundings, payload = (
-        Surroundings(os.getpid(), cores, work.settings),
-        packed(work),
-    )
+    surroundings = Surroundings(os.getpid(), work.settings)
+    payload = packed(work)
 
     def submit(number: int) -> Future:
         call = Call(surroundings, payload, number, work.grid.part(number))

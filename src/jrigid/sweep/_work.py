@@ -4,8 +4,6 @@ import contextlib
 import functools
 import os
 import pickle
-import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -136,12 +134,10 @@ class Surroundings(NamedTuple):
 
     Attributes:
         driver: The process that has the work.
-        cores: How many a worker may have, if that is known.
         settings: Of jax.
     """
 
     driver: int
-    cores: int | None
     settings: tuple[Any, ...]
 
 
@@ -182,7 +178,7 @@ def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> 
     elsewhere = surroundings.driver != os.getpid()
     with _one_at_a_time, under(surroundings.settings):
         if elsewhere:
-            _settle_in(surroundings.cores)
+            end_with_driver()
         worker = _unpacked(work)
         about = worker.work.about
         if elsewhere and about != _about_here(work, part):
@@ -218,23 +214,13 @@ def _about_here(work: bytes, part: Any) -> dict[str, Any]:
     return _seen[work]
 
 
-@functools.lru_cache(maxsize=1)
-def _settle_in(cores: int | None) -> None:
-    """Once in a process, before its backend starts: what it may use, and when it ends."""
-    end_with_driver()
-    _take_cores(cores or _threads_of_dask())
-    if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update(
-            "jax_compilation_cache_dir", str(_own_directory() / "compiled")
-        )
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
 @functools.cache
 def end_with_driver() -> None:
-    """End this process when the one that started it ends, if it is a worker of a pool.
+    """End this process when its parent ends, if it is a worker of a process pool.
 
-    It would wait forever for a driver that was killed.
+    `concurrent.futures` leaves the workers of a killed driver waiting for ever, so that
+    they hold memory and may still write to the store of the next run
+    (`tests/test_sweep_killed.py`). Workers of dask end by themselves.
     """
     import multiprocessing
 
@@ -249,55 +235,3 @@ def _end_with(sentinel: Any) -> None:
 
     connection.wait([sentinel])
     os._exit(1)
-
-
-def _threads_of_dask() -> int | None:
-    if "distributed" not in sys.modules:
-        return None
-    from distributed import get_worker
-
-    try:
-        return get_worker().state.nthreads
-    except ValueError:
-        return None
-
-
-@functools.cache
-def _own_directory() -> Path:
-    """One that all workers of a user have on this machine, and nobody else can write to."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    path = Path(tempfile.gettempdir()) / f"jrigid-{user}"
-    with contextlib.suppress(FileExistsError):
-        path.mkdir(mode=0o700)
-    found = path.lstat()
-    safe = path.is_dir() and found.st_uid == user and not found.st_mode & 0o022
-    return path if safe else Path(tempfile.mkdtemp())
-
-
-_held: list[int] = []
-
-
-def _take_cores(count: int | None) -> None:
-    """Keep to so many cores that no other worker on this machine has taken, if there are."""
-    if count is None or not hasattr(os, "sched_setaffinity"):
-        return
-    import fcntl
-
-    taken: dict[int, int] = {}
-    for core in sorted(os.sched_getaffinity(0)):
-        lock = os.open(_own_directory() / f"core-{core}", os.O_CREAT | os.O_RDWR)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the process ends
-            taken[core] = lock
-        except OSError:
-            os.close(lock)
-        if len(taken) == count:
-            break
-    else:
-        for lock in taken.values():
-            os.close(lock)
-        return
-    _held.extend(taken.values())
-    for thread in os.listdir("/proc/self/task"):
-        with contextlib.suppress(ProcessLookupError):
-            os.sched_setaffinity(int(thread), set(taken))
