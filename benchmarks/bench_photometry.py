@@ -45,7 +45,7 @@ def main(write):
 
     def exact(omega):
         state = jr.State(attitude, omega)
-        return ph.light_curve(MOMENTS, state, ts, sun, observer, SHAPE, throw=False)
+        return ph.light_curve(MOMENTS, state, ts, sun, observer, SHAPE)
 
     @jax.vmap
     def seen(attitude, sun, observer):

@@ -369,7 +369,7 @@ def test_observations_are_what_was_read_and_what_was_left(found, readings):
 
 def test_what_a_record_does_not_tell_is_written(found, pictures):
     ax = jr.plot.fit(found, {"ratios": pictures.figure().add_subplot()})["ratios"]
-    assert ax.texts[0].get_text() == "not told: overall scale"
+    assert ax.texts[0].get_text() == "not determined: overall scale"
 
 
 def test_ratios_that_are_not_told_have_no_ellipse(found, pictures):

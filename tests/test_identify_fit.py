@@ -207,7 +207,7 @@ def test_what_is_printed(one_fit):
         "200 samples",
         "I3/I1 = ",
         "trace as declared",
-        "not told by the record: overall",
+        "not determined by the record: overall",
     ):
         assert line in text
     assert found.names == tuple(f"inertia[{i}]" for i in range(5))

@@ -155,7 +155,7 @@ def toutatis_1992() -> ToutatisRecord:
 def gyro_example() -> GyroRecord:
     """A SYNTHETIC gyro record of a tumbling box: 200 readings, 2 % noise, the same at every call.
 
-    A body of moments in the ratio 2 : 3 : 4 spins about its middle axis, flips over
+    A body of moments in the ratio 2 : 3 : 4 spins about its intermediate axis, flips over
     every 5.7 s, and is watched for 20 s at 10 Hz. Made for examples and tests; nothing
     was measured.
 

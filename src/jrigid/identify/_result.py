@@ -418,7 +418,7 @@ class FitResult(eqx.Module):
         return self.problem.options.dense
 
     def observations(self, record: int = 0) -> Observations:
-        """What was read in a record, and what was left of it; of a single fit.
+        """Values that were read in a record, with their residuals; of a single fit.
 
         Args:
             record: Which record.

@@ -320,7 +320,7 @@ def report(result: FitResult) -> str:
     lines += _of_torque(result)
     lines += _of_estimates(result)
     undetermined = "; ".join(result.null_directions) or "nothing"
-    lines.append(f"  not told by the record: {undetermined}")
+    lines.append(f"  not determined by the record: {undetermined}")
     return "\n".join(lines + [f"  {note}" for note in remarks(result)])
 
 

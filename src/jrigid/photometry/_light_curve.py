@@ -71,7 +71,6 @@ def light_curve(
     *,
     t0: ScalarLike = 0.0,
     light_time: bool = True,
-    throw: bool = True,
 ) -> Float[Array, " epochs"]:
     """Brightness of a free body at many epochs, by the exact flow.
 
@@ -90,14 +89,10 @@ def light_curve(
         light_time: True: `ts` are times at the observer, and light left the body
             earlier by the distance over the speed of light. False: `ts` are times at
             the body, as in files that are corrected for the light time.
-        throw: False: bad input gives NaN instead of an error.
 
     Returns:
-        Brightness at unit distances [m^2], as by `brightness`.
-
-    Raises:
-        ValueError: Wrong shapes.
-        RuntimeError: Inertia, state or times that no body has.
+        Brightness at unit distances [m^2], as by `brightness`. NaN for an inertia, a
+        state or times that no body has.
 
     Gradients: exact in all arguments, of any order, as those of `free_rotation` and
     `brightness`.
@@ -120,7 +115,7 @@ def light_curve(
     )
     if light_time:
         ts = ts - safe_norm(to_observer) / SPEED_OF_LIGHT
-    motion = free_rotation(inertia, state0, ts, t0=t0, throw=throw)
+    motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
     seen = functools.partial(_seen_from_space, shape, scattering)
     curve = jax.vmap(seen)(motion.attitude, to_sun, to_observer)
     return nan_where(motion.result != RESULTS.successful, curve)

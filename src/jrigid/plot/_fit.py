@@ -104,10 +104,8 @@ def _record(ax: Axes, result: FitResult, record: int, trial: int) -> None:
         times = np.linspace(ts[0], ts[-1], max(min(20 * ts.size, _POINTS), ts.size))
         model = np.asarray(result.predict(times, record, trial))
     sensor = result.fitted(trial)[1 + record]
-    if sensor.width == 4:  # q and -q are the same attitude
-        near = np.stack([np.interp(ts, times, x) for x in model.T], axis=1)
-        is_opposite = np.sum(near * values, axis=1, keepdims=True) < 0
-        values = np.where(is_opposite, -values, values)
+    if sensor.width == 4:
+        values = _of_equal_sign(values, ts, model, times)
     names = {3: "xyz", 4: "wxyz"}.get(values.shape[1], "0123456789")
     columns = zip(names, values.T, model.T, strict=False)
     for (colour, marker), (name, column, line) in looks(columns):
@@ -120,6 +118,15 @@ def _record(ax: Axes, result: FitResult, record: int, trial: int) -> None:
     which = f", trial {trial} of {count}" if count > 1 else ""
     quantity = _QUANTITIES.get(kind, "value")
     label(ax, f"{kind}{which}, and model", "time [s]", quantity)
+
+
+def _of_equal_sign(
+    values: np.ndarray, ts: np.ndarray, model: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Quaternions with the sign of the model's: q and -q are the same attitude."""
+    near = np.stack([np.interp(ts, times, x) for x in model.T], axis=1)
+    is_opposite = np.sum(near * values, axis=1, keepdims=True) < 0
+    return np.where(is_opposite, -values, values)
 
 
 def _followed(
@@ -251,7 +258,7 @@ def _ratios(ax: Axes, result: FitResult, *_: int) -> None:
     label(ax, title, "I2/I1", "I3/I1")
     text = ""
     if result.null_directions:
-        text = "not told: " + "; ".join(result.null_directions)
+        text = "not determined: " + "; ".join(result.null_directions)
     box = {"facecolor": "w", "lw": 0, "pad": 1}
     text = "\n".join(wrap(text, _LETTERS))
     ax.text(0.02, 0.98, text, transform=ax.transAxes, va="top", bbox=box)
