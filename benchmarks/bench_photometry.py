@@ -49,8 +49,9 @@ def main(write):
 
     @jax.vmap
     def seen(attitude, sun, observer):
-        sides = (jr.rotation.rotate_inverse(attitude, x) for x in (sun, observer))
-        return ph.brightness(SHAPE, *sides)
+        to_sun = jr.rotation.rotate_inverse(attitude, sun)
+        to_observer = jr.rotation.rotate_inverse(attitude, observer)
+        return ph.brightness(SHAPE, to_sun, to_observer)
 
     def integrated(omega):
         state = jr.State(attitude, omega)

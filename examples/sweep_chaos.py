@@ -54,6 +54,7 @@ def draw(found: jr.SweepResult) -> None:
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(12.0, 5.2), constrained_layout=True, sharey=True
     )
+    assert found.classes is not None  # of a refined map
     extent = (*np.degrees(found.extent[:2]), *found.extent[2:])
     style: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": extent}
     left.imshow(found.classes.T, cmap=ListedColormap(COLOURS), vmin=0, vmax=1, **style)
@@ -94,7 +95,9 @@ def main() -> None:
     found = jr.sweep(
         chaos, axes, refine=is_chaotic, store=given.store, attributes=UNITS
     )
-    seconds, computed = time.perf_counter() - start, np.mean(found.valid[...])
+    seconds = time.perf_counter() - start
+    computed = np.mean(found.valid)
+    assert found.classes is not None  # of a refined map
     print(
         f"{found.classes.size} points in {seconds:.0f} s, {computed:.1%} of them computed"
     )

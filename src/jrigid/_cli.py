@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -215,7 +216,8 @@ def _fit(options: argparse.Namespace) -> int:
         identify.save(options.save, result)
     if options.plot:
         os.environ.setdefault("MPLBACKEND", "Agg")
-        plot.fit(result)["record"].figure.savefig(options.plot)
+        figure: Any = plot.fit(result)["record"].figure
+        figure.savefig(options.plot)
     codes = (x for name, x in _EXIT.items() if result.status == getattr(Status, name))
     return next(codes)
 

@@ -9,7 +9,7 @@ arguments coincide.
 
 import functools
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -199,11 +199,11 @@ def _along_axes(kernel: Kernel) -> Kernel:
         slopes = jax.tree.map(
             lambda x, d: jnp.where(x == jnp.inf, -jnp.inf, d), values, partials
         )
-        return values, tuple(
-            sum(d[n] * tangents[i] for n, i in enumerate(varied)) for d in slopes
-        )
+        given = [cast("Array", tangents[i]) for i in varied]
+        totals = (sum(d[n] * x for n, x in enumerate(given)) for d in slopes)
+        return values, cast("Arrays", tuple(totals))
 
-    function.defjvp(rule, symbolic_zeros=True)
+    function.defjvp(rule, symbolic_zeros=True)  # pyright: ignore[reportArgumentType]
     return function
 
 
@@ -246,8 +246,9 @@ def _by_slopes(function: jax.custom_jvp[Array], *slopes: Callable[..., Array]) -
     def rule(
         primals: Arrays, tangents: tuple[Array | SymbolicZero, ...]
     ) -> tuple[Array, Array]:
-        total = sum(slopes[i](*primals) * tangents[i] for i in _varied(tangents))
-        return function(*primals), -total
+        given = {i: cast("Array", tangents[i]) for i in _varied(tangents)}
+        total = sum(slopes[i](*primals) * x for i, x in given.items())
+        return function(*primals), -cast("Array", total)
 
     function.defjvp(rule, symbolic_zeros=True)
 

@@ -97,7 +97,8 @@ def _reduced(u: Array, m: Array, mc: Array) -> tuple[Array, Array, Array, Array]
     return jax.tree.map(functools.partial(jnp.where, end), limits, values)
 
 
-@_reduced.defjvp
+# jax asks for a tuple of four where the rule has a tuple of any length.
+@_reduced.defjvp  # pyright: ignore[reportArgumentType]
 def _reduced_rule(primals: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
     u, m, mc = primals
     d_u, _, d_mc = tangents

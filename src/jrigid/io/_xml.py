@@ -2,8 +2,9 @@
 
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 from jrigid._checks import demand
 
@@ -81,7 +82,9 @@ def around_root(source: Document) -> tuple[str, str]:
     has_begun = False
     before = ""
     after = ""
-    for event, x in parser.read_events():
+    # What comes with an event is an element or a pair of names.
+    events = cast("Iterable[tuple[str, Any]]", parser.read_events())
+    for event, x in events:
         if event == "start":
             depth += 1
             has_begun = True

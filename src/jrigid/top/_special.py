@@ -131,11 +131,12 @@ def steady_precession(
     >>> print(rates.slow.round(6), rates.fast.round(6), rates.exists)
     0.354249 5.645751 True
     """
-    if (omega3 is None) == (psi_dot is None):
+    given = {"omega3": omega3, "psi_dot": psi_dot}
+    spin = {name: value for name, value in given.items() if value is not None}
+    if len(spin) != 1:
         raise ValueError(
             "One of the arguments `omega3` and `psi_dot` must be given, and one only."
         )
-    spin = {"psi_dot": psi_dot} if omega3 is None else {"omega3": omega3}
     slow, fast = where_valid(
         partial(_steady, of_psi=omega3 is None), top, theta=theta, **spin
     )
