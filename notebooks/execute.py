@@ -11,9 +11,7 @@ import nbformat
 
 HERE = pathlib.Path(__file__).parent
 TARGET = HERE.parent / "outputs" / "notebooks"
-FIGURES = {
-    "MPLBACKEND": "module://matplotlib_inline.backend_inline"
-}  # into the executed copy
+FIGURES = {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}  # into the executed copy
 
 
 def is_executed(path: pathlib.Path) -> bool:
@@ -31,14 +29,10 @@ def execute(path: pathlib.Path) -> bool:
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code" and (cell.outputs or cell.execution_count):
-            print(
-                f"{path.name} holds outputs: strip them before committing", flush=True
-            )
+            print(f"{path.name} holds outputs: strip them before committing", flush=True)
             return False
     start = time.perf_counter()
-    client = nbclient.NotebookClient(
-        notebook, timeout=600, resources={"metadata": {"path": HERE}}
-    )
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": HERE}})
     client.execute(env={**os.environ, **FIGURES})
     nbformat.write(notebook, TARGET / path.name)
     print(f"{path.name}: {time.perf_counter() - start:.1f} s", flush=True)
@@ -49,9 +43,7 @@ def main() -> int:
     """Run the notebooks beside this file, one on each core; with --new those not run yet."""
     TARGET.mkdir(parents=True, exist_ok=True)
     wanted = [
-        x
-        for x in sorted(HERE.glob("*.ipynb"))
-        if "--new" not in sys.argv or not is_executed(x)
+        x for x in sorted(HERE.glob("*.ipynb")) if "--new" not in sys.argv or not is_executed(x)
     ]
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         return int(not all(list(pool.map(execute, wanted))))

@@ -126,7 +126,7 @@ def toutatis_1992() -> ToutatisRecord:
 
     Returns:
         The record: times in s from the epoch, unit quaternions (body to space), rates
-            in rad/s.
+        in rad/s.
 
     >>> import jrigid as jr
     >>> record = jr.datasets.toutatis_1992()

@@ -124,9 +124,9 @@ def acceleration(
         finite.
 
     Gradients: those of the solution, of any order that L has. Zero where M is singular
-        or a coordinate is not finite, so that such a lane spoils none of what it shares
-        with others; where derivatives of L are not finite those of what it shares are
-        NaN.
+    or a coordinate is not finite, so that such a lane spoils none of what it shares
+    with others; where derivatives of L are not finite those of what it shares are
+    NaN.
     Source: Goldstein, Classical Mechanics, 3rd ed., eq. 1.57.
 
     >>> import jax.numpy as jnp

@@ -349,7 +349,7 @@ def rf(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
         zero, 0 where one is infinite, NaN where one is negative. Arguments broadcast.
 
     Gradients: R_D of the same arguments, to any order; -inf with respect to an argument
-        at 0.
+    at 0.
     Source: DLMF 19.16.1; the duplication theorem 19.26.18, the series 19.36.1.
 
     >>> import jrigid.elliptic
@@ -372,7 +372,7 @@ def rc(x: ValuesLike, y: ValuesLike) -> Values:
         R_C to 6 ulps; inf where y = 0, NaN where x < 0. Arguments broadcast.
 
     Gradients: R_D, to any order, right also at x = y; infinite with respect to x at x =
-        0.
+    0.
     Source: DLMF 19.2.17-19.2.20.
 
     >>> import jrigid.elliptic
@@ -398,7 +398,7 @@ def rd(x: ValuesLike, y: ValuesLike, z: ValuesLike) -> Values:
         Arguments broadcast.
 
     Gradients: of the duplication along each argument, which has no cancellation: right
-        also where arguments coincide; -inf with respect to an argument at 0.
+    also where arguments coincide; -inf with respect to an argument at 0.
     Source: DLMF 19.16.5; Carlson, Numerical Algorithms 10 (1995) 13.
 
     >>> import jrigid.elliptic
@@ -426,7 +426,7 @@ def rj(x: ValuesLike, y: ValuesLike, z: ValuesLike, p: ValuesLike) -> Values:
         one of them is negative. Arguments broadcast.
 
     Gradients: of the duplication along each argument, which has no cancellation: right
-        also where arguments coincide; -inf with respect to x, y or z at 0.
+    also where arguments coincide; -inf with respect to x, y or z at 0.
     Source: DLMF 19.16.2, 19.26.22, 19.36.2; Carlson, Numerical Algorithms 10 (1995) 13.
 
     >>> import jrigid.elliptic

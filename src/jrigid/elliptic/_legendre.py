@@ -217,7 +217,7 @@ def ellipe(m: ValuesLike | None, *, mc: ValuesLike | None = None) -> Values:
         E to 6 ulps; 1 at m = 1, NaN for m > 1. Arguments broadcast.
 
     Gradients: -R_D(0, mc, 1) / 6, negative, to any order, right at m = 0; -inf at m =
-        1.
+    1.
     Source: DLMF 19.2.8, 19.25.1.
 
     >>> import jrigid.elliptic
@@ -247,9 +247,9 @@ def ellippi(
         Arguments broadcast.
 
     Gradients: those of R_F and R_J, to any order, right at m = 0 and n = 0; infinite at
-        m = 1.
+    m = 1.
     Source: DLMF 19.2.8, 19.25.2, 19.6.6; for n < 0 19.21.12, which leaves only positive
-        terms.
+    terms.
 
     >>> import jrigid.elliptic
     >>> print(jrigid.elliptic.ellippi(0.3, 0.5).round(12))
@@ -329,7 +329,7 @@ def ellipkinc(
         beyond |phi| = pi/2, NaN outside the domain. Arguments broadcast.
 
     Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; infinite
-        where m sin^2 phi = 1.
+    where m sin^2 phi = 1.
     Source: DLMF 19.2.4, 19.25.5; derivative 19.4.4 in the form of 19.18.1.
 
     >>> import jrigid.elliptic
@@ -357,7 +357,7 @@ def ellipeinc(
         E to 8 ulps, NaN outside the domain. Arguments broadcast.
 
     Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; at m = 1
-        -inf with respect to m beyond |phi| = pi/2.
+    -inf with respect to m beyond |phi| = pi/2.
     Source: DLMF 19.2.5, 19.25.9-19.25.11.
 
     >>> import jrigid.elliptic
@@ -392,7 +392,7 @@ def ellippiinc(
         Arguments broadcast.
 
     Gradients: in phi the integrand; in n and m those of R_F and R_J, to any order,
-        right at m = 0, m = 1 and n = 0.
+    right at m = 0, m = 1 and n = 0.
     Source: DLMF 19.2.7, 19.25.14, 19.21.12.
 
     >>> import jrigid.elliptic

@@ -205,7 +205,7 @@ def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
         k = sqrt(m), see `parameter`; NaN where that is.
 
     Gradients: at k = 0, where k has a kink, zero; `parameter` is smooth at a stable
-        spin.
+    spin.
     Source: Landau & Lifshitz, Mechanics, 3rd ed., eq. 37.11.
 
     >>> import jax.numpy as jnp, jrigid as jr

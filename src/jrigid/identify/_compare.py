@@ -100,7 +100,7 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
 
     Gradients: none.
     Source: G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6
-        (1978) 461.
+    (1978) 461.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record, body = jr.datasets.gyro_example(), jr.RigidBody(jnp.ones(3))

@@ -488,7 +488,7 @@ def residuals(
         RuntimeError: `free_rotation` or `simulate` fails.
 
     Gradients: those of the motion, in every mode that `free_rotation` or `simulate`
-        has.
+    has.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()

@@ -425,7 +425,7 @@ def minimise(
         settings: What is to be done.
 
     Source: J. J. More (1978); H. B. Nielsen, "Damping parameter in Marquardt's method"
-        (1999).
+    (1999).
     """
     over_lanes = jax.vmap if settings.steps.shape[0] > 1 else _over_one_lane
     push = over_lanes(push_over)(problem, layout, point.numbers, settings)

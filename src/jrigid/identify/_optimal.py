@@ -85,7 +85,7 @@ def optimal_trial(
 
     Gradients: none.
     Source: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM Journal on Optimization 10
-        (2000) 1196.
+    (2000) 1196.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.identify.Rates(jnp.linspace(0.0, 20.0, 100), None, 0.01)

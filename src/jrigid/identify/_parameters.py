@@ -60,9 +60,9 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
         Inertia tensor [kg m^2]; NaN unless all six are finite.
 
     Gradients: analytic. Each tensor of a body with extent in three directions has
-        exactly one set of numbers, and there are no singular points.
+    exactly one set of numbers, and there are no singular points.
     Source: P. M. Wensing, S. Kim, J.-J. Slotine, IEEE Robotics and Automation Letters 3
-        (2018) 60, for the second moments.
+    (2018) 60, for the second moments.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.identify.inertia_from_parameters(jnp.zeros(6)))
@@ -93,7 +93,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
         in three directions has.
 
     Gradients: correct for symmetric changes of the tensor. They grow without bound as
-        the body becomes flat.
+    the body becomes flat.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> numbers = jr.identify.parameters_from_inertia(jnp.array([1.0, 2.0, 2.5]))
@@ -134,7 +134,7 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
 
     Gradients: analytic.
     Source: C. Rucker, P. M. Wensing, "Smooth parameterization of rigid-body inertia",
-        IEEE Robotics and Automation Letters 7 (2022) 2771.
+    IEEE Robotics and Automation Letters 7 (2022) 2771.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> body = jr.identify.body_from_log_cholesky(jnp.zeros(10))
@@ -166,7 +166,7 @@ def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
         (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3); NaN for a flat body.
 
     Gradients: correct for symmetric changes of the tensor. They grow without bound as
-        the body becomes flat.
+    the body becomes flat.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> box = jr.solids.box(8.0, jnp.array([1.0, 2.0, 3.0]))

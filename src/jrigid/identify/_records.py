@@ -390,7 +390,7 @@ def _inverse_factor(covariance: AnyArray) -> AnyArray:
 
     It is NaN where there is no L.
     By Gram and Schmidt: its rows are orthonormal in the product that the covariance
-        makes.
+    makes.
     """
     xp = covariance.__array_namespace__()
     eye = xp.eye(covariance.shape[-1], dtype=covariance.dtype)

@@ -200,8 +200,8 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
         Parameters, of length at most 1; NaN of the zero quaternion.
 
     Gradients: finite everywhere. At a half turn (w = 0, length 1), where the value
-        jumps to its shadow, they are those of the set that is returned, that of the
-        sign of the quaternion.
+    jumps to its shadow, they are those of the set that is returned, that of the
+    sign of the quaternion.
     Source: H. Schaub and J. Junkins, J. Astronautical Sciences 44 (1996) 1-19.
 
     >>> import jax.numpy as jnp, jrigid as jr

@@ -282,8 +282,8 @@ def read_inertials(
         FileNotFoundError: No such file.
 
     Source: URDF, wiki.ros.org/urdf/XML/link; MuJoCo, XML reference, body/inertial;
-        SDFormat 1.12, inertial. All three mean tensors about the centre of mass with
-        ixy = -sum m x y.
+    SDFormat 1.12, inertial. All three mean tensors about the centre of mass with
+    ixy = -sum m x y.
 
     >>> import jrigid as jr
     >>> text = "<inertial mass='2' pos='0 0 1' diaginertia='1 2 2.5' euler='0 0 90'/>"

@@ -156,7 +156,7 @@ def nearest_physical(
     no negative principal moment. Of all such the one whose S is nearest in the
     Frobenius norm is taken: what is below 0 in S becomes 0, and its axes stay. That
     body is flat. With a mass and a thickness no direction is thinner than a plate of
-        that thickness: no moment of S is below m h^2 / 12.
+    that thickness: no moment of S is below m h^2 / 12.
 
     Args:
         inertia: Moments or tensor [kg m^2]; of a tensor the symmetric part counts.

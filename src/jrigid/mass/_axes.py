@@ -84,7 +84,7 @@ def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
     """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
 
     Entries and scale are about 1: products of much larger or smaller ones leave the
-        range.
+    range.
     """
     # A few ulps off at any moments, where the roots of the cubic lose half the digits.
     shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
@@ -174,7 +174,7 @@ def to_center_of_mass(
     The inverse of `parallel_axis`: $I_{com} = I - m (|d|^2 1 - d d^T)$. NaN where the
     tensor is not symmetric or the mass negative, and where a moment about the centre of
     mass comes out negative: no body with `mass` at `displacement` has so small a
-        tensor.
+    tensor.
 
     Args:
         inertia: Moments or tensor about the point [kg m^2].

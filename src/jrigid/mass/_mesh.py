@@ -103,9 +103,9 @@ def _mesh_integrals(
 
     The divergence theorem, as tetrahedra between the faces and an origin amid the
     vertices: the sums do not depend on it, so no derivative runs through it, and far
-        bodies lose no digits.
+    bodies lose no digits.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties
-        (2002).
+    (2002).
     """
     sums = jnp.stack([lane_sum(vertices[:, i]) for i in range(3)])
     origin = jax.lax.stop_gradient(sums / vertices.shape[0])
@@ -164,7 +164,7 @@ def from_mesh(
 
     Gradients: exact in the vertices and the density.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties
-        (2002).
+    (2002).
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> corners = jnp.array([[0.0, 0, 0], [6.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])

@@ -139,7 +139,7 @@ def animate(
 
     Returns:
         An `Animation`: a notebook shows it, `.save("top.html")` (or .gif, .mp4) writes
-            it.
+        it.
 
     Raises:
         ValueError: Not one time for each state of one motion, in their order, or fewer

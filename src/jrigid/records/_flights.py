@@ -102,7 +102,7 @@ def flights(
     flight 1 of 1, 0.51 s to 1.19 s: no contact by the specific forces
 
     Source: the consensus of guesses is that of Fischler and Bolles, Comm. ACM 24, 381
-        (1981).
+    (1981).
     """
     check_option("by", by, (None, "forces", "momentum"))
     rates, forces, t = reading.rates, reading.specific_forces, reading.times

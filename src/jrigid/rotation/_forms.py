@@ -295,7 +295,7 @@ def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
         roll and yaw in [-pi, pi].
 
     Gradients: exact for |pitch| < pi/2. At the two poles pitch has a cone (gradient 0)
-        and yaw and roll the derivatives along the choice roll = 0: finite always.
+    and yaw and roll the derivatives along the choice roll = 0: finite always.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> angles = jnp.array([0.3, -0.8, 1.2])

@@ -197,7 +197,7 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
 
     Returns:
         Space components, same unit. Exact for any non-zero quaternion: its norm drops
-            out.
+        out.
 
     Gradients: finite for any non-zero quaternion, of order 1 / norm in the attitude.
 
@@ -318,7 +318,7 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
         Angle in [0, pi] [rad], accurate also for tiny angles; 0 if p or q is zero.
 
     Gradients: at p = q the angle has a cone; the gradient there is 0, as at a zero
-        quaternion.
+    quaternion.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> q = jr.rotation.exp(jnp.array([0.0, 1e-3, 0.0]))
@@ -343,9 +343,9 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
         Unit quaternion p exp(s log(p^-1 q)), of the sign of p at s = 0.
 
     Gradients: analytic also at p = q, to any order. Attitudes half a turn apart have
-        two shortest arcs: where conj(p) q has no scalar part the one about its vector
-        part is taken, and the value jumps from one to the other across; derivatives are
-        those on the side taken.
+    two shortest arcs: where conj(p) q has no scalar part the one about its vector
+    part is taken, and the value jumps from one to the other across; derivatives are
+    those on the side taken.
     Source: K. Shoemake, Animating rotation with quaternion curves, SIGGRAPH (1985) 245.
 
     >>> import jax.numpy as jnp, jrigid as jr

@@ -260,7 +260,7 @@ class Store:
         """Keep a block, its mask last.
 
         As zarr would, but without a copy: the numbers, little end first, and their
-            checksum.
+        checksum.
         """
         for leaf, value in zip(self.leaves, values, strict=True):
             numbers = (
