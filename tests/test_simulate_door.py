@@ -178,7 +178,7 @@ def test_a_condition_is_given_what_it_asks_for():
         condition_of_states(x, jnp.array(1.0), lambda y: 2 * y, known)
         for x in (plain, named, every)
     ]
-    found = [condition(jnp.array(2.0), 3.0, 4) for condition in each]
+    found = [condition(jnp.array(2.0), jnp.array(3.0), 4) for condition in each]
     assert found == [(3.0, 6.0, 4), 5, known]
 
 

@@ -168,7 +168,9 @@ def _of_numbers(
             numbers).
         units: Natural units of the numbers.
     """
-    r = np.linalg.qr(rest.reshape(-1, units.size), mode="r")
+    trials, count, _ = rest.shape
+    # There may be no numbers, so no length can be left to numpy.
+    r = np.linalg.qr(rest.reshape(trials * count, units.size), mode="r")
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
     eps = np.finfo(units.dtype).eps
