@@ -37,7 +37,8 @@ def condition_of_states(
     names = {x.name for x in parameters}
     passed = {name: x for name, x in options.items() if takes_all or name in names}
 
-    def of_array(t: Array, y: Array, args: PyTree) -> Array:
+    # What a user's condition returns is checked where it is called.
+    def of_array(t: Array, y: Array, args: PyTree) -> Any:
         with traced_by_jax("the condition of an event"):
             return condition(t0 + t, to_state(y), args, **passed)
 
