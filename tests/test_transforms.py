@@ -371,7 +371,8 @@ def shapes_of_a_top(i1, i3, mgl):
     lever = jnp.stack([0 * i3, 0 * i3, i3])
     shifted = jr.SymmetricTop.from_mass_properties(body, lever)
     rigid = held.as_rigid_body()
-    return held, shifted, rigid.inertia, rigid.torque.lever
+    unchecked = jr.SymmetricTop.unchecked(i1, i3, mgl)
+    return held, unchecked, shifted, rigid.inertia, rigid.torque.lever
 
 
 def nutation(one, state):
@@ -645,7 +646,9 @@ CASES = {
     "top.SymmetricTop": Case(
         shapes_of_a_top,
         (1.0, 0.6, 0.8),
-        methods("top.SymmetricTop", "as_rigid_body", "from_mass_properties"),
+        methods(
+            "top.SymmetricTop", "as_rigid_body", "from_mass_properties", "unchecked"
+        ),
     ),
     "top.top_motion": Case(
         lambda i1, i3, mgl, q, w, t: (

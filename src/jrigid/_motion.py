@@ -36,7 +36,7 @@ from jrigid.rotation import normalize
 from jrigid.systems import AbstractSystem, RigidBody
 
 Motion = TypeVar("Motion", bound=Any)
-State_ = TypeVar("State_", bound=BodyState)
+_State = TypeVar("_State", bound=BodyState)
 
 #: Notes invalid values of a body, as `check(findings, body)`.
 Check = Callable[[Findings, Any], None]
@@ -92,8 +92,8 @@ def motion_arguments(
 
 
 def _in_one_dtype(
-    name: str, state: State_, *others: object
-) -> tuple[State_, tuple[Array, ...]]:
+    name: str, state: _State, *others: object
+) -> tuple[_State, tuple[Array, ...]]:
     """A state and other arrays in one dtype; ValueError for a shape that is wrong."""
     vectors = {field: value for field, value in vars(state).items() if field in _SIZES}
     for field, value in vectors.items():

@@ -38,7 +38,7 @@ from jrigid.mass import MassProperties
 from jrigid.rotation import attitude_rate, rotate
 from jrigid.torques import AbstractTorque, Sum, TorqueFunction, as_torque
 
-State_ = TypeVar("State_", bound=BodyState)
+_State = TypeVar("_State", bound=BodyState)
 
 
 class AbstractSystem(Readable):
@@ -73,7 +73,7 @@ class AbstractSystem(Readable):
             Space components [kg m^2/s].
         """
 
-    def with_parts(self, state: State_) -> State_:
+    def with_parts(self, state: _State) -> _State:
         """The state, with internal parts at rest in the body if it has none.
 
         `simulate` adds them to a state without parts. The vector field needs them, for

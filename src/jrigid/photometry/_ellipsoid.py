@@ -21,7 +21,7 @@ class Ellipsoid(Readable):
     >>> import jax.numpy as jnp, jrigid as jr
     >>> cigar = jr.photometry.Ellipsoid(jnp.array([3.0, 1.0, 1.0]))
     >>> print(cigar.facets(8).areas.shape)
-    (128,)
+    (224,)
     """
 
     semi_axes: Float[Array, "3"] = eqx.field(
@@ -32,7 +32,8 @@ class Ellipsoid(Readable):
         """Triangles with their corners on the ellipsoid.
 
         Args:
-            rows: Between pole and pole; there are 2 `rows`^2 triangles.
+            rows: Rings of triangles from pole to pole; there are about 4 `rows`^2
+                triangles in all.
         """
         vertices, faces = _sphere(whole_number("rows", rows, least=4))
         corners = jnp.asarray(vertices, self.semi_axes.dtype) * self.semi_axes[None]

@@ -172,7 +172,7 @@ def omega_from_periods(
     >>> day = 86400.0
     >>> omega = jr.photometry.omega_from_periods(toutatis, 7.35 * day, 5.41 * day, "long-axis")
     >>> print(jnp.rad2deg(jr.photometry.tumbling(toutatis, omega).tilt_max).round(1))
-    51.5
+    51.2
     """
     check_option("mode", mode, _MODES)
     inertia, precession_period, rotation_period = shaped(
