@@ -149,7 +149,7 @@ def to_spice(attitude: QuaternionLike) -> Quaternion:
     SPICE is scalar first with Hamilton's product, as here, but its C-matrix takes
     components in the reference frame to the instrument's: the conjugate. Its angular
     velocities are in components of the reference frame:
-        `jrigid.rotation.rotate(attitude, omega)`.
+    `jrigid.rotation.rotate(attitude, omega)`.
 
     Args:
         attitude: Unit quaternion, body to space.

@@ -240,7 +240,7 @@ def from_density(
         order: Nodes along each axis. Exact for densities that are polynomials of degree
             up to 2 order - 3 in each coordinate; a density that jumps inside the box,
             such as that of a ball, converges slowly: split the box, or use `from_mesh`
-                or `jrigid.solids`.
+            or `jrigid.solids`.
         throw: False: a bad value makes the body of its lane NaN instead of an error.
 
     Returns:

@@ -32,8 +32,8 @@ class Ellipsoid(Readable):
         """Triangles with their corners on the ellipsoid.
 
         Args:
-            rows: Rings of triangles from pole to pole; there are about 4 `rows`^2
-                triangles in all.
+            rows: Rings of triangles from pole to pole. The number of triangles is about
+                four times the square of this one.
         """
         vertices, faces = _sphere(whole_number("rows", rows, least=4))
         corners = jnp.asarray(vertices, self.semi_axes.dtype) * self.semi_axes[None]
