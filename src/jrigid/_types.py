@@ -36,7 +36,7 @@ else:
     AnyArray = Array | np.ndarray | np.generic
     #: A time or a step that diffrax passes to a solver. Type checkers reject arithmetic
     #: with `ScalarLike`, which includes numbers of numpy.
-    TimeLike = ScalarLike
+    TimeLike = TypeAliasType("TimeLike", _Real[ArrayLike, ""])
     #: A matrix of either kind, shown in signatures by this name.
     AnyMatrix = TypeAliasType(
         "AnyMatrix", Float[Array, "3 3"] | Float[np.ndarray, "3 3"]
