@@ -91,7 +91,7 @@ def _of_parts(system: RigidBody, motion: Motion, states: Rotating) -> np.ndarray
         ts = motion.ts
         args = motion.args
 
-    def momentum(t: Array, state: Any, args: Any) -> Array:
+    def momentum(t: AnyArray, state: Any, args: Any) -> Array:
         return system.torque.internal_momentum(t, system.with_parts(state), args)
 
     if states.omega.ndim == 1:
