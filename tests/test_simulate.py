@@ -486,7 +486,7 @@ def test_a_body_at_rest_stays_at_rest():
 
 def test_a_body_spun_up_from_rest_in_any_unit_of_time():
     for unit in (1e-7, 1.0, 1e4):
-        torque = jr.torques.Constant([0.0, 0.0, 3 * unit**2])
+        torque = jr.torques.Constant(np.array([0.0, 0.0, 3 * unit**2]))
         trajectory = jr.simulate(
             jr.RigidBody(MOMENTS, torque),
             jr.State(UPRIGHT, jnp.zeros(3)),
