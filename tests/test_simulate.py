@@ -703,7 +703,7 @@ def test_every_field_of_a_trajectory_carries_the_error(field, reached_by_the_err
 
 def test_nan_in_a_torque_at_the_start_is_an_error():
     state0 = jr.State(ATTITUDE, OMEGA)
-    body = jr.RigidBody(MOMENTS, jr.torques.Constant([jnp.nan, 0.0, 0.0]))
+    body = jr.RigidBody(MOMENTS, jr.torques.Constant(np.array([np.nan, 0.0, 0.0])))
     with pytest.raises(RuntimeError, match="`torque` of `Constant` must be finite"):
         jr.simulate(body, state0, np.array([1.0]))
     body = jr.RigidBody(MOMENTS, lambda _t, state, _args: jnp.nan * state.omega)
