@@ -97,7 +97,7 @@ def facets_from_mesh(
             must then be None.
 
     Returns:
-        The facets, without triangles of no area.
+        The facets. A triangle of no area has the normal 0 and adds no light.
 
     Raises:
         ValueError: A mesh that is not convex (where `vertices` is known at trace time):
@@ -131,12 +131,12 @@ def facets_from_mesh(
     )
     if hull:
         faces = _hull(np.asarray(vertices))
-    elif is_concrete(vertices):
-        _demand_convex(np.asarray(vertices), faces)
     corners = vertices[faces]
     across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = safe_norm(across)
     normals = across / jnp.where(twice > 0, twice, 1.0)[:, None]
+    if is_concrete(vertices) and not hull:
+        _demand_convex(np.asarray(corners), np.asarray(normals))
     return Facets(twice / 2, normals, albedo)
 
 
@@ -152,17 +152,13 @@ def _hull(vertices: np.ndarray) -> np.ndarray:
     return faces
 
 
-def _demand_convex(vertices: np.ndarray, faces: np.ndarray) -> None:
+def _demand_convex(corners: np.ndarray, normals: np.ndarray) -> None:
     """Raise ValueError unless all corners lie behind the planes of all triangles."""
-    size = np.max(np.ptp(vertices, axis=0))
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(lengths > 0, lengths, 1.0)
-    used = vertices[np.unique(faces)]
-    for first in range(0, len(faces), _AT_A_TIME):
+    used = np.unique(corners.reshape(-1, 3), axis=0)
+    size = np.max(np.ptp(used, axis=0))
+    for first in range(0, len(normals), _AT_A_TIME):
         part = slice(first, first + _AT_A_TIME)
-        offsets = np.sum(normals[part] * a[part], axis=1, keepdims=True)
+        offsets = np.sum(normals[part] * corners[part, 0], axis=1, keepdims=True)
         beyond = np.max(normals[part] @ used.T - offsets, axis=1) / size
         worst = int(np.argmax(beyond))
         demand(
