@@ -1,12 +1,11 @@
 """Tumbling in the observers' terms: two periods, a mode, the tilt and the energy."""
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jrigid._checks import (
     INERTIA,
@@ -21,6 +20,7 @@ from jrigid._types import InertiaLike, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import angular_momentum
 from jrigid.free import REGIMES, mean_precession_rate, polhode_period, regime
 from jrigid.mass import principal_axes
+from jrigid.stability import boundary
 
 _MODES = ("long-axis", "short-axis")
 # Logarithms of the tangent of the largest tilt between which a motion is sought. Below
@@ -28,10 +28,6 @@ _MODES = ("long-axis", "short-axis")
 # the tilt is 90 degrees but for 1e-17.
 _LOWEST = -20.0
 _HIGHEST = 40.0
-_HALVINGS = 60
-# Each of Newton's steps from the exact root doubles the orders of derivatives in the
-# arguments that are right: 1, then 3.
-_NEWTON_STEPS = 2
 
 
 class Tumbling(NamedTuple):
@@ -165,7 +161,7 @@ def omega_from_periods(
 
     Gradients: right to second order, in all arguments.
     Source: the formulas of `free.polhode_period` and `free.mean_precession_rate`,
-    solved by bisection.
+    solved by `stability.boundary`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> toutatis = jnp.array([1.0, 3.09, 3.22])
@@ -192,18 +188,27 @@ def _of_periods(
     principal = principal_axes(inertia)
     moments = principal.moments
     wanted = rotation_period / precession_period
-
-    def excess(y: Scalar) -> Scalar:
-        """Logarithm of the ratio of the periods over the wanted one."""
-        omega = _at_largest_tilt(moments, y, long_axis)
-        turns = polhode_period(moments, omega) * mean_precession_rate(moments, omega)
-        return jnp.log(turns / (2 * jnp.pi) / wanted)
-
-    y, found = _root(excess, jax.lax.stop_gradient(wanted))
-    omega = _at_largest_tilt(moments, y, long_axis)
+    lowest, highest = (jnp.asarray(y, wanted.dtype) for y in (_LOWEST, _HIGHEST))
+    excess = _EXCESS[long_axis]
+    eps = float(jnp.finfo(wanted.dtype).eps)
+    y = boundary(excess, lowest, highest, moments, wanted, rtol=eps, throw=False)
+    found = jnp.isfinite(y)
+    # Derivatives of other lanes stay clean.
+    omega = _at_largest_tilt(moments, jnp.where(found, y, 0.0), long_axis)
     period = 2 * jnp.pi / mean_precession_rate(moments, omega)
     omega = omega * period / precession_period
     return jnp.where(found, product("ij,j->i", principal.axes, omega), jnp.nan)
+
+
+def _excess(long_axis: bool, y: Scalar, moments: Vector, wanted: Scalar) -> Scalar:
+    """Logarithm of the ratio of the periods over the wanted one; it rises with y."""
+    omega = _at_largest_tilt(moments, y, long_axis)
+    turns = polhode_period(moments, omega) * mean_precession_rate(moments, omega)
+    return jnp.log(turns / (2 * jnp.pi) / wanted)
+
+
+# One function object for each mode, so that no call compiles a new one.
+_EXCESS = {mode: functools.partial(_excess, mode) for mode in (False, True)}
 
 
 def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
@@ -213,29 +218,3 @@ def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
     zero = jnp.zeros_like(y)
     momentum = [cosine, sine, zero] if long_axis else [zero, sine, cosine]
     return jnp.stack(momentum) / moments
-
-
-def _root(
-    function: Callable[[Scalar], Scalar], like: Scalar
-) -> tuple[Scalar, Bool[Array, ""]]:
-    """The root of an increasing function by bisection, and whether there is one.
-
-    Bisection has no derivatives; Newton's steps from the root give it those of the
-    implicit function.
-    """
-    low = jnp.full_like(like, _LOWEST)
-    high = jnp.full_like(like, _HIGHEST)
-    found = (function(low) <= 0) & (function(high) >= 0)
-
-    def halve(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
-        low, high = ends
-        middle = (low + high) / 2
-        below = function(middle) < 0
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))
-    root = jax.lax.stop_gradient((low + high) / 2)
-    for _ in range(_NEWTON_STEPS):
-        value, slope = jax.value_and_grad(function)(root)
-        root = root - value / jnp.where(slope > 0, slope, jnp.inf)
-    return root, found
