@@ -189,8 +189,9 @@ def main(write: bool) -> None:
 
     header = ["what", "compile ms", "min ms", "median ms", "of the value", "error"]
     text = (
-        "Ratios are to the value of the same group, for ellipj to scipy, whose difference is the "
-        "error there.\n\n" + common.table(header, rows)
+        "Ratios are to the value of the same group, for ellipj to scipy, whose "
+        "difference is the error there.\n"
+        "\n" + common.table(header, rows)
     )
     packages = ["jax", "diffrax", "numpy", "scipy"]
     if any("heyoka" in row[0] for row in rows):

@@ -255,7 +255,8 @@ def main():
             common.table(
                 ["errors", "gap 1, 2", "gap 2, 3", *ratios], tensors(given.trials)
             ),
-            f"Fits, {given.fits} in each cell ({100 * np.sqrt(0.0475 / given.fits):.1f} points).",
+            f"Fits, {given.fits} in each cell "
+            f"({100 * np.sqrt(0.0475 / given.fits):.1f} points).",
             common.table(["moments, noise", "gap", "OK", *ratios], fitted),
             "The bodies together (a standard error of "
             f"{100 * np.sqrt(0.0475 / all_fits):.1f} points):",

@@ -93,7 +93,10 @@ if __name__ == "__main__":
     )
     text = f"{len(rows)} records: {kinds}. OK and wrong, by seed: {wrong}.\n\n"
     text += common.table(heads, lines)
-    text += "\n\nOf five numbers within their errors the median is 4.4, and 99 % are below 15.1. "
+    text += (
+        "\n\nOf five numbers within their errors the median is 4.4, and 99 % are below "
+        "15.1. "
+    )
     text += (
         f"{(time.perf_counter() - start) / len(rows) * 1e3:.0f} ms a record, all told."
     )

@@ -179,8 +179,14 @@ def nonlinear():
     found = run()
     ours = (time.perf_counter() - start) * 1e3
     order = found.values[0]
-    share = f"{100 * np.mean(order > 5):.0f} % chaotic, {100 * np.mean(order < 3):.0f} % regular"
-    worst = f"{share}; valid {100 * found.valid.mean():.0f} %; error {found.values[2].max():.0e}"
+    share = (
+        f"{100 * np.mean(order > 5):.0f} % chaotic, {100 * np.mean(order < 3):.0f} % "
+        "regular"
+    )
+    worst = (
+        f"{share}; valid {100 * found.valid.mean():.0f} %; error "
+        f"{found.values[2].max():.0e}"
+    )
     rows = [["16,384 motions to T = 200: megno", first - ours, ours, ours, worst]]
     begin = starts()
     for tolerance in (1e-9, 1e-15):

@@ -370,9 +370,10 @@ def main():
     ]
     explained = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:3]]
     sizes = (
-        f"The {options.body} body; in each row {options.worlds} worlds of {options.trials} trials, "
-        f"in groups of {options.group}. The standard deviation of the torque is about "
-        f"{options.level:g} / s times the spin and the mean moment."
+        f"The {options.body} body; in each row {options.worlds} worlds of "
+        f"{options.trials} trials, in groups of {options.group}. The standard "
+        f"deviation of the torque is about {options.level:g} / s times the spin and "
+        "the mean moment."
     )
     text = "\n\n".join([*explained, sizes, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")

@@ -366,8 +366,9 @@ def main() -> None:
             good, error, seconds, evaluations = np.array(fits).T
             found = f"{int(good.sum())} of {records}, error {np.median(error):.2g}"
             print(
-                f"{fit.__name__:10} {name:9} {found}, {np.median(seconds):.2g} s (longest "
-                f"{np.max(seconds):.2g}), {int(np.median(evaluations))} motions",
+                f"{fit.__name__:10} {name:9} {found}, {np.median(seconds):.2g} s "
+                f"(longest {np.max(seconds):.2g}), {int(np.median(evaluations))} "
+                "motions",
                 flush=True,
             )
 

@@ -215,7 +215,9 @@ def gallery() -> str:
             image.save(THUMBNAILS / f"{path.stem}.png")
             shown = f":img-top: thumbnails/{path.stem}.png\n:img-alt: {title}\n"
         cards.append(
-            f":::{{grid-item-card}} {title}\n:link: ../notebooks/{path.stem}\n:link-type: doc\n"
+            f":::{{grid-item-card}} {title}\n"
+            f":link: ../notebooks/{path.stem}\n"
+            ":link-type: doc\n"
             f"{shown}:::\n"
         )
     return f"::::{{grid}} 1 2 2 3\n:gutter: 3\n\n{''.join(cards)}::::\n"

@@ -537,9 +537,10 @@ def picture(result: Result) -> Any:
     figure.text(
         0.055,
         0.931,
-        f"observed (colour) and as a rotating body moves by Euler's equations (black); "
-        f"it wobbles once in {result.period:.1f} \u00b1 {result.period_error:.1f} days, "
-        f"(I3 \u2212 I1)/I1 = {result.ellipticity:.6f} \u00b1 {result.ellipticity_error:.6f}",
+        "observed (colour) and as a rotating body moves by Euler's equations "
+        f"(black); it wobbles once in {result.period:.1f} \u00b1 "
+        f"{result.period_error:.1f} days, (I3 \u2212 I1)/I1 = "
+        f"{result.ellipticity:.6f} \u00b1 {result.ellipticity_error:.6f}",
         fontsize=11,
         color=ink,
     )

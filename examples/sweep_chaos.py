@@ -99,7 +99,8 @@ def main() -> None:
     computed = np.mean(found.valid)
     assert found.classes is not None  # of a refined map
     print(
-        f"{found.classes.size} points in {seconds:.0f} s, {computed:.1%} of them computed"
+        f"{found.classes.size} points in {seconds:.0f} s, {computed:.1%} of them "
+        "computed"
     )
     print(f"chaotic: {found.classes.mean():.1%}")
     draw(found)

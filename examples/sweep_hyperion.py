@@ -128,7 +128,8 @@ def main() -> None:
     found = jr.sweep(chaos, axes, block_size=2048)
     print(f"{found.valid.sum()} of {found.valid.size} motions are valid")
     print(
-        f"chaotic {np.mean(found.values > 5):.0%}, regular {np.mean(found.values < 3):.0%}"
+        f"chaotic {np.mean(found.values > 5):.0%}, regular "
+        f"{np.mean(found.values < 3):.0%}"
     )
     centres = islands()
     for resonance, angle, rate in centres:

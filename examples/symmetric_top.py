@@ -59,8 +59,8 @@ def report(ratio: float, error: float) -> str:
     """The result in one line."""
     off = (ratio - TRUE_RATIO) / error
     return (
-        f"A synthetic top, 2 % noise, started from a sphere: I1/I3 = {ratio:.5f} +- {error:.5f}, "
-        f"true {TRUE_RATIO} ({off:+.1f} standard errors)"
+        f"A synthetic top, 2 % noise, started from a sphere: I1/I3 = {ratio:.5f} +- "
+        f"{error:.5f}, true {TRUE_RATIO} ({off:+.1f} standard errors)"
     )
 
 

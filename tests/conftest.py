@@ -1,4 +1,5 @@
-"""Set-up of the test suite: x64, strict promotion, run-time type checks, warnings as errors."""
+"""Set-up of the test suite: x64, strict promotion, run-time type checks,
+warnings as errors."""
 
 import gc
 import itertools
@@ -46,7 +47,8 @@ from hypothesis import strategies as st  # noqa: E402
 
 @pytest.fixture(scope="session", autouse=True)
 def first_hypothesis():
-    """Hypothesis collects garbage before its first test: here, while there is little to go through.
+    """Hypothesis collects garbage before its first test: here,
+    while there is little to go through.
 
     In a process that has run for long it takes eight seconds.
     """
@@ -61,7 +63,8 @@ def first_hypothesis():
 
 @pytest.fixture
 def untyped():
-    """Switch the run-time type checks off, to reach the errors a user sees without them."""
+    """Switch the run-time type checks off, to reach the errors a user sees without
+    them."""
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)

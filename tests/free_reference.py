@@ -42,7 +42,8 @@ _EXACT = 700
 
 
 def free_motion(inertia, attitude, omega, times):
-    """Attitude (4,) and omega (3,) at each time, as lists of mpf good to more than 30 digits.
+    """Attitude (4,) and omega (3,) at each time, as lists of mpf good to more than 30
+    digits.
 
     The attitude's sign is continuous in time from that of the attitude given, which is
     normalised first.
@@ -137,7 +138,8 @@ def _rotation(w, t):
 
 
 def _euler(momentum, phi, psi):
-    """The z-x-z attitude of axes in which L has these components, L along z in space."""
+    """The z-x-z attitude of axes in which L has these components,
+    L along z in space."""
     theta = mp.atan2(mp.hypot(momentum[0], momentum[1]), momentum[2])
     c, s = mp.cos(theta / 2), mp.sin(theta / 2)
     plus, minus = (phi + psi) / 2, (phi - psi) / 2
@@ -145,7 +147,8 @@ def _euler(momentum, phi, psi):
 
 
 def _generic(moments, w, times):
-    """Euler angles about L, as a quaternion, and omega; the polhode circles the third axis."""
+    """Euler angles about L, as a quaternion, and omega;
+    the polhode circles the third axis."""
     ia, ib, ic = moments
     # Coefficients with (A, B, C) the largest values of the components; all summands are
     # positive.
@@ -197,7 +200,8 @@ def _generic(moments, w, times):
 
 
 def _separatrix(moments, w, times):
-    """As `_generic`, exactly on the separatrix; the third axis is that of the middle moment.
+    """As `_generic`, exactly on the separatrix; the third axis is that of the middle
+    moment.
 
     The components across the middle axis go as sech u with a constant ratio, so psi is
     constant; 2 E = L^2 / I_b makes phi' = L / I_b.

@@ -40,13 +40,15 @@ _KERNEL = re.compile(r"\s(fusion|call|conditional|while|custom-call)\(")
 
 
 def kernels(optimised_hlo):
-    """Count fusions, calls, conditionals, loops and custom calls in the optimised HLO."""
+    """Count fusions, calls, conditionals, loops and custom calls in the optimised
+    HLO."""
     instructions = (line.split(", metadata=")[0] for line in optimised_hlo.splitlines())
     return sum(bool(_KERNEL.search(line)) for line in instructions)
 
 
 def quick_jit(function):
-    """jax.jit that spends less on compiling: for large derivatives that are run once."""
+    """jax.jit that spends less on compiling: for large derivatives that are run
+    once."""
     if jax.default_backend() != "cpu":
         return jax.jit(function)
     options = {
@@ -72,7 +74,8 @@ def quick_jit(function):
 
 
 def in_a_process(script, **environment):
-    """What a script prints and complains of in a process of its own, quickly compiled."""
+    """What a script prints and complains of in a process of its own,
+    quickly compiled."""
     # The compiler's time is not the point.
     own = {
         "XLA_FLAGS": "--xla_backend_optimization_level=0",

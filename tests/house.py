@@ -1,4 +1,5 @@
-"""The size and the order of the house: `python tests/house.py [FOLDER ...]` prints it."""
+"""The size and the order of the house: `python tests/house.py [FOLDER ...]` prints
+it."""
 
 import ast
 import inspect
@@ -60,7 +61,8 @@ def functions():
 
 
 def is_parallel(node):
-    """Whether an assignment gives several names values that are written side by side."""
+    """Whether an assignment gives several names values that are written side by
+    side."""
     return (
         isinstance(node, ast.Assign)
         and isinstance(node.targets[0], ast.Tuple)
@@ -74,7 +76,8 @@ def is_any(annotation):
 
 
 def reading(root=ROOT):
-    """How the code below a folder reads: the numbers of the table in the style guide."""
+    """How the code below a folder reads: the numbers of the table in the style
+    guide."""
     lines = tokens = comments = assigned = parallel = arguments = anything = 0
     sizes = []
     for path in sorted(root.rglob("*.py")):

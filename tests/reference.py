@@ -1,4 +1,5 @@
-"""Reference motions in extended precision, by a method unlike the package's: Taylor series.
+"""Reference motions in extended precision, by a method unlike the package's:
+Taylor series.
 
 Free and heavy bodies are quadratic differential equations, x_i' = sum of c x_j x_k over
 a short list of terms. Their Taylor coefficients and those of the variational equations
@@ -31,7 +32,8 @@ _CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
 def _bilinear(x, y, terms):
-    """Sum of c x_j y_k into row i; x (a, n, B), y (a, n, ..., B) summed over the first axis."""
+    """Sum of c x_j y_k into row i; x (a, n, B), y (a, n, ...,
+    B) summed over the first axis."""
     i, j, k, c = terms
     left = x[:, j]
     right = y[:, k]
@@ -136,7 +138,8 @@ def heavy_body(moments, attitude, omega, duration, moment_of_weight=None):
 
 
 def _products(x, y):
-    """The n-th Taylor coefficient of all x_j y_k; x (J, B, n) and y (K, columns, B, n)."""
+    """The n-th Taylor coefficient of all x_j y_k; x (J, B, n) and y (K, columns, B,
+    n)."""
     return np.einsum("jbn,kcbn->jkcb", x, y[..., ::-1])
 
 

@@ -1,4 +1,5 @@
-"""A sweep in a process of its own, to be killed: `python sweep_job.py MODE STORE BLOCKS`."""
+"""A sweep in a process of its own, to be killed: `python sweep_job.py MODE STORE
+BLOCKS`."""
 
 import hashlib
 import os

@@ -52,7 +52,8 @@ def taylor_motion(moments, attitude, omega, time, bits=256):
 
 
 def taylor_top(i1, i3, mgl, attitude, omega, time, bits=128):
-    """Attitude (4,) and omega (3,) of a heavy symmetric top at one time, as lists of mpf.
+    """Attitude (4,) and omega (3,) of a heavy symmetric top at one time,
+    as lists of mpf.
 
     I1 omega1' = (I1 - I3) omega2 omega3 + mgl gamma2, and so on, with gamma the
     vertical in body components. The error is as in `taylor_motion`.
@@ -78,7 +79,8 @@ def taylor_top(i1, i3, mgl, attitude, omega, time, bits=128):
 
 
 def _motion(ratios, torque, attitude, omega, time, fastest, bits):
-    """omega1' = ratio1 omega2 omega3 + torque gamma2, and so on; `torque` None: a free body."""
+    """omega1' = ratio1 omega2 omega3 + torque gamma2, and so on; `torque` None:
+    a free body."""
 
     def fixed(x):
         return (x.numerator << bits) // x.denominator
@@ -144,7 +146,8 @@ def _rate(series, row):
 
 
 def _product(a, b):
-    """The last coefficient of the product of two series, one of which may be constant."""
+    """The last coefficient of the product of two series,
+    one of which may be constant."""
     short, long = (a, b) if len(a) < len(b) else (b, a)
     return sum(map(operator.mul, short, reversed(long)))
 

@@ -1,4 +1,5 @@
-"""Every way to differentiate an integration gives the same derivative, under every torque."""
+"""Every way to differentiate an integration gives the same derivative,
+under every torque."""
 
 import diffrax
 import jax

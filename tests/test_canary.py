@@ -1,4 +1,5 @@
-"""What the package stands on: a jax that multiplies right, versions that are what they say."""
+"""What the package stands on: a jax that multiplies right,
+versions that are what they say."""
 
 import importlib.metadata
 import re
@@ -13,7 +14,8 @@ import jrigid as jr
 
 
 def test_jitted_vmapped_product_with_a_shared_matrix_is_right():
-    """jax 0.10.2 on CPU gets this wrong above 16384 rows, silently (jax-ml/jax#39103)."""
+    """jax 0.10.2 on CPU gets this wrong above 16384 rows,
+    silently (jax-ml/jax#39103)."""
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(3, 3))
     omegas = rng.normal(size=(20000, 3))

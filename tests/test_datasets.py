@@ -118,7 +118,8 @@ def misfit_degrees(toutatis, omega):
 
 
 def test_toutatis_axes_are_right_handed_as_labelled(toutatis):
-    """The published epoch state, moving freely with the published moments, meets the radar."""
+    """The published epoch state, moving freely with the published moments,
+    meets the radar."""
     degrees, per_day = misfit_degrees(toutatis, toutatis.epoch_omega)
     assert np.median(degrees) < 6.0
     assert np.max(degrees) < 16.5

@@ -75,7 +75,8 @@ NUMBER = re.compile(r"(?<![\w.^])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 
 
 def compare(page, *printed):
-    """`print` in a block: numbers are those of the comment beside it, or on the next line."""
+    """`print` in a block: numbers are those of the comment beside it,
+    or on the next line."""
     line = sys._getframe(1).f_lineno
     comment = (
         "#".join(page[line - 1].split("#")[1:]) or page[line].strip().partition("# ")[2]
@@ -103,7 +104,8 @@ DRAWS = re.compile(
     "path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem
 )
 def test_notebooks_draw_in_ten_lines(path):
-    """A cell draws last: from where it begins to its end there are ten lines of code at most."""
+    """A cell draws last: from where it begins to its end there are ten lines of code at
+    most."""
     for cell in json.loads(path.read_text())["cells"]:
         code = [
             line for line in map(str.strip, cell["source"]) if line and line[0] != "#"

@@ -57,7 +57,8 @@ def test_against_numpy(name, dtype):
 
 @pytest.mark.parametrize("name", BODIES)
 def test_angular_momentum_in_space_changes_at_the_rate_of_the_torque(name):
-    """d/dt (R I R^T omega_space) = R N along attitude and rate that follow the equations."""
+    """d/dt (R I R^T omega_space) = R N along attitude and rate that follow the
+    equations."""
     inertia = BODIES[name]
 
     @jax.jit
@@ -158,7 +159,8 @@ def test_a_tensor_of_any_size_neither_overflows_nor_underflows(size, dtype):
 
 
 def test_derivatives_at_the_sphere_and_at_equal_moments():
-    """Where moments coincide and omega is of order one: polynomials over moments, no edge."""
+    """Where moments coincide and omega is of order one: polynomials over moments,
+    no edge."""
 
     @jax.jit
     def jacobians(inertia):

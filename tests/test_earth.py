@@ -140,7 +140,8 @@ def linearised_fit(pole, observed, ellipticity):
 
 
 def test_standard_error_is_right_for_a_wobble_that_is_kicked_all_the_time():
-    """Over simulated Earths the kicked covariance gives honest pulls, the block bootstrap not."""
+    """Over simulated Earths the kicked covariance gives honest pulls,
+    the block bootstrap not."""
     pole = earth_wobble.rotation_pole(jr.datasets.earth_pole(), days=80)
     rng = np.random.default_rng(1891)
     rate = earth_wobble.ellipticity_of_period(432.6)

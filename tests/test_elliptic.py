@@ -285,7 +285,8 @@ def partial(function, index):
 
 
 def forward(function, pairs):
-    """First partial derivatives, and second ones by pairs of arguments, as lanes of one trace."""
+    """First partial derivatives, and second ones by pairs of arguments,
+    as lanes of one trace."""
 
     def derivatives(*args):
         count = len(args)
@@ -319,7 +320,8 @@ def forward(function, pairs):
 
 @functools.cache
 def derivatives(name):
-    """By one compilation: the first derivatives, forward and reverse, and pairs of the second."""
+    """By one compilation: the first derivatives, forward and reverse,
+    and pairs of the second."""
     function, _, rows = OF_POINTS[name]
     count, pairs = len(rows[0]), PAIRS_OF[name]
 
@@ -367,7 +369,8 @@ def compare_second(derivatives, reference, rows, pairs, allowed, scale=None):
 
 
 def slope(reference, index, arguments, order=1):
-    """Derivative of a reference by a central difference with a step far below rounding."""
+    """Derivative of a reference by a central difference with a step far below
+    rounding."""
     small = min((abs(x) for x in arguments if x), default=1)
     with mp.workdps(3 * STEP - 2 * min(0, int(np.log10(small)))):
         arguments = [mpf(x) for x in arguments]
@@ -747,7 +750,7 @@ def test_derivatives_at_m_1_are_infinite_where_the_truth_is():
 
 
 # --- Jacobi
-# ---------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 NAMES = ("sn", "cn", "dn", "am")
 
@@ -856,7 +859,8 @@ PAIRS = [(0, 0), (1, 1), (0, 1)]
 
 @pytest.fixture(scope="module")
 def of_jacobi():
-    """Derivatives of the four functions, by one compilation: forward, reverse, second."""
+    """Derivatives of the four functions, by one compilation: forward, reverse,
+    second."""
 
     @quick_jit
     def every(*args):

@@ -1,4 +1,5 @@
-"""A fixed number of equal steps against diffrax's, and its derivatives in every mode."""
+"""A fixed number of equal steps against diffrax's,
+and its derivatives in every mode."""
 
 import diffrax
 import jax

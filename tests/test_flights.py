@@ -132,7 +132,8 @@ def test_drag_is_allowed_for_where_there_is_no_accelerometer(rng):
 
 
 def test_an_even_rest_is_not_the_end_of_a_range(rng):
-    """A synthetic record may read 9.8 m/s^2 throughout, and a slow clock leaves large steps."""
+    """A synthetic record may read 9.8 m/s^2 throughout,
+    and a slow clock leaves large steps."""
     body = jr.datasets.gyro_example()
     rest = 0.01 * rng.normal(size=(300, 3))
     rates = np.concatenate([rest, body.omegas, rest])

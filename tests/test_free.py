@@ -42,7 +42,8 @@ def rows(regime):
 
 
 def same_sign(found, exact):
-    """The attitudes of `found` with the signs of those of `exact`: q and -q are one attitude."""
+    """The attitudes of `found` with the signs of those of `exact`:
+    q and -q are one attitude."""
     signs = np.sign(np.sum(found[:, :4] * exact[:, :4], axis=1))[:, None]
     return np.concatenate([signs * found[:, :4], found[:, 4:]], axis=1)
 
@@ -55,7 +56,8 @@ def exact_states(regime):
 
 
 def of_lanes(function):
-    """A function of the cases of any regime, compiled for as many as the largest has."""
+    """A function of the cases of any regime, compiled for as many as the largest
+    has."""
     lanes = max(np.sum(RECORD["regime"] == regime) for regime in REGIMES)
 
     def call(*inputs):
@@ -179,7 +181,8 @@ UNPHYSICAL = np.array(
 
 
 def of_unit_rate(per_regime):
-    """A few bodies of every regime with |omega| = 1 and the middle moment 1, side by side."""
+    """A few bodies of every regime with |omega| = 1 and the middle moment 1,
+    side by side."""
     chosen = np.concatenate(
         [
             np.flatnonzero(RECORD["regime"] == regime)[
@@ -212,7 +215,8 @@ def of_inputs(x, t):
 @pytest.fixture(scope="module")
 def derivatives():
     def along(x, v, t):
-        """Jacobian by columns and by rows, and its derivative along v in both orders."""
+        """Jacobian by columns and by rows, and its derivative along v in both
+        orders."""
         (value, *first), (_, *second) = jax.jvp(
             lambda y: both_ways(lambda z: of_inputs(z, t), y), (x,), (v,)
         )
@@ -357,7 +361,8 @@ def test_first_derivatives_in_a_tensor_are_right_at_repeated_moments(name, of_te
 
 @pytest.mark.parametrize("t", [1e2, 1e3, 1e4, 1e5])
 def test_derivatives_in_a_tensor_at_a_long_spin_about_one_of_two_equal_axes(t):
-    """I = (1, 1, 1.5), omega along x: domega_y / dI_xy = -t^2 / 6 is by far the largest."""
+    """I = (1, 1, 1.5), omega along x: domega_y / dI_xy = -t^2 / 6 is by far the
+    largest."""
 
     def end(s):
         tensor = jnp.diag(jnp.array([1.0, 1.0, 1.5])) + s * jnp.zeros((3, 3)).at[
@@ -371,7 +376,8 @@ def test_derivatives_in_a_tensor_at_a_long_spin_about_one_of_two_equal_axes(t):
 
 @pytest.mark.parametrize("gap", [0.0, 2.0**-40, 2.0**-17, 2.0**-13])
 def test_derivatives_in_a_tensor_after_a_long_time_near_the_separatrix(gap, of_tensor):
-    """There a gap's effect grows with the square of the time: what is near must know."""
+    """There a gap's effect grows with the square of the time:
+    what is near must know."""
     tensor, t, n = np.diag([1.0, 1.0 + gap, 1.5]), 1000.0, np.ones((3, 3))
     omega, turn = np.array([0.75, -0.625, 2.0**-10]), np.zeros(3)
 
@@ -558,7 +564,8 @@ BAD = {
     "NaN rate": (
         {"omega": np.array([1.0, np.nan, 3.0])},
         "invalid_state",
-        r"`state0` must be finite, .*: \[ 1\.  0\.  0\.  0\.  1\. nan  3\.\] in lane 1\.",
+        r"`state0` must be finite, .*: \[ 1\.  0\.  0\.  0\.  1\. nan  3\.\] in lane "
+        r"1\.",
     ),
     "NaN attitude": (
         {"attitude": np.array([1.0, 0.0, np.nan, 0.0])},
@@ -594,7 +601,8 @@ def run(inertia, attitude, omega, ts, t0, throw=True):
 
 @quick_jit
 def three_lanes(lanes):
-    """Numbers of two good lanes around a bad one, the motion, and the derivatives of all inputs."""
+    """Numbers of two good lanes around a bad one, the motion,
+    and the derivatives of all inputs."""
 
     def total(lanes, shared):
         motion = jax.vmap(lambda lane: run(**shift(lane, shared), throw=False))(lanes)
@@ -705,7 +713,10 @@ def test_nothing_that_is_compiled_calls_back(inertia):
 )
 def test_a_body_in_place_of_its_inertia_is_a_sentence(make, untyped):
     body, state0 = make(np.array([1.0, 1.5, 2.0])), jr.State(GOOD["attitude"], OMEGA)
-    message = rf"`inertia` must be .* but it is a {type(body).__name__}: pass its `\.inertia`\."
+    message = (
+        rf"`inertia` must be .* but it is a {type(body).__name__}: pass its "
+        r"`\.inertia`\."
+    )
     for call in (
         lambda: jr.free_rotation(body, state0, 1.0),
         lambda: free.polhode_period(body, OMEGA),

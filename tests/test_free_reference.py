@@ -14,7 +14,8 @@ REGIMES = list(dict.fromkeys(DATA["regime"].tolist()))
 
 
 def _distance(motion, other, omega):
-    """Largest difference of the attitudes, sign included, and of omega relative to its size."""
+    """Largest difference of the attitudes, sign included,
+    and of omega relative to its size."""
     scale = mp.sqrt(sum(mp.mpf(float(w)) ** 2 for w in omega)) or mp.mpf(1)
     with mp.workdps(50):
         attitude = max(abs(a - b) for a, b in zip(motion[0], other[0], strict=True))
@@ -78,7 +79,8 @@ def test_stored_motions_are_those_of_the_closed_form(every):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", [r for r in REGIMES if r not in ("rest", "tensor")])
 def test_every_regime_against_taylor_series(regime, rng):
-    """Four cases of each, 60 to 200 radians, less where the body itself is much faster."""
+    """Four cases of each, 60 to 200 radians, less where the body itself is much
+    faster."""
     rows = np.flatnonzero(DATA["regime"] == regime)
     largest = 0.0
     for k in rng.choice(rows, 4, replace=False):
@@ -154,7 +156,8 @@ def test_three_thousand_radians_against_taylor_series():
 
 @pytest.mark.parametrize("duration", [5.0, -8.0])
 def test_second_derivatives_are_differences_of_the_first(rng, duration):
-    """Of any body, the separatrix, a sphere, a symmetric body, and spin about an axis."""
+    """Of any body, the separatrix, a sphere, a symmetric body,
+    and spin about an axis."""
     moments = rng.uniform(1, 2, (6, 3))
     moments[1], moments[2], moments[3, 0] = [1, 2, 2.25], 1.5, moments[3, 1]
     omega = rng.normal(size=(6, 3))

@@ -1,4 +1,5 @@
-"""What a textbook says of free rotation, by name; asteroids that tumble; an independent check."""
+"""What a textbook says of free rotation, by name; asteroids that tumble;
+an independent check."""
 
 import functools
 
@@ -111,7 +112,8 @@ def test_the_axis_of_a_symmetric_body_precesses_at_the_precession_rate():
 
 
 def test_the_separatrix_is_where_landau_says():
-    """L3/L1 = +-sqrt((I2/I1 - 1) / (1 - I2/I3)); about the third axis above, the first below."""
+    """L3/L1 = +-sqrt((I2/I1 - 1) / (1 - I2/I3)); about the third axis above,
+    the first below."""
     i1, i2, i3 = 1.0, 1.7, 2.9
     moments = np.array([i1, i2, i3])
     edge = free.separatrix(moments)
@@ -131,7 +133,8 @@ def test_the_separatrix_is_where_landau_says():
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
 def test_which_axis_is_circled_follows_from_energy_and_momentum(share):
-    """About the third axis for 1/I3 < 2E/L^2 < 1/I2, about the first for 1/I2 < 2E/L^2 < 1/I1."""
+    """About the third axis for 1/I3 < 2E/L^2 < 1/I2,
+    about the first for 1/I2 < 2E/L^2 < 1/I1."""
     moments = np.array([1.0, 1.7, 2.9])
     for low, high, name, fixed in ((2, 1, "largest", 2), (1, 0, "smallest", 0)):
         ratio = (1 - share) / moments[low] + share / moments[high]
@@ -215,7 +218,8 @@ BODIES = {
 
 @pytest.mark.parametrize("name", BODIES)
 def test_periods_and_phases_against_an_integration(name):
-    """scipy integrates the body through one period; its turn about the momentum is unwrapped."""
+    """scipy integrates the body through one period;
+    its turn about the momentum is unwrapped."""
     moments, omega = BODIES[name]
     period = float(free.polhode_period(moments, omega))
     momentum = moments * omega
@@ -271,7 +275,8 @@ def test_periods_and_phases_against_an_integration(name):
 
 
 def test_a_period_can_be_fitted_and_designed():
-    """Derivatives of period, phases and modulus against central differences, moments and tensor."""
+    """Derivatives of period, phases and modulus against central differences,
+    moments and tensor."""
     names = (
         "polhode_period",
         "mean_precession_rate",
@@ -305,7 +310,8 @@ def test_a_period_can_be_fitted_and_designed():
 
 
 def test_the_period_has_its_derivative_at_a_pure_spin():
-    """T = 2 pi sqrt(I1 I2 / ((I3 - I1)(I3 - I2))) / omega3, in the limit of small wobbles."""
+    """T = 2 pi sqrt(I1 I2 / ((I3 - I1)(I3 - I2))) / omega3,
+    in the limit of small wobbles."""
 
     def small(x):
         i1, i2, i3, w = x[0], x[1], x[2], x[5]
@@ -331,7 +337,8 @@ def test_the_period_has_its_derivative_at_a_pure_spin():
 
 
 def test_jacobi_s_modulus_of_landau():
-    """k^2 = (I2 - I1)(2 E I3 - L^2) / ((I3 - I2)(L^2 - 2 E I1)), eq. 37.11, when L^2 > 2 E I2."""
+    """k^2 = (I2 - I1)(2 E I3 - L^2) / ((I3 - I2)(L^2 - 2 E I1)), eq. 37.11,
+    when L^2 > 2 E I2."""
     i1, i2, i3 = MOMENTS
     omega = np.array([0.3, 0.5, 1.0])
     energy, square = omega @ (MOMENTS * omega), np.sum((MOMENTS * omega) ** 2)
@@ -451,8 +458,9 @@ def test_linearised_sphere_and_symmetric_body_are_exact_limits():
 
 
 def test_periods_of_4179_toutatis():
-    """Published: 5.38 and 7.41 days (B. E. A. Mueller, N. H. Samarasinha, M. J. S. Belton, Icarus
-    158 (2002) 305), 5.41 and 7.35 (R. S. Hudson, S. J. Ostro, Science 270 (1995) 84).
+    """Published: 5.38 and 7.41 days (B. E. A. Mueller, N. H. Samarasinha, M. J. S.
+    Belton, Icarus 158 (2002) 305), 5.41 and 7.35 (R. S. Hudson, S. J. Ostro,
+    Science 270 (1995) 84).
 
     Moments and state: Y. Takahashi, M. W. Busch, D. J. Scheeres, Astron. J. 146:95
         (2013).
@@ -502,9 +510,9 @@ def test_radar_attitudes_of_toutatis_as_closely_as_principia():
 
 
 def test_periods_of_99942_apophis():
-    """P. Pravec et al., Icarus 233 (2014) 48: precession 27.38 +- 0.07 h, rotation 263 +- 6 h, from
-    I1/I3 = 0.61, I2/I3 = 0.965, E/E0 = 1.024, E0 the energy of the slowest spin with
-    that momentum.
+    """P. Pravec et al., Icarus 233 (2014) 48: precession 27.38 +- 0.07 h, rotation 263
+    +- 6 h, from I1/I3 = 0.61, I2/I3 = 0.965, E/E0 = 1.024, E0 the energy of the slowest
+    spin with that momentum.
     """
     i1, _, i3 = moments = np.array([0.61, 0.965, 1.0])
     energy = 1.024 / i3  # 2 E for |L| = 1
@@ -568,7 +576,8 @@ def every_formula(inertia, omega):
 
 @quick_jit
 def all_lanes(inertia, omega):
-    """Values of every formula, and the derivatives of their sum where they are numbers."""
+    """Values of every formula, and the derivatives of their sum where they are
+    numbers."""
 
     def total(inertia, omega, shift):
         more = shift * (1.0 if inertia.ndim == 2 else jnp.eye(3))

@@ -1,4 +1,5 @@
-"""One word for one thing: the glossary is in order, and retired words are used nowhere."""
+"""One word for one thing: the glossary is in order,
+and retired words are used nowhere."""
 
 import inspect
 import json
@@ -23,7 +24,7 @@ RETIRED = {
     "face": None,
     "follow": None,
     "knot": None,
-    "lane that is through": r"(lanes?|motions?) (that )?(is|are) through|is through, when",
+    "lane that is through": "(lanes?|motions?) (that )?(is|are) through|is through, when",
     "leaf": None,
     "middle axis": r"middle axis",
     "momentum": None,

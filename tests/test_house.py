@@ -131,7 +131,8 @@ def _names_of_tableaus(tree):
 
 
 def _is_field(callee, function):
-    """Whether a call may be one of a vector field: given, defined on the spot, or a body's."""
+    """Whether a call may be one of a vector field: given, defined on the spot,
+    or a body's."""
     arguments = [x.arg for x in function.args.args]
     inside = [x.name for x in ast.walk(function) if isinstance(x, ast.FunctionDef)]
     return callee in [*arguments, *inside] or callee.endswith(

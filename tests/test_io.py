@@ -105,7 +105,8 @@ def test_what_is_no_attitude_is_told_so(door, untyped):
 
 
 def m2q(matrix):
-    """NAIF's SPICE quaternion of a matrix: Q2M's formula of its header, solved for q0 > 0."""
+    """NAIF's SPICE quaternion of a matrix: Q2M's formula of its header,
+    solved for q0 > 0."""
     q0 = 0.5 * np.sqrt(1 + np.trace(matrix))
     off = [
         matrix[2, 1] - matrix[1, 2],
@@ -331,7 +332,8 @@ def mjcf(inertial, compiler=""):
 
 
 def in_mujoco(text, name="b"):
-    """A body as MuJoCo has it, its tensor from the principal moments and axes that it keeps."""
+    """A body as MuJoCo has it, its tensor from the principal moments and axes that it
+    keeps."""
     model = mujoco.MjModel.from_xml_string(text)
     body, turn = model.body(name), np.zeros(9)
     mujoco.mju_quat2Mat(turn, body.iquat)
@@ -475,7 +477,10 @@ def test_sdf_turns_by_roll_pitch_yaw_about_fixed_axes_as_urdf():
 def test_links_of_several_models_have_their_models_in_the_name():
     """As in Drake."""
     inner = "<model name='x'><link name='b'><inertial/></link></model>"
-    more = f"<world name='w'><model name='n'>{inner}</model><model name='k'>{inner}</model></world>"
+    more = (
+        f"<world name='w'><model name='n'>{inner}</model><model "
+        f"name='k'>{inner}</model></world>"
+    )
     assert set(jr.io.read_inertials(sdf("", more))) == {"m::b", "n::x::b", "k::x::b"}
 
 
@@ -509,7 +514,10 @@ def test_a_template_keeps_what_is_around_its_root_and_its_prefixes(
         "<!-- Licence: yes --><?note by hand?>",
         "<!-- old: <robot/></robot> -->",
     )
-    text = f"{before}<robot {space}><?keep me?><{prefix}:plate/><link name='b'/></robot>{after}"
+    text = (
+        f"{before}<robot {space}><?keep me?><{prefix}:plate/><link "
+        f"name='b'/></robot>{after}"
+    )
     jr.io.write_inertials(
         tmp_path / "b.urdf", {"b": bodies(rng)["a"]}, template=f"\n {text}\n"
     )
@@ -538,14 +546,15 @@ def test_mjcf_in_several_files(tmp_path):
         "<mujoco><compiler angle='radian'/></mujoco>"
     )
     (tmp_path / "arm.xml").write_text(
-        "<mujocoinclude><body name='b'><inertial pos='0 0 1' mass='2' diaginertia='1 2 2.5' "
-        "euler='0.4 -1.1 2'/><body><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/></body>"
-        "</body></mujocoinclude>"
+        "<mujocoinclude><body name='b'><inertial pos='0 0 1' mass='2' diaginertia='1 "
+        "2 2.5' euler='0.4 -1.1 2'/><body><inertial pos='0 0 0' mass='1' "
+        "diaginertia='1 1 1'/></body></body></mujocoinclude>"
     )
     path = tmp_path / "robot.xml"
     path.write_text(
-        "<mujoco><compiler angle='degree' eulerseq='zxz'/><include file='settings.xml'/>"
-        "<worldbody><include file='arm.xml'/><body name='d'/></worldbody></mujoco>"
+        "<mujoco><compiler angle='degree' eulerseq='zxz'/><include "
+        "file='settings.xml'/><worldbody><include file='arm.xml'/><body "
+        "name='d'/></worldbody></mujoco>"
     )
     read = jr.io.read_inertials(path)
     assert list(read) == ["b", "body 2"]
@@ -740,8 +749,8 @@ def test_what_mujoco_refuses_is_refused(text, match):
         ),
         (
             urdf(
-                "<inertial><mass value='1'/><inertia ixx='1' ixz='0' iyy='1' izz='1' iyz='0'/>"
-                "</inertial>"
+                "<inertial><mass value='1'/><inertia ixx='1' ixz='0' iyy='1' izz='1' "
+                "iyz='0'/></inertial>"
             ),
             r"of 'b' cannot be read: it has no inertia ixy\.$",
         ),
@@ -763,8 +772,8 @@ def test_what_mujoco_refuses_is_refused(text, match):
             "gz sdf -p",
         ),
         (
-            "<mujoco><worldbody><replicate count='2'><frame><body name='b'/></frame></replicate>"
-            "</worldbody></mujoco>",
+            "<mujoco><worldbody><replicate count='2'><frame><body "
+            "name='b'/></frame></replicate></worldbody></mujoco>",
             "`<replicate>` makes bodies: save the compiled model",
         ),
         (
@@ -800,7 +809,8 @@ def test_what_mujoco_refuses_is_refused(text, match):
         ),
         (sdf("<pose relative_to='m'>0 0 0 0 0 0</pose>"), "relative to the link"),
         (
-            "<sdf><model name='m'><link name='b'><inertial auto='true'/></link></model></sdf>",
+            "<sdf><model name='m'><link name='b'><inertial "
+            "auto='true'/></link></model></sdf>",
             "`auto`",
         ),
         (
@@ -856,7 +866,10 @@ def test_drake_19551_rounding():
 
 
 def test_drake_11109_all_links_are_named_in_one_error():
-    one = "<inertial><mass value='{}'/><inertia ixx='{}' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
+    one = (
+        "<inertial><mass value='{}'/><inertia ixx='{}' iyy='1' izz='1' ixy='0' "
+        "ixz='0' iyz='0'/>"
+    )
     one += "</inertial>"
     links = [
         one.format(1, 2.5),
@@ -937,7 +950,8 @@ def second(tensor):
 
 @pytest.mark.parametrize("thickness", [0.0, 0.4])
 def test_the_nearest_tensor_is_a_projection(rng, thickness):
-    """The conditions of Karush, Kuhn and Tucker: S' - S and S' - l are semi-definite, product 0."""
+    """The conditions of Karush, Kuhn and Tucker: S' - S and S' - l are semi-definite,
+    product 0."""
     least = 3.0 * thickness**2 / 12
     for scale in (1.0, 1e-6):
         tensor = rng.normal(size=(3, 3))

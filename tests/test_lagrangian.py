@@ -338,7 +338,8 @@ def test_cyclic_coordinates_of_a_top_are_phi_and_psi(dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_coordinate_that_cancels_is_cyclic_and_a_slow_one_is_not(dtype):
     def planet(q, q_dot, mu):
-        """In the plane, by way of x and y: the angle drops out only in exact numbers."""
+        """In the plane, by way of x and y: the angle drops out only in exact
+        numbers."""
         place = lambda q: q[0] * jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])])  # noqa: E731
         at, velocity = jax.jvp(place, (q,), (q_dot,))
         return 0.5 * jnp.sum(velocity**2) + mu / jnp.sqrt(jnp.sum(at**2))
@@ -468,7 +469,8 @@ def test_how_close_to_singular(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32])
 def test_units_do_not_make_a_mass_matrix_singular(dtype):
-    """Coordinates in units 1e12 apart, with a definite and with an indefinite matrix."""
+    """Coordinates in units 1e12 apart, with a definite and with an indefinite
+    matrix."""
     plain = np.array([[2.0, 0.5, -0.3], [0.5, 1.0, 0.2], [-0.3, 0.2, 1.5]])
     hollow = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.5]])
     units = np.array([1e-6, 1.0, 1e6])

@@ -504,7 +504,8 @@ def test_an_inside_out_mesh_is_an_error_under_jit():
 
 
 def cubes(*parts):
-    """Vertices and faces of cubes (centre, edge); a negative edge turns its cube inside out."""
+    """Vertices and faces of cubes (centre, edge);
+    a negative edge turns its cube inside out."""
     vertices = [edge * (CUBE - 0.5) + np.asarray(centre) for centre, edge in parts]
     faces = [CUBE_FACES + 8 * k for k in range(len(parts))]
     return np.concatenate(vertices), np.concatenate(faces)
@@ -820,7 +821,8 @@ def test_third_derivatives_of_tensor_function_raise_instead_of_being_wrong():
 
 
 def every_function(x):
-    """All of the module's functions of one array (3,) near one; x[0] < x[1] + x[2] and so on."""
+    """All of the module's functions of one array (3,) near one;
+    x[0] < x[1] + x[2] and so on."""
     tensor = jnp.diag(x) + 0.1 * x[0] * (
         jnp.ones((3, 3), x.dtype) - jnp.eye(3, dtype=x.dtype)
     )

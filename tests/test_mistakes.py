@@ -1,4 +1,5 @@
-"""Mistakes of new users, each with the message that must come; for the rest: docs/gotchas.md."""
+"""Mistakes of new users, each with the message that must come; for the rest:
+docs/gotchas.md."""
 # ruff: noqa: ARG005
 
 # Users write out the arguments of a lambda, used or not.
@@ -84,7 +85,8 @@ MISTAKES = {
     # arguments
     "a state's two arrays swapped": (
         lambda: simulate(BODY, jr.State(OMEGA, UPRIGHT), TS),
-        r"`state0.attitude` must have shape \(4,\), .*\(3,\)\. \(`State\(attitude, omega\)`",
+        r"`state0.attitude` must have shape \(4,\), .*\(3,\)\. \(`State\(attitude, "
+        r"omega\)`",
     ),
     "rates for a state": (
         lambda: free(MOMENTS, OMEGA, TS),
@@ -98,7 +100,8 @@ MISTAKES = {
         lambda: free(
             MOMENTS, jr.State(np.tile(UPRIGHT, (9, 1)), np.tile(OMEGA, (9, 1))), TS
         ),
-        r"`state0.attitude` must have shape \(4,\), .*\(9, 4\)\. \(For many, `jax.vmap`\.\)",
+        r"`state0.attitude` must have shape \(4,\), .*\(9, 4\)\. \(For many, "
+        r"`jax.vmap`\.\)",
     ),
     "many inertias at once": (
         lambda: free(np.ones((9, 3)), STATE, TS),
@@ -110,7 +113,8 @@ MISTAKES = {
     ),
     "an attitude that is not of norm 1": (
         lambda: free(MOMENTS, jr.State(np.array([1.0, 1, 0, 0]), OMEGA), TS),
-        r"norm is not 1: \[1\. 1\. 0\. 0\.\]\. \(`jrigid.rotation.normalize` makes it 1",
+        r"norm is not 1: \[1\. 1\. 0\. 0\.\]\. \(`jrigid.rotation.normalize` makes it "
+        "1",
     ),
     "a class for an instance": (
         lambda: simulate(BODY, STATE, TS, adjoint=diffrax.ForwardMode),
@@ -123,7 +127,8 @@ MISTAKES = {
     ),
     "six products of inertia": (
         lambda: jr.RigidBody([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]),
-        r"`inertia` must have shape .*\(6,\)\. \(Six numbers make \[\[Ixx, Ixy, Ixz\].*sign",
+        r"`inertia` must have shape .*\(6,\)\. \(Six numbers make \[\[Ixx, Ixy, "
+        r"Ixz\].*sign",
     ),
     "half of a tensor": (
         lambda: jr.MassProperties(
@@ -145,7 +150,8 @@ MISTAKES = {
     ),
     "an STL file's corners": (
         lambda: mesh(CUBE[FACES.ravel()], np.arange(36).reshape(12, 3)),
-        r"as in an STL file\. This merges them: `vertices, same = np.unique\(vertices, axis=0",
+        r"as in an STL file\. This merges them: `vertices, same = np.unique\(vertices, "
+        "axis=0",
     ),
     "faces counted from 1": (
         lambda: mesh(CUBE, FACES + 1),
@@ -184,7 +190,8 @@ MISTAKES = {
     ),
     "a torque of two arguments": (
         lambda: jr.RigidBody(MOMENTS, lambda t, state: state.omega),
-        r"`torque` must be a callable \(t, state, args\) -> \(3,\), but it does not take these",
+        r"`torque` must be a callable \(t, state, args\) -> \(3,\), but it does not "
+        "take these",
     ),
     "an array for a torque": (
         lambda: jr.RigidBody(MOMENTS, np.ones(3)),
@@ -194,7 +201,8 @@ MISTAKES = {
         lambda: forced(
             lambda t, state, args: state.omega if t > 0.5 else 0 * state.omega
         ),
-        r"Use `jnp.where` or `jax.lax.cond` in a torque, not `if`, `and` or `max` of Python",
+        "Use `jnp.where` or `jax.lax.cond` in a torque, not `if`, `and` or `max` of "
+        "Python",
     ),
     "numpy in a torque": (
         lambda: forced(lambda t, state, args: np.sin(t) * state.omega),
@@ -268,7 +276,8 @@ MISTAKES = {
     # records and fits
     "an array for a record": (
         lambda: fit(BLIND, RECORD.omegas),
-        r"`observations` must be a record \(jr.identify.Rates, ...\).* but it is ndarray",
+        r"`observations` must be a record \(jr.identify.Rates, ...\).* but it is "
+        "ndarray",
     ),
     "values as columns": (
         lambda: rates(values=RECORD.omegas.T),
@@ -306,11 +315,13 @@ MISTAKES = {
     ),
     "a file without units": (
         lambda: jr.records.read(table(RECORD.times, RECORD.omegas)),
-        r"`unit` must say the unit of the rates, .* \(`unit=\{'rates': .*rad/s, .*deg/s",
+        r"`unit` must say the unit of the rates, .* \(`unit=\{'rates': .*rad/s, "
+        ".*deg/s",
     ),
     "a file without names": (
         lambda: jr.records.read(io.StringIO("a,b,c,d\n0,1,2,3\n1,1,2,3\n")),
-        "`path` must hold three columns of a sensor, .*: name them by `columns`. There are a, b",
+        "`path` must hold three columns of a sensor, .*: name them by `columns`. "
+        "There are a, b",
     ),
     "a system for its mass properties": (
         lambda: jr.io.write_inertials("none.urdf", {"a": BODY}),
@@ -332,7 +343,8 @@ MISTAKES = {
         lambda: jr.plot.polhode(
             MOMENTS, jr.State(np.ones((2, 9, 4)), np.ones((2, 9, 3)))
         ),
-        r"one motion, but it is several: take one by `jax.tree.map\(lambda x: x\[i\], motion\)`",
+        r"one motion, but it is several: take one by `jax.tree.map\(lambda x: x\[i\], "
+        r"motion\)`",
     ),
     "a motion before the body": (
         lambda: jr.plot.polhode(STATE, MOMENTS),

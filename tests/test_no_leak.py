@@ -147,7 +147,8 @@ def compilations():
 
 @pytest.fixture(scope="module", autouse=True)
 def only_what_is_new():
-    """Leave out of each collection what earlier tests hold: gigabytes take eight seconds."""
+    """Leave out of each collection what earlier tests hold:
+    gigabytes take eight seconds."""
     gc.freeze()
     yield
     gc.unfreeze()

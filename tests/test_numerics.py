@@ -15,7 +15,8 @@ from jrigid._numerics import (
 
 
 def derivatives(function):
-    """Value and first three derivatives of a scalar function, over an array of points."""
+    """Value and first three derivatives of a scalar function,
+    over an array of points."""
     orders = [function]
     for _ in range(3):
         orders.append(jax.grad(orders[-1]))

@@ -1,4 +1,5 @@
-"""Pictures: what is drawn is the physics it shows. Those of a fit are in test_fit_interface.py."""
+"""Pictures: what is drawn is the physics it shows.
+Those of a fit are in test_fit_interface.py."""
 
 import json
 import sys

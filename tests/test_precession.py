@@ -31,7 +31,8 @@ MOON_DISTANCE = (MU_EARTH_AND_MOON / MOON_MOTION**2) ** (
 
 
 class Orbit(eqx.Module):
-    """Kepler ellipse about the Earth that turns steadily; gives the Earth as seen from the body.
+    """Kepler ellipse about the Earth that turns steadily;
+    gives the Earth as seen from the body.
 
     `angles` at t = 0 and their `rates`: longitude of the node, argument of perigee,
     mean anomaly.
@@ -64,7 +65,8 @@ def orbit(
     node_rate=0.0,
     perigee_rate=0.0,
 ):
-    """Orbit of sidereal mean motion `motion`; rates of the longitudes of node and perigee."""
+    """Orbit of sidereal mean motion `motion`; rates of the longitudes of node and
+    perigee."""
     rates = np.array([node_rate, perigee_rate - node_rate, motion - perigee_rate])
     numbers = (semi_major_axis, e, inclination)
     return Orbit(
@@ -90,7 +92,8 @@ def averaged_rate(mu, attractor, flattening=FLATTENING, obliquity=OBLIQUITY):
 def precess(
     ts, sun=SUN, moon=MOON, mu_sun=MU_SUN, mu_moon=MU_MOON, flattening=FLATTENING
 ):
-    """Westward longitude of the Earth's angular momentum and its obliquity [rad] at times ts.
+    """Westward longitude of the Earth's angular momentum and its obliquity [rad] at
+    times ts.
 
     Angular momentum, not the figure axis: it does not take part in the wobble.
     """
@@ -114,7 +117,8 @@ def times(duration):
 
 
 def second_order(rate, motion, longitude):
-    """Relative correction to the averaged rate after whole circular orbits from a longitude.
+    """Relative correction to the averaged rate after whole circular orbits from a
+    longitude.
 
     With k = rate / motion: the attractor meets the moving equinox early (it spends k
     more of its orbit there, and less time where the equinox moves fast), and the
@@ -166,7 +170,8 @@ def test_moon_on_a_circle_moves_the_equinox_as_averaged():
 
 
 def test_inclined_eccentric_orbit_precesses_as_averaged():
-    """Mean of (a/r)^3 and of the node: e = 0.1, 20 degrees, a node once around in 20 months.
+    """Mean of (a/r)^3 and of the node: e = 0.1, 20 degrees,
+    a node once around in 20 months.
 
     Whole numbers of orbits, of turns of the node and of the perigee, so that nutation
     is back.
@@ -189,7 +194,8 @@ def test_inclined_eccentric_orbit_precesses_as_averaged():
 
 
 def test_sun_and_moon_move_the_equinox_by_50_arcseconds_a_year():
-    """The real orbits over one turn of the Moon's node, 18.6 years, 6816 turns of the Earth.
+    """The real orbits over one turn of the Moon's node, 18.6 years,
+    6816 turns of the Earth.
 
     Precession: N. Capitaine, P. T. Wallace, J. Chapront, Astron. Astrophys. 432 (2005)
     355-367, table 2: first-order lunisolar precession 5494.062986 cos(84381.406") =

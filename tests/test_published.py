@@ -1,4 +1,5 @@
-"""Published motions, made by others: each test is named after its source and cites it in full.
+"""Published motions, made by others: each test is named after its source and cites it
+in full.
 
 References are compared through scipy's rotations, not this package's own.
 """
@@ -44,7 +45,8 @@ EARTH_RATE = 7.292115e-5  # rad/s, WGS-84
 
 
 def nesc_record(name):
-    """Times, attitudes and rates relative to inertial space of a NESC record, and its columns."""
+    """Times, attitudes and rates relative to inertial space of a NESC record,
+    and its columns."""
     lines = [x for x in (DATA / name).read_text().splitlines() if not x.startswith("#")]
     data = np.genfromtxt(lines, delimiter=",", names=True)
     yaw_pitch_roll = [data[f"eulerAngle_deg_{x}"] for x in ("Yaw", "Pitch", "Roll")]
@@ -77,7 +79,8 @@ def test_nesc_case_02_dragless_tumbling_brick(simulation):
 
 
 class FallingDrag(eqx.Module):
-    """Rate damping in proportion to (density times airspeed), interpolated from a record."""
+    """Rate damping in proportion to (density times airspeed),
+    interpolated from a record."""
 
     knots: jax.Array
     coefficients: jax.Array  # (4, intervals), highest power first
@@ -194,7 +197,8 @@ def test_jeod_run_9b_published_angular_acceleration():
 
 
 def test_jeod_run_9b_space_station_with_torque_pulse():
-    """Tensor with products of inertia; 10 N m about body x from 1000 s to 2000 s; 8 hours.
+    """Tensor with products of inertia; 10 N m about body x from 1000 s to 2000 s;
+    8 hours.
 
     NASA JEOD v5 (commit 6550cf4e), verif/SIM_dyncomp RUN_9B, "Rotational State
     Comparison: Torque, Initial Rate", of the same family as the NESC exo-atmospheric
@@ -281,7 +285,8 @@ class KeplerOrbit(eqx.Module):
 
 
 def flying_cylinder():
-    """The orbit integrated with the attitude, the torque from the state's own position."""
+    """The orbit integrated with the attitude, the torque from the state's own
+    position."""
     body = MassProperties(1000.0, np.zeros(3), CYLINDER)
 
     def gravity(t, state, args):
@@ -308,7 +313,8 @@ def guided_cylinder():
 
 @pytest.mark.parametrize("case", [flying_cylinder, guided_cylinder])
 def test_jeod_run_10a_gravity_gradient_cylinder(case):
-    """Libration in the gradient of a spherical Earth's gravity over 8 hours, five orbits.
+    """Libration in the gradient of a spherical Earth's gravity over 8 hours,
+    five orbits.
 
     NASA JEOD v5 (commit 6550cf4e), verif/SIM_dyncomp RUN_10A, "Rot State Comparison:
     Gravity Gradient, Circular, 0 Rate": 85 degrees pitch, 1 degree yaw from local
@@ -327,7 +333,8 @@ def test_jeod_run_10a_gravity_gradient_cylinder(case):
 
 
 def test_hughes_libration_periods():
-    """Small libration of RUN_10A's cylinder on a circular orbit has the printed periods.
+    """Small libration of RUN_10A's cylinder on a circular orbit has the printed
+    periods.
 
     Printed in NASA JEOD v5 (commit 6550cf4e),
     verif/SIM_dyncomp/SET_test/RUN_10A/input.py: 3257.94 s in the plane of the orbit and
@@ -465,7 +472,8 @@ def test_simo_wong_heavy_top_energy():
 
 @pytest.mark.parametrize("root", [0, 1])
 def test_curtis_example_11_26_steady_precession(root):
-    """A top set going at a root of the steady-precession equation precesses at that rate.
+    """A top set going at a root of the steady-precession equation precesses at that
+    rate.
 
     H. D. Curtis, Orbital Mechanics for Engineering Students, 4th ed., examples 11.15
     and 11.26: 0.5 kg at 5 cm, moments 12e-4 and 4.5e-4 kg m^2 about the pivot, spin

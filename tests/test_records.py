@@ -34,7 +34,7 @@ def said(reading, words):
 
 
 # phyphox
-# ------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -225,18 +225,20 @@ def test_only_what_is_used_is_told_of(tmp_path):
 
 
 # Betaflight
-# ---------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 BETAFLIGHT = (
-    "loopIteration, time (us), axisP[0], gyroADC[0]{r}, gyroADC[1]{r}, gyroADC[2]{r}, "
-    "accSmooth[0]{a}, accSmooth[1]{a}, accSmooth[2]{a}, motor[0], flightModeFlags (flags)\n"
+    "loopIteration, time (us), axisP[0], gyroADC[0]{r}, gyroADC[1]{r}, "
+    "gyroADC[2]{r}, accSmooth[0]{a}, accSmooth[1]{a}, accSmooth[2]{a}, motor[0], "
+    "flightModeFlags (flags)\n"
 )
 
 
 def blackbox_csv(rates="", forces="", one=2048.0):
     rows = "".join(
-        f"{8 * i}, {33011567 + 500 * i}, 0, {i}, -90, 180, 0, 0, {one:g}, {158 + i}, ANGLE\n"
+        f"{8 * i}, {33011567 + 500 * i}, 0, {i}, -90, 180, 0, 0, {one:g}, {158 + i}, "
+        "ANGLE\n"
         for i in range(5)
     )
     return BETAFLIGHT.format(r=rates, a=forces) + rows
@@ -707,11 +709,12 @@ def test_what_read_refuses(tmp_path):
         jr.records.read(tmp_path / "numbers.csv")
 
 
-# Text ---------------------------------------------------------------------------------------------
+# Text ---------------------------------------------------------------------------------
 
 
 def test_a_file_that_has_been_through_much(tmp_path):
-    """Byte order mark, remarks, Windows lines, quotes, empty cells, a header twice, a cut end."""
+    """Byte order mark, remarks, Windows lines, quotes, empty cells, a header twice,
+    a cut end."""
     lines = [
         "made by hand",
         '"Time (ms)","Gyro X (°/s)","Gyro Y (°/s)","Gyro Z (°/s)","Temp","µ"',
@@ -807,7 +810,7 @@ def test_a_reading_is_cut_and_printed():
 
 
 # Clocks
-# -------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 def test_a_good_clock_is_left_alone(rng):
@@ -907,7 +910,7 @@ def test_times_that_say_nothing():
 
 
 # Flights
-# ------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 TENSOR = np.array([[2.0, 0.2, -0.1], [0.2, 3.0, 0.3], [-0.1, 0.3, 4.0]]) * 1e-3
@@ -1028,7 +1031,8 @@ def test_no_flight_in_a_hand(seed):
 
 
 def test_a_lever_is_not_taken_for_contact(rng):
-    """Where the spin shows 40 m/s^2, a threshold on the force alone would find nothing."""
+    """Where the spin shows 40 m/s^2, a threshold on the force alone would find
+    nothing."""
     rate, flights, spin, lever = CASES["an accelerometer far out"]
     reading = thrown(rng, rate, flights, np.array(spin), np.array(lever))
     [flight] = jr.records.flights(reading)
@@ -1085,7 +1089,7 @@ def test_what_flights_needs():
         jr.records.flights(jr.records.Reading(times, np.zeros((100, 3))), by="eye")
 
 
-# Noise --------------------------------------------------------------------------------------------
+# Noise --------------------------------------------------------------------------------
 
 
 def direct_allan(x, m):
@@ -1120,7 +1124,8 @@ def test_a_random_walk_rises_with_the_root_of_time(rng):
 
 
 def test_flicker_is_level(rng):
-    """Of two-sided spectral density B^2 / (2 pi f): 0.664 B over all averaging times."""
+    """Of two-sided spectral density B^2 / (2 pi f):
+    0.664 B over all averaging times."""
     size, instability = 2**19, 0.02
     frequency = np.fft.rfftfreq(size, 1.0)
     density = np.zeros_like(frequency)
@@ -1180,7 +1185,8 @@ def test_a_hand_that_trembles_is_no_rest_where_there_is_one(rng):
 
 
 def test_bias_instability_of_white_noise_and_flicker(rng):
-    """Where N / sqrt(t) meets a level of 0.664 B, the least is a little above the level."""
+    """Where N / sqrt(t) meets a level of 0.664 B,
+    the least is a little above the level."""
     size, instability = 2**18, 0.002
     frequency = np.fft.rfftfreq(size, 0.01)
     density = np.zeros_like(frequency)
@@ -1202,7 +1208,8 @@ def test_bias_instability_of_white_noise_and_flicker(rng):
 
 
 def test_noise_of_a_gyro_that_filters(rng):
-    """Averages over 10 readings: sigma small, the density that of the noise before the filter."""
+    """Averages over 10 readings: sigma small, the density that of the noise before the
+    filter."""
     white = 0.1 * rng.normal(size=(60_009, 3))
     sums = np.cumsum(np.concatenate([np.zeros((1, 3)), white]), axis=0)
     reading = jr.records.Reading(

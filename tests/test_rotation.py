@@ -58,7 +58,8 @@ axioms_of = settings(
 
 @jax.jit
 def axioms(u, v, w, x):
-    """Residuals of the axioms of SO(3) for attitudes exp(u), exp(v), exp(w) and a vector x."""
+    """Residuals of the axioms of SO(3) for attitudes exp(u), exp(v),
+    exp(w) and a vector x."""
     p, q, r = ro.exp(u), ro.exp(v), ro.exp(w)
     one = ro.identity(p.dtype)
     pq = ro.multiply(p, q)
@@ -330,7 +331,8 @@ def test_axis_and_angle_about_no_axis_is_the_identity_with_gradient_zero_in_the_
 
 
 def sizes(dtype):
-    """Norms over nearly all of the range of a dtype; squares of most of them are out of it."""
+    """Norms over nearly all of the range of a dtype;
+    squares of most of them are out of it."""
     tiny, most = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
     return [
         256 * tiny,
@@ -507,7 +509,8 @@ def test_euler_rates_are_those_of_the_rotation():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_euler_rates_at_the_poles_are_those_of_the_choice(dtype):
-    """psi' = 0, phi' takes the turning about the vertical; a tiny angle is not a pole."""
+    """psi' = 0, phi' takes the turning about the vertical;
+    a tiny angle is not a pole."""
     omega = jnp.asarray([0.3, -0.2, 0.8], dtype)
     for theta, sign in ((0.0, 1), (np.pi, -1), (-np.pi, -1)):
         angles = jnp.asarray([0.4, theta, 1.1], dtype)
@@ -933,7 +936,8 @@ def test_slerp_is_scipys_along_the_shortest_arc():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_slerp_at_equal_and_at_opposite_attitudes(dtype):
-    """Along p exp(u) and p exp(v), both tangent at 0, slerp is p exp((1 - s) u + s v)."""
+    """Along p exp(u) and p exp(v), both tangent at 0,
+    slerp is p exp((1 - s) u + s v)."""
     p = jnp.asarray(ATTITUDE, dtype)
 
     def way(x):
@@ -1059,7 +1063,8 @@ EZ = np.array([0.0, 0.0, 1.0], np.float32)
 
 
 def test_derivatives_of_roll_pitch_and_yaw():
-    """Both ways they are each other's inverse, and the rates are those of the textbook."""
+    """Both ways they are each other's inverse, and the rates are those of the
+    textbook."""
 
     @quick_jit
     @jax.vmap
@@ -1316,7 +1321,8 @@ MATRIX_AXES = [np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], AXIS, -AXIS, unit(1, 1,
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_from_matrix_along_the_group(dtype):
-    """Of q exp(e): q (0, e) / 2 and -q |e|^2 / 4, at every angle, half turns and ties included."""
+    """Of q exp(e): q (0, e) / 2 and -q |e|^2 / 4, at every angle,
+    half turns and ties included."""
 
     @quick_jit
     @jax.vmap
@@ -1350,7 +1356,8 @@ def test_derivatives_of_from_matrix_along_the_group(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_the_angle_between_attitudes(dtype):
-    """The gradient along v of the angle from p to p exp(v) is v / |v|; at v = 0 it is 0."""
+    """The gradient along v of the angle from p to p exp(v) is v / |v|;
+    at v = 0 it is 0."""
 
     @quick_jit
     def both(p, v):

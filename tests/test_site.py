@@ -50,7 +50,8 @@ def test_the_index_has_every_public_name():
 
 
 def is_told(name, shown):
-    """Its own example, or that of a function of the module that returns it or speaks of it."""
+    """Its own example, or that of a function of the module that returns it or speaks of
+    it."""
     text = inspect.getdoc(shown) or ""
     module, _, short = name.rpartition(".")
     others = [

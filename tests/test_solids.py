@@ -52,7 +52,8 @@ def nodes(lower, upper, order=40):
 
 
 def revolved(profiles, mass):
-    """Moments of a solid of revolution about its centre: annuli from (z0, z1, inner, outer)."""
+    """Moments of a solid of revolution about its centre: annuli from (z0, z1, inner,
+    outer)."""
     volume = first = along = across = 0.0
     for z0, z1, inner, outer in profiles:
         z, w = nodes(z0, z1)

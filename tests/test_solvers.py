@@ -1,4 +1,5 @@
-"""The diffrax solvers: the exact flow, alone and as a stage, splitting, methods of high order."""
+"""The diffrax solvers: the exact flow, alone and as a stage, splitting,
+methods of high order."""
 
 import warnings
 
@@ -185,7 +186,8 @@ def test_the_exact_solver_is_for_free_bodies(untyped):
 
 
 def test_verners_weights_integrate_polynomials_of_their_degrees():
-    """The conditions of quadrature of the method, of its estimate and of its dense output."""
+    """The conditions of quadrature of the method,
+    of its estimate and of its dense output."""
     tableau = jr.solvers.Verner9.tableau
     assert tableau.fsal
     c = np.concatenate([[0.0], tableau.c])
@@ -217,7 +219,8 @@ def test_verners_dense_output_has_the_order_it_claims():
 
 
 def test_verners_dense_output_of_a_lane_that_is_through_keeps_its_gradient():
-    """A loop of fixed length goes on with steps of no length, whose slope is masked, not NaN."""
+    """A loop of fixed length goes on with steps of no length, whose slope is masked,
+    not NaN."""
 
     def middle(a):
         return diffrax.diffeqsolve(
@@ -337,7 +340,8 @@ def test_splitting_follows_a_potential_that_moves():
 
 @pytest.mark.slow
 def test_the_rounding_of_splitting_does_not_drift():
-    """10^6 steps of nine free motions: eps times the root of their number, not their number."""
+    """10^6 steps of nine free motions: eps times the root of their number,
+    not their number."""
 
     @quick_jit
     def energies(state):

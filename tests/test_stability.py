@@ -1,4 +1,5 @@
-"""Linear stability: growth rates, linearisation in a turning frame, maps, boundaries."""
+"""Linear stability: growth rates, linearisation in a turning frame, maps,
+boundaries."""
 
 import functools
 
@@ -25,7 +26,8 @@ def spin(axis, rate=1.0):
 
 
 def satellite(moments, eccentricity=0.0):
-    """A body whose axes point along the radius, the flight and the normal of its orbit; n = 1."""
+    """A body whose axes point along the radius, the flight and the normal of its orbit;
+    n = 1."""
     moments = jnp.asarray(moments)
     orbit = jr.torques.KeplerOrbit(1.0, 1.0, eccentricity)
     return jr.RigidBody(moments, jr.torques.GravityGradient(1.0, orbit))
@@ -54,7 +56,8 @@ def about_damped(moments, damping, omega):
 @quick_jit
 @jax.vmap
 def six_gyrostats(moments, axis, rate, rotor):
-    """Linearisations about spins about an axis, and the slopes of the margin in the rotor."""
+    """Linearisations about spins about an axis, and the slopes of the margin in the
+    rotor."""
 
     def margin(rotor):
         body = jr.RigidBody(moments, jr.torques.Rotor(rotor * axis))
@@ -81,7 +84,8 @@ def gyrostats(moments, axes, rate, rotors):
 
 
 def test_theorem_of_the_tennis_racket_over_a_million_bodies():
-    """Unstable about the axis between the other two, stable about those, with no exception."""
+    """Unstable about the axis between the other two, stable about those,
+    with no exception."""
     rng = np.random.default_rng(0)
     moments = rng.uniform(0.1, 10.0, (1_000_000, 3))
     # A third of them with gaps down to 1e-12 of the moments.
@@ -121,7 +125,8 @@ def after_a_turn(omega, momentum):
 @pytest.mark.parametrize("rotor", [0.0, 1.5, -0.4])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_growth_rates_and_frequencies_are_those_of_the_monodromy_matrix(axis, rotor):
-    """The integrated motion's Jacobian over one turn has the eigenvalues exp(rate x period)."""
+    """The integrated motion's Jacobian over one turn has the eigenvalues exp(rate x
+    period)."""
     moments, rate = jnp.array([1.0, 1.7, 2.3]), 1.3
     momentum = rotor * np.eye(3)[axis]
     period = 2 * np.pi / rate
@@ -295,7 +300,8 @@ def test_tops_and_satellites_outside_their_domain():
 
 
 def test_sleeping_top_map_against_the_formula():
-    """Sign of the square on a grid of spin and mgl; the boundary to 1e-10, with its slope."""
+    """Sign of the square on a grid of spin and mgl; the boundary to 1e-10,
+    with its slope."""
 
     def square(omega3, mgl):
         top = jr.SymmetricTop(1.3, 0.6, mgl)
@@ -433,7 +439,8 @@ def test_regions_of_debra_and_delp_located_to_1e_10():
 
 
 def test_satellite_growth_is_that_of_the_integrated_motion():
-    """Jacobian over one orbit against the exponential of the matrix, in the frame of the orbit."""
+    """Jacobian over one orbit against the exponential of the matrix,
+    in the frame of the orbit."""
     moments = np.array([1.6, 1.8, 1.0])
     body = satellite(moments)
 
@@ -499,7 +506,8 @@ def test_zeros_that_drift_nowhere_are_stable():
 
 @pytest.mark.slow  # programs of its own
 def test_a_stiff_part_hides_nothing():
-    """Damped fast, a satellite off its equilibrium or orbit is one all the same; so is growth."""
+    """Damped fast, a satellite off its equilibrium or orbit is one all the same;
+    so is growth."""
     n, moments = 1.08e-3, jnp.array([1.0, 2.0, 2.5])
 
     @quick_jit
@@ -541,7 +549,8 @@ def test_a_damper_makes_the_largest_axis_attract_and_the_others_repel():
 
 
 def test_any_torque_and_any_leaf_with_derivatives():
-    """A torque of a user's; slopes of the growth rate in a parameter, against differences."""
+    """A torque of a user's; slopes of the growth rate in a parameter,
+    against differences."""
 
     def pull(t, state, args, k):
         """Turns body axis 3 away from up."""
@@ -619,7 +628,8 @@ def test_bad_requests(untyped):
 
 
 def test_margin_of_a_spin_is_minus_the_square_of_its_growth_rate():
-    """For any body and rotor; also in the rotor's slope, and where it changes its sign."""
+    """For any body and rotor; also in the rotor's slope,
+    and where it changes its sign."""
     axes = np.array([0, 1, 2, 1, 1, 1])
     rotors = np.array([0.0, 0.0, 0.0, 0.3, 0.9, -1.1])
     moments = np.array([1.0, 2.0, 2.7])
@@ -652,7 +662,8 @@ SLEEPING = np.array(
 
 @pytest.fixture(scope="module")
 def sleeping():
-    """Margins and growth rates of sleeping tops, and their slopes in the spin and the weight."""
+    """Margins and growth rates of sleeping tops, and their slopes in the spin and the
+    weight."""
 
     def of(spin_and_weight):
         body = jr.SymmetricTop(1.0, 0.5, spin_and_weight[1]).as_rigid_body()
@@ -868,7 +879,8 @@ def test_a_boundary_at_an_end_and_lanes_without_one():
 
 
 def test_slope_of_a_boundary_in_the_shape_of_a_solid_and_of_a_mesh():
-    """Shape -> moments -> growth rate -> rotor that steadies it -> slope, against differences."""
+    """Shape -> moments -> growth rate -> rotor that steadies it -> slope,
+    against differences."""
 
     def of_box(length):
         body = jr.solids.box(2.0, jnp.stack([1.0, length, 2.5]))

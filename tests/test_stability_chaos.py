@@ -1,4 +1,5 @@
-"""Order and chaos: exponents, the indicator, sections, flips, and where a damped body ends."""
+"""Order and chaos: exponents, the indicator, sections, flips,
+and where a damped body ends."""
 
 import functools
 
@@ -41,7 +42,8 @@ def hyperion(eccentricity=0.1):
 
 
 def spectrum_of_heavy(lanes, count):
-    """Exponents of motions of one energy and one momentum about the vertical, to T = 1200."""
+    """Exponents of motions of one energy and one momentum about the vertical,
+    to T = 1200."""
     rng = np.random.default_rng(3)
     turns = 1e-6 * rng.normal(size=(lanes, 3))
     body = heavy(*HEAVY)
@@ -63,7 +65,8 @@ def spectrum_of_heavy(lanes, count):
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
-    """Over a short time a small motion's growth is the difference of two motions, to first order.
+    """Over a short time a small motion's growth is the difference of two motions,
+    to first order.
 
     The rate is between 1/2 and 1, where its scale is 1.
     """
@@ -151,7 +154,8 @@ def test_exponents_without_damping_pair_to_zero():
 
 
 def euler_poisson(y, moments, lever):
-    """Rates of (omega, up in the body), (6,) or (6, lanes): another way to write the heavy top."""
+    """Rates of (omega, up in the body), (6,) or (6, lanes):
+    another way to write the heavy top."""
     (i, j, k), (r, s, t) = moments.tolist(), lever.tolist()
     a, b, c, x, y, z = y
     return np.array(
@@ -168,7 +172,8 @@ def euler_poisson(y, moments, lever):
 
 @pytest.mark.slow  # half a minute of running
 def test_exponent_of_an_asymmetric_top_by_two_trajectories():
-    """Neighbours 1e-8 apart, drawn together again and again, by Runge-Kutta in numpy: to 2 %.
+    """Neighbours 1e-8 apart, drawn together again and again, by Runge-Kutta in numpy:
+    to 2 %.
 
     The means of 256 motions: each is uncertain by 0.4 %.
     """
@@ -213,7 +218,8 @@ REGULAR = np.array([[np.pi / 2, 0.5], [0.0, 0.5], [np.pi / 2, 2.3], [0.3, 2.9]])
 
 @functools.cache
 def planar(orbits):
-    """Exponents and indicator of motions in the plane of the orbit, from the pericentre.
+    """Exponents and indicator of motions in the plane of the orbit,
+    from the pericentre.
 
     16 motions that are said to be chaotic, then 8 regular ones.
     """
@@ -258,7 +264,8 @@ def test_hyperion_is_chaotic_where_it_is_said_to_be():
 
 @pytest.mark.slow
 def test_exponent_of_hyperion_is_the_published_one():
-    """Wisdom, Peale & Mignard (1984): a large chaotic zone, e-folding in one to two orbits.
+    """Wisdom, Peale & Mignard (1984): a large chaotic zone,
+    e-folding in one to two orbits.
 
     Motions stick to islands now and then, so that the median of 16 is what is compared.
     """
@@ -306,7 +313,8 @@ def test_planar_hyperion_is_the_pendulum_on_an_ellipse():
 
 
 def test_hyperion_out_of_its_plane_tumbles_in_three_dimensions():
-    """Two exponents of about 0.1 n and a spectrum that pairs (Wisdom, Peale & Mignard, fig. 8)."""
+    """Two exponents of about 0.1 n and a spectrum that pairs (Wisdom, Peale & Mignard,
+    fig. 8)."""
     start = state([0.01, 0.02, 0.3], [0.02, 0.01, 1.3])
     found = quick_jit(
         lambda s: st.lyapunov_spectrum(hyperion(), s, TURN * 600, 36_000, throw=False)
@@ -432,7 +440,8 @@ def test_flip_time_is_that_between_events(offset):
 
 
 def test_a_body_flips_if_it_now_and_then_turns_mainly_about_its_intermediate_axis(rng):
-    """Against the polhode itself; a wobble about a stable axis, or steady rotation, never flips."""
+    """Against the polhode itself; a wobble about a stable axis, or steady rotation,
+    never flips."""
     omegas = rng.normal(size=(60, 3))
 
     @quick_jit
@@ -589,7 +598,8 @@ def test_bad_requests_are_errors_and_bad_lanes_are_marked(untyped):
 
 
 def test_a_map_of_order_and_chaos_marks_what_fails():
-    """A 4 x 4 map of the heavy top: indicator where it could be followed, marked where not."""
+    """A 4 x 4 map of the heavy top: indicator where it could be followed,
+    marked where not."""
 
     def point(tilt, spin):
         start = jr.State(

@@ -37,7 +37,8 @@ def finished(store):
 
 
 def killed(mode, store, what, count):
-    """Start a sweep, kill something once so many blocks are done; how the driver ended."""
+    """Start a sweep, kill something once so many blocks are done;
+    how the driver ended."""
     driver = start(mode, store)
     until = time.monotonic() + 120
     while len(finished(store)) < count and driver.poll() is None:
@@ -88,7 +89,8 @@ def undisturbed(tmp_path_factory):
 
 
 def goes_on(mode, what, count, store, undisturbed):
-    """Nothing that was finished is computed again, and the store is that of an undisturbed run."""
+    """Nothing that was finished is computed again,
+    and the store is that of an undisturbed run."""
     code = killed(mode, store, what, count)
     before = finished(store)
     assert len(before) >= count

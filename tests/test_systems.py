@@ -113,7 +113,8 @@ def test_momentum_about_the_vertical_of_a_heavy_body_is_constant():
 
 
 def test_a_heavy_body_with_any_inertia_and_lever_is_lagranges_equation():
-    """Against the Euler-Lagrange equations in Euler angles, written without any torque."""
+    """Against the Euler-Lagrange equations in Euler angles,
+    written without any torque."""
     angles, rates = jnp.array([0.3, 1.1, -0.7]), jnp.array([0.5, -0.4, 1.3])
 
     def lagrangian(q, dq):
@@ -155,7 +156,8 @@ def swinging(inertia):
 
 @pytest.mark.parametrize("inertia", [TENSOR, MOMENTS], ids=["tensor", "moments"])
 def test_the_gradient_of_gravity_acts_on_the_bodys_own_inertia(inertia):
-    """Built with it, replaced, in lanes, in flight; derivatives flow through the torque too."""
+    """Built with it, replaced, in lanes, in flight;
+    derivatives flow through the torque too."""
     gradient = tq.GravityGradient(4.0, orbit)
     by_hand = lambda i: jr.euler_equations(  # noqa: E731
         i, OMEGA, gradient.of_body(i)(0.7, STATE, None) - 0.1 * OMEGA
@@ -318,7 +320,8 @@ def test_a_projectile_flies_a_parabola_and_tumbles_as_if_it_hung_still():
 
 
 def test_laws_of_momentum_of_a_body_in_flight():
-    """P' = F; L' about the origin = r x F + torque; E' = power of what has no potential."""
+    """P' = F; L' about the origin = r x F + torque;
+    E' = power of what has no potential."""
     push = lambda t, s, a: jnp.stack([a * t, s.velocity[0], -s.position[1]])  # noqa: E731
     twist = tq.Constant(LEVER)
     body = jr.FloatingBody(BODY, push, twist)
@@ -343,7 +346,8 @@ def test_a_force_with_a_potential_conserves_energy_and_a_plain_one_does_not_pret
 
 
 def test_a_force_at_an_offset_turns_the_body_as_the_lagrangian_says():
-    """A spring from a point of the body to the origin: conservative only if both agree."""
+    """A spring from a point of the body to the origin:
+    conservative only if both agree."""
     stiffness = 3.0
 
     def tip(state):

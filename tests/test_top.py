@@ -47,7 +47,8 @@ def jacobians(parameters, attitude, omega, t):
 
 @quick_jit
 def along(x, v):
-    """The state of (parameters, attitude, omega, t) and its first two derivatives along v."""
+    """The state of (parameters, attitude, omega, t) and its first two derivatives along
+    v."""
 
     def moved(s):
         y = x + s * v
@@ -161,7 +162,8 @@ def test_energy_and_momenta_keep_their_values(regime, compiled):
 
 
 def test_a_million_turns_err_no_more_than_their_phase(compiled):
-    """Against the same closed form at 50 digits, itself checked against the Taylor series."""
+    """Against the same closed form at 50 digits, itself checked against the Taylor
+    series."""
     parameters, attitude, omega, _ = rows("generic nutation")
     time = 2e6 * np.pi / rates(parameters, omega)
     found = compiled["value"](parameters, attitude, omega, time)
@@ -293,7 +295,8 @@ def test_derivatives_equal_the_variational_equations(compiled):
 
 
 def test_stored_derivatives_are_those_of_the_variational_equations():
-    """A few rows again, over a shorter time, beside differences of the 30-digit motion."""
+    """A few rows again, over a shorter time, beside differences of the 30-digit
+    motion."""
     x = np.array([0.5, -0.1, 0.7, 0.5, 0.3, -0.4, 0.6, 1.5, 0.5, 0.75])
     x[:4] /= np.linalg.norm(x[:4])
     lever = np.array([[0.0, 0.0, x[9]]])

@@ -1,4 +1,5 @@
-"""What a textbook says of the heavy top, against other routes to it and printed numbers."""
+"""What a textbook says of the heavy top, against other routes to it and printed
+numbers."""
 
 import functools
 from typing import NamedTuple
@@ -244,7 +245,8 @@ def of_the_momenta():
 
 @pytest.mark.parametrize("p_phi", [3.0, -3.0, 1.0])
 def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
-    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical have."""
+    """Also at p_phi = +-p_psi, which all pendulums and passages through the vertical
+    have."""
     h = 1e-5
     curvature, (_, found) = of_the_momenta(p_phi)
     up, down = (of_the_momenta(p_phi + step)[1][0] for step in (h, -h))
@@ -257,7 +259,8 @@ def test_slopes_of_potential_and_rates_in_the_momenta(p_phi, of_the_momenta):
 
 
 def quadratures(one, state):
-    """Bounds, period and advance of phi and psi by integrals over u = cos theta, 25 digits."""
+    """Bounds, period and advance of phi and psi by integrals over u = cos theta,
+    25 digits."""
     p_phi, p_psi, energy = (mp.mpf(float(x)) for x in top.conserved(one, state))
     i1, i3, mgl = (mp.mpf(float(x)) for x in (one.I1, one.I3, one.mgl))
     alpha, beta, a, b = (
@@ -447,7 +450,8 @@ def test_the_endless_motion_comes_to_the_vertical_at_its_rate():
 
 @pytest.mark.parametrize("tilt", [1e-6, 1e-9, 1e-30])
 def test_precession_at_the_threshold_of_sleeping(tilt):
-    """The slower a nutation, the longer the axis stands upright and turns at I3 omega3 / (2 I1)."""
+    """The slower a nutation, the longer the axis stands upright and turns at I3 omega3
+    / (2 I1)."""
     state = top.initial_state(TOP, tilt, omega3=4.0)
     assert nutation(TOP, state).precession == pytest.approx(1.0, abs=tilt**0.5 + 1e-13)
 
@@ -550,7 +554,8 @@ def test_when_steady_precession_exists():
     ("factor", "least", "most"), [(0.999, 5.12, 5.13), (1.001, 1e-4, 5e-3)]
 )
 def test_a_sleeping_top_a_thousandth_below_and_above_its_threshold(factor, least, most):
-    """Started at a tilt of 1e-6: below, the largest tilt is arccos(2 0.999^2 - 1) = 5.125 deg."""
+    """Started at a tilt of 1e-6: below, the largest tilt is arccos(2 0.999^2 - 1) =
+    5.125 deg."""
     spin = factor * float(top.sleeping_spin(TOP))
     assert spin == factor * 4.0
     state = top.initial_state(TOP, 1e-6, omega3=spin)
@@ -816,7 +821,8 @@ TILTED = rotation.exp(np.array([0.05, 0, 0]))
 
 @functools.cache
 def long_motions(turns=100):
-    """All of them by one compilation, as lanes: at this size a step of six costs that of one."""
+    """All of them by one compilation, as lanes: at this size a step of six costs that
+    of one."""
 
     def run(moments, lever, attitude, omega, ts):
         gravity = jr.torques.UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
@@ -1012,7 +1018,8 @@ def test_bruls_cardona_heavy_top_in_closed_form():
 
 
 def test_simo_wong_heavy_top_in_closed_form():
-    """See tests/test_published.py: H = 1269.975 as printed, kept; the cosine of the tilt 0.99875.
+    """See tests/test_published.py: H = 1269.975 as printed, kept;
+    the cosine of the tilt 0.99875.
 
     Beside it the quaternions' equations, and the mean precession by quadrature.
     """
@@ -1084,7 +1091,8 @@ FORMULAS = {
 def test_formulas_are_nan_in_a_bad_lane_and_leave_the_others_and_what_is_shared_alone(
     name,
 ):
-    """Bad tops, then bad states; the slopes of what all lanes share are those of the good ones."""
+    """Bad tops, then bad states; the slopes of what all lanes share are those of the
+    good ones."""
     state = start("wave", psi=0.3, theta_dot=0.1)
 
     def total(shared, i1, attitudes, omegas):

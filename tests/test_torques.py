@@ -131,7 +131,8 @@ def test_uniform_gravity_against_numpy():
 
 @pytest.mark.parametrize("inertia", [TENSOR, MOMENTS], ids=["tensor", "moments"])
 def test_gravity_gradient_is_that_of_a_body_of_points(inertia):
-    """Six point masses on the principal axes under Newton's force; the rest is of fourth order."""
+    """Six point masses on the principal axes under Newton's force;
+    the rest is of fourth order."""
     matrix = np.diag(inertia) if inertia.ndim == 1 else inertia
     moments, axes = np.linalg.eigh(matrix)
     arms = np.sqrt(moments.sum() / 2 - moments)  # two masses of 1/2 at each end
@@ -283,7 +284,8 @@ def test_a_sail_in_flight_feels_force_and_torque():
 
 
 def test_no_light_no_torque_and_clean_derivatives_edge_on():
-    """In an eclipse, from behind, and seen edge on, where value and derivatives are zero."""
+    """In an eclipse, from behind, and seen edge on,
+    where value and derivatives are zero."""
     one = {"areas": np.ones(1), "normals": np.eye(3)[:1], "centers": np.eye(3)[1:2]}
     upright = jr.State(np.eye(4)[0], OMEGA)
 
@@ -337,7 +339,8 @@ FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 
 @pytest.fixture(scope="module")
 def runs():
-    """Four motions as lanes of one compilation, of a body that has all torques, some of them zero.
+    """Four motions as lanes of one compilation, of a body that has all torques,
+    some of them zero.
 
     Slowed by linear and by quadratic drag, stopped by friction, a gyrostat.
     """
@@ -433,7 +436,8 @@ def test_friction_is_of_one_size_and_linear_below_its_width(dtype):
 
 
 def test_friction_brings_a_body_to_rest_at_the_time_and_in_few_steps(runs):
-    """I w' = -c w / sqrt(w^2 + e^2): sqrt(w^2 + e^2) - e arsinh(e / w) falls as c t / I.
+    """I w' = -c w / sqrt(w^2 + e^2): sqrt(w^2 + e^2) - e arsinh(e / w) falls as c t /
+    I.
 
     A callable -c sign(omega) took 43 s and ended at `max_steps`.
     """
@@ -569,7 +573,8 @@ def test_the_internal_state_of_one_carrier_is_a_tuple_of_one():
 
 
 def test_a_plain_torque_sees_the_whole_internal_state_alone_and_in_a_sum():
-    """Terms that carry a part see their own; the others all of it, in torque and potential."""
+    """Terms that carry a part see their own; the others all of it,
+    in torque and potential."""
     first = lambda s: jax.tree.leaves(s.internal)[0]  # noqa: E731
     plain = tq.Torque(lambda _t, s, _a: 1.0 * first(s), lambda _t, s, _a: first(s)[0])
     inner, outer = jnp.array([1.0, 2, 3]), jnp.array([-0.5, 0.2, 0.1])
@@ -645,7 +650,8 @@ def test_a_damper_loses_energy_as_its_coupling_says():
 
 
 def test_damping_ends_in_spin_about_the_major_axis_with_all_momentum_kept():
-    """From near the minor axis through the separatrix; two dampers and a free wheel's state."""
+    """From near the minor axis through the separatrix;
+    two dampers and a free wheel's state."""
     body = jr.RigidBody(
         MOMENTS, tq.InternalDamper(0.3, 0.5) + tq.InternalDamper(0.2, 0.1)
     )
@@ -708,7 +714,8 @@ def test_a_prescribed_function_of_time_may_be_constant():
 
 
 def test_prescribed_momentum_equals_a_wheel_driven_by_the_motor_that_keeps_it():
-    """J s = h + J a.omega and motor = h' + J a.omega'; the wheel leaves the body's inertia."""
+    """J s = h + J a.omega and motor = h' + J a.omega';
+    the wheel leaves the body's inertia."""
     axis = np.array([1.0, 2.0, -2.0]) / 3
     moment = 0.3
     h = lambda t: 0.5 + 0.2 * t - 0.1 * t**3  # noqa: E731
@@ -757,7 +764,8 @@ def test_a_free_wheel_keeps_energy_momentum_and_its_spin():
 
 
 def test_a_wheel_started_without_a_state_turns_with_the_body():
-    """Then, and only at that instant, body and wheel move as one rigid body with a brake."""
+    """Then, and only at that instant, body and wheel move as one rigid body with a
+    brake."""
     axis = np.array([1.0, 2.0, -2.0]) / 3
     body = jr.RigidBody(TENSOR, WHEEL)
     state = jr.State(ATTITUDE, OMEGA, body.torque.internal_at_rest(STATE))
@@ -972,7 +980,8 @@ WRONG = {
     ),
     "unbound": (
         lambda: tq.GravityGradient(MU, orbit)(0.0, STATE, None),
-        r"`torque` must know the inertia of its body, but this `GravityGradient` does not",
+        "`torque` must know the inertia of its body, but this `GravityGradient` does "
+        "not",
     ),
     "dipole": (
         lambda: tq.MagneticDipole(FOUR, FIELD),
@@ -996,7 +1005,8 @@ WRONG = {
     ),
     "linear": (
         lambda: tq.LinearDrag(FOUR),
-        r"`coefficient` must have shape \(\) or \(3,\) or \(3, 3\), but it has shape \(4,\)",
+        r"`coefficient` must have shape \(\) or \(3,\) or \(3, 3\), but it has shape "
+        r"\(4,\)",
     ),
     "quadratic": (lambda: tq.QuadraticDrag(FOUR), r"`coefficient` must have shape"),
     "damper": (

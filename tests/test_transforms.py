@@ -1,4 +1,5 @@
-"""Every public function under jit, vmap, grad, jacfwd and second derivatives, in both precisions.
+"""Every public function under jit, vmap, grad, jacfwd and second derivatives,
+in both precisions.
 
 A new public name of a module below must be added to `CASES`; the first test says which
 is missing.
@@ -161,7 +162,8 @@ CODE_METHOD = "check"
 
 @dataclass
 class Case:
-    """A function of arrays, generic inputs for it, and the public names it goes through."""
+    """A function of arrays, generic inputs for it,
+    and the public names it goes through."""
 
     function: Callable[..., Any]
     inputs: tuple[Any, ...]
@@ -224,7 +226,8 @@ def knots(t):
 
 
 def sampled(t, values):
-    """The value at a time, between fixed knots; the jumps of knots that move with it."""
+    """The value at a time, between fixed knots; the jumps of knots that move with
+    it."""
     value = torques.Sampled(np.arange(4.0), values)(number(t)[()])
     return value, torques.Sampled(knots(t), values).jumps
 
@@ -234,7 +237,8 @@ def methods(name, *own):
 
 
 def of_external(make):
-    """All methods of a torque without internal state, as a function of its data and the state."""
+    """All methods of a torque without internal state,
+    as a function of its data and the state."""
     return lambda *x: all_of_a_torque(make(*x[:-3]), x[-3], jr.State(x[-2], x[-1]))
 
 
@@ -324,7 +328,8 @@ def of_symmetric_body(function, *covers):
 
 
 def free_state(function):
-    """Of moments, attitude, rate and time, the attitude made a unit quaternion first."""
+    """Of moments, attitude, rate and time, the attitude made a unit quaternion
+    first."""
     return Case(
         lambda i, q, w, t: function(i, jr.State(rotation.normalize(q), w), t),
         (MOMENTS, ATTITUDE, OMEGA, 3.0),
@@ -817,7 +822,8 @@ CASES = {
 
 
 def public_names():
-    """`module.function`, `module.Class` and `module.Class.method` of the modules' own names."""
+    """`module.function`, `module.Class` and `module.Class.method` of the modules' own
+    names."""
     names = set()
     for short, module in MODULES.items():
         for name, value in vars(module).items():
@@ -855,7 +861,8 @@ def as_arrays(case, dtype):
 
 
 def weighted(case, dtype):
-    """The function of one flat vector, and the sum of its outputs with generic weights."""
+    """The function of one flat vector, and the sum of its outputs with generic
+    weights."""
     flat, unravel = ravel_pytree(as_arrays(case, dtype))
 
     def outputs(x):
@@ -875,13 +882,15 @@ def weighted(case, dtype):
 
 @pytest.fixture(scope="module", params=list(CASES))
 def name(request):
-    """A case; by the scope of the module its tests follow each other and share what is computed."""
+    """A case; by the scope of the module its tests follow each other and share what is
+    computed."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def derivatives():
-    """Values and derivatives of a case in a dtype, computed once; the second only if `twice`."""
+    """Values and derivatives of a case in a dtype, computed once;
+    the second only if `twice`."""
 
     @functools.cache
     def compute(name, dtype, twice=False):

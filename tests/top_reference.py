@@ -1,4 +1,5 @@
-"""The closed form of Lagrange's top in mpmath, at 50 digits, for times out of a series' reach."""
+"""The closed form of Lagrange's top in mpmath, at 50 digits,
+for times out of a series' reach."""
 
 import mpmath as mp
 
@@ -46,7 +47,8 @@ def _carried(x, dx, m, a, b, g, s, slope, w):
 
 
 def closed_form(i1, i3, mgl, attitude, omega, time):
-    """Attitude (4,) and omega (3,) at one time, as lists of mpf; mgl > 0 and no special case."""
+    """Attitude (4,) and omega (3,) at one time, as lists of mpf;
+    mgl > 0 and no special case."""
     with mp.workdps(DIGITS):
         i1, i3, mgl, time = (mp.mpf(float(x)) for x in (i1, i3, mgl, time))
         q = [mp.mpf(float(x)) for x in attitude]

@@ -1,4 +1,5 @@
-"""The built wheel where nothing else is installed: README and every recipe, as they stand.
+"""The built wheel where nothing else is installed: README and every recipe,
+as they stand.
 
 python tests/wheel.py                     # any Python from 3.11 on; needs the network
 """
@@ -97,7 +98,8 @@ def names(python: Path, here: Path, group: str, call: str) -> bool:
 
 
 def runs(python: Path, here: Path, page: Path) -> bool:
-    """Whether the blocks of a page run one after the other; a sweep of a day only has to begin."""
+    """Whether the blocks of a page run one after the other;
+    a sweep of a day only has to begin."""
     usual = BLOCK.search((RECIPES / "index.md").read_text())[1]
     script = here / f"page_{page.stem}.py"  # no name that one imports
     script.write_text(usual + "".join(BLOCK.findall(page.read_text())))
@@ -119,7 +121,8 @@ def runs(python: Path, here: Path, page: Path) -> bool:
 
 
 def box() -> bytes:
-    """An STL file of a box, 240 x 170 x 30 mm; every triangle has its own corners, as they have."""
+    """An STL file of a box, 240 x 170 x 30 mm; every triangle has its own corners,
+    as they have."""
     corners = [(x, y, z) for x in (0, 240) for y in (0, 170) for z in (0, 30)]
     sides = [
         (0, 1, 3, 2),

@@ -51,8 +51,8 @@ def _bind(lagrangian: Lagrangian, params: tuple[Any, ...], dtype: Any) -> _Bound
         value = jnp.asarray(lagrangian(q, q_dot, *params))
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
             raise ValueError(
-                "Argument `lagrangian` must return a real scalar, but it returns an array of "
-                f"shape {value.shape} and dtype {value.dtype}."
+                "Argument `lagrangian` must return a real scalar, but it returns an "
+                f"array of shape {value.shape} and dtype {value.dtype}."
             )
         return value.astype(dtype)
 
@@ -187,8 +187,8 @@ def vector_field(
     def field(t: Any, y: Any, args: Any) -> tuple[Array, Array]:  # noqa: ARG001
         if args is not None and type(args) not in (tuple, list):
             raise ValueError(
-                "Argument `args` must be a tuple of the Lagrangian's parameters or None, but it "
-                f"is a {type(args).__name__}: write `(args,)`."
+                "Argument `args` must be a tuple of the Lagrangian's parameters or "
+                f"None, but it is a {type(args).__name__}: write `(args,)`."
             )
         q, q_dot = _coordinates(*y)
         return q_dot, acceleration(lagrangian, q, q_dot, *(args or ()))

@@ -1,4 +1,5 @@
-"""Write free_rotation.npz: free motions of every kind at 30 digits, for tests of the exact flow.
+"""Write free_rotation.npz: free motions of every kind at 30 digits,
+for tests of the exact flow.
 
 Run as `python tests/data/make_free_rotation.py`; it takes about ten seconds. The cases
 are drawn with a fixed seed, and the motions come from tests/free_reference.py.

@@ -1,4 +1,5 @@
-"""Write top_motion.npz and top_derivatives.npz: heavy symmetric tops of every kind at 30 digits.
+"""Write top_motion.npz and top_derivatives.npz: heavy symmetric tops of every kind at
+30 digits.
 
 Run as `python tests/data/make_top_motion.py`; it takes about ten minutes. The cases are
 drawn with a fixed seed, and the motions come from tests/taylor_reference.py.
@@ -60,7 +61,8 @@ class Cases:
         return self.rng.normal(size=3) * np.sqrt(top[2] / top[0])
 
     def tilted(self, cos, sin):
-        """An attitude with these cosine and sine of half the tilt; any turn about each vertical."""
+        """An attitude with these cosine and sine of half the tilt;
+        any turn about each vertical."""
         a, b = self.rng.uniform(0, 2 * np.pi, 2)
         return np.array(
             [cos * np.cos(a), sin * np.cos(b), sin * np.sin(b), cos * np.sin(a)]
@@ -237,7 +239,8 @@ class Cases:
                 self.add(regime, top, attitude, omega, unstable=True, span=span)
 
     def near_sleeping(self, repeats, longer=0):
-        """Over times of 60 and, `longer` times more, 300 to 1500: a nutation lasts that long."""
+        """Over times of 60 and, `longer` times more, 300 to 1500:
+        a nutation lasts that long."""
         tilts, signs = (0.5, 1e-2, 1e-4, 1e-6), (-1, 1)
         levels = (1e-3, 1e-8, 1e-12)
         for level, tilt, sign, k in itertools.product(
@@ -337,7 +340,8 @@ SCALES = ("slow units", "fast units")
 
 
 def derivatives(rows):
-    """Some tops of every kind in units in which their rates are below 1, and their Jacobians.
+    """Some tops of every kind in units in which their rates are below 1,
+    and their Jacobians.
 
     By variational equations in 80-bit Taylor series (tests/reference.py): the last
     state with respect to attitude (4, its norm free), omega (3), I1, I3 and mgl. Over

@@ -40,14 +40,16 @@ def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
     """What, if it were so, would make a tensor that no body has a real one."""
     (a, b, c), (_, d, e), (_, _, f) = tensor
     guesses = {
-        "its products of inertia are negated (CAD programs print +sum m x y; ixy of URDF, MJCF and "
-        "SDF is -sum m x y)": 2 * np.diag(np.diag(tensor)) - tensor,
-        "its numbers are in the order xx yy zz xy xz yz of MJCF's `fullinertia` where ixx ixy ixz "
-        "iyy iyz izz are asked for": np.array([[a, d, e], [d, b, f], [e, f, c]]),
-        "its numbers are in the order xx xy xz yy yz zz where MJCF's `fullinertia` is xx yy zz xy "
-        "xz yz": np.array([[a, d, f], [d, b, c], [f, c, e]]),
-        "it was already about the centre of mass when m (|d|^2 1 - d d^T) was subtracted to bring "
-        "it there (add it back)": tensor + _shift(mass, center),
+        "its products of inertia are negated (CAD programs print +sum m x y; ixy of "
+        "URDF, MJCF and SDF is -sum m x y)": 2 * np.diag(np.diag(tensor)) - tensor,
+        "its numbers are in the order xx yy zz xy xz yz of MJCF's `fullinertia` "
+        "where ixx ixy ixz iyy iyz izz are asked for": np.array(
+            [[a, d, e], [d, b, f], [e, f, c]]
+        ),
+        "its numbers are in the order xx xy xz yy yz zz where MJCF's `fullinertia` "
+        "is xx yy zz xy xz yz": np.array([[a, d, f], [d, b, c], [f, c, e]]),
+        "it was already about the centre of mass when m (|d|^2 1 - d d^T) was "
+        "subtracted to bring it there (add it back)": tensor + _shift(mass, center),
     }
     guesses = {
         k: x for k, x in guesses.items() if not np.allclose(x, tensor) and _is_real(x)
@@ -76,14 +78,16 @@ def faults(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
         / (size or 1.0)
     )
     words = {
-        f"The mass is {mass:.4g} kg, which is not positive: give a mass to what moves, and to a "
-        "mere frame no inertial at all.": mass <= 0,
+        f"The mass is {mass:.4g} kg, which is not positive: give a mass to what "
+        "moves, and to a mere frame no inertial at all.": mass <= 0,
         "The tensor is not symmetric.": np.linalg.norm(tensor - tensor.T)
         > _ROUNDING * size,
-        f"The principal moments are {shown} kg m^2, of which the {what}: no body has them, as each "
-        f"is a sum of m (y^2 + z^2).{why} Else take it from the mesh (`jrigid.io.read_mesh`), "
-        "or the nearest that a body has (`jrigid.io.nearest_physical`), which changes it by "
-        f"{change:.3g} %.": not _is_real(tensor),
+        f"The principal moments are {shown} kg m^2, of which the {what}: no body has "
+        f"them, as each is a sum of m (y^2 + z^2).{why} Else take it from the mesh "
+        "(`jrigid.io.read_mesh`), or the nearest that a body has "
+        f"(`jrigid.io.nearest_physical`), which changes it by {change:.3g} %.": not _is_real(
+            tensor
+        ),
     }
     return tuple(text for text, wrong in words.items() if wrong)
 
@@ -96,17 +100,23 @@ def doubts(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
     shift = _shift(mass, center)
     mistaken = _is_real(tensor - shift) and not _is_real(tensor - shift / _MISTAKEN)
     words = {
-        "The tensor is 1 kg m^2 about every axis, which programs write where they know none: take "
-        "it from the mesh (`jrigid.io.read_mesh`).": np.array_equal(tensor, np.eye(3)),
-        f"The radius of gyration is {radius:.2g} m. If that is not about the size of the body, its "
-        f"units are not kg and kg m^2: it is {1e-3 * radius:.2g} m if the tensor is in kg mm^2, "
-        f"{1e-9**0.5 * radius:.2g} m if in g mm^2, {1e3**0.5 * radius:.2g} m if the mass is in g."
-        "": not _SIZES[0] < radius < _SIZES[1],
-        f"The centre of mass is {distance:.2g} m from the origin, {distance / radius:.0f} radii of "
-        "gyration: is it in mm?": distance > _FAR * radius,
-        "The tensor may be about the origin of the link, not about the centre of mass as it should "
-        "be: it is larger than the m (|d|^2 1 - d d^T) between them, by little. If so, "
-        "`jrigid.to_center_of_mass(inertia, mass, center_of_mass)` mends it.": mistaken,
+        "The tensor is 1 kg m^2 about every axis, which programs write where they "
+        "know none: take it from the mesh (`jrigid.io.read_mesh`).": np.array_equal(
+            tensor, np.eye(3)
+        ),
+        f"The radius of gyration is {radius:.2g} m. If that is not about the size of "
+        f"the body, its units are not kg and kg m^2: it is {1e-3 * radius:.2g} m if "
+        f"the tensor is in kg mm^2, {1e-9**0.5 * radius:.2g} m if in g mm^2, "
+        f"{1e3**0.5 * radius:.2g} m if the mass is in g.": not _SIZES[0]
+        < radius
+        < _SIZES[1],
+        f"The centre of mass is {distance:.2g} m from the origin, "
+        f"{distance / radius:.0f} radii of gyration: is it in mm?": distance
+        > _FAR * radius,
+        "The tensor may be about the origin of the link, not about the centre of "
+        "mass as it should be: it is larger than the m (|d|^2 1 - d d^T) between "
+        "them, by little. If so, `jrigid.to_center_of_mass(inertia, mass, "
+        "center_of_mass)` mends it.": mistaken,
     }
     return tuple(text for text, odd in words.items() if odd)
 

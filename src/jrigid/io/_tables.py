@@ -55,7 +55,8 @@ def _with_errors(fit: FitResult) -> dict[str, tuple[tuple[str, ...], Any, Any]]:
     single = np.ndim(fit.chi_square) == 0
     demand(
         single,
-        "Argument `x` must be a single fit, but it is many: take one by `jax.tree.map`.",
+        "Argument `x` must be a single fit, but it is many: take one by "
+        "`jax.tree.map`.",
     )
     picked = fit.estimates.items()
     return {
@@ -155,7 +156,10 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> Any:
             for x in ("", "_error")
         ]
         return pandas.DataFrame(dict(zip(("value", "error"), pair, strict=True)))
-    message = "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), but they have"
+    message = (
+        "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), but "
+        "they have"
+    )
     demand(x.ts.ndim == 1, f"{message} shape {x.ts.shape}: use `to_xarray`.")
     columns = [(n, *pair) for n in dataset for pair in _flat(dataset[n], n, keep=1)]
     table = pandas.DataFrame({k: v for _, k, v in columns}, dataset.indexes["time"])

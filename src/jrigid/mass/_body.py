@@ -36,9 +36,9 @@ from jrigid.mass._axes import (
 from jrigid.rotation import to_matrix
 
 _NOT_A_BODY = (
-    "Argument `inertia` must hold three finite, non-negative principal moments or be a finite, "
-    "symmetric, positive semi-definite (3, 3) tensor, but it is not. (Three bodies are three "
-    "lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
+    "Argument `inertia` must hold three finite, non-negative principal moments or be "
+    "a finite, symmetric, positive semi-definite (3, 3) tensor, but it is not. "
+    "(Three bodies are three lanes of `jax.vmap`, not the rows of a (3, 3) array.)"
 )
 
 

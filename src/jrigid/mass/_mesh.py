@@ -15,16 +15,17 @@ from jrigid.mass._body import MassProperties
 from jrigid.mass._points import PAIRS, lane_sum, symmetric
 
 _OPEN = (
-    "Argument `faces` must describe a closed surface in which every edge is shared by two "
-    "faces that run through it in opposite directions, but an edge is not."
+    "Argument `faces` must describe a closed surface in which every edge is shared "
+    "by two faces that run through it in opposite directions, but an edge is not."
 )
 _INSIDE_OUT = (
-    "Argument `faces` must be ordered counter-clockwise seen from outside, enclosing a "
-    "positive volume, but the enclosed volume is not positive: the mesh is inside out or flat."
+    "Argument `faces` must be ordered counter-clockwise seen from outside, enclosing "
+    "a positive volume, but the enclosed volume is not positive: the mesh is inside "
+    "out or flat."
 )
 _CUTS_ITSELF = (
-    "Argument `faces` must describe a surface that does not cut itself and no part of which is "
-    "inside out, but the tensor is not that of a real body."
+    "Argument `faces` must describe a surface that does not cut itself and no part "
+    "of which is inside out, but the tensor is not that of a real body."
 )
 
 
@@ -52,12 +53,16 @@ def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
         )
     if np.unique(faces).size == faces.size:
         return (
-            " (No two faces share a vertex, as in an STL file. This merges them: `vertices, same = "
-            "np.unique(vertices, axis=0, return_inverse=True)`, `faces = same.ravel()[faces]`.)"
+            " (No two faces share a vertex, as in an STL file. This merges them: "
+            "`vertices, same = np.unique(vertices, axis=0, return_inverse=True)`, "
+            "`faces = same.ravel()[faces]`.)"
         )
     runs = faces.astype(np.int64) * vertices + np.roll(faces, -1, axis=1)
     if np.unique(runs).size < runs.size:
-        return " (A face is there twice or flipped: `trimesh.repair.fix_winding` turns it.)"
+        return (
+            " (A face is there twice or flipped: `trimesh.repair.fix_winding` turns "
+            "it.)"
+        )
     return " (A face is missing, or vertices at one place are not merged.)"
 
 
@@ -86,7 +91,8 @@ def _index_array(faces: Any) -> Any:
     check_shape("faces", faces, (None, 3))
     if not jnp.issubdtype(faces.dtype, jnp.integer):
         raise ValueError(
-            f"Argument `faces` must hold integers, but it holds {faces.dtype}: indices of vertices."
+            f"Argument `faces` must hold integers, but it holds {faces.dtype}: "
+            "indices of vertices."
         )
     if faces.shape[0] == 0:
         raise ValueError(

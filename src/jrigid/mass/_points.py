@@ -263,7 +263,8 @@ def from_density(
     shape = jax.eval_shape(density, jax.ShapeDtypeStruct((3,), lower.dtype))
     if getattr(shape, "shape", None) != ():
         raise ValueError(
-            f"Argument `density` must map coordinates (3,) to a scalar, but it gives {shape}."
+            "Argument `density` must map coordinates (3,) to a scalar, but it gives "
+            f"{shape}."
         )
     nodes, node_weights = np.polynomial.legendre.leggauss(order)
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(
@@ -272,7 +273,10 @@ def from_density(
     weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
     findings = Findings()
     box = jnp.stack([lower, upper])
-    message = "Arguments `lower`, `upper` must be finite with `lower` < `upper`, but they are not."
+    message = (
+        "Arguments `lower`, `upper` must be finite with `lower` < `upper`, but they "
+        "are not."
+    )
     findings.require(all_finite(box) & jnp.all(lower < upper), None, message, box)
     lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)

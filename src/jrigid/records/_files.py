@@ -93,7 +93,8 @@ def _blackbox(path: str, name: str, log: int) -> Table:
         parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
     except RuntimeError as error:
         raise ValueError(
-            f"Arguments `path` and `log` must be of a log that can be decoded, but: {error}"
+            "Arguments `path` and `log` must be of a log that can be decoded, but: "
+            f"{error}"
         ) from error
     names, several, frames = parser.field_names, parser.reader.log_count, []
     notes = [f"log {log} of {several}"] if several > 1 else []
@@ -122,7 +123,10 @@ def _parse(text: str, name: str) -> Table:
     rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
     head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
-    lacking = f"Argument `path` must have names of its columns above numbers, but {name!r} has not."
+    lacking = (
+        f"Argument `path` must have names of its columns above numbers, but {name!r} "
+        "has not."
+    )
     demand(head >= 0, lacking)
     headers, width = rows[head], len(rows[head])
     below = [row for row in rows[head + 1 :] if row != headers]
@@ -217,10 +221,16 @@ def _with_units_of_blackbox(table: Table) -> Table:
     # A scale of 1 is written by firmware that scales itself, and by some that does not.
     if scale == 1.0 and _OVER * _FULL_SCALE < most <= _MOST_COUNTS and whole:
         unit = "counts"
-        said = f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a deg/s; "
+        said = (
+            f"no gyro of 2000 deg/s reads {most:.0f} deg/s, and counts are 16.4 to a "
+            "deg/s; "
+        )
         said += f"if they are tenths of deg/s, pass unit={np.pi / 1800:.6g}"
     elif not said and not table.about.keys() & {"gyro_scale", "gyro.scale"}:
-        said = "so Betaflight logs it since 2017; there is no gyro_scale, and older logs have "
+        said = (
+            "so Betaflight logs it since 2017; there is no gyro_scale, and older "
+            "logs have "
+        )
         said += "counts (unit='counts')"
     for j in gyros:
         table.headers[j] += f" ({unit})"

@@ -123,7 +123,10 @@ def flights(
         if rows.size and t[last - 1] - t[first] >= min_duration:
             flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
     for i, x in enumerate(flown):
-        note = f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} s: "
+        note = (
+            f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} "
+            "s: "
+        )
         note += f"no contact by the {by.replace('forces', 'specific forces')}"
         flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
     return flown

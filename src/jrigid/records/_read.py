@@ -155,11 +155,12 @@ def _question(most: float, why: str) -> str:
     """Ask for the unit of rates, and say what their largest number is in the usual ones."""
     degree, count = np.pi / 180, _UNITS["rates"]["counts"]
     return (
-        f"Argument `unit` must say the unit of the rates, but it does not, and {why}. The largest "
-        f"number, {most:.6g}, is {most:.4g} rad/s by `unit='rad/s'`, {most * degree:.4g} rad/s by "
-        f"`unit='deg/s'`, {most * count:.4g} rad/s by `unit='counts'` (of a gyro of 2000 deg/s, "
-        f"16.4 to a deg/s). (`unit={{'rates': ...}}`, one of {', '.join(_UNITS['rates'])}, or a "
-        "factor to rad/s.)"
+        f"Argument `unit` must say the unit of the rates, but it does not, and {why}. "
+        f"The largest number, {most:.6g}, is {most:.4g} rad/s by `unit='rad/s'`, "
+        f"{most * degree:.4g} rad/s by `unit='deg/s'`, {most * count:.4g} rad/s by "
+        "`unit='counts'` (of a gyro of 2000 deg/s, 16.4 to a deg/s). "
+        f"(`unit={{'rates': ...}}`, one of {', '.join(_UNITS['rates'])}, or a factor "
+        "to rad/s.)"
     )
 
 
@@ -318,7 +319,10 @@ def _rename(tables: list[Table], columns: Columns) -> None:
     headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
         olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
-        named = f"Argument `columns` must name three columns for `{new}`, but it names {old!r}."
+        named = (
+            f"Argument `columns` must name three columns for `{new}`, but it names "
+            f"{old!r}."
+        )
         demand(len(olds) == 3 or not three, named)
         for i, one in enumerate(olds):
             places = [
@@ -327,7 +331,10 @@ def _rename(tables: list[Table], columns: Columns) -> None:
             places = [x for x in places if x[2] == one] or [
                 x for x in places if x[3] == one
             ]
-            there = f"Argument `columns` must name columns of the file, but {one!r} is none of "
+            there = (
+                f"Argument `columns` must name columns of the file, but {one!r} is "
+                "none of "
+            )
             demand(len(places) > 0, there + headers)
             for table, j, _, _, unit in places:
                 name = f"{new}[{i}]" if three else new
@@ -361,7 +368,10 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
         label = (
             ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
         )
-        needed = "Argument `columns` must name the column of the times, but it does not, and none "
+        needed = (
+            "Argument `columns` must name the column of the times, but it does not, "
+            "and none "
+        )
         demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
         time = max((j for j in times if j < three[0]), default=times[0])
         whole = known[:, three].all(axis=1)
@@ -452,7 +462,10 @@ def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None,
     unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
     if unit is None and kind == "times":
         doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
-        doubt = f"Argument `unit` must say the unit of the times, but it does not, and {doubt}."
+        doubt = (
+            "Argument `unit` must say the unit of the times, but it does not, and "
+            f"{doubt}."
+        )
         raise ValueError(
             f"{doubt} (`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)"
         )

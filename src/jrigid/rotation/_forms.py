@@ -187,8 +187,8 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
         shape = getattr(value, "shape", None)
         kind = type(rotation).__name__ if shape is None else f"of shape {shape}"
         raise ValueError(
-            "Argument `rotation` must be a single scipy.spatial.transform.Rotation or a quaternion "
-            f"(x, y, z, w) of shape (4,), but it is {kind}."
+            "Argument `rotation` must be a single scipy.spatial.transform.Rotation "
+            f"or a quaternion (x, y, z, w) of shape (4,), but it is {kind}."
         ) from error
 
 

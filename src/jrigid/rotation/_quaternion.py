@@ -42,7 +42,8 @@ def _dtype(dtype: DTypeLike | None) -> jnp.dtype:
     dtype = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(
-            f"Argument `dtype` must be of floating point numbers, but it is {dtype.name}."
+            "Argument `dtype` must be of floating point numbers, but it is "
+            f"{dtype.name}."
         )
     return dtype
 

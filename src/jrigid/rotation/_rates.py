@@ -172,7 +172,8 @@ def integrate_rate(
     ts, omegas, start = shaped(ts=(ts, None), omegas=vectors, attitude0=(start, 4))
     if ts.shape[0] < 2:
         raise ValueError(
-            f"Argument `ts` must hold at least two samples, but it has shape {ts.shape}."
+            "Argument `ts` must hold at least two samples, but it has shape "
+            f"{ts.shape}."
         )
     step = ts[1:] - ts[:-1]
     increasing = jnp.all(

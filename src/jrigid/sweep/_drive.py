@@ -42,8 +42,8 @@ def outcomes(
                 waiting.append(outcome.number)
     except BrokenExecutor as error:
         raise RuntimeError(
-            "A worker of the executor died, and with it the executor. What a store has is kept, "
-            "and the same call with a new executor goes on from there."
+            "A worker of the executor died, and with it the executor. What a store "
+            "has is kept, and the same call with a new executor goes on from there."
         ) from error
     finally:
         for future in running:
@@ -59,8 +59,8 @@ def _outcome(number: int, future: Future) -> Outcome:
         raise error
     if isinstance(error, ImportError):
         raise ImportError(
-            f"A worker lacks a package: {error}. (Workers need jrigid, and what the function "
-            "imports, in the versions that are here.)"
+            f"A worker lacks a package: {error}. (Workers need jrigid, and what the "
+            "function imports, in the versions that are here.)"
         ) from error
     if error is not None:
         return Outcome(number, error=in_words(error))

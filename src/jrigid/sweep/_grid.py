@@ -103,8 +103,8 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
             )
         if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
             raise ValueError(
-                f"Argument `axes` must hold arrays of numbers of shape (n,), but {name!r} has "
-                f"shape {x.shape} and type {x.dtype}."
+                "Argument `axes` must hold arrays of numbers of shape (n,), but "
+                f"{name!r} has shape {x.shape} and type {x.dtype}."
             )
     if not arrays:
         raise ValueError(
@@ -129,14 +129,14 @@ def _list_of(points: Any) -> Grid:
     ]
     if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in leaves):
         raise ValueError(
-            "Argument `points` must hold numbers, but it has keys. (Pass integers, and call "
-            "`jax.random.key` in the function.)"
+            "Argument `points` must hold numbers, but it has keys. (Pass integers, "
+            "and call `jax.random.key` in the function.)"
         )
     lengths = {x.shape[:1] for x in leaves}
     if len(lengths) != 1 or lengths <= {(), (0,)}:
         raise ValueError(
-            "Argument `points` must hold arrays with the same number of points in front, but they "
-            f"have the shapes {[x.shape for x in leaves]}."
+            "Argument `points` must hold arrays with the same number of points in "
+            f"front, but they have the shapes {[x.shape for x in leaves]}."
         )
     (shape,) = lengths
     arrays = jtu.tree_unflatten(jtu.tree_structure(points), map(np.asarray, leaves))
@@ -149,8 +149,8 @@ def _defined(values: Any) -> Bool[Array, ""]:
     codes = [x for x in leaves if isinstance(x, EnumerationItem)]
     if not codes and not any(eqx.is_inexact_array(x) for x in leaves):
         raise ValueError(
-            "Argument `function` must return floats, NaN where it is undefined, or codes, but it "
-            "returns nothing that could say so."
+            "Argument `function` must return floats, NaN where it is undefined, or "
+            "codes, but it returns nothing that could say so."
         )
     defined = all_finite(leaves)
     for code in codes:

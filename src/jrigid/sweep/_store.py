@@ -98,8 +98,8 @@ def _told(path: Path) -> dict[str, Any]:
         return json.loads((path / "zarr.json").read_text())["attributes"][_KEY]
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(
-            "Argument `store` must be a new directory or one that a sweep has written, but "
-            f"{path} is not. (Choose another, or remove it.)"
+            "Argument `store` must be a new directory or one that a sweep has "
+            f"written, but {path} is not. (Choose another, or remove it.)"
         ) from error
 
 
@@ -173,7 +173,10 @@ class Store:
                 self._arrays = {x.name: group[x.name] for x in self.leaves}
                 self._axes = {name: group[name] for name in self.grid.axes}
             except (KeyError, ValueError) as error:
-                text = f"The store {self.path} is spoilt: its description is not whole ({error!r})."
+                text = (
+                    f"The store {self.path} is spoilt: its description is not whole "
+                    f"({error!r})."
+                )
                 raise OSError(text) from error
         return self._arrays
 
@@ -296,9 +299,9 @@ class Store:
             ]
             if differences:
                 raise ValueError(
-                    f"Argument `store` must be new or that of the same sweep, but {self.path} is "
-                    f"of another: {'; '.join(differences)}. (Choose another directory, or remove "
-                    "it.)"
+                    "Argument `store` must be new or that of the same sweep, but "
+                    f"{self.path} is of another: {'; '.join(differences)}. (Choose "
+                    "another directory, or remove it.)"
                 )
             self._mend_axes()
             yield

@@ -195,8 +195,8 @@ def _cut(
             )
             if refine is not None and not tiles:
                 raise ValueError(
-                    f"Argument `refine` needs a store in tiles, but the blocks of {path} are "
-                    f"{block}: choose another."
+                    "Argument `refine` needs a store in tiles, but the blocks of "
+                    f"{path} are {block}: choose another."
                 )
             return grid._replace(block=block)
     if refine is not None:
@@ -289,7 +289,8 @@ def _submitting(
     processes = getattr(executor, "_mp_context", None)
     if processes is not None and processes.get_start_method() == "fork":
         raise ValueError(
-            "Argument `executor` must not fork, beside the threads of jax, but it does: pass it "
+            "Argument `executor` must not fork, beside the threads of jax, but it "
+            "does: pass it "
             '`mp_context=multiprocessing.get_context("spawn")`.'
         )
     pool: Any = executor

@@ -97,7 +97,10 @@ class Worker:
         try:
             self.kept.write(number, values)
         except OSError as error:
-            text = f"The store cannot be written: {error}. What is finished is kept, and the same "
+            text = (
+                f"The store cannot be written: {error}. What is finished is kept, and "
+                "the same "
+            )
             return Outcome(
                 number, error=text + "call goes on from there.", final=OSError
             )
@@ -167,9 +170,10 @@ def packed(work: Work) -> bytes:
         return dumps(work._replace(grid=work.grid._replace(points=axes)))
     except Exception as error:
         raise ValueError(
-            "Argument `function` must be one that other processes can be sent, but it is not: "
-            f"{error}. (Write it at the top of a module, with all it needs as arrays inside of an "
-            "equinox.Module; lambdas need cloudpickle, of the extra jrigid[sweep].)"
+            "Argument `function` must be one that other processes can be sent, but "
+            f"it is not: {error}. (Write it at the top of a module, with all it needs "
+            "as arrays inside of an equinox.Module; lambdas need cloudpickle, of the "
+            "extra jrigid[sweep].)"
         ) from error
 
 
@@ -183,8 +187,8 @@ def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> 
         about = worker.work.about
         if elsewhere and about != _about_here(work, part):
             text = (
-                f"A worker has not the function and versions {about} of the driver, or another "
-                "kind of device: start it anew."
+                f"A worker has not the function and versions {about} of the driver, "
+                "or another kind of device: start it anew."
             )
             return Outcome(number, error=text, final=RuntimeError)
     return worker(number, part)
