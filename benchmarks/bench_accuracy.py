@@ -1,4 +1,4 @@
-"""Error at the end against time, at tolerances from 1e-4 to 1e-14, for five kinds of body.
+"""Error at the end against time, at tolerances from 1e-4 to 1e-14, of five bodies.
 
     taskset -c 1 python benchmarks/bench_accuracy.py [--write] [--lanes N]
 
@@ -96,7 +96,7 @@ class Case(NamedTuple):
     torque: Callable[..., list[Any]]
 
     def rates(self, maths, t, *z):
-        """Of angular velocity and attitude; `maths` knows sin, cos and sqrt of such numbers."""
+        """Of angular velocity and attitude; `maths` has their sin, cos and sqrt."""
         (p, q, r), (a, b, c, d) = z[:3], z[3:7]
         gyroscopic = cross([m * x for m, x in zip(MOMENTS, z[:3], strict=True)], z[:3])
         torque = self.torque(maths, t, z[:3], z[3:7])
@@ -167,7 +167,7 @@ def check_rates(case, starts):
 
 
 class Truth(NamedTuple):
-    """States at the end, radians turned, which motions are regular, how far two references differ.
+    """Reference states, radians turned, which are regular, how far references differ.
 
     Regular: what disturbs the start grows by no more than 1 + radians.
     """
@@ -179,7 +179,7 @@ class Truth(NamedTuple):
 
 
 def errors_of(ends, starts, truth):
-    """Of each body, the larger of that of q, which is also -q, and of omega / |omega(0)|."""
+    """Of each body, the larger error of q (or -q) and of omega / |omega(0)|."""
     count = min(len(ends), len(truth))
     ends, truth = np.asarray(ends)[:count], truth[:count]
     unit = np.linalg.norm(starts[:count, :3], axis=1)
@@ -257,10 +257,10 @@ def by_diffrax(case, solver):
 
 
 class Curve:
-    """Runs of a tool at one tolerance after the other: their errors, and the least times so far."""
+    """Runs of a tool at one tolerance after the other: errors and least times."""
 
     def __init__(self, make: Callable[[Any], Any], knobs: Sequence[Any], starts, truth):
-        """`make` builds of a knob a run, and tells its compile time, None: that of a first call."""
+        """`make` builds a run; a compile time of None is that of a first call."""
         self.runs, self.errors, self.times, self.compile_ms = [], [], [], 0.0
         self.bodies = len(starts)
         for run, built in map(make, knobs):
@@ -292,7 +292,7 @@ class Curve:
 
 
 class Measured(NamedTuple):
-    """Errors and times [ms] of one body and of many, and the errors of each of the many."""
+    """Errors and times [ms] of one body and of many, and the error of each."""
 
     one: np.ndarray
     many: np.ndarray
@@ -476,16 +476,17 @@ def main(lanes, write):
     reference, other = "scipy's DOP853 at its tightest", "diffrax's Dopri8"
     if peers.package("heyoka") is not None:
         reference, other = "heyoka in long double", "itself with longer steps"
-    text = f"""The time for a median error of the state at the end (the larger of those of the
-quaternion and of omega / |omega(0)|), between two tolerances; empty where it is not reached. Of
-diffrax's many a tenth is run, of scipy's and MuJoCo's eight.
+    text = f"""\
+The time for a median error of the state at the end (the larger of those of the
+quaternion and of omega / |omega(0)|), between two tolerances; empty where it is not
+reached. Of diffrax's many a tenth is run, of scipy's and MuJoCo's eight.
 
 {common.table(header, rows)}
 
 The worst error of jrigid in parts of what it promises, 10 rtol (at least 100 eps) times
-1 + radians, among those of {min(CHECKED, lanes)} bodies that are regular (a disturbance grows by no
-more than 1 + radians). The reference is {reference}: the third column is how far it is from
-{other}.
+1 + radians, among those of {min(CHECKED, lanes)} bodies that are regular (a disturbance
+grows by no more than 1 + radians). The reference is {reference}: the third column is
+how far it is from {other}.
 
 """
     header = ["body", "radians, median", "reference", "regular"]

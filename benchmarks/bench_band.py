@@ -1,4 +1,4 @@
-"""A narrow band of torque at the spin rate: do fits whose chi-square is good say so wrongly?
+"""A narrow band of torque at the spin rate: is a good chi-square wrong about it?
 
 Records of 60 samples of a gyro, 0.3 rad of rotation apart, with noise of 1 % of the
 spin; bodies of moments 1, 1.7 and 2.3, their axes and spins drawn anew for each record
@@ -72,7 +72,7 @@ def precession_rates(directions):
 
 
 def readings_of(rng, count, size, band):
-    """Rates read by the gyro (records, samples, 3), of a spin of 1 rad/s at the first sample."""
+    """Rates read by the gyro (records, samples, 3); the first sample is 1 rad/s."""
     axes = np.stack([worlds.random_axes(rng) for _ in range(count)])
     tensors = np.einsum("nij,j,nkj->nik", axes, MOMENTS / MOMENTS.mean(), axes)
     directions = np.array([0.5, 1.0, 0.4]) + 0.25 * rng.uniform(-1, 1, size=(count, 3))

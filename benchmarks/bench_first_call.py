@@ -313,7 +313,7 @@ def relative_error(outputs, reference, lanes):
 
 
 def enclosing(error_at, error):
-    """Exponents x, x + 1 and the errors of the tolerances 10**-x that enclose an error."""
+    """Exponents x, x + 1 and errors of tolerances 10**-x that enclose an error."""
     exponent = round(-np.log10(PEER_TOLERANCE))
     errors = {exponent: error_at(exponent)}
     while errors[exponent] > error and exponent < 12:

@@ -1,4 +1,4 @@
-"""CPU seconds of the first fit of a fresh process, of the command line, and of new lengths.
+"""CPU seconds of a first fit: in a fresh process, a command line, at new lengths.
 
     python benchmarks/bench_first_fit.py [--write]
 
@@ -106,7 +106,8 @@ def main():
         ]
         programs = cpu_of([*python, LENGTHS])[1].strip()
     text = common.table(["process", "CPU s, min", "CPU s, median"], rows)
-    text += f"\n\nTwenty records of 180 to 218 samples compile `minimise` {programs} time(s)."
+    text += "\n\nTwenty records of 180 to 218 samples compile `minimise` "
+    text += f"{programs} time(s)."
     common.report("first_fit", "The first fit", text, ("jax", "numpy"), options.write)
 
 

@@ -1,4 +1,4 @@
-"""How well `records.flights` finds trials: simulated ones, whose release and catch are known.
+"""How well `records.flights` finds simulated trials of known release and catch.
 
 A rigid body lies in a hand, is shaken, wound up and thrown. It flies for 0.3 to 1 s
 with a spin of 2 to 30 rad/s and is caught, or bounces (40 %) and flies again. In flight
@@ -303,7 +303,7 @@ def overlap(a, b):
 
 
 def compare(case, found):
-    """Errors of start and end of each flight, NaN if missed; the number of false parts."""
+    """Errors of both ends of each flight, NaN if missed; number of false parts."""
     spans = [(float(x.times[0]), float(x.times[-1])) for x in found]
     errors = []
     for flight in case.flights:

@@ -35,7 +35,7 @@ CHECKED = 50
 
 
 def final(x, t):
-    """State (7,) at time t of the body with moments x[:3] and angular velocity x[3:]."""
+    """State (7,) at time t of moments x[:3] and angular velocity x[3:]."""
     return final_of(x[:3], x[3:], t)
 
 

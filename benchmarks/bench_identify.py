@@ -103,7 +103,7 @@ def bound_at_truth(tensor, omega, ts, noise):
 
 
 def grid():
-    """One row for each noise and kind of record, over the bodies; and pooled numbers."""
+    """One row for each noise and kind of record, over bodies; pooled numbers."""
     rows, pooled, worst_cell = [], {n: [] for n in NOISE}, 1.0
     apart, silent = [], []
     for turns in TURNS:
@@ -194,7 +194,7 @@ SECOND = np.arange(100) * 0.01
 
 
 def scene(rng, count, ts, spin=1.0, **motion):
-    """Tensors of mean moment 1 and their motions, axes and spins drawn anew for each."""
+    """Tensors of mean moment 1 and their motions, all drawn anew for each."""
     axes = np.stack([worlds.random_axes(rng) for _ in range(count)])
     tensors = np.einsum("nij,j,nkj->nik", axes, MOMENTS / MOMENTS.mean(), axes)
     inside = np.array([0.5, 1.0, 0.4]) + 0.25 * rng.uniform(-1, 1, size=(count, 3))

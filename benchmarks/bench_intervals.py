@@ -1,4 +1,4 @@
-"""How many of the 95 % intervals of I2/I1 and I3/I1 hold the truth where moments nearly coincide.
+"""How many 95 % intervals of ratios hold the truth where moments nearly coincide.
 
 A gap is in standard errors of an isolated gap. Tensors: the estimate is the truth and
 normal errors of 0.5 % of a moment, no fit; errors alike in all five numbers, or with
@@ -36,7 +36,7 @@ BODIES = {
 
 
 def basis():
-    """Five orthonormal symmetric matrices without a trace; the first is half of I2 - I1."""
+    """Five orthonormal traceless symmetric matrices; the first is half of I2 - I1."""
     found = np.zeros((5, 3, 3))
     found[0], found[1] = (
         np.diag([-1, 1, 0]) / np.sqrt(2),
@@ -53,7 +53,7 @@ def ratio(which, tensor):
 
 
 def quick_ratio(which, tensor):
-    """By the cosines of a cubic's roots: five times quicker; equal moments to 1e-8 alone."""
+    """By the roots of a cubic: five times quicker, equal moments to 1e-8 alone."""
     mean = jnp.trace(tensor) / 3
     rest = tensor - mean * jnp.eye(3)
     size = jnp.sqrt(jnp.sum(rest**2) / 6)
@@ -63,7 +63,7 @@ def quick_ratio(which, tensor):
 
 
 def both(tensor, covariance):
-    """Intervals of both ratios, the new ones and by derivatives: (way, limit, ratio)."""
+    """Intervals of both ratios, new ones and by derivatives: (way, limit, ratio)."""
     new, old = [], []
     for which in (1, 2):
         function = functools.partial(ratio, which)
@@ -77,7 +77,7 @@ def both(tensor, covariance):
 
 @jax.jit
 def of_tensors(tensors, roots):
-    """Of estimates, and roots of their covariances in the five numbers (trials, 5, 5)."""
+    """Of estimates, and roots of their covariances in the numbers (trials, 5, 5)."""
 
     def one(pair):
         tensor, root = pair
@@ -150,7 +150,7 @@ def tensors(trials):
 
 
 def records(name, gap, trials, rng):
-    """Moments, and readings (trials, samples, 3), of a body with a gap of so many errors."""
+    """Moments and readings (trials, samples, 3) of a body with a gap in errors."""
     moments, which, spin, noise = BODIES[name]
     turned = lambda m: (TURN * np.asarray(m)) @ TURN.T  # noqa: E731
     omega = TURN @ np.array(spin) / np.linalg.norm(spin)

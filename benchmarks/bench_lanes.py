@@ -254,7 +254,7 @@ def on_two_devices(lanes):
 
 
 def memory(lanes):
-    """Seconds and peak memory [MiB] of the gradients of so many motions, in three moments each."""
+    """Seconds and peak memory [MiB] of gradients in three moments of each motion."""
     w0 = np.random.default_rng(2).normal(size=(lanes, 3))
 
     def end(moments, omega):

@@ -25,7 +25,7 @@ def inertia_of(second: np.ndarray) -> np.ndarray:
 
 
 def torus(around: int, across: int) -> tuple[np.ndarray, np.ndarray]:
-    """A closed mesh of 2 x around x across faces: a lumpy, tilted torus, off the origin."""
+    """A closed mesh of 2 x around x across faces: a tilted torus off the origin."""
     i, j = (
         x.ravel()
         for x in np.meshgrid(np.arange(around), np.arange(across), indexing="ij")

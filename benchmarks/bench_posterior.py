@@ -1,4 +1,4 @@
-"""The posterior of a fit by blackjax beside its linear errors and its intervals: where they agree.
+"""Posteriors by blackjax beside linear errors and intervals: where they agree.
 
 Three bodies, one record each of 200 rates in ten turns: a plain one, one of nearly
 equal moments and one that is nearly flat. NUTS starts at the fit, its mass matrix is

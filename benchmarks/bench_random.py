@@ -29,7 +29,7 @@ MOST = 53.0
 
 
 def rows_of(seeds):
-    """Status, squares of five numbers in units of their errors, ratios in theirs, samples."""
+    """Status, squares of five numbers over their errors, ratios, samples."""
     records = [worlds.random_record(np.random.default_rng([7, seed])) for seed in seeds]
     tensors = np.stack([3 * x.tensor / np.trace(x.tensor) for x in records])
     readings = [identify.Rates(x.ts, x.readings, x.sigma) for x in records]

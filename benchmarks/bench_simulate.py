@@ -1,4 +1,4 @@
-"""One simulate() call and its gradient, beside scipy's solve_ivp and hand-written diffrax.
+"""One simulate() call and its gradient beside scipy and hand-written diffrax.
 
 A tumbling body, I = (1, 2, 3), 100 turns. Beside each time stands the error, against a
 run at the tightest tolerance: contenders are to be compared at equal error, not at

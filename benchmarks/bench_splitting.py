@@ -199,8 +199,10 @@ def main(steps, write):
     ]
     mean, worst = float(walk[1][:, -1].mean()), float(np.abs(walk[1][:, -1]).max())
     doubt = float(walk[1][:, -1].std(ddof=1)) / TOPS**0.5
-    text = f"""I = (1, 2, 3), a heavy top that turns by a radian in a second or so. Relative errors,
-the largest so far; the norm of the attitude after 1e5 steps in diffrax (`simulate` normalises).
+    text = f"""\
+I = (1, 2, 3), a heavy top that turns by a radian in a second or so. Relative errors,
+the largest so far; the norm of the attitude after 1e5 steps in diffrax (`simulate`
+normalises).
 Microseconds of the processor for a step, and for a second of the motion.
 
 {common.table([*header, "vertical momentum", "norm"], rows)}

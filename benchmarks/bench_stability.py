@@ -1,4 +1,4 @@
-"""Maps of stability: ten million linear points, and 128 x 128 motions told apart by MEGNO.
+"""Maps of stability: ten million linear points, and 128 x 128 motions by MEGNO.
 
 Linear: the square of the growth rate about an axis over (I2/I1, I3/I1), against
 vectorised numpy; and DeBra and Delp's plane, growth rate and region. Peak memory of the
@@ -145,7 +145,7 @@ def starts():
 
 
 def by_var_ode_sys(some):
-    """With the variational equations of heyoka itself, all six directions, on some motions."""
+    """With heyoka's own variational equations, in six directions, on some motions."""
     import heyoka as hy  # pyright: ignore[reportMissingImports]
 
     variables = hy.make_vars(*(f"x{i}" for i in range(6)))

@@ -1,4 +1,4 @@
-"""Sweeps: 10^8 linear points streamed to a store, peers, memory, and what a block costs.
+"""Sweeps: 10^8 points streamed to a store, peers, memory, the cost of a block.
 
 The square of the growth rate about an axis, and DeBra and Delp's plane (growth rate and
 region), on a grid of 10,000 x 10,000: evaluated by vectorised numpy (in rows of blocks,
@@ -167,7 +167,7 @@ def work(x):
 
 
 def a_block(count=40, size=4096):
-    """Milliseconds of a block of about 50 ms beside the same call in a loop; on one core."""
+    """Milliseconds of a 50 ms block beside the same call in a loop; on one core."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
     x = np.linspace(0, 1, count * size)
@@ -242,7 +242,7 @@ def executors(count=400):
 
 
 def many(count):
-    """Seconds of so many blocks of four points to a store, in process, and of a look at them."""
+    """Seconds to store many blocks of four points in process, and to look at them."""
     with tempfile.TemporaryDirectory() as path:
         start = time.perf_counter()
         x = np.linspace(0, 1, 4 * count)

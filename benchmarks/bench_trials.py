@@ -1,4 +1,4 @@
-"""Trials like real ones, fitted in groups: do the errors stated account for the scatter?
+"""Groups of trials like real ones: do the stated errors account for the scatter?
 
 Each world is one body and a series of trials of it by an independent integrator
 (tests/worlds.py). The body is flat, of moments 0.07, 0.93 and 1, or a general one of
@@ -123,7 +123,7 @@ def other_body(moments, by):
 
 
 def world_of(options, case, tau, seed):
-    """A world of a case and a correlation time; the same seeds draw the same spins and axes."""
+    """A world of a case and a correlation time; equal seeds draw equal spins."""
     moments = np.array(BODIES[options.body])
     rng = np.random.default_rng([options.seed, seed])
     axes = worlds.random_axes(rng)
@@ -166,7 +166,7 @@ def drag_of(body):
 
 
 def drag_and_turns(sessions):
-    """What is sought beside the inertia of trials of several sessions, -1 for the first."""
+    """What is sought beside the inertia; sessions count from -1, the first."""
 
     def free(body, gyro):
         return body.torque.coefficient, identify.each(gyro.misalignment, sessions)
@@ -251,7 +251,7 @@ def chi_square_between(values, errors):
 
 
 def rms_between(values, errors, usable):
-    """Scatter between the groups of each world over the errors stated; pooled over worlds.
+    """Scatter between groups of each world over stated errors; pooled over worlds.
 
     Args:
         values: Estimates (worlds, groups, 3).

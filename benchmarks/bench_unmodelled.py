@@ -1,4 +1,4 @@
-"""A hundred trials of a racquet with drag and a lash, read by a gyro with a lag: is `fit` honest?
+"""A hundred trials of a racquet with drag and a loose mass: is `fit` honest?
 
 The trials come from an independent integrator (tests/worlds.py): a flat body of moments
 0.07, 0.93 and 1 (their unit plays no role), 0.5 to 1 s at 100 Hz, 5 to 20 rad/s, about
@@ -66,7 +66,7 @@ def trials_of(lash, count, seed):
 
 
 def fitter(shape, lag, unmodelled):
-    """A function that fits each of several sets of trials, given as `fit` takes them."""
+    """A function that fits each of several sets of trials."""
     body = jr.RigidBody(np.full(3, MEAN), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
     gyro = identify.Gyro(time_constant=None if lag == "ignored" else jnp.asarray(LAG))
 
@@ -98,7 +98,7 @@ def drags_of(found):
 
 
 def of_singles(found):
-    """Explained %, at boundary %, told, scatters, error of I3/I1, errors over the sensor's."""
+    """Explained %, at boundary %, determined, scatters, error of I3/I1, errors."""
     ratios = np.asarray(found.ratios)
     errors = np.asarray(found.ratios_errors)
     failed = is_one_of(found.status, FAILED)
@@ -125,7 +125,7 @@ def of_singles(found):
 
 
 def of_halves(found):
-    """Differences of the ratios and each half's error, in units of what was stated; its size."""
+    """Differences of the ratios and each half's error over those stated; size."""
     ratios = np.asarray(found.ratios)
     errors = np.asarray(found.ratios_errors)
     apart = (ratios[0] - ratios[1]) / np.linalg.norm(errors, axis=0)

@@ -1,4 +1,4 @@
-"""What every benchmark shares: timing in turns, compile time apart, the machine, the report."""
+"""What benchmarks share: timing in turns, compile times, the machine, the report."""
 
 import argparse
 import importlib.metadata
@@ -90,7 +90,7 @@ def report(
 def report_by_jax(
     name: str, title: str, text: str, packages: Sequence[str], write: bool
 ) -> None:
-    """As `report`; the file has one section for each version of jax and keeps the others."""
+    """As `report`, with one section of the file for each version of jax."""
     print(machine(packages), text, sep="\n\n")
     if not write:
         return

@@ -20,7 +20,7 @@ def package(name: str) -> Any:
 
 
 def _heyoka() -> Any:
-    """Heyoka without the code that it keeps on disk, which would hide what compilation takes."""
+    """Heyoka without its cache on disk, which would hide compile times."""
     hy = package("heyoka")
     if hy is not None:
         with contextlib.suppress(AttributeError):  # of older versions, which keep none
@@ -31,7 +31,7 @@ def _heyoka() -> Any:
 def by_heyoka(
     rates: Callable[..., list[Any]], starts: np.ndarray, end: float, tolerance: float
 ) -> tuple[Callable[[], np.ndarray], float] | tuple[None, None]:
-    """The batch Taylor integrator of heyoka, on one thread, the widest vectors it recommends.
+    """The batch Taylor integrator of heyoka, on one thread, in its widest vectors.
 
     Args:
         rates: Of the symbolic variables, one each, their right-hand sides.
@@ -106,7 +106,7 @@ def by_scipy(
     tolerance: float,
     method: str,
 ) -> tuple[Callable[[], np.ndarray], float] | tuple[None, None]:
-    """`solve_ivp`, one state after the other; `rates` of the time and of plain floats."""
+    """`solve_ivp`, one state after the other; `rates` takes time and floats."""
     integrate = package("scipy.integrate")
     if integrate is None:
         return None, None
@@ -127,14 +127,15 @@ def by_scipy(
 
 
 _BALL = """<mujoco><option integrator="RK4" gravity="0 0 0">
-<flag constraint="disable" contact="disable"/></option><worldbody><body><joint type="ball"/>
+<flag constraint="disable" contact="disable"/></option>
+<worldbody><body><joint type="ball"/>
 <inertial pos="0 0 0" mass="1" diaginertia="{} {} {}"/></body></worldbody></mujoco>"""
 
 
 def by_mujoco(
     moments: Any, starts: np.ndarray, end: float, steps: int
 ) -> tuple[Callable[[], np.ndarray], float] | tuple[None, None]:
-    """A free body in `steps` steps of MuJoCo's RK4; states of rates and attitude, one by one."""
+    """A free body in `steps` steps of MuJoCo's RK4: rates and attitudes."""
     mujoco = package("mujoco")
     if mujoco is None:
         return None, None
@@ -159,7 +160,7 @@ def by_diffrax(
     solver: diffrax.AbstractSolver | None = None,
     timed: bool = False,
 ) -> Any:
-    """What a user of diffrax writes by hand, on one array; `timed` if `rates` want the time too."""
+    """Hand-written diffrax on one array; `timed` if `rates` takes the time too."""
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(
             lambda t, y, _args: jnp.stack(rates(t, *y) if timed else rates(*y))

@@ -58,7 +58,7 @@ class PeerFit:
 
 
 def numbers_of(tensor: np.ndarray) -> np.ndarray:
-    """Five numbers of a tensor up to its size: of the factor L of the second moments L L^T."""
+    """Five numbers of a tensor up to its size: the factor L of second moments."""
     tensor = np.asarray(tensor, float)
     factor = np.linalg.cholesky(np.trace(tensor) / 2 * np.eye(3) - tensor)
     factor = factor / factor[2, 2]
@@ -119,7 +119,7 @@ def fit_scipy(
     sigma: float,
     start: tuple[np.ndarray, np.ndarray],
 ) -> PeerFit:
-    """`scipy.optimize.least_squares`, the nine motions of a Jacobian in one integration.
+    """`scipy.optimize.least_squares`; one integration runs a Jacobian's nine motions.
 
     Args:
         ts: Times of the readings (samples,) [s].
@@ -154,7 +154,7 @@ def fit_scipy(
 
 
 def _spec_with(spec: Any, numbers: np.ndarray) -> Any:
-    """MuJoCo's specification with another inertia, of which its compiler takes the axes."""
+    """MuJoCo's specification with another inertia; its compiler takes the axes."""
     spec.body("body").fullinertia[:] = tensor_of(numbers)[
         [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     ]
@@ -162,7 +162,7 @@ def _spec_with(spec: Any, numbers: np.ndarray) -> Any:
 
 
 def _timestep(ts: np.ndarray, omegas: np.ndarray) -> tuple[float, int]:
-    """A step that divides the shortest gap between samples, and how many reach the last."""
+    """A step that divides the shortest gap, and how many reach the last sample."""
     gap, spin = np.min(np.diff(ts)), np.max(np.linalg.norm(omegas, axis=1))
     step = gap / np.ceil(max(1.0, spin * gap / _LARGEST_TURN))
     return float(step), int(np.ceil((ts[-1] - ts[0]) / step * (1 - 1e-12))) + 1
@@ -232,7 +232,7 @@ def fit_sysid(
     sigma: float,
     start: tuple[np.ndarray, np.ndarray],
 ) -> PeerFit | None:
-    """MuJoCo's toolbox: parameters with modifiers, a sequence, its rollouts, its optimizer.
+    """MuJoCo's toolbox: parameters with modifiers, a sequence, its optimizer.
 
     Arguments as `fit_scipy`. First rates are unknowns by way of `custom_rollout`, and
     the residual is over the noise by way of `modify_residual`. None where
@@ -312,7 +312,7 @@ def fit_sysid(
 
 
 def _record(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Tensor, times, true rates and noise of one standard deviation: 200 samples, 10 turns."""
+    """Tensor, times, true rates and noise of 200 samples over 10 turns."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     moments = np.array([1.0, 1.7, 2.3]) / 5 * 3

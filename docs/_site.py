@@ -1,4 +1,4 @@
-"""What the site does beyond Sphinx's extensions: pages of modules, formulas, notebooks, links."""
+"""What the site adds to Sphinx: pages of modules, formulas, notebooks, links."""
 
 import base64
 import inspect
@@ -92,7 +92,7 @@ def skip_numbered_fields(app, what, name, thing, skip, options):
 
 
 def mark_up(app, what, name, thing, options, lines) -> None:
-    """Formulas, code, names and last words of docstrings, as reStructuredText has them."""
+    """Write formulas, code, names and last words of docstrings in reStructuredText."""
     module = next((k for k in MODULES if f"{name}.".startswith(f"{k}.")), "jrigid")
 
     def code(match: re.Match) -> str:

@@ -1,4 +1,4 @@
-"""The site: `make docs` builds it into build/docs, to be read without a server or a network."""
+"""The site: `make docs` builds build/docs, which is read without a server."""
 
 import pathlib
 import sys

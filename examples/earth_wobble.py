@@ -113,7 +113,7 @@ def drift_basis(tau: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4"
 
 
 def seasonal_torque(seasons: Float[Array, "4 2"], tau: Any) -> Float[Array, " 3"]:
-    """Seasonal torque, (real + i imaginary) exp(i season tau), equatorial [I1 Omega^2]."""
+    """Seasonal torque (real + i imaginary) exp(i season tau) [I1 Omega^2]."""
     real, imaginary = seasons.T * (SCALE * ANNUAL)
     of_cosine = jnp.stack([real, imaginary, jnp.zeros(4)])
     of_sine = jnp.stack([-imaginary, real, jnp.zeros(4)])
@@ -188,7 +188,7 @@ def pole_of_body(
 
 
 def seen(tau: Any, state: jr.State, system: Any) -> Float[Array, " 3"]:
-    """Observed values: the pole as seen from the ground [SCALE], and the spin [Omega]."""
+    """Observed values: the pole from the ground [SCALE], and the spin [Omega]."""
     x = 2 * tau / system.torque.span - 1
     legendre = jnp.stack(
         [jnp.ones_like(x), x, 1.5 * x * x - 0.5, (2.5 * x * x - 1.5) * x]
@@ -465,21 +465,24 @@ The Earth's wobble, {years[0]:.0f} to {years[-1]:.1f}: IERS C04, {len(years)} po
 {result.steps} integrations with derivatives
 
                             start, rigid    fitted, effective
-  wobble period [days]      {RIGID_PERIOD:9.1f}       {result.period:9.1f} +- {error:.1f}
+  wobble period [days]      {RIGID_PERIOD:9.1f}       {result.period:9.1f} \
++- {error:.1f}
   (I3 - I1)/I1              {rigid:9.6f}       {effective:9.6f} +- {effective_error:.6f}
   residuals, rms [mas]      {result.rigid_rms:9.1f}       {result.rms:9.1f}
 
   Linear least squares on the same model: {result.linear_period:.2f} days, \
 {agreement:.5f} standard errors away.
-  A rigid Earth's 305 days are {off:.0f} standard errors away. The solid Earth and the ocean yield
-  to the wobble, which slows it; the fluid core stays out of it, which quickens it, but by less.
-  A bootstrap over blocks of four years would claim +- {result.bootstrap_error:.1f} days. That is \
-too sure: air and
-  water kick the wobble all the time, and it remembers for decades. The errors above count the
-  kicks; windows show them:
+  A rigid Earth's 305 days are {off:.0f} standard errors away. The solid Earth and the
+  ocean yield to the wobble, which slows it; the fluid core stays out of it, which
+  quickens it, but by less.
+  A bootstrap over blocks of four years would claim \
++- {result.bootstrap_error:.1f} days. That is too sure: air
+  and water kick the wobble all the time, and it remembers for decades. The errors above
+  count the kicks; windows show them:
   {windows}.
   For the same reason no trustworthy damping comes out of this record: none is fitted.
-  One mas is 3.1 cm at the pole; the residuals are the kicked wobble, not errors of measurement."""
+  One mas is 3.1 cm at the pole; the residuals are the kicked wobble, not errors of
+  measurement."""
 
 
 def draw(result: Result, path: Path) -> None:

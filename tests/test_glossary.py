@@ -24,7 +24,9 @@ RETIRED = {
     "face": None,
     "follow": None,
     "knot": None,
-    "lane that is through": "(lanes?|motions?) (that )?(is|are) through|is through, when",
+    "lane that is through": (
+        "(lanes?|motions?) (that )?(is|are) through|is through, when"
+    ),
     "leaf": None,
     "middle axis": r"middle axis",
     "momentum": None,

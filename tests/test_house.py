@@ -99,8 +99,12 @@ def test_undocumented_parts_of_other_packages_are_used_in_one_module():
 # alone.
 _STEPPING = "_stepping."
 _CALLS_OF_A_STEP = {
-    "simulate._equal_steps": "Splitting and FreeRotation are made for rotation: no tableau",
-    "stability._stepped_motion": "a user's solver that is no explicit Runge-Kutta method",
+    "simulate._equal_steps": (
+        "Splitting and FreeRotation are made for rotation: no tableau"
+    ),
+    "stability._stepped_motion": (
+        "a user's solver that is no explicit Runge-Kutta method"
+    ),
 }
 _TABLEAUS = {
     "solvers._verner": "defines one",

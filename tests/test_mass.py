@@ -658,7 +658,7 @@ def test_first_derivatives_of_symmetric_functions_of_moments_at_repeated_moments
         np.testing.assert_allclose(forward, along, atol=1e-13 * np.max(np.abs(along)))
 
 
-def test_derivatives_of_axes_where_moments_are_apart_and_their_finiteness_where_they_repeat():
+def test_derivatives_of_axes_where_moments_are_apart_and_where_they_repeat():
     direction = jnp.asarray(symmetric(9))
     tensor = jnp.asarray(rotation(2) @ np.diag([1.0, 1.7, 2.3]) @ rotation(2).T)
     slope = jax.jit(

@@ -338,7 +338,7 @@ def test_laws_of_momentum_of_a_body_in_flight():
     )
 
 
-def test_a_force_with_a_potential_conserves_energy_and_a_plain_one_does_not_pretend_to():
+def test_a_force_conserves_energy_only_if_it_has_a_potential():
     for force, conserved in ((WEIGHT, True), (WEIGHT.fn, False)):
         _, _, power, _ = along_the_motion(jr.FloatingBody(BODY, force), 0.0, FLYING)
         expected = 0.0 if conserved else MASS * GRAVITY @ VELOCITY

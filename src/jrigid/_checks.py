@@ -1,13 +1,13 @@
 """Input validation: converts arguments, checks shapes and values, raises errors.
 
 Shapes, dtypes and options are checked when a call is traced (ValueError). Values are
-checked by `Findings`, and handled in one of three ways, which `docs/contributing/architecture.md`
-explains. A formula is NaN outside its domain (`where_defined`). A builder raises an
-error or returns NaN (`Findings.guard`). A solver or an estimator raises an error or
-returns a result code (`settle`). Where the values are known, the error is raised in
-Python, so that the compiled function has no callbacks. In a user's own jit it is raised
-by `equinox.error_if`. After the first failed call no other compiles anything
-(tests/test_no_leak.py).
+checked by `Findings`, and handled in one of three ways, which
+`docs/contributing/architecture.md` explains. A formula is NaN outside its domain
+(`where_defined`). A builder raises an error or returns NaN (`Findings.guard`). A solver
+or an estimator raises an error or returns a result code (`settle`). Where the values
+are known, the error is raised in Python, so that the compiled function has no
+callbacks. In a user's own jit it is raised by `equinox.error_if`. After the first failed call no other
+compiles anything (tests/test_no_leak.py).
 """
 
 import functools

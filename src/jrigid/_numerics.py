@@ -63,7 +63,7 @@ def without_gradient(value: AnyArray) -> AnyArray:
 
 
 def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
-    """Root mean square length of the vectors that are `there`; 1 if it is not a size."""
+    """Root mean square length of the vectors that count; 1 if that is no size."""
     xp = vectors.__array_namespace__()
     shown = xp.where(there[..., None], vectors, 0.0)
     largest = without_gradient(or_one(xp.max(xp.abs(shown))))
@@ -185,7 +185,7 @@ _WORTH_A_PLAN = 1000  # numbers of an array, where numpy's plan for a product pa
 
 
 def product(subscripts: str, *operands: AnyArray) -> AnyArray:
-    """`einsum` in the full precision of the dtype on every device; numpy's of arrays of numpy."""
+    """`einsum` in full precision on every device; numpy's if all arrays are numpy's."""
     if not all(isinstance(x, np.ndarray) for x in operands):
         return jnp.einsum(subscripts, *operands, precision=_EXACT)
     if _is_matrix_product(subscripts):

@@ -13,6 +13,7 @@ from jaxtyping import Float, Shaped
 from jrigid._extra import extra
 from jrigid._types import Readable
 
+_DEGREE = math.pi / 180.0
 _ARCSECOND = math.pi / 648000.0
 _DAY = 86400.0
 
@@ -44,7 +45,7 @@ class EarthPole(Readable):
 
 
 class ToutatisRecord(Readable):
-    """Attitude and spin of the asteroid 4179 Toutatis, observed by radar, with a published fit.
+    """Attitudes and spins of the asteroid 4179 Toutatis by radar, and a published fit.
 
     Body axes: x the principal axis of the intermediate moment, y of the short body axis
     (largest moment), z of the long body axis (smallest moment). In this order they are
@@ -69,7 +70,7 @@ class ToutatisRecord(Readable):
 
 
 class GyroRecord(Readable):
-    """SYNTHETIC readings of a three-axis gyro on a freely tumbling body, with the truth behind.
+    """SYNTHETIC readings of a three-axis gyro on a free body, and the true motion.
 
     Attributes:
         times: Sampling times [s], equally spaced from 0.
@@ -115,7 +116,7 @@ def earth_pole() -> EarthPole:
 
 
 def toutatis_1992() -> ToutatisRecord:
-    """Radar observations of Toutatis, a body that tumbles about no axis, and their published fit.
+    """Radar observations of the tumbling asteroid Toutatis, and their published fit.
 
     Free rotation with the published moments from the published epoch state passes the
     17 attitudes of 1992 at a median of 5.6 degrees (16 at most) and their spins at a
@@ -138,26 +139,26 @@ def toutatis_1992() -> ToutatisRecord:
     """
     path = importlib.resources.files("jrigid") / "data" / "toutatis_1992.csv"
     with path.open(encoding="ascii") as file:
-        table = np.loadtxt(
-            file, delimiter=",", skiprows=6
-        )  # remarks and the names of the columns
-    degree = math.pi / 180.0
+        # The first six lines are remarks and the names of the columns.
+        table = np.loadtxt(file, delimiter=",", skiprows=6)
+    epoch_angles = np.array([145.498, 65.865, 241.524])
+    epoch_spin = np.array([14.51, 33.529, -98.709])
     return ToutatisRecord(
         times=table[:, 0] * _DAY,
-        attitudes=_attitude(table[:, 1:4] * degree),
-        omegas=table[:, 4:7] * degree / _DAY,
+        attitudes=_attitude(table[:, 1:4] * _DEGREE),
+        omegas=table[:, 4:7] * _DEGREE / _DAY,
         moments=np.array([3.0836, 3.235, 1.0]),
-        epoch_attitude=_attitude(np.array([145.498, 65.865, 241.524]) * degree),
-        epoch_omega=np.array([14.51, 33.529, -98.709]) * degree / _DAY,
+        epoch_attitude=_attitude(epoch_angles * _DEGREE),
+        epoch_omega=epoch_spin * _DEGREE / _DAY,
     )
 
 
 def gyro_example() -> GyroRecord:
-    """A SYNTHETIC gyro record of a tumbling box: 200 readings, 2 % noise, the same at every call.
+    """A SYNTHETIC gyro record of a tumbling box: 200 readings with 2 % noise.
 
-    A body of moments in the ratio 2 : 3 : 4 spins about its intermediate axis, flips over
-    every 5.7 s, and is watched for 20 s at 10 Hz. Made for examples and tests; nothing
-    was measured.
+    A body of moments in the ratio 2 : 3 : 4 spins about its intermediate axis and flips
+    over every 5.7 s. The gyro reads it for 20 s at 10 Hz. Every call returns the same
+    record. It is made for examples and tests; nothing was measured.
 
     Returns:
         Readings and truth: times in s, rates in rad/s, moments in units of their sum.
@@ -176,29 +177,30 @@ def gyro_example() -> GyroRecord:
 
 
 def _attitude(angles: Shaped[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4"]:
-    """Quaternion of Rz(a) Rx(b) Rz(c); in NumPy, so that the record does not depend on x64."""
+    """Quaternion of Rz(a) Rx(b) Rz(c), a, b, c the angles [rad]."""
+    # By NumPy: `jrigid.rotation` would give float32 where x64 is off.
     a, b, c = np.moveaxis(angles, -1, 0)
-    cosine, sine = np.cos(b / 2), np.sin(b / 2)
-    plus, minus = (a + c) / 2, (a - c) / 2
-    return np.stack(
-        [
-            cosine * np.cos(plus),
-            sine * np.cos(minus),
-            sine * np.sin(minus),
-            cosine * np.sin(plus),
-        ],
-        axis=-1,
-    )
+    w = np.cos(b / 2) * np.cos((a + c) / 2)
+    x = np.sin(b / 2) * np.cos((a - c) / 2)
+    y = np.sin(b / 2) * np.sin((a - c) / 2)
+    z = np.cos(b / 2) * np.sin((a + c) / 2)
+    return np.stack([w, x, y, z], axis=-1)
 
 
-def _tumble(moments, omega, times):
-    """Free rotation by Runge-Kutta's fourth-order steps, in NumPy: error 1e-8 of the rate."""
+def _tumble(
+    moments: Float[np.ndarray, "3"],
+    omega: Float[np.ndarray, "3"],
+    times: Float[np.ndarray, " samples"],
+) -> Float[np.ndarray, "samples 3"]:
+    """Angular velocities of a free body at the times, with a relative error of 1e-8."""
     differences = np.roll(moments, -1) - np.roll(moments, -2)
 
-    def rate(omega):
+    def rate(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         return differences / moments * np.roll(omega, -1) * np.roll(omega, -2)
 
     omegas = [omega]
+    # Classical Runge-Kutta steps, ten from sample to sample. The exact motion would
+    # depend on JAX's precision.
     for step in np.repeat(np.diff(times) / 10, 10):
         k1 = rate(omega)
         k2 = rate(omega + step / 2 * k1)

@@ -174,7 +174,7 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
 def _evened(
     t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]
 ) -> np.ndarray:
-    """Each piece on the line through it, where that is asked for or all it does is to round."""
+    """Put each piece on its line if asked to, or if that only undoes rounding."""
     ticks = (t - t[0])[:, None] / _DIGITS
     digit = _DIGITS[np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3].max(initial=0.0)
     pieces, beside = np.split(t, breaks), []
@@ -199,7 +199,7 @@ def _evened(
 
 
 def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
-    """A robust line through times, counted one by one or, if that fits better, with some `lost`."""
+    """Fit a robust line through times; if `lost`, lost samples are counted too."""
     counts: list[np.ndarray] = [np.arange(t.size)]
     if lost:
         usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))

@@ -57,7 +57,7 @@ class Table(NamedTuple):
 
 
 def tables_of(path: Source, log: int) -> list[Table]:
-    """All tables behind a path; files of a folder or a zip that hold none are passed over."""
+    """All tables behind a path; files without a table are passed over."""
     if isinstance(path, io.TextIOBase):
         files = {str(getattr(path, "name", "text")): path.read().encode()}
     elif (path := pathlib.Path(path)).is_dir():
@@ -114,7 +114,7 @@ def _blackbox(path: str, name: str, log: int) -> Table:
 
 
 def _parse(text: str, name: str) -> Table:
-    """The table in a text, whatever its separator, decimal sign and lines above the header."""
+    """Parse a text with any separator, decimal sign and lines above the header."""
     lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
     last = lines[-50:]
     separator = next(
@@ -164,7 +164,7 @@ def _number(cell: str) -> float:
 
 
 def _with_units(table: Table) -> Table:
-    """The table with units in its headers that Sensor Logger and Betaflight leave to the reader."""
+    """Add the units that Sensor Logger and Betaflight do not state in headers."""
     if "seconds_elapsed" in table.headers:
         return _with_units_of_sensor_logger(table)
     if any(x.startswith(("gyroADC", "gyroUnfilt")) for x in table.headers):
@@ -243,13 +243,13 @@ def _with_units_of_blackbox(table: Table) -> Table:
 
 
 def _columns(table: Table, stem: str) -> list[int]:
-    """Columns of the three axes of a field of a blackbox log, if the file states no unit."""
+    """Columns of the three axes of a field of a blackbox log without a unit."""
     fits = re.compile(rf"^{stem}\[[012]\]$")
     return [j for j, header in enumerate(table.headers) if fits.match(header)]
 
 
 def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
-    """Degrees per second of the number 1, by the settings, and a note unless they are usual.
+    """Degrees per second of the number 1, and a note unless the settings are usual.
 
     Source: betaflight/blackbox-tools, `parser.c`; blackbox-log-viewer,
     `flightlog_parser.js` and `flightlog_fields_presenter.js`.

@@ -198,7 +198,7 @@ def _by_forces(
 
 
 def _shifted(reading: Reading, forces: np.ndarray, delay: float) -> np.ndarray:
-    """Specific forces of an accelerometer that lags by a delay, at the times of the gyro."""
+    """Specific forces at the gyro's times, from an accelerometer with a delay."""
     if delay == 0.0:
         return forces
     t = reading.times
@@ -246,7 +246,7 @@ class _Part(NamedTuple):
     def of(
         cls, reading: Reading, delay: float, free: Bool[np.ndarray, " rows"]
     ) -> "_Part":
-        """Prepare the equations of a part of a reading, of which some rows are known to be free."""
+        """Prepare the equations of a part in which some rows are known to be free."""
         rates, forces, t = reading.rates, reading.specific_forces, reading.times
         assert rates is not None
         assert forces is not None
@@ -268,7 +268,7 @@ class _Part(NamedTuple):
         return spans
 
     def span(self, first: int, last: int) -> tuple[int, int] | None:
-        """The rows that belong to a flight of which some rows are known; None if it is none."""
+        """Grow a flight from rows that are known to be in it; None if it is none."""
         core = np.zeros(self.times.size, bool)
         core[first:last] = True
         for _ in range(_ROUNDS):
@@ -296,7 +296,7 @@ class _Part(NamedTuple):
         return first, last
 
     def fit(self, core: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, "6"]:
-        """Lever [m] and bias [m/s^2] by least squares, twice without the rows that fit worst."""
+        """Lever [m] and bias [m/s^2]: least squares, twice without the worst rows."""
         model = np.concatenate(
             [self.models[0], np.broadcast_to(np.eye(3), (core.size, 3, 3))], 2
         )
@@ -327,13 +327,13 @@ class _Part(NamedTuple):
     def residuals(
         self, fit: Float[np.ndarray, "6"]
     ) -> Float[np.ndarray, "slopes rows"]:
-        """What the lever and bias leave unexplained [m/s^2]; infinite where nothing is read."""
+        """Residuals of lever and bias [m/s^2]; infinite where nothing is read."""
         shown = self.models @ fit[:3] + fit[3:]
         residuals = np.linalg.norm(self.clipped(shown) - self.forces, axis=2)
         return np.where(np.isfinite(residuals), residuals, np.inf)
 
     def clipped(self, shown: np.ndarray) -> np.ndarray:
-        """Specific forces within the range of the accelerometer, which shows its end beyond."""
+        """Clip specific forces to the range of the accelerometer, as it does."""
         most = np.nanmax(np.abs(self.forces), initial=0.0)
         return np.clip(shown, -most, most)
 
@@ -352,7 +352,7 @@ class _Part(NamedTuple):
 def _trimmed(
     fits: Bool[np.ndarray, "slopes rows"], first: int, last: int
 ) -> tuple[int, int]:
-    """A flight without the rows at its ends that do not fit by slopes from inside it."""
+    """A flight without rows at its ends that do not fit by slopes from inside."""
     central, before, after = fits[:, first:last]
     starts = np.argmax(central | after)
     ends = np.argmax((central | before)[::-1])
@@ -413,7 +413,7 @@ def _of_a_lever(
 
 
 def _at_the_end(forces: np.ndarray) -> np.ndarray:
-    """Where an accelerometer shows the end of its range, which it does several times or never."""
+    """Where an accelerometer shows the end of its range: several times or never."""
     size = np.abs(np.nan_to_num(forces))
     at_end = size >= max((1 - 1e-6) * size.max(initial=0.0), _LEAST_RANGE)
     return at_end & (at_end.sum() >= _CLIPPED)
@@ -435,7 +435,7 @@ def _slope(t: np.ndarray, rates: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]:
-    """Angular accelerations from readings before alone, and after alone: of parabolas."""
+    """Angular accelerations from earlier readings alone and from later ones alone."""
     slopes = []
     for shift in (reach, -reach):
         t1, t2 = np.roll(t, shift), np.roll(t, 2 * shift)
@@ -550,7 +550,7 @@ class _Equations(NamedTuple):
         return self.law.model.shape[2]
 
     def solve(self, rows: slice | np.ndarray) -> np.ndarray:
-        """Least squares, drawn to zero by what is usual where rows do not determine it."""
+        """Solve least squares; usual values fill in what rows do not determine."""
         drawn = np.eye(self.unknowns) / _USUAL**2
         a = self.law.model[rows].reshape(-1, self.unknowns)
         return np.linalg.solve(a.T @ a + drawn, a.T @ self.law.wanted[rows].ravel())

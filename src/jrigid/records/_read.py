@@ -69,7 +69,7 @@ _LIKE = 0.4  # correlation of the two from which their ratio is believed
 
 
 class _Sensor(NamedTuple):
-    """Times and three axes of a table, in the rows where all axes are numbers; others `missed`."""
+    """Times and three axes of a table, in the rows where all axes are numbers."""
 
     label: str
     table: Table
@@ -87,7 +87,7 @@ class _Units(NamedTuple):
     def factor(
         self, kind: str, sensor: _Sensor, values: np.ndarray, turned: str = ""
     ) -> float | None:
-        """The factor to SI by the caller, the file or the numbers; None where nobody says it."""
+        """The factor to SI from the caller, the file or the numbers, else None."""
         table, column = sensor.table, sensor.columns[kind != "times"]
         unit = _split(table.headers[column])[1]
         scale = table.scales.get(column, 1.0)
@@ -123,7 +123,7 @@ class _Units(NamedTuple):
     def _as_asked(
         self, kind: str, unit: str | None, scale: float, guessed: bool
     ) -> tuple[float, str]:
-        """The factor that the caller states, and a note; `unit` is what the file says."""
+        """The caller's factor and a note; `unit` is what the file says."""
         asked = self.asked[kind]
         if not isinstance(asked, str):
             return float(asked), f"multiplied by {asked:g}: `unit` says so"
@@ -141,7 +141,7 @@ def _label(kind: str, sensor: _Sensor) -> str:
 
 
 def _range_checked(values: np.ndarray, factor: float, asked: bool) -> str:
-    """A note on rates that no gyro reads, where the caller states a unit; else an error."""
+    """Note rates that no gyro reads if the caller states a unit, else raise."""
     most = float(np.abs(values).max(initial=0.0))
     if most * factor <= _RANGE[0]:
         return ""
@@ -152,7 +152,7 @@ def _range_checked(values: np.ndarray, factor: float, asked: bool) -> str:
 
 
 def _question(most: float, why: str) -> str:
-    """Ask for the unit of rates, and say what their largest number is in the usual ones."""
+    """Ask for the unit of rates, with the largest number in the usual units."""
     degree, count = np.pi / 180, _UNITS["rates"]["counts"]
     return (
         f"Argument `unit` must say the unit of the rates, but it does not, and {why}. "
@@ -172,7 +172,7 @@ def read(
     clock: str | None = None,
     log: int = 1,
 ) -> Reading:
-    r"""Read a file of sensors: phyphox, Sensor Logger, Betaflight, or anyone's columns by names.
+    r"""Read a file of sensors: phyphox, Sensor Logger, Betaflight or named columns.
 
     A folder or a zip may hold a file for each sensor. Units are those that `unit` says,
     else those that the file says (headers, or the format), else recognised where only
@@ -238,7 +238,7 @@ def read(
 def _chosen(
     tables: list[Table], columns: Columns
 ) -> tuple[dict[str, _Sensor], _Sensor]:
-    """The sensors that are read, by what they measure, and the one that has the clock."""
+    """Choose the sensors to read, by what they measure, and the one with the clock."""
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns)
     sensors = [x for table in tables for x in _sensors(table, columns)]
@@ -311,7 +311,7 @@ def _asked(unit: Unit | Mapping[str, Unit] | None) -> dict[str, Unit]:
 
 
 def _rename(tables: list[Table], columns: Columns) -> None:
-    """Give columns the names that the caller has for them; where it is no sensor's, in SI."""
+    """Give columns the caller's names; those of no known sensor are in SI."""
     factors: dict[str | None, float] = {None: 1.0}
     factors |= {
         unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()
@@ -346,7 +346,7 @@ def _rename(tables: list[Table], columns: Columns) -> None:
 
 
 def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
-    """The sensors of a table: three columns whose names differ by the axis, and their times."""
+    """Find sensors: three columns whose names differ by the axis, and their times."""
     known, names = np.isfinite(table.values), [_split(x)[0] for x in table.headers]
     times, triples = [], dict[str, dict[str, int]]()
     for j in np.flatnonzero(known.any(axis=0)).tolist():
@@ -387,7 +387,7 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
 def _on_one_clock(
     chosen: dict[str, _Sensor], main: _Sensor, clock: str | None, units: _Units
 ) -> tuple[Clock, dict[str, np.ndarray]]:
-    """The clock of the main sensor put right, and what each sensor reads at its times."""
+    """Repair the clock of the main sensor and read every sensor at its times."""
     raw = {k: x.table.values[x.rows][:, x.columns] for k, x in chosen.items()}
     times = _times(chosen, raw, units)
     clocks = {k: repair(times[k], raw[k][:, 1:], clock=clock) for k in chosen}
@@ -483,7 +483,7 @@ def _recognised_rates(values: np.ndarray, turned: str) -> tuple[str, str]:
 
 
 def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
-    """The unit in which gravity turns as the rates say, df/dt = -omega x f; "" if unclear."""
+    """The unit in which gravity obeys df/dt = -omega x f; empty if unclear."""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
     sums, size = (
@@ -512,7 +512,7 @@ def _kind(name: str) -> str | None:
 
 
 def _split(header: str) -> tuple[str, str | None]:
-    """A header without its unit, and the unit: `gyro x (deg/s)`, `t [ms]`, `gyro_x_dps`."""
+    """Split the unit off a header such as `gyro x (deg/s)`, `t [ms]`, `gyro_x_dps`."""
     match = _UNIT.search(header) or _SUFFIX.search(header)
     if not match or not match.start():
         return header, "s" if header == "seconds_elapsed" else None

@@ -206,7 +206,7 @@ def allan(
 
 
 def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
-    """The parts of a reading in which the body rests: as quiet as its quietest, and not turning.
+    """The parts of a reading in which the body is at rest: quiet and not turning.
 
     Args:
         reading: With rates.
@@ -248,7 +248,7 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
 def noise(
     reading: Reading, *, at_rest: bool = False, min_duration: float = 1.0
 ) -> Noise:
-    """Noise of the gyro from the rest in a reading: white noise, bias, bias instability.
+    """Noise of the gyro from its rests: white noise, bias, bias instability.
 
     Args:
         reading: With rates.
