@@ -6,7 +6,7 @@ checked by `Findings`, and handled in one of three ways, which
 (`where_defined`). A builder raises an error or returns NaN (`Findings.guard`). A solver
 or an estimator raises an error or returns a result code (`settle`). Where the values
 are known, the error is raised in Python, so that the compiled function has no
-callbacks. In a user's own jit it is raised by `equinox.error_if`. After the first failed
+callbacks. In a user's own jit `equinox.error_if` raises it. After the first failed
 call no other compiles anything (tests/test_no_leak.py).
 """
 
