@@ -1,7 +1,7 @@
-"""Tensors: what is one, parallel axis, principal axes, functions of a tensor."""
+"""Inertia tensors: checks, parallel axes, principal axes, functions of a tensor."""
 
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
 import jax
 import jax.numpy as jnp
@@ -29,11 +29,12 @@ from jrigid._types import (
     VectorLike,
 )
 
-ULPS = 64  # rounding allowed in "not negative" and "I3 <= I1 + I2"
+#: Rounding that is allowed in "not negative" and "I3 <= I1 + I2".
+ULPS = 64
 
 
 def as_tensor(inertia: Array) -> Matrix:
-    """A tensor of moments or of a tensor, or ValueError."""
+    """Make a tensor of principal moments; return a tensor as it is."""
     check_shape("inertia", inertia, *INERTIA)
     return jnp.diag(inertia) if inertia.ndim == 1 else inertia
 
@@ -41,8 +42,8 @@ def as_tensor(inertia: Array) -> Matrix:
 def inertia_of_second_moment(second: Matrix) -> Matrix:
     """Inertia tensor of a second moment of the mass, tr(S) 1 - S.
 
-    Diagonal elements are sums of two, as differences of three would leave no digits to
-    a needle.
+    Diagonal elements are sums of two numbers. The difference tr(S) - S_zz would leave
+    no digits to a needle along z.
 
     Args:
         second: S, the integral of r r^T over the mass [kg m^2].
@@ -50,7 +51,8 @@ def inertia_of_second_moment(second: Matrix) -> Matrix:
     Gradients: linear.
 
     >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jnp.diag(jr.mass.inertia_of_second_moment(jnp.diag(jnp.array([1.0, 2.0, 3.0])))))
+    >>> second = jnp.diag(jnp.array([1.0, 2.0, 3.0]))
+    >>> print(jnp.diag(jr.mass.inertia_of_second_moment(second)))
     [5. 4. 3.]
     """
     x, y, z = jnp.diagonal(second)
@@ -76,45 +78,51 @@ def second_moment(inertia: Matrix) -> Matrix:
 
 
 def steiner(displacement: Vector) -> Matrix:
-    """Tensor of a unit mass at a place, |d|^2 1 - d d^T."""
+    """Inertia tensor of a unit mass at a place d, |d|^2 1 - d d^T."""
     return inertia_of_second_moment(displacement[:, None] * displacement[None, :])
 
 
 def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
-    """Whether no moment is below -64 ulps of a scale: Cholesky with diagonal pivots.
+    """Whether no moment is below -64 ulps of a scale, by Cholesky with pivoting.
 
-    Entries and scale are about 1: products of much larger or smaller ones leave the
-    range.
+    Entries and scale must be about 1: products of much larger or smaller ones leave the
+    range of the dtype.
     """
-    # A few ulps off at any moments, where the roots of the cubic lose half the digits.
+    # The pivots are good to a few ulps whatever the moments are. The roots of the
+    # characteristic cubic lose half the digits where moments nearly coincide.
     shift = ULPS * jnp.finfo(tensor.dtype).eps * scale
     remainder = tensor + shift * jnp.eye(3, dtype=tensor.dtype)
-    left, fine = jnp.ones(3, bool), jnp.asarray(True)
+    remaining = jnp.ones(3, bool)
+    is_fine = jnp.asarray(True)
     for _ in range(3):
-        k = jnp.argmax(jnp.where(left, jnp.diagonal(remainder), -jnp.inf))
-        row, pivot = remainder[k], remainder[k, k]
-        fine = fine & (pivot >= 0)
-        remainder = remainder - row[:, None] * row[None, :] / jnp.where(
-            pivot > 0, pivot, 1.0
-        )
-        left = left & (jnp.arange(3) != k)
-    return fine
+        k = jnp.argmax(jnp.where(remaining, jnp.diagonal(remainder), -jnp.inf))
+        row = remainder[k]
+        pivot = row[k]
+        is_fine = is_fine & (pivot >= 0)
+        divisor = jnp.where(pivot > 0, pivot, 1.0)
+        remainder = remainder - row[:, None] * row[None, :] / divisor
+        remaining = remaining & (jnp.arange(3) != k)
+    return is_fine
 
 
 @jax.jit
 def is_physical(tensor: Matrix) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a tensor is symmetric, finite and semi-definite, and whether I3 <= I1 + I2."""
+    """Whether a tensor is symmetric and semi-definite, and whether I3 <= I1 + I2."""
     tensor = jax.lax.stop_gradient(tensor)
     (unit,) = scaled_together(tensor)
     trace = jnp.trace(unit)
-    second = is_semidefinite(second_moment(unit), trace)
-    return is_symmetric(tensor) & is_semidefinite(unit, trace), second
+    is_positive = is_symmetric(tensor) & is_semidefinite(unit, trace)
+    obeys_triangle = is_semidefinite(second_moment(unit), trace)
+    return is_positive, obeys_triangle
 
 
 def body_arrays(
     inertia: ArrayLike, mass: ArrayLike, **vector: ArrayLike
 ) -> tuple[Matrix, Scalar, Vector]:
-    """Tensor, mass and a vector, given by its name, of one dtype, or ValueError."""
+    """Convert a tensor, a mass and a vector to one dtype, or raise ValueError.
+
+    The vector is a keyword argument: errors call it by that name.
+    """
     ((name, value),) = vector.items()
     inertia, mass, value = shaped(
         inertia=(inertia, *INERTIA), mass=(mass,), **{name: (value, 3)}
@@ -122,19 +130,18 @@ def body_arrays(
     return as_tensor(inertia), mass, value
 
 
-def _displaced(arguments: tuple[Matrix, Scalar, Vector], *, to_center: bool) -> Matrix:
-    """Parallel axis theorem, from the centre of mass or to it; NaN where it does not apply."""
+def _from_center(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
+    return tensor + mass * steiner(displacement)
 
-    def displaced(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
-        excess = mass * steiner(displacement)
-        return tensor - excess if to_center else tensor + excess
 
-    tensor, mass, displacement = known = jax.lax.stop_gradient(arguments)
-    ok = is_symmetric(tensor) & (mass >= 0) & all_finite((mass, displacement))
-    if to_center:
-        whole, own = scaled_together(tensor, displaced(*known))
-        ok = ok & is_semidefinite(own, jnp.trace(whole))
-    return where_defined(ok, displaced, *arguments)
+def _to_center(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
+    return tensor - mass * steiner(displacement)
+
+
+def _can_be_displaced(
+    tensor: Matrix, mass: Scalar, displacement: Vector
+) -> Bool[Array, ""]:
+    return is_symmetric(tensor) & (mass >= 0) & all_finite((mass, displacement))
 
 
 def parallel_axis(
@@ -161,9 +168,9 @@ def parallel_axis(
     >>> print(jnp.diag(jr.parallel_axis(jnp.array([1.0, 1.0, 0.0]), 3.0, d)))
     [13. 13.  0.]
     """
-    return _displaced(
-        body_arrays(inertia, mass, displacement=displacement), to_center=False
-    )
+    arguments = body_arrays(inertia, mass, displacement=displacement)
+    ok = _can_be_displaced(*jax.lax.stop_gradient(arguments))
+    return where_defined(ok, _from_center, *arguments)
 
 
 def to_center_of_mass(
@@ -192,9 +199,12 @@ def to_center_of_mass(
     >>> print(jnp.diag(jr.to_center_of_mass(jnp.array([13.0, 13.0, 0.0]), 3.0, d)))
     [1. 1. 0.]
     """
-    return _displaced(
-        body_arrays(inertia, mass, displacement=displacement), to_center=True
-    )
+    arguments = body_arrays(inertia, mass, displacement=displacement)
+    known = jax.lax.stop_gradient(arguments)
+    about_point, about_center = scaled_together(known[0], _to_center(*known))
+    # Rounding of the difference is that of the larger tensor.
+    is_real = is_semidefinite(about_center, jnp.trace(about_point))
+    return where_defined(_can_be_displaced(*known) & is_real, _to_center, *arguments)
 
 
 @final
@@ -244,8 +254,8 @@ def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
     )
 
 
-def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
-    """Function of a tensor, axes diag(f(moments)) axes^T, with derivatives right everywhere.
+def tensor_function(f: Callable[[Scalar], Scalar], inertia: InertiaLike) -> Matrix:
+    """Function of a tensor, axes diag(f(moments)) axes^T, with right derivatives.
 
     NaN where the tensor is not symmetric, and where f is.
 
@@ -284,7 +294,7 @@ def tensor_function(f: Callable[[Any], Any], inertia: InertiaLike) -> Matrix:
             f"Argument `f` must map {moment} to the same, but it gives {shape}."
         )
     hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
-    # Of a bad lane f is asked at 1, which is in the domain of most functions.
+    # In a bad lane f is evaluated at 1, which is in the domain of most functions.
     return where_defined(
         is_symmetric(tensor),
         lambda x: spectral_function(hoisted, x, *parameters),

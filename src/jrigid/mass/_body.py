@@ -44,11 +44,11 @@ _NOT_A_BODY = (
 
 @final
 class MassProperties(Readable):
-    """Mass, centre of mass, and inertia tensor about the centre of mass, of a real body.
+    """Mass, centre of mass and inertia tensor about it, of a real body.
 
     Thin bodies are bodies too: a plate may have I3 = I1 + I2, a rod one zero moment, a
-    point three. `a + b` is the two bodies rigidly joined (coordinates in common), and
-    `sum` works. What is done with a body of NaN gives NaN.
+    point three. `a + b` joins two bodies rigidly; both use the same coordinates. `sum`
+    joins many. All results computed from a body of NaN are NaN.
 
     Attributes:
         mass: Mass [kg].
@@ -96,14 +96,13 @@ class MassProperties(Readable):
         values = body_arrays(inertia, mass, center_of_mass=center_of_mass)
         tensor, mass, center_of_mass = jax.lax.stop_gradient(values)
         findings = Findings()
-        findings.require(
-            (mass > 0) & jnp.isfinite(mass), RESULTS.invalid_mass, value=mass
-        )
+        is_mass = (mass > 0) & jnp.isfinite(mass)
+        findings.require(is_mass, RESULTS.invalid_mass, value=mass)
         message = "Argument `center_of_mass` must be finite, but it is not."
         findings.require(all_finite(center_of_mass), None, message, center_of_mass)
-        positive, triangle = is_physical(tensor)
-        findings.require(positive, None, _NOT_A_BODY, inertia)
-        findings.require(triangle, RESULTS.unphysical_inertia, value=inertia)
+        is_positive, obeys_triangle = is_physical(tensor)
+        findings.require(is_positive, None, _NOT_A_BODY, inertia)
+        findings.require(obeys_triangle, RESULTS.unphysical_inertia, value=inertia)
         tensor, self.mass, self.center_of_mass = findings.guard(values, throw)
         self.inertia = _symmetrised(tensor)
 
@@ -111,7 +110,7 @@ class MassProperties(Readable):
     def unchecked(
         cls, mass: ScalarLike, center_of_mass: VectorLike, inertia: InertiaLike
     ) -> "MassProperties":
-        """The body of values at which nobody looks, for formulas that give those of real bodies.
+        """Make a body without checks, from values that a formula makes physical.
 
         Args:
             mass: Mass [kg].
@@ -128,12 +127,11 @@ class MassProperties(Readable):
         >>> print(jr.MassProperties.unchecked(1.0, jnp.zeros(3), jnp.ones(3)).mass)
         1.0
         """
+        tensor, mass, center = body_arrays(inertia, mass, center_of_mass=center_of_mass)
+        # equinox forbids a second constructor and assignments outside of the first.
         body = object.__new__(cls)
-        tensor, mass, center_of_mass = body_arrays(
-            inertia, mass, center_of_mass=center_of_mass
-        )
         object.__setattr__(body, "mass", mass)
-        object.__setattr__(body, "center_of_mass", center_of_mass)
+        object.__setattr__(body, "center_of_mass", center)
         object.__setattr__(body, "inertia", _symmetrised(tensor))
         return body
 
@@ -176,9 +174,8 @@ class MassProperties(Readable):
         """
         body, shift = _in_one_dtype(self, displacement)
         check_shape("displacement", shift, (3,))
-        return MassProperties.unchecked(
-            body.mass, body.center_of_mass + shift, body.inertia
-        )
+        center = body.center_of_mass + shift
+        return MassProperties.unchecked(body.mass, center, body.inertia)
 
     def rotated(self, attitude: QuaternionLike) -> "MassProperties":
         """The body turned about the origin of the coordinates.
@@ -203,7 +200,9 @@ class MassProperties(Readable):
         return _rotated(body, turn)
 
     def principal_axes(self) -> PrincipalAxes:
-        """Principal moments and axes about the centre of mass; see `jrigid.principal_axes`.
+        """Principal moments and axes about the centre of mass.
+
+        See `jrigid.principal_axes`.
 
         Returns:
             Moments and axes.
@@ -218,19 +217,20 @@ class MassProperties(Readable):
         return principal_axes(self.inertia)
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
-        """The two bodies rigidly joined."""
+        """Join two bodies rigidly."""
         if not isinstance(other, MassProperties):
             return NotImplemented
         return _joined(*_in_one_dtype(self, other))
 
     def __radd__(self, other: int) -> "MassProperties":
-        """Start of `sum`: 0 is no body."""
+        """Return the body itself for 0, the start of `sum`."""
         if isinstance(other, int) and other == 0:
             return self
         return NotImplemented
 
 
 def _symmetrised(tensor: Matrix) -> Matrix:
+    # Halves first: the sum of the largest numbers would be infinite.
     return 0.5 * tensor + 0.5 * tensor.T
 
 

@@ -1,7 +1,5 @@
 """Mass properties of closed triangle meshes by the divergence theorem."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int
 
 from jrigid._checks import Findings, check_shape, harmless, is_concrete, shaped
-from jrigid._types import Matrix, Real, Scalar, ScalarLike, Vector
+from jrigid._types import AnyArray, Matrix, Real, Scalar, ScalarLike, Vector
 from jrigid.mass._axes import ULPS, inertia_of_second_moment, is_physical
 from jrigid.mass._body import MassProperties
 from jrigid.mass._points import PAIRS, lane_sum, symmetric
@@ -34,18 +32,24 @@ def is_closed(faces: Int[np.ndarray, "faces 3"], vertices: int) -> bool:
     faces = faces.astype(np.int64)
     if faces.min() < 0 or faces.max() >= vertices:
         return False
-    start, end = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    edges = np.sort(2 * (low * vertices + high) + (start > end))
-    forth, back = edges[::2], edges[1::2]
-    # Sorted, every edge once forth and once back leaves no room for a third run or a
-    # point.
-    return not (edges.size % 2 or np.any(forth % 2) or np.any(back != forth + 1))
+    start = faces.T.ravel()
+    end = np.roll(faces, -1, axis=1).T.ravel()
+    low = np.minimum(start, end)
+    high = np.maximum(start, end)
+    # One integer for each run along an edge: even forth, the next odd one back.
+    runs = np.sort(2 * (low * vertices + high) + (start > end))
+    if runs.size % 2:
+        return False
+    forth = runs[::2]
+    back = runs[1::2]
+    # A third run along an edge, or an edge from a vertex to itself, spoils a pair.
+    return bool(np.all(forth % 2 == 0) and np.all(back == forth + 1))
 
 
 def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
-    """What may have left faces open, and what mends it."""
-    least, most = faces.min(), faces.max()
+    """Say what may have left faces open, and what mends it."""
+    least = faces.min()
+    most = faces.max()
     if least < 0 or most >= vertices:
         return (
             f" (Indices count from 0 to {vertices - 1} here, but they go from {least} "
@@ -70,8 +74,9 @@ def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array,
     """As `is_closed`, at run time."""
     if faces.shape[0] % 2:
         return jnp.asarray(False)
-    start, end = faces.T.ravel(), jnp.roll(faces, -1, axis=1).T.ravel()
-    # Keys stay apart: their product overflows int32.
+    start = faces.T.ravel()
+    end = jnp.roll(faces, -1, axis=1).T.ravel()
+    # Three keys instead of one integer, which would overflow int32.
     keys = (
         jnp.minimum(start, end),
         jnp.maximum(start, end),
@@ -84,8 +89,17 @@ def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array,
     return inside & jnp.all(same & alternate)
 
 
-def _index_array(faces: Any) -> Any:
-    """Faces as numpy's array if they are known, or ValueError."""
+def _closed(faces: AnyArray, vertices: int) -> tuple[Bool[Array, ""], str]:
+    """Whether faces are closed; if they are known and are not, the reason."""
+    if not isinstance(faces, np.ndarray):
+        return is_closed_traced(faces, vertices), ""
+    if is_closed(faces, vertices):
+        return jnp.asarray(True), ""
+    return jnp.asarray(False), _why_open(faces, vertices)
+
+
+def _index_array(faces: AnyArray) -> AnyArray:
+    """Convert known faces to an array of numpy, or raise ValueError."""
     if is_concrete(faces) or not eqx.is_array_like(faces):
         faces = np.asarray(faces)
     check_shape("faces", faces, (None, 3))
@@ -107,28 +121,39 @@ def _mesh_integrals(
 ) -> tuple[Scalar, Scalar, Vector, Matrix]:
     """Volume, sum of the absolute volumes of its tetrahedra, centre, tensor about it.
 
-    The divergence theorem, as tetrahedra between the faces and an origin amid the
-    vertices: the sums do not depend on it, so no derivative runs through it, and far
-    bodies lose no digits.
+    By the divergence theorem: each face makes a tetrahedron with an origin amid the
+    vertices.
     Source: Tonon, J. Math. Stat. 1 (2005) 8-11; Eberly, Polyhedral Mass Properties
     (2002).
     """
     sums = jnp.stack([lane_sum(vertices[:, i]) for i in range(3)])
+    # The sums do not depend on the origin, so it has no derivative. It is amid the
+    # vertices so that bodies far away lose no digits.
     origin = jax.lax.stop_gradient(sums / vertices.shape[0])
     local = [vertices[:, i] - origin[i] for i in range(3)]
-    a, b, c = ([x.at[faces[:, k]].get(mode="clip") for x in local] for k in range(3))
-    six_volumes: Any = sum(
-        a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3)
+
+    def corners(k: int) -> list[Array]:
+        # One array for each component, as the sums over lanes take them.
+        return [x.at[faces[:, k]].get(mode="clip") for x in local]
+
+    a = corners(0)
+    b = corners(1)
+    c = corners(2)
+    six_volumes = (
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
     s = [a[i] + b[i] + c[i] for i in range(3)]
+
+    def second_moment(i: int, j: int) -> Scalar:
+        squares = a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j]
+        return lane_sum(six_volumes * squares) / 120
+
     volume = lane_sum(six_volumes) / 6
     magnitude = lane_sum(jnp.abs(jax.lax.stop_gradient(six_volumes))) / 6
     first = jnp.stack([lane_sum(six_volumes * s[i]) for i in range(3)]) / 24
-    second = symmetric(
-        lane_sum(six_volumes * (a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j]))
-        / 120
-        for i, j in PAIRS
-    )
+    second = symmetric(second_moment(i, j) for i, j in PAIRS)
     center = first / jnp.where(volume == 0, 1.0, volume)
     about_center = second - volume * center[:, None] * center[None, :]
     return volume, magnitude, origin + center, inertia_of_second_moment(about_center)
@@ -143,9 +168,9 @@ def from_mesh(
 ) -> MassProperties:
     """Mass properties of a homogeneous body bounded by a closed triangle mesh; exact.
 
-    Surfaces that close each for itself are taken at their word: a cavity is a surface
-    turned inward, and where surfaces overlap or one is inside out outside of the others
-    (a part mirrored by its program) their masses add or subtract. Programs that repair
+    The mesh may consist of several closed surfaces. A surface that is turned inward is
+    a cavity: its mass is subtracted wherever it lies, also if a program has mirrored a
+    part by mistake. Where surfaces overlap their masses add. Programs that repair
     meshes join them.
 
     Args:
@@ -181,20 +206,19 @@ def from_mesh(
     """
     vertices, density = shaped(vertices=(vertices, None, 3), density=(density,))
     indices = _index_array(faces)
-    known, findings = isinstance(indices, np.ndarray), Findings()
-    closed: Any = (is_closed if known else is_closed_traced)(indices, vertices.shape[0])
+    findings = Findings()
     finite = jnp.all(jnp.isfinite(vertices), axis=1)
     message = "Argument `vertices` must be finite, but it is not."
     findings.require(jnp.all(finite), None, message, vertices[jnp.argmin(finite)])
     message = "Argument `density` must be positive and finite, but it is not."
     findings.require((density > 0) & jnp.isfinite(density), None, message, density)
-    why = _why_open(indices, vertices.shape[0]) if known and not closed else ""
-    findings.require(jnp.asarray(closed), None, _OPEN + why)
+    closed, why = _closed(indices, vertices.shape[0])
+    findings.require(closed, None, _OPEN + why)
     vertices, density = harmless(findings.ok, (vertices, density))
     volume, magnitude, center, tensor = _mesh_integrals(vertices, indices)
     rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude
     findings.require(jax.lax.stop_gradient(volume) > rounding, None, _INSIDE_OUT)
-    positive, triangle = is_physical(tensor)
-    findings.require(positive & triangle, None, _CUTS_ITSELF)
+    is_positive, obeys_triangle = is_physical(tensor)
+    findings.require(is_positive & obeys_triangle, None, _CUTS_ITSELF)
     body = MassProperties.unchecked(density * volume, center, density * tensor)
     return findings.guard(body, throw)

@@ -1,7 +1,6 @@
 """Mass properties of point clouds, and of densities by quadrature."""
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +21,12 @@ from jrigid._types import Matrix, Real, Scalar, Vector, VectorLike
 from jrigid.mass._axes import inertia_of_second_moment
 from jrigid.mass._body import MassProperties
 
-# Sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's CPU
-# reductions and products of tall thin matrices run below numpy's speed; lanes of
-# partial sums mend both.
+# Partial sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's
+# reductions and products of tall thin matrices run below numpy's speed on a CPU. Lanes
+# of partial sums mend both.
 _LANES = 1024
 
-
+#: Indices of the entries of a symmetric matrix.
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -38,11 +37,13 @@ def symmetric(entries: Iterable[Array]) -> Matrix:
 
 
 def lane_sum(x: Float[Array, " points"]) -> Scalar:
+    """Sum in 64 lanes: see `_LANES`; few terms do not fill more."""
     padded = jnp.pad(x, (0, -x.shape[0] % 64))
     return jnp.sum(jnp.sum(padded.reshape(-1, 64), axis=0))
 
 
 def _terms(m: Array, positions: Array, place: Vector) -> list[Array]:
+    """The nine products m r and m r r^T of each point, r from a place."""
     r = [positions[:, i] - place[i] for i in range(3)]
     first = [m * x for x in r]
     return [*first, *(first[i] * r[j] for i, j in PAIRS)]
@@ -54,15 +55,14 @@ def _at_once(weights: Array, positions: Array, place: Vector) -> list[Array]:
 
 def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
     def add(i: Array, sums: list[Array]) -> list[Array]:
-        m, r = (
-            jax.lax.dynamic_slice_in_dim(x, _LANES * i, _LANES)
-            for x in (weights, positions)
-        )
+        m = jax.lax.dynamic_slice_in_dim(weights, _LANES * i, _LANES)
+        r = jax.lax.dynamic_slice_in_dim(positions, _LANES * i, _LANES)
         return [s + x for s, x in zip(sums, _terms(m, r, place), strict=True)]
 
     blocks = weights.shape[0] // _LANES
     lanes = jax.lax.fori_loop(0, blocks, add, [jnp.zeros(_LANES, weights.dtype)] * 9)
-    rest = _at_once(weights[_LANES * blocks :], positions[_LANES * blocks :], place)
+    done = _LANES * blocks
+    rest = _at_once(weights[done:], positions[done:], place)
     return [jnp.sum(x) + y for x, y in zip(lanes, rest, strict=True)]
 
 
@@ -70,8 +70,9 @@ def _in_lanes(weights: Array, positions: Array, place: Vector) -> list[Array]:
 def _moments(weights: Array, positions: Array, place: Vector) -> tuple[Vector, Matrix]:
     """Sums of m r and of m r r^T, r from a place, in one pass.
 
-    The rule spares reverse mode the memory of a scan, and NaN from bad values: to keep
-    them from the sum itself would cost as much as the sum.
+    The rule below spares reverse mode the memory of a scan. It also keeps NaN of bad
+    points from the derivatives of the others; masking them in the sum would cost as
+    much as the sum.
     """
     on_cpu = _in_lanes if len(weights) >= _LANES else _at_once
     sums = jax.lax.platform_dependent(
@@ -81,54 +82,67 @@ def _moments(weights: Array, positions: Array, place: Vector) -> tuple[Vector, M
 
 
 @_moments.defjvp
-def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    m, r, place = primals
+def _moments_jvp(
+    primals: tuple[Array, Array, Vector], tangents: tuple[Array, Array, Vector]
+) -> tuple[tuple[Vector, Matrix], tuple[Vector, Matrix]]:
+    weights, positions, place = primals
     dm, dr, _ = tangents  # the place is a constant
-    m, r = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (m, r - place[None, :]))
+    m = _finite_or_zero(weights)
+    r = _finite_or_zero(positions - place[None, :])
     first = jnp.sum(dm[:, None] * r + m[:, None] * dr, axis=0)
     half = product("na,nb->ab", 0.5 * dm[:, None] * r + m[:, None] * dr, r)
     return _moments(*primals), (first, half + half.T)
 
 
+def _finite_or_zero(x: Array) -> Array:
+    return jnp.where(jnp.isfinite(x), x, 0.0)
+
+
 @jax.jit
 def _cloud(masses: Array, positions: Array) -> MassProperties:
-    """The body, in one pass about the midst of some points, in two where the mass is elsewhere."""
+    """The body of points, in one pass over them, or in two for an uneven mass."""
     mass = lane_sum(masses)
     divisor = jnp.where(mass == 0, 1.0, mass)
-    place = jax.lax.stop_gradient(
-        jnp.mean(positions[:: -(-len(positions) // 64)], axis=0)
-    )
+    # Sums are about a place amid 64 points, which is usually near the centre of mass.
+    some = positions[:: -(-len(positions) // 64)]
+    place = jax.lax.stop_gradient(jnp.mean(some, axis=0))
     sums = _moments(masses, positions, place)
-    off = jax.lax.stop_gradient(sums[0]) / divisor
-    far = 2 * mass * jnp.sum(off * off) > jnp.trace(sums[1])  # then digits are lost
-    place = place + jnp.where(far, off, 0.0)
-    again = lambda *_: _moments(masses, positions, place)  # noqa: E731
-    first, second = jax.lax.cond(far, again, lambda *x: x, *sums)
+    offset = jax.lax.stop_gradient(sums[0]) / divisor
+    # The difference of second moments loses digits if most of them is the offset's.
+    is_far = 2 * mass * jnp.sum(offset * offset) > jnp.trace(sums[1])
+    place = place + jnp.where(is_far, offset, 0.0)
+
+    def about_new_place(*_: Array) -> tuple[Vector, Matrix]:
+        return _moments(masses, positions, place)
+
+    first, second = jax.lax.cond(is_far, about_new_place, lambda *x: x, *sums)
     center = first / divisor
-    inertia = inertia_of_second_moment(
-        second - mass * center[:, None] * center[None, :]
-    )
+    about_center = second - mass * center[:, None] * center[None, :]
+    inertia = inertia_of_second_moment(about_center)
     return MassProperties.unchecked(mass, place + center, inertia)
 
 
+def _first_bad(ok: Bool[Array, "points ..."], x: Array) -> tuple[Array, Array]:
+    """Whether all of x are good, and the first entry that is not."""
+    all_good = jnp.all(ok)
+
+    def searched() -> Array:
+        return x[jnp.argmin(jnp.all(ok.reshape(len(x), -1), axis=1))]
+
+    # The search is left out where there is nothing to find: it costs more than the sum.
+    return all_good, jax.lax.cond(all_good, lambda: x[0], searched)
+
+
 @jax.jit
-def _examined(masses: Array, positions: Array) -> list[tuple[Bool[Array, ""], Array]]:
-    """Whether all masses are finite and not negative, and positions finite; the first that is not.
-
-    Asked of the whole, not of each one, a good answer is quick.
-    """
-
-    def first_bad(ok: Array, x: Array) -> Array:
-        each = ok.reshape(len(x), -1)
-        return jax.lax.cond(
-            jnp.all(ok), lambda: x[0], lambda: x[jnp.argmin(jnp.all(each, axis=1))]
-        )
-
-    fine, finite = jnp.isfinite(masses) & (masses >= 0), jnp.isfinite(positions)
-    return [
-        (jnp.all(ok), first_bad(ok, x))
-        for ok, x in ((fine, masses), (finite, positions))
-    ]
+def _examined(
+    masses: Array, positions: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Whether all masses, then all positions, are good, and the first that is not."""
+    are_masses = jnp.isfinite(masses) & (masses >= 0)
+    return (
+        _first_bad(are_masses, masses),
+        _first_bad(jnp.isfinite(positions), positions),
+    )
 
 
 def _cloud_arrays(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array]:
@@ -172,19 +186,18 @@ def from_points(
     [0. 0. 1.] [2. 2. 0.]
     """
     arrays = _cloud_arrays(masses, positions)
-    (fine, mass), (finite, position) = _examined(*jax.lax.stop_gradient(arrays))
+    (are_masses, mass), (are_places, place) = _examined(*jax.lax.stop_gradient(arrays))
     findings = Findings()
     message = "Argument `masses` must be finite and non-negative, but it is not."
-    findings.require(fine, None, message, mass)
-    findings.require(
-        finite, None, "Argument `positions` must be finite, but it is not.", position
-    )
-    if not throw:  # NaN in the sums would reach the gradients of the other lanes
+    findings.require(are_masses, None, message, mass)
+    message = "Argument `positions` must be finite, but it is not."
+    findings.require(are_places, None, message, place)
+    if not throw:
+        # NaN in the sums would reach the gradients of the other lanes.
         arrays = harmless(findings.ok, arrays)
     body = _cloud(*arrays)
-    findings.require(
-        body.mass > 0, None, "Argument `masses` must not be all zero, but it is."
-    )
+    message = "Argument `masses` must not be all zero, but it is."
+    findings.require(body.mass > 0, None, message)
     return findings.guard(body, throw)
 
 
@@ -222,15 +235,25 @@ def _inertia_about_origin(masses: Array, positions: Array) -> Matrix:
     return nan_where(~ok, inertia_of_second_moment(second))
 
 
+def _quadrature(
+    order: int, dtype: np.dtype
+) -> tuple[Float[Array, "nodes 3"], Float[Array, " nodes"]]:
+    """Nodes and weights of Gauss-Legendre quadrature in the cube from -1 to 1."""
+    x, w = np.polynomial.legendre.leggauss(order)
+    nodes = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", w, w, w).ravel()
+    return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
+
+
 def from_density(
-    density: Callable[[Float[Array, "3"]], Any],
+    density: Callable[[Vector], Scalar],
     lower: VectorLike,
     upper: VectorLike,
     *,
     order: int = 16,
     throw: bool = True,
 ) -> MassProperties:
-    """Mass properties of a density in a box, by tensor-product Gauss-Legendre quadrature.
+    """Mass properties of a density in a box, by Gauss-Legendre quadrature.
 
     Args:
         density: Maps coordinates [m] to a density [kg/m^3], non-negative. It may close
@@ -266,11 +289,6 @@ def from_density(
             "Argument `density` must map coordinates (3,) to a scalar, but it gives "
             f"{shape}."
         )
-    nodes, node_weights = np.polynomial.legendre.leggauss(order)
-    grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(
-        -1, 3
-    )
-    weights = np.einsum("i,j,k->ijk", node_weights, node_weights, node_weights).ravel()
     findings = Findings()
     box = jnp.stack([lower, upper])
     message = (
@@ -280,16 +298,14 @@ def from_density(
     findings.require(all_finite(box) & jnp.all(lower < upper), None, message, box)
     lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)
-    positions = 0.5 * (lower + upper)[None, :] + half[None, :] * jnp.asarray(
-        grid, half.dtype
-    )
+    nodes, weights = _quadrature(order, half.dtype)
+    positions = 0.5 * (lower + upper)[None, :] + half[None, :] * nodes
     values = jax.vmap(density)(positions).astype(half.dtype)
-    [(fine, value), _] = _examined(*jax.lax.stop_gradient((values, positions)))
+    [(is_fine, value), _] = _examined(*jax.lax.stop_gradient((values, positions)))
     message = "Argument `density` must be finite and non-negative, but it is not."
-    findings.require(fine, None, message, value)
-    masses = harmless(fine, values) * jnp.prod(half) * jnp.asarray(weights, half.dtype)
+    findings.require(is_fine, None, message, value)
+    masses = harmless(is_fine, values) * jnp.prod(half) * weights
     body = _cloud(masses, positions)
-    findings.require(
-        body.mass > 0, None, "Argument `density` must not be zero, but it is."
-    )
+    message = "Argument `density` must not be zero, but it is."
+    findings.require(body.mass > 0, None, message)
     return findings.guard(body, throw)
