@@ -1,4 +1,4 @@
-"""Mechanics from any Lagrangian: accelerations, canonical momenta, energy, cyclic coordinates.
+"""Mechanics from any Lagrangian: accelerations, momenta, energy, cyclic coordinates.
 
 A Lagrangian is a pure function `L(q, q_dot, *params) -> scalar` of n generalised
 coordinates, their rates and whatever parameters it needs (numbers, arrays, any pytree);
@@ -23,19 +23,24 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._numerics import power_of_two, product
-from jrigid._types import Real, Scalar
+from jrigid._types import Real, Scalar, TimeLike
 
 Lagrangian: TypeAlias = Callable[..., Any]
 Coordinates: TypeAlias = Float[Array, " n"]
 CoordinatesLike: TypeAlias = Real[ArrayLike, " n"]
-_Bound: TypeAlias = Callable[[Array, Array], Array]  # without parameters
+#: A Lagrangian whose parameters are bound.
+_Bound: TypeAlias = Callable[[Array, Array], Array]
 
-_SCALING_SWEEPS = 5  # each takes the square root of what is left of a ratio of 1e16
+# Each sweep takes the square root of the remaining ratio of scales, 1e16 at first.
+_SCALING_SWEEPS = 5
+# Points at which `cyclic_coordinates` looks, and rounding errors of a slope that count
+# as zero.
 _PROBES = 4
 _ROUNDING_ERRORS = 64
 
 
-def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
+def _coordinates(q: ArrayLike, q_dot: ArrayLike) -> tuple[Array, Array]:
+    """Convert coordinates and rates to arrays (n,) of one dtype, or raise an error."""
     q, q_dot = shaped(q=(q, None), q_dot=(q_dot, *np.shape(q)))
     if q.size == 0:
         raise ValueError(
@@ -44,8 +49,8 @@ def _coordinates(q: Any, q_dot: Any) -> tuple[Array, Array]:
     return q, q_dot
 
 
-def _bind(lagrangian: Lagrangian, params: tuple[Any, ...], dtype: Any) -> _Bound:
-    """The Lagrangian of coordinates and rates alone, known to be a real scalar."""
+def _bind(lagrangian: Lagrangian, params: tuple[Any, ...], dtype: np.dtype) -> _Bound:
+    """Bind the parameters of a Lagrangian; check that its value is a real scalar."""
 
     def bound(q: Array, q_dot: Array) -> Array:
         value = jnp.asarray(lagrangian(q, q_dot, *params))
@@ -63,15 +68,17 @@ def _equations(lagrangian: _Bound, q: Array, q_dot: Array) -> tuple[Array, Array
     """Mass matrix M and generalised force f of M q'' = f."""
     momenta = jax.grad(lagrangian, argnums=1)
     mass = jax.jacfwd(momenta, argnums=1)(q, q_dot)
-    carried = jax.jvp(lambda q: momenta(q, q_dot), (q,), (q_dot,))[1]
-    return 0.5 * (mass + mass.T), jax.grad(lagrangian)(q, q_dot) - carried
+    # dp/dt at constant rates, (d^2 L / dq_dot dq) q_dot, without the mixed Hessian.
+    _, carried = jax.jvp(lambda q: momenta(q, q_dot), (q,), (q_dot,))
+    force = jax.grad(lagrangian)(q, q_dot) - carried
+    return 0.5 * (mass + mass.T), force
 
 
 def _scales(mass: Array) -> Array:
     """Powers of two s, such that the rows of s_i M_ij s_j are all of order one.
 
-    The diagonal is enough for a definite matrix; Ruiz's iteration (RAL-TR-2001-034) is
-    for one with zeros on its diagonal.
+    The diagonal is enough for a definite matrix. Ruiz's iteration (RAL-TR-2001-034)
+    serves matrices with zeros on the diagonal. Powers of two do not round.
     """
     mass = jnp.abs(mass)
     diagonal = jnp.diagonal(mass)
@@ -82,18 +89,19 @@ def _scales(mass: Array) -> Array:
     return power_of_two(scales)
 
 
-@jax.jit  # for eager callers: one compilation for each n, not fifty
+# Jitted for eager callers: one compilation for each n, not one for each operation.
+@jax.jit
 def _accelerations(mass: Array, force: Array) -> Array:
-    """M^-1 f; NaN, and derivatives zero, where M is singular or the answer is not finite.
-
-    By LU: a mass matrix is symmetric but need not be definite.
-    """
+    """M^-1 f; NaN without derivatives if M is singular or the result not finite."""
     scales = jax.lax.stop_gradient(_scales(mass))
-    mass, force = scales[:, None] * mass * scales[None, :], scales * force
+    mass = scales[:, None] * mass * scales[None, :]
+    force = scales * force
     threshold = 16 * force.size * float(jnp.finfo(force.dtype).eps)
     condition = jnp.linalg.cond(jax.lax.stop_gradient(mass), jnp.inf)
-    regular = (threshold * condition <= 1) & all_finite(force)  # false for inf and NaN
-    result = scales * where_defined(regular, jnp.linalg.solve, mass, force)
+    # A condition that is infinite or NaN compares false.
+    is_regular = (threshold * condition <= 1) & all_finite(force)
+    # By LU: a mass matrix is symmetric but need not be definite.
+    result = scales * where_defined(is_regular, jnp.linalg.solve, mass, force)
     return nan_where(~all_finite(result), result)
 
 
@@ -140,7 +148,8 @@ def acceleration(
     q, q_dot = _coordinates(q, q_dot)
 
     def formula(q: Array, q_dot: Array, params: tuple[Any, ...]) -> Array:
-        return _accelerations(*_equations(_bind(lagrangian, params, q.dtype), q, q_dot))
+        bound = _bind(lagrangian, params, q.dtype)
+        return _accelerations(*_equations(bound, q, q_dot))
 
     return where_defined(all_finite((q, q_dot)), formula, q, q_dot, params)
 
@@ -150,10 +159,10 @@ def vector_field(
 ) -> Callable[..., tuple[Coordinates, Coordinates]]:
     """Vector field of the motion for diffrax: `(t, (q, q_dot), args) -> (q_dot, q'')`.
 
-    Where `acceleration` is NaN so is q'' here, never infinite or a large wrong number:
-    an adaptive solve that meets it rejects its steps and ends with an error at
-    `max_steps`, one of constant steps goes on with NaN. Steps may jump over an isolated
-    point such as theta = 0 and not see it.
+    Where `acceleration` is NaN so is q'' here; it is never infinite or a large wrong
+    number. An adaptive solve that meets NaN rejects its steps and ends with an error at
+    `max_steps`. A solve with constant steps goes on with NaN. Steps may jump over an
+    isolated point such as theta = 0 and not see it.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
@@ -184,7 +193,12 @@ def vector_field(
     [1.]
     """
 
-    def field(t: Any, y: Any, args: Any) -> tuple[Array, Array]:  # noqa: ARG001
+    # diffrax passes `args` on as they are: None, or what the caller made of them.
+    def field(
+        t: TimeLike,  # noqa: ARG001
+        y: tuple[CoordinatesLike, CoordinatesLike],
+        args: Any,
+    ) -> tuple[Coordinates, Coordinates]:
         if args is not None and type(args) not in (tuple, list):
             raise ValueError(
                 "Argument `args` must be a tuple of the Lagrangian's parameters or "
@@ -218,7 +232,8 @@ def momenta(
     >>> import jax.numpy as jnp
     >>> from jrigid import lagrangian
     >>> def charge(q, q_dot, field):  # of unit mass and charge, symmetric gauge
-    ...     return 0.5 * jnp.sum(q_dot**2) + 0.5 * field * (q[0] * q_dot[1] - q[1] * q_dot[0])
+    ...     areal_rate = 0.5 * (q[0] * q_dot[1] - q[1] * q_dot[0])
+    ...     return 0.5 * jnp.sum(q_dot**2) + field * areal_rate
     >>> print(lagrangian.momenta(charge, jnp.array([1.0, 2.0]), jnp.zeros(2), 3.0))
     [-3.   1.5]
     """
@@ -254,10 +269,9 @@ def energy(
     4.0
     """
     q, q_dot = _coordinates(q, q_dot)
-    value, slope = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=1)(
-        q, q_dot
-    )
-    return product("i,i->", q_dot, slope) - value
+    bound = _bind(lagrangian, params, q.dtype)
+    value, momentum = jax.value_and_grad(bound, argnums=1)(q, q_dot)
+    return product("i,i->", q_dot, momentum) - value
 
 
 def cyclic_coordinates(
@@ -269,13 +283,13 @@ def cyclic_coordinates(
 ) -> Bool[Array, " n"]:
     """Which coordinates the Lagrangian does not depend on: their momenta are conserved.
 
-    A numerical verdict: dL/dq_i must vanish, to 64 rounding errors of the largest of
-    the terms p_j q_dot_j and reach_j dL/dq_j, at four fixed generic points about `q`,
-    each at rest and in motion. So an angle that drops out of L only because cos^2 +
-    sin^2 = 1 is found to be cyclic. A term of L that is switched off about `q`, or so
-    weak that it is lost in rounding, is not seen; a point where L is not finite makes
-    every coordinate count as not cyclic; and only the given coordinates are asked, not
-    their combinations (of two coupled bodies neither position is cyclic).
+    This is a numerical verdict. dL/dq_i must vanish at four fixed generic points about
+    `q`, each at rest and in motion: to 64 rounding errors of the largest of the terms
+    p_j q_dot_j and reach_j dL/dq_j. So an angle that drops out of L only because cos^2
+    + sin^2 = 1 is found to be cyclic. A term of L that is switched off about `q`, or so
+    weak that it is lost in rounding, is not seen. If L is not finite at a point, no
+    coordinate counts as cyclic. Only the given coordinates are tested, not their
+    combinations: of two coupled bodies neither position is cyclic.
 
     Args:
         lagrangian: Pure `L(q, q_dot, *params) -> scalar` [J, or any unit].
@@ -297,30 +311,32 @@ def cyclic_coordinates(
     >>> def kepler(q, q_dot, mu):
     ...     (r, _), (r_dot, angle_dot) = q, q_dot
     ...     return 0.5 * (r_dot**2 + (r * angle_dot) ** 2) + mu / r
-    >>> print(lagrangian.cyclic_coordinates(kepler, jnp.array([1.0, 0]), jnp.array([0, 1.0]), 1.0))
+    >>> q, q_dot = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
+    >>> print(lagrangian.cyclic_coordinates(kepler, q, q_dot, 1.0))
     [False  True]
     """
     q, q_dot = _coordinates(q, q_dot)
     slopes = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=(0, 1))
-    spread = (
-        0.25 * (1 + jnp.abs(q))
-        if reach is None
-        else float_arrays(reach)[0].astype(q.dtype)
-    )
-    if spread.shape != ():
-        check_shape("reach", spread, q.shape)
+    if reach is None:
+        spread = 0.25 * (1 + jnp.abs(q))
+    else:
+        spread = float_arrays(reach)[0].astype(q.dtype)
+        if spread.ndim > 0:
+            check_shape("reach", spread, q.shape)
     fastest = jnp.max(jnp.abs(q_dot))
     speed = jnp.where(fastest == 0, 1.0, fastest)
     tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
 
     def flat(place: Array, q_dot: Array) -> Array:
         value, (slope, momentum) = slopes(q + place * spread, q_dot)
-        # As changes of L over the reach, which coordinates of any unit have in common
+        # Changes of L over the reach can be compared between coordinates of any unit.
         change = jnp.abs(slope) * spread
         largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
         return (change <= tolerance * largest) & jnp.isfinite(value)
 
     steps = np.random.default_rng(0).uniform(-1, 1, (2, _PROBES, q.size))
-    places, rates = jnp.asarray(steps, q.dtype)
-    rates = jnp.stack([q_dot[None] + rates * speed, jnp.zeros_like(rates)])
-    return jnp.all(jax.vmap(jax.vmap(flat), (None, 0))(places, rates), axis=(0, 1))
+    places, changes = jnp.asarray(steps, q.dtype)
+    moving = q_dot[None] + changes * speed
+    rates = jnp.stack([moving, jnp.zeros_like(moving)])
+    flat_at_places = jax.vmap(flat)
+    return jnp.all(jax.vmap(flat_at_places, (None, 0))(places, rates), axis=(0, 1))

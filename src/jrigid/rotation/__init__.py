@@ -1,9 +1,8 @@
-r"""Rotations: quaternions, matrices, angles, rates, interpolation and gyro dead reckoning.
+r"""Rotations: quaternions, matrices, angles, rates, interpolation, dead reckoning.
 
 An attitude is a unit quaternion, scalar first (w, x, y, z), that takes body components
-to space
-components: `v_space = R(q) v_body`. `omega` is the angular velocity in body components
-[rad/s], `hat(omega) = R^T R'`. q and -q are the same attitude.
+to space components: `v_space = R(q) v_body`. `omega` is the angular velocity in body
+components [rad/s], `hat(omega) = R^T R'`. q and -q are the same attitude.
 """
 
 from jrigid.rotation._forms import from_euler as from_euler

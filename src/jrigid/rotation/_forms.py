@@ -1,9 +1,10 @@
 """Other forms of an attitude: matrices, Euler angles, roll-pitch-yaw, scipy."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from jrigid._checks import array_of_shape, where_defined
@@ -120,15 +121,20 @@ def _is_rotation(matrix: Array) -> Bool[Array, ""]:
 def _from_rotation(m: Array) -> Quaternion:
     """Shepperd's formula: the row of 4 q q^T with the largest diagonal element."""
     a, b, c = jnp.diagonal(m)
-    p, q, r = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    s, t, u = m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2]
-    # Each row is 4 q_k q; the one with the largest q_k is the accurate one.
+    # Elements of 4 q q^T off the diagonal, named by the components of q.
+    wx = m[2, 1] - m[1, 2]
+    wy = m[0, 2] - m[2, 0]
+    wz = m[1, 0] - m[0, 1]
+    xy = m[1, 0] + m[0, 1]
+    xz = m[2, 0] + m[0, 2]
+    yz = m[2, 1] + m[1, 2]
+    # Each row is 4 q_k q. The row with the largest q_k loses the fewest digits.
     rows = jnp.array(
         [
-            [1 + a + b + c, p, q, r],
-            [p, 1 + a - b - c, s, t],
-            [q, s, 1 - a + b - c, u],
-            [r, t, u, 1 - a - b + c],
+            [1 + a + b + c, wx, wy, wz],
+            [wx, 1 + a - b - c, xy, xz],
+            [wy, xy, 1 - a + b - c, yz],
+            [wz, xz, yz, 1 - a - b + c],
         ]
     )
     row = rows[jnp.argmax(jnp.diagonal(rows))]
@@ -153,13 +159,14 @@ def to_scipy(attitude: QuaternionLike) -> Quaternion:
     return jnp.roll(array_of_shape("attitude", attitude, 4), -1)
 
 
+# scipy is not imported: who passes a rotation of its has done so.
 @runtime_checkable
 class _ScipyRotation(Protocol):
-    def as_quat(self) -> Any: ...
+    def as_quat(self) -> np.ndarray: ...
 
 
 def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
-    """Attitude of one of scipy's rotations, or scalar-first order from scipy's scalar-last one.
+    """Attitude of a rotation of scipy, or of a scalar-last quaternion.
 
     Args:
         rotation: A single `scipy.spatial.transform.Rotation`, or a quaternion (x, y, z,
@@ -169,7 +176,7 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
         The same quaternion, scalar first.
 
     Raises:
-        ValueError: Of what is neither.
+        ValueError: The argument is neither.
 
     Gradients: linear in a quaternion, finite everywhere.
 
@@ -208,8 +215,10 @@ def from_euler(angles: VectorLike) -> Quaternion:
     [0. 1. 0. 0.]
     """
     phi, theta, psi = 0.5 * array_of_shape("angles", angles, 3)
-    c, s = jnp.cos(theta), jnp.sin(theta)
-    plus, minus = phi + psi, phi - psi
+    c = jnp.cos(theta)
+    s = jnp.sin(theta)
+    plus = phi + psi
+    minus = phi - psi
     return jnp.stack(
         [c * jnp.cos(plus), s * jnp.cos(minus), s * jnp.sin(minus), c * jnp.sin(plus)]
     )
@@ -218,8 +227,8 @@ def from_euler(angles: VectorLike) -> Quaternion:
 def to_euler(attitude: QuaternionLike) -> Vector:
     """z-x-z Euler angles of an attitude.
 
-    At theta = 0 only phi + psi is defined, at theta = pi only phi - psi: there psi = 0
-    is chosen and phi carries the whole rotation about the vertical.
+    At theta = 0 only phi + psi is defined, at theta = pi only phi - psi. There psi is 0
+    and phi carries the whole rotation about the vertical.
 
     Args:
         attitude: Unit quaternion, body to space; its norm drops out.
@@ -236,25 +245,30 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     [ 0.3  0.8 -1.2]
     """
     w, x, y, z = rescaled(array_of_shape("attitude", attitude, 4))
-    upper, lower = (w == 0) & (z == 0), (x == 0) & (y == 0)
-    half_sum, half_difference = safe_arctan2(z, w), safe_arctan2(y, x)
-    half_difference = jnp.where(lower, half_sum, half_difference)
-    half_sum = jnp.where(upper, half_difference, half_sum)
-    theta = 2 * safe_arctan2(safe_norm(jnp.stack([x, y])), safe_norm(jnp.stack([w, z])))
-    phi, psi = half_sum + half_difference, half_sum - half_difference
-    return jnp.stack([_wrap(phi), theta, _wrap(psi)])
+    # q = (c cos(plus), s cos(minus), s sin(minus), c sin(plus)), as in `from_euler`.
+    c = safe_norm(jnp.stack([w, z]))
+    s = safe_norm(jnp.stack([x, y]))
+    plus = safe_arctan2(z, w)
+    minus = safe_arctan2(y, x)
+    # At a pole one of the two is not defined; psi = plus - minus = 0 replaces it.
+    minus = jnp.where((x == 0) & (y == 0), plus, minus)
+    plus = jnp.where((w == 0) & (z == 0), minus, plus)
+    theta = 2 * safe_arctan2(s, c)
+    return jnp.stack([_wrap(plus + minus), theta, _wrap(plus - minus)])
 
 
 def _wrap(angle: Array) -> Array:
+    """The same angle in [-pi, pi]."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     """Attitude of roll, pitch and yaw: `R = Rz(yaw) Ry(pitch) Rx(roll)`, body to space.
 
-    The aerospace sequence z-y'-x'': from the space axes the body is turned by yaw about
-    z, then by pitch about its new y axis, then by roll about its newest x axis, each
-    right-handed. It is scipy's `Rotation.from_euler("ZYX", (yaw, pitch, roll))`.
+    This is the aerospace sequence z-y'-x''. From the space axes the body is turned by
+    yaw about z, then by pitch about its new y axis, then by roll about its newest x
+    axis, each right-handed. scipy writes it as
+    `Rotation.from_euler("ZYX", (yaw, pitch, roll))`.
 
     Args:
         angles: (roll, pitch, yaw) [rad].
@@ -284,8 +298,8 @@ def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
 def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     """Roll, pitch and yaw of an attitude, as `from_roll_pitch_yaw` takes them.
 
-    At pitch = +-pi/2, to rounding, only roll -+ yaw is defined: there roll = 0 is
-    chosen and yaw carries the whole rotation about the vertical.
+    At pitch = +-pi/2, to rounding, only roll -+ yaw is defined. There roll is 0 and yaw
+    carries the whole rotation about the vertical.
 
     Args:
         attitude: Unit quaternion, body to space; its norm drops out.
@@ -304,14 +318,14 @@ def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     [ 0.3 -0.8  1.2]
     """
     q = rescaled(array_of_shape("attitude", attitude, 4))
-    # Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C; four
-    # halves are C^-1.
+    # Rz(yaw) Ry(pitch) Rx(roll) = Rz(yaw + pi/2) Rx(pitch + pi/2) Rz(roll) C, where C
+    # permutes the axes. The quaternion of C^-1 is four halves.
     q = multiply(q, jnp.full(4, 0.5, q.dtype))
-    # No float is a pole exactly: a pair of components is zero where it is so to
-    # rounding.
+    # `to_euler` takes a pole where two components are 0. No float is a pole exactly, so
+    # components that are 0 to rounding become 0.
     w, x, y, z = jnp.abs(q) / (4 * jnp.finfo(q.dtype).eps)
-    upper, lower = w + z < 1, x + y < 1
-    yaw, pitch, roll = to_euler(
-        jnp.where(jnp.stack([upper, lower, lower, upper]), 0.0, q)
-    )
+    upper = w + z < 1
+    lower = x + y < 1
+    is_zero = jnp.stack([upper, lower, lower, upper])
+    yaw, pitch, roll = to_euler(jnp.where(is_zero, 0.0, q))
     return jnp.stack([roll, pitch - jnp.pi / 2, _wrap(yaw - jnp.pi / 2)])

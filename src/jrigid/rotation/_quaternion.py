@@ -26,14 +26,16 @@ from jrigid._types import (
 
 
 def _scale(vector: Array) -> Array:
+    """Power of two that brings the sum of the magnitudes of a vector to [1, 2)."""
+    # Component by component: a reduction would not fuse with what follows.
     return 2 / power_of_two(functools.reduce(jnp.add, [jnp.abs(x) for x in vector]))
 
 
 def rescaled(vector: Array) -> Array:
-    """Vector times the power of two that brings the sum of its magnitudes to [1, 2).
+    """Scale a vector by a power of two, to a sum of magnitudes in [1, 2).
 
-    No rounding, and no squares that leave the range of numbers, in values or in
-    derivatives; zero stays zero.
+    This does not round. Squares of the result stay in the range of numbers, in values
+    and in derivatives. Zero stays zero.
     """
     return vector * _scale(vector)
 
@@ -52,8 +54,8 @@ def identity(dtype: DTypeLike | None = None) -> Quaternion:
     """The unit quaternion (1, 0, 0, 0): body and space axes coincide.
 
     Args:
-        dtype: Of floating point numbers; JAX's default by default (float32 unless x64
-            is on). Beside arrays of another precision pass theirs.
+        dtype: Floating point type; JAX's default by default (float32 unless x64 is on).
+            For use with arrays of another precision pass theirs.
 
     Returns:
         The quaternion of no rotation.
@@ -66,12 +68,14 @@ def identity(dtype: DTypeLike | None = None) -> Quaternion:
 
 
 def random(key: PRNGKeyArray, dtype: DTypeLike | None = None) -> Quaternion:
-    """A random attitude: uniform on the sphere of unit quaternions, so in every turned frame.
+    """A random attitude, uniform on the sphere of unit quaternions.
+
+    The distribution is the same in every turned frame.
 
     Args:
         key: Of `jax.random`; for many attitudes `jax.vmap` over
             `jax.random.split(key, count)`.
-        dtype: Of floating point numbers; JAX's default by default.
+        dtype: Floating point type; JAX's default by default.
 
     Returns:
         Unit quaternion, of either sign.
@@ -107,10 +111,10 @@ def _direction(vector: Array) -> Array:
     """Vector over its norm; at zero the value is zero and the gradient zero."""
     vector = rescaled(vector)
     square = sum_of_squares(vector)
-    zero = square == 0
-    return jnp.where(
-        zero, jnp.zeros_like(vector), vector / jnp.sqrt(jnp.where(zero, 1.0, square))
-    )
+    is_zero = square == 0
+    # The inner `where` keeps NaN of sqrt(0) out of the derivative.
+    norm = jnp.sqrt(jnp.where(is_zero, 1.0, square))
+    return jnp.where(is_zero, jnp.zeros_like(vector), vector / norm)
 
 
 def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
@@ -185,7 +189,7 @@ def inverse(quaternion: QuaternionLike) -> Quaternion:
 
 
 def _spans(quaternion: Array) -> Array:
-    """True where a quaternion stands for an attitude: not zero, finite."""
+    """Whether a quaternion stands for an attitude: finite and not zero."""
     return jnp.any(quaternion != 0) & jnp.all(jnp.isfinite(quaternion))
 
 
@@ -213,9 +217,9 @@ def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
 
 
 def _rescaled_components(quaternion: Array) -> list[Array]:
-    """The components of `rescaled`, which are no array.
+    """The components of `rescaled`, as scalars.
 
-    One more array on the way to a result is one more program to compile and to run.
+    XLA compiles and runs one more kernel for each intermediate array.
     """
     scale = _scale(quaternion)
     return [component * scale for component in quaternion]
@@ -224,9 +228,11 @@ def _rescaled_components(quaternion: Array) -> list[Array]:
 def _rotated(w: Array, x: Array, y: Array, z: Array, vector: Array) -> Vector:
     """A vector rotated by a quaternion of any norm, given by its components."""
     a, b, c = vector
-    # v + 2 (w u x v + u x (u x v)) / |q|^2
+    # v + 2 (w u x v + u x (u x v)) / |q|^2, with u = (x, y, z) and (p, q, r) = u x v
     scale = 2 / (w * w + x * x + y * y + z * z)
-    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+    p = y * c - z * b
+    q = z * a - x * c
+    r = x * b - y * a
     return jnp.stack(
         [
             a + scale * (w * p + y * r - z * q),
@@ -287,8 +293,8 @@ def log(attitude: QuaternionLike) -> Vector:
     Returns:
         Axis times angle [rad]; zero for the zero quaternion.
 
-    Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion;
-    across a half turn the value itself jumps from +pi to -pi along the axis.
+    Gradients: finite everywhere, analytic at the identity, zero at the zero quaternion.
+    Across a half turn the value itself jumps from +pi to -pi along the axis.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> v = jnp.array([0.1, -0.2, 0.3])
@@ -297,15 +303,20 @@ def log(attitude: QuaternionLike) -> Vector:
     """
     q = rescaled(array_of_shape("attitude", attitude, 4))
     q = jnp.where(q[0] < 0, -q, q)
-    w, v = q[0], q[1:]
+    w = q[0]
+    v = q[1:]
     square = jnp.sum(v * v)
-    near = square <= w * w  # angle up to a quarter turn
-    zero = jnp.all(q == 0)
-    w_near = jnp.where(near & ~zero, w, 1.0)
-    half_near = arctanc_sqrt(jnp.where(near, square, 0.0) / (w_near * w_near)) / w_near
-    norm = jnp.sqrt(jnp.where(near, 1.0, square))
-    half_far = (jnp.pi / 2 - jnp.arctan(jnp.where(near, 0.0, w) / norm)) / norm
-    return 2 * jnp.where(zero, 0.0, jnp.where(near, half_near, half_far)) * v
+    # Half the angle over |v| is arctan(|v| / w) / |v|. Up to a quarter turn it is a
+    # series in |v|^2 / w^2; beyond, w / |v| is the smaller number.
+    is_near = square <= w * w
+    is_zero = jnp.all(q == 0)
+    w_near = jnp.where(is_near & ~is_zero, w, 1.0)
+    ratio = jnp.where(is_near, square, 0.0) / (w_near * w_near)
+    half_near = arctanc_sqrt(ratio) / w_near
+    norm = jnp.sqrt(jnp.where(is_near, 1.0, square))
+    half_far = (jnp.pi / 2 - jnp.arctan(jnp.where(is_near, 0.0, w) / norm)) / norm
+    half = jnp.where(is_near, half_near, half_far)
+    return 2 * jnp.where(is_zero, 0.0, half) * v
 
 
 def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
@@ -323,7 +334,8 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> q = jr.rotation.exp(jnp.array([0.0, 1e-3, 0.0]))
-    >>> print(round(float(jr.rotation.angle_between(jnp.array([1.0, 0.0, 0.0, 0.0]), q)), 9))
+    >>> angle = jr.rotation.angle_between(jr.rotation.identity(), q)
+    >>> print(round(float(angle), 9))
     0.001
     """
     p, q = shaped(p=(p, 4), q=(q, 4))
@@ -331,7 +343,9 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
 
 
 def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
-    """Spherical linear interpolation: from p to q at a constant rate, along the shortest arc.
+    """Spherical linear interpolation from p to q along the shortest arc.
+
+    The rate of rotation is constant.
 
     Args:
         p: Attitude at s = 0: unit quaternion; its norm drops out.
@@ -344,21 +358,23 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
         Unit quaternion p exp(s log(p^-1 q)), of the sign of p at s = 0.
 
     Gradients: analytic also at p = q, to any order. Attitudes half a turn apart have
-    two shortest arcs: where conj(p) q has no scalar part the one about its vector
-    part is taken, and the value jumps from one to the other across; derivatives are
-    those on the side taken.
+    two shortest arcs, and the value jumps from one to the other there. If conj(p) q has
+    no scalar part, the arc about its vector part is taken, with the derivatives of that
+    side.
     Source: K. Shoemake, Animating rotation with quaternion curves, SIGGRAPH (1985) 245.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> half = jr.rotation.exp(jnp.array([0.0, 0.0, 1.0]))
-    >>> print(jr.rotation.log(jr.rotation.slerp(jr.rotation.identity(), half, 0.25)).round(6))
+    >>> quarter = jr.rotation.slerp(jr.rotation.identity(), half, 0.25)
+    >>> print(jr.rotation.log(quarter).round(6))
     [0.   0.   0.25]
     """
     p, q, s = shaped(p=(p, 4), q=(q, 4), s=(s,))
 
     def formula(p: Array, q: Array, s: Array) -> Array:
         p = normalize(p)
-        return multiply(p, exp(s * log(multiply(conjugate(p), rescaled(q)))))
+        turn = multiply(conjugate(p), rescaled(q))
+        return multiply(p, exp(s * log(turn)))
 
     return where_defined(_spans(p) & _spans(q), formula, p, q, s)
 
@@ -381,6 +397,5 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
     [0. 0. 0. 1.]
     """
     v, a = shaped(axis=(axis, 3), angle=(angle,))
-    return normalize(
-        jnp.concatenate([jnp.cos(0.5 * a)[None], jnp.sin(0.5 * a) * _direction(v)])
-    )
+    vector_part = jnp.sin(0.5 * a) * _direction(v)
+    return normalize(jnp.concatenate([jnp.cos(0.5 * a)[None], vector_part]))

@@ -64,8 +64,9 @@ def angular_velocity(rotation: MatrixLike, rotation_rate: MatrixLike) -> Vector:
     Gradients: bilinear, finite everywhere.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
-    >>> turning = lambda t: jr.rotation.to_matrix(jr.rotation.exp(jnp.array([0.0, 0.0, 2.0]) * t))
-    >>> R, dR = jax.jvp(turning, (0.3,), (1.0,))
+    >>> spin = jnp.array([0.0, 0.0, 2.0])
+    >>> turned = lambda t: jr.rotation.to_matrix(jr.rotation.exp(spin * t))
+    >>> R, dR = jax.jvp(turned, (0.3,), (1.0,))
     >>> print(jr.rotation.angular_velocity(R, dR).round(5))
     [0. 0. 2.]
     """
@@ -94,18 +95,24 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     [2. 0. 4.]
     """
     (_, theta, psi), (dphi, dtheta, dpsi) = shaped(angles=(angles, 3), rates=(rates, 3))
-    s, c, tilt = jnp.sin(psi), jnp.cos(psi), dphi * jnp.sin(theta)
+    s = jnp.sin(psi)
+    c = jnp.cos(psi)
+    horizontal = dphi * jnp.sin(theta)
     return jnp.stack(
-        [tilt * s + dtheta * c, tilt * c - dtheta * s, dpsi + dphi * jnp.cos(theta)]
+        [
+            horizontal * s + dtheta * c,
+            horizontal * c - dtheta * s,
+            dpsi + dphi * jnp.cos(theta),
+        ]
     )
 
 
 def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """Rates of the z-x-z Euler angles from the angular velocity in body components.
 
-    Where sin theta = 0 exactly, psi' = 0 is chosen, as `to_euler` chooses psi = 0; phi'
-    carries the turning about the vertical, and the part of omega that no rates can
-    express is dropped.
+    Where sin theta = 0 exactly, psi' is 0, as psi is in `to_euler`, and phi' carries
+    the turning about the vertical. The part of omega that no rates can express is
+    dropped.
 
     Args:
         angles: (phi, theta, psi) [rad].
@@ -124,13 +131,14 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """
     (_, theta, psi), (a, b, c) = shaped(angles=(angles, 3), omega=(omega, 3))
     sine = jnp.sin(theta)
-    # sin(pi) is 1.2e-16 in floating point: the pole is where theta is its closest
-    # float.
-    pole = jnp.abs(sine) <= 0.5 * jnp.finfo(sine.dtype).eps * jnp.abs(theta)
+    # sin(pi) is 1.2e-16 in floating point: at the pole theta is the float that is
+    # closest to it.
+    at_pole = jnp.abs(sine) <= 0.5 * jnp.finfo(sine.dtype).eps * jnp.abs(theta)
     horizontal = a * jnp.sin(psi) + b * jnp.cos(psi)
-    dphi = jnp.where(pole, c * jnp.cos(theta), horizontal / jnp.where(pole, 1.0, sine))
+    divisor = jnp.where(at_pole, 1.0, sine)
+    dphi = jnp.where(at_pole, c * jnp.cos(theta), horizontal / divisor)
     dtheta = a * jnp.cos(psi) - b * jnp.sin(psi)
-    dpsi = jnp.where(pole, 0.0, c - dphi * jnp.cos(theta))
+    dpsi = jnp.where(at_pole, 0.0, c - dphi * jnp.cos(theta))
     return jnp.stack([dphi, dtheta, dpsi])
 
 
@@ -139,12 +147,13 @@ def integrate_rate(
     omegas: Real[_ArrayLike, "samples 3"],
     attitude0: QuaternionLike | None = None,
 ) -> Float[Array, "samples 4"]:
-    r"""Dead-reckon an attitude from sampled gyro rates, coning-corrected, to fourth order.
+    r"""Dead-reckon an attitude from sampled gyro rates, to fourth order.
 
-    The rotation is the time-ordered exponential of omega, new increments on the right.
-    Between two samples omega is the cubic through the four nearest ones, and the
-    increment is the fourth-order Magnus expansion with the rates a, b at the two Gauss
-    points, $q \to q \exp(h (a + b) / 2 + \sqrt{3} h^2 (a \times b) / 12)$.
+    The rotation is the time-ordered exponential of omega, with new increments on the
+    right. Between two samples omega is the cubic through the four nearest ones. The
+    increment is the fourth-order Magnus expansion, which corrects for coning, with the
+    rates a, b at the two Gauss points:
+    $q \to q \exp(h (a + b) / 2 + \sqrt{3} h^2 (a \times b) / 12)$.
 
     Args:
         ts: Times of two or more samples [s], increasing, not necessarily uniform.
@@ -176,22 +185,29 @@ def integrate_rate(
             f"{ts.shape}."
         )
     step = ts[1:] - ts[:-1]
-    increasing = jnp.all(
-        (step > 0) & jnp.isfinite(step)
-    )  # no time is infinite or NaN then
-    ok = increasing & all_finite(omegas) & is_unit(start)
+    # Then every time is finite, too.
+    is_increasing = jnp.all((step > 0) & jnp.isfinite(step))
+    ok = is_increasing & all_finite(omegas) & is_unit(start)
     return where_defined(ok, _dead_reckon, ts, omegas, start)
 
 
-@jax.jit  # run eagerly, each level of the scan would be compiled by itself
-def _dead_reckon(ts: Array, omegas: Array, start: Quaternion) -> Array:
+# Jitted for eager callers, for which each level of the scan would be compiled apart.
+@jax.jit
+def _dead_reckon(
+    ts: Float[Array, " samples"],
+    omegas: Float[Array, "samples 3"],
+    start: Quaternion,
+) -> Float[Array, "samples 4"]:
+    """The attitudes of `integrate_rate`, of valid arguments."""
+    # Between samples i and i + 1 the cubic goes through i - 1 to i + 2, at the ends of
+    # the record through the first four or the last four samples.
     count = ts.shape[0]
     width = min(4, count)
     first = jnp.clip(jnp.arange(count - 1) - (width - 2) // 2, 0, count - width)
     window = first[:, None] + jnp.arange(width)[None, :]
     step = ts[1:] - ts[:-1]
-    # From the middle of the step, in its units; differences of times come first, so
-    # that an epoch far from zero costs nothing.
+    # Times from the middle of the step, in units of it. Differences come first, so that
+    # an epoch far from zero costs no digits.
     nodes = (ts[window] - ts[:-1, None]) / step[:, None] - 0.5
 
     def interpolate(place: float) -> Array:
@@ -200,19 +216,19 @@ def _dead_reckon(ts: Array, omegas: Array, start: Quaternion) -> Array:
         return jnp.sum(weights[:, :, None] * omegas[window], axis=1)
 
     gauss = 3**-0.5 / 2
-    a, b = interpolate(-gauss), interpolate(gauss)
+    a = interpolate(-gauss)
+    b = interpolate(gauss)
     h = step[:, None]
-    increments = jax.vmap(exp)(
-        0.5 * h * (a + b) + (3**0.5 / 12) * h * h * jnp.cross(a, b)
-    )
-    quaternions = jnp.concatenate([start[None], increments])
-    product = jax.lax.associative_scan(jax.vmap(multiply), quaternions)
-    return jax.vmap(normalize)(product)
+    turns = 0.5 * h * (a + b) + (3**0.5 / 12) * h * h * jnp.cross(a, b)
+    quaternions = jnp.concatenate([start[None], jax.vmap(exp)(turns)])
+    products = jax.lax.associative_scan(jax.vmap(multiply), quaternions)
+    return jax.vmap(normalize)(products)
 
 
 def _lagrange_weights(
     nodes: Float[Array, " nodes"], place: float
 ) -> Float[Array, " nodes"]:
+    """Weights of values at the nodes in the polynomial through them, at a place."""
     count = nodes.shape[0]
     others = ~jnp.eye(count, dtype=bool)
     numerator = jnp.where(others, place - nodes[None, :], 1.0)

@@ -1,31 +1,40 @@
-"""What all solids share: the way from a mass and lengths to mass properties."""
+"""Mass properties of a solid from the mean squares of its coordinates."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Bool
 
 from jrigid._checks import all_positive, shaped, where_defined
+from jrigid._types import ScalarLike, Vector
 from jrigid.mass import MassProperties
+
+#: The means of x^2, y^2 and z^2 over a body.
+MeanSquares = Sequence[ScalarLike] | Vector
+
+
+def _always(*_: Array) -> Bool[Array, ""]:
+    return jnp.asarray(True)
 
 
 def solid(
-    mean_squares: Callable[..., Any],
-    mass: ArrayLike,
+    mean_squares: Callable[..., MeanSquares],
+    mass: ScalarLike,
     *,
     shape: tuple[int, ...] = (),
-    fits: Callable[..., Any] = lambda *_: True,
-    **lengths: Any,
+    fits: Callable[..., Bool[Array, ""]] = _always,
+    **lengths: ArrayLike,
 ) -> MassProperties:
-    """The body about its centre; NaN where its mass or a length is not positive and finite.
+    """Make the body about its centre.
+
+    The body is NaN where its mass or a length is not positive and finite.
 
     Args:
-        mean_squares: The means of x^2, y^2 and z^2 over the body, of the lengths.
+        mean_squares: Function of the lengths, in the order of `lengths`.
         mass: Mass.
         shape: That of each of the lengths.
-        fits: Whether lengths that are positive go together.
-        **lengths: By the names that they have as arguments.
+        fits: Function of the lengths: whether lengths that are positive fit together.
+        **lengths: By the names that they have as arguments, for errors.
     """
     shapes = {name: (length, *shape) for name, length in lengths.items()}
     mass, *sizes = shaped(mass=(mass,), **shapes)
@@ -35,4 +44,5 @@ def solid(
         moments = mass * jnp.stack([y + z, x + z, x + y])
         return MassProperties.unchecked(mass, jnp.zeros(3, mass.dtype), moments)
 
-    return where_defined(all_positive((mass, sizes)) & fits(*sizes), body, mass, *sizes)
+    ok = all_positive((mass, sizes)) & fits(*sizes)
+    return where_defined(ok, body, mass, *sizes)

@@ -1,18 +1,19 @@
 """Solids with curved faces."""
 
-from typing import Any
-
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.mass import MassProperties
-from jrigid.solids._common import solid
-
-MeanSquares = tuple[ScalarLike, ScalarLike, ScalarLike]
+from jrigid.solids._common import MeanSquares, solid
 
 
 def _round(across: ScalarLike, along: ScalarLike) -> MeanSquares:
+    """The mean squares of a body of revolution about z."""
     return across, across, along
+
+
+def _in_order(inner: Scalar, outer: Scalar, *_: Scalar) -> Bool[Array, ""]:
+    return inner <= outer
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -31,7 +32,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
     [2. 2. 2.]
     """
-    return solid(lambda r: (r * r / 5,) * 3, mass, radius=radius)
+    return solid(lambda r: _round(r * r / 5, r * r / 5), mass, radius=radius)
 
 
 def shell(
@@ -56,15 +57,20 @@ def shell(
     """
 
     def mean_squares(inner: Scalar, outer: Scalar) -> MeanSquares:
-        # (R^5 - r^5) / (R^3 - r^3) with the common factor R - r divided out: 5/3 R^2 in
-        # the limit.
+        # (R^5 - r^5) / (R^3 - r^3), without the common factor R - r: a thin shell,
+        # r = R, is no exception and gives 5/3 R^2.
         q = inner / outer
         ratio = (1 + q * (1 + q * (1 + q * (1 + q)))) / (1 + q * (1 + q))
         square = outer * outer / 5 * ratio
         return square, square, square
 
-    radii: dict[str, Any] = {"inner_radius": inner_radius, "outer_radius": outer_radius}
-    return solid(mean_squares, mass, **radii, fits=_in_order)
+    return solid(
+        mean_squares,
+        mass,
+        inner_radius=inner_radius,
+        outer_radius=outer_radius,
+        fits=_in_order,
+    )
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
@@ -139,8 +145,14 @@ def tube(
     def mean_squares(inner: Scalar, outer: Scalar, height: Scalar) -> MeanSquares:
         return _round((inner * inner + outer * outer) / 4, height * height / 12)
 
-    radii: dict[str, Any] = {"inner_radius": inner_radius, "outer_radius": outer_radius}
-    return solid(mean_squares, mass, **radii, height=height, fits=_in_order)
+    return solid(
+        mean_squares,
+        mass,
+        inner_radius=inner_radius,
+        outer_radius=outer_radius,
+        height=height,
+        fits=_in_order,
+    )
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -227,11 +239,16 @@ def torus(
     [56. 56. 96.]
     """
 
-    def mean_squares(ring: Scalar, tube: Scalar) -> MeanSquares:
+    def mean_squares(tube: Scalar, ring: Scalar) -> MeanSquares:
         return _round(ring * ring / 2 + 3 * tube * tube / 8, tube * tube / 4)
 
-    radii: dict[str, Any] = {"ring_radius": ring_radius, "tube_radius": tube_radius}
-    return solid(mean_squares, mass, **radii, fits=lambda ring, tube: tube <= ring)
+    return solid(
+        mean_squares,
+        mass,
+        tube_radius=tube_radius,
+        ring_radius=ring_radius,
+        fits=_in_order,
+    )
 
 
 def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -255,14 +272,11 @@ def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPro
     def mean_squares(r: Scalar, h: Scalar) -> MeanSquares:
         # Shares of the mass: volumes pi r^2 h and 4 pi r^3 / 3.
         whole = h + 4 * r / 3
-        middle, ends = h / whole, 4 * r / (3 * whole)
-        # A half ball has its centre of mass 3 r / 8 above its base, and r^2 / 5 about
-        # the base.
+        middle = h / whole
+        ends = 4 * r / (3 * whole)
+        # Height z above the base of a half ball has the mean 3 r / 8 and the mean
+        # square r^2 / 5. The mean of (h / 2 + z)^2 follows.
         along = middle * h * h / 12 + ends * (r * r / 5 + h * h / 4 + 3 * r * h / 8)
         return _round(middle * r * r / 4 + ends * r * r / 5, along)
 
     return solid(mean_squares, mass, radius=radius, height=height)
-
-
-def _in_order(inner: Scalar, outer: Scalar, *_: Scalar) -> Array:
-    return inner <= outer

@@ -1,12 +1,12 @@
 """Solids with plane faces, and the rod."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import all_finite, all_positive, shaped, where_defined
 from jrigid._types import Real, ScalarLike, VectorLike
 from jrigid.mass import MassProperties, inertia_tensor
-from jrigid.solids._common import solid
+from jrigid.solids._common import MeanSquares, solid
 
 
 def box(mass: ScalarLike, lengths: VectorLike) -> MassProperties:
@@ -63,9 +63,12 @@ def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
     >>> print(jnp.diag(jr.solids.lamina(12.0, jnp.array([1.0, 2.0])).inertia))
     [4. 1. 5.]
     """
-    return solid(
-        lambda edges: (*(edges * edges / 12), 0.0), mass, shape=(2,), lengths=lengths
-    )
+
+    def mean_squares(edges: Float[Array, "2"]) -> MeanSquares:
+        x, y = edges
+        return x * x / 12, y * y / 12, 0.0
+
+    return solid(mean_squares, mass, shape=(2,), lengths=lengths)
 
 
 def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassProperties:
@@ -93,13 +96,11 @@ def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassPrope
     def body(mass: Array, vertices: Array) -> MassProperties:
         origin = vertices[0]
         center = origin + jnp.sum(vertices - origin[None, :], axis=0) / 4
-        # Its tensor is that of a twentieth of the mass at each corner, the others at
+        # A point of a twentieth of the mass at each corner has the same tensor about
         # the centre.
         corners = jnp.broadcast_to(mass / 20, (4,))
-        return MassProperties.unchecked(
-            mass, center, inertia_tensor(corners, vertices - center[None, :])
-        )
+        inertia = inertia_tensor(corners, vertices - center[None, :])
+        return MassProperties.unchecked(mass, center, inertia)
 
-    return where_defined(
-        all_positive(mass) & all_finite(vertices), body, mass, vertices
-    )
+    ok = all_positive(mass) & all_finite(vertices)
+    return where_defined(ok, body, mass, vertices)
