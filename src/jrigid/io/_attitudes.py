@@ -16,7 +16,9 @@ Positions = Real[Any, "*batch 3"]
 Pose = tuple[Float[Array, "*batch 4"], Float[Array, "*batch 3"]]
 
 
-def _one_of(kinds: str, rotation: Any, method: str) -> None:
+def _one_of(kinds: str, rotation: object, method: str) -> None:
+    """Raise ValueError unless a rotation has the method of these kinds."""
+    # By its method, not its type: the package need not be imported for that.
     kind = type(rotation).__name__
     demand(
         hasattr(rotation, method),
@@ -25,7 +27,7 @@ def _one_of(kinds: str, rotation: Any, method: str) -> None:
 
 
 def _arrays(attitude: Attitudes, position: Positions | None) -> tuple[Array, ...]:
-    """Attitudes, and as many positions where there are any."""
+    """Convert attitudes, and as many positions if there are any."""
     arrays = float_arrays(*(x for x in (attitude, position) if x is not None))
     for name, length, x in zip(("attitude", "position"), (4, 3), arrays, strict=False):
         check_shape(name, x, (*arrays[0].shape[:-1], length))
@@ -33,7 +35,7 @@ def _arrays(attitude: Attitudes, position: Positions | None) -> tuple[Array, ...
 
 
 def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
-    """One of scipy's rotations, body to space, or rigid transforms where positions are given.
+    """Convert attitudes to scipy's rotations, or with positions to rigid transforms.
 
     `jrigid.rotation.to_scipy` gives the scalar-last quaternion alone, under jit too.
 
@@ -46,8 +48,8 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
         many.
 
     Raises:
-        ValueError: Other than four numbers in each attitude, or not three of a position
-            for each.
+        ValueError: An attitude has other than four numbers, or there are not three
+            numbers of a position for each attitude.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> turn = jr.io.to_scipy(jr.rotation.exp(jnp.array([0.0, 0.0, jnp.pi / 2])))
@@ -63,7 +65,7 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
 
 
 def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
-    """Attitudes of scipy's rotations, or attitudes and positions of its rigid transforms.
+    """Attitudes of scipy's rotations, with positions of its rigid transforms.
 
     Args:
         rotation: `Rotation` or `RigidTransform`, of one or many, taken as body to
@@ -73,7 +75,7 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
         Unit quaternions, scalar first; of a `RigidTransform` (attitude, position).
 
     Raises:
-        ValueError: Of what is neither.
+        ValueError: `rotation` is neither.
 
     >>> import jrigid as jr
     >>> from scipy.spatial.transform import Rotation
@@ -85,13 +87,15 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     turn = rotation.rotation if hasattr(rotation, "translation") else rotation
     _one_of("a scipy.spatial.transform.Rotation or RigidTransform", turn, "as_quat")
     attitude = jnp.roll(jnp.asarray(turn.as_quat()), 1, axis=-1)
-    return (
-        attitude if turn is rotation else (attitude, jnp.asarray(rotation.translation))
-    )
+    if turn is rotation:
+        return attitude
+    return attitude, jnp.asarray(rotation.translation)
 
 
 def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
-    """Rotations of jaxlie, or rigid transforms where positions are given; both are scalar first.
+    """Convert attitudes to rotations of jaxlie, or with positions to rigid transforms.
+
+    Quaternions of jaxlie are scalar first, too.
 
     Args:
         attitude: Unit quaternions, scalar first, body to space.
@@ -102,8 +106,8 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
         components.
 
     Raises:
-        ValueError: Other than four numbers in each attitude, or not three of a position
-            for each.
+        ValueError: An attitude has other than four numbers, or there are not three
+            numbers of a position for each attitude.
 
     Gradients: the identity.
 
@@ -120,7 +124,7 @@ def to_jaxlie(attitude: Attitudes, position: Positions | None = None) -> Any:
 
 
 def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
-    """Attitudes of Rotations of jaxlie, or attitudes and positions of its rigid transforms.
+    """Attitudes of rotations of jaxlie, with positions of its rigid transforms.
 
     Args:
         rotation: `jaxlie.SO3` or `jaxlie.SE3`, of one or many, taken as body to space.
@@ -129,7 +133,7 @@ def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
         Unit quaternions, scalar first; of an `SE3` (attitude, position).
 
     Raises:
-        ValueError: Of what is neither.
+        ValueError: `rotation` is neither.
 
     Gradients: the identity.
 
@@ -144,7 +148,7 @@ def from_jaxlie(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
 
 
 def to_spice(attitude: QuaternionLike) -> Quaternion:
-    """SPICE's quaternion of a C-matrix, as in C-kernels: `m2q(C)`, C from space to body.
+    """SPICE's quaternion of a C-matrix, `m2q(C)` with C from space to body.
 
     SPICE is scalar first with Hamilton's product, as here, but its C-matrix takes
     components in the reference frame to the instrument's: the conjugate. Its angular
@@ -199,9 +203,8 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
     Returns:
         Parameters, of length at most 1; NaN of the zero quaternion.
 
-    Gradients: finite everywhere. At a half turn (w = 0, length 1), where the value
-    jumps to its shadow, they are those of the set that is returned, that of the
-    sign of the quaternion.
+    Gradients: finite everywhere. At a half turn (w = 0, length 1) the value jumps to
+    its shadow. The derivatives there are those of the set that is returned.
     Source: H. Schaub and J. Junkins, J. Astronautical Sciences 44 (1996) 1-19.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -214,19 +217,19 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
 
 
 def shadow_mrp(mrp: VectorLike) -> Vector:
-    """The other set of modified Rodrigues parameters of the same attitude, -mrp / |mrp|^2.
+    """The other modified Rodrigues parameters of the same attitude, -mrp / |mrp|^2.
 
     A record that goes through half a turn stays smooth in one set and jumps in the
     shorter one.
 
     Args:
-        mrp: Parameters of either set; of none, the identity's, NaN: its shadow is
-            infinite.
+        mrp: Parameters of either set. Those of the identity, zeros, give NaN: their
+            shadow is infinite.
 
     Returns:
         Parameters of the other set.
 
-    Gradients: finite but at zero.
+    Gradients: finite except at zero.
     Source: H. Schaub and J. Junkins, J. Astronautical Sciences 44 (1996) 1-19.
 
     >>> import jax.numpy as jnp, jrigid as jr

@@ -54,8 +54,10 @@ _MADE = (
     ),
     ("mujoco", ".//attach", f"`<attach>` adds bodies: {_SAVED} and read that."),
 )
-_MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")  # of MJCF's compiler
-_TURNS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")  # MJCF's
+# Options of MJCF's compiler that change masses.
+_MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")
+# MJCF's ways to state a rotation.
+_TURNS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
 # Python's `float` also takes `1_0` and digits of other scripts; simulators do not.
 _NUMBER = re.compile(
     r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity)",
@@ -151,7 +153,8 @@ def _mjcf(inertial: ET.Element, root: ET.Element) -> _Stated:
     return _Stated(full | known, options)
 
 
-_Reader = Callable[[ET.Element, ET.Element], _Stated]  # of an inertial and the root
+#: Function of an inertial and the root of its file.
+_Reader = Callable[[ET.Element, ET.Element], _Stated]
 _FORMATS: dict[str, _Reader] = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
 
 
