@@ -1,4 +1,4 @@
-"""Functions over grids too large for memory or one machine: blocks, executors, a store."""
+"""Functions over grids that are too large for memory or for one machine."""
 
 from jrigid.sweep._result import Failure as Failure
 from jrigid.sweep._result import SweepResult as SweepResult

@@ -1,32 +1,36 @@
-"""Blocks handed out, tried again where they failed, and counted."""
+"""Hand out blocks, try failed ones again, and show the progress."""
 
 import contextlib
 import queue
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, Future
 from typing import Any
 
 from jrigid.sweep._work import Outcome, in_words
 
+#: Function that has a block computed.
+Submit = Callable[[int], Future[Outcome]]
+
 _TRIALS = 3
 
 
 def outcomes(
-    submit: Callable[[int], Future], numbers: Iterable[int], ahead: int
-) -> Iterator[Outcome]:
-    """What became of each block, in the order in which they end.
+    submit: Submit, numbers: Iterable[int], ahead: int
+) -> Generator[Outcome, None, None]:
+    """Yield the outcome of each block, in the order in which they end.
 
     Args:
         submit: Has a block computed.
         numbers: The blocks.
-        ahead: How many are on their way at a time.
+        ahead: How many blocks are submitted at a time. Their points are in memory.
     """
-    waiting, trials = deque(numbers), Counter[int]()
-    ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
-    running: dict[Future, int] = {}
+    waiting = deque(numbers)
+    trials = Counter[int]()
+    ended: queue.SimpleQueue[Future[Outcome]] = queue.SimpleQueue()
+    running: dict[Future[Outcome], int] = {}
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
@@ -50,8 +54,12 @@ def outcomes(
             future.cancel()
 
 
-def _outcome(number: int, future: Future) -> Outcome:
-    """What became of a block, also where its worker could not say so."""
+def _outcome(number: int, future: Future[Outcome]) -> Outcome:
+    """The outcome of a block, also where its worker could not return it.
+
+    Raises:
+        Exception: No other trial or block can do better.
+    """
     if future.cancelled():
         return Outcome(number, error="The executor gave the block up.")
     error = future.exception()
@@ -64,15 +72,21 @@ def _outcome(number: int, future: Future) -> Outcome:
         ) from error
     if error is not None:
         return Outcome(number, error=in_words(error))
-    outcome: Outcome = future.result()
+    outcome = future.result()
     if outcome.final is not None:
         raise outcome.final(outcome.error)
     return outcome
 
 
 @contextlib.contextmanager
-def meter(total: int, done: int, shown: bool) -> Iterator[Callable[[int], Any]]:
-    """Shows how many points are done, if wanted: a bar where there is tqdm, else a line."""
+def meter(
+    total: int, done: int, shown: bool
+) -> Generator[Callable[[int], Any], None, None]:
+    """Show how many points are done: a bar if tqdm is installed, else lines.
+
+    Yields:
+        A function that is told of points that have been finished.
+    """
     if not shown:
         yield lambda _: None
         return
@@ -86,14 +100,14 @@ def meter(total: int, done: int, shown: bool) -> Iterator[Callable[[int], Any]]:
 
 
 def _lines(total: int, done: int) -> Callable[[int], None]:
-    """Says how many points are done, every few seconds."""
-    said = time.monotonic()
+    """Print how many points are done, every five seconds."""
+    last = time.monotonic()
 
-    def say(points: int) -> None:
-        nonlocal done, said
+    def advance(points: int) -> None:
+        nonlocal done, last
         done += points
-        if done == total or time.monotonic() > said + 5:
-            said = time.monotonic()
+        if done == total or time.monotonic() > last + 5:
+            last = time.monotonic()
             print(f"{done} of {total} points", file=sys.stderr, flush=True)
 
-    return say
+    return advance

@@ -1,8 +1,8 @@
-"""Points in blocks of one shape, and a function on a block of them."""
+"""Points in blocks of one shape, and the evaluation of a function on a block."""
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,9 +21,9 @@ class Grid(NamedTuple):
 
     Attributes:
         points: A dict of axes, or any tree with the points in front; numpy arrays.
-        names: Of the axes; None of a list.
-        shape: How many points along each.
-        block: How many of them a block has.
+        names: Of the axes; None for a list.
+        shape: How many points there are along each axis.
+        block: How many points of each axis a block has.
     """
 
     points: Any
@@ -33,10 +33,10 @@ class Grid(NamedTuple):
 
     @property
     def axes(self) -> dict[str, np.ndarray]:
-        """Coordinates along each axis; of a list `point`, numbers from 0."""
-        return (
-            {"point": np.arange(self.shape[0])} if self.names is None else self.points
-        )
+        """Coordinates along each axis; for a list `point`, numbers from 0."""
+        if self.names is None:
+            return {"point": np.arange(self.shape[0])}
+        return self.points
 
     @property
     def blocks(self) -> tuple[int, ...]:
@@ -46,41 +46,49 @@ class Grid(NamedTuple):
         )
 
     def corner(self, number: int) -> tuple[int, ...]:
-        """Where a block begins; the last axis runs fastest."""
+        """Indices of the first point of a block; the last axis runs fastest."""
         place = np.unravel_index(number, self.blocks)
         return tuple(int(x) * width for x, width in zip(place, self.block, strict=True))
 
     def region(self, number: int) -> tuple[slice, ...]:
-        """Which points a block has."""
+        """Indices of the points of a block."""
         ends = zip(self.corner(number), self.shape, self.block, strict=True)
         return tuple(slice(first, min(first + width, n)) for first, n, width in ends)
 
     def inside(self, number: int) -> tuple[slice, ...]:
-        """Which of the points of a block are not beyond the end of an axis."""
+        """Indices within a block of the points that are not beyond the last ones."""
         return tuple(slice(0, x.stop - x.start) for x in self.region(number))
 
     def part(self, number: int) -> Any:
-        """The points of a block; beyond the end of an axis its last one again."""
-        region = self.region(number)
+        """The points of a block.
 
-        def cut(x: np.ndarray, places: slice, width: int) -> np.ndarray:
-            return x[
-                np.minimum(
-                    np.arange(places.start, places.start + width), places.stop - 1
-                )
-            ]
+        All blocks have one shape, for one compilation: beyond the end of an axis its
+        last point is repeated.
+        """
 
+        def indices(places: slice, width: int) -> np.ndarray:
+            whole = np.arange(places.start, places.start + width)
+            return np.minimum(whole, places.stop - 1)
+
+        picked = list(map(indices, self.region(number), self.block))
         if self.names is None:
-            return jtu.tree_map(lambda x: cut(x, region[0], self.block[0]), self.points)
-        return tuple(map(cut, self.points.values(), region, self.block))
+            return jtu.tree_map(lambda x: x[picked[0]], self.points)
+        axes = self.points.values()
+        return tuple(x[places] for x, places in zip(axes, picked, strict=True))
 
     def tiled(self, size: int) -> "Grid":
-        """The same points in blocks of about so many that are as long along each axis."""
+        """The same points in tiles, blocks of about that size of equal sides."""
         side = max(round(size ** (1 / len(self.shape))), 2)
         return self._replace(block=tuple(min(side, n) for n in self.shape))
 
+    def is_tile(self, block: tuple[int, ...]) -> bool:
+        """Whether the sides of a block are equal, or as long as a shorter axis."""
+        side = max(block)
+        pairs = zip(block, self.shape, strict=True)
+        return all(width == min(side, n) for width, n in pairs)
+
     def cut(self, size: int) -> "Grid":
-        """The same points in blocks of about so many, cut along the first axes first."""
+        """The same points in blocks of about that size, cut along the first axes."""
         block: list[int] = []
         for n in reversed(self.shape):
             pieces = -(-n // max(min(size, n), 1))
@@ -90,7 +98,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
-    """Axes or points with types and shapes checked, in one block."""
+    """Check types and shapes of axes or points, and make them one block."""
     if (axes is None) == (points is None):
         raise ValueError("Give one of the arguments `axes` and `points`, but not both.")
     if axes is None:
@@ -111,7 +119,7 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
             "Argument `axes` must name at least one axis, but it is empty."
         )
     shape = tuple(x.size for x in arrays.values())
-    # One dtype, that of all axes taken together.
+    # All axes get one dtype, as the arguments of other functions.
     values = map(np.asarray, float_arrays(*arrays.values()))
     return Grid(dict(zip(arrays, values, strict=True)), tuple(arrays), shape, shape)
 
@@ -123,6 +131,7 @@ def _native(values: Any) -> np.ndarray:
 
 
 def _list_of(points: Any) -> Grid:
+    """Check a tree of arrays with the points in front."""
     leaves = [
         jnp.asarray(_native(x) if isinstance(x, np.ndarray) else x)
         for x in jtu.tree_leaves(points)
@@ -143,10 +152,14 @@ def _list_of(points: Any) -> Grid:
     return Grid(arrays, None, shape, shape)
 
 
+def _is_code(value: object) -> bool:
+    return isinstance(value, EnumerationItem)
+
+
 def _defined(values: Any) -> Bool[Array, ""]:
     """Whether all numbers are finite and no code is `undefined`."""
-    leaves = jtu.tree_leaves(values, is_leaf=lambda x: isinstance(x, EnumerationItem))
-    codes = [x for x in leaves if isinstance(x, EnumerationItem)]
+    leaves = jtu.tree_leaves(values, is_leaf=_is_code)
+    codes = [x for x in leaves if _is_code(x)]
     if not codes and not any(eqx.is_inexact_array(x) for x in leaves):
         raise ValueError(
             "Argument `function` must return floats, NaN where it is undefined, or "
@@ -162,12 +175,23 @@ def _defined(values: Any) -> Bool[Array, ""]:
 def on_block(
     function: Callable[..., Any], names: tuple[str, ...] | None, part: Any
 ) -> tuple[Any, Array]:
-    """Values at the points of a block, and where they are defined."""
+    """Evaluate a function at the points of a block.
+
+    Args:
+        function: Of a point, or of a number for each axis.
+        names: Of the axes, None for a list.
+        part: The points of the block, or its piece of each axis.
+
+    Returns:
+        Values, with the axes of the block in front, and where they are defined.
+    """
     if names is None:
-        points, shape = part, jtu.tree_leaves(part)[0].shape[:1]
+        points = part
+        shape = jtu.tree_leaves(part)[0].shape[:1]
     else:
-        spread, shape = jnp.meshgrid(*part, indexing="ij"), tuple(x.size for x in part)
+        spread = jnp.meshgrid(*part, indexing="ij")
         points = {name: x.reshape(-1) for name, x in zip(names, spread, strict=True)}
+        shape = tuple(x.size for x in part)
 
     def evaluate(point: Any) -> tuple[Any, Array]:
         values = function(point) if names is None else function(**point)
@@ -184,14 +208,15 @@ def on_block(
 
 
 class Leaf(eqx.Module):
-    """One array of what a function returns: its name, its own shape, what its numbers mean.
+    """Description of one array of the tree that a function returns.
 
     Attributes:
-        name: The path in the tree, joined by underscores; `value` where there is
-            nothing but it.
+        name: The path in the tree, joined by underscores; `value` if the tree is the
+            array itself.
         shape: Without the axes of the grid.
         dtype: Its numpy dtype.
-        fill: Where nothing is known: NaN; of codes `undefined`, of integers the least.
+        fill: Value of points that are not known: NaN; for codes `undefined`, for
+            integers the least one.
         codes: Names of the codes in their order, if it holds codes.
     """
 
@@ -203,7 +228,7 @@ class Leaf(eqx.Module):
 
     @property
     def flags(self) -> dict[str, Any]:
-        """What its numbers mean, by the climate and forecast conventions."""
+        """Attributes that explain its numbers, by the conventions CF-1.11."""
         if self.codes:
             return {
                 "flag_values": list(range(len(self.codes))),
@@ -219,34 +244,37 @@ class Leaf(eqx.Module):
 VALID = Leaf("valid", (), np.dtype(bool), False, ())
 
 
-def leaves_of(values: Any, axes: Iterable[str]) -> list[Leaf]:
-    """The arrays of what a function returned on axes, by names that no axis has; `valid` last."""
-    found: list[Leaf] = []
+def leaves_of(values: Any, axes: Collection[str]) -> list[Leaf]:
+    """Describe the arrays that a function returned on axes, and `valid` as the last.
+
+    No array or dimension has the name of an axis or of another one.
+    """
+    leaves: list[Leaf] = []
     names = {*axes, VALID.name}
-    beyond = len(names) - 1
-    paths, _ = jtu.tree_flatten_with_path(
-        values, is_leaf=lambda x: isinstance(x, EnumerationItem)
-    )
+    paths, _ = jtu.tree_flatten_with_path(values, is_leaf=_is_code)
     for path, value in paths:
-        codes: tuple[str, ...] = ()
-        if isinstance(value, EnumerationItem):
-            codes = names_of(enumeration_of(value))
-            value = code_of(value)
-        dtype = np.dtype(value.dtype)
-        if codes:
-            fill: Any = codes.index("undefined") if "undefined" in codes else -1
-        elif jnp.issubdtype(dtype, jnp.inexact):
-            fill = np.nan
-        elif dtype.kind == "b":
-            fill = False
-        else:
-            fill = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
-        name = (
-            re.sub(r"\W", "_", jtu.keystr(path, simple=True, separator="_")) or "value"
-        )
-        leaf = Leaf(name, value.shape[beyond:], dtype, fill, codes)
+        leaf = _leaf(jtu.keystr(path, simple=True, separator="_"), value, len(axes))
         while names & {leaf.name, *leaf.dimensions(())}:
             leaf = dataclasses.replace(leaf, name=leaf.name + "_")
         names |= {leaf.name, *leaf.dimensions(())}
-        found.append(leaf)
-    return [*found, VALID]
+        leaves.append(leaf)
+    return [*leaves, VALID]
+
+
+def _leaf(path: str, value: Any, axes: int) -> Leaf:
+    """Describe one array or code, of which the first axes are those of the grid."""
+    codes: tuple[str, ...] = ()
+    if _is_code(value):
+        codes = names_of(enumeration_of(value))
+        value = code_of(value)
+    dtype = np.dtype(value.dtype)
+    if codes:
+        fill: Any = codes.index("undefined") if "undefined" in codes else -1
+    elif jnp.issubdtype(dtype, jnp.inexact):
+        fill = np.nan
+    elif dtype.kind == "b":
+        fill = False
+    else:
+        fill = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+    name = re.sub(r"\W", "_", path) or "value"
+    return Leaf(name, value.shape[axes:], dtype, fill, codes)

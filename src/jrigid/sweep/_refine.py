@@ -15,7 +15,7 @@ from jrigid.sweep._store import Memory, Store
 
 
 def corners_of(grid: Grid) -> dict[str, np.ndarray]:
-    """Axes through the first points of all tiles, and through the last points."""
+    """Axes through the first points of all tiles and the last points of the grid."""
     lattice = {}
     for (name, x), width in zip(grid.axes.items(), grid.block, strict=True):
         lattice[name] = x[np.minimum(np.arange(0, x.size + width, width), x.size - 1)]
@@ -69,7 +69,7 @@ class RefinedMap:
 
         Args:
             grid: The points, in tiles.
-            kept: Where finished tiles are.
+            kept: Where finished tiles are kept.
             structure: Of the values of the function.
             classify: The class of the values of one point.
             corners: Values at the corners of all tiles.
@@ -91,7 +91,7 @@ class RefinedMap:
     def refine(
         self, compute: Callable[[Iterable[int]], tuple[Failure, ...]]
     ) -> tuple[Failure, ...]:
-        """Compute all tiles that hold a change of class, and return those that failed."""
+        """Compute all tiles with a change of class, and return those that failed."""
         all_tiles = range(self._numbers.size)
         finished = filter(self._kept.has, all_tiles)
         waiting = {*self._with_change, *finished}

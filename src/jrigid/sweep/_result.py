@@ -1,4 +1,4 @@
-"""What a sweep gives back."""
+"""The result of a sweep."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ class Failure(NamedTuple):
     Attributes:
         first: Indices of its first point.
         last: Indices of its last point.
-        error: What the last of three trials ended with.
+        error: Type and text of the error of the last of three trials.
     """
 
     first: tuple[int, ...]
@@ -27,23 +27,25 @@ class SweepResult(NamedTuple):
     """Values of a function at many points.
 
     Attributes:
-        values: As the function returned them, with the axes of the grid in front: numpy
-            arrays, or of a store zarr arrays, which are read where they are indexed.
-        valid: Where all numbers are finite and no code is `undefined`: a mask of the
-            shape of the grid, a numpy array.
-        axes: Names and points of the axes, in their order; of a list `point`, its
+        values: The tree that the function returns, with the axes of the grid in front.
+            Its arrays are those of numpy, or with a store those of zarr, which are read
+            when they are indexed.
+        valid: Where all numbers are finite and no code is `undefined`: a numpy array of
+            the shape of the grid.
+        axes: Names and points of the axes, in their order; for a list `point`, its
             numbers.
-        failures: The blocks that failed thrice, whose points are not valid.
-        attributes: What was said about axes and values (units, names), by their names.
-        store: Where it is kept, if anywhere.
-        classes: Of a refined map the class of every point, also of those not evaluated.
+        failures: The blocks that failed three times. Their points are not valid.
+        attributes: Attributes of axes and values (units, names), by their names.
+        store: The directory of the store, if there is one.
+        classes: The class of every point of a refined map, also of points that were not
+            evaluated.
     """
 
     values: Any
     valid: np.ndarray
     axes: dict[str, np.ndarray]
     failures: tuple[Failure, ...] = ()
-    attributes: dict[str, dict] = {}  # noqa: RUF012
+    attributes: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     store: str | None = None
     classes: np.ndarray | None = None
 
@@ -54,7 +56,9 @@ class SweepResult(NamedTuple):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Of a map over two axes, for matplotlib's `imshow(values.T, origin="lower", extent=...)`.
+        """The edges of a map over two axes, half a step beyond its points.
+
+        Made for `imshow(values.T, origin="lower", extent=...)` of matplotlib.
 
         Raises:
             ValueError: The map is over more or fewer axes.
@@ -70,9 +74,9 @@ class SweepResult(NamedTuple):
         return ends[0], ends[1], ends[2], ends[3]
 
     def to_xarray(self) -> Any:
-        """An `xarray.Dataset`: a variable for each array, `valid`, named dimensions, coordinates.
+        """Convert to an `xarray.Dataset` with named dimensions and coordinates.
 
-        Lazy where there is a store.
+        It has a variable for each array, and `valid`. With a store it is lazy.
 
         Raises:
             ImportError: Without the extra `jrigid[sweep]`.
@@ -81,16 +85,19 @@ class SweepResult(NamedTuple):
         if self.store is not None:
             dataset = xarray.open_zarr(self.store)
         else:
-            coordinates = {
-                k: (k, x, self.attributes.get(k)) for k, x in self.axes.items()
-            }
-            dataset = xarray.Dataset(coords=coordinates)
-            arrays = [*jtu.tree_leaves(self.values), self.valid]
-            for leaf, array in zip(
-                leaves_of(self.values, self.labels), arrays, strict=True
-            ):
-                about = leaf.flags | self.attributes.get(leaf.name, {})
-                dataset[leaf.name] = leaf.dimensions(self.labels), array, about
+            dataset = self._dataset(xarray)
         if self.classes is not None:
             dataset["classes"] = self.labels, self.classes
+        return dataset
+
+    def _dataset(self, xarray: Any) -> Any:
+        """The data set of arrays in memory, as `open_zarr` would give it."""
+        attributes = self.attributes
+        axes = {name: (name, x, attributes.get(name)) for name, x in self.axes.items()}
+        dataset = xarray.Dataset(coords=axes)
+        arrays = [*jtu.tree_leaves(self.values), self.valid]
+        leaves = leaves_of(self.values, self.labels)
+        for leaf, array in zip(leaves, arrays, strict=True):
+            about = leaf.flags | attributes.get(leaf.name, {})
+            dataset[leaf.name] = leaf.dimensions(self.labels), array, about
         return dataset

@@ -1,10 +1,10 @@
-"""A function at very many points: in blocks, here or elsewhere, kept and gone on with."""
+"""Evaluate a function at very many points, in blocks that are kept and resumed."""
 
 import math
 import os
 import pickle
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jrigid._checks import whole_number
-from jrigid.sweep._drive import meter, outcomes
+from jrigid.sweep._drive import Submit, meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import RefinedMap, corners_of
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
 from jrigid.sweep._work import (
     Call,
+    Outcome,
     Surroundings,
     Work,
     Worker,
@@ -31,12 +32,16 @@ from jrigid.sweep._work import (
     traced,
 )
 
-# Blocks that an executor has at a time.
+# Blocks that an executor has at a time: enough for its workers never to wait.
 _AHEAD = 1024
-# A sweep is cut into so many blocks or more, unless they got smaller, or larger, than
-# these.
-_BLOCKS, _LEAST, _MOST = 64, 256, 2**18
-_BYTES = 2**24  # of what a block returns
+# By default a sweep has so many blocks, unless a block would have fewer points than
+# _LEAST (a call costs a millisecond), or more than _MOST, or more bytes of values than
+# _BYTES (an interrupt loses the blocks that are not finished).
+_BLOCKS = 64
+_LEAST = 256
+_MOST = 2**18
+_BYTES = 2**24
+# Points of a tile of a refined map.
 _TILE = 1024
 
 
@@ -45,54 +50,56 @@ def sweep(
     axes: Mapping[str, ArrayLike] | None = None,
     *,
     points: Any = None,
-    store: str | os.PathLike | None = None,
+    store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     block_size: int | None = None,
     attributes: Mapping[str, Mapping[str, Any]] | None = None,
     refine: Callable[[Any], Any] | None = None,
     progress: bool = True,
 ) -> SweepResult:
-    """Evaluate a function of some parameters on the grid they span, or at each of many points.
+    """Evaluate a function on the grid that axes span, or at each of many points.
 
-    The points are cut into blocks of one shape, each of which is one call of one
-    compiled and vmapped function, so that what comes out does not depend on where a
-    block was computed, when, or beside which. Memory is that of some blocks, and of the
-    result where there is no store.
+    The points are cut into blocks of one shape. Each block is one call of the same
+    compiled and vmapped function, so results do not depend on where or when a block was
+    computed. The sweep needs the memory of some blocks and, without a store, of the
+    result.
 
     Args:
-        function: A pure function (as for `jax.jit`: what it closes over must not
-            change) of one number for each axis, given by name, or of one of the points;
-            it returns an array, a code, or a tree of them. With `throw=False` inside
-            where it takes it, so that points that fail are NaN.
+        function: A pure function of one number for each axis, passed by name, or of one
+            of the points. As for `jax.jit`, what it closes over must not change. It
+            returns an array, a code, or a tree of them. Inside, pass `throw=False` to
+            functions that take it, so that points that fail are NaN.
         axes: Name and points of each axis; the last one runs fastest.
-        points: In place of axes: any tree of arrays that have the points in front.
-        store: A directory that keeps what is done (zarr, version 3; extra
-            `jrigid[sweep]`), and that the same call goes on from, whatever ended it.
-            `xarray.open_zarr` opens it at any time, NaN where nothing is yet.
-        executor: What computes the blocks, in place of the devices of this process:
-            anything with the interface of `concurrent.futures.Executor`, such as
+        points: In place of axes: any tree of arrays whose first axis is that of the
+            points.
+        store: A directory that keeps finished blocks (zarr, version 3; extra
+            `jrigid[sweep]`). After any interruption the same call resumes from it.
+            `xarray.open_zarr` opens it at any time, with NaN in unfinished blocks.
+        executor: Computes the blocks, in place of the devices of this process: anything
+            with the interface of `concurrent.futures.Executor`, such as
             `Client.get_executor()` of `dask.distributed`, or a `ProcessPoolExecutor`
             that spawns. Workers need jrigid and, if there is a store, the directory.
-        block_size: About how many points a block has: axes are cut whole, and evenly.
-            By default a 64th of all, within 256 and 2^18 and 16 MB of what comes out;
-            that of a store if it has one.
-        attributes: By name of an axis or value what is to be said of it, as
+        block_size: About how many points a block has. Axes are cut evenly, the last one
+            only if a block is smaller than it. The default is a 64th of all points, but
+            between 256 and 2^18 points and at most 16 MB of values; or the block of an
+            existing store.
+        attributes: Attributes of axes and values by name, such as
             `{"units": "rad/s"}`.
-        refine: `values -> class` of one point, an integer, boolean or code: only blocks
-            that hold a change of class are computed, found from the corners of all and
-            followed from block to block. The blocks are tiles, of 1,024 points by
-            default. What lies within one tile and shows at no corner is missed.
+        refine: Maps the values of one point to its class, an integer, boolean or code.
+            Then only blocks that hold a change of class are computed. They are found
+            from the corners of all blocks and followed from block to block. The blocks
+            are tiles, of 1,024 points by default. A region within one tile that no
+            corner shows is missed.
         progress: Show how many points are done.
 
     Returns:
-        Values, where they are valid, and which blocks failed three times; refined, also
-        the class of every point, and values where a class changes.
+        Values, where they are valid, and which blocks failed three times. A refined map
+        also has the class of every point, and values where a class changes.
 
     Raises:
-        ValueError: Axes that are not arrays of numbers, a function that returns
-            integers or booleans only, which cannot say that they are undefined (return
-            floats, NaN where they are), one that cannot be sent to a worker, a store of
-            another sweep.
+        ValueError: Axes are not arrays of numbers; the function returns integers or
+            booleans only, which cannot be undefined (return floats, NaN where they
+            are); it cannot be sent to a worker; or the store is of another sweep.
         OSError: The store cannot be written.
         RuntimeError: Another process writes to the store, or a worker died and took the
             executor along.
@@ -113,7 +120,7 @@ def sweep(
     path = None if store is None else Path(store).absolute()
     values, about = traced(function, grid.names, grid.cut(1).part(0))
     leaves = leaves_of(values, grid.axes)
-    grid = _cut(grid, block_size, path, refine, leaves)
+    grid = _cut(grid, block_size, path, refine is not None, leaves)
     descriptions = _descriptions(attributes, grid, leaves)
     work = Work(function, grid, leaves, path, about, settings())
     kept = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
@@ -125,7 +132,7 @@ def sweep(
             failures = run.compute(range(math.prod(grid.blocks)))
         else:
             failures, classes = run.refine(refine, structure)
-        kept.tell(failures)
+        kept.record(failures)
     _warn(failures, run.valid, grid)
     *arrays, valid = kept.arrays.values()
     return SweepResult(
@@ -180,32 +187,44 @@ def _warn(failures: tuple[Failure, ...], valid: int, grid: Grid) -> None:
 
 
 def _cut(
-    grid: Grid, size: int | None, path: Path | None, refine: Any, leaves: list[Leaf]
+    grid: Grid,
+    size: int | None,
+    path: Path | None,
+    is_refined: bool,
+    leaves: list[Leaf],
 ) -> Grid:
-    """The points in blocks, those of a store if there is one and nothing else was asked for."""
-    if refine is not None and grid.names is None:
+    """Cut the points into blocks of a size, by default into those of an existing store.
+
+    Args:
+        grid: The points.
+        size: Points of a block, if the caller chose it.
+        path: Of the store, if there is one.
+        is_refined: Whether blocks must be tiles.
+        leaves: What the function returns.
+    """
+    if is_refined and grid.names is None:
         raise ValueError(
             "Argument `refine` is for a grid of `axes`, not for a list of points."
         )
-    if size is None:
-        block = path and known_block(path)
-        if block and len(block) == len(grid.shape):
-            tiles = all(
-                x == min(max(block), n) for x, n in zip(block, grid.shape, strict=True)
+    if size is not None:
+        size = whole_number("block_size", size)
+        return grid.tiled(size) if is_refined else grid.cut(size)
+    block = None if path is None else known_block(path)
+    # A block of other dimensions is of another sweep, which the store will refuse.
+    if block is not None and len(block) == len(grid.shape):
+        if is_refined and not grid.is_tile(block):
+            raise ValueError(
+                "Argument `refine` needs a store in tiles, but the blocks of "
+                f"{path} are {block}: choose another."
             )
-            if refine is not None and not tiles:
-                raise ValueError(
-                    "Argument `refine` needs a store in tiles, but the blocks of "
-                    f"{path} are {block}: choose another."
-                )
-            return grid._replace(block=block)
-    if refine is not None:
-        return grid.tiled(_TILE if size is None else whole_number("block_size", size))
-    if size is None:
-        bytes_of_point = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaves)
-        most = max(min(_MOST, _BYTES // bytes_of_point), _LEAST)
-        size = min(max(math.prod(grid.shape) // _BLOCKS, _LEAST), most)
-    return grid.cut(whole_number("block_size", size))
+        return grid._replace(block=block)
+    return grid.tiled(_TILE) if is_refined else grid.cut(_default_size(grid, leaves))
+
+
+def _default_size(grid: Grid, leaves: list[Leaf]) -> int:
+    bytes_of_point = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaves)
+    most = max(min(_MOST, _BYTES // bytes_of_point), _LEAST)
+    return min(max(math.prod(grid.shape) // _BLOCKS, _LEAST), most)
 
 
 class _Run:
@@ -230,7 +249,8 @@ class _Run:
 
     def compute(self, numbers: Iterable[int]) -> tuple[Failure, ...]:
         """Compute the blocks that are not kept yet, and return those that failed."""
-        grid, kept = self._work.grid, self._kept
+        grid = self._work.grid
+        kept = self._kept
         counts = {number: kept.count(number) for number in numbers}
         sizes = {
             number: math.prod(x.stop - x.start for x in grid.region(number))
@@ -278,14 +298,28 @@ def _failure(grid: Grid, number: int, error: str) -> Failure:
 @contextmanager
 def _submitting(
     work: Work, kept: Memory | Store, executor: Executor | None
-) -> Iterator[tuple[Callable, int]]:
-    """How to have a block computed, and how many may wait for it."""
+) -> Generator[tuple[Submit, int], None, None]:
+    """A function that has a block computed, and how many blocks may wait for it."""
     if executor is None:
         worker = Worker(work, kept)
-        threads = 2 * len(worker.devices)  # of two one writes while the other computes
+        # Two for each device: one writes while the other computes.
+        threads = 2 * len(worker.devices)
         with ThreadPoolExecutor(threads) as pool:
             yield lambda n: pool.submit(worker, n, work.grid.part(n)), threads + 2
-        return
+    else:
+        _prepare(executor)
+        surroundings = Surroundings(os.getpid(), work.settings)
+        payload = packed(work)
+
+        def submit(number: int) -> Future[Outcome]:
+            call = Call(surroundings, payload, number, work.grid.part(number))
+            return executor.submit(pickle.loads, pickle.dumps(call))
+
+        yield submit, _AHEAD
+
+
+def _prepare(executor: Any) -> None:
+    """Refuse a pool of processes that forks; let its workers end with this process."""
     processes = getattr(executor, "_mp_context", None)
     if processes is not None and processes.get_start_method() == "fork":
         raise ValueError(
@@ -293,15 +327,6 @@ def _submitting(
             "does: pass it "
             '`mp_context=multiprocessing.get_context("spawn")`.'
         )
-    pool: Any = executor
-    if getattr(pool, "_initializer", end_with_driver) is None:
-        # A pool's worker that has no block yet would outlive a driver that is killed.
-        pool._initializer = end_with_driver
-    surroundings = Surroundings(os.getpid(), work.settings)
-    payload = packed(work)
-
-    def submit(number: int) -> Future:
-        call = Call(surroundings, payload, number, work.grid.part(number))
-        return executor.submit(pickle.loads, pickle.dumps(call))
-
-    yield submit, _AHEAD
+    if getattr(executor, "_initializer", end_with_driver) is None:
+        # A worker that has no block yet would outlive a driver that is killed.
+        executor._initializer = end_with_driver

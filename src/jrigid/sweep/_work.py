@@ -1,11 +1,11 @@
-"""A block computed, here or in a process that only has the bytes of what to do."""
+"""Compute a block, in this process or in one that receives the work as bytes."""
 
 import contextlib
 import functools
 import os
 import pickle
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,12 +17,12 @@ import numpy as np
 from jrigid.sweep._grid import Grid, Leaf, on_block
 from jrigid.sweep._store import Memory, Store, fingerprint
 
-# The compiled function is kept for the next sweep of the same one in the same blocks.
+# One function for all sweeps: the next sweep of the same function in the same blocks
+# compiles nothing.
 evaluated = eqx.filter_jit(on_block)
 
-
-# What decides besides a function what is traced, and is known to one thread of one
-# process.
+# Settings of jax that change what is traced. They belong to a thread, so that the
+# threads and processes that compute blocks do not have those of the caller.
 _SETTINGS = {
     "jax_enable_x64": jax.enable_x64,
     "jax_default_matmul_precision": jax.default_matmul_precision,
@@ -32,13 +32,13 @@ _SETTINGS = {
 
 
 def settings() -> tuple[Any, ...]:
-    """Those of jax here and now."""
+    """The settings of jax in this thread."""
     return tuple(getattr(jax.config, name) for name in _SETTINGS)
 
 
 @contextlib.contextmanager
-def under(values: tuple[Any, ...]) -> Iterator[None]:
-    """With the settings of elsewhere."""
+def under(values: tuple[Any, ...]) -> Generator[None, None, None]:
+    """Apply the settings of another thread or process."""
     with contextlib.ExitStack() as stack:
         for context, value in zip(_SETTINGS.values(), values, strict=True):
             stack.enter_context(context(value))
@@ -46,7 +46,16 @@ def under(values: tuple[Any, ...]) -> Iterator[None]:
 
 
 class Work(NamedTuple):
-    """What is to be done with each block."""
+    """What a worker does with each block.
+
+    Attributes:
+        function: Of a point, or of a number for each axis.
+        grid: All points, in blocks.
+        leaves: What the function returns.
+        store: Where the worker writes; None: it returns the values.
+        about: Fingerprint of the function in the driver.
+        settings: Of jax in the driver.
+    """
 
     function: Callable[..., Any]
     grid: Grid
@@ -57,14 +66,13 @@ class Work(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a block.
+    """Outcome of a block.
 
     Attributes:
         number: Which block.
         count: How many points are valid.
-        values: Of the block, its mask last; None where they are kept already.
-        error: What went wrong, in words: an exception need not survive the way between
-            processes.
+        values: Of the block, with the mask `valid` last; None if they are kept already.
+        error: What went wrong, as a text: not every exception can be pickled.
         final: What to raise, if no other trial or block can do better.
     """
 
@@ -76,17 +84,24 @@ class Outcome(NamedTuple):
 
 
 class Worker:
-    """Computes blocks on all devices of a process; from several threads at once."""
+    """Computes blocks on all devices of a process; several threads may call it."""
 
     def __init__(self, work: Work, kept: Store | Memory | None):
-        """Without a place to keep blocks they are returned."""
-        self.work, self.kept, self.devices = work, kept, jax.local_devices()
-        # Two at a time on a device would compile twice, and on a CPU can wait for each
-        # other for ever: both run in the same few threads of XLA.
+        """Prepare a worker.
+
+        Args:
+            work: What to do.
+            kept: Where to keep blocks; None to return them.
+        """
+        self.work = work
+        self.kept = kept
+        self.devices = jax.local_devices()
+        # Two blocks at a time on a device would compile twice, and on a CPU can wait
+        # for each other for ever: both run in the same few threads of XLA.
         self.free = {device: threading.Lock() for device in self.devices}
 
     def __call__(self, number: int, part: Any) -> Outcome:
-        """Compute a block, and keep it if there is where."""
+        """Compute a block, and keep or return it."""
         try:
             values = self._computed(number, part)
         except Exception as error:
@@ -99,11 +114,9 @@ class Worker:
         except OSError as error:
             text = (
                 f"The store cannot be written: {error}. What is finished is kept, and "
-                "the same "
+                "the same call goes on from there."
             )
-            return Outcome(
-                number, error=text + "call goes on from there.", final=OSError
-            )
+            return Outcome(number, error=text, final=OSError)
         return Outcome(number, count)
 
     def _computed(self, number: int, part: Any) -> list[np.ndarray]:
@@ -115,29 +128,32 @@ class Worker:
 
 
 def traced(
-    function: Callable[..., Any], names: Any, part: Any
+    function: Callable[..., Any], names: tuple[str, ...] | None, part: Any
 ) -> tuple[Any, dict[str, Any]]:
-    """What a function returns for the first of some points, as shapes, and its fingerprint."""
+    """Trace a function; return the shapes of its values and its fingerprint.
+
+    Only the first of some points is traced: the fingerprint must not depend on the
+    blocks.
+    """
     one = jtu.tree_map(lambda x: x[:1], part)
     jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, names, one)
     return values, fingerprint(function, jaxpr)
 
 
 def in_words(error: BaseException) -> str:
-    """What kind of error it was and what it says, without stacks and hints."""
+    """Type and text of an error, without what XLA and equinox add."""
     text = str(error)
-    text = (text.partition("EquinoxRuntimeError: ")[2] or text).partition("\n\n-----")[
-        0
-    ]
+    text = text.partition("EquinoxRuntimeError: ")[2] or text
+    text = text.partition("\n\n-----")[0]
     return f"{type(error).__name__}: {text.strip()}"
 
 
 class Surroundings(NamedTuple):
-    """What a process must be told before it has a backend.
+    """What a process needs before it imports or traces anything.
 
     Attributes:
-        driver: The process that has the work.
-        settings: Of jax.
+        driver: Number of the process that hands out the blocks.
+        settings: Of jax in the driver.
     """
 
     driver: int
@@ -145,22 +161,23 @@ class Surroundings(NamedTuple):
 
 
 class Call:
-    """Bytes that compute a block where `pickle.loads` reads them.
+    """A call of `compute`, which is made where `pickle.loads` reads it.
 
-    So that an executor's own machinery needs no jrigid: where it is missing it says so.
+    An executor then only unpickles a function of Python. A worker without jrigid
+    raises an ImportError, where it could not even read a function of jrigid.
     """
 
     def __init__(self, *arguments: Any):
-        """Of `compute`."""
+        """Take the arguments of `compute`."""
         self.arguments = arguments
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """How to be read."""
+        """The call that `pickle.loads` makes."""
         return compute, self.arguments
 
 
 def packed(work: Work) -> bytes:
-    """The work without its points as bytes, or ValueError."""
+    """Pickle the work without its points, or raise ValueError."""
     try:
         from cloudpickle import dumps
     except ModuleNotFoundError:
@@ -178,14 +195,15 @@ def packed(work: Work) -> bytes:
 
 
 def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> Outcome:
-    """Compute a block, in whatever process this is."""
-    elsewhere = surroundings.driver != os.getpid()
+    """Compute a block, in any process."""
+    is_elsewhere = surroundings.driver != os.getpid()
+    # Workers of dask have threads, which must not unpack or trace the work twice.
     with _one_at_a_time, under(surroundings.settings):
-        if elsewhere:
+        if is_elsewhere:
             end_with_driver()
         worker = _unpacked(work)
         about = worker.work.about
-        if elsewhere and about != _about_here(work, part):
+        if is_elsewhere and about != _about_here(work, part):
             text = (
                 f"A worker has not the function and versions {about} of the driver, "
                 "or another kind of device: start it anew."
@@ -200,21 +218,21 @@ _one_at_a_time = threading.Lock()
 @functools.lru_cache(maxsize=1)
 def _unpacked(work: bytes) -> Worker:
     known: Work = pickle.loads(work)
-    store = known.store
-    return Worker(
-        known, None if store is None else Store(store, known.grid, known.leaves)
-    )
+    if known.store is None:
+        return Worker(known, None)
+    return Worker(known, Store(known.store, known.grid, known.leaves))
 
 
+# The fingerprint of the latest work; `part` is no key of a cache.
 _seen: dict[bytes, dict[str, Any]] = {}
 
 
 def _about_here(work: bytes, part: Any) -> dict[str, Any]:
-    """The fingerprint that the function has in this process: its module may be an older one."""
+    """Fingerprint of the function in this process, whose module may be an older one."""
     if work not in _seen:
         known = _unpacked(work).work
         _seen.clear()
-        _seen[work] = traced(known.function, known.grid.names, part)[1]
+        _, _seen[work] = traced(known.function, known.grid.names, part)
     return _seen[work]
 
 
