@@ -11,7 +11,7 @@ call no other compiles anything (tests/test_no_leak.py).
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
@@ -278,7 +278,7 @@ def check_known(name: str, value: object) -> None:
 
 
 @contextmanager
-def traced_by_jax(function: str) -> Iterator[None]:
+def traced_by_jax(function: str) -> Generator[None, None, None]:
     """Raise a helpful ValueError if a user's function cannot be traced.
 
     Args:

@@ -203,22 +203,26 @@ def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
     counts: list[np.ndarray] = [np.arange(t.size)]
     if lost:
         usual = float(np.median(np.diff(t))) or float(np.mean(np.diff(t)))
-        ticks, phase = np.ones(t.size), t[0]
+        ticks = np.ones(t.size)
+        phase = t[0]
         for row in range(1, t.size):
-            # lost is a reading only where all of the next stamps are late, not this one
-            # alone
+            # A reading is lost only if all of the next stamps are late. One late stamp
+            # may be the delay of a single message.
             ahead = t[row : row + _NEXT] - phase
             late = (ahead - usual * np.arange(ahead.size)).min()
             ticks[row] = max(1, round(late / usual))
             phase += ticks[row] * usual
             phase += _LOCK * (t[row] - phase)
         counts.append(np.cumsum(ticks))
-    fits = []
-    for count in counts:
-        use = np.ones(t.size, bool)
-        for _ in range(3):  # outliers are left out, twice
-            slope, start = np.polyfit(count[use], t[use], 1)
-            beside = np.abs(t - start - slope * count)
-            use = beside <= 4 * np.median(beside) + 1e-12 * np.ptp(t)
-        fits.append((np.median(beside), start + slope * count, float(slope)))
-    return min(fits, key=lambda fit: fit[0])[1:]
+    lines = [_line_of(count, t) for count in counts]
+    return min(lines, key=lambda line: np.median(np.abs(t - line[0])))
+
+
+def _line_of(count: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a line through times by their counts; return its times and its slope."""
+    slope, start = np.polyfit(count, t, 1)
+    for _ in range(2):  # outliers are left out, twice
+        beside = np.abs(t - start - slope * count)
+        use = beside <= 4 * np.median(beside) + 1e-12 * np.ptp(t)
+        slope, start = np.polyfit(count[use], t[use], 1)
+    return start + slope * count, float(slope)
