@@ -115,6 +115,14 @@ def _index_array(faces: AnyArray) -> AnyArray:
     return faces.astype(np.int32) if isinstance(faces, np.ndarray) else faces
 
 
+def _triple_product(a: list[Array], b: list[Array], c: list[Array]) -> Array:
+    """Components of a . (b x c), summed."""
+    x = a[0] * (b[1] * c[2] - b[2] * c[1])
+    y = a[1] * (b[2] * c[0] - b[0] * c[2])
+    z = a[2] * (b[0] * c[1] - b[1] * c[0])
+    return x + y + z
+
+
 @jax.jit
 def _mesh_integrals(
     vertices: Array, faces: Array
@@ -139,11 +147,7 @@ def _mesh_integrals(
     a = corners(0)
     b = corners(1)
     c = corners(2)
-    six_volumes = (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
+    six_volumes = _triple_product(a, b, c)
     s = [a[i] + b[i] + c[i] for i in range(3)]
 
     def second_moment(i: int, j: int) -> Scalar:

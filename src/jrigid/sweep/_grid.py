@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from jrigid._checks import all_finite, float_arrays
 from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of, names_of
@@ -26,7 +26,7 @@ class Grid(NamedTuple):
         block: How many points of each axis a block has.
     """
 
-    points: Any
+    points: PyTree
     names: tuple[str, ...] | None
     shape: tuple[int, ...]
     block: tuple[int, ...]
@@ -59,7 +59,7 @@ class Grid(NamedTuple):
         """Indices within a block of the points that are not beyond the last ones."""
         return tuple(slice(0, x.stop - x.start) for x in self.region(number))
 
-    def part(self, number: int) -> Any:
+    def part(self, number: int) -> PyTree:
         """The points of a block.
 
         All blocks have one shape, for one compilation: beyond the end of an axis its
@@ -97,7 +97,7 @@ class Grid(NamedTuple):
         return self._replace(block=tuple(block))
 
 
-def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
+def grid_of(axes: Mapping[str, ArrayLike] | None, points: PyTree) -> Grid:
     """Check types and shapes of axes or points, and make them one block."""
     if (axes is None) == (points is None):
         raise ValueError("Give one of the arguments `axes` and `points`, but not both.")
@@ -124,13 +124,13 @@ def grid_of(axes: Mapping[str, Any] | None, points: Any) -> Grid:
     return Grid(dict(zip(arrays, values, strict=True)), tuple(arrays), shape, shape)
 
 
-def _native(values: Any) -> np.ndarray:
+def _native(values: ArrayLike) -> np.ndarray:
     """Return numbers in the byte order of this machine, the only one that JAX takes."""
     array = np.asarray(values)
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def _list_of(points: Any) -> Grid:
+def _list_of(points: PyTree) -> Grid:
     """Check a tree of arrays with the points in front."""
     leaves = [
         jnp.asarray(_native(x) if isinstance(x, np.ndarray) else x)
@@ -156,7 +156,7 @@ def _is_code(value: object) -> bool:
     return isinstance(value, EnumerationItem)
 
 
-def _defined(values: Any) -> Bool[Array, ""]:
+def _defined(values: PyTree) -> Bool[Array, ""]:
     """Whether all numbers are finite and no code is `undefined`."""
     leaves = jtu.tree_leaves(values, is_leaf=_is_code)
     codes = [x for x in leaves if _is_code(x)]
@@ -173,8 +173,8 @@ def _defined(values: Any) -> Bool[Array, ""]:
 
 
 def on_block(
-    function: Callable[..., Any], names: tuple[str, ...] | None, part: Any
-) -> tuple[Any, Array]:
+    function: Callable[..., Any], names: tuple[str, ...] | None, part: PyTree
+) -> tuple[PyTree, Array]:
     """Evaluate a function at the points of a block.
 
     Args:
@@ -193,7 +193,7 @@ def on_block(
         points = {name: x.reshape(-1) for name, x in zip(names, spread, strict=True)}
         shape = tuple(x.size for x in part)
 
-    def evaluate(point: Any) -> tuple[Any, Array]:
+    def evaluate(point: PyTree) -> tuple[PyTree, Array]:
         values = function(point) if names is None else function(**point)
         for leaf in jtu.tree_leaves(values):
             if not eqx.is_array_like(leaf):
@@ -244,7 +244,7 @@ class Leaf(eqx.Module):
 VALID = Leaf("valid", (), np.dtype(bool), False, ())
 
 
-def leaves_of(values: Any, axes: Collection[str]) -> list[Leaf]:
+def leaves_of(values: PyTree, axes: Collection[str]) -> list[Leaf]:
     """Describe the arrays that a function returned on axes, and `valid` as the last.
 
     No array or dimension has the name of an axis or of another one.

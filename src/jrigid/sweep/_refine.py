@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 from jrigid.sweep._grid import Grid
 from jrigid.sweep._result import Failure, SweepResult
@@ -23,7 +24,7 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
 
 
 def _classes(
-    classify: Callable[[Any], Any], values: Any, shape: tuple[int, ...]
+    classify: Callable[[PyTree], Any], values: PyTree, shape: tuple[int, ...]
 ) -> np.ndarray:
     """Return the classes of values that have axes of this shape in front."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
@@ -62,7 +63,7 @@ class RefinedMap:
         grid: Grid,
         kept: Memory | Store,
         structure: Any,
-        classify: Callable[[Any], Any],
+        classify: Callable[[PyTree], Any],
         corners: SweepResult,
     ):
         """Give all points the class of the first corner of their tile.

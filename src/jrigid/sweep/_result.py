@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 from jrigid._extra import extra
 from jrigid.sweep._grid import leaves_of
@@ -41,7 +42,7 @@ class SweepResult(NamedTuple):
             evaluated.
     """
 
-    values: Any
+    values: PyTree
     valid: np.ndarray
     axes: dict[str, np.ndarray]
     failures: tuple[Failure, ...] = ()

@@ -13,7 +13,7 @@ import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ _CONVENTIONS = {"Conventions": "CF-1.11"}
 Attributes = Mapping[str, Mapping[str, Any]]
 
 
-def _constants(jaxpr: Any) -> Iterator[Any]:
+def _constants(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
     """Arrays that a traced function and the functions it calls close over."""
     if isinstance(jaxpr, ClosedJaxpr):
         yield from jaxpr.consts
@@ -56,7 +56,7 @@ def _constants(jaxpr: Any) -> Iterator[Any]:
                 yield from _constants(value)
 
 
-def _is_jaxpr(value: Any) -> bool:
+def _is_jaxpr(value: object) -> bool:
     return isinstance(value, ClosedJaxpr | Jaxpr)
 
 
@@ -75,12 +75,12 @@ def _digest(*values: Any) -> str:
     return digest.hexdigest()[:32]
 
 
-def _checksum(numbers: Any) -> bytes:
+def _checksum(numbers: bytes | np.ndarray) -> bytes:
     """The bytes that zarr's codec `crc32c` appends."""
     return extra("sweep", "google_crc32c").value(numbers).to_bytes(4, "little")
 
 
-def fingerprint(function: Any, jaxpr: Any) -> dict[str, Any]:
+def fingerprint(function: Callable[..., Any], jaxpr: ClosedJaxpr) -> dict[str, Any]:
     """Identify what a function computes: a hash of its jaxpr, and versions.
 
     The jaxpr includes the functions that it calls and the arrays that it closes over.

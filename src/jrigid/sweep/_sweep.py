@@ -12,7 +12,7 @@ from typing import Any
 
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, PyTree
 
 from jrigid._checks import whole_number
 from jrigid.sweep._drive import Submit, meter, outcomes
@@ -49,12 +49,12 @@ def sweep(
     function: Callable[..., Any],
     axes: Mapping[str, ArrayLike] | None = None,
     *,
-    points: Any = None,
+    points: PyTree = None,
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     block_size: int | None = None,
     attributes: Mapping[str, Mapping[str, Any]] | None = None,
-    refine: Callable[[Any], Any] | None = None,
+    refine: Callable[[PyTree], Any] | None = None,
     progress: bool = True,
 ) -> SweepResult:
     """Evaluate a function on the grid that axes span, or at each of many points.
@@ -276,7 +276,7 @@ class _Run:
         return tuple(failures)
 
     def refine(
-        self, classify: Callable[[Any], Any], structure: Any
+        self, classify: Callable[[PyTree], Any], structure: Any
     ) -> tuple[tuple[Failure, ...], np.ndarray]:
         """Compute the tiles with a change of class; return failures and all classes."""
         grid = self._work.grid
@@ -318,6 +318,7 @@ def _submitting(
         yield submit, _AHEAD
 
 
+# Any: pools of processes have attributes that `Executor` has not.
 def _prepare(executor: Any) -> None:
     """Refuse a pool of processes that forks; let its workers end with this process."""
     processes = getattr(executor, "_mp_context", None)

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 from jrigid.sweep._grid import Grid, Leaf, on_block
 from jrigid.sweep._store import Memory, Store, fingerprint
@@ -100,7 +101,7 @@ class Worker:
         # for each other for ever: both run in the same few threads of XLA.
         self.free = {device: threading.Lock() for device in self.devices}
 
-    def __call__(self, number: int, part: Any) -> Outcome:
+    def __call__(self, number: int, part: PyTree) -> Outcome:
         """Compute a block, and keep or return it."""
         try:
             values = self._computed(number, part)
@@ -119,7 +120,7 @@ class Worker:
             return Outcome(number, error=text, final=OSError)
         return Outcome(number, count)
 
-    def _computed(self, number: int, part: Any) -> list[np.ndarray]:
+    def _computed(self, number: int, part: PyTree) -> list[np.ndarray]:
         device = self.devices[number % len(self.devices)]
         with under(self.work.settings), self.free[device]:
             part = jax.device_put(part, device)
@@ -128,8 +129,8 @@ class Worker:
 
 
 def traced(
-    function: Callable[..., Any], names: tuple[str, ...] | None, part: Any
-) -> tuple[Any, dict[str, Any]]:
+    function: Callable[..., Any], names: tuple[str, ...] | None, part: PyTree
+) -> tuple[PyTree, dict[str, Any]]:
     """Trace a function; return the shapes of its values and its fingerprint.
 
     Only the first of some points is traced: the fingerprint must not depend on the
@@ -194,7 +195,9 @@ def packed(work: Work) -> bytes:
         ) from error
 
 
-def compute(surroundings: Surroundings, work: bytes, number: int, part: Any) -> Outcome:
+def compute(
+    surroundings: Surroundings, work: bytes, number: int, part: PyTree
+) -> Outcome:
     """Compute a block, in any process."""
     is_elsewhere = surroundings.driver != os.getpid()
     # Workers of dask have threads, which must not unpack or trace the work twice.
@@ -227,7 +230,7 @@ def _unpacked(work: bytes) -> Worker:
 _seen: dict[bytes, dict[str, Any]] = {}
 
 
-def _about_here(work: bytes, part: Any) -> dict[str, Any]:
+def _about_here(work: bytes, part: PyTree) -> dict[str, Any]:
     """Fingerprint of the function in this process, whose module may be an older one."""
     if work not in _seen:
         known = _unpacked(work).work
@@ -251,7 +254,7 @@ def end_with_driver() -> None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
 
 
-def _end_with(sentinel: Any) -> None:
+def _end_with(sentinel: int) -> None:
     """End this process when another one has ended."""
     from multiprocessing import connection
 
