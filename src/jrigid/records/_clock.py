@@ -7,17 +7,24 @@ from jaxtyping import Float, Int
 
 from jrigid._checks import check_option, check_shape
 
-# Intervals that a row may come too late; a clock that goes back further was reset
+# Intervals that a row may come too late. A clock that goes back further was reset.
 _LATE = 20
-# When micro- and milliseconds in 32 bits wrap [s]
+# When micro- and milliseconds in 32 bits wrap [s].
 _COUNTERS = 2.0**32 * np.array([1e-6, 1e-3])
-_DIGITS = 10.0 ** -np.arange(5)  # [s] decimal digits that times may end with
-_ROUND = 0.7  # of a digit: what rounding or cutting leaves beside the line through it
-_COARSE = 0.02  # of the interval: a coarser digit is worth a repair
-_OFTEN = 0.2  # of the steps: rounding makes them unequal more often than an accident
-_NEXT = 8  # stamps that tell a late reading from a lost one
-_LOCK = 0.05  # of a stamp's lateness that the count of readings follows
-_SEVERAL = 0.05  # of all rows: more equal times are no accident but a coarse clock
+# Decimal digits that times may end with [s].
+_DIGITS = 10.0 ** -np.arange(5)
+# What rounding or cutting leaves beside the line, in units of the digit.
+_ROUND = 0.7
+# A digit coarser than this part of the interval is worth a repair.
+_COARSE = 0.02
+# Rounding makes more than this part of the steps unequal; an accident makes fewer.
+_OFTEN = 0.2
+# Stamps that tell a late reading from a lost one.
+_NEXT = 8
+# The part of a stamp's lateness that the count of readings follows.
+_LOCK = 0.05
+# If more than this part of the rows have equal times, the clock is coarse.
+_SEVERAL = 0.05
 _REPEATED = "with the time of the row before"
 
 
@@ -176,20 +183,22 @@ def _evened(
 ) -> np.ndarray:
     """Put each piece on its line if asked to, or if that only undoes rounding."""
     ticks = (t - t[0])[:, None] / _DIGITS
-    digit = _DIGITS[np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3].max(initial=0.0)
-    pieces, beside = np.split(t, breaks), []
+    is_whole = np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3
+    digit = _DIGITS[is_whole].max(initial=0.0)
+    pieces = np.split(t, breaks)
+    beside: list[tuple[float, float]] = []
     for i, piece in enumerate(pieces):
         steps = np.diff(piece)
         if piece.size < 4 or np.ptp(steps) < 1e-9 * np.ptp(piece):
             continue
         line, interval = _line(piece, asked)
         jitter = np.abs(piece - line)
-        uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
-        if asked or (
-            uneven and digit > _COARSE * interval and jitter.max() < _ROUND * digit
-        ):
+        is_uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
+        is_coarse = digit > _COARSE * interval
+        is_rounding = jitter.max() < _ROUND * digit
+        if asked or (is_uneven and is_coarse and is_rounding):
             pieces[i] = line
-            beside.append((interval, np.sqrt(np.mean(jitter**2))))
+            beside.append((interval, float(np.sqrt(np.mean(jitter**2)))))
     if beside:
         intervals, jitters = 1e3 * np.transpose(beside)
         why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"

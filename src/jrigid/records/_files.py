@@ -1,4 +1,4 @@
-"""Files become tables with the units that their formats leave unsaid."""
+"""Read files as tables, with the units that their formats do not state."""
 
 import csv
 import io
@@ -17,18 +17,19 @@ from jrigid._checks import demand
 from jrigid._extra import extra
 
 Source = str | os.PathLike[str] | io.TextIOBase
-_BLACKBOX = "H Product:Blackbox"  # how the log of a flight controller begins
-# Lines that may stand above the header: blackbox logs have their settings there
+# How the log of a flight controller begins.
+_BLACKBOX = "H Product:Blackbox"
+# Lines that may stand above the header: blackbox logs have their settings there.
 _MOST_ABOVE = 400
 _NOTHING: Mapping[int, float] = types.MappingProxyType({})
 # Flight controllers run their gyros at 2000 deg/s, which 16 bits divide into 16.4
 # counts a deg/s.
-_FULL_SCALE = 2000.0  # [deg/s]
-_OVER = 1.05  # of the full scale: zero offsets and filters add a little
+_FULL_SCALE = 2000.0
+# Zero offsets and filters add a little to the full scale.
+_OVER = 1.05
 _MOST_COUNTS = 1 << 15
-_PER_MICROSECOND = (
-    1e-6  # smaller scales are in radians per microsecond, as Baseflight has them
-)
+# Smaller scales are in radians per microsecond, as Baseflight has them.
+_PER_MICROSECOND = 1e-6
 
 
 class Table(NamedTuple):
@@ -57,38 +58,50 @@ class Table(NamedTuple):
 
 
 def tables_of(path: Source, log: int) -> list[Table]:
-    """All tables behind a path; files without a table are passed over."""
-    if isinstance(path, io.TextIOBase):
-        files = {str(getattr(path, "name", "text")): path.read().encode()}
-    elif (path := pathlib.Path(path)).is_dir():
-        files = {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
-    elif zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
-            files = {pathlib.PurePath(n).stem: archive.read(n) for n in names}
-    else:
-        files = {path.stem: path.read_bytes()}
+    """All tables of a path.
+
+    Of several files those without a table are passed over.
+    """
     texts = {
-        name: data.decode("utf-8-sig", errors="replace") for name, data in files.items()
+        name: data.decode("utf-8-sig", errors="replace")
+        for name, data in _files_of(path).items()
     }
-    about = next(csv.DictReader(texts.get("Metadata", "").splitlines(), restval=""), {})
-    tables = []
+    # Sensor Logger writes this file beside those of the sensors.
+    metadata = texts.get("Metadata", "").splitlines()
+    about = next(csv.DictReader(metadata, restval=""), {})
+    tables: list[Table] = []
     for name, text in texts.items():
         try:
-            is_log = text.startswith(_BLACKBOX)
-            tables.append(
-                _blackbox(str(path), name, log) if is_log else _parse(text, name)
-            )
+            if text.startswith(_BLACKBOX):
+                table = _blackbox(str(path), name, log)
+            else:
+                table = _parse(text, name)
         except ValueError:
             if len(texts) == 1:
                 raise
-    return [_with_units(table._replace(about=table.about | about)) for table in tables]
+            continue
+        tables.append(_with_units(table._replace(about=table.about | about)))
+    return tables
+
+
+def _files_of(path: Source) -> dict[str, bytes]:
+    """Contents of an open text, a file, or the CSV files of a folder or an archive."""
+    if isinstance(path, io.TextIOBase):
+        return {str(getattr(path, "name", "text")): path.read().encode()}
+    path = pathlib.Path(path)
+    if path.is_dir():
+        return {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
+            return {pathlib.PurePath(n).stem: archive.read(n) for n in names}
+    return {path.stem: path.read_bytes()}
 
 
 def _blackbox(path: str, name: str, log: int) -> Table:
     """A log of a flight controller, decoded by orangebox."""
     orangebox = extra("records", "orangebox")
-    # A parser for each log: one that goes on to another keeps the headers of the last
+    # A parser for each log: one that goes on to another keeps the headers of the last.
     try:
         parser = orangebox.Parser.load(path, log, allow_invalid_header=True)
     except RuntimeError as error:
@@ -96,19 +109,19 @@ def _blackbox(path: str, name: str, log: int) -> Table:
             "Arguments `path` and `log` must be of a log that can be decoded, but: "
             f"{error}"
         ) from error
-    names, several, frames = parser.field_names, parser.reader.log_count, []
+    names = parser.field_names
+    several = parser.reader.log_count
     notes = [f"log {log} of {several}"] if several > 1 else []
+    frames: list[list[int | float]] = []
     try:
         for frame in parser.frames():
-            frames.append(
-                [x if isinstance(x, int | float) else np.nan for x in frame.data]
-            )
+            row = [x if isinstance(x, int | float) else np.nan for x in frame.data]
+            frames.append(row)
     except (RuntimeError, ValueError, IndexError) as error:
         # Where a crash or the battery ended the log, orangebox raises one of these.
         notes.append(f"the log breaks off after {len(frames)} frames ({error})")
-    values = np.array([x for x in frames if len(x) == len(names)], float).reshape(
-        -1, len(names)
-    )
+    whole = [x for x in frames if len(x) == len(names)]
+    values = np.array(whole, float).reshape(-1, len(names))
     about = {key: str(value) for key, value in parser.headers.items()}
     return Table(name, names, values, about, notes)
 
@@ -116,35 +129,49 @@ def _blackbox(path: str, name: str, log: int) -> Table:
 def _parse(text: str, name: str) -> Table:
     """Parse a text with any separator, decimal sign and lines above the header."""
     lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
-    last = lines[-50:]
-    separator = next(
-        (d for d in "\t;," if sum(d in x for x in last) > len(last) / 2), ","
-    )
+    separator = _separator(lines)
     rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
     head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
-    lacking = (
+    demand(
+        head >= 0,
         f"Argument `path` must have names of its columns above numbers, but {name!r} "
-        "has not."
+        "has not.",
     )
-    demand(head >= 0, lacking)
-    headers, width = rows[head], len(rows[head])
+    headers = rows[head]
+    width = len(headers)
+    # Some programs write the header again where they were paused.
     below = [row for row in rows[head + 1 :] if row != headers]
     whole = [row[:width] for row in below if len(row) >= width and not any(row[width:])]
-    values = np.array([[_number(x) for x in row] for row in whole], float).reshape(
-        -1, width
-    )
-    cut = len(rows[-1]) < width
-    commas = any("," in x and not np.isnan(_number(x)) for row in whole for x in row)
-    said = (
-        (cut, "the last line is cut off: dropped"),
-        (len(below) - len(whole) - cut, "{} with another number of columns dropped"),
-        (len(rows) - head - 1 - len(below), "{} of headers in the middle skipped"),
-        (commas, "read with decimal commas"),
-    )
-    notes = [what.format(f"{n} line{'s' if n > 1 else ''}") for n, what in said if n]
+    numbers = [[_number(x) for x in row] for row in whole]
+    values = np.array(numbers, float).reshape(-1, width)
+    is_cut = len(rows[-1]) < width
+    odd = len(below) - len(whole) - is_cut
+    repeated = len(rows) - head - 1 - len(below)
+    notes: list[str] = []
+    if is_cut:
+        notes.append("the last line is cut off: dropped")
+    if odd:
+        notes.append(f"{_lines(odd)} with another number of columns dropped")
+    if repeated:
+        notes.append(f"{_lines(repeated)} of headers in the middle skipped")
+    if any("," in x and not np.isnan(_number(x)) for row in whole for x in row):
+        notes.append("read with decimal commas")
     about = {row[0]: separator.join(row[1:]) for row in rows[:head]}
     return Table(name, headers, values, about, notes)
+
+
+def _separator(lines: list[str]) -> str:
+    """The separator of columns: one that most of the last lines have."""
+    last = lines[-50:]
+    for separator in "\t;,":
+        if sum(separator in x for x in last) > len(last) / 2:
+            return separator
+    return ","
+
+
+def _lines(count: int) -> str:
+    return f"{count} line{'s' if count > 1 else ''}"
 
 
 def _is_header(names: list[str], numbers: list[str]) -> bool:

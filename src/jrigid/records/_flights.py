@@ -11,48 +11,50 @@ from jaxtyping import Bool, Float
 from jrigid._checks import check_option
 from jrigid.records._reading import Reading, runs
 
-_WINDOW = 0.2  # [s] over which a lever or a tensor is guessed
-_GUESSES = 300  # windows that are tried, at most
-# Of the rows of a window that its own guess must explain to be tried on the rest
+# Time over which a lever or a tensor is guessed [s], and how many guesses are tried.
+_WINDOW = 0.2
+_GUESSES = 300
+# A guess is tried on all rows if it explains this part of its own window.
 _SOUND = 0.9
-_REACH = {"forces": 0.01, "momentum": 0.05}  # [s] to either side that an equation looks
-# [m] from the mass centre to an accelerometer; moments from equal, of a trace of 1
+# An equation looks at readings so far to either side [s].
+_REACH = {"forces": 0.01, "momentum": 0.05}
+# Usual size of a lever, from the mass centre to an accelerometer [m]; and of what
+# distinguishes moments from equal ones, for a trace of 1.
 _USUAL = 0.2
-_FORCE = (
-    3.0,
-    0.05,
-)  # [m/s^2], and of the force itself: noise, drag of the air, a wrong scale
-_KEPT = (
-    0.02,
-    6.0,
-)  # of a momentum that may come or go in that time, and of the gyro's noise
-_SPIN = 2.0  # [rad/s] slower spins tell nothing of a momentum
-_LARGEST = 0.55  # moment of a trace of 1: half for a flat body, and some noise
-# Delays of the accelerometer after the gyro [s]: both have filters, and their own.
+# Noise, drag of the air and a wrong scale change the specific force by so much [m/s^2],
+# and by this part of it.
+_FORCE = (3.0, 0.05)
+# The momentum may change by this part over the reach, and by so many deviations of the
+# gyro's noise.
+_KEPT = (0.02, 6.0)
+# Slower spins determine no momentum [rad/s].
+_SPIN = 2.0
+# Largest moment for a trace of 1: half for a flat body, and some noise.
+_LARGEST = 0.55
+# Delays of the accelerometer after the gyro [s]: each filters its readings.
 _DELAYS = (0.0, 0.002, -0.002, 0.004, -0.004, 0.006, -0.006, 0.008, -0.008)
-_BETTER = 1.05  # times the rows that a delay must explain to be preferred to none
-_BIAS = 1.0  # [m/s^2] of an accelerometer; more is no bias but a hand
-_QUIET = 1.5  # [m/s^2] what a flight may differ from its own lever without any noise
-_NOISY = (
-    3.5,
-    7.0,
-)  # medians of what a flight differs from its lever, and the most allowed [m/s^2]
-_EDGE = (
-    1.0,
-    2.0,
-    0.03,
-)  # [m/s^2], medians, and of the force: allowed at the ends of a flight
-_CLIPPED = (
-    4  # readings equal to the largest: the accelerometer was at the end of its range,
-)
-_LEAST_RANGE = 19.0  # [m/s^2] which is 2 g at least
-_JUMP = (
-    8.0,
-    0.15,
-)  # medians of what slopes leave of a step, and parts of the rate: a blow
-# [s] of a flight that may be unexplained, if by less than twice what is allowed
+# A delay must explain so many times the rows to be preferred to none.
+_BETTER = 1.05
+# Bias of an accelerometer [m/s^2]. If it is larger, a hand holds the body.
+_BIAS = 1.0
+# A flight without noise may differ from its lever by so much [m/s^2].
+_QUIET = 1.5
+# A flight with noise may differ by so many medians, and by so much at most [m/s^2].
+_NOISY = (3.5, 7.0)
+# Ends of a flight may differ by so much [m/s^2], by so many medians, and by this part
+# of the force.
+_EDGE = (1.0, 2.0, 0.03)
+# If so many readings equal the largest one, the accelerometer was at the end of its
+# range, which is 2 g at least [m/s^2].
+_CLIPPED = 4
+_LEAST_RANGE = 19.0
+# A step of the rates is a blow if the slopes leave so many medians of it unexplained,
+# and this part of the rate.
+_JUMP = (8.0, 0.15)
+# So much of a flight may be unexplained [s], if by less than twice what is allowed.
 _HOLE = 0.06
-_ROUNDS = 3  # of fitting a lever to a flight and finding where the flight ends
+# Rounds of fitting a lever to a flight and finding where the flight ends.
+_ROUNDS = 3
 
 
 def flights(
@@ -105,7 +107,9 @@ def flights(
     (1981).
     """
     check_option("by", by, (None, "forces", "momentum"))
-    rates, forces, t = reading.rates, reading.specific_forces, reading.times
+    rates = reading.rates
+    forces = reading.specific_forces
+    t = reading.times
     if rates is None or (by == "forces" and forces is None):
         needed = "rates" if rates is None else "specific forces"
         raise ValueError(f"Argument `reading` must have {needed}, but it has none.")
@@ -122,12 +126,10 @@ def flights(
         rows = _inside(reading, first, last, margin, by)
         if rows.size and t[last - 1] - t[first] >= min_duration:
             flown.append(reading[int(rows[0]) : int(rows[-1]) + 1])
+    reason = f"no contact by the {by.replace('forces', 'specific forces')}"
     for i, x in enumerate(flown):
-        note = (
-            f"flight {i + 1} of {len(flown)}, {x.times[0]:.6g} s to {x.times[-1]:.6g} "
-            "s: "
-        )
-        note += f"no contact by the {by.replace('forces', 'specific forces')}"
+        span = f"{x.times[0]:.6g} s to {x.times[-1]:.6g} s"
+        note = f"flight {i + 1} of {len(flown)}, {span}: {reason}"
         flown[i] = dataclasses.replace(x, notes=(*x.notes, note))
     return flown
 
@@ -247,16 +249,22 @@ class _Part(NamedTuple):
         cls, reading: Reading, delay: float, free: Bool[np.ndarray, " rows"]
     ) -> "_Part":
         """Prepare the equations of a part in which some rows are known to be free."""
-        rates, forces, t = reading.rates, reading.specific_forces, reading.times
+        rates = reading.rates
+        forces = reading.specific_forces
+        t = reading.times
         assert rates is not None
         assert forces is not None
-        reach = max(1, round(_REACH["forces"] / reading.interval)) if t.size > 1 else 1
+        reach = 1
+        hole = 0
+        if t.size > 1:
+            reach = max(1, round(_REACH["forces"] / reading.interval))
+            hole = round(_HOLE / reading.interval)
         slopes = [_slope(t, rates, reach), *_one_sided(t, rates, reach)]
         models = np.array([_cross(x) + _cross(rates) @ _cross(rates) for x in slopes])
-        hole = round(_HOLE / reading.interval) if t.size > 1 else 0
-        jumps = (
-            _jumps(t, rates, slopes[1:], free) if reach == 1 else np.zeros(t.size, bool)
-        )
+        jumps = np.zeros(t.size, bool)
+        if reach == 1:
+            # A blow that falls between two readings of a slow clock.
+            jumps = _jumps(t, rates, slopes[1:], free)
         return cls(t, _shifted(reading, forces, delay), models, hole, jumps)
 
     def parted(self, free: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
@@ -297,11 +305,11 @@ class _Part(NamedTuple):
 
     def fit(self, core: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, "6"]:
         """Lever [m] and bias [m/s^2]: least squares, twice without the worst rows."""
-        model = np.concatenate(
-            [self.models[0], np.broadcast_to(np.eye(3), (core.size, 3, 3))], 2
-        )
+        of_bias = np.broadcast_to(np.eye(3), (core.size, 3, 3))
+        model = np.concatenate([self.models[0], of_bias], axis=2)
         known = core & np.isfinite(self.forces.sum(axis=1) + model.sum(axis=(1, 2)))
         noise = _FORCE[0]
+        # Usual sizes fill in what the rows do not determine.
         drawn = np.repeat([_USUAL, _BIAS / 2], 3) ** -2.0
         fit = np.zeros(6)
         use = known
@@ -370,12 +378,12 @@ def _jumps(
     usual = float(np.median(size[free])) if free.any() else 0.0
     # The parabolas of the neighbours look across a jump, too: it is where most is left.
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 2), 5)
-    largest = size == around.max(axis=1)
-    return largest & (
-        size > np.maximum(_JUMP[0] * usual, _JUMP[1] * np.linalg.norm(rates, axis=1))
-    )
+    is_largest = size == around.max(axis=1)
+    spin = np.linalg.norm(rates, axis=1)
+    return is_largest & (size > np.maximum(_JUMP[0] * usual, _JUMP[1] * spin))
 
 
+#: Function of the unknowns and the rows.
 _Bound = Callable[[np.ndarray, slice], np.ndarray | float]
 
 
@@ -436,22 +444,23 @@ def _slope(t: np.ndarray, rates: np.ndarray, reach: int) -> np.ndarray:
 
 def _one_sided(t: np.ndarray, rates: np.ndarray, reach: int) -> list[np.ndarray]:
     """Angular accelerations from earlier readings alone and from later ones alone."""
-    slopes = []
-    for shift in (reach, -reach):
-        t1, t2 = np.roll(t, shift), np.roll(t, 2 * shift)
-        w1, w2 = np.roll(rates, shift, axis=0), np.roll(rates, 2 * shift, axis=0)
-        a = (2 * t - t1 - t2) / ((t - t1) * (t - t2))
-        b = (t - t2) / ((t1 - t) * (t1 - t2))
-        c = (t - t1) / ((t2 - t) * (t2 - t1))
-        slope = a[:, None] * rates + b[:, None] * w1 + c[:, None] * w2
-        edge = (
-            slice(0, 2 * reach)
-            if shift > 0
-            else slice(max(t.size - 2 * reach, 0), None)
-        )
-        slope[edge] = np.nan  # rolled in from the other end
-        slopes.append(slope)
-    return slopes
+    earlier = _from_one_side(t, rates, reach)
+    earlier[: 2 * reach] = np.nan  # rolled in from the other end
+    later = _from_one_side(t, rates, -reach)
+    later[max(t.size - 2 * reach, 0) :] = np.nan
+    return [earlier, later]
+
+
+def _from_one_side(t: np.ndarray, rates: np.ndarray, shift: int) -> np.ndarray:
+    """Slopes of the parabola through a reading and two others on one side of it."""
+    t1 = np.roll(t, shift)
+    t2 = np.roll(t, 2 * shift)
+    w1 = np.roll(rates, shift, axis=0)
+    w2 = np.roll(rates, 2 * shift, axis=0)
+    a = (2 * t - t1 - t2) / ((t - t1) * (t - t2))
+    b = (t - t2) / ((t1 - t) * (t1 - t2))
+    c = (t - t1) / ((t2 - t) * (t2 - t1))
+    return a[:, None] * rates + b[:, None] * w1 + c[:, None] * w2
 
 
 class _MomentumBound(NamedTuple):

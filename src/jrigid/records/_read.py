@@ -32,7 +32,8 @@ _UNITS: dict[str, dict[str, float]] = {
         "gauss": 1e-4,
     },
 }
-Unit = str | float | int  # a name, or a factor to SI
+#: A name, or a factor to SI.
+Unit = str | float | int
 Columns = Mapping[str, str | Sequence[str]]
 _MEASURED = ("rates", "specific_forces", "magnetic_fields")
 # What a column measures, by words in its name; the first that fits.
@@ -49,11 +50,12 @@ _UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
 _SUFFIX = re.compile(
     r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE
 )
-_EPOCH = 1e6  # [s] later times count from some epoch and are made to count from 0
+# Times beyond this count from some epoch [s], and are made to count from 0.
+_EPOCH = 1e6
 # No common gyro measures more: 4000 deg/s is the widest range of those in phones,
 # loggers and flight controllers. In rad/s, and in deg/s with a margin for what a filter
 # or an offset adds.
-_RANGE = 70.0, 4100.0
+_RANGE = (70.0, 4100.0)
 # Medians of what each row says: steps of 8 Hz to 8 kHz, and sizes at hand.
 _USUAL = {
     "times": {
@@ -64,8 +66,10 @@ _USUAL = {
     },
     "specific_forces": {"g": (0.8, 1.25), "m/s^2": (7.8, 12.3)},
 }
-_TURN = 0.1  # [s] over which the turning of gravity is compared with the rates
-_LIKE = 0.4  # correlation of the two from which their ratio is believed
+# Time over which the turning of gravity is compared with the rates [s].
+_TURN = 0.1
+# If the two have at least this correlation, their ratio is believed.
+_LIKE = 0.4
 
 
 class _Sensor(NamedTuple):
@@ -88,8 +92,9 @@ class _Units(NamedTuple):
         self, kind: str, sensor: _Sensor, values: np.ndarray, turned: str = ""
     ) -> float | None:
         """The factor to SI from the caller, the file or the numbers, else None."""
-        table, column = sensor.table, sensor.columns[kind != "times"]
-        unit = _split(table.headers[column])[1]
+        table = sensor.table
+        column = sensor.columns[0 if kind == "times" else 1]
+        _, unit = _split(table.headers[column])
         scale = table.scales.get(column, 1.0)
         what = f"{kind.replace('_', ' ')} ({_label(kind, sensor)})"
         if unit == "counts":
@@ -109,7 +114,8 @@ class _Units(NamedTuple):
                 unit != "counts" or column in table.sources
             )
             demand(known, f"Argument `unit` must say the unit of `{kind}`, {other}")
-            factor, said = scale * _UNITS[kind][unit], f"taken as {unit}: {source}"
+            factor = scale * _UNITS[kind][unit]
+            said = f"taken as {unit}: {source}"
         if kind == "rates":
             said += _range_checked(values, factor, "rates" in self.asked)
         self.notes.append(f"{what} {said}")
@@ -153,7 +159,8 @@ def _range_checked(values: np.ndarray, factor: float, asked: bool) -> str:
 
 def _question(most: float, why: str) -> str:
     """Ask for the unit of rates, with the largest number in the usual units."""
-    degree, count = np.pi / 180, _UNITS["rates"]["counts"]
+    degree = np.pi / 180
+    count = _UNITS["rates"]["counts"]
     return (
         f"Argument `unit` must say the unit of the rates, but it does not, and {why}. "
         f"The largest number, {most:.6g}, is {most:.4g} rad/s by `unit='rad/s'`, "
@@ -312,76 +319,87 @@ def _asked(unit: Unit | Mapping[str, Unit] | None) -> dict[str, Unit]:
 
 def _rename(tables: list[Table], columns: Columns) -> None:
     """Give columns the caller's names; those of no known sensor are in SI."""
-    factors: dict[str | None, float] = {None: 1.0}
-    factors |= {
-        unit: x for known in reversed(_UNITS.values()) for unit, x in known.items()
-    }
+    factors: dict[str | None, float] = {}
+    # Units of the same name, such as g, are those of the first quantity.
+    for known in reversed(_UNITS.values()):
+        factors |= known
     headers = ", ".join(header for table in tables for header in table.headers)
     for new, old in columns.items():
-        olds, three = [old] if isinstance(old, str) else old, new in _MEASURED
-        named = (
+        olds = [old] if isinstance(old, str) else old
+        is_sensor = new in _MEASURED
+        demand(
+            len(olds) == 3 or not is_sensor,
             f"Argument `columns` must name three columns for `{new}`, but it names "
-            f"{old!r}."
+            f"{old!r}.",
         )
-        demand(len(olds) == 3 or not three, named)
         for i, one in enumerate(olds):
-            places = [
-                (t, j, x, *_split(x)) for t in tables for j, x in enumerate(t.headers)
-            ]
-            places = [x for x in places if x[2] == one] or [
-                x for x in places if x[3] == one
-            ]
-            there = (
+            name = f"{new}[{i}]" if is_sensor else new
+            places = _places(tables, one)
+            demand(
+                len(places) > 0,
                 f"Argument `columns` must name columns of the file, but {one!r} is "
-                "none of "
+                f"none of {headers}",
             )
-            demand(len(places) > 0, there + headers)
-            for table, j, _, _, unit in places:
-                name = f"{new}[{i}]" if three else new
-                table.headers[j] = (
-                    f"{name} ({unit})" if unit and new in _UNITS else name
-                )
-                if new not in _UNITS:
+            for table, j in places:
+                _, unit = _split(table.headers[j])
+                if new in _UNITS:
+                    table.headers[j] = f"{name} ({unit})" if unit else name
+                else:
+                    table.headers[j] = name
                     table.values[:, j] *= factors.get(unit, 1.0)
+
+
+def _places(tables: list[Table], name: str) -> list[tuple[Table, int]]:
+    """Columns whose header is a name, else those whose header without a unit is it."""
+    columns = [(t, j) for t in tables for j in range(len(t.headers))]
+    exact = [(t, j) for t, j in columns if t.headers[j] == name]
+    return exact or [(t, j) for t, j in columns if _split(t.headers[j])[0] == name]
 
 
 def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
     """Find sensors: three columns whose names differ by the axis, and their times."""
-    known, names = np.isfinite(table.values), [_split(x)[0] for x in table.headers]
-    times, triples = [], dict[str, dict[str, int]]()
-    for j in np.flatnonzero(known.any(axis=0)).tolist():
+    names = [_split(x)[0] for x in table.headers]
+    times: list[int] = []
+    triples: dict[str, dict[str, int]] = {}
+    for j in np.flatnonzero(np.isfinite(table.values).any(axis=0)).tolist():
         match = _AXIS.match(names[j])
         if match:
             triples.setdefault(match[1], {}).setdefault(match[2].lower(), j)
         elif _kind(names[j]) == "times":
             times.append(j)
-    times = [names.index("times")] if "times" in columns else times
-    sensors = []
+    if "times" in columns:
+        times = [names.index("times")]
+    sensors: list[tuple[str, _Sensor]] = []
     for stem, axes in triples.items():
-        kind, three = _kind(stem or table.name), [axes[axis] for axis in sorted(axes)]
-        if (
-            len(three) < 3
-            or kind in (None, "times")
-            or (kind in columns and kind != stem)
-        ):
+        kind = _kind(stem or table.name)
+        is_other = kind in columns and kind != stem  # the caller names another one
+        if len(axes) < 3 or kind is None or kind == "times" or is_other:
             continue
-        label = (
-            ", ".join(names[j] for j in three) if len(stem) == 1 else stem or table.name
-        )
-        needed = (
+        demand(
+            len(times) > 0,
             "Argument `columns` must name the column of the times, but it does not, "
-            "and none "
+            f"and none of {', '.join(table.headers)} is recognised.",
         )
-        demand(len(times) > 0, f"{needed}of {', '.join(table.headers)} is recognised.")
+        three = [axes[axis] for axis in sorted(axes)]
+        is_letter = len(stem) == 1  # as in gx, gy, gz
+        label = ", ".join(names[j] for j in three) if is_letter else stem or table.name
+        # Each sensor may have times of its own, to the left of it.
         time = max((j for j in times if j < three[0]), default=times[0])
-        whole = known[:, three].all(axis=1)
-        rows = np.flatnonzero(whole)
-        if rows.size:
-            # Below the last row the column is padded, unless there are times.
-            missed = ~whole & (known[:, time] | (np.arange(whole.size) < rows[-1]))
-            sensor = _Sensor(label, table, [time, *three], rows, int(missed.sum()))
+        sensor = _sensor(label, table, time, three)
+        if sensor.rows.size:
             sensors.append((kind, sensor))
     return sensors
+
+
+def _sensor(label: str, table: Table, time: int, three: list[int]) -> _Sensor:
+    """A sensor in the rows where all axes are numbers."""
+    is_known = np.isfinite(table.values)
+    is_whole = is_known[:, three].all(axis=1)
+    rows = np.flatnonzero(is_whole)
+    # Below the last row the columns are padded, unless there are times.
+    is_row = is_known[:, time] | (np.arange(is_whole.size) < rows.max(initial=-1))
+    missed = int(np.sum(~is_whole & is_row))
+    return _Sensor(label, table, [time, *three], rows, missed)
 
 
 def _on_one_clock(
@@ -461,13 +479,10 @@ def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None,
     usual = _USUAL.get(kind, {}).items()
     unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
     if unit is None and kind == "times":
-        doubt = f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz"
-        doubt = (
-            "Argument `unit` must say the unit of the times, but it does not, and "
-            f"{doubt}."
-        )
         raise ValueError(
-            f"{doubt} (`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)"
+            "Argument `unit` must say the unit of the times, but it does not, and "
+            f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz. "
+            f"(`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)"
         )
     return unit, f"their median {'step ' * (kind == 'times')}is {size:.4g}"
 
@@ -486,29 +501,32 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     """The unit in which gravity obeys df/dt = -omega x f; empty if unclear."""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
-    sums, size = (
-        np.cumsum(steps, axis=0) - steps / 2,
-        np.linalg.norm(forces, axis=1)[lag:],
-    )
-    said, seen = sums[lag:] - sums[:-lag], forces[lag:] - forces[:-lag]
+    sums = np.cumsum(steps, axis=0) - steps / 2
+    by_rates = sums[lag:] - sums[:-lag]
+    seen = forces[lag:] - forces[:-lag]
+    # Only where the accelerometer shows gravity and nothing else.
+    size = np.linalg.norm(forces, axis=1)[lag:]
     least, most = _USUAL["specific_forces"]["m/s^2"]
     use = np.isfinite(seen).all(axis=1) & (size > least) & (size < most)
-    said, seen = said[use], seen[use]
-    product, square = np.sum(said * seen), np.sum(said**2)
+    by_rates = by_rates[use]
+    seen = seen[use]
+    product = np.sum(by_rates * seen)
+    square = np.sum(by_rates**2)
     if product <= _LIKE * np.sqrt(square * np.sum(seen**2)):
         return ""
-    return min(
-        ("rad/s", "deg/s"),
-        key=lambda u: abs(np.log(product / square / _UNITS["rates"][u])),
-    )
+    ratio = product / square
+
+    def misfit(unit: str) -> float:
+        return abs(np.log(ratio / _UNITS["rates"][unit]))
+
+    return min(("rad/s", "deg/s"), key=misfit)
 
 
 def _kind(name: str) -> str | None:
     """What the words of a name say that is measured: a key of `_KINDS`."""
     words = name.strip().lower()
-    return next(
-        (kind for kind, pattern in _KINDS.items() if re.search(pattern, words)), None
-    )
+    fits = (kind for kind, pattern in _KINDS.items() if re.search(pattern, words))
+    return next(fits, None)
 
 
 def _split(header: str) -> tuple[str, str | None]:
@@ -521,7 +539,7 @@ def _split(header: str) -> tuple[str, str | None]:
 
 def _plain(unit: str) -> str:
     """A unit as in `_UNITS`; two signs for micro, and one lost in decoding, are u."""
-    unit = re.sub(
-        r"\s|(?<=s)ec(onds?|s)?", "", re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower())
-    )
+    unit = re.sub("[\u00b5\u03bc\ufffd]", "u", unit.lower())
+    # "m/sec" and "m/second" are m/s.
+    unit = re.sub(r"\s|(?<=s)ec(onds?|s)?", "", unit)
     return unit.replace("²", "^2").replace("**", "^")

@@ -10,19 +10,17 @@ from jaxtyping import Float
 from jrigid._checks import check_shape, demand
 from jrigid._types import Readable
 
-_REST = 0.25  # [s] over which it is judged whether the body rests
-_STILL = (
-    0.1,
-    0.2,
-)  # [rad/s] standard deviation, and mean, above which a body does not rest
-_FLOOR = (
-    0.1,
-    3.0,
-)  # the quietest tenth of the windows, and how much noisier others at rest may be
-_PER_OCTAVE = 4  # averaging times in a factor of two
-_FLICKER = (
-    0.664  # Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi)
-)
+# Time over which it is judged whether the body is at rest [s].
+_REST = 0.25
+# Standard deviation and mean of the rates [rad/s] of a body at rest, at most.
+_STILL = (0.1, 0.2)
+# The quietest tenth of the windows are at rest; others at rest are up to three times
+# as noisy.
+_FLOOR = (0.1, 3.0)
+# Averaging times in a factor of two.
+_PER_OCTAVE = 4
+# Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi).
+_FLICKER = 0.664
 
 
 class Reading(Readable):
@@ -178,9 +176,8 @@ def allan(
 
     Source: IEEE Std 952-1997, annex C; Riley, NIST SP 1065 (2008), section 5.2.
     """
-    pieces = [
-        np.asarray(x, float) for x in (values if isinstance(values, list) else [values])
-    ]
+    stretches = values if isinstance(values, list) else [values]
+    pieces = [np.asarray(x, float) for x in stretches]
     for piece in pieces:
         check_shape("values", piece, (None, None))
     longest = max(map(len, pieces), default=0)
@@ -189,12 +186,10 @@ def allan(
     )
     octaves = np.arange(0, np.log2(longest / 3) + 1e-9, 1 / _PER_OCTAVE)
     averaged = np.unique(np.round(2**octaves).astype(int))
-    squares, counts = (
-        np.zeros((averaged.size, pieces[0].shape[1])),
-        np.zeros(averaged.size),
-    )
+    squares = np.zeros((averaged.size, pieces[0].shape[1]))
+    counts = np.zeros(averaged.size)
     for piece in pieces:
-        # the mean changes nothing but the rounding of the sums
+        # The mean changes nothing but the rounding of the sums.
         sums = np.cumsum(piece - piece.mean(axis=0), axis=0)
         sums = np.concatenate([np.zeros((1, piece.shape[1])), sums])
         for i, m in enumerate(averaged[2 * averaged < len(sums)]):
@@ -223,7 +218,8 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
     >>> print([x.times[[0, -1]].round(1).tolist() for x in parts])
     [[0.0, 2.0], [4.0, 6.0]]
     """
-    rates, times = reading.rates, reading.times
+    rates = reading.rates
+    times = reading.times
     if rates is None:
         raise ValueError("Argument `reading` must have rates, but it has none.")
     size = max(4, round(_REST / reading.interval)) if times.size > 1 else 4
@@ -233,16 +229,34 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
         return []
     windows = starts[:, None] + np.arange(size)
     spreads = np.linalg.norm(rates[windows].std(axis=1), axis=1)
-    (quantile, factor), (spread, mean) = _FLOOR, _STILL
-    quiet = spreads <= min(spread, factor * np.quantile(spreads, quantile))
-    quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < mean
-    still = np.isin(np.arange(times.size), windows[quiet])
-    parts = [
-        part for first, last in runs(still) for part in reading[first:last].pieces()
-    ]
-    return [
-        part for part in parts if np.ptp(part.times) >= min_duration - reading.interval
-    ]
+    quantile, factor = _FLOOR
+    most_spread, most_mean = _STILL
+    floor = factor * np.quantile(spreads, quantile)
+    is_quiet = spreads <= min(most_spread, floor)
+    is_quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < most_mean
+    is_still = np.isin(np.arange(times.size), windows[is_quiet])
+    shortest = min_duration - reading.interval
+    parts: list[Reading] = []
+    for first, last in runs(is_still):
+        parts += reading[first:last].pieces()
+    return [part for part in parts if np.ptp(part.times) >= shortest]
+
+
+def _density(curve: Allan, lowest: np.ndarray) -> np.ndarray:
+    """White noise [unit/sqrt(Hz)] of each column, from times before the lowest one.
+
+    The Allan deviation of white noise falls as the root of the averaging time. If it
+    falls so nowhere, all times before the lowest deviation count.
+    """
+    times = curve.times[:, None]
+    logs = np.log(np.maximum(curve.deviations, np.finfo(float).tiny))
+    run = np.diff(np.log(times), axis=0, append=np.nan)
+    slopes = np.diff(logs, axis=0, append=np.nan) / run
+    is_early = np.arange(len(times))[:, None] < np.maximum(lowest, 1)
+    is_white = is_early & (np.abs(slopes + 0.5) < 0.1)
+    used = np.where(is_white.any(axis=0), is_white, is_early)
+    densities = np.where(used, curve.deviations * np.sqrt(times), np.nan)
+    return np.nanmedian(densities, axis=0)
 
 
 def noise(
@@ -270,26 +284,17 @@ def noise(
     needed = f"rates at rest for {min_duration:g} s"
     demand(len(parts) > 0, f"Argument `reading` must have {needed}, but it has none.")
     curve = allan(parts, reading.interval)
-    times, deviations = curve.times[:, None], curve.deviations
+    deviations = curve.deviations
     lowest = np.argmin(deviations, axis=0)
-    logs = np.log(np.maximum(deviations, np.finfo(float).tiny))
-    slopes = np.diff(logs, axis=0, append=np.nan) / np.diff(
-        np.log(times), axis=0, append=np.nan
-    )
-    early = np.arange(len(times))[:, None] < np.maximum(lowest, 1)
-    white = early & (np.abs(slopes + 0.5) < 0.1)
-    white = np.where(white.any(axis=0), white, early)
     total = sum(map(len, parts)) * reading.interval
     notes = [f"{len(parts)} rest{'s' if len(parts) > 1 else ''}, {total:.4g} s in all"]
-    if (lowest == len(times) - 1).any():
+    if (lowest == len(curve.times) - 1).any():
         notes.append("the rest is too short for the bias instability: an upper bound")
     return Noise(
         reading.interval,
         bias=np.concatenate(parts).mean(axis=0),
         sigma=deviations[0],
-        density=np.nanmedian(
-            np.where(white, deviations * np.sqrt(times), np.nan), axis=0
-        ),
+        density=_density(curve, lowest),
         instability=deviations.min(axis=0) / _FLICKER,
         instability_times=curve.times[lowest],
         allan=curve,
