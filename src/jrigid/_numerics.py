@@ -239,7 +239,8 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     factor = jnp.ones_like(z)
     for _ in range(3):
         below = 1 + jnp.sqrt(1 + z)
-        factor, z = factor * (2 / below), z / (below * below)
+        factor = factor * (2 / below)
+        z = z / (below * below)
     return factor * _series(_ARCTANC, z)
 
 

@@ -316,7 +316,7 @@ def cyclic_coordinates(
     [False  True]
     """
     q, q_dot = _coordinates(q, q_dot)
-    slopes = jax.value_and_grad(_bind(lagrangian, params, q.dtype), argnums=(0, 1))
+    bound = _bind(lagrangian, params, q.dtype)
     if reach is None:
         spread = 0.25 * (1 + jnp.abs(q))
     else:
@@ -325,18 +325,27 @@ def cyclic_coordinates(
             check_shape("reach", spread, q.shape)
     fastest = jnp.max(jnp.abs(q_dot))
     speed = jnp.where(fastest == 0, 1.0, fastest)
-    tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
-
-    def flat(place: Array, q_dot: Array) -> Array:
-        value, (slope, momentum) = slopes(q + place * spread, q_dot)
-        # Changes of L over the reach can be compared between coordinates of any unit.
-        change = jnp.abs(slope) * spread
-        largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
-        return (change <= tolerance * largest) & jnp.isfinite(value)
-
+    # The same numbers at every call: the verdict must not depend on chance.
     steps = np.random.default_rng(0).uniform(-1, 1, (2, _PROBES, q.size))
     places, changes = jnp.asarray(steps, q.dtype)
     moving = q_dot[None] + changes * speed
     rates = jnp.stack([moving, jnp.zeros_like(moving)])
+
+    def flat(place: Array, q_dot: Array) -> Array:
+        return _is_flat(bound, q + place * spread, q_dot, spread)
+
     flat_at_places = jax.vmap(flat)
     return jnp.all(jax.vmap(flat_at_places, (None, 0))(places, rates), axis=(0, 1))
+
+
+def _is_flat(
+    lagrangian: _Bound, q: Array, q_dot: Array, spread: Array
+) -> Bool[Array, " n"]:
+    """Whether L does not change with each coordinate at a point, to rounding."""
+    value_and_slopes = jax.value_and_grad(lagrangian, argnums=(0, 1))
+    value, (slope, momentum) = value_and_slopes(q, q_dot)
+    # Changes of L over the reach can be compared between coordinates of any unit.
+    change = jnp.abs(slope) * spread
+    largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
+    tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
+    return (change <= tolerance * largest) & jnp.isfinite(value)

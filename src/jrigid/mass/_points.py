@@ -26,6 +26,11 @@ from jrigid.mass._body import MassProperties
 # of partial sums mend both.
 _LANES = 1024
 
+_NO_BOX = (
+    "Arguments `lower`, `upper` must be finite with `lower` < `upper`, but they are "
+    "not."
+)
+
 #: Indices of the entries of a symmetric matrix.
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -291,11 +296,8 @@ def from_density(
         )
     findings = Findings()
     box = jnp.stack([lower, upper])
-    message = (
-        "Arguments `lower`, `upper` must be finite with `lower` < `upper`, but they "
-        "are not."
-    )
-    findings.require(all_finite(box) & jnp.all(lower < upper), None, message, box)
+    is_box = all_finite(box) & jnp.all(lower < upper)
+    findings.require(is_box, None, _NO_BOX, box)
     lower, upper = harmless(findings.ok, (lower, upper))
     half = 0.5 * (upper - lower)
     nodes, weights = _quadrature(order, half.dtype)

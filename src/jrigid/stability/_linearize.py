@@ -202,7 +202,8 @@ class _Frame(NamedTuple):
         momentum along.
         """
         system, state, args, t0, *_ = self.motion
-        own, none = self.own, jnp.zeros(self.motion.dimension, rate.dtype)
+        own = self.own
+        none = jnp.zeros(self.motion.dimension, rate.dtype)
         # The axis of symmetry of the system in space.
         along = jnp.where(safe_norm(self.up) > 0, self.up, self.across)
         turned = none.at[:3].set(rotate_inverse(state.attitude, along))
@@ -258,7 +259,8 @@ def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
     rate = known(frame.rate(fixed))
     rests = rate == 0  # and nothing holds it: then it must not move at all
     rate = jnp.where(jnp.isfinite(rate) & ~rests, rate, 1.0)
-    units, accuracy = frame.units(rate), _accuracy(rate.dtype)
+    units = frame.units(rate)
+    accuracy = _accuracy(rate.dtype)
     size = units[None, :] / units[:, None] / rate
     largest = jnp.where(rests, 0.0, accuracy) * units * rate
     stays = jnp.all(jnp.abs(known(moves)) <= largest)
@@ -274,7 +276,9 @@ def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
 @eqx.filter_jit
 def _linearize(frame: _Frame) -> Linearization:
     findings, frame, matrix, rate = _looked_at(frame)
-    ok, units, accuracy = findings.ok, frame.units(rate), _accuracy(rate.dtype)
+    ok = findings.ok
+    units = frame.units(rate)
+    accuracy = _accuracy(rate.dtype)
     known = jax.lax.stop_gradient
     eye = jnp.eye(units.size, dtype=units.dtype)
     plain = jnp.where(ok, matrix * units[None, :] / units[:, None] / rate, eye)
