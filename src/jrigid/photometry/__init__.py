@@ -5,23 +5,31 @@ directions of the Sun and of the observer; the motion of the body turns these di
 in body axes. All functions are pure, and `jit`, `vmap` and derivatives of any order
 work. Vectors to the Sun and to the observer start at the body. They are in space axes
 where a state is given, and in body axes where a shape alone is. Bodies are convex:
-nothing here casts a shadow.
+nothing here casts a shadow. `find_tumblers` goes the other way: it finds the tumblers
+that explain light curves.
 """
 
+from jrigid.photometry._alias import Alias as Alias
+from jrigid.photometry._alias import Estimates as Estimates
 from jrigid.photometry._ellipsoid import Ellipsoid as Ellipsoid
 from jrigid.photometry._facets import Facets as Facets
 from jrigid.photometry._facets import facets_from_mesh as facets_from_mesh
 from jrigid.photometry._files import LightCurve as LightCurve
 from jrigid.photometry._files import read_light_curves as read_light_curves
 from jrigid.photometry._files import read_shape as read_shape
+from jrigid.photometry._inversion import Inversion as Inversion
+from jrigid.photometry._inversion import find_tumblers as find_tumblers
 from jrigid.photometry._light_curve import brightness as brightness
 from jrigid.photometry._light_curve import light_curve as light_curve
+from jrigid.photometry._periodogram import PeriodPairs as PeriodPairs
+from jrigid.photometry._periodogram import period_pairs as period_pairs
 from jrigid.photometry._pole import state_of_pole as state_of_pole
 from jrigid.photometry._scattering import AbstractScattering as AbstractScattering
 from jrigid.photometry._scattering import Geometric as Geometric
 from jrigid.photometry._scattering import Lambert as Lambert
 from jrigid.photometry._scattering import LommelSeeliger as LommelSeeliger
 from jrigid.photometry._scattering import Mixture as Mixture
+from jrigid.photometry._tumbler import Tumbler as Tumbler
 from jrigid.photometry._tumbling import Tumbling as Tumbling
 from jrigid.photometry._tumbling import omega_from_periods as omega_from_periods
 from jrigid.photometry._tumbling import tumbling as tumbling

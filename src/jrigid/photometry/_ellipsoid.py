@@ -28,6 +28,12 @@ class Ellipsoid(Readable):
         converter=lambda value: array_of_shape("semi_axes", value, (3,))
     )
 
+    @property
+    def moments(self) -> Vector:
+        """Principal moments of inertia of a homogeneous ellipsoid of mass 1 [m^2]."""
+        square = self.semi_axes**2
+        return (jnp.sum(square) - square) / 5
+
     def facets(self, rows: int = 64) -> Facets:
         """Triangles with their corners on the ellipsoid.
 
@@ -58,7 +64,7 @@ class Ellipsoid(Readable):
             f"brightness is known by that law alone, but it is {scattering!r}: take "
             "`shape.facets()`.",
         )
-        return _brightness(self.semi_axes, to_sun, to_observer)
+        return lommel_seeliger_brightness(self.semi_axes, to_sun, to_observer)
 
 
 def _sphere(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +90,9 @@ def _sphere(rows: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.concatenate(faces)
 
 
-def _brightness(semi_axes: Vector, to_sun: Vector, to_observer: Vector) -> Scalar:
+def lommel_seeliger_brightness(
+    semi_axes: Vector, to_sun: Vector, to_observer: Vector
+) -> Scalar:
     """Integral of mu0 mu / (mu0 + mu) over the lit and visible surface.
 
     A point of the ellipsoid is A n, with n on the unit sphere and A the diagonal matrix

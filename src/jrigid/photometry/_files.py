@@ -25,7 +25,9 @@ class LightCurve:
         brightness: At each time; of a relative curve only the ratios matter.
         to_sun: From the body to the Sun, space axes (DAMIT: the ecliptic) [m].
         to_observer: From the body to the observer, space axes [m].
-        is_relative: Whether the scale of the brightness is unknown.
+        is_relative: Whether the scale of the brightness is unknown. Curves that are not
+            relative have one scale, in each band.
+        band: Name of the filter.
     """
 
     epoch: float
@@ -34,6 +36,7 @@ class LightCurve:
     to_sun: Float[np.ndarray, "epochs 3"]
     to_observer: Float[np.ndarray, "epochs 3"]
     is_relative: bool
+    band: str = ""
 
 
 class _Lines:

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jrigid._checks import shaped
-from jrigid._types import ScalarLike
+from jrigid._types import Quaternion, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import from_axis_angle, multiply
 
@@ -41,9 +41,15 @@ def state_of_pole(
         period=(period,),
         angle=(angle,),
     )
-    _, y, z = jnp.eye(3, dtype=period.dtype)
-    tilted = multiply(
-        from_axis_angle(z, longitude), from_axis_angle(y, jnp.pi / 2 - latitude)
-    )
+    z = jnp.asarray([0.0, 0.0, 1.0], period.dtype)
+    tilted = attitude_of_pole(longitude, latitude)
     attitude = multiply(tilted, from_axis_angle(z, angle))
     return State(attitude, 2 * jnp.pi / period * z)
+
+
+def attitude_of_pole(longitude: Scalar, latitude: Scalar) -> Quaternion:
+    """Rotation that takes the z axis to a pole, and the x axis south of it."""
+    _, y, z = jnp.eye(3, dtype=longitude.dtype)
+    return multiply(
+        from_axis_angle(z, longitude), from_axis_angle(y, jnp.pi / 2 - latitude)
+    )

@@ -1,0 +1,207 @@
+"""One tumbler that explains light curves: its estimates, errors and evidence."""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._numerics import product
+from jrigid._types import AnyArray
+from jrigid.photometry._ellipsoid import Ellipsoid
+from jrigid.photometry._model import (
+    COUNT,
+    Geometry,
+    Mode,
+    Task,
+    axes_of_momentum,
+    geometry_of,
+    inverse_moments,
+    rows_of,
+    semi_axes,
+    sought,
+    unpacked,
+)
+from jrigid.photometry._readings import MAGNITUDE, Readings
+from jrigid.photometry._tumbler import Tumbler
+
+MODES = {
+    "principal-axis": Mode.principal_axis,
+    "short-axis": Mode.short_axis,
+    "long-axis": Mode.long_axis,
+}
+_NAMES = {mode: name for name, mode in MODES.items()}
+# Least eigenvalue of a scaled normal matrix: no error is more than this^-1/2 larger.
+_LEAST = 1e-15
+
+
+class Estimates(NamedTuple):
+    """What observers quote of a tumbler, or the standard errors of these.
+
+    Attributes:
+        precession_period: P_phi, or the period of a principal-axis rotation [s].
+        rotation_period: P_psi [s]; NaN for a principal-axis rotation.
+        longitude: Of the angular momentum, space axes [rad].
+        latitude: Of the angular momentum [rad].
+        energy_ratio: E/E0; 1 for a principal-axis rotation.
+        moments: Ratios I1/I3 and I2/I3; NaN for a principal-axis rotation.
+        axis_ratios: b/a and c/b of the ellipsoid.
+    """
+
+    precession_period: Float[AnyArray, ""]
+    rotation_period: Float[AnyArray, ""]
+    longitude: Float[AnyArray, ""]
+    latitude: Float[AnyArray, ""]
+    energy_ratio: Float[AnyArray, ""]
+    moments: Float[AnyArray, "2"]
+    axis_ratios: Float[AnyArray, "2"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alias:
+    """One tumbler that explains light curves.
+
+    Attributes:
+        tumbler: The body; its time 0 is at `Inversion.epoch`.
+        estimates: Its periods, pole, energy, moments and shape.
+        errors: Their standard errors, enlarged where chi-square is too large.
+        chi_square: Sum of squares of the residuals over the noise.
+        weight: Probability of this alias among those of the table.
+        residuals: Of each point of the curves, in their order [mag].
+        numbers: The numbers of the fit.
+        task: How they are read.
+        covariance: Of the numbers.
+    """
+
+    tumbler: Tumbler
+    estimates: Estimates
+    errors: Estimates
+    chi_square: float
+    weight: float
+    residuals: Float[np.ndarray, " epochs"]
+    numbers: Float[np.ndarray, " 11"] = dataclasses.field(repr=False)
+    task: Task = dataclasses.field(repr=False)
+    covariance: Float[np.ndarray, "11 11"] = dataclasses.field(repr=False)
+
+
+def alias_of(
+    numbers: np.ndarray, task: Task, readings: Readings, scale: float
+) -> Alias:
+    """One row of the table, without its weight."""
+    rows, slopes = rows_at(numbers, task, readings)
+    seeks = np.asarray(sought(task))
+    normal = np.asarray(slopes).T @ np.asarray(slopes)
+    covariance = np.zeros((COUNT, COUNT))
+    covariance[np.ix_(seeks, seeks)] = scale * _inverse(normal[np.ix_(seeks, seeks)])
+    span = np.asarray(readings.span)
+    estimates, of_numbers = _estimates_and_slopes(numbers, task, span)
+    errors = jax.tree.map(
+        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), of_numbers
+    )
+    there = readings.weights > 0
+    residuals = np.asarray(rows)[:-1][there] / (readings.weights[there] * MAGNITUDE)
+    return Alias(
+        tumbler=_tumbler(numbers, task, estimates),
+        estimates=jax.tree.map(np.asarray, estimates),
+        errors=errors,
+        chi_square=float(np.sum(np.asarray(rows) ** 2)),
+        weight=0.0,
+        residuals=-residuals,
+        numbers=numbers,
+        task=task,
+        covariance=covariance,
+    )
+
+
+rows_at = jax.jit(rows_of)
+
+
+def _inverse(normal: np.ndarray) -> np.ndarray:
+    """Inverse of a normal matrix, by its scale; infinite along what is not determined."""
+    size = np.sqrt(np.diag(normal))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    values = np.maximum(values, _LEAST)
+    return (vectors / values) @ vectors.T / np.outer(size, size)
+
+
+def log_evidence(alias: Alias, growth: float) -> float:
+    """Logarithm of the evidence of an alias, but for a constant, by Laplace's method.
+
+    All numbers have flat priors: cycles and angles, directions, ratios of axes. The
+    equation between the periods fixes the tilt.
+    """
+    seeks = np.asarray(sought(alias.task))
+    covariance = alias.covariance[np.ix_(seeks, seeks)]
+    size = np.sqrt(np.diag(covariance))
+    _, logarithm = np.linalg.slogdet(covariance / np.outer(size, size))
+    numbers = unpacked(alias.numbers)
+    spread = 0.5 * logarithm + np.sum(np.log(size))
+    of_directions = np.log(np.cos(numbers.pole[1]))
+    ratios = 1 / (1 + np.exp(-numbers.shape))
+    return float(
+        -growth / 2 + spread + of_directions + np.sum(np.log(ratios * (1 - ratios)))
+    )
+
+
+@jax.jit
+def _estimates_and_slopes(
+    numbers: Array, task: Task, span: Array
+) -> tuple[Estimates, Estimates]:
+    """Estimates and their derivatives in the numbers."""
+    estimates = functools.partial(_estimates, task=task, span=span)
+    return estimates(numbers), jax.jacfwd(estimates)(numbers)
+
+
+def _estimates(vector: Array, task: Task, span: Array) -> Estimates:
+    """What observers quote."""
+    numbers = unpacked(vector)
+    tumbles = task.mode != Mode.principal_axis
+    pole = product("ij,i->j", task.frame, axes_of_momentum(numbers.pole)[2])
+    logits = jnp.where(task.homogeneous, numbers.shape, numbers.inertia)
+    inverse = inverse_moments(semi_axes(logits), task.mode == Mode.long_axis)
+    tangent2 = jnp.exp(2 * jnp.where(tumbles, numbers.log_tangent[0], 0.0))
+    energy = (inverse[1] * tangent2 + inverse[2]) / (1 + tangent2)
+    moments = 1 / inverse_moments(semi_axes(logits), jnp.asarray(False))
+    return Estimates(
+        precession_period=span / numbers.cycles[0],
+        rotation_period=jnp.where(
+            tumbles, span / jnp.where(tumbles, numbers.cycles[1], 1.0), jnp.nan
+        ),
+        longitude=jnp.arctan2(pole[1], pole[0]),
+        latitude=jnp.arcsin(jnp.clip(pole[2], -1.0, 1.0)),
+        energy_ratio=jnp.where(tumbles, energy, 1.0),
+        moments=jnp.where(tumbles, moments[:2], jnp.nan),
+        axis_ratios=jax.nn.sigmoid(numbers.shape),
+    )
+
+
+def _tumbler(vector: np.ndarray, task: Task, estimates: Estimates) -> Tumbler:
+    """The body in space axes."""
+    numbers = unpacked(jnp.asarray(vector))
+    geometry = _geometry(vector, task)
+    pole = jnp.stack([estimates.longitude, estimates.latitude])
+    # The angle of precession counts from the axis that points south of the pole.
+    south = product("ij,kj->ik", geometry.to_momentum, axes_of_momentum(pole))[0]
+    angle = numbers.angles[0] + jnp.arctan2(south[1], south[0])
+    logits = numbers.shape if task.homogeneous else numbers.inertia
+    return Tumbler(
+        moments=1 / inverse_moments(semi_axes(logits), jnp.asarray(False)),
+        precession_period=estimates.precession_period,
+        rotation_period=estimates.rotation_period,
+        longitude=estimates.longitude,
+        latitude=estimates.latitude,
+        precession_angle=angle,
+        rotation_phase=numbers.angles[1] / (2 * jnp.pi),
+        shape=Ellipsoid(geometry.axes),
+        mode=_NAMES[Mode(int(task.mode))],
+    )
+
+
+@jax.jit
+def _geometry(vector: Array, task: Task) -> Geometry:
+    """The geometry of a lane."""
+    return geometry_of(unpacked(vector), task)

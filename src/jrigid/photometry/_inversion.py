@@ -1,0 +1,301 @@
+"""Inversion of light curves: every tumbler that explains them, with errors and weights."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jrigid._checks import check_option, demand, whole_number
+from jrigid._types import AnyArray
+from jrigid.photometry._alias import (
+    MODES,
+    Alias,
+    alias_of,
+    log_evidence,
+    rows_at,
+)
+from jrigid.photometry._files import LightCurve
+from jrigid.photometry._model import Task, sought
+from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._search import Found, search
+
+_INERTIA = ("homogeneous", "free")
+# Noise of the first search where none is given [mag]; what is left replaces it.
+_FIRST_NOISE = 0.02
+# A tumbler has up to ten numbers.
+_LEAST_POINTS = 12
+_HOUR = 3600.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Inversion:
+    """Tumblers that explain light curves, the best first: an alias table.
+
+    Attributes:
+        aliases: The tumblers whose chi-square is near the least one.
+        rejected: The best of the others.
+        epoch: Julian date of time 0 of the tumblers.
+        noise: Standard deviation of a point [mag], stated or found.
+        reduced_chi_square: Chi-square of the best alias over its degrees of freedom.
+        degrees_of_freedom: Points less unknown numbers.
+        follows: Whether the best alias follows the curves to their noise.
+        determined: Whether one tumbler alone explains the curves: the best one follows
+            them, and there is no other alias.
+    """
+
+    aliases: list[Alias]
+    rejected: list[Alias]
+    epoch: float
+    noise: float
+    reduced_chi_square: float
+    degrees_of_freedom: int
+    follows: bool
+    determined: bool
+    _span: float = dataclasses.field(repr=False)
+
+    def report(self) -> str:
+        """The table in words."""
+        return report_of(self)
+
+    def separation(
+        self, curves: Sequence[LightCurve], noise: float
+    ) -> Float[np.ndarray, "curves aliases"]:
+        """How well future light curves would tell the best alias from each other one.
+
+        Args:
+            curves: Light curves with the epochs and the geometry that are planned;
+                their brightness is not used.
+            noise: Standard deviation of a point [mag].
+
+        Returns:
+            Expected growth of chi-square of each alias if the best one is true, after
+            both are fitted again. Above 25 the curve decides; the best has 0.
+        """
+        return np.array(
+            [[_apart(self, x, curve, noise) for x in self.aliases] for curve in curves]
+        )
+
+
+def find_tumblers(
+    curves: Sequence[LightCurve],
+    noise: float | None = None,
+    *,
+    shortest: float,
+    longest: float,
+    modes: Sequence[str] = tuple(MODES),
+    inertia: str = "homogeneous",
+    pairs: int = 300,
+    threshold: float = 25.0,
+) -> Inversion:
+    """Find the tumbling ellipsoids that explain light curves.
+
+    Gradients do not find periods: chi-square has a minimum for each turn that is
+    counted wrongly. So pairs of periods come from a two-dimensional periodogram, a scan
+    tries shapes, phases and directions of the angular momentum for each pair and mode,
+    and Levenberg-Marquardt refines the best ones. Curves may be relative: their factors
+    are taken out exactly.
+
+    Args:
+        curves: Light curves, corrected for the light time.
+        noise: Standard deviation of a point [mag]. None: it is what the best tumbler
+            leaves, and a misfit cannot be seen.
+        shortest: Shortest period of precession or rotation [s].
+        longest: Longest period [s].
+        modes: Kinds of motion to try: "principal-axis", "short-axis", "long-axis".
+        inertia: "homogeneous": the moments are those of the ellipsoid. "free": they are
+            those of another ellipsoid, sought apart.
+        pairs: Pairs of periods that are tried.
+        threshold: Growth of chi-square up to which a tumbler is an alias, in units of
+            the reduced chi-square where that is above 1.
+
+    Returns:
+        The aliases. The shape is an ellipsoid by Lommel-Seeliger's law, of which the
+        longest semi-axis is 1. Ellipsoids look alike after half turns about their axes,
+        so orientations that differ by these are given once.
+
+    Raises:
+        ValueError: Curves or options from which nothing follows.
+
+    Source: the model of M. Kaasalainen, Astron. Astrophys. 376 (2001) 302, with the
+    exact motion in place of an integration.
+    """
+    check_option("inertia", inertia, _INERTIA)
+    for mode in modes:
+        check_option("modes", mode, tuple(MODES))
+    whole_number("pairs", pairs)
+    demand(
+        len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
+    )
+    points = sum(len(x.ts) for x in curves)
+    demand(
+        points >= _LEAST_POINTS,
+        f"Argument `curves` must hold at least {_LEAST_POINTS} points, but it holds "
+        f"{points}.",
+    )
+    stated = noise is not None
+    readings, epoch = readings_of(curves, noise if stated else _FIRST_NOISE)
+    span = float(readings.span)
+    found = search(
+        readings,
+        span / longest,
+        span / shortest,
+        [MODES[mode] for mode in modes],
+        inertia == "homogeneous",
+        pairs,
+    )
+    demand(
+        len(found.numbers) > 0,
+        "Arguments `shortest` and `longest` hold no motion of these modes.",
+    )
+    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
+    return _inversion(found, readings, epoch, points - factors, stated, threshold)
+
+
+def _inversion(
+    found: Found,
+    readings: Readings,
+    epoch: float,
+    points: int,
+    stated: bool,
+    threshold: float,
+) -> Inversion:
+    """The table of what a search found."""
+    tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
+    freedom = points - int(np.count_nonzero(sought(tasks[0])))
+    demand(
+        freedom > 0,
+        "Argument `curves` must hold more points than the tumbler has numbers, but it "
+        "does not.",
+    )
+    least = float(found.quadratic.chi_square[0])
+    reduced = least / freedom
+    scale = max(reduced, 1.0) if stated else reduced
+    every = []
+    for numbers, task in zip(found.numbers, tasks, strict=True):
+        every.append(alias_of(numbers, task, readings, scale))
+    growth = (found.quadratic.chi_square - least) / scale
+    near = int(np.count_nonzero(growth <= threshold))
+    logarithms = np.array(
+        [log_evidence(x, growth[i]) for i, x in enumerate(every[:near])]
+    )
+    weights = np.exp(logarithms - logarithms.max())
+    aliases = [
+        dataclasses.replace(alias, weight=float(weight))
+        for alias, weight in zip(every, weights / weights.sum(), strict=False)
+    ]
+    # Within the noise, chi-square has this spread.
+    follows = not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)
+    noise = 1 / (MAGNITUDE * float(readings.weights.max()))
+    return Inversion(
+        aliases=aliases,
+        rejected=every[near : near + 5],
+        epoch=epoch,
+        noise=noise if stated else noise * np.sqrt(reduced),
+        reduced_chi_square=reduced if stated else 1.0,
+        degrees_of_freedom=freedom,
+        follows=bool(follows),
+        determined=bool(near == 1 and follows),
+        _span=float(readings.span),
+    )
+
+
+def _apart(
+    inversion: Inversion, other: Alias, curve: LightCurve, noise: float
+) -> float:
+    """Expected growth of chi-square of another alias in a light curve to come.
+
+    The difference of the predictions is compared with the noise and with what both
+    predictions may still change by, each by its own covariance.
+    """
+    best = inversion.aliases[0]
+    readings, _ = readings_of([curve], noise)
+    day = 86400.0
+    shift = (curve.epoch - inversion.epoch) * day + curve.ts
+    ts = np.zeros_like(readings.ts)
+    ts[: len(shift)] = shift
+    readings = readings._replace(ts=ts, span=np.asarray(inversion._span))
+    first, of_first = (
+        np.asarray(x)[:-1] for x in rows_at(best.numbers, best.task, readings)
+    )
+    second, of_second = (
+        np.asarray(x)[:-1] for x in rows_at(other.numbers, other.task, readings)
+    )
+    spread = np.eye(len(first))
+    for slopes, alias in ((of_first, best), (of_second, other)):
+        spread = spread + slopes @ alias.covariance @ slopes.T
+    difference = second - first
+    return float(difference @ np.linalg.solve(spread, difference))
+
+
+def report_of(inversion: Inversion) -> str:
+    """The table of aliases in words."""
+    lines = [_verdict(inversion)]
+    for rank, alias in enumerate(inversion.aliases, 1):
+        lines += ["", *_described(rank, alias)]
+    if inversion.rejected:
+        best = inversion.aliases[0].chi_square
+        grown = inversion.rejected[0].chi_square - best
+        lines += [
+            "",
+            f"The next tumbler has a chi-square that is larger by {grown:.0f}.",
+        ]
+    return "\n".join(lines)
+
+
+def _verdict(inversion: Inversion) -> str:
+    """What the table says, in a sentence."""
+    count = len(inversion.aliases)
+    points = f"chi-square over {inversion.degrees_of_freedom} degrees of freedom"
+    value = f"{points} is {inversion.reduced_chi_square:.2f}"
+    if not inversion.follows:
+        return (
+            "No tumbler was found that follows the light curves to their noise: "
+            f"{value}. The noise is larger than stated, the body is no ellipsoid, or "
+            "its periods were not among the `pairs`."
+        )
+    if inversion.determined:
+        return f"One tumbler explains the light curves: {value}."
+    return (
+        f"{count} tumblers explain the light curves, which do not say which one is "
+        f"true: {value}."
+    )
+
+
+def _described(rank: int, alias: Alias) -> list[str]:
+    """One alias in words."""
+    x, error = alias.estimates, alias.errors
+    mode = alias.tumbler.mode
+    head = (
+        f"{rank}. {mode}, chi-square {alias.chi_square:.1f}, weight {alias.weight:.3f}"
+    )
+    periods = f"   P_phi {_hours(x.precession_period, error.precession_period)}"
+    if mode == "principal-axis":
+        periods = periods.replace("P_phi", "period")
+    else:
+        periods += f", P_psi {_hours(x.rotation_period, error.rotation_period)}"
+    pole = (
+        f"   angular momentum towards longitude {_degrees(x.longitude, error.longitude)}, "
+        f"latitude {_degrees(x.latitude, error.latitude)}"
+    )
+    shape = ", ".join(
+        f"{name} {value:.3f} +- {spread:.3f}"
+        for name, value, spread in zip(
+            ("b/a", "c/b"), x.axis_ratios, error.axis_ratios, strict=True
+        )
+    )
+    lines = [head, periods, pole, f"   {shape}"]
+    if mode != "principal-axis":
+        lines.append(f"   E/E0 {x.energy_ratio:.4f} +- {error.energy_ratio:.4f}")
+    return lines
+
+
+def _hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
+    """A period in hours with its error."""
+    digits = int(np.clip(1 - np.floor(np.log10(error / _HOUR)), 0, 9))
+    return f"{period / _HOUR:.{digits}f} +- {error / _HOUR:.{digits}f} h"
+
+
+def _degrees(angle: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
+    """An angle in degrees with its error."""
+    return f"{np.rad2deg(angle):.1f} +- {np.rad2deg(error):.1f} degrees"

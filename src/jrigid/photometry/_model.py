@@ -1,0 +1,235 @@
+"""Light curves of a tumbling ellipsoid in the numbers that a fit seeks."""
+
+import enum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from jrigid._numerics import product
+from jrigid._types import AnyArray, Matrix, Scalar, Vector
+from jrigid.photometry._ellipsoid import lommel_seeliger_brightness
+from jrigid.photometry._readings import Readings
+from jrigid.photometry._wobble import Wobble, body_axes, wobble
+
+
+class Mode(enum.IntEnum):
+    """Kinds of motion; the values are those that compiled programs are given."""
+
+    principal_axis = 0
+    short_axis = 1
+    long_axis = 2
+
+
+class Numbers(NamedTuple):
+    """What a fit seeks; leaves may have lanes in front.
+
+    Attributes:
+        cycles: Turns of precession and of rotation within the span.
+        angles: Mean angle of precession and phase of rotation at time 0 [rad].
+        pole: Longitude and latitude of the momentum, in the axes of the fit [rad].
+        log_tangent: Logarithm of the tangent of the largest tilt.
+        shape: Logits of the ratios b/a and c/b of the semi-axes.
+        inertia: The same of the homogeneous ellipsoid that has the moments of inertia.
+    """
+
+    cycles: Float[Array, "*lanes 2"]
+    angles: Float[Array, "*lanes 2"]
+    pole: Float[Array, "*lanes 2"]
+    log_tangent: Float[Array, "*lanes 1"]
+    shape: Float[Array, "*lanes 2"]
+    inertia: Float[Array, "*lanes 2"]
+
+
+COUNT = 11
+_SLICES = Numbers(
+    *(slice(i, j) for i, j in [(0, 2), (2, 4), (4, 6), (6, 7), (7, 9), (9, 11)])
+)
+
+
+def unpacked(vector: Float[AnyArray, "*lanes 11"]) -> Numbers:
+    """The numbers of a vector."""
+    return Numbers(*(vector[..., part] for part in _SLICES))
+
+
+class Task(NamedTuple):
+    """How the numbers of one lane are read.
+
+    Attributes:
+        frame: Axes of the fit, in which the pole is near the x axis; rows are their
+            directions in space.
+        mode: A `Mode`.
+        homogeneous: Whether the moments are those of the ellipsoid that is seen.
+        link: Weight of the equation between the periods, the tilt and the moments.
+    """
+
+    frame: Float[Array, "*lanes 3 3"]
+    mode: Int[Array, "*lanes"]
+    homogeneous: Bool[Array, "*lanes"]
+    link: Float[Array, "*lanes"]
+
+
+def sought(task: Task) -> Bool[Array, " 11"]:
+    """Which numbers a lane seeks; the others have no meaning there."""
+    tumbles = task.mode != Mode.principal_axis
+    always = jnp.ones(2, bool)
+    free = tumbles & ~task.homogeneous
+    one_of_two = jnp.stack([always[0], tumbles])
+    return jnp.concatenate(
+        Numbers(
+            cycles=one_of_two,
+            angles=one_of_two,
+            pole=always,
+            log_tangent=tumbles[None],
+            shape=always,
+            inertia=jnp.stack([free, free]),
+        )
+    )
+
+
+def semi_axes(logits: Float[Array, "2"]) -> Vector:
+    """Semi-axes of which the longest is 1, from logits of b/a and c/b."""
+    ratios = jax.nn.sigmoid(logits)
+    return jnp.stack([jnp.ones_like(ratios[0]), ratios[0], ratios[0] * ratios[1]])
+
+
+def inverse_moments(axes: Vector, long_axis: Bool[Array, ""]) -> Vector:
+    """1 / I of the axes other, middle, circled; that of the shortest semi-axis is 1."""
+    square = axes * axes
+    moments = jnp.sum(square) - square
+    inverse = moments[2] / moments
+    return jnp.where(long_axis, inverse[::-1], inverse)
+
+
+def motion_of(numbers: Numbers, task: Task) -> Wobble:
+    """The series of the motion; of a tumbler of no matter what for the others."""
+    tumbles = task.mode != Mode.principal_axis
+    logits = jnp.where(task.homogeneous, numbers.shape, numbers.inertia)
+    logits = jnp.where(tumbles, logits, 0.0)
+    log_tangent = jnp.where(tumbles, numbers.log_tangent[0], 0.0)
+    inverse = inverse_moments(semi_axes(logits), task.mode == Mode.long_axis)
+    return wobble(inverse, log_tangent)
+
+
+def gap_of_periods(numbers: Numbers, motion: Wobble, task: Task) -> Scalar:
+    """Logarithm of the ratio of the frequencies, over that of the motion."""
+    tumbles = task.mode != Mode.principal_axis
+    cycles = jnp.where(tumbles, numbers.cycles, 1.0)
+    sought = jnp.log(cycles[0]) - jnp.log(cycles[1])
+    given = jnp.log(motion.precession_rate) - jnp.log(motion.rotation_rate)
+    return jnp.where(tumbles, sought - given, 0.0)
+
+
+class Geometry(NamedTuple):
+    """What the brightness at all epochs depends on, computed once from the numbers.
+
+    Attributes:
+        cycles: Turns of precession and of rotation within the span.
+        angles: Mean angle of precession and phase of rotation at time 0 [rad].
+        motion: The series of the motion.
+        to_momentum: Rotation from space axes to axes with z along the momentum.
+        axes: The semi-axes.
+    """
+
+    cycles: Float[Array, "2"]
+    angles: Float[Array, "2"]
+    motion: Wobble
+    to_momentum: Matrix
+    axes: Vector
+
+
+def geometry_of(numbers: Numbers, task: Task) -> Geometry:
+    """The geometry of a lane."""
+    return Geometry(
+        cycles=numbers.cycles,
+        angles=numbers.angles,
+        motion=motion_of(numbers, task),
+        to_momentum=product("ij,jk->ik", axes_of_momentum(numbers.pole), task.frame),
+        axes=semi_axes(numbers.shape),
+    )
+
+
+def axes_of_momentum(pole: Float[Array, "2"]) -> Matrix:
+    """Axes with z along the momentum, rows, for its longitude and latitude."""
+    cosines = jnp.cos(pole)
+    sines = jnp.sin(pole)
+    zero = jnp.zeros_like(sines[0])
+    south = jnp.stack([sines[1] * cosines[0], sines[1] * sines[0], -cosines[1]])
+    east = jnp.stack([-sines[0], cosines[0], zero])
+    along = jnp.stack([cosines[1] * cosines[0], cosines[1] * sines[0], sines[1]])
+    return jnp.stack([south, east, along])
+
+
+def directions_of_axes(geometry: Geometry, mode: Array, time: Scalar) -> Matrix:
+    """Directions of the body axes at a time in spans, in axes with z along the momentum.
+
+    Row i is the direction of axis i.
+    """
+    angles = 2 * jnp.pi * geometry.cycles * time + geometry.angles
+    tumbling = body_axes(geometry.motion, angles[1], angles[0])
+    # A long-axis mode circles x, and y is turned so that the axes stay right-handed.
+    about_x = tumbling[::-1] * jnp.asarray([[1.0], [-1.0], [1.0]], tumbling.dtype)
+    tumbling = jnp.where(mode == Mode.long_axis, about_x, tumbling)
+    cosine = jnp.cos(angles[0])
+    sine = jnp.sin(angles[0])
+    zero = jnp.zeros_like(sine)
+    steady = jnp.stack(
+        [
+            jnp.stack([cosine, sine, zero]),
+            jnp.stack([-sine, cosine, zero]),
+            jnp.stack([zero, zero, zero + 1]),
+        ]
+    )
+    return jnp.where(mode == Mode.principal_axis, steady, tumbling)
+
+
+def log_brightness(
+    geometry: Geometry, mode: Array, time: Scalar, to_sun: Vector, to_observer: Vector
+) -> Scalar:
+    """Logarithm of the brightness at a time in spans, for directions in space."""
+    axes = directions_of_axes(geometry, mode, time)
+    body = product("ij,jk->ik", axes, geometry.to_momentum)
+    sun = product("ij,j->i", body, to_sun)
+    observer = product("ij,j->i", body, to_observer)
+    return jnp.log(lommel_seeliger_brightness(geometry.axes, sun, observer))
+
+
+class Rows(NamedTuple):
+    """Residuals over the noise, the gap between the periods last, and their slopes."""
+
+    residuals: Float[Array, " rows"]
+    slopes: Float[Array, "rows 11"]
+
+
+def rows_of(vector: Float[Array, "11"], task: Task, readings: Readings) -> Rows:
+    """Readings less the model, and derivatives in the numbers.
+
+    Reverse mode gives the derivatives of one epoch in the geometry, and forward mode
+    those of the geometry in the numbers: together they cost half of forward mode alone.
+    """
+
+    def of_vector(x: Array) -> tuple[Array, Array]:
+        numbers = unpacked(x)
+        geometry = geometry_of(numbers, task)
+        flat, _ = ravel_pytree(geometry)
+        gap = task.link * gap_of_periods(numbers, geometry.motion, task)
+        return flat, gap
+
+    flat, gap = of_vector(vector)
+    flat_slopes, gap_slopes = jax.jacfwd(of_vector)(vector)
+    _, restored = ravel_pytree(geometry_of(unpacked(vector), task))
+
+    def of_epoch(flat: Array, time: Array, sun: Array, observer: Array) -> Array:
+        return log_brightness(restored(flat), task.mode, time, sun, observer)
+
+    each = jax.vmap(jax.value_and_grad(of_epoch), (None, 0, 0, 0))
+    times = readings.ts / readings.span
+    model, slopes = each(flat, times, readings.to_sun, readings.to_observer)
+    slopes = product("eg,gn->en", slopes, flat_slopes)
+    projected = jax.vmap(readings.projected, -1, -1)(slopes)
+    return Rows(
+        residuals=jnp.append(readings.values - readings.projected(model), gap),
+        slopes=jnp.concatenate([-projected, gap_slopes[None]]),
+    )

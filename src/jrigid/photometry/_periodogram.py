@@ -1,0 +1,197 @@
+"""Pairs of periods that may explain light curves, by Fourier series in two frequencies."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import demand
+from jrigid._numerics import product
+from jrigid._types import Scalar
+from jrigid.photometry._files import LightCurve
+from jrigid.photometry._readings import Readings, readings_of
+
+# Frequencies in one resolution element, 1 over the span.
+_OVERSAMPLING = 4
+# Strongest lines of the ordinary periodogram of which one must be a line of the pair.
+_LINES = 10
+# Lines k f_phi + m f_psi that are the strongest ones of tumblers. An ellipsoid looks the
+# same after half a turn about each of its axes, so m is even.
+_STRONGEST = ((2, 0), (2, -2), (2, 2), (1, -2), (1, 2), (1, 0))
+# Lines of the series that is fitted for a pair.
+_SERIES = ((0, 2), (1, -2), (1, 0), (1, 2), (2, -2), (2, 0), (2, 2))
+_LINE = ((1,),)
+# Two candidates this many resolution elements apart are one.
+_APART = 0.5
+# Added to the diagonal of the normal equations, as a fraction of its mean: some series
+# hold the same line twice.
+_RIDGE = 1e-4
+_LANES = 64  # series fitted at once
+_BLOCK = 4096  # candidates in a call, so that a search compiles one program
+
+
+class PeriodPairs(NamedTuple):
+    """Pairs of periods, the best first.
+
+    Attributes:
+        precession_period: P_phi [s].
+        rotation_period: P_psi [s].
+        explained: Fraction of the variance of the light curves that a Fourier series
+            with these periods explains.
+    """
+
+    precession_period: Float[np.ndarray, " pairs"]
+    rotation_period: Float[np.ndarray, " pairs"]
+    explained: Float[np.ndarray, " pairs"]
+
+
+def period_pairs(
+    curves: Sequence[LightCurve],
+    shortest: float,
+    longest: float,
+    *,
+    count: int = 60,
+) -> PeriodPairs:
+    """Pairs of periods of a tumbler by a two-dimensional periodogram.
+
+    A light curve of a tumbler is a Fourier series in its two frequencies. One of the
+    strongest lines of the ordinary periodogram is taken for one of the lines 2 f_phi,
+    2 (f_phi - f_psi) and others; the second frequency is then sought on a grid.
+
+    Args:
+        curves: Light curves, relative or absolute.
+        shortest: Shortest period [s].
+        longest: Longest period [s].
+        count: How many pairs are returned at most.
+
+    Returns:
+        The pairs, with unlike frequencies. Sampling by night, and frequencies that
+        differ by f_psi, give many pairs that explain the curves about as well:
+        `find_tumblers` tells them apart by the physics.
+
+    Raises:
+        ValueError: Curves without a point, or periods out of order.
+
+    Source: P. Pravec et al., Icarus 173 (2005) 108, section 3.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> ts = jnp.linspace(0.0, 1e6, 300)
+    >>> # a line at 2 (f_phi - f_psi) and one at 2 f_phi
+    >>> wave = 0.1 * jnp.cos(4 * jnp.pi * ts / 3e4) + 0.03 * jnp.cos(4 * jnp.pi * ts / 2e4)
+    >>> far = jnp.ones((300, 3))
+    >>> curve = jr.photometry.LightCurve(0.0, ts, 10**(-0.4 * wave), far, far, True)
+    >>> pairs = jr.photometry.period_pairs([curve], 1e4, 1e5, count=5)
+    >>> print(pairs.explained.round(2).max())
+    1.0
+    """
+    readings, _ = readings_of(curves, noise=0.01)
+    span = float(readings.span)
+    pairs, powers = frequency_pairs(readings, span / longest, span / shortest, count)
+    explained = powers / float(np.sum(readings.values**2))
+    return PeriodPairs(span / pairs[:, 0], span / pairs[:, 1], explained)
+
+
+def frequency_pairs(
+    readings: Readings, lowest: float, highest: float, count: int
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, " pairs"]]:
+    """Pairs of frequencies, in cycles within the span, and chi-square they explain."""
+    demand(
+        0 < lowest < highest,
+        "Arguments `shortest` and `longest` must be periods in this order.",
+    )
+    lines, _ = strongest_lines(readings, lowest, highest)
+    step = 1 / _OVERSAMPLING
+    rotation = np.arange(max(lowest, 0.5), highest, step)
+    rows = []
+    for line in lines:
+        for k, m in _STRONGEST:
+            precession = (line - m * rotation) / k
+            inside = (precession > lowest) & (precession < highest)
+            rows.append(np.stack([precession[inside], rotation[inside]], axis=1))
+    pairs = np.concatenate(rows)
+    powers = _in_blocks(_SERIES, readings, pairs)
+    chosen = unlike(pairs, powers, _APART, count)
+    return pairs[chosen], powers[chosen]
+
+
+def strongest_lines(
+    readings: Readings, lowest: float, highest: float
+) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Lines of the ordinary periodogram, in cycles within the span, and their power."""
+    frequencies = np.arange(2 * max(lowest, 1.0), 4 * highest, 1 / _OVERSAMPLING)
+    powers = _in_blocks(_LINE, readings, frequencies[:, None])
+    chosen = unlike(frequencies[:, None], powers, 1.0, _LINES)
+    return frequencies[chosen], powers[chosen]
+
+
+def unlike(
+    places: Float[np.ndarray, "many n"],
+    merits: Float[np.ndarray, " many"],
+    apart: float,
+    count: int,
+) -> list[int]:
+    """Indices of the places of most merit that are apart from all better ones."""
+    chosen: list[int] = []
+    for index in np.argsort(-merits):
+        gaps = np.abs(places[index] - places[chosen]).max(axis=1)
+        if np.all(gaps > apart):
+            chosen.append(int(index))
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def _in_blocks(
+    series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: np.ndarray
+) -> Float[np.ndarray, " many"]:
+    """What a series explains for each row of frequencies, by a program of one size."""
+    powers = []
+    for first in range(0, len(frequencies), _BLOCK):
+        block = frequencies[first : first + _BLOCK]
+        missing = _BLOCK - len(block)
+        block = np.pad(block, ((0, missing), (0, 0)), mode="edge")
+        powers.append(np.asarray(_powers(series, readings, block))[: _BLOCK - missing])
+    return np.concatenate(powers)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _powers(
+    series: tuple[tuple[int, ...], ...],
+    readings: Readings,
+    frequencies: Float[Array, "many n"],
+) -> Float[Array, " many"]:
+    """What a series explains for each row of frequencies, some at a time."""
+    one = functools.partial(_power, series, readings)
+    return jax.lax.map(one, frequencies, batch_size=_LANES)
+
+
+def _power(
+    series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: Array
+) -> Scalar:
+    """The part of chi-square that a Fourier series explains.
+
+    Single precision suffices to find candidates, and takes half the time.
+    """
+    turns = jnp.outer(readings.ts / readings.span, frequencies)
+    # Whole turns are taken off in double precision.
+    angles = (2 * jnp.pi * (turns - jnp.round(turns))).astype(jnp.float32)
+    lines = product("en,ln->el", angles, jnp.asarray(series, jnp.float32))
+    weights = readings.weights.astype(jnp.float32)
+    columns = jnp.concatenate([jnp.cos(lines), jnp.sin(lines)], axis=1)
+    columns = columns * weights[:, None]
+    basis = readings.basis.astype(jnp.float32)
+    inside = product("ef,ec->fc", basis, columns)
+    # The values have no part along the basis already.
+    slope = product("ec,e->c", columns, readings.values.astype(jnp.float32))
+    normal = product("ec,ed->cd", columns, columns) - product(
+        "fc,fd->cd", inside, inside
+    )
+    ridge = _RIDGE * jnp.trace(normal) / len(normal)
+    factor = jax.scipy.linalg.cho_factor(
+        normal + ridge * jnp.eye(len(normal), dtype=jnp.float32)
+    )
+    return product("c,c->", slope, jax.scipy.linalg.cho_solve(factor, slope))

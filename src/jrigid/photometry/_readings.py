@@ -1,0 +1,126 @@
+"""Light curves as a fit takes them: one whitened vector, and what the model cannot say."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import demand
+from jrigid._numerics import product
+from jrigid._types import AnyArray
+from jrigid.photometry._files import LightCurve
+
+# Natural logarithm of the brightness in one magnitude.
+MAGNITUDE = 0.4 * np.log(10.0)
+_DAY = 86400.0
+EPOCHS = 128  # arrays are filled up to whole blocks of epochs
+_FACTORS = 16  # and of unknown factors
+
+
+class Readings(NamedTuple):
+    """Logarithms of the brightness of all curves, over their noise.
+
+    Each relative curve has an unknown factor, and calibrated curves share one. They
+    are a part of the model that is linear, and a projection removes them exactly.
+
+    Rows without weight and columns of zeros fill the arrays up to a few sizes, so that
+    one compiled program serves many sets of curves.
+
+    Attributes:
+        ts: Times since the middle of the observations [s].
+        to_sun: Unit vectors to the Sun, space axes.
+        to_observer: Unit vectors to the observer, space axes.
+        values: Logarithm of the brightness over the noise, projected.
+        weights: 1 over the noise of the logarithm.
+        basis: Orthonormal columns that span what the projection removes.
+        span: Time from the first epoch to the last [s].
+    """
+
+    ts: Float[AnyArray, " epochs"]
+    to_sun: Float[AnyArray, "epochs 3"]
+    to_observer: Float[AnyArray, "epochs 3"]
+    values: Float[AnyArray, " epochs"]
+    weights: Float[AnyArray, " epochs"]
+    basis: Float[AnyArray, "epochs factors"]
+    span: Float[AnyArray, ""]
+
+    def projected(self, logarithms: Float[Array, " epochs"]) -> Float[Array, " epochs"]:
+        """Logarithms over the noise, without the unknown factors."""
+        whitened = logarithms * self.weights
+        return whitened - self.factors(whitened)
+
+    def factors(self, whitened: Float[Array, " epochs"]) -> Float[Array, " epochs"]:
+        """The part of a whitened vector that unknown factors explain."""
+        return product("ef,f->e", self.basis, product("ef,e->f", self.basis, whitened))
+
+
+def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, float]:
+    """All curves in one vector.
+
+    Args:
+        curves: At least one, with three points or more in all.
+        noise: Standard deviation of each point [mag].
+
+    Returns:
+        The readings, and the Julian date of their time 0.
+
+    Raises:
+        ValueError: Curves from which nothing follows.
+    """
+    demand(
+        len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
+    )
+    epoch = curves[0].epoch
+    ts = np.concatenate([x.ts + (x.epoch - epoch) * _DAY for x in curves])
+    middle = (ts.min() + ts.max()) / 2
+    brightness = np.concatenate([x.brightness for x in curves])
+    demand(
+        bool(np.all(np.isfinite(brightness) & (brightness > 0))),
+        "Argument `curves` must hold positive brightness, but a point is not positive.",
+    )
+    weights = np.full(len(ts), 1 / (noise * MAGNITUDE))
+    basis = _basis(curves, weights)
+    whitened = np.log(brightness) * weights
+    readings = Readings(
+        ts=ts - middle,
+        to_sun=_unit(np.concatenate([x.to_sun for x in curves])),
+        to_observer=_unit(np.concatenate([x.to_observer for x in curves])),
+        values=whitened - basis @ (basis.T @ whitened),
+        weights=weights,
+        basis=basis,
+        span=np.asarray(np.ptp(ts)),
+    )
+    return filled(readings), epoch + middle / _DAY
+
+
+def filled(readings: Readings) -> Readings:
+    """The readings, filled up to whole blocks of epochs and of factors."""
+    count, factors = readings.basis.shape
+    rows = -count % EPOCHS
+    basis = np.pad(readings.basis, ((0, rows), (0, -factors % _FACTORS)))
+    return Readings(
+        ts=np.pad(readings.ts, (0, rows)),
+        # A row without weight still needs directions.
+        to_sun=np.pad(readings.to_sun, ((0, rows), (0, 0)), mode="edge"),
+        to_observer=np.pad(readings.to_observer, ((0, rows), (0, 0)), mode="edge"),
+        values=np.pad(readings.values, (0, rows)),
+        weights=np.pad(readings.weights, (0, rows)),
+        basis=basis,
+        span=readings.span,
+    )
+
+
+def _basis(curves: Sequence[LightCurve], weights: np.ndarray) -> np.ndarray:
+    """Orthonormal columns for the factor of each relative curve and of all others."""
+    keys = [(x.band, index if x.is_relative else -1) for index, x in enumerate(curves)]
+    known = sorted(set(keys))
+    of_curve = np.array([known.index(key) for key in keys])
+    of_point = np.repeat(of_curve, [len(x.ts) for x in curves])
+    columns = (of_point[:, None] == np.arange(len(known))) * weights[:, None]
+    return columns / np.linalg.norm(columns, axis=0)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors over their lengths."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -1,0 +1,136 @@
+"""Chi-square of many tumblers at once: where a search begins.
+
+A scan looks at one block of epochs: more do not change which starting points are best.
+
+The motion of a lane serves all directions of the momentum in space and all angles of
+precession, since these only turn the directions of the Sun and of the observer.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial.transform import Rotation
+
+from jrigid._numerics import product
+from jrigid._types import Vector
+from jrigid.photometry._ellipsoid import lommel_seeliger_brightness
+from jrigid.photometry._model import (
+    Task,
+    directions_of_axes,
+    geometry_of,
+    unpacked,
+)
+from jrigid.photometry._readings import EPOCHS, Readings, filled
+
+_POLES = 24
+_ANGLES = 8
+_LANES = 4  # motions at once: each has all directions as lanes of its own
+_KEPT = 2  # best directions of each motion
+# Of a column of the basis, in the epochs that were chosen; its size in all is 1.
+_LEAST_SIZE = 1e-9
+
+
+class Directions(NamedTuple):
+    """Best orientations of each lane: chi-square, and the index of the orientation."""
+
+    chi_square: Float[np.ndarray, "lanes kept"]
+    index: Int[np.ndarray, "lanes kept"]
+
+
+def orientations() -> Float[np.ndarray, "many 3 3"]:
+    """Axes with z along the momentum, rows in space: even poles, and turns about them."""
+    index = np.arange(_POLES) + 0.5
+    latitude = np.arcsin(1 - 2 * index / _POLES)
+    longitude = np.pi * (1 + 5**0.5) * index
+    turns = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    angles = [
+        (b, np.pi / 2 - a, turn)
+        for a, b in zip(latitude, longitude, strict=True)
+        for turn in turns
+    ]
+    return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
+
+
+def fewer_epochs(readings: Readings) -> Readings:
+    """One block of the readings, evenly chosen, with the basis of their own."""
+    there = np.flatnonzero(readings.weights)
+    even = np.linspace(0, len(there) - 1, min(EPOCHS, len(there)))
+    chosen = there[even.astype(int)]
+    left, sizes, _ = np.linalg.svd(readings.basis[chosen], full_matrices=False)
+    basis = left * (sizes > _LEAST_SIZE)
+    values = readings.values[chosen]
+    few = Readings(
+        ts=readings.ts[chosen],
+        to_sun=readings.to_sun[chosen],
+        to_observer=readings.to_observer[chosen],
+        values=values - basis @ (basis.T @ values),
+        weights=readings.weights[chosen],
+        basis=basis,
+        span=readings.span,
+    )
+    return filled(few)
+
+
+@jax.jit
+def best_orientations(
+    numbers: Float[Array, "lanes 11"],
+    tasks: Task,
+    turned: Float[Array, "many 3 3"],
+    readings: Readings,
+) -> tuple[Float[Array, "lanes kept"], Int[Array, "lanes kept"]]:
+    """Chi-square of the best orientations of each lane, in single precision.
+
+    Args:
+        numbers: Their poles and angles of precession are not used.
+        tasks: One for each lane; the frame is not used.
+        turned: Orientations to try.
+        readings: A part of the light curves.
+    """
+    to_sun = product("dij,ej->dei", turned, readings.to_sun).astype(jnp.float32)
+    to_observer = product("dij,ej->dei", turned, readings.to_observer)
+    to_observer = to_observer.astype(jnp.float32)
+    few = jax.tree.map(lambda x: x.astype(jnp.float32), readings)
+    times = readings.ts / readings.span
+
+    def of_lane(lane: tuple[Array, Task]) -> tuple[Array, Array]:
+        vector, task = lane
+        geometry = geometry_of(unpacked(vector), task)
+        of_time = functools.partial(directions_of_axes, geometry, task.mode)
+        axes = jax.vmap(of_time)(times).astype(jnp.float32)
+        semi_axes = geometry.axes.astype(jnp.float32)
+        each = functools.partial(_chi_square, semi_axes, axes, few)
+        values = jax.vmap(each)(to_sun, to_observer)
+        values = jnp.where(jnp.isfinite(values), values, jnp.inf)
+        best, index = jax.lax.top_k(-values, _KEPT)
+        return -best, index
+
+    return jax.lax.map(of_lane, (numbers, tasks), batch_size=_LANES)
+
+
+def _chi_square(
+    semi_axes: Vector,
+    axes: Float[Array, "epochs 3 3"],
+    readings: Readings,
+    to_sun: Float[Array, "epochs 3"],
+    to_observer: Float[Array, "epochs 3"],
+) -> Float[Array, ""]:
+    """Chi-square of one orientation."""
+    sun = jnp.einsum("eij,ej->ei", axes, to_sun)
+    observer = jnp.einsum("eij,ej->ei", axes, to_observer)
+    each = jax.vmap(lommel_seeliger_brightness, (None, 0, 0))
+    rows = readings.values - readings.projected(jnp.log(each(semi_axes, sun, observer)))
+    return jnp.sum(rows * rows)
+
+
+def frame_of(turned: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Axes of a fit for an orientation: its pole lies on the x axis.
+
+    With longitude, latitude and angle of precession 0 in these axes the body has the
+    given orientation.
+    """
+    # Longitude 0 and latitude 0 put the axis "south" along -z and "along" along x.
+    return np.stack([turned[2], turned[1], -turned[0]])

@@ -1,0 +1,134 @@
+"""A free body and its surface: everything that its light curves depend on."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jrigid._checks import array_of_shape, check_option
+from jrigid._types import Readable, Real
+from jrigid.dynamics import State
+from jrigid.free import free_rotation
+from jrigid.photometry._ellipsoid import Ellipsoid
+from jrigid.photometry._facets import Facets
+from jrigid.photometry._light_curve import light_curve
+from jrigid.photometry._pole import attitude_of_pole, state_of_pole
+from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
+from jrigid.photometry._tumbling import omega_from_periods
+from jrigid.rotation import from_axis_angle, multiply
+
+MODES = ("short-axis", "long-axis", "principal-axis")
+
+
+def _field(name: str, *shape: int) -> Any:  # to a type checker, its value
+    """A field of one shape."""
+    return eqx.field(converter=lambda value: array_of_shape(name, value, shape))
+
+
+class Tumbler(Readable):
+    """A free body in the terms of observers: its motion, its shape and its surface.
+
+    Body axes are the principal axes of inertia: x has the smallest moment, z the
+    largest.
+
+    Attributes:
+        moments: Principal moments in rising order; only their ratios matter.
+        precession_period: P_phi [s]. In the mode "principal-axis", the period of the
+            rotation.
+        rotation_period: P_psi [s]. It has no meaning in the mode "principal-axis".
+        longitude: Of the angular momentum, space axes [rad].
+        latitude: Of the angular momentum, space axes [rad].
+        precession_angle: Mean angle of the precession at time 0 [rad].
+        rotation_phase: Fraction of P_psi since the tilt was largest, at time 0.
+        shape: `Facets` or an `Ellipsoid`, body axes.
+        scattering: The scattering law.
+        mode: "short-axis", "long-axis" or "principal-axis", the steady rotation about
+            the axis of the largest moment.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> shape = jr.photometry.Ellipsoid(jnp.array([3.0, 2.0, 1.5]))
+    >>> body = jr.photometry.Tumbler(
+    ...     shape.moments, 27.4 * 3600, 263 * 3600, 4.0, -1.3, 0.0, 0.0, shape)
+    >>> terms = jr.photometry.tumbling(body.moments, body.state.omega)
+    >>> print((terms.precession_period / 3600).round(6))
+    27.4
+    """
+
+    moments: Float[Array, "3"] = _field("moments", 3)
+    precession_period: Float[Array, ""] = _field("precession_period")
+    rotation_period: Float[Array, ""] = _field("rotation_period")
+    longitude: Float[Array, ""] = _field("longitude")
+    latitude: Float[Array, ""] = _field("latitude")
+    precession_angle: Float[Array, ""] = _field("precession_angle")
+    rotation_phase: Float[Array, ""] = _field("rotation_phase")
+    shape: Facets | Ellipsoid
+    scattering: AbstractScattering = LommelSeeliger()
+    mode: str = eqx.field(static=True, default="short-axis")
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for a mode that does not exist."""
+        check_option("mode", self.mode, MODES)
+
+    @property
+    def state(self) -> State:
+        """The state at time 0.
+
+        NaN where no motion of this mode has these periods.
+        """
+        if self.mode == "principal-axis":
+            return state_of_pole(
+                self.longitude,
+                self.latitude,
+                self.precession_period,
+                self.precession_angle,
+            )
+        x, _, z = jnp.eye(3, dtype=self.moments.dtype)
+        omega = omega_from_periods(
+            self.moments, self.precession_period, self.rotation_period, self.mode
+        )
+        # The momentum lies in the plane of the circled axis and of the middle one.
+        momentum = self.moments * omega
+        if self.mode == "short-axis":
+            tilt = jnp.arctan2(momentum[1], momentum[2])
+            upright = from_axis_angle(x, tilt)
+        else:
+            omega = omega * jnp.asarray([1.0, -1.0, 1.0], omega.dtype)
+            tilt = jnp.arctan2(momentum[1], momentum[0])
+            half = jnp.sqrt(jnp.asarray(0.5, omega.dtype))
+            swap = jnp.stack([0 * half, half, 0 * half, half])  # x to z, y to -y
+            upright = multiply(from_axis_angle(x, tilt), swap)
+        elapsed = self.rotation_phase * self.rotation_period
+        start = State(upright, omega)
+        later = free_rotation(self.moments, start, elapsed[None], throw=False)
+        # The mean precession of that time is not a part of the angle.
+        back = 2 * jnp.pi * elapsed / self.precession_period
+        turned = multiply(
+            from_axis_angle(z, self.precession_angle - back), later.attitude[0]
+        )
+        tilted = attitude_of_pole(self.longitude, self.latitude)
+        return State(multiply(tilted, turned), later.omega[0])
+
+    def light_curve(
+        self,
+        ts: Real[ArrayLike, " epochs"],
+        to_sun: Real[ArrayLike, "epochs 3"],
+        to_observer: Real[ArrayLike, "epochs 3"],
+    ) -> Float[Array, " epochs"]:
+        """Brightness at unit distances [m^2], as by `photometry.light_curve`.
+
+        Args:
+            ts: Times [s] at the body: light times are taken off.
+            to_sun: Vectors from the body to the Sun, space axes.
+            to_observer: Vectors from the body to the observer, space axes.
+        """
+        return light_curve(
+            self.moments,
+            self.state,
+            ts,
+            to_sun,
+            to_observer,
+            self.shape,
+            self.scattering,
+            light_time=False,
+        )

@@ -1,0 +1,240 @@
+"""Inversion of light curves: tumblers made by other code are found."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tumbler_reference
+
+import jrigid as jr
+from jrigid import photometry as ph
+from jrigid.photometry import _model as model
+from jrigid.photometry import _readings as readings
+from jrigid.photometry import _wobble as wobble
+
+HOUR = 3600.0
+SEMI_AXES = jnp.array([1.0, 0.7, 0.45])
+
+
+def body(mode, **changes):
+    """A tumbler with the periods of Apophis, or with those of a cigar."""
+    shape = ph.Ellipsoid(SEMI_AXES)
+    rotation = 60.0 if mode == "short-axis" else 40.0
+    values = {
+        "moments": shape.moments,
+        "precession_period": 12.0 * HOUR,
+        "rotation_period": rotation * HOUR,
+        "longitude": 1.0,
+        "latitude": -0.4,
+        "precession_angle": 0.3,
+        "rotation_phase": 0.2,
+        "shape": shape,
+        "mode": mode,
+    }
+    return ph.Tumbler(**values | changes)
+
+
+@pytest.mark.parametrize("long_axis", [False, True])
+@pytest.mark.parametrize("log_tangent", [-2.0, 0.0, 1.0])
+def test_the_series_are_the_exact_motion(long_axis, log_tangent):
+    inverse = model.inverse_moments(SEMI_AXES, jnp.asarray(long_axis))
+    motion = wobble.wobble(inverse, jnp.asarray(log_tangent))
+    ts = jnp.linspace(0.0, 300.0, 9)
+    axes = jax.vmap(wobble.body_axes, (None, 0, 0))(
+        motion, motion.rotation_rate * ts, motion.precession_rate * ts
+    )
+    moments = 1 / inverse
+    start = jnp.stack([motion.first * 0, motion.second]).sum(axis=1)
+    momentum = start.at[0].set(0.0)
+    momentum = jnp.stack(
+        [momentum[0], momentum[1], jnp.cos(jnp.arctan(jnp.exp(log_tangent)))]
+    )
+    # The axis of the largest moment may be the third or the first by the new names, so
+    # the motion of these axes is that of a body with moments in this order.
+    attitude = jr.rotation.from_matrix(axes[0].T)
+    state = jr.State(attitude, momentum / moments)
+    exact = jr.free_rotation(moments, state, ts)
+    expected = jax.vmap(jr.rotation.to_matrix)(exact.attitude).transpose(0, 2, 1)
+    np.testing.assert_allclose(axes, expected, atol=3e-5)
+
+
+@pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
+def test_a_tumbler_has_the_periods_and_the_pole_that_it_is_given(mode):
+    tumbler = body(mode)
+    terms = ph.tumbling(tumbler.moments, tumbler.state.omega)
+    np.testing.assert_allclose(terms.precession_period, 12.0 * HOUR, rtol=1e-12)
+    np.testing.assert_allclose(
+        terms.rotation_period, tumbler.rotation_period, rtol=1e-12
+    )
+    momentum = jr.rotation.rotate(
+        tumbler.state.attitude, tumbler.moments * tumbler.state.omega
+    )
+    pole = momentum / jnp.linalg.norm(momentum)
+    expected = [np.cos(1.0) * np.cos(0.4), np.sin(1.0) * np.cos(0.4), -np.sin(0.4)]
+    np.testing.assert_allclose(pole, expected, atol=1e-12)
+
+
+def synthetic(tumbler, rng, noise=0.01, points=60, curves=4):
+    """Relative light curves of a tumbler by the exact flow, from a moving observer."""
+    found = []
+    for k in range(curves):
+        ts = 86400.0 * (3.0 * k + np.sort(rng.uniform(0.0, 2.0, points)))
+        angle = ts / 86400.0 * 0.03
+        sun = 1e11 * np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * angle], axis=1)
+        observer = 1e11 * np.stack([0 * ts, 1 + 0 * ts, angle], axis=1)
+        light = np.asarray(tumbler.light_curve(ts, sun, observer))
+        light = light * np.exp(
+            rng.normal() + noise * readings.MAGNITUDE * rng.normal(size=points)
+        )
+        found.append(ph.LightCurve(0.0, ts, light, sun, observer, is_relative=True))
+    return found
+
+
+def numbers_of(tumbler, data, epoch):
+    """The numbers of a tumbler whose axes of the fit are those of space."""
+    elapsed = (epoch - 0.0) * 86400.0
+    span = float(data.span)
+    ratios = np.asarray(tumbler.shape.semi_axes[1:] / tumbler.shape.semi_axes[:2])
+    logits = np.log(ratios / (1 - ratios))
+    momentum = tumbler.moments * tumbler.state.omega
+    start = ph.omega_from_periods(
+        tumbler.moments,
+        tumbler.precession_period,
+        tumbler.rotation_period,
+        tumbler.mode,
+    )
+    first = tumbler.moments * start
+    circled = 2 if tumbler.mode == "short-axis" else 0
+    assert np.linalg.norm(momentum) > 0
+    return np.concatenate(
+        [
+            [span / tumbler.precession_period, span / tumbler.rotation_period],
+            [
+                tumbler.precession_angle
+                + 2 * np.pi * elapsed / tumbler.precession_period,
+                2
+                * np.pi
+                * (tumbler.rotation_phase + elapsed / tumbler.rotation_period),
+            ],
+            [tumbler.longitude, tumbler.latitude],
+            [np.log(abs(first[1] / first[circled]))],
+            logits,
+            logits,
+        ]
+    )
+
+
+@pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
+def test_the_model_of_a_fit_is_the_light_curve_of_the_tumbler(mode, rng):
+    tumbler = body(mode)
+    data, epoch = readings.readings_of(synthetic(tumbler, rng, noise=1e-9), 1.0)
+    code = model.Mode.short_axis if mode == "short-axis" else model.Mode.long_axis
+    task = model.Task(
+        np.eye(3), np.asarray(int(code)), np.asarray(True), np.asarray(1.0)
+    )
+    vector = numbers_of(tumbler, data, epoch)
+    rows = jax.jit(model.rows_of)(vector, task, data)
+    np.testing.assert_allclose(rows.residuals, 0.0, atol=1e-4)
+
+    # Derivatives, by central differences.
+    def residuals(x):
+        return jax.jit(model.rows_of)(x, task, data).residuals
+
+    for k in np.flatnonzero(np.asarray(model.sought(task))):
+        step = 1e-5 * np.eye(len(vector))[k]
+        slope = (residuals(vector + step) - residuals(vector - step)) / 2e-5
+        np.testing.assert_allclose(rows.slopes[:, k], slope, rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def inversion():
+    """A tumbler by DOP853 and facets, and what is found."""
+    curves, truth = tumbler_reference.tumbler(np.random.default_rng(3), "long-axis")
+    found = ph.find_tumblers(
+        curves, 0.02, shortest=8 * HOUR, longest=400 * HOUR, pairs=60
+    )
+    return curves, truth, found
+
+
+def test_a_tumbler_of_another_code_is_found(inversion):
+    _, truth, found = inversion
+    best = found.aliases[0]
+    assert found.determined
+    assert best.tumbler.mode == truth.mode
+    estimates, errors = best.estimates, best.errors
+    pairs = [
+        (
+            estimates.precession_period,
+            errors.precession_period,
+            truth.precession_period,
+        ),
+        (estimates.rotation_period, errors.rotation_period, truth.rotation_period),
+        (estimates.latitude, errors.latitude, np.arcsin(truth.pole[2])),
+        (estimates.moments[0], errors.moments[0], truth.moments[0] / truth.moments[2]),
+        (estimates.axis_ratios[0], errors.axis_ratios[0], truth.semi_axes[1]),
+    ]
+    for value, error, true in pairs:
+        assert abs(value - true) < 4 * error
+    assert 0.8 < found.reduced_chi_square < 1.2
+
+
+def test_the_tumbler_that_is_found_has_the_residuals_that_are_stated(inversion):
+    curves, _, found = inversion
+    best = found.aliases[0]
+    residuals = []
+    for curve in curves:
+        elapsed = (curve.epoch - found.epoch) * 86400.0
+        light = best.tumbler.light_curve(
+            curve.ts + elapsed, curve.to_sun, curve.to_observer
+        )
+        magnitudes = -2.5 * np.log10(curve.brightness / np.asarray(light))
+        residuals.append(magnitudes - magnitudes.mean())
+    np.testing.assert_allclose(np.concatenate(residuals), best.residuals, atol=1e-5)
+
+
+def test_a_report_says_which_tumblers_explain_the_curves(inversion):
+    _, _, found = inversion
+    report = found.report()
+    assert report.startswith("One tumbler explains the light curves: ")
+    assert "1. long-axis" in report
+    assert "P_psi" in report
+
+
+def test_a_planned_curve_tells_the_best_alias_from_a_rejected_one(inversion):
+    curves, _, found = inversion
+    both = dataclasses.replace(found, aliases=[found.aliases[0], found.rejected[0]])
+    apart = both.separation(curves[:2], 0.02)
+    assert apart.shape == (2, 2)
+    np.testing.assert_allclose(apart[:, 0], 0.0, atol=1e-9)
+    assert np.all(apart[:, 1] > 0)
+
+
+def test_candidates_hold_the_pair_of_a_tumbler(inversion):
+    curves, truth, _ = inversion
+    pairs = ph.period_pairs(curves, 8 * HOUR, 400 * HOUR, count=60)
+    span = max(x.ts.max() for x in curves) - min(x.ts.min() for x in curves)
+    apart = np.maximum(
+        abs(span / pairs.precession_period - span / truth.precession_period),
+        abs(span / pairs.rotation_period - span / truth.rotation_period),
+    )
+    assert apart.min() < 0.75
+    assert np.all(np.diff(pairs.explained) <= 1e-6)
+
+
+def test_mistakes_in_an_inversion_say_what_to_pass():
+    far = np.ones((20, 3))
+    curve = ph.LightCurve(0.0, np.arange(20.0), np.ones(20), far, far, is_relative=True)
+    with pytest.raises(ValueError, match="`curves` must hold a light curve"):
+        ph.find_tumblers([], shortest=1.0, longest=2.0)
+    with pytest.raises(ValueError, match="in this order"):
+        ph.find_tumblers([curve], shortest=2.0, longest=1.0)
+    with pytest.raises(ValueError, match="`modes` must be"):
+        ph.find_tumblers([curve], shortest=1.0, longest=2.0, modes=["spin"])
+    dark = ph.LightCurve(0.0, np.arange(20.0), np.zeros(20), far, far, is_relative=True)
+    with pytest.raises(ValueError, match="positive brightness"):
+        ph.find_tumblers([dark], shortest=1.0, longest=2.0)
+    few = ph.LightCurve(0.0, np.arange(5.0), np.ones(5), far[:5], far[:5], True)
+    with pytest.raises(ValueError, match="at least 12 points"):
+        ph.find_tumblers([few], shortest=1.0, longest=2.0)
