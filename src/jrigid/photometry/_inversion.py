@@ -119,6 +119,25 @@ def find_tumblers(
 
     Source: the model of M. Kaasalainen, Astron. Astrophys. 376 (2001) 302, with the
     exact motion in place of an integration.
+
+    >>> import jax.numpy as jnp, numpy as np, jrigid as jr
+    >>> shape = jr.photometry.Ellipsoid(jnp.array([1.0, 0.6, 0.5]))
+    >>> hour = 3600.0
+    >>> body = jr.photometry.Tumbler(
+    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape, mode="principal-axis")
+    >>> ts = np.linspace(0.0, 40 * hour, 100)
+    >>> angle = ts / 4e5
+    >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.2 + 0 * ts], axis=1)
+    >>> earth = np.stack([np.sin(angle), np.cos(angle), 0.1 + 0 * ts], axis=1)
+    >>> noise = 0.01 * np.random.default_rng(0).normal(size=100)
+    >>> light = np.asarray(body.light_curve(ts, sun, earth)) * 10 ** (-0.4 * noise)
+    >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
+    >>> found = jr.photometry.find_tumblers(
+    ...     [curve], 0.01, shortest=4 * hour, longest=20 * hour,
+    ...     modes=["principal-axis"], pairs=5)
+    >>> best = found.aliases[0]  # an Alias with its Tumbler and its Estimates
+    >>> print((best.estimates.precession_period / hour).round(1))
+    6.0
     """
     check_option("inertia", inertia, _INERTIA)
     for mode in modes:

@@ -62,6 +62,7 @@ class Wobble(NamedTuple):
     precession_rate: Scalar
 
 
+# Long: one solution from the moments to its series, where each line needs those above.
 def wobble(inverse_moments: Vector, log_tangent: Scalar) -> Wobble:
     """The series of a motion.
 
