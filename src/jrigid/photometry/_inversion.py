@@ -42,6 +42,7 @@ class Inversion:
         follows: Whether the best alias follows the curves to their noise.
         determined: Whether one tumbler alone explains the curves: the best one follows
             them, and there is no other alias.
+        span: Time from the first epoch to the last [s].
     """
 
     aliases: list[Alias]
@@ -52,7 +53,7 @@ class Inversion:
     degrees_of_freedom: int
     follows: bool
     determined: bool
-    _span: float = dataclasses.field(repr=False)
+    span: float
 
     def report(self) -> str:
         """The table in words."""
@@ -215,7 +216,7 @@ def _inversion(
         degrees_of_freedom=freedom,
         follows=bool(follows),
         determined=bool(near == 1 and follows),
-        _span=float(readings.span),
+        span=float(readings.span),
     )
 
 
@@ -233,7 +234,7 @@ def _apart(
     shift = (curve.epoch - inversion.epoch) * day + curve.ts
     ts = np.zeros_like(readings.ts)
     ts[: len(shift)] = shift
-    readings = readings._replace(ts=ts, span=np.asarray(inversion._span))
+    readings = readings._replace(ts=ts, span=np.asarray(inversion.span))
     first, of_first = (
         np.asarray(x)[:-1] for x in rows_at(best.numbers, best.task, readings)
     )

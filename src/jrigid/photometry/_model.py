@@ -35,12 +35,12 @@ class Numbers(NamedTuple):
         inertia: The same of the homogeneous ellipsoid that has the moments of inertia.
     """
 
-    cycles: Float[Array, "*lanes 2"]
-    angles: Float[Array, "*lanes 2"]
-    pole: Float[Array, "*lanes 2"]
-    log_tangent: Float[Array, "*lanes 1"]
-    shape: Float[Array, "*lanes 2"]
-    inertia: Float[Array, "*lanes 2"]
+    cycles: Float[AnyArray, "*lanes 2"]
+    angles: Float[AnyArray, "*lanes 2"]
+    pole: Float[AnyArray, "*lanes 2"]
+    log_tangent: Float[AnyArray, "*lanes 1"]
+    shape: Float[AnyArray, "*lanes 2"]
+    inertia: Float[AnyArray, "*lanes 2"]
 
 
 COUNT = 11
@@ -65,10 +65,10 @@ class Task(NamedTuple):
         link: Weight of the equation between the periods, the tilt and the moments.
     """
 
-    frame: Float[Array, "*lanes 3 3"]
-    mode: Int[Array, "*lanes"]
-    homogeneous: Bool[Array, "*lanes"]
-    link: Float[Array, "*lanes"]
+    frame: Float[AnyArray, "*lanes 3 3"]
+    mode: Int[AnyArray, "*lanes"]
+    homogeneous: Bool[AnyArray, "*lanes"]
+    link: Float[AnyArray, "*lanes"]
 
 
 def sought(task: Task) -> Bool[Array, " 11"]:

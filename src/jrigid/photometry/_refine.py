@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._numerics import product
+from jrigid._types import AnyArray
 from jrigid.photometry._model import Task, rows_of, sought
 from jrigid.photometry._readings import Readings
 
@@ -28,9 +29,9 @@ _FLOOR = 1e-12
 class Quadratic(NamedTuple):
     """Chi-square about a point: its value, half its slope and its normal matrix."""
 
-    chi_square: Float[Array, "*lanes"]
-    slope: Float[Array, "*lanes 11"]
-    normal: Float[Array, "*lanes 11 11"]
+    chi_square: Float[AnyArray, "*lanes"]
+    slope: Float[AnyArray, "*lanes 11"]
+    normal: Float[AnyArray, "*lanes 11 11"]
 
 
 class _Loop(NamedTuple):

@@ -1,5 +1,6 @@
 """A free body and its surface: everything that its light curves depend on."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,9 +22,9 @@ from jrigid.rotation import from_axis_angle, multiply
 MODES = ("short-axis", "long-axis", "principal-axis")
 
 
-def _field(name: str, *shape: int) -> Any:  # to a type checker, its value
-    """A field of one shape."""
-    return eqx.field(converter=lambda value: array_of_shape(name, value, shape))
+def _converter(name: str, *shape: int) -> Callable[[Any], Array]:
+    """What makes an array of one shape of a field's value."""
+    return lambda value: array_of_shape(name, value, shape)
 
 
 class Tumbler(Readable):
@@ -55,13 +56,19 @@ class Tumbler(Readable):
     27.4
     """
 
-    moments: Float[Array, "3"] = _field("moments", 3)
-    precession_period: Float[Array, ""] = _field("precession_period")
-    rotation_period: Float[Array, ""] = _field("rotation_period")
-    longitude: Float[Array, ""] = _field("longitude")
-    latitude: Float[Array, ""] = _field("latitude")
-    precession_angle: Float[Array, ""] = _field("precession_angle")
-    rotation_phase: Float[Array, ""] = _field("rotation_phase")
+    moments: Float[Array, "3"] = eqx.field(converter=_converter("moments", 3))
+    precession_period: Float[Array, ""] = eqx.field(
+        converter=_converter("precession_period")
+    )
+    rotation_period: Float[Array, ""] = eqx.field(
+        converter=_converter("rotation_period")
+    )
+    longitude: Float[Array, ""] = eqx.field(converter=_converter("longitude"))
+    latitude: Float[Array, ""] = eqx.field(converter=_converter("latitude"))
+    precession_angle: Float[Array, ""] = eqx.field(
+        converter=_converter("precession_angle")
+    )
+    rotation_phase: Float[Array, ""] = eqx.field(converter=_converter("rotation_phase"))
     shape: Facets | Ellipsoid
     scattering: AbstractScattering = LommelSeeliger()
     mode: str = eqx.field(static=True, default="short-axis")
