@@ -9,6 +9,7 @@ nothing here casts a shadow. `find_tumblers` goes the other way: it finds the tu
 that explain light curves.
 """
 
+from jrigid.photometry._alcdef import read_alcdef as read_alcdef
 from jrigid.photometry._alias import Alias as Alias
 from jrigid.photometry._alias import Estimates as Estimates
 from jrigid.photometry._ellipsoid import Ellipsoid as Ellipsoid
@@ -21,6 +22,9 @@ from jrigid.photometry._inversion import Inversion as Inversion
 from jrigid.photometry._inversion import find_tumblers as find_tumblers
 from jrigid.photometry._light_curve import brightness as brightness
 from jrigid.photometry._light_curve import light_curve as light_curve
+from jrigid.photometry._orbit import Orbit as Orbit
+from jrigid.photometry._orbit import earth_position as earth_position
+from jrigid.photometry._orbit import geometry_of_orbit as geometry_of_orbit
 from jrigid.photometry._periodogram import PeriodPairs as PeriodPairs
 from jrigid.photometry._periodogram import period_pairs as period_pairs
 from jrigid.photometry._pole import state_of_pole as state_of_pole

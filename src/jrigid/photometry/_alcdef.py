@@ -1,0 +1,273 @@
+"""Reader of ALCDEF files: light curves of asteroids as observers publish them."""
+
+import dataclasses
+import pathlib
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from jaxtyping import Float
+
+from jrigid.photometry._files import ASTRONOMICAL_UNIT, LightCurve
+from jrigid.photometry._orbit import Positions, Vectors, light_time
+
+_DAY = 86400  # s
+_DELIMITERS = {"PIPE": "|", "TAB": "\t"}
+# How a correction was applied: not at all, one value a session, one value a point.
+_CORRECTIONS = ("NONE", "AVERAGE", "POINT")
+# Programs write 99.99 where they measured no magnitude.
+_NO_MAGNITUDE = 90
+# The time of observation from that of the light's departure: errors shrink by 1e4 each.
+_LIGHT_TIME_STEPS = 4
+
+
+@dataclasses.dataclass
+class _Session:
+    """One block of metadata and the data that follow it."""
+
+    line: int
+    has_ended_metadata: bool = False
+    metadata: dict[str, tuple[int, str]] = dataclasses.field(default_factory=dict)
+    dates: list[Decimal] = dataclasses.field(default_factory=list)
+    magnitudes: list[float] = dataclasses.field(default_factory=list)
+
+
+class _Parser:
+    """Collects the sessions of a file line by line."""
+
+    def __init__(self, path: str | pathlib.Path):
+        """Read all sessions of a file."""
+        self.path = pathlib.Path(path)
+        self.line = 0
+        self.sessions: list[_Session] = []
+        self.session: _Session | None = None
+        text = self.path.read_text(encoding="utf-8-sig", errors="replace")
+        for self.line, line in enumerate(text.splitlines(), 1):
+            if line.strip() and not line.startswith("#"):
+                self._read(line)
+        if self.session is not None:
+            raise self.error(
+                f"the block of line {self.session.line} has no ENDDATA: add it, or get "
+                "the whole file."
+            )
+        if not self.sessions:
+            raise self.error("there is no STARTMETADATA: pass an ALCDEF file.")
+
+    def error(self, text: str, line: int | None = None) -> ValueError:
+        """An error that names the file and the line."""
+        return ValueError(f"{self.path.name}, line {line or self.line}: {text}")
+
+    def option(self, session: _Session, key: str, options: tuple[str, ...]) -> str:
+        """The value of a keyword, by default the first one."""
+        line, value = session.metadata.get(key, (session.line, options[0]))
+        value = value.upper() or options[0]
+        if value not in options:
+            raise self.error(
+                f"{key} must be one of {', '.join(options)}, but it is {value[:20]!r}.",
+                line,
+            )
+        return value
+
+    def _read(self, line: str) -> None:
+        """Take one line."""
+        key, equals, value = line.partition("=")
+        key = key.strip().upper()
+        if key == "STARTMETADATA":
+            self._start()
+        elif self.session is None:
+            raise self.error(
+                f"{key[:20]!r} is outside of a block: put STARTMETADATA before it."
+            )
+        elif key == "ENDMETADATA":
+            self.session.has_ended_metadata = True
+        elif key == "ENDDATA":
+            self._end(self.session)
+        elif key == "DATA":
+            self._point(self.session, value)
+        elif not equals:
+            raise self.error(f"a line must be KEYWORD=value, but it is {line[:30]!r}.")
+        else:
+            self.session.metadata[key] = (self.line, value.strip())
+
+    def _start(self) -> None:
+        """Begin a session."""
+        if self.session is not None:
+            raise self.error(
+                f"the block of line {self.session.line} has no ENDDATA: add it before."
+            )
+        self.session = _Session(self.line)
+
+    def _end(self, session: _Session) -> None:
+        """End a session."""
+        if not session.dates:
+            raise self.error(
+                f"the block of line {session.line} has no DATA: remove the block."
+            )
+        self.sessions.append(session)
+        self.session = None
+
+    def _point(self, session: _Session, value: str) -> None:
+        """Take one point: date, magnitude, and perhaps error and airmass."""
+        if not session.has_ended_metadata:
+            raise self.error("DATA is among the metadata: put ENDMETADATA before it.")
+        words = value.split(self._delimiter(session))
+        if len(words) < 2 or not words[1].strip():
+            raise self.error(
+                "the magnitude is missing: DATA must be date and magnitude with the "
+                "DELIMITER between. Remove the line or correct DELIMITER."
+            )
+        date = self._number("the Julian date", words[0])
+        magnitude = self._number("the magnitude", words[1])
+        if abs(magnitude) > _NO_MAGNITUDE:
+            raise self.error(
+                f"the magnitude {magnitude} stands for a missing one: remove the line."
+            )
+        if session.dates and date < session.dates[-1]:
+            raise self.error(
+                f"the date {date} is before that of the point before: sort the points."
+            )
+        session.dates.append(date)
+        session.magnitudes.append(float(magnitude))
+
+    def _delimiter(self, session: _Session) -> str:
+        """What stands between the values of a point."""
+        if "DELIMITER" not in session.metadata:
+            raise self.error(
+                "the metadata have no DELIMITER: add DELIMITER=PIPE or DELIMITER=TAB.",
+                session.line,
+            )
+        return _DELIMITERS[self.option(session, "DELIMITER", tuple(_DELIMITERS))]
+
+    def _number(self, what: str, word: str) -> Decimal:
+        """A finite number. Dates have more digits than a float holds."""
+        try:
+            number = Decimal(word.strip())
+        except InvalidOperation:
+            number = Decimal("nan")
+        if not number.is_finite():
+            raise self.error(
+                f"{what} must be a number, but it is {word.strip()[:20]!r}: correct or "
+                "remove the line."
+            )
+        return number
+
+
+def read_alcdef(
+    path: str | pathlib.Path, positions: Positions, *, epoch: float | None = None
+) -> list[LightCurve]:
+    r"""Read a file in the Asteroid Lightcurve Data Exchange Format.
+
+    Such a file holds magnitudes, but no vectors to the Sun and to the observer: these
+    come from `positions`. Each session (a block of metadata and its data) becomes a
+    relative light curve, 10^(-0.4 m) with a mean of 1.
+
+    The times become those at which the light left the body, unless LTCAPP says that
+    they are already. The brightness becomes that at 1 au from the Sun and from the
+    observer, unless REDUCEDMAGS is POINT. The average that REDUCEDMAGS=AVERAGE took
+    off is a constant, which a relative curve ignores. The light is not corrected for
+    the phase angle.
+
+    Args:
+        path: The file.
+        positions: A function of the Julian dates of observation. It returns vectors
+            from the body, where the light left it, to the Sun and to the observer
+            [m, ecliptic]: `geometry_of_orbit` makes one, or interpolate a table.
+        epoch: Julian date of time 0; the first one in the file if None.
+
+    Returns:
+        A light curve for each session, all with the same epoch. Their `band` is MAGBAND,
+        or else FILTER.
+
+    Raises:
+        ValueError: A line that does not hold what it should, with the file and the line;
+            or positions that are not vectors.
+
+    Source: ALCDEF, Definition and standards, v. 2.2.7 (alcdef.org).
+
+    >>> import pathlib, tempfile, jrigid as jr
+    >>> text = "STARTMETADATA\nMAGBAND=V\nDELIMITER=PIPE\nENDMETADATA\n"
+    >>> text += "DATA=2451545.0|15.1\nDATA=2451545.1|15.2\nENDDATA\n"
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "curve.txt"
+    >>> _ = path.write_text(text)
+    >>> orbit = jr.photometry.Orbit(3e11, 0.1, 0.0, 0.0, 0.0, 0.0, 2451545.0)
+    >>> positions = jr.photometry.geometry_of_orbit(orbit)
+    >>> curve = jr.photometry.read_alcdef(path, positions)[0]
+    >>> print(curve.band, curve.brightness.round(3))
+    V [1.046 0.954]
+    """
+    parser = _Parser(path)
+    zero = parser.sessions[0].dates[0]
+    if epoch is not None:
+        zero = Decimal(repr(float(epoch)))
+    return [_curve(parser, session, positions, zero) for session in parser.sessions]
+
+
+def _curve(
+    parser: _Parser, session: _Session, positions: Positions, zero: Decimal
+) -> LightCurve:
+    """A session as a relative light curve."""
+    is_corrected = parser.option(session, "LTCAPP", _CORRECTIONS) != "NONE"
+    reduced = parser.option(session, "REDUCEDMAGS", _CORRECTIONS)
+    dates = np.array(session.dates, dtype=float)
+    ts = np.array([float((date - zero) * _DAY) for date in session.dates])
+    if is_corrected:
+        to_sun, to_observer = _seen_later(positions, dates)
+    else:
+        to_sun, to_observer = _vectors(positions, dates)
+        ts = ts - light_time(to_observer)
+    magnitudes = np.array(session.magnitudes)
+    if reduced != "POINT":
+        magnitudes = magnitudes - _distance_modulus(to_sun, to_observer)
+    # From the brightest point, so that no power overflows.
+    brightness = 10 ** (-0.4 * (magnitudes - magnitudes.min()))
+    _, filter_ = session.metadata.get("FILTER", (0, ""))
+    _, band = session.metadata.get("MAGBAND", (0, filter_))
+    return LightCurve(
+        epoch=float(zero),
+        ts=ts,
+        brightness=brightness / brightness.mean(),
+        to_sun=to_sun,
+        to_observer=to_observer,
+        is_relative=True,
+        band=band or filter_,
+    )
+
+
+def _vectors(
+    positions: Positions, dates: Float[np.ndarray, " epochs"]
+) -> tuple[Vectors, Vectors]:
+    """What the caller's function returns, checked."""
+    vectors = [np.asarray(each, dtype=float) for each in positions(dates)]
+    shape = (len(dates), 3)
+    if [each.shape for each in vectors] != [shape, shape]:
+        raise ValueError(
+            f"Argument `positions` must return two arrays of shape {shape}, but it "
+            f"returned {[each.shape for each in vectors]}."
+        )
+    lengths = np.linalg.norm(vectors, axis=-1)
+    if not np.all(np.isfinite(lengths) & (lengths > 0)):
+        raise ValueError(
+            "Argument `positions` must return finite vectors other than 0, but some "
+            "are not: check the dates that it covers."
+        )
+    to_sun, to_observer = vectors
+    return to_sun, to_observer
+
+
+def _seen_later(
+    positions: Positions, dates: Float[np.ndarray, " epochs"]
+) -> tuple[Vectors, Vectors]:
+    """Vectors for dates at which the light left the body."""
+    light_days = np.zeros_like(dates)
+    for _ in range(_LIGHT_TIME_STEPS):
+        to_sun, to_observer = _vectors(positions, dates + light_days)
+        light_days = light_time(to_observer) / _DAY
+    return to_sun, to_observer
+
+
+def _distance_modulus(
+    to_sun: Vectors, to_observer: Vectors
+) -> Float[np.ndarray, " epochs"]:
+    """Magnitudes between a body and the same one at 1 au from Sun and observer."""
+    r = np.linalg.norm(to_sun, axis=-1) / ASTRONOMICAL_UNIT
+    delta = np.linalg.norm(to_observer, axis=-1) / ASTRONOMICAL_UNIT
+    return 5 * np.log10(r * delta)

@@ -1,0 +1,221 @@
+"""Where a body and the Earth are: Kepler orbits about the Sun, on the host."""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jrigid._checks import demand
+from jrigid._types import Readable
+from jrigid.photometry._files import ASTRONOMICAL_UNIT
+
+SPEED_OF_LIGHT = 299792458.0  # m / s
+# Of the Sun [m^3 / s^2], JPL's ephemeris DE440.
+_GRAVITATIONAL_PARAMETER = 1.32712440041e20
+_DAY = 86400.0  # s
+_J2000 = 2451545.0
+_CENTURY = 36525.0  # days
+# Elements of the Earth-Moon barycentre at J2000 and their rates a century: semi-major
+# axis [au], eccentricity, and inclination, mean longitude, longitude of perihelion [deg].
+_EARTH = np.array(
+    [
+        [1.00000261, 0.00000562],
+        [0.01671123, -0.00004392],
+        [-0.00001531, -0.01294668],
+        [100.46457166, 35999.37244981],
+        [102.93768193, 0.32327364],
+    ]
+)
+# Newton's method contracts by 2/3 at worst, and a start is within 2 of the root.
+_NEWTON_STEPS = 100
+# Each step divides the error by the speed of light over that of the body, about 1e4.
+_LIGHT_TIME_STEPS = 4
+
+Vectors: TypeAlias = Float[np.ndarray, "epochs 3"]
+Positions: TypeAlias = Callable[[Float[np.ndarray, " epochs"]], tuple[Vectors, Vectors]]
+
+
+class Orbit(Readable):
+    """A Kepler orbit about the Sun, with elements in the ecliptic of J2000.
+
+    Attributes:
+        semi_major_axis: [m], positive.
+        eccentricity: From 0 to below 1.
+        inclination: To the ecliptic [rad].
+        node: Longitude of the ascending node [rad].
+        argument_of_perihelion: From the node [rad].
+        mean_anomaly: At the epoch [rad].
+        epoch: Julian date of the mean anomaly (TDB).
+
+    Raises:
+        ValueError: An element that is not finite or out of its range.
+
+    >>> import numpy as np, jrigid as jr
+    >>> orbit = jr.photometry.Orbit(3e11, 0.1, 0.0, 0.0, 0.0, 0.0, 2451545.0)
+    >>> print(orbit.position(np.array([2451545.0])) / 1e11)
+    [[2.7 0.  0. ]]
+    """
+
+    semi_major_axis: float = eqx.field(converter=float)
+    eccentricity: float = eqx.field(converter=float)
+    inclination: float = eqx.field(converter=float)
+    node: float = eqx.field(converter=float)
+    argument_of_perihelion: float = eqx.field(converter=float)
+    mean_anomaly: float = eqx.field(converter=float)
+    epoch: float = eqx.field(converter=float)
+
+    def __check_init__(self):
+        """Reject elements that are no ellipse."""
+        for name, value in vars(self).items():
+            demand(
+                bool(np.isfinite(value)),
+                f"Argument `{name}` must be finite, but it is {value}.",
+            )
+        demand(
+            self.semi_major_axis > 0,
+            "Argument `semi_major_axis` must be positive, but it is "
+            f"{self.semi_major_axis}.",
+        )
+        demand(
+            0 <= self.eccentricity < 1,
+            "Argument `eccentricity` must be from 0 to below 1, but it is "
+            f"{self.eccentricity}: pass positions of your own for an open orbit.",
+        )
+
+    def position(self, julian_dates: Float[np.ndarray, " epochs"]) -> Vectors:
+        """Heliocentric positions in the ecliptic of J2000 [m], without perturbations.
+
+        Args:
+            julian_dates: Epochs (TDB; UTC is about a minute behind it).
+
+        Source: C. D. Murray and S. F. Dermott, Solar System Dynamics, eq. 2.122.
+        """
+        rate = np.sqrt(_GRAVITATIONAL_PARAMETER / self.semi_major_axis**3)
+        mean_anomaly = self.mean_anomaly + rate * _DAY * (julian_dates - self.epoch)
+        return _position(
+            self.semi_major_axis,
+            self.eccentricity,
+            self.inclination,
+            self.node,
+            self.argument_of_perihelion,
+            mean_anomaly,
+        )
+
+
+def earth_position(julian_dates: Float[np.ndarray, " epochs"]) -> Vectors:
+    """Heliocentric positions of the Earth-Moon barycentre, ecliptic of J2000 [m].
+
+    Mean elements with linear rates. From 1800 to 2050 they are accurate to 1e-4 au; the
+    centre of the Earth is up to 3e-5 au from the barycentre. The light time of an
+    asteroid is thus off by at most 0.07 s.
+
+    Args:
+        julian_dates: Epochs from 1800 to 2050 (TDB).
+
+    Source: E. M. Standish and J. G. Williams, Approximate positions of the planets,
+    Explanatory Supplement to the Astronomical Almanac, 3rd ed., table 8.10.2.
+
+    >>> import numpy as np, jrigid as jr
+    >>> print(jr.photometry.earth_position(np.array([2451545.0])).round(-9) / 1e9)
+    [[-27. 145.  -0.]]
+    """
+    centuries = (julian_dates - _J2000) / _CENTURY
+    elements = _EARTH[:, :1] + _EARTH[:, 1:] * centuries[None]
+    axis, eccentricity = elements[:2]
+    inclination, longitude, perihelion = np.radians(elements[2:])
+    # The node is at longitude 0 by definition of these elements.
+    node = np.zeros_like(perihelion)
+    return _position(
+        ASTRONOMICAL_UNIT * axis,
+        eccentricity,
+        inclination,
+        node,
+        perihelion,
+        longitude - perihelion,
+    )
+
+
+def geometry_of_orbit(orbit: Orbit) -> Positions:
+    """Directions of the Sun and of the Earth, seen from a body on an orbit.
+
+    Args:
+        orbit: Of the body.
+
+    Returns:
+        A function of the Julian dates of observation at the Earth. It returns vectors
+        from the body to the Sun and to the Earth [m], in the ecliptic of J2000. The body
+        is where it was when the light left it.
+
+    >>> import numpy as np, jrigid as jr
+    >>> orbit = jr.photometry.Orbit(3e11, 0.1, 0.0, 0.0, 0.0, 0.0, 2451545.0)
+    >>> positions = jr.photometry.geometry_of_orbit(orbit)
+    >>> to_sun, to_observer = positions(np.array([2451545.0]))
+    >>> print(to_observer.round(-9) / 1e9)
+    [[-297.  145.   -0.]]
+    """
+
+    def positions(
+        julian_dates: Float[np.ndarray, " epochs"],
+    ) -> tuple[Vectors, Vectors]:
+        """Vectors to the Sun and to the Earth, corrected for the light time."""
+        earth = earth_position(julian_dates)
+        light_days = np.zeros_like(julian_dates)
+        for _ in range(_LIGHT_TIME_STEPS):
+            body = orbit.position(julian_dates - light_days)
+            light_days = light_time(earth - body) / _DAY
+        return -body, earth - body
+
+    return positions
+
+
+def light_time(vectors: Vectors) -> Float[np.ndarray, " epochs"]:
+    """Time that light takes along each vector [s]."""
+    return np.linalg.norm(vectors, axis=-1) / SPEED_OF_LIGHT
+
+
+def _position(
+    axis: float | Float[np.ndarray, " epochs"],
+    eccentricity: float | Float[np.ndarray, " epochs"],
+    inclination: float | Float[np.ndarray, " epochs"],
+    node: float | Float[np.ndarray, " epochs"],
+    argument: float | Float[np.ndarray, " epochs"],
+    mean_anomaly: Float[np.ndarray, " epochs"],
+) -> Vectors:
+    """Positions on ellipses, from their elements."""
+    anomaly = _eccentric_anomaly(mean_anomaly, eccentricity)
+    x = axis * (np.cos(anomaly) - eccentricity)
+    y = axis * np.sqrt(1 - eccentricity**2) * np.sin(anomaly)
+    along = np.cos(argument) * x - np.sin(argument) * y
+    across = np.sin(argument) * x + np.cos(argument) * y
+    level = np.cos(inclination) * across
+    return np.stack(
+        [
+            np.cos(node) * along - np.sin(node) * level,
+            np.sin(node) * along + np.cos(node) * level,
+            np.sin(inclination) * across,
+        ],
+        axis=-1,
+    )
+
+
+def _eccentric_anomaly(
+    mean_anomaly: Float[np.ndarray, " epochs"],
+    eccentricity: float | Float[np.ndarray, " epochs"],
+) -> Float[np.ndarray, " epochs"]:
+    """Solve Kepler's equation, E - e sin E = M, by Newton's method.
+
+    From 0 to pi the left side is convex, so that the iteration from an upper bound of
+    the root converges monotonically; the other half follows by symmetry.
+    """
+    wrapped = np.remainder(mean_anomaly + np.pi, 2 * np.pi) - np.pi
+    size = np.abs(wrapped)
+    anomaly = np.minimum(size + eccentricity, np.pi)
+    for _ in range(_NEWTON_STEPS):
+        excess = anomaly - eccentricity * np.sin(anomaly) - size
+        step = excess / (1 - eccentricity * np.cos(anomaly))
+        anomaly = anomaly - step
+        if np.all(np.abs(step) <= 1e-15):
+            break
+    return np.copysign(anomaly, wrapped)

@@ -1,0 +1,269 @@
+"""ALCDEF files and Kepler orbits: known geometry, light time, and errors by line."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jrigid as jr
+
+ph = jr.photometry
+
+AU = 149597870700.0
+LIGHT = 299792458.0
+DAY = 86400.0
+GM = 1.32712440041e20
+J2000 = 2451545.0
+ORBIT = ph.Orbit(2.3 * AU, 0.35, 0.2, 1.1, 2.5, 0.7, 2457000.5)
+DATES = [f"{2457100.5 + 0.013 * i:.6f}" for i in range(40)]
+
+
+def write(tmp_path, lines):
+    """A file of these lines."""
+    path = tmp_path / "session.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def block(rows, delimiter="PIPE", **metadata):
+    """The lines of a session."""
+    sign = {"PIPE": "|", "TAB": "\t"}.get(delimiter, "|")
+    pairs = {"OBJECTNAME": "Test", "FILTER": "C", "MAGBAND": "V", **metadata}
+    lines = [f"{key}={value}" for key, value in pairs.items()]
+    data = ["DATA=" + sign.join(row) for row in rows]
+    head = ["STARTMETADATA", *lines, f"DELIMITER={delimiter}", "ENDMETADATA"]
+    return [*head, *data, "ENDDATA"]
+
+
+def linear(julian_dates):
+    """A body that leaves the Sun and the Earth fast and in a straight line."""
+    days = (julian_dates - 2457100.5)[:, None]
+    to_sun = AU * (np.array([[2.0, 0.3, -0.1]]) + days * np.array([[0.3, 0.0, 0.1]]))
+    to_observer = to_sun - AU * np.array([[0.9, 0.4, 0.0]])
+    return to_sun, to_observer
+
+
+def modulus(to_sun, to_observer):
+    """5 log10(r delta)."""
+    r = np.linalg.norm(to_sun, axis=1) / AU
+    delta = np.linalg.norm(to_observer, axis=1) / AU
+    return 5 * np.log10(r * delta)
+
+
+def truth(ts):
+    """Magnitudes of a body at unit distances, at times of departure."""
+    return 15 + 0.3 * np.sin(2 * np.pi * ts / 7000)
+
+
+@pytest.mark.parametrize("delimiter", ["PIPE", "TAB"])
+@pytest.mark.parametrize("positions", [linear, ph.geometry_of_orbit(ORBIT)])
+def test_apparent_magnitudes_come_back(tmp_path, delimiter, positions):
+    dates = np.array(DATES, dtype=float)
+    to_sun, to_observer = positions(dates)
+    seen = np.array([round((float(d) - 2457100.5) * DAY, 3) for d in DATES])
+    left = seen - np.linalg.norm(to_observer, axis=1) / LIGHT
+    magnitudes = truth(left) + modulus(to_sun, to_observer)
+    rows = [
+        (d, f"{m:.12f}", "0.01", "1.2", "")
+        for d, m in zip(DATES, magnitudes, strict=True)
+    ]
+    path = write(tmp_path, block(rows, delimiter, LTCAPP="NONE", REDUCEDMAGS="NONE"))
+    (curve,) = ph.read_alcdef(path, positions, epoch=2457100.5)
+    assert curve.epoch == 2457100.5
+    assert curve.is_relative
+    assert curve.band == "V"
+    np.testing.assert_allclose(curve.ts, left, rtol=0, atol=1e-6)
+    expected = 10 ** (-0.4 * truth(left))
+    np.testing.assert_allclose(curve.brightness, expected / expected.mean(), rtol=1e-10)
+    np.testing.assert_array_equal(curve.to_sun, to_sun)
+    np.testing.assert_array_equal(curve.to_observer, to_observer)
+
+
+@pytest.mark.parametrize("applied", ["AVERAGE", "POINT", "point"])
+def test_corrected_times_stay_and_the_geometry_is_that_of_observation(
+    tmp_path, applied
+):
+    seen = 2457100.5 + 0.01 * np.arange(5)
+    to_sun, to_observer = linear(seen)
+    left = seen - np.linalg.norm(to_observer, axis=1) / LIGHT / DAY
+    rows = [(f"{date:.12f}", "15.0") for date in left]
+    path = write(tmp_path, block(rows, LTCAPP=applied, LTCDAYS="-0.01"))
+    (curve,) = ph.read_alcdef(path, linear, epoch=2457100.5)
+    np.testing.assert_allclose(curve.ts, (left - 2457100.5) * DAY, atol=1e-4)
+    # A Julian date as a float is good to 4e-10 days.
+    np.testing.assert_allclose(curve.to_sun, to_sun, rtol=0, atol=1e-8 * AU)
+    np.testing.assert_allclose(curve.to_observer, to_observer, rtol=0, atol=1e-8 * AU)
+    wrong = linear(left)[0]
+    assert np.abs(wrong - curve.to_sun).max() > 1e-4 * AU
+
+
+@pytest.mark.parametrize(
+    ("reduced", "takes_off"), [("NONE", True), ("AVERAGE", True), ("POINT", False)]
+)
+def test_distances_are_taken_off_once(tmp_path, reduced, takes_off):
+    dates = ["2457100.5", "2457101.5"]
+    rows = [(date, "15") for date in dates]
+    path = write(tmp_path, block(rows, REDUCEDMAGS=reduced, UCORMAG="-2.1"))
+    (curve,) = ph.read_alcdef(path, linear)
+    off = modulus(*linear(np.array(dates, dtype=float))) * takes_off
+    expected = 10 ** (0.4 * off)
+    np.testing.assert_allclose(curve.brightness, expected / expected.mean(), rtol=1e-12)
+
+
+def test_sessions_share_an_epoch_and_dates_keep_their_digits(tmp_path):
+    first = block([("2457100.1234567891", "3"), ("2457100.1234567892", "3")])
+    second = block([("2457101.1234567891", "-400e-1")], MAGBAND="", FILTER="R")
+    path = write(tmp_path, ["# a comment", "", *first, *second])
+    one, two = ph.read_alcdef(path, linear)
+    assert one.epoch == two.epoch == 2457100.1234567891
+    assert (one.band, two.band) == ("V", "R")
+    steps = np.diff(one.ts + np.linalg.norm(one.to_observer, axis=1) / LIGHT)
+    np.testing.assert_allclose(steps, DAY * 1e-10, rtol=1e-3)
+    np.testing.assert_array_equal(two.brightness, [1.0])
+
+
+GOOD = block([("2457100.5", "15"), ("2457100.6", "15")])
+
+
+def changed(line, text):
+    """The good file with another line; lines count from 1."""
+    return [*GOOD[: line - 1], *text, *GOOD[line:]]
+
+
+@pytest.mark.parametrize(
+    ("lines", "line", "words"),
+    [
+        (GOOD[:-1], 8, "the block of line 1 has no ENDDATA"),
+        (GOOD[:-1] + GOOD, 9, "the block of line 1 has no ENDDATA"),
+        (["DATA=2457100.5|15", *GOOD], 1, "'DATA' is outside of a block"),
+        ([*GOOD, "DATA=2457100.5|15"], 10, "'DATA' is outside of a block"),
+        (changed(6, []), 6, "put ENDMETADATA before it"),
+        (changed(7, ["DATA=24571OO.5|15"]), 7, "the Julian date must be a number"),
+        (changed(7, ["DATA=2457100.5|bright"]), 7, "the magnitude must be a number"),
+        (changed(7, ["DATA=2457100.5|inf"]), 7, "the magnitude must be a number"),
+        (changed(7, ["DATA=2457100.5|"]), 7, "the magnitude is missing"),
+        (changed(7, ["DATA=2457100.5\t15"]), 7, "the magnitude is missing"),
+        (changed(8, ["DATA=2457100.6|99.99"]), 8, "stands for a missing one"),
+        (changed(8, ["DATA=2457100.4|15"]), 8, "sort the points"),
+        (changed(5, ["DELIMITER=COMMA"]), 5, "DELIMITER must be one of PIPE, TAB"),
+        (changed(5, []), 1, "the metadata have no DELIMITER"),
+        (changed(4, ["LTCAPP=MAYBE"]), 4, "LTCAPP must be one of NONE"),
+        (changed(4, ["REDUCEDMAGS=YES"]), 4, "REDUCEDMAGS must be one of NONE"),
+        (changed(4, ["no keyword here"]), 4, "a line must be KEYWORD=value"),
+        ([*GOOD[:6], "ENDDATA"], 7, "the block of line 1 has no DATA"),
+        (["# nothing"], 1, "there is no STARTMETADATA"),
+    ],
+)
+def test_errors_name_the_file_and_the_line(tmp_path, lines, line, words):
+    path = write(tmp_path, lines)
+    with pytest.raises(ValueError, match=rf"session.txt, line {line}: .*{words}") as e:
+        ph.read_alcdef(path, linear)
+    assert len(str(e.value)) < 200
+
+
+def test_positions_must_be_vectors(tmp_path):
+    path = write(tmp_path, GOOD)
+
+    def short(julian_dates):
+        return linear(julian_dates[:1])
+
+    def outside(julian_dates):
+        to_sun, to_observer = linear(julian_dates)
+        return to_sun, np.nan * to_observer
+
+    with pytest.raises(ValueError, match=r"`positions` must return two arrays of"):
+        ph.read_alcdef(path, short)
+    with pytest.raises(ValueError, match="check the dates that it covers"):
+        ph.read_alcdef(path, outside)
+
+
+@pytest.mark.parametrize("eccentricity", [0.0, 0.35, 0.97])
+def test_orbit_is_the_two_body_problem(eccentricity):
+    axis = 1.4 * AU
+    orbit = ph.Orbit(axis, eccentricity, 0.6, 1.1, 2.5, 0.0, J2000)
+    normal = [np.sin(1.1) * np.sin(0.6), -np.cos(1.1) * np.sin(0.6), np.cos(0.6)]
+    start = orbit.position(np.array([J2000]))[0]
+    # At perihelion the velocity is across, of the speed of the vis-viva equation.
+    size = np.sqrt(GM / axis * (1 + eccentricity) / (1 - eccentricity))
+    velocity = size * np.cross(normal, start) / np.linalg.norm(start)
+    np.testing.assert_allclose(np.linalg.norm(start), axis * (1 - eccentricity))
+    np.testing.assert_allclose(np.dot(normal, start) / axis, 0, atol=1e-15)
+
+    def rate(_, y):
+        return np.concatenate([y[3:], -GM * y[:3] / np.linalg.norm(y[:3]) ** 3])
+
+    days = np.linspace(0.0, 700.0, 15)
+    solution = solve_ivp(
+        rate,
+        (0.0, days[-1] * DAY),
+        np.concatenate([start, velocity]),
+        method="DOP853",
+        t_eval=days * DAY,
+        rtol=1e-12,
+        atol=1e-3,
+    )
+    difference = orbit.position(J2000 + days) - solution.y[:3].T
+    assert np.abs(difference).max() < 1e-8 * AU
+
+
+def test_node_and_argument_of_perihelion_are_where_they_should_be():
+    """At perihelion with argument 0 a body is at its node, and then rises."""
+    orbit = ph.Orbit(AU, 0.2, 0.3, 1.1, 0.0, 0.0, J2000)
+    at_node, later = orbit.position(J2000 + np.array([0.0, 10.0]))
+    direction = at_node / np.linalg.norm(at_node)
+    np.testing.assert_allclose(direction, [np.cos(1.1), np.sin(1.1), 0], atol=1e-15)
+    assert later[2] > 0
+
+
+def test_earth_at_j2000_agrees_with_vsop87():
+    """Check value of VSOP87 (P. Bretagnon and G. Francou, 1988), for the Earth."""
+    longitude, latitude, distance = 1.7519238681, -0.0000039656, 0.9833276819
+    level = distance * np.cos(latitude)
+    expected = [
+        level * np.cos(longitude),
+        level * np.sin(longitude),
+        distance * np.sin(latitude),
+    ]
+    (earth,) = ph.earth_position(np.array([J2000])) / AU
+    np.testing.assert_allclose(earth, expected, rtol=0, atol=1.3e-4)
+
+
+def test_sun_at_the_equinox_of_2013():
+    """2013-03-20 11:02 UT: apparent longitude 0 of date, precessed to J2000."""
+    date = 2456371.5 + (11 + 2 / 60) / 24 + 67 / DAY
+    x, y, _ = -ph.earth_position(np.array([date]))[0]
+    precession = 50.29 / 3600 * (date - J2000) / 365.25
+    aberration = -20.5 / 3600
+    longitude = np.degrees(np.arctan2(y, x)) + precession + aberration
+    assert abs(longitude) < 0.02
+
+
+def test_perihelion_of_the_earth_in_2013():
+    """2013-01-02, 0.98329 au; the Moon shifts the date by up to about two days."""
+    dates = 2456289.5 + np.arange(0.0, 15.0, 0.05)
+    distance = np.linalg.norm(ph.earth_position(dates), axis=1) / AU
+    assert abs(distance.min() - 0.98329) < 1e-4
+    assert abs(dates[distance.argmin()] - 2456294.7) < 3
+
+
+def test_light_time_of_an_orbit():
+    dates = 2457100.5 + 30 * np.arange(4.0)
+    to_sun, to_observer = ph.geometry_of_orbit(ORBIT)(dates)
+    days = np.linalg.norm(to_observer, axis=1) / LIGHT / DAY
+    # A Julian date as a float is good to 4e-10 days, in which the body moves 1 m.
+    np.testing.assert_allclose(to_sun, -ORBIT.position(dates - days), rtol=0, atol=20)
+    earth = ph.earth_position(dates)
+    np.testing.assert_allclose(to_observer - to_sun, earth, rtol=0, atol=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ((-AU, 0.1, 0.0), "`semi_major_axis` must be positive"),
+        ((AU, 1.0, 0.0), "`eccentricity` must be from 0 to below 1"),
+        ((AU, -0.1, 0.0), "`eccentricity` must be from 0 to below 1"),
+        ((AU, 0.1, np.nan), "`inclination` must be finite"),
+    ],
+)
+def test_elements_that_are_no_ellipse(changes, words):
+    with pytest.raises(ValueError, match=words):
+        ph.Orbit(*changes, 0.0, 0.0, 0.0, J2000)
