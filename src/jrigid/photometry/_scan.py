@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial.transform import Rotation
 
 from jrigid._numerics import product
 from jrigid._types import Vector
@@ -43,6 +42,9 @@ class Directions(NamedTuple):
 
 def orientations() -> Float[np.ndarray, "many 3 3"]:
     """Axes with z along the momentum, rows in space: even poles, and turns about them."""
+    # Imported where it is used: scipy takes a second, which `import jrigid` must not.
+    from scipy.spatial.transform import Rotation
+
     index = np.arange(_POLES) + 0.5
     latitude = np.arcsin(1 - 2 * index / _POLES)
     longitude = np.pi * (1 + 5**0.5) * index
