@@ -12,6 +12,7 @@ import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _model as model
 from jrigid.photometry import _readings as readings
+from jrigid.photometry import _refine as refine
 from jrigid.photometry import _wobble as wobble
 
 HOUR = 3600.0
@@ -152,9 +153,12 @@ def test_the_model_of_a_fit_is_the_light_curve_of_the_tumbler(mode, rng):
 def inversion():
     """A tumbler by DOP853 and facets, and what is found."""
     curves, truth = tumbler_reference.tumbler(np.random.default_rng(3), "long-axis")
+    programs = refine.refined._cache_size()
     found = ph.find_tumblers(
         curves, 0.02, shortest=8 * HOUR, longest=400 * HOUR, pairs=60
     )
+    # One for a part of the epochs and one for all, whatever the number of steps.
+    assert refine.refined._cache_size() <= programs + 2
     return curves, truth, found
 
 

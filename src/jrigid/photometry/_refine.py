@@ -1,12 +1,11 @@
 """Levenberg-Marquardt for many starting points at once."""
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jrigid._numerics import product
 from jrigid._types import AnyArray
@@ -55,9 +54,12 @@ def quadratic(vector: Float[Array, "11"], task: Task, readings: Readings) -> Qua
     )
 
 
-@functools.partial(jax.jit, static_argnames="steps")
+@jax.jit
 def refined(
-    numbers: Float[Array, "lanes 11"], tasks: Task, readings: Readings, steps: int
+    numbers: Float[Array, "lanes 11"],
+    tasks: Task,
+    readings: Readings,
+    steps: Int[ArrayLike, ""],
 ) -> tuple[Float[Array, "lanes 11"], Quadratic]:
     """Minimise chi-square in each lane.
 
@@ -65,7 +67,7 @@ def refined(
         numbers: Starting points.
         tasks: One for each lane.
         readings: The light curves, the same for all.
-        steps: The largest number of steps.
+        steps: The largest number of steps; one program serves all.
 
     Source: J. J. More, Lecture Notes in Mathematics 630 (1978) 105.
     """
