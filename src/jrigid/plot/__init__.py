@@ -3,20 +3,24 @@
 Every function takes what the library returns, draws into the axes `ax` that it is
 given, or into a new figure, and returns the axes. What was drawn is in their `lines`
 and `collections`, and the figure is `ax.figure`. Pictures of several panels (`fit`,
-`motion`) take and return a dict of axes by their names. Pictures on a sphere
-(`polhode`, `tip`, `body`) need axes of three dimensions,
+`light_curves`, `motion`) take and return a dict of axes by their names. Pictures on a
+sphere (`polhode`, `tip`, `body`) need axes of three dimensions,
 `figure.add_subplot(projection="3d")`, whose view is not changed. Lines behind the
-sphere are faint. `animate` returns an `Animation`, to show in a notebook or to save.
-Matplotlib is imported when the first picture is drawn.
+sphere are faint. `animate` and `animate_light_curve` return an `Animation`, to show in
+a notebook or to save. Matplotlib is imported when the first picture is drawn.
 """
 
 from jrigid.plot._animate import Animation as Animation
 from jrigid.plot._animate import animate as animate
+from jrigid.plot._animate import animate_light_curve as animate_light_curve
+from jrigid.plot._appearance import appearance as appearance
 from jrigid.plot._body import body as body
 from jrigid.plot._chart import chart as chart
 from jrigid.plot._fit import fit as fit
 from jrigid.plot._free import herpolhode as herpolhode
 from jrigid.plot._free import polhode as polhode
+from jrigid.plot._light import light_curves as light_curves
+from jrigid.plot._light import period_map as period_map
 from jrigid.plot._motion import motion as motion
 from jrigid.plot._top import effective_potential as effective_potential
 from jrigid.plot._top import tip as tip

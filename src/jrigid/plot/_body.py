@@ -13,6 +13,9 @@ from jrigid.plot._common import Axes3D, Body
 from jrigid.top import SymmetricTop
 
 _LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from
+# Brightness of faces in the dark, by that light and by one that is given.
+_DARK = 0.5
+_NIGHT = 0.15
 _FLAT = 1e-6  # least square of a side, of the largest
 # Radius and height along a top's outline, from its tip, in units of its height.
 _TOP = np.array(
@@ -42,18 +45,21 @@ class Surface(NamedTuple):
     kinds: np.ndarray
     lines: np.ndarray
 
-    def colours(self, attitude: AnyArray) -> np.ndarray:
+    def colours(
+        self, attitude: AnyArray, light: np.ndarray | None = None
+    ) -> np.ndarray:
         """Colours of the faces of a turned body, with light and shade (m, 3)."""
         from matplotlib.colors import to_rgb
 
         base = np.array([to_rgb(colour) for colour, _ in common.LOOKS])[self.kinds]
-        light = 0.5 + 0.5 * np.maximum(
-            common.turned(attitude, self.normals) @ _LIGHT, 0
-        )
-        return light[:, None] * (0.55 * base + 0.45)
+        direction = _LIGHT if light is None else light
+        dark = _DARK if light is None else _NIGHT
+        cosines = common.turned(attitude, self.normals) @ direction
+        bright = dark + (1 - dark) * np.maximum(cosines, 0)
+        return bright[:, None] * (0.55 * base + 0.45)
 
 
-def _rings(
+def rings(
     radii: np.ndarray, heights: np.ndarray, sides: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners and faces, four corners each, of a body of revolution."""
@@ -70,7 +76,7 @@ def _rings(
     return vertices, np.stack(corners, axis=-1).reshape(-1, 4)
 
 
-_BALL = _rings(np.sin(_POLAR), np.cos(_POLAR), 24)
+_BALL = rings(np.sin(_POLAR), np.cos(_POLAR), 24)
 
 
 class _Outline(NamedTuple):
@@ -93,7 +99,7 @@ class _Outline(NamedTuple):
 
 def _of_top() -> _Outline:
     """A top that stands on its tip."""
-    vertices, faces = _rings(_TOP[0], _TOP[1], _SIDES)
+    vertices, faces = rings(_TOP[0], _TOP[1], _SIDES)
     radius = _TOP[0, 2]
     center = np.array([0, 0, 1 - radius])
     return _Outline(vertices, faces, center, np.eye(3), np.full(3, radius))
@@ -201,12 +207,14 @@ def _title(body: Body, kind: str) -> str:
     return "{}\nI = {:.3g}, {:.3g}, {:.3g} kg m$^2$".format(name, *moments)
 
 
-def place(ax: Axes3D, surface: Surface, attitude: AnyArray) -> list[Any]:
+def place(
+    ax: Axes3D, surface: Surface, attitude: AnyArray, light: np.ndarray | None = None
+) -> list[Any]:
     """Draw a surface and its axes as they are turned; returns the artists."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     corners = common.turned(attitude, surface.vertices)[surface.faces]
-    colours = surface.colours(attitude)
+    colours = surface.colours(attitude, light)
     faces = Poly3DCollection(
         corners, facecolors=colours, edgecolors=0.7 * colours, lw=0.4
     )
