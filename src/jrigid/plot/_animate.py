@@ -311,7 +311,7 @@ def animate_light_curve(
     points = points_of([curve], shown)
     first, last = points.ts[[0, -1]]
     message = "Argument `curve` must have points at two times at least, but it has not."
-    demand(last > first, message)
+    demand(bool(last > first), message)
     demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
     ts = np.linspace(first, last, max(round(seconds * fps), 2))
     to_sun = between(ts, points.ts, points.to_sun)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from jrigid._checks import check_shape, demand, kind_of
-from jrigid._types import AnyArray
+from jrigid._types import AnyArray, VectorLike
 from jrigid.dynamics import State
 from jrigid.photometry import (
     AbstractScattering,
@@ -44,9 +44,9 @@ class Outline(NamedTuple):
 
 def appearance(
     body: Tumbler | Ellipsoid | Mesh,
-    to_sun: AnyArray,
-    to_observer: AnyArray,
-    attitude: AnyArray | State | None = None,
+    to_sun: VectorLike,
+    to_observer: VectorLike,
+    attitude: AnyArray | State | tuple[float, ...] | None = None,
     *,
     time: float = 0.0,
     mesh: Mesh | None = None,
@@ -136,7 +136,7 @@ def sky_axes(observer: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(observer, right), observer])
 
 
-def _unit(name: str, vector: AnyArray) -> np.ndarray:
+def _unit(name: str, vector: VectorLike) -> np.ndarray:
     """A vector over its length."""
     array = np.asarray(vector, float)
     check_shape(name, array, (3,))
@@ -147,7 +147,9 @@ def _unit(name: str, vector: AnyArray) -> np.ndarray:
 
 
 def _attitude_of(
-    body: Tumbler | Ellipsoid | Mesh, attitude: AnyArray | State | None, time: float
+    body: Tumbler | Ellipsoid | Mesh,
+    attitude: AnyArray | State | tuple[float, ...] | None,
+    time: float,
 ) -> np.ndarray:
     """The quaternion of a body."""
     if isinstance(body, Tumbler):

@@ -30,6 +30,7 @@ _MARKS = 14  # times below the axis, at most
 _SURE = 1.96  # standard deviations: 95 %
 _SIDE = 48  # of the map of two phases
 _SCALE = (1.0, 2.0, 5.0, 10.0)  # lengths of a bar, in powers of ten
+_LEAST_BARS = 3.0  # a bar may be one unit long, other times are some
 # Looks of the kinds of motion.
 _MODES = {"short-axis": LOOKS[0], "long-axis": LOOKS[1], "principal-axis": LOOKS[2]}
 _RANGE = 3.0  # ratio of the longest period to the shortest, above which an axis is log
@@ -224,7 +225,7 @@ def _draw_bar(ax: Axes, stretches: _Stretches) -> None:
     longest = float(np.max(stretches.ends - stretches.starts))
     if len(stretches.starts) == 1 or longest == 0:
         return
-    scale, unit = unit_of(longest)
+    scale, unit = unit_of(_LEAST_BARS * longest)
     power = 10.0 ** np.floor(np.log10(longest / scale))
     length = power * max(x for x in _SCALE if x * power * scale <= longest)
     end = float(stretches.place(stretches.ends)[-1])

@@ -140,7 +140,9 @@ def magnitudes_at(
 
 
 def between(
-    ts: Numbers, known: Numbers, vectors: Float[np.ndarray, "known 3"]
+    ts: Numbers,
+    known: Float[np.ndarray, " known"],
+    vectors: Float[np.ndarray, "known 3"],
 ) -> Vectors:
     """Vectors at times between those at which they are known."""
     return np.stack([np.interp(ts, known, x) for x in vectors.T], axis=1)

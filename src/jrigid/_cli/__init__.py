@@ -1,4 +1,7 @@
-"""The command line: `jrigid fit record.csv`, or `python -m jrigid fit record.csv`."""
+"""The command line: `jrigid fit record.csv` and `jrigid photometry curves.txt`.
+
+`python -m jrigid` does the same.
+"""
 
 import argparse
 import os
@@ -13,6 +16,7 @@ import numpy as np
 
 from jrigid import identify, plot, records
 from jrigid._checks import demand
+from jrigid._cli import _photometry
 from jrigid.identify import Status
 from jrigid.systems import RigidBody
 
@@ -45,6 +49,7 @@ _OPTIONS = (
     (r"`unit`", "`--unit`"),
     (r"\bunit=\{'(\w+)': \.\.\.\}", r"--unit \1=..."),
     (r"\bunit='?([\w./]+)'?", r"--unit \1"),
+    *_photometry.OPTIONS,
 )
 
 
@@ -57,12 +62,13 @@ def _torque(text: str) -> str | identify.GaussMarkov:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The parser of all commands, of which there is one."""
+    """The parser of all commands."""
     parser = argparse.ArgumentParser(
         "jrigid", description="The rotation of rigid bodies."
     )
     codes = ", ".join(f"{code} {name}" for name, code in _EXIT.items())
-    command = parser.add_subparsers(required=True).add_parser(
+    commands = parser.add_subparsers(required=True)
+    command = commands.add_parser(
         "fit",
         help="inertia from a file with a gyro's record of free motion",
         description="Inertia from a file with a gyro's record of free motion, of one "
@@ -71,8 +77,10 @@ def _parser() -> argparse.ArgumentParser:
         "arguments. `--flights` takes noise and bias from where the body rests; "
         "without a sigma the noise is taken from the residuals.",
     )
+    command.set_defaults(run=_fit)
     _add_options_of_reading(command)
     _add_options_of_fit(command)
+    _photometry.add_command(commands).set_defaults(run=_light_curves)
     return parser
 
 
@@ -222,12 +230,17 @@ def _fit(options: argparse.Namespace) -> int:
     return next(codes)
 
 
+def _light_curves(options: argparse.Namespace) -> int:
+    """Run the command of light curves; returns the exit status."""
+    return _photometry.run(options, lambda text: print(_with_options(text), flush=True))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command `jrigid`; returns the exit status."""
     options = _parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        return _fit(options)
+        return options.run(options)
     except (ValueError, RuntimeError, OSError, ImportError) as error:
         print(f"jrigid: {_with_options(str(error))}", file=sys.stderr)
         return 1
