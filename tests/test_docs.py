@@ -25,6 +25,8 @@ PAGES = [
 
 # What takes long in CI; recipes are all run.
 LONG = re.compile(r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate", re.DOTALL)
+# What takes minutes to compile, in recipes too.
+SLOW = re.compile(r"jr\.photometry\.find_tumblers\(")
 LONG_PAGES = [
     x
     for x in PAGES
@@ -33,17 +35,22 @@ LONG_PAGES = [
     if x.parent.name != "recipes" and x.stem != "identify"
     if any(map(LONG.search, BLOCK.findall(x.read_text())))
 ]
+SLOW_PAGES = [x for x in PAGES if any(map(SLOW.search, BLOCK.findall(x.read_text())))]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_code_blocks_run_and_print_what_is_written_beside(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where they write their pictures
     is_short = page.parent.name == "recipes"
-    assert run(page, lambda code: is_short or not LONG.search(code))
+
+    def is_wanted(code):
+        return not SLOW.search(code) and (is_short or not LONG.search(code))
+
+    assert run(page, is_wanted)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", LONG_PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", LONG_PAGES + SLOW_PAGES, ids=lambda page: page.stem)
 def test_code_blocks_that_take_long_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(page, lambda _: True)

@@ -155,12 +155,12 @@ def test_gaps_are_cut_out_and_the_times_written_below():
     shown = [x.get_text() for x in ax.get_xticklabels()]
     assert shown == [f"{x / HOUR / 24:.1f}" for x in firsts]
     assert "[d]" in ax.get_xlabel()
-    assert [x.get_text() for x in ax.texts] == ["1 h"]
+    assert [x.get_text() for x in ax.texts] == ["50 min"]
 
 
 def test_curves_of_one_stretch_have_no_gaps():
     ax = jr.plot.light_curves(CURVES[:1], TUMBLER, epoch=EPOCH)["unfolded"]
-    assert ax.get_xlabel() == "time since the first point [s]"
+    assert ax.get_xlabel() == "time since the first point [min]"
     assert not ax.texts
 
 
@@ -291,7 +291,7 @@ def test_a_film_is_seen_from_the_observer_above_its_curve(tmp_path):
     magnitudes = -2.5 * np.log10(np.asarray(expected))
     shifted = film.curve.values - film.curve.values[0]
     np.testing.assert_allclose(shifted, magnitudes - magnitudes[0], atol=2e-3)
-    assert film.unit == (1.0, "s")
+    assert film.unit == (60.0, "min")
     page = film.save(tmp_path / "curve.html").read_text()
     assert "NaN" not in page
     assert '"lights":[[' in page

@@ -125,8 +125,16 @@ def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
         "Argument `--orbit` must be given for an ALCDEF file, which has no vectors."
     )
     demand(options.orbit is not None, message)
-    axis, eccentricity, *angles, epoch = options.orbit
-    orbit = photometry.Orbit(_AU * axis, eccentricity, *np.radians(angles), epoch)
+    axis, eccentricity, inclination, node, argument, anomaly, epoch = options.orbit
+    orbit = photometry.Orbit(
+        semi_major_axis=_AU * axis,
+        eccentricity=eccentricity,
+        inclination=np.radians(inclination),
+        node=np.radians(node),
+        argument_of_perihelion=np.radians(argument),
+        mean_anomaly=np.radians(anomaly),
+        epoch=epoch,
+    )
     return photometry.read_alcdef(path, photometry.geometry_of_orbit(orbit))
 
 

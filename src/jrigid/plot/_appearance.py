@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jrigid._checks import check_shape, demand, kind_of
@@ -111,11 +112,11 @@ def outline_of(body: Tumbler | Ellipsoid | Mesh, mesh: Mesh | None) -> Outline:
     """Corners and faces of a body."""
     shape = body.shape if isinstance(body, Tumbler) else body
     shape = shape if mesh is None else mesh
-    message = (
-        "Argument `mesh` must be the vertices and faces of a body with `Facets`, which "
-        "do not say where they are, but it is None."
-    )
-    demand(not isinstance(shape, Facets), message)
+    if isinstance(shape, Facets):
+        raise ValueError(
+            "Argument `mesh` must be the vertices and faces of a body with `Facets`, "
+            "which do not say where they are, but it is None."
+        )
     if isinstance(shape, Ellipsoid):
         polar = np.linspace(np.pi - 1e-3, 1e-3, _ROWS + 1)
         ball, faces = rings(np.sin(polar), np.cos(polar), 2 * _ROWS)
@@ -196,7 +197,8 @@ def _surface_brightness(
 ) -> np.ndarray:
     """Brightness of a unit of area on the sky, over the largest; 0 where not lit."""
     lit = to_sun > 0
-    of_area = jax.vmap(law.of_area)(np.where(lit, to_sun, 1.0), to_observer)
+    cos_sun = jnp.asarray(np.where(lit, to_sun, 1.0))
+    of_area = jax.vmap(law.of_area)(cos_sun, jnp.asarray(to_observer))
     light = np.where(lit, np.asarray(of_area) / to_observer, 0.0)
     return light / max(float(np.max(light, initial=0.0)), np.finfo(float).tiny)
 
@@ -211,7 +213,7 @@ def _draw_axes(
     for name, start, end in zip("123", starts, ends, strict=True):
         style: dict[str, Any] = {"color": "#0072B2", "zorder": 3 if end[2] > 0 else 0}
         ax.plot([start[0], end[0]], [start[1], end[1]], lw=1.2, **style)
-        ax.text(*(1.1 * end[:2]), name, ha="center", va="center", **style)
+        ax.text(1.1 * end[0], 1.1 * end[1], name, ha="center", va="center", **style)
 
 
 def _draw_sun(ax: Axes, direction: np.ndarray) -> None:
@@ -223,4 +225,6 @@ def _draw_sun(ax: Axes, direction: np.ndarray) -> None:
     inner = 1.1 * across
     outer = 1.25 * across
     ax.plot([inner[0], outer[0]], [inner[1], outer[1]], color=_SUN, lw=2.5)
-    ax.text(*(1.36 * across), "Sun", color=_SUN, ha="center", va="center")
+    side = {-1: "right", 0: "center", 1: "left"}[round(across[0])]
+    where = 1.32 * across
+    ax.text(where[0], where[1], "Sun", color=_SUN, ha=side, va="center")

@@ -29,7 +29,8 @@ _GAPS = 0.3  # of the observed time: all gaps together, where they are cut out
 _MARKS = 14  # times below the axis, at most
 _SURE = 1.96  # standard deviations: 95 %
 _SIDE = 48  # of the map of two phases
-_SCALE = (1.0, 2.0, 5.0, 10.0)  # lengths of a bar, in powers of ten
+_BAR = 0.5  # of the longest stretch: the bar is not longer
+_SCALE = (1.0, 2.0, 5.0)  # lengths of a bar, in powers of ten
 _LEAST_BARS = 3.0  # a bar may be one unit long, other times are some
 # Looks of the kinds of motion.
 _MODES = {"short-axis": LOOKS[0], "long-axis": LOOKS[1], "principal-axis": LOOKS[2]}
@@ -222,7 +223,7 @@ def _mark_times(ax: Axes, points: Points, stretches: _Stretches) -> None:
 
 def _draw_bar(ax: Axes, stretches: _Stretches) -> None:
     """Draw how long the stretches are above the picture, where gaps are cut out."""
-    longest = float(np.max(stretches.ends - stretches.starts))
+    longest = _BAR * float(np.max(stretches.ends - stretches.starts))
     if len(stretches.starts) == 1 or longest == 0:
         return
     scale, unit = unit_of(_LEAST_BARS * longest)

@@ -25,7 +25,7 @@ from jrigid.rotation import rotate_inverse
 
 DAY = 86400.0
 # Units of time, the largest first: seconds in one, and its name.
-_UNITS = ((DAY, "d"), (3600.0, "h"), (1.0, "s"))
+_UNITS = ((DAY, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _LEAST_UNITS = 3.0  # of a unit in what is shown by it
 # Epochs in one call: programs of one size serve all pictures.
 _BLOCK = 512
@@ -112,10 +112,16 @@ def points_of(curves: Sequence[LightCurve], model: Model) -> Points:
     for k in np.unique(factor):
         own = factor == k
         magnitudes[own] -= np.mean(magnitudes[own] - predicted[own])
-    points = Points(ts, magnitudes, predicted, to_sun, to_observer, curve, zero)
     order = np.argsort(ts, kind="stable")
-    rows = [np.asarray(x)[order] for x in points[:-1]]
-    return Points(*rows, zero)
+    return Points(
+        ts=ts[order],
+        magnitudes=magnitudes[order],
+        predicted=predicted[order],
+        to_sun=to_sun[order],
+        to_observer=to_observer[order],
+        curve=curve[order],
+        zero=zero,
+    )
 
 
 def attitudes_at(tumbler: Tumbler, ts: AnyArray) -> Float[np.ndarray, "epochs 4"]:
@@ -187,7 +193,8 @@ def _brightness(
     """Brightness for attitudes and vectors in space axes."""
 
     def at(attitude: Array, sun: Array, observer: Array) -> Array:
-        in_body = (rotate_inverse(attitude, x) for x in (sun, observer))
-        return brightness(shape, *in_body, scattering)
+        sun_in_body = rotate_inverse(attitude, sun)
+        observer_in_body = rotate_inverse(attitude, observer)
+        return brightness(shape, sun_in_body, observer_in_body, scattering)
 
     return jax.vmap(at)(attitudes, to_sun, to_observer)
