@@ -17,7 +17,7 @@ _CORRECTIONS = ("NONE", "AVERAGE", "POINT")
 # Programs write 99.99 where they measured no magnitude.
 _NO_MAGNITUDE = 90
 # The time of observation from that of the light's departure: errors shrink by 1e4 each.
-_LIGHT_TIME_STEPS = 4
+_LIGHT_TIME_STEPS = 3
 
 
 @dataclasses.dataclass
@@ -257,10 +257,10 @@ def _seen_later(
     positions: Positions, dates: Float[np.ndarray, " epochs"]
 ) -> tuple[Vectors, Vectors]:
     """Vectors for dates at which the light left the body."""
-    light_days = np.zeros_like(dates)
+    to_sun, to_observer = _vectors(positions, dates)
     for _ in range(_LIGHT_TIME_STEPS):
-        to_sun, to_observer = _vectors(positions, dates + light_days)
         light_days = light_time(to_observer) / _DAY
+        to_sun, to_observer = _vectors(positions, dates + light_days)
     return to_sun, to_observer
 
 

@@ -86,7 +86,7 @@ def find_tumblers(
     longest: float,
     modes: Sequence[str] = tuple(MODES),
     inertia: str = "homogeneous",
-    pairs: int = 300,
+    pairs: int = 100,
     threshold: float = 25.0,
 ) -> Inversion:
     """Find the tumbling ellipsoids that explain light curves.

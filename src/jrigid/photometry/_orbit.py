@@ -31,7 +31,7 @@ _EARTH = np.array(
 # Newton's method contracts by 2/3 at worst, and a start is within 2 of the root.
 _NEWTON_STEPS = 100
 # Each step divides the error by the speed of light over that of the body, about 1e4.
-_LIGHT_TIME_STEPS = 4
+_LIGHT_TIME_STEPS = 3
 
 Vectors: TypeAlias = Float[np.ndarray, "epochs 3"]
 Positions: TypeAlias = Callable[[Float[np.ndarray, " epochs"]], tuple[Vectors, Vectors]]
@@ -161,10 +161,10 @@ def geometry_of_orbit(orbit: Orbit) -> Positions:
     ) -> tuple[Vectors, Vectors]:
         """Vectors to the Sun and to the Earth, corrected for the light time."""
         earth = earth_position(julian_dates)
-        light_days = np.zeros_like(julian_dates)
+        body = orbit.position(julian_dates)
         for _ in range(_LIGHT_TIME_STEPS):
-            body = orbit.position(julian_dates - light_days)
             light_days = light_time(earth - body) / _DAY
+            body = orbit.position(julian_dates - light_days)
         return -body, earth - body
 
     return positions

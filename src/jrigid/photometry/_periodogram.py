@@ -1,4 +1,10 @@
-"""Pairs of periods that may explain light curves, by Fourier series in two frequencies."""
+"""Pairs of periods that may explain light curves, by Fourier series in two frequencies.
+
+During an apparition the direction from which a body is seen and lit turns. The terms of
+the series grow, shrink and shift with it, often by more than their size. So each term
+has coefficients that are linear in the two directions in which the bisector of the Sun
+and the observer moves most.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -17,6 +23,7 @@ from jrigid.photometry._readings import Readings, readings_of
 
 # Frequencies in one resolution element, 1 over the span.
 _OVERSAMPLING = 4
+_OVERSAMPLING_OF_LINES = 8
 # Strongest lines of the ordinary periodogram of which one must be a line of the pair.
 _LINES = 10
 # Lines k f_phi + m f_psi that are the strongest ones of tumblers. An ellipsoid looks the
@@ -25,8 +32,11 @@ _STRONGEST = ((2, 0), (2, -2), (2, 2), (1, -2), (1, 2), (1, 0))
 # Lines of the series that is fitted for a pair.
 _SERIES = ((0, 2), (1, -2), (1, 0), (1, 2), (2, -2), (2, 0), (2, 2))
 _LINE = ((1,),)
-# Two candidates this many resolution elements apart are one.
+# Two candidates this many resolution elements apart are one, and two lines.
 _APART = 0.5
+_LINES_APART = 0.6
+# A bisector that moves by less than this [rad, root mean square] modulates nothing.
+_LEAST_MOTION = 0.02
 # Added to the diagonal of the normal equations, as a fraction of its mean: some series
 # hold the same line twice.
 _RIDGE = 1e-4
@@ -58,9 +68,11 @@ def period_pairs(
 ) -> PeriodPairs:
     """Pairs of periods of a tumbler by a two-dimensional periodogram.
 
-    A light curve of a tumbler is a Fourier series in its two frequencies. One of the
-    strongest lines of the ordinary periodogram is taken for one of the lines 2 f_phi,
-    2 (f_phi - f_psi) and others; the second frequency is then sought on a grid.
+    A light curve of a tumbler is a Fourier series in its two frequencies, with
+    coefficients that change with the direction from which it is seen: they are linear
+    in that direction here. One of the strongest lines of the periodogram is taken for
+    one of the lines 2 f_phi, 2 (f_phi - f_psi) and others; the second frequency is then
+    sought on a grid.
 
     Args:
         curves: Light curves, relative or absolute.
@@ -122,9 +134,10 @@ def strongest_lines(
     readings: Readings, lowest: float, highest: float
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """Lines of the ordinary periodogram, in cycles within the span, and their power."""
-    frequencies = np.arange(2 * max(lowest, 1.0), 4 * highest, 1 / _OVERSAMPLING)
+    step = 1 / _OVERSAMPLING_OF_LINES
+    frequencies = np.arange(2 * max(lowest, 1.0), 4 * highest, step)
     powers = _in_blocks(_LINE, readings, frequencies[:, None])
-    chosen = unlike(frequencies[:, None], powers, 1.0, _LINES)
+    chosen = unlike(frequencies[:, None], powers, _LINES_APART, _LINES)
     return frequencies[chosen], powers[chosen]
 
 
@@ -145,16 +158,35 @@ def unlike(
     return chosen
 
 
+def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
+    """1, and how far the bisector is along the two directions in which it moves most."""
+    there = readings.weights > 0
+    both = (readings.to_sun + readings.to_observer)[there]
+    # Zero where the Sun is straight behind the body, where there is no light either.
+    length = np.linalg.norm(both, axis=1, keepdims=True)
+    bisectors = both / np.where(length > 0, length, 1.0)
+    moved = bisectors - bisectors.mean(axis=0)
+    _, _, directions = np.linalg.svd(moved, full_matrices=False)
+    along = moved @ directions[:2].T
+    size = np.sqrt(np.mean(along**2, axis=0))
+    columns = np.zeros((len(readings.ts), 3))
+    columns[there, 0] = 1
+    columns[there, 1:] = along / np.where(size > _LEAST_MOTION, size, np.inf)
+    return columns
+
+
 def _in_blocks(
     series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: np.ndarray
 ) -> Float[np.ndarray, " many"]:
     """What a series explains for each row of frequencies, by a program of one size."""
+    modulating = modulations(readings)
     powers = []
     for first in range(0, len(frequencies), _BLOCK):
         block = frequencies[first : first + _BLOCK]
         missing = _BLOCK - len(block)
         block = np.pad(block, ((0, missing), (0, 0)), mode="edge")
-        powers.append(np.asarray(_powers(series, readings, block))[: _BLOCK - missing])
+        values = np.asarray(_powers(series, readings, modulating, block))
+        powers.append(values[: _BLOCK - missing])
     return np.concatenate(powers)
 
 
@@ -162,15 +194,19 @@ def _in_blocks(
 def _powers(
     series: tuple[tuple[int, ...], ...],
     readings: Readings,
+    modulating: Float[Array, "epochs 3"],
     frequencies: Float[Array, "many n"],
 ) -> Float[Array, " many"]:
     """What a series explains for each row of frequencies, some at a time."""
-    one = functools.partial(_power, series, readings)
+    one = functools.partial(_power, series, readings, modulating)
     return jax.lax.map(one, frequencies, batch_size=_LANES)
 
 
 def _power(
-    series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: Array
+    series: tuple[tuple[int, ...], ...],
+    readings: Readings,
+    modulating: Float[Array, "epochs 3"],
+    frequencies: Array,
 ) -> Scalar:
     """The part of chi-square that a Fourier series explains.
 
@@ -180,9 +216,9 @@ def _power(
     # Whole turns are taken off in double precision.
     angles = (2 * jnp.pi * (turns - jnp.round(turns))).astype(jnp.float32)
     lines = product("en,ln->el", angles, jnp.asarray(series, jnp.float32))
-    weights = readings.weights.astype(jnp.float32)
-    columns = jnp.concatenate([jnp.cos(lines), jnp.sin(lines)], axis=1)
-    columns = columns * weights[:, None]
+    waves = jnp.concatenate([jnp.cos(lines), jnp.sin(lines)], axis=1)
+    weighted = (modulating * readings.weights[:, None]).astype(jnp.float32)
+    columns = (waves[:, :, None] * weighted[:, None]).reshape(len(waves), -1)
     basis = readings.basis.astype(jnp.float32)
     inside = product("ef,ec->fc", basis, columns)
     # The values have no part along the basis already.
