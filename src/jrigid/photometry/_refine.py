@@ -30,14 +30,14 @@ class Quadratic(NamedTuple):
     """Chi-square about a point: its value, half its slope and its normal matrix."""
 
     chi_square: Float[AnyArray, "*lanes"]
-    slope: Float[AnyArray, "*lanes 11"]
-    normal: Float[AnyArray, "*lanes 11 11"]
+    slope: Float[AnyArray, "*lanes numbers"]
+    normal: Float[AnyArray, "*lanes numbers numbers"]
 
 
 class _Loop(NamedTuple):
     """The best points so far and what comes next."""
 
-    numbers: Float[Array, "lanes 11"]
+    numbers: Float[Array, "lanes numbers"]
     at: Quadratic
     damping: Float[Array, " lanes"]
     going: Bool[Array, " lanes"]
@@ -59,18 +59,33 @@ def quadratic(vector: Float[Array, "11"], task: Task, readings: Readings) -> Qua
 def refined(
     numbers: Float[Array, "lanes 11"], tasks: Task, readings: Readings, steps: int
 ) -> tuple[Float[Array, "lanes 11"], Quadratic]:
-    """Minimise chi-square in each lane.
+    """Minimise chi-square of tumblers in each lane.
 
     Args:
         numbers: Starting points.
         tasks: One for each lane.
         readings: The light curves, the same for all.
         steps: The largest number of steps.
+    """
+    evaluate = jax.vmap(quadratic, (0, 0, None))
+    return minimised(lambda x: evaluate(x, tasks, readings), numbers, steps)
+
+
+def minimised(
+    evaluate: Callable[[Float[Array, "lanes numbers"]], Quadratic],
+    numbers: Float[Array, "lanes numbers"],
+    steps: int,
+) -> tuple[Float[Array, "lanes numbers"], Quadratic]:
+    """Minimise in each lane what a function of all lanes says.
+
+    Args:
+        evaluate: Chi-square about the points of all lanes.
+        numbers: Starting points.
+        steps: The largest number of steps.
 
     Source: J. J. More, Lecture Notes in Mathematics 630 (1978) 105.
     """
-    evaluate = jax.vmap(quadratic, (0, 0, None))
-    start = evaluate(numbers, tasks, readings)
+    start = evaluate(numbers)
     loop = _Loop(
         numbers=numbers,
         at=start,
@@ -80,7 +95,7 @@ def refined(
     )
     found = jax.lax.while_loop(
         lambda loop: jnp.any(loop.going) & (loop.steps < steps),
-        lambda loop: _iteration(loop, lambda x: evaluate(x, tasks, readings)),
+        lambda loop: _iteration(loop, evaluate),
         loop,
     )
     return found.numbers, found.at
@@ -112,7 +127,7 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     )
 
 
-def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, "11"]:
+def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, " numbers"]:
     """The step of Levenberg and Marquardt, with More's scaling by the diagonal."""
     diagonal = jnp.maximum(jnp.diagonal(at.normal), _FLOOR)
     # In units in which the diagonal is 1 the equations are well scaled.
