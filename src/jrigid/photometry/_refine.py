@@ -37,7 +37,7 @@ class Quadratic(NamedTuple):
 class _Loop(NamedTuple):
     """The best points so far and what comes next."""
 
-    numbers: Float[Array, "lanes numbers"]
+    numbers: Float[Array, "lanes 11"]
     at: Quadratic
     damping: Float[Array, " lanes"]
     going: Bool[Array, " lanes"]
@@ -59,33 +59,18 @@ def quadratic(vector: Float[Array, "11"], task: Task, readings: Readings) -> Qua
 def refined(
     numbers: Float[Array, "lanes 11"], tasks: Task, readings: Readings, steps: int
 ) -> tuple[Float[Array, "lanes 11"], Quadratic]:
-    """Minimise chi-square of tumblers in each lane.
+    """Minimise chi-square in each lane.
 
     Args:
         numbers: Starting points.
         tasks: One for each lane.
         readings: The light curves, the same for all.
         steps: The largest number of steps.
-    """
-    evaluate = jax.vmap(quadratic, (0, 0, None))
-    return minimised(lambda x: evaluate(x, tasks, readings), numbers, steps)
-
-
-def minimised(
-    evaluate: Callable[[Float[Array, "lanes numbers"]], Quadratic],
-    numbers: Float[Array, "lanes numbers"],
-    steps: int,
-) -> tuple[Float[Array, "lanes numbers"], Quadratic]:
-    """Minimise in each lane what a function of all lanes says.
-
-    Args:
-        evaluate: Chi-square about the points of all lanes.
-        numbers: Starting points.
-        steps: The largest number of steps.
 
     Source: J. J. More, Lecture Notes in Mathematics 630 (1978) 105.
     """
-    start = evaluate(numbers)
+    evaluate = jax.vmap(quadratic, (0, 0, None))
+    start = evaluate(numbers, tasks, readings)
     loop = _Loop(
         numbers=numbers,
         at=start,
@@ -95,7 +80,7 @@ def minimised(
     )
     found = jax.lax.while_loop(
         lambda loop: jnp.any(loop.going) & (loop.steps < steps),
-        lambda loop: _iteration(loop, evaluate),
+        lambda loop: _iteration(loop, lambda x: evaluate(x, tasks, readings)),
         loop,
     )
     return found.numbers, found.at
