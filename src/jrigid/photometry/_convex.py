@@ -123,14 +123,20 @@ def surface_of(
 
 
 def even_directions(count: int) -> Float[np.ndarray, "many 3"]:
-    """Unit vectors that cover the sphere evenly, on a spiral of the golden ratio."""
-    index = np.arange(count) + 0.5
-    height = 1 - 2 * index / count
+    """Unit vectors that cover the sphere evenly, in pairs of opposite ones.
+
+    Half of them lie on a spiral of the golden ratio. With opposite ones a sphere is
+    closed and the mirror of a body is a body.
+    """
+    half = (count + 1) // 2
+    index = np.arange(half) + 0.5
+    height = 1 - index / half
     longitude = np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - height**2)
-    return np.stack(
+    upper = np.stack(
         [radius * np.cos(longitude), radius * np.sin(longitude), height], axis=1
     )
+    return np.concatenate([upper, -upper])
 
 
 def real_harmonics(

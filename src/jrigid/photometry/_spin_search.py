@@ -205,7 +205,8 @@ def minimise(
         result = _minimised(
             numbers[block], frames[block], surface, readings, np.asarray(steps)
         )
-        blocks.append(Spins(result[0], frames[block], result[1]).rows(range(len(rows))))
+        spins = Spins(result[0], frames[block], result[1])
+        blocks.append(spins.rows(np.arange(len(rows))))
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
 
 
