@@ -148,7 +148,7 @@ def test_the_plane_of_the_ecliptic_leaves_two_poles():
 
 def test_calibrated_curves_give_the_phase_function_and_the_albedo():
     albedo = np.array([0.15, -0.1, 0.05])
-    curves = observed(0.003, False, np.deg2rad(12.0), albedo)
+    curves = observed(0.008, False, np.deg2rad(12.0), albedo)
     start = ph.Mixture(0.1, amplitude=0.5, width=0.1, slope=-0.5)
     result = ph.find_spin(
         curves,
@@ -159,14 +159,15 @@ def test_calibrated_curves_give_the_phase_function_and_the_albedo():
         albedo=True,
     )
     best = result.solutions[0]
-    np.testing.assert_allclose(result.noise, 0.003, rtol=0.25)
+    np.testing.assert_allclose(result.noise, 0.008, rtol=0.25)
     truth = [LAW[name] for name in ("amplitude", "width", "slope")]
     off = (best.estimates.scattering[1:] - truth) / best.errors.scattering[1:]
     assert np.max(np.abs(off)) < 4
     # The body axes are those of the truth but for the angle about z.
-    np.testing.assert_allclose(best.estimates.albedo[2], albedo[2], atol=0.03)
+    along = best.estimates.albedo[2] - albedo[2]
+    assert abs(along) < 4 * best.errors.albedo[2]
     size = np.linalg.norm(best.estimates.albedo)
-    np.testing.assert_allclose(size, np.linalg.norm(albedo), atol=0.03)
+    np.testing.assert_allclose(size, np.linalg.norm(albedo), atol=0.06)
     assert "albedo varies by a factor of" in result.report()
 
 
@@ -190,6 +191,8 @@ def test_derivatives_are_those_of_central_differences():
     taken, _ = readings.readings_of(curves, 0.01)
     start = ph.Mixture(0.2, amplitude=0.4, width=0.1, slope=-0.5)
     surface = convex.surface_of(3, 80, start, convex.SCATTERING, True, 0.01)
+    # Arrays of JAX, as those of a compiled program are.
+    on_device, data = jax.tree.map(jnp.asarray, (surface, taken))
     rng = np.random.default_rng(1)
     frame = jnp.asarray(Rotation.random(random_state=2).as_matrix())
     vector = surface.centre + 0.2 * rng.normal(size=surface.centre.size)
@@ -197,11 +200,11 @@ def test_derivatives_are_those_of_central_differences():
 
     @jax.jit
     def rows(vector):
-        return convex.spin_rows(vector, frame, surface, taken)
+        return convex.spin_rows(vector, frame, on_device, data)
 
     @jax.jit
     def quadratic(vector):
-        return convex.spin_quadratic(vector, frame, surface, taken)
+        return convex.spin_quadratic(vector, frame, on_device, data)
 
     slopes = rows(jnp.asarray(vector)).slopes
     half_gradient = quadratic(jnp.asarray(vector)).slope

@@ -165,19 +165,16 @@ def _lifted(
 
 
 def mirrored(spins: Spins) -> tuple[AnyArray, AnyArray]:
-    """Numbers and frames of the same motions seen in the plane of the ecliptic.
+    """Numbers and frames that give the same light in the plane of the ecliptic.
 
-    Where Sun and observer are in this plane, the light is the same. The pole has another
-    longitude by half a turn, and each facet the opposite normal.
+    There, the mirror image has the Sun and the observer where they are. Its pole has
+    another longitude by half a turn. In body axes all directions are opposite, and so
+    are the normals.
     """
-    frames = np.stack(
-        [frame_of_pole(pole * [-1.0, -1.0, 1.0]) for pole in spins.poles()]
-    )
     numbers = np.array(spins.numbers)
-    numbers[:, 1:3] = 0.0
     numbers[:, 3:6] *= -1
     numbers[:, 10:] *= (-1.0) ** degrees_of_harmonics(numbers.shape[1] - 10)
-    return numbers, frames
+    return numbers, np.asarray(spins.frames) * [-1.0, -1.0, 1.0]
 
 
 def best(spins: Spins, count: int) -> Spins:
