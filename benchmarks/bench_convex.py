@@ -130,22 +130,24 @@ def shown(times):
 def main(package, repeats, write):
     """Measure and report."""
     curves = ph.read_light_curves(package / "test_lcs_rel")
-    ours, theirs = [], []
-    first = None
+    ours = []
+    theirs = []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(repeats):
             found, seconds = by_jrigid(curves)
-            first = seconds if first is None else first
             ours.append(seconds)
-            best, periods, seconds = by_convexinv(package, pathlib.Path(folder))
-            theirs.append(seconds)
+            theirs.append(by_convexinv(package, pathlib.Path(folder)))
             print("jrigid", ours, "convexinv", theirs, flush=True)
     found, seconds = by_jrigid(curves)
+    first = ours[0]
     ours = [*ours[1:], seconds]
+    best, periods, _ = theirs[-1]
     table = rows_of("`find_spin`", found, shown(ours))
     deviation, longitude, latitude, period = best
     pole = (longitude, latitude)
-    table.append(row("convexinv", period, None, pole, deviation, shown(theirs)))
+    table.append(
+        row("convexinv", period, None, pole, deviation, shown([x[-1] for x in theirs]))
+    )
     for degree in (4, 8):
         other, seconds = by_jrigid(curves, degree=degree)
         table += rows_of(f"`find_spin`, degree {degree}", other, None)[:1]
@@ -161,16 +163,16 @@ def main(package, repeats, write):
     separation = 0.5 * PERIOD**2 / (float(np.ptp([x.ts[0] for x in curves])) / HOUR)
     text = (
         "The test asteroid of DAMIT's package, (43) Ariadne, from its relative light "
-        "curves. Published with the package (convexinv_doc.pdf, without errors): period "
-        f"{PERIOD} h, pole {POLES[0]}, rms 0.016; {POLES[1]} is the mirror of that pole."
-        "\n\n"
+        "curves. Published with the package (convexinv_doc.pdf, without errors): "
+        f"period {PERIOD} h, pole {POLES[0]}, rms 0.016; {POLES[1]} is the mirror of "
+        "that pole.\n\n"
         + common.table(header, table)
-        + f"\n\nRange of periods: {SHORTEST} to {LONGEST} h, in which period_scan takes "
-        f"{periods} trial periods with 6 poles and 50 steps, and `find_spin` 17 with 12 "
-        "poles. Neighbouring minima of chi-square are "
-        f"{1e6 * separation:.0f}e-6 h apart. convexinv then takes 300 steps from each of "
-        f"6 poles. Times: {repeats} runs in turns, of `find_spin` without the first one, "
-        f"which compiles and took {first:.0f} CPU s."
+        + f"\n\nRange of periods: {SHORTEST} to {LONGEST} h, in which period_scan "
+        f"takes {periods} trial periods with 6 poles and 50 steps, and `find_spin` 17 "
+        "with 12 poles. Neighbouring minima of chi-square are "
+        f"{1e6 * separation:.0f}e-6 h apart. convexinv then takes 300 steps from each "
+        f"of 6 poles. Times: {repeats} runs in turns, of `find_spin` without the first "
+        f"one, which compiles and took {first:.0f} CPU s."
     )
     title = "Inversion to a spin and a convex shape"
     common.report("convex", title, text, ["jax", "numpy"], write)

@@ -95,7 +95,9 @@ def alias_of(
     seeks = np.asarray(sought(task))
     normal = np.asarray(slopes).T @ np.asarray(slopes)
     covariance = np.zeros((COUNT, COUNT))
-    covariance[np.ix_(seeks, seeks)] = scale * inverse_normal(normal[np.ix_(seeks, seeks)])
+    covariance[np.ix_(seeks, seeks)] = scale * inverse_normal(
+        normal[np.ix_(seeks, seeks)]
+    )
     span = np.asarray(readings.span)
     estimates, of_numbers = _estimates_and_slopes(numbers, task, span)
     errors = jax.tree.map(

@@ -27,6 +27,7 @@ from jrigid.photometry._scattering import Mixture
 SCATTERING = ("lambert", "amplitude", "width", "slope")
 # These are sought by their logarithms, so that they stay positive.
 _POSITIVE = np.array([True, False, True, False])
+_LEAST = 1e-12  # of a weight that is given as 0
 # Standard deviations of what is known beforehand: of each harmonic of the logarithm of
 # the areas, of the slope of the logarithm of the albedo, and of logarithms of positive
 # scattering parameters. They matter where the light says nothing.
@@ -99,15 +100,20 @@ def surface_of(
     normals = even_directions(facets)
     harmonics = real_harmonics(normals, degree)
     given = np.array([float(getattr(scattering, name)) for name in SCATTERING])
-    with np.errstate(divide="ignore"):
-        given = np.where(_POSITIVE, np.log(np.where(_POSITIVE, given, 1.0)), given)
+    logarithms = np.log(np.where(_POSITIVE, np.maximum(given, _LEAST), 1.0))
+    given = np.where(_POSITIVE, logarithms, given)
     coefficients = harmonics.shape[1]
     is_fitted = np.array([name in fitted for name in SCATTERING])
     return Surface(
         normals=normals,
         harmonics=harmonics,
         sought=np.concatenate(
-            [np.ones(3, bool), np.full(3, albedo), is_fitted, np.ones(coefficients, bool)]
+            [
+                np.ones(3, bool),
+                np.full(3, albedo),
+                is_fitted,
+                np.ones(coefficients, bool),
+            ]
         ),
         centre=np.concatenate([np.zeros(6), given, np.zeros(coefficients)]),
         stiffness=np.concatenate(
@@ -144,36 +150,44 @@ def real_harmonics(
 ) -> Float[np.ndarray, "many harmonics"]:
     """Real spherical harmonics of degree 1 to `degree`, of mean square 1 on the sphere.
 
-    Columns are in rising order of the degree l, and of the order m from -l to l within.
+    Columns are in rising order of the degree, and of the order from -degree to degree
+    within. Negative orders are sines of the longitude.
 
     Source: the recurrences of W. H. Press et al., Numerical Recipes, 3rd ed., 6.7.
     """
     x, y, z = directions.T
-    along = x + 1j * y
     columns: dict[tuple[int, int], np.ndarray] = {}
-    sectoral = np.ones_like(z)
+    highest = np.ones_like(z)
     for m in range(degree + 1):
         if m > 0:
-            sectoral = sectoral * np.sqrt((2 * m + 1) / (2 * m))
-        before = np.zeros_like(z)
-        current = sectoral
-        ratio = 0.0
-        turned = along**m
-        for l in range(m, degree + 1):
-            if m == 0:
-                columns[l, 0] = current
-            else:
-                columns[l, m] = np.sqrt(2) * current * turned.real
-                columns[l, -m] = np.sqrt(2) * current * turned.imag
-            of_next = np.sqrt((4 * (l + 1) ** 2 - 1) / ((l + 1) ** 2 - m**2))
-            before, current = current, of_next * (z * current - ratio * before)
-            ratio = 1 / of_next
-    order = [(l, m) for l in range(1, degree + 1) for m in range(-l, l + 1)]
+            highest = highest * np.sqrt((2 * m + 1) / (2 * m))
+        turned = (x + 1j * y) ** m * (1 if m == 0 else np.sqrt(2))
+        for n, legendre in enumerate(_legendre(highest, z, m, degree), m):
+            columns[n, -m] = legendre * turned.imag
+            columns[n, m] = legendre * turned.real
+    order = [(n, m) for n in range(1, degree + 1) for m in range(-n, n + 1)]
     return np.stack([columns[key] for key in order], axis=1)
 
 
+def _legendre(
+    highest: np.ndarray, z: np.ndarray, m: int, degree: int
+) -> list[np.ndarray]:
+    """Legendre functions of order m and degrees from m, over the sine to the power m.
+
+    The next one is w(n + 1) (z P(n) - P(n - 1) / w(n)).
+    """
+    functions = [highest]
+    before = np.zeros_like(z)
+    for n in range(m + 1, degree + 1):
+        weight = np.sqrt((4 * n**2 - 1) / (n**2 - m**2))
+        following = weight * (z * functions[-1] - before)
+        before = functions[-1] / weight
+        functions.append(following)
+    return functions
+
+
 def degrees_of_harmonics(count: int) -> np.ndarray:
-    """The degree l of each of so many harmonics."""
+    """The degree of each of so many harmonics."""
     return np.floor(np.sqrt(np.arange(1, count + 1))).astype(int)
 
 
@@ -211,9 +225,7 @@ def _albedo(slope: Vector, surface: Surface) -> Array:
     return jnp.exp(product("fi,i->f", surface.normals, slope))
 
 
-def openness(
-    shape: Float[Array, " harmonics"], surface: Surface
-) -> Float[Array, "3"]:
+def openness(shape: Float[Array, " harmonics"], surface: Surface) -> Float[Array, "3"]:
     """The sum of the areas as vectors, over their sum as numbers."""
     areas = _areas(shape, surface)
     return product("f,fi->i", areas, surface.normals) / jnp.sum(areas)

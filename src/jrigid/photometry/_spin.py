@@ -163,7 +163,7 @@ def find_spin(
             2.5 times the span of the curves over `shortest` less that over `longest`.
         degree: Largest degree of the harmonics.
         facets: Number of facets.
-        scattering: The law, or where its fit starts; `Mixture(0.1)` where it is None.
+        scattering: The law, or where its fit starts; `Mixture()` where it is None.
         fitted: Names of parameters of `scattering` that are fitted: "lambert",
             "amplitude", "width", "slope". All but the first need curves that are not
             relative.
@@ -200,7 +200,7 @@ def find_spin(
     >>> print((found.solutions[0].estimates.period / hour).round(2))
     6.0
     """
-    law = Mixture(0.1) if scattering is None else scattering
+    law = Mixture() if scattering is None else scattering
     _check_curves(curves, noise, fitted)
     _check_options(degree, facets, law, fitted, closure)
     readings, epoch = readings_of(curves, _FIRST_NOISE if noise is None else noise)
@@ -257,9 +257,10 @@ def _check_options(
     demand(closure > 0, f"Argument `closure` must be positive, but it is {closure}.")
     for name in ("lambert", "width"):
         value = float(getattr(law, name))
-        least = 0 < value if name in fitted or name == "width" else 0 <= value
+        # A parameter is sought by its logarithm, but a given weight may be 0.
+        may_be_zero = name == "lambert" and name not in fitted
         demand(
-            least,
+            value > 0 or (may_be_zero and value == 0),
             f"Argument `scattering` must have a positive `{name}`, but it is {value}.",
         )
 
@@ -315,7 +316,10 @@ def _inversion(
     freedom = _freedom(readings, surface)
     reduced = _light(spins, surface, readings) / freedom
     scale = max(reduced, 1.0)
-    every = [_spin(spins.rows([i]), surface, readings, scale) for i in range(len(spins.numbers))]
+    every = [
+        _spin(spins.rows([i]), surface, readings, scale)
+        for i in range(len(spins.numbers))
+    ]
     growth = (spins.quadratic.chi_square - spins.quadratic.chi_square[0]) / scale
     near = int(np.count_nonzero(growth <= threshold))
     mirror = _index_of_mirror(spins)
@@ -423,7 +427,9 @@ def _report(found: SpinInversion) -> str:
     others = [x for x in found.rejected if x is not found.mirror]
     if others:
         grown = others[0].chi_square - found.solutions[0].chi_square
-        lines.append(f"The next solution has a chi-square that is larger by {grown:.0f}.")
+        lines.append(
+            f"The next solution has a chi-square that is larger by {grown:.0f}."
+        )
     lines.append(
         "Errors assume that those of the points are independent and that the body is "
         "convex; the errors of poles in use are often several times larger."

@@ -18,7 +18,6 @@ from jrigid.photometry._convex import (
     spin_quadratic,
     unpacked_spin,
 )
-from jrigid.photometry._model import axes_of_momentum
 from jrigid.photometry._periodogram import unlike
 from jrigid.photometry._readings import Readings
 from jrigid.photometry._refine import Quadratic, damped_step
@@ -120,9 +119,7 @@ def search_spins(
     is_motion = np.arange(coarse.centre.size) < 3
     still = coarse._replace(sought=coarse.sought & ~is_motion)
     scanned = minimise(numbers, frames, still, few, _SHAPE_STEPS, _COARSE_LANES)
-    scanned = minimise(
-        scanned.numbers, frames, coarse, few, _SCAN_STEPS, _COARSE_LANES
-    )
+    scanned = minimise(scanned.numbers, frames, coarse, few, _SCAN_STEPS, _COARSE_LANES)
     better = best(scanned, _SURVIVORS)
     better = minimise(
         better.numbers, better.frames, coarse, few, _COARSE_STEPS, _COARSE_LANES
@@ -143,7 +140,9 @@ def settled(spins: Spins, surface: Surface, readings: Readings) -> Spins:
     return best(joined, len(joined.numbers))
 
 
-def starts(surface: Surface, lowest: float, highest: float) -> tuple[AnyArray, AnyArray]:
+def starts(
+    surface: Surface, lowest: float, highest: float
+) -> tuple[AnyArray, AnyArray]:
     """Numbers and frames of all starting points."""
     count = max(1, int(np.ceil((highest - lowest) / STRIDE)))
     cycles = lowest + (highest - lowest) * (np.arange(count) + 0.5) / count
