@@ -190,14 +190,16 @@ def find_spin(
     ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape, mode="principal-axis")
     >>> ts = np.linspace(0.0, 400 * hour, 120)
     >>> angle = ts / 4e5
-    >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.2 + 0 * ts], axis=1)
-    >>> earth = np.stack([np.sin(angle), np.cos(angle), 0.1 + 0 * ts], axis=1)
+    >>> seen = angle + 0.4 * np.cos(angle)
+    >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * ts], axis=1)
+    >>> earth = np.stack([np.cos(seen), np.sin(seen), 0.1 + 0 * ts], axis=1)
     >>> noise = 0.01 * np.random.default_rng(0).normal(size=120)
     >>> light = np.asarray(body.light_curve(ts, sun, earth)) * 10 ** (-0.4 * noise)
     >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
     >>> found = jr.photometry.find_spin(
-    ...     [curve], 0.01, shortest=5.9 * hour, longest=6.1 * hour, degree=2, facets=128)
-    >>> print((found.solutions[0].estimates.period / hour).round(2))
+    ...     [curve], 0.01, shortest=5.9 * hour, longest=6.1 * hour, degree=3, facets=128)
+    >>> best = found.solutions[0]  # a Spin with its body and its SpinEstimates
+    >>> print((best.estimates.period / hour).round(2))
     6.0
     """
     law = Mixture() if scattering is None else scattering
