@@ -162,6 +162,7 @@ def main(package, repeats, write):
     ]
     separation = 0.5 * PERIOD**2 / (float(np.ptp([x.ts[0] for x in curves])) / HOUR)
     text = (
+        "The command takes the folder of DAMIT's package, as its docstring says.\n\n"
         "The test asteroid of DAMIT's package, (43) Ariadne, from its relative light "
         "curves. Published with the package (convexinv_doc.pdf, without errors): "
         f"period {PERIOD} h, pole {POLES[0]}, rms 0.016; {POLES[1]} is the mirror of "
