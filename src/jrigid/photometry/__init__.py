@@ -6,7 +6,8 @@ in body axes. All functions are pure, and `jit`, `vmap` and derivatives of any o
 work. Vectors to the Sun and to the observer start at the body. They are in space axes
 where a state is given, and in body axes where a shape alone is. Bodies are convex:
 nothing here casts a shadow. `find_tumblers` goes the other way: it finds the tumblers
-that explain light curves.
+that explain light curves. `find_spin` finds the pole, the period and the convex shape of
+a body that rotates steadily.
 """
 
 from jrigid.photometry._alcdef import read_alcdef as read_alcdef
@@ -33,6 +34,10 @@ from jrigid.photometry._scattering import Geometric as Geometric
 from jrigid.photometry._scattering import Lambert as Lambert
 from jrigid.photometry._scattering import LommelSeeliger as LommelSeeliger
 from jrigid.photometry._scattering import Mixture as Mixture
+from jrigid.photometry._spin import Spin as Spin
+from jrigid.photometry._spin import SpinEstimates as SpinEstimates
+from jrigid.photometry._spin import SpinInversion as SpinInversion
+from jrigid.photometry._spin import find_spin as find_spin
 from jrigid.photometry._tumbler import Tumbler as Tumbler
 from jrigid.photometry._tumbling import Tumbling as Tumbling
 from jrigid.photometry._tumbling import omega_from_periods as omega_from_periods

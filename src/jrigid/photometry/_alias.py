@@ -95,7 +95,9 @@ def alias_of(
     seeks = np.asarray(sought(task))
     normal = np.asarray(slopes).T @ np.asarray(slopes)
     covariance = np.zeros((COUNT, COUNT))
-    covariance[np.ix_(seeks, seeks)] = scale * _inverse(normal[np.ix_(seeks, seeks)])
+    covariance[np.ix_(seeks, seeks)] = scale * inverse_normal(
+        normal[np.ix_(seeks, seeks)]
+    )
     span = np.asarray(readings.span)
     estimates, of_numbers = _estimates_and_slopes(numbers, task, span)
     errors = jax.tree.map(
@@ -119,7 +121,7 @@ def alias_of(
 rows_at = jax.jit(rows_of)
 
 
-def _inverse(normal: np.ndarray) -> np.ndarray:
+def inverse_normal(normal: np.ndarray) -> np.ndarray:
     """Inverse of a normal matrix, by its scale; infinite along what is not determined."""
     size = np.sqrt(np.diag(normal))
     size = np.where(size > 0, size, 1.0)

@@ -289,14 +289,14 @@ def _described(rank: int, alias: Alias) -> list[str]:
     head = (
         f"{rank}. {mode}, chi-square {alias.chi_square:.1f}, weight {alias.weight:.3f}"
     )
-    periods = f"   P_phi {_hours(x.precession_period, error.precession_period)}"
+    periods = f"   P_phi {in_hours(x.precession_period, error.precession_period)}"
     if mode == "principal-axis":
         periods = periods.replace("P_phi", "period")
     else:
-        periods += f", P_psi {_hours(x.rotation_period, error.rotation_period)}"
+        periods += f", P_psi {in_hours(x.rotation_period, error.rotation_period)}"
     pole = (
-        f"   angular momentum towards longitude {_degrees(x.longitude, error.longitude)}, "
-        f"latitude {_degrees(x.latitude, error.latitude)}"
+        f"   angular momentum towards longitude {in_degrees(x.longitude, error.longitude)}, "
+        f"latitude {in_degrees(x.latitude, error.latitude)}"
     )
     shape = ", ".join(
         f"{name} {value:.3f} +- {spread:.3f}"
@@ -310,12 +310,12 @@ def _described(rank: int, alias: Alias) -> list[str]:
     return lines
 
 
-def _hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
+def in_hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
     """A period in hours with its error."""
     digits = int(np.clip(1 - np.floor(np.log10(error / _HOUR)), 0, 9))
     return f"{period / _HOUR:.{digits}f} +- {error / _HOUR:.{digits}f} h"
 
 
-def _degrees(angle: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
+def in_degrees(angle: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
     """An angle in degrees with its error."""
     return f"{np.rad2deg(angle):.1f} +- {np.rad2deg(error):.1f} degrees"

@@ -29,8 +29,8 @@ class Quadratic(NamedTuple):
     """Chi-square about a point: its value, half its slope and its normal matrix."""
 
     chi_square: Float[AnyArray, "*lanes"]
-    slope: Float[AnyArray, "*lanes 11"]
-    normal: Float[AnyArray, "*lanes 11 11"]
+    slope: Float[AnyArray, "*lanes numbers"]
+    normal: Float[AnyArray, "*lanes numbers numbers"]
 
 
 class _Loop(NamedTuple):
@@ -114,7 +114,7 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     )
 
 
-def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, "11"]:
+def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, " numbers"]:
     """The step of Levenberg and Marquardt, with More's scaling by the diagonal."""
     diagonal = jnp.maximum(jnp.diagonal(at.normal), _FLOOR)
     # In units in which the diagonal is 1 the equations are well scaled.

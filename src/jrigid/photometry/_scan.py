@@ -57,10 +57,10 @@ def orientations() -> Float[np.ndarray, "many 3 3"]:
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
 
 
-def fewer_epochs(readings: Readings) -> Readings:
-    """One block of the readings, evenly chosen, with the basis of their own."""
+def fewer_epochs(readings: Readings, count: int = EPOCHS) -> Readings:
+    """So many of the epochs, evenly chosen, with the basis of their own."""
     there = np.flatnonzero(readings.weights)
-    even = np.linspace(0, len(there) - 1, min(EPOCHS, len(there)))
+    even = np.linspace(0, len(there) - 1, min(count, len(there)))
     chosen = there[even.astype(int)]
     left, sizes, _ = np.linalg.svd(readings.basis[chosen], full_matrices=False)
     basis = left * (sizes > _LEAST_SIZE)

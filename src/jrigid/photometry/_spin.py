@@ -1,0 +1,502 @@
+"""Inversion of light curves to the spin and the convex shape of a steady rotator."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import check_option, demand, whole_number
+from jrigid._numerics import product
+from jrigid._types import AnyArray, Matrix
+from jrigid.photometry._alias import inverse_normal
+from jrigid.photometry._convex import (
+    SCATTERING,
+    Surface,
+    facets_of,
+    law_of,
+    openness,
+    spin_rows,
+    surface_of,
+    unpacked_spin,
+)
+from jrigid.photometry._files import LightCurve
+from jrigid.photometry._inversion import in_degrees, in_hours
+from jrigid.photometry._model import axes_of_momentum
+from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._scattering import Mixture
+from jrigid.photometry._spin_search import (
+    COARSE_DEGREE,
+    COARSE_FACETS,
+    STRIDE,
+    Spins,
+    search_spins,
+    settled,
+)
+from jrigid.photometry._tumbler import Tumbler
+
+# Noise of the search where none is given [mag]; what the best solution leaves replaces
+# it.
+_FIRST_NOISE = 0.02
+_MOST_PERIODS = 50_000
+_MOST_DEGREE = 12
+# A mirror has the other longitude by half a turn, but for what the inclination of the
+# orbit tells.
+_NEAR_MIRROR = 0.6
+_SAME_TURNS = 0.3
+_NEEDS_SCALE = ("amplitude", "width", "slope")
+
+
+class SpinEstimates(NamedTuple):
+    """What observers quote of a steady rotation, or the standard errors of these.
+
+    Attributes:
+        period: Sidereal period of rotation [s].
+        longitude: Of the pole, space axes [rad].
+        latitude: Of the pole [rad].
+        scattering: `lambert`, `amplitude`, `width` and `slope` of the `Mixture`; an
+            error of 0 where they are given.
+        albedo: Slope of the logarithm of the albedo along the body axes.
+    """
+
+    period: Float[AnyArray, ""]
+    longitude: Float[AnyArray, ""]
+    latitude: Float[AnyArray, ""]
+    scattering: Float[AnyArray, "4"]
+    albedo: Float[AnyArray, "3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spin:
+    """One steady rotation of a convex body that explains light curves.
+
+    Attributes:
+        body: The body, in the mode "principal-axis", with its facets and its scattering
+            law. The sum of the areas is that of a unit sphere. The moments of inertia
+            are not known and have no effect: they are given as equal.
+        estimates: Its period, pole and scattering.
+        errors: Their standard errors. They hold if the errors of the points are
+            independent and the surface is as assumed, and are enlarged where chi-square
+            is too large.
+        chi_square: Sum of squares of the residuals over the noise, and of what the areas
+            and the numbers deviate from what is expected, over its spread.
+        open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
+            closed surface. Above about .01 the albedo is not uniform, or the body is
+            far from convex.
+        residuals: Of each point of the curves, in their order [mag].
+    """
+
+    body: Tumbler
+    estimates: SpinEstimates
+    errors: SpinEstimates
+    chi_square: float
+    open_share: float
+    residuals: Float[np.ndarray, " epochs"] = dataclasses.field(repr=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class SpinInversion:
+    """Steady rotations that explain light curves, the best first.
+
+    Attributes:
+        solutions: Those whose chi-square is near the least one.
+        rejected: The best of the others.
+        mirror: The solution with the pole's longitude larger by half a turn. Curves
+            from the plane of the ecliptic do not tell it from the first solution. None
+            if a fit that starts there goes elsewhere.
+        epoch: Julian date of time 0 of the bodies.
+        noise: Standard deviation of a point [mag], stated or found.
+        reduced_chi_square: Chi-square of the light over its degrees of freedom.
+        degrees_of_freedom: Points less unknown numbers.
+        follows: Whether the best solution follows the curves to their noise.
+    """
+
+    solutions: list[Spin]
+    rejected: list[Spin]
+    mirror: Spin | None
+    epoch: float
+    noise: float
+    reduced_chi_square: float
+    degrees_of_freedom: int
+    follows: bool
+
+    def report(self) -> str:
+        """The table in words."""
+        return _report(self)
+
+
+def find_spin(
+    curves: Sequence[LightCurve],
+    noise: float | None = None,
+    *,
+    shortest: float,
+    longest: float,
+    degree: int = 6,
+    facets: int = 512,
+    scattering: Mixture | None = None,
+    fitted: Sequence[str] = (),
+    albedo: bool = False,
+    closure: float = 0.01,
+    threshold: float = 25.0,
+) -> SpinInversion:
+    """Find the period, the pole and the convex shape of a body that rotates steadily.
+
+    The normals of the facets are fixed, and the logarithms of their areas are sums of
+    spherical harmonics. Each trial period is combined with poles all over the sky; a
+    coarse body sorts them, and Levenberg-Marquardt refines the best ones. The mirror
+    image of the best one is always refined too. Curves may be relative: their factors
+    are taken out exactly.
+
+    The body rotates about its z axis. Whether that is the axis of its largest moment
+    is not imposed.
+
+    Args:
+        curves: Light curves, corrected for the light time.
+        noise: Standard deviation of a point [mag]. None: it is what the best solution
+            leaves, and a misfit cannot be seen.
+        shortest: Shortest sidereal period [s].
+        longest: Longest sidereal period [s]. The cost grows with the number of periods,
+            2.5 times the span of the curves over `shortest` less that over `longest`.
+        degree: Largest degree of the harmonics.
+        facets: Number of facets.
+        scattering: The law, or where its fit starts; `Mixture()` where it is None.
+        fitted: Names of parameters of `scattering` that are fitted: "lambert",
+            "amplitude", "width", "slope". All but the first need curves that are not
+            relative.
+        albedo: Whether the albedo varies as an exponential along one direction, which
+            is what closure can determine.
+        closure: Standard deviation of the sum of the areas as vectors, over their sum
+            as numbers.
+        threshold: Growth of chi-square up to which a solution is in the table, in units
+            of the reduced chi-square where that is above 1.
+
+    Returns:
+        The solutions.
+
+    Raises:
+        ValueError: Curves or options from which nothing follows.
+
+    Source: M. Kaasalainen and J. Torppa, Icarus 153 (2001) 24; M. Kaasalainen, J.
+    Torppa and K. Muinonen, Icarus 153 (2001) 37.
+
+    >>> import jax.numpy as jnp, numpy as np, jrigid as jr
+    >>> shape = jr.photometry.Ellipsoid(jnp.array([1.5, 1.0, 0.8]))
+    >>> hour = 3600.0
+    >>> body = jr.photometry.Tumbler(
+    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape, mode="principal-axis")
+    >>> ts = np.linspace(0.0, 400 * hour, 120)
+    >>> angle = ts / 4e5
+    >>> seen = angle + 0.4 * np.cos(angle)
+    >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * ts], axis=1)
+    >>> earth = np.stack([np.cos(seen), np.sin(seen), 0.1 + 0 * ts], axis=1)
+    >>> noise = 0.01 * np.random.default_rng(0).normal(size=120)
+    >>> light = np.asarray(body.light_curve(ts, sun, earth)) * 10 ** (-0.4 * noise)
+    >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
+    >>> found = jr.photometry.find_spin(
+    ...     [curve], 0.01, shortest=5.9 * hour, longest=6.1 * hour, degree=3, facets=128)
+    >>> best = found.solutions[0]  # a Spin with its body and its SpinEstimates
+    >>> print((best.estimates.period / hour).round(2))
+    6.0
+    """
+    law = Mixture() if scattering is None else scattering
+    _check_curves(curves, noise, fitted)
+    _check_options(degree, facets, law, fitted, closure)
+    readings, epoch = readings_of(curves, _FIRST_NOISE if noise is None else noise)
+    turns = _turns(float(readings.span), shortest, longest)
+    make = functools.partial(
+        surface_of,
+        scattering=law,
+        fitted=tuple(fitted),
+        albedo=albedo,
+        closure=closure,
+    )
+    surface = make(degree, facets)
+    coarse = make(min(degree, COARSE_DEGREE), min(facets, COARSE_FACETS))
+    freedom = _freedom(readings, surface)
+    spins = search_spins(readings, surface, coarse, *turns)
+    if noise is None:
+        noise_found = _FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / freedom)
+        readings, epoch = readings_of(curves, float(noise_found))
+        spins = settled(spins, surface, readings)
+    return _inversion(spins, surface, readings, epoch, noise is not None, threshold)
+
+
+def _check_curves(
+    curves: Sequence[LightCurve], noise: float | None, fitted: Sequence[str]
+) -> None:
+    """Raise ValueError for curves that do not determine what is fitted."""
+    demand(
+        len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
+    )
+    demand(
+        noise is None or noise > 0,
+        f"Argument `noise` must be positive or None, but it is {noise}.",
+    )
+    for name in fitted:
+        check_option("fitted", name, SCATTERING)
+    scaled = not all(curve.is_relative for curve in curves)
+    demand(
+        scaled or not set(fitted) & set(_NEEDS_SCALE),
+        "Argument `fitted` must be empty or `lambert` where all curves are relative, "
+        f"since these say nothing of the phase function, but it is {tuple(fitted)}.",
+    )
+
+
+def _check_options(
+    degree: int, facets: int, law: Mixture, fitted: Sequence[str], closure: float
+) -> None:
+    """Raise ValueError for options from which nothing follows."""
+    whole_number("degree", degree, least=2)
+    demand(
+        degree <= _MOST_DEGREE,
+        f"Argument `degree` must be at most {_MOST_DEGREE}, but it is {degree}.",
+    )
+    whole_number("facets", facets, least=2 * (degree + 1) ** 2)
+    demand(closure > 0, f"Argument `closure` must be positive, but it is {closure}.")
+    for name in ("lambert", "width"):
+        value = float(getattr(law, name))
+        # A parameter is sought by its logarithm, but a given weight may be 0.
+        may_be_zero = name == "lambert" and name not in fitted
+        demand(
+            value > 0 or (may_be_zero and value == 0),
+            f"Argument `scattering` must have a positive `{name}`, but it is {value}.",
+        )
+
+
+def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
+    """Fewest and most turns within the span."""
+    demand(
+        0 < shortest <= longest,
+        "Arguments `shortest` and `longest` must be periods in seconds in rising order, "
+        f"but they are {shortest} and {longest}.",
+    )
+    turns = span / longest, span / shortest
+    count = (turns[1] - turns[0]) / STRIDE
+    demand(
+        count < _MOST_PERIODS,
+        f"Arguments `shortest` and `longest` hold {count:.0f} trial periods, more than "
+        f"{_MOST_PERIODS}: narrow the range, or fit a part of the curves first.",
+    )
+    return turns
+
+
+def _freedom(readings: Readings, surface: Surface) -> int:
+    """Points less unknown factors and numbers."""
+    points = int(np.count_nonzero(readings.weights))
+    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
+    unknown = factors + int(np.count_nonzero(surface.sought))
+    demand(
+        points > unknown,
+        f"Argument `curves` must hold more points than there are unknown numbers, but "
+        f"it holds {points} for {unknown}: take a smaller `degree`.",
+    )
+    return points - unknown
+
+
+_rows_at = jax.jit(spin_rows)
+
+
+def _light(spins: Spins, surface: Surface, readings: Readings) -> float:
+    """Chi-square of the light of the best solution."""
+    rows, _ = _rows_at(spins.numbers[0], spins.frames[0], surface, readings)
+    return float(np.sum(np.square(rows)))
+
+
+def _inversion(
+    spins: Spins,
+    surface: Surface,
+    readings: Readings,
+    epoch: float,
+    stated: bool,
+    threshold: float,
+) -> SpinInversion:
+    """The table of what a search found."""
+    freedom = _freedom(readings, surface)
+    reduced = _light(spins, surface, readings) / freedom
+    scale = max(reduced, 1.0)
+    every = [
+        _spin(spins.rows([i]), surface, readings, scale)
+        for i in range(len(spins.numbers))
+    ]
+    growth = (spins.quadratic.chi_square - spins.quadratic.chi_square[0]) / scale
+    near = int(np.count_nonzero(growth <= threshold))
+    mirror = _index_of_mirror(spins)
+    return SpinInversion(
+        solutions=every[:near],
+        rejected=every[near:],
+        mirror=None if mirror is None else every[mirror],
+        epoch=epoch,
+        noise=1 / (MAGNITUDE * float(readings.weights.max())),
+        reduced_chi_square=reduced,
+        degrees_of_freedom=freedom,
+        # Within the noise, chi-square has this spread.
+        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)),
+    )
+
+
+def _index_of_mirror(spins: Spins) -> int | None:
+    """Which solution is the mirror of the first one, if one is."""
+    poles = spins.poles()
+    apart = np.linalg.norm(poles - poles[0] * [-1.0, -1.0, 1.0], axis=1)
+    turns = np.abs(spins.numbers[:, 0] - spins.numbers[0, 0])
+    near = np.flatnonzero((apart < _NEAR_MIRROR) & (turns < _SAME_TURNS))
+    near = near[near > 0]
+    return int(near[np.argmin(apart[near])]) if len(near) else None
+
+
+def _spin(one: Spins, surface: Surface, readings: Readings, scale: float) -> Spin:
+    """One row of the table."""
+    vector = one.numbers[0]
+    frame = one.frames[0]
+    sought = np.ix_(surface.sought, surface.sought)
+    covariance = np.zeros((vector.size, vector.size))
+    covariance[sought] = scale * inverse_normal(one.quadratic.normal[0][sought])
+    span = np.asarray(readings.span)
+    estimates, slopes = _estimates_and_slopes(vector, frame, span)
+    errors = jax.tree.map(
+        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
+    )
+    rows, _ = _rows_at(vector, frame, surface, readings)
+    there = readings.weights > 0
+    residuals = np.asarray(rows)[there] / (readings.weights[there] * MAGNITUDE)
+    shape = unpacked_spin(jnp.asarray(vector)).shape
+    return Spin(
+        body=_body(vector, frame, surface, estimates),
+        estimates=jax.tree.map(np.asarray, estimates),
+        errors=errors,
+        chi_square=float(one.quadratic.chi_square[0]),
+        open_share=float(np.linalg.norm(openness(shape, surface))),
+        residuals=-residuals,
+    )
+
+
+@jax.jit
+def _estimates_and_slopes(
+    vector: Array, frame: Array, span: Array
+) -> tuple[SpinEstimates, SpinEstimates]:
+    """Estimates and their derivatives in the numbers."""
+    estimates = functools.partial(_estimates, frame=frame, span=span)
+    return estimates(vector), jax.jacfwd(estimates)(vector)
+
+
+def _estimates(vector: Array, frame: Matrix, span: Array) -> SpinEstimates:
+    """What observers quote."""
+    numbers = unpacked_spin(vector)
+    pole = product("ij,i->j", frame, axes_of_momentum(numbers.pole)[2])
+    law = law_of(numbers.scattering)
+    return SpinEstimates(
+        period=span / numbers.cycles[0],
+        longitude=jnp.arctan2(pole[1], pole[0]) % (2 * jnp.pi),
+        latitude=jnp.arcsin(jnp.clip(pole[2], -1.0, 1.0)),
+        scattering=jnp.stack([law.lambert, law.amplitude, law.width, law.slope]),
+        albedo=numbers.albedo,
+    )
+
+
+def _body(
+    vector: np.ndarray, frame: np.ndarray, surface: Surface, estimates: SpinEstimates
+) -> Tumbler:
+    """The body in space axes."""
+    numbers = unpacked_spin(jnp.asarray(vector))
+    axes = product("ij,jk->ik", axes_of_momentum(numbers.pole), jnp.asarray(frame))
+    pole = jnp.stack([estimates.longitude, estimates.latitude])
+    # The angle of rotation counts from the axis that points south of the pole.
+    south = product("ij,kj->ik", axes, axes_of_momentum(pole))[0]
+    return Tumbler(
+        moments=jnp.ones(3, axes.dtype),
+        precession_period=estimates.period,
+        rotation_period=estimates.period,
+        longitude=estimates.longitude,
+        latitude=estimates.latitude,
+        precession_angle=jnp.arctan2(south[1], south[0]),
+        rotation_phase=0.0,
+        shape=facets_of(jnp.asarray(vector), surface),
+        scattering=law_of(numbers.scattering),
+        mode="principal-axis",
+    )
+
+
+def _report(found: SpinInversion) -> str:
+    """The table in words."""
+    lines = [_verdict(found)]
+    for rank, spin in enumerate(found.solutions, 1):
+        lines += ["", *_described(f"{rank}.", spin)]
+    lines += ["", _of_mirror(found)]
+    others = [x for x in found.rejected if x is not found.mirror]
+    if others:
+        grown = others[0].chi_square - found.solutions[0].chi_square
+        lines.append(
+            f"The next solution has a chi-square that is larger by {grown:.0f}."
+        )
+    lines.append(
+        "Errors assume that those of the points are independent and that the body is "
+        "convex; the errors of poles in use are often several times larger."
+    )
+    return "\n".join(lines)
+
+
+def _verdict(found: SpinInversion) -> str:
+    """What the table says, in a sentence."""
+    count = len(found.solutions)
+    value = (
+        f"chi-square over {found.degrees_of_freedom} degrees of freedom is "
+        f"{found.reduced_chi_square:.2f} for a noise of {found.noise:.4f} mag"
+    )
+    if not found.follows:
+        return (
+            "No steady rotation was found that follows the light curves to their noise: "
+            f"{value}. The noise is larger than stated, the body tumbles or is far from "
+            "convex, or its period is out of the range."
+        )
+    if count == 1:
+        return f"One steady rotation explains the light curves: {value}."
+    return (
+        f"{count} steady rotations explain the light curves, which do not say which one "
+        f"is true: {value}."
+    )
+
+
+def _of_mirror(found: SpinInversion) -> str:
+    """What is known of the mirror solution, in a sentence."""
+    mirror = found.mirror
+    if mirror is None:
+        return "The mirror solution, with the pole's other longitude, is no minimum."
+    for rank, spin in enumerate(found.solutions, 1):
+        if spin is mirror:
+            return (
+                f"Solution {rank} is the mirror of 1, with the pole's other longitude: "
+                "curves from near the plane of the ecliptic hardly tell them apart."
+            )
+    grown = mirror.chi_square - found.solutions[0].chi_square
+    pole = in_degrees(mirror.estimates.longitude, mirror.errors.longitude)
+    latitude = in_degrees(mirror.estimates.latitude, mirror.errors.latitude)
+    return (
+        f"The mirror of 1, with its pole at longitude {pole}, latitude {latitude}, has a "
+        f"chi-square that is larger by {grown:.0f}."
+    )
+
+
+def _described(head: str, spin: Spin) -> list[str]:
+    """One solution in words."""
+    x = spin.estimates
+    error = spin.errors
+    lines = [
+        f"{head} period {in_hours(x.period, error.period)}, chi-square "
+        f"{spin.chi_square:.1f}",
+        f"   pole at longitude {in_degrees(x.longitude, error.longitude)}, latitude "
+        f"{in_degrees(x.latitude, error.latitude)}",
+        f"   the areas fail to close by {100 * spin.open_share:.2g} % of their sum",
+    ]
+    for name, value, spread in zip(
+        SCATTERING, x.scattering, error.scattering, strict=True
+    ):
+        if spread > 0:
+            lines.append(f"   {name} {value:.3f} +- {spread:.3f}")
+    if np.any(error.albedo > 0):
+        contrast = np.exp(2 * np.linalg.norm(x.albedo))
+        lines.append(f"   albedo varies by a factor of {contrast:.2f}")
+    return lines

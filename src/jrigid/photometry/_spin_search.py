@@ -1,0 +1,287 @@
+"""The search for steady rotations that explain light curves."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jrigid._numerics import product
+from jrigid._types import AnyArray
+from jrigid.photometry._convex import (
+    Surface,
+    degrees_of_harmonics,
+    even_directions,
+    first_shape,
+    spin_quadratic,
+    unpacked_spin,
+)
+from jrigid.photometry._periodogram import unlike
+from jrigid.photometry._readings import Readings
+from jrigid.photometry._refine import Quadratic, damped_step
+from jrigid.photometry._scan import fewer_epochs
+
+# Chi-square has a minimum about every half turn within the span: half turns of an
+# elongated body look alike.
+STRIDE = 0.4
+_POLES = 12
+# The scan uses a coarse body and a part of the epochs.
+COARSE_DEGREE = 3
+COARSE_FACETS = 128
+_EPOCHS = 512
+# A body that is nearly round says little of its pole, so the shape goes first.
+_SHAPE_STEPS = 3
+_SCAN_STEPS = 7
+_SURVIVORS = 48
+_COARSE_STEPS = 40
+_FINALISTS = 8
+_FULL_STEPS = 25
+_BEST = 4
+_LAST_STEPS = 200
+# Solutions are one if their turns within the span differ by less than this, and their
+# poles by less than a quarter of a radian.
+_APART = 0.3
+_APART_IN_POLE = 0.25
+_COARSE_LANES = 32
+# A processor gains nothing by more lanes of the full body at once, and all lanes wait
+# for the slowest.
+_LANES = 1
+_FIRST_DAMPING = 1e-2
+_LEAST_DAMPING = 1e-9
+_STUCK = 1e12  # above this much damping no step helps
+# A lane has converged where a nearly undamped step promises less of chi-square.
+_ENOUGH = 1e-2
+_UNDAMPED = 1e-2
+
+
+class Spins(NamedTuple):
+    """Points of a search, one in each row.
+
+    Attributes:
+        numbers: Of the fit.
+        frames: Axes of the fit, rows; its x axis is near the pole.
+        quadratic: Chi-square about the points.
+    """
+
+    numbers: Float[AnyArray, "many numbers"]
+    frames: Float[AnyArray, "many 3 3"]
+    quadratic: Quadratic
+
+    def poles(self) -> Float[np.ndarray, "many 3"]:
+        """Directions of the poles in space."""
+        return poles_of(self.numbers, self.frames)
+
+    def rows(self, chosen: list[int] | np.ndarray) -> "Spins":
+        """Some of the points."""
+        index = np.asarray(chosen, int)
+        return jax.tree.map(lambda x: np.asarray(x)[index], self)
+
+
+def poles_of(
+    numbers: Float[np.ndarray, "many numbers"], frames: Float[np.ndarray, "many 3 3"]
+) -> Float[np.ndarray, "many 3"]:
+    """Directions of the poles in space."""
+    longitude, latitude = unpacked_spin(numbers).pole.T
+    across = np.cos(latitude)
+    inside = np.stack(
+        [across * np.cos(longitude), across * np.sin(longitude), np.sin(latitude)], 1
+    )
+    return np.einsum("ni,nij->nj", inside, frames)
+
+
+def frame_of_pole(pole: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Axes of a fit, rows: the pole, east of it and north of it."""
+    longitude = np.arctan2(pole[1], pole[0])
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    return np.stack([pole, east, np.cross(pole, east)])
+
+
+def search_spins(
+    readings: Readings,
+    surface: Surface,
+    coarse: Surface,
+    lowest: float,
+    highest: float,
+) -> Spins:
+    """Steady rotations that explain the readings, the best first, with its mirror.
+
+    Args:
+        readings: The light curves.
+        surface: The body that is sought.
+        coarse: The body of the scan, with fewer harmonics and facets.
+        lowest: Fewest turns within the span.
+        highest: Most turns.
+    """
+    few = fewer_epochs(readings, _EPOCHS)
+    numbers, frames = starts(coarse, lowest, highest)
+    is_motion = np.arange(coarse.centre.size) < 3
+    still = coarse._replace(sought=coarse.sought & ~is_motion)
+    scanned = minimise(numbers, frames, still, few, _SHAPE_STEPS, _COARSE_LANES)
+    scanned = minimise(scanned.numbers, frames, coarse, few, _SCAN_STEPS, _COARSE_LANES)
+    better = best(scanned, _SURVIVORS)
+    better = minimise(
+        better.numbers, better.frames, coarse, few, _COARSE_STEPS, _COARSE_LANES
+    )
+    finalists = best(better, _FINALISTS)
+    numbers = _lifted(finalists.numbers, surface)
+    full = minimise(numbers, finalists.frames, surface, readings, _FULL_STEPS, _LANES)
+    full = best(full, _BEST)
+    return settled(full, surface, readings)
+
+
+def settled(spins: Spins, surface: Surface, readings: Readings) -> Spins:
+    """The points refined to their end, with the mirror of the best; the best first."""
+    last = (surface, readings, _LAST_STEPS, _LANES)
+    found = best(minimise(spins.numbers, spins.frames, *last), len(spins.numbers))
+    of_mirror = minimise(*mirrored(found.rows([0])), *last)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), found, of_mirror)
+    return best(joined, len(joined.numbers))
+
+
+def starts(
+    surface: Surface, lowest: float, highest: float
+) -> tuple[AnyArray, AnyArray]:
+    """Numbers and frames of all starting points."""
+    count = max(1, int(np.ceil((highest - lowest) / STRIDE)))
+    cycles = lowest + (highest - lowest) * (np.arange(count) + 0.5) / count
+    frames = np.stack([frame_of_pole(pole) for pole in even_directions(_POLES)])
+    first = surface.centre.copy()
+    first[10:] = first_shape(surface)
+    numbers = np.tile(first, (count * _POLES, 1))
+    numbers[:, 0] = np.repeat(cycles, _POLES)
+    return numbers, np.tile(frames, (count, 1, 1))
+
+
+def _lifted(
+    numbers: Float[np.ndarray, "many coarse"], surface: Surface
+) -> Float[np.ndarray, "many numbers"]:
+    """Numbers of a coarse body as those of a finer one."""
+    lifted = np.zeros((len(numbers), surface.centre.size))
+    lifted[:, : numbers.shape[1]] = numbers
+    return lifted
+
+
+def mirrored(spins: Spins) -> tuple[AnyArray, AnyArray]:
+    """Numbers and frames that give the same light in the plane of the ecliptic.
+
+    There, the mirror image has the Sun and the observer where they are. Its pole has
+    another longitude by half a turn. In body axes all directions are opposite, and so
+    are the normals.
+    """
+    numbers = np.array(spins.numbers)
+    numbers[:, 3:6] *= -1
+    numbers[:, 10:] *= (-1.0) ** degrees_of_harmonics(numbers.shape[1] - 10)
+    return numbers, np.asarray(spins.frames) * [-1.0, -1.0, 1.0]
+
+
+def best(spins: Spins, count: int) -> Spins:
+    """The best points, unlike in their periods or their poles."""
+    chi_square = spins.quadratic.chi_square
+    spins = spins.rows(np.flatnonzero(np.isfinite(chi_square)))
+    poles = spins.poles() * _APART / _APART_IN_POLE
+    places = np.column_stack([spins.numbers[:, 0], poles])
+    return spins.rows(unlike(places, -spins.quadratic.chi_square, _APART, count))
+
+
+def minimise(
+    numbers: Float[np.ndarray, "many numbers"],
+    frames: Float[np.ndarray, "many 3 3"],
+    surface: Surface,
+    readings: Readings,
+    steps: int,
+    lanes: int,
+) -> Spins:
+    """The points after so many steps, so many lanes at a time."""
+    blocks = []
+    for first in range(0, len(numbers), lanes):
+        rows = np.arange(first, min(first + lanes, len(numbers)))
+        block = np.resize(rows, lanes)
+        result = _minimised(
+            numbers[block], frames[block], surface, readings, np.asarray(steps)
+        )
+        spins = Spins(result[0], frames[block], result[1])
+        blocks.append(spins.rows(np.arange(len(rows))))
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+class _Loop(NamedTuple):
+    """The best points so far and what comes next."""
+
+    numbers: Float[Array, "lanes numbers"]
+    at: Quadratic
+    damping: Float[Array, " lanes"]
+    rise: Float[Array, " lanes"]
+    going: Bool[Array, " lanes"]
+    steps: Int[Array, ""]
+
+
+@jax.jit
+def _minimised(
+    numbers: Float[Array, "lanes numbers"],
+    frames: Float[Array, "lanes 3 3"],
+    surface: Surface,
+    readings: Readings,
+    steps: Int[Array, ""],
+) -> tuple[Float[Array, "lanes numbers"], Quadratic]:
+    """Levenberg-Marquardt in all lanes, with the damping of Nielsen.
+
+    The areas are exponentials of the numbers, and a damping that heeds how well a step
+    was predicted takes half of the steps that one with fixed factors takes.
+
+    Source: K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least
+    squares problems, 2nd ed., 2004, algorithm 3.16.
+    """
+    each = jax.vmap(spin_quadratic, (0, 0, None, None))
+
+    def evaluate(numbers: Array) -> Quadratic:
+        return each(numbers, frames, surface, readings)
+
+    def next_loop(loop: _Loop) -> _Loop:
+        return _iteration(loop, evaluate)
+
+    def is_going(loop: _Loop) -> Array:
+        return jnp.any(loop.going) & (loop.steps < steps)
+
+    start = evaluate(numbers)
+    loop = _Loop(
+        numbers=numbers,
+        at=start,
+        damping=jnp.full_like(start.chi_square, _FIRST_DAMPING),
+        rise=jnp.full_like(start.chi_square, 2.0),
+        going=jnp.isfinite(start.chi_square),
+        steps=jnp.zeros_like(steps),
+    )
+    found = jax.lax.while_loop(is_going, next_loop, loop)
+    return found.numbers, found.at
+
+
+def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
+    """Try a damped step in all lanes, and keep the better points."""
+    moves = jax.vmap(damped_step)(loop.at, loop.damping)
+    numbers = loop.numbers + moves
+    new = evaluate(numbers)
+    bent = product("ln,lnm,lm->l", moves, loop.at.normal, moves)
+    predicted = -2 * product("ln,ln->l", moves, loop.at.slope) - bent
+    gain = loop.at.chi_square - new.chi_square
+    finite = jnp.isfinite(new.chi_square) & jnp.all(
+        jnp.isfinite(new.normal), axis=(1, 2)
+    )
+    better = loop.going & finite & (gain > 0)
+    ratio = jnp.where(better, gain / predicted, 0.0)
+    fall = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+    damping = loop.damping * jnp.where(better, fall, loop.rise)
+    promising = (predicted > _ENOUGH) | (loop.damping > _UNDAMPED)
+
+    def chosen(a: Array, b: Array) -> Array:
+        return jnp.where(better.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+
+    return _Loop(
+        numbers=chosen(numbers, loop.numbers),
+        at=jax.tree.map(chosen, new, loop.at),
+        damping=jnp.maximum(damping, _LEAST_DAMPING),
+        rise=jnp.where(better, 2.0, 2 * loop.rise),
+        going=loop.going & promising & (damping < _STUCK),
+        steps=loop.steps + 1,
+    )
