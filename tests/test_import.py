@@ -8,10 +8,12 @@ import pytest
 
 LOOK = """
 import sys, time
+start = time.process_time()
 import jax, diffrax, equinox
+dependencies = time.process_time() - start
 before, start = set(sys.modules), time.process_time()
 import jrigid
-took = time.process_time() - start
+took = (time.process_time() - start) / dependencies
 new = {name.partition(".")[0] for name in set(sys.modules) - before}
 print(*sorted(new - sys.stdlib_module_names), took)
 """
@@ -37,6 +39,6 @@ def test_nothing_is_computed_and_no_other_package_imported(imported):
 
 
 def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
-    """0.1 s of processor time, 0.3 where no bytecode may be written; idle or not."""
+    """The ratio of the processor times is the same on an idle and on a busy machine."""
     _, took = imported
-    assert took < 1.0
+    assert took < 0.5

@@ -94,7 +94,7 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
         help="whether the moments are those of the ellipsoid that is seen",
     )
     command.add_argument(
-        "--pairs", type=int, default=300, help="pairs of periods to try (300)"
+        "--pairs", type=int, default=100, help="pairs of periods to try (100)"
     )
     command.add_argument(
         "--plot",
