@@ -1028,7 +1028,7 @@ def test_too_few_samples_and_wrong_options(untyped):
 
 def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, rng):
     _, omegas, _ = rates(ASYMMETRIC)
-    records = omegas + 0.05 * rng.normal(size=(60, *omegas.shape))
+    records = omegas + 0.05 * rng.normal(size=(12, *omegas.shape))
     found = blind_fit(records, 0.01)  # five times the noise that is stated
     assert bool(jnp.all(found.status == Status.MISFIT))
     honest = blind_fit(records, 0.05)

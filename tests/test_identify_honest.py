@@ -180,9 +180,10 @@ def off_by(found, tensor):
     return square, np.max(ratios, axis=1)
 
 
-def test_500_random_records_are_never_ok_and_wrong():
+@pytest.mark.parametrize("count", [100, pytest.param(500, marks=pytest.mark.slow)])
+def test_random_records_are_never_ok_and_wrong(count):
     """Beyond six of their errors: chi-square of five numbers 53, and each ratio six."""
-    draws = (np.random.default_rng([1, seed]) for seed in range(500))
+    draws = (np.random.default_rng([1, seed]) for seed in range(count))
     records = [worlds.random_record(rng, largest=60) for rng in draws]
     tensors = np.stack([3 * x.tensor / np.trace(x.tensor) for x in records])
     readings = [identify.Rates(x.ts, x.readings, x.sigma) for x in records]
@@ -197,7 +198,7 @@ def test_500_random_records_are_never_ok_and_wrong():
     ]
     right = np.sum(good)
     assert not wrong, "\n".join(wrong)
-    assert right > 90, right
+    assert right > 0.18 * count, right
 
 
 @pytest.mark.slow  # a long record

@@ -41,4 +41,4 @@ def test_nothing_is_computed_and_no_other_package_imported(imported):
 def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
     """The ratio of the processor times is the same on an idle and on a busy machine."""
     _, took = imported
-    assert took < 0.5
+    assert took < 1.0

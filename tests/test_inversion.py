@@ -216,6 +216,8 @@ def test_a_planned_curve_tells_the_best_alias_from_a_rejected_one(inversion):
 
 
 def test_candidates_hold_the_pair_of_a_tumbler(inversion):
+    """With terms that do not change with the geometry it is the twelfth, and the best
+    series explains .82 of the variance."""
     curves, truth, _ = inversion
     pairs = ph.period_pairs(curves, 8 * HOUR, 400 * HOUR, count=60)
     span = max(x.ts.max() for x in curves) - min(x.ts.min() for x in curves)
@@ -223,7 +225,8 @@ def test_candidates_hold_the_pair_of_a_tumbler(inversion):
         abs(span / pairs.precession_period - span / truth.precession_period),
         abs(span / pairs.rotation_period - span / truth.rotation_period),
     )
-    assert apart.min() < 0.75
+    assert apart[:5].min() < 0.75
+    assert pairs.explained[0] > 0.95
     assert np.all(np.diff(pairs.explained) <= 1e-6)
 
 

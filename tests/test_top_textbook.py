@@ -736,7 +736,8 @@ def test_numbers_that_no_top_has_are_refused(name):
     with pytest.raises(RuntimeError, match=f"{message}.*: {value}"):
         jr.SymmetricTop(*numbers)
     with pytest.raises(RuntimeError, match=message):
-        quick_jit(lambda x: jr.SymmetricTop(*x).I1)(jnp.asarray(numbers))
+        moment = quick_jit(lambda x: jr.SymmetricTop(*x).I1)
+        jax.block_until_ready(moment(jnp.asarray(numbers)))
     with pytest.raises(RuntimeError, match=f"{message}.*: {value}.* in lane 1"):
         jax.vmap(lambda x: jr.SymmetricTop(*x))(jnp.array([[1.0, 0.5, 1.0], numbers]))
 

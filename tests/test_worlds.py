@@ -172,8 +172,9 @@ def test_a_held_torque_forgets_itself_within_its_time(rng, tau):
     product = np.mean(torque[:, 1:] * torque[:, :-1], axis=(0, 1))
     assert product / variance == pytest.approx(like, abs=0.05)
     # A ball keeps what it was given.
-    still = worlds.tumble(2 * np.eye(3), np.zeros((2000, 3)), ts, held=torque)
-    given = step * np.cumsum(torque, axis=1)
+    few = torque[:100]
+    still = worlds.tumble(2 * np.eye(3), np.zeros((100, 3)), ts, held=few)
+    given = step * np.cumsum(few, axis=1)
     assert 2 * still.omega[:, 1:] == pytest.approx(given, abs=1e-12)
 
 
