@@ -196,7 +196,7 @@ def test_random_records_are_never_ok_and_wrong(count):
         f"{x}: {y} {z}"
         for x, y, z in zip(seeds, square[~good], ratio[~good], strict=True)
     ]
-    right = np.sum(good)
+    right = int(np.sum(good))
     assert not wrong, "\n".join(wrong)
     assert right > 0.18 * count, right
 

@@ -492,8 +492,8 @@ def test_a_good_lane_among_bad_ones_is_as_alone_and_the_first_is_named(in_lanes)
 
 
 def test_inside_jit_the_error_names_the_argument():
+    omega = quick_jit(lambda x: motion_of(**x, throw=True).omega)
     with pytest.raises(RuntimeError, match="`top` must have I1 > 0"):
-        omega = quick_jit(lambda x: motion_of(**x, throw=True).omega)
         jax.block_until_ready(omega({**GOOD, "I1": -1.0}))
 
 

@@ -735,8 +735,8 @@ def test_numbers_that_no_top_has_are_refused(name):
     numbers, message, value = BAD_TOPS[name]
     with pytest.raises(RuntimeError, match=f"{message}.*: {value}"):
         jr.SymmetricTop(*numbers)
+    moment = quick_jit(lambda x: jr.SymmetricTop(*x).I1)
     with pytest.raises(RuntimeError, match=message):
-        moment = quick_jit(lambda x: jr.SymmetricTop(*x).I1)
         jax.block_until_ready(moment(jnp.asarray(numbers)))
     with pytest.raises(RuntimeError, match=f"{message}.*: {value}.* in lane 1"):
         jax.vmap(lambda x: jr.SymmetricTop(*x))(jnp.array([[1.0, 0.5, 1.0], numbers]))
