@@ -21,16 +21,20 @@ print(*sorted(new - sys.stdlib_module_names), took)
 
 @pytest.fixture(scope="module")
 def imported():
-    # There is no such platform: whatever is computed at import fails.
-    out = subprocess.run(
-        [sys.executable, "-W", "error", "-c", LOOK],
-        env={**os.environ, "JAX_PLATFORMS": "nowhere"},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    *packages, took = out.stdout.split()
-    return packages, float(took)
+    """The packages, and the least ratio of three processes: one varies by a fifth."""
+    ratios = []
+    for _ in range(3):
+        # There is no such platform: whatever is computed at import fails.
+        out = subprocess.run(
+            [sys.executable, "-W", "error", "-c", LOOK],
+            env={**os.environ, "JAX_PLATFORMS": "nowhere"},
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        *packages, took = out.stdout.split()
+        ratios.append(float(took))
+    return packages, min(ratios)
 
 
 def test_nothing_is_computed_and_no_other_package_imported(imported):
@@ -41,4 +45,4 @@ def test_nothing_is_computed_and_no_other_package_imported(imported):
 def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
     """The ratio of the processor times is the same on an idle and on a busy machine."""
     _, took = imported
-    assert took < 1.0
+    assert took < 0.5
