@@ -251,6 +251,22 @@ def test_flat_bodies_are_not_told_to_be_unknown_beside_sharp_ratios(rng):
 # The noise that was stated, or not
 
 
+@pytest.mark.parametrize("noise", [0.002, 0.02])
+def test_a_noise_that_is_not_stated_gives_the_errors_of_one_that_is(noise, rng):
+    # The fit begins with a noise of its own, which may be far from the true one.
+    ts = np.arange(400) / 200
+    start = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array([3.0, 5.0, 2.0]))
+    omegas = jr.free_rotation(np.array([1.0, 1.7, 2.3]), start, ts).omega
+    omegas = omegas + noise * rng.normal(size=omegas.shape)
+    stated, unstated = (
+        identify.fit(jr.RigidBody(np.ones(3)), identify.Rates(ts, omegas, sigma))
+        for sigma in (noise, None)
+    )
+    assert unstated.status == Status.OK
+    errors = unstated.ratios_errors / stated.ratios_errors
+    np.testing.assert_allclose(errors, 1.0, atol=0.1)
+
+
 def test_a_noise_stated_a_little_too_small_is_a_misfit_and_no_error(rng):
     tensor = body_of(rng)
     _, values = seen(rng, tensor)

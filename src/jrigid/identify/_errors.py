@@ -592,11 +592,11 @@ def _with_larger_errors(
 
 
 def _scatter_of_trials(
-    known: Precision, alive: np.ndarray, units: np.ndarray
+    known: Precision, alive: np.ndarray, units: np.ndarray, inflation: float
 ) -> np.ndarray:
     """Errors by the scatter of trials over those stated, along each direction.
 
-    Ones where there are few trials.
+    Those stated are the inflated ones. Ones where there are few trials.
     """
     trials = np.sum(alive)
     if trials < _FEWEST or not np.all(np.isfinite(known.scores)):
@@ -606,7 +606,7 @@ def _scatter_of_trials(
         @ known.directions
         / np.maximum(known.values, 1e-150)
     )
-    return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1))
+    return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1) / inflation)
 
 
 def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
@@ -729,8 +729,8 @@ def _judgement(
     """Judge a fit by its whitened residuals, or innovations."""
     remainder = _remainder(problem, fit, known, white)
     takes_part = np.any(fit.kept > 0, axis=1)
-    scatter = _scatter_of_trials(known, takes_part, fit.minimum.units)
-    scatter = scatter / np.sqrt(remainder.inflation)
+    units = fit.minimum.units
+    scatter = _scatter_of_trials(known, takes_part, units, remainder.inflation)
     covariance = _inflated(problem, fit, known, scatter, remainder.inflation)
     pure = quality.is_pure(problem, fit, remainder.inflation)
     unexplained = quality.unexplained(problem, fit, _kicks(problem, fit))
