@@ -1,9 +1,13 @@
 """The first line of a report names what is wrong with a request, and what to pass."""
 
 import re
+from typing import ClassVar
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
 import jrigid as jr
@@ -96,3 +100,33 @@ def test_a_torque_that_swings_is_named_and_is_no_bias(readings):
     assert found.reduced_chi_square < 1 + 5 * np.sqrt(2 / 600)
     assert found.status == Status.MISFIT
     assert "band of frequencies" in line
+
+
+class Blinded(identify.AbstractSensor):
+    """A gyro that does not read small rates."""
+
+    depends_on_attitude: ClassVar[bool] = False
+    least: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def predict(self, t, state, system):  # noqa: ARG002
+        return jnp.where(jnp.abs(state.omega) > self.least, state.omega, jnp.nan)
+
+    def rates(self, value):
+        return value
+
+
+def test_predictions_that_are_not_finite_matter_only_where_there_is_a_reading(readings):
+    seen = np.where(np.abs(readings) > 2.5, readings, np.nan)
+    assert 50 < np.sum(np.isnan(seen)) < 150
+
+    def fitted(least):
+        record = identify.Record(Blinded(least), TS, seen, NOISE)
+        return identify.fit(BLIND, record, throw=False)
+
+    found = fitted(1.0)
+    assert found.status == Status.OK
+    error = found.ratios - MOMENTS[1:] / MOMENTS[0]
+    assert np.all(np.abs(error) < 5 * found.ratios_errors)
+    never = fitted(np.inf)
+    assert never.status == Status.NOT_CONVERGED
+    assert "Predictions are not finite" in str(never).splitlines()[0]

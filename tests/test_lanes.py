@@ -293,6 +293,20 @@ def _library():
     }
 
 
+def test_every_public_torque_is_in_the_library():
+    public = [getattr(jr.torques, name) for name in jr.torques.__all__]
+    general = (jr.torques.AbstractTorque, jr.torques.Sum, jr.torques.Torque)
+    torques = {
+        x
+        for x in public
+        if isinstance(x, type)
+        and issubclass(x, jr.torques.AbstractTorque)
+        and x not in general
+    }
+    missing = torques - {type(x) for x in _library().values()}
+    assert not missing, f"add {sorted(x.__name__ for x in missing)} to _library"
+
+
 @pytest.mark.parametrize("name", _library())
 def test_every_torque_of_the_library_is_the_same_in_lanes(name, rng):
     body = jr.RigidBody(TOP.inertia, _library()[name])

@@ -2,6 +2,7 @@
 
 import inspect
 import pydoc
+import re
 import types
 
 import pytest
@@ -27,6 +28,75 @@ def test_dir_help_and_star_import_show_the_modules_own_names(module):
     assert all(home.startswith("jrigid") for home in homes)
     first = next(x.__name__ for x in shown if isinstance(x, type | types.FunctionType))
     assert first in pydoc.plain(pydoc.render_doc(module))
+
+
+def _documented():
+    """Public classes and functions, and public methods of the classes."""
+    for module in MODULES:
+        for name in module.__all__:
+            value = getattr(module, name)
+            if isinstance(value, type):
+                methods = vars(value).values()
+                yield from (x for x in methods if isinstance(x, types.FunctionType))
+            if isinstance(value, type | types.FunctionType):
+                yield value
+
+
+def _words_of_examples_and_results():
+    """Words in the examples of all docstrings, and in what functions return."""
+    lines = [
+        line
+        for value in _documented()
+        for line in (value.__doc__ or "").splitlines()
+        if line.strip().startswith((">>>", "..."))
+    ]
+    results = [
+        str(inspect.signature(value).return_annotation)
+        for value in _documented()
+        if isinstance(value, types.FunctionType)
+    ]
+    return set(re.findall(r"\w+", " ".join([*lines, *results])))
+
+
+def test_every_public_class_and_function_has_an_example_that_runs():
+    """Of its own, or as a part of others; results have those of their functions.
+
+    The examples are run by `make doctest`.
+    """
+    known = _words_of_examples_and_results()
+    without = {
+        x.__name__
+        for x in _documented()
+        if "." not in x.__qualname__
+        and ">>>" not in (x.__doc__ or "")
+        and x.__name__ not in known
+    }
+    assert not without, f"no example (`>>>`) in the docstring of {sorted(without)}"
+
+
+def _descendants(kind):
+    for child in kind.__subclasses__():
+        yield child
+        yield from _descendants(child)
+
+
+@pytest.mark.parametrize(
+    ("module", "base"),
+    [
+        (jr.torques, "AbstractTorque"),
+        (jr.identify, "AbstractSensor"),
+        (jr.identify, "AbstractInertiaModel"),
+    ],
+)
+def test_torques_sensors_and_inertia_models_are_public(module, base):
+    own = [
+        x
+        for x in _descendants(getattr(module, base))
+        if x.__module__.startswith(module.__name__) and not x.__name__.startswith("_")
+    ]
+    hidden = {x.__name__ for x in own} - set(module.__all__)
+    home = module.__name__.replace(".", "/")
+    assert not hidden, f"add {sorted(hidden)} to {home}/__init__.py"
 
 
 def test_names_of_dynamics():

@@ -36,7 +36,9 @@ def test_every_public_name_is_in_the_table():
     names = {
         n for n, value in vars(jr.solids).items() if callable(value) and n[0] != "_"
     }
-    assert set(SOLIDS) == names
+    missing = names - set(SOLIDS)
+    assert not missing, f"add {sorted(missing)} to SOLIDS"
+    assert not set(SOLIDS) - names
 
 
 def assert_ulps(actual, expected, ulps):

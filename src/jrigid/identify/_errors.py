@@ -741,6 +741,8 @@ def _judgement(
     else:
         status = _status_of_match(problem, fit, remainder, covariance, pure)
     sound = np.all(np.isfinite(covariance)) and remainder.freedom > 0
+    # A sum that is not finite: no point was found where all predictions are finite.
+    sound = sound and bool(np.isfinite(fit.minimum.square))
     if not (sound and np.isfinite(remainder.chi_square)):
         status = "NOT_CONVERGED"
     return _Judgement(

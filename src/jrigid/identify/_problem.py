@@ -329,7 +329,9 @@ def whitened(
             )
         part = jax.vmap(sensor.difference)(observed, values)
         parts.append(jnp.pad(part, ((0, 0), (0, width - part.shape[1]))))
-    rows = product("nij,nj->ni", samples.whitener, jnp.concatenate(parts))
+    # What a sensor predicts where it had no reading may be NaN.
+    seen = jnp.where(samples.weight > 0, jnp.concatenate(parts), 0.0)
+    rows = product("nij,nj->ni", samples.whitener, seen)
     if any(x.saturation() is not None for x in sensors):
         rows = _unlikely(rows, samples.sign)
     # Missing readings have finite values, so that derivatives stay finite too.

@@ -28,6 +28,11 @@ def reason(result: FitResult) -> str:
     """The sentence, or an empty one where there is nothing to say; of a single fit."""
     if result.status == Status.BAD_INPUT:
         return RESULTS[result.diagnostics.input_result]
+    if not np.any(np.isfinite(np.asarray(result.diagnostics.history))):
+        return (
+            "Predictions are not finite at the initial values: `predict` of each sensor "
+            "must be finite wherever there is a reading, and `simulate` from `start`."
+        )
     if _is_nearly_a_sphere(result):
         return (
             "Nearly a sphere: so looks any body whose rates are in degrees a second, "

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jrigid import rotation
 from jrigid._checks import array_of_shape, check_option, demand
 from jrigid._numerics import product, safe_norm
-from jrigid._types import AnyArray, Readable
+from jrigid._types import AnyArray, Readable, ScalarLike
 from jrigid.dynamics import State, angular_momentum
 from jrigid.systems import AbstractSystem
 
@@ -74,6 +74,7 @@ class AbstractSensor(Readable):
         unit_length: Whether values are unit vectors, attitudes to within a thousandth
             and others to within a half.
         depends_on_attitude: Whether the reading depends on the attitude.
+        quantity: What a value is and its unit, for the axis of a figure.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> class SpinMeter(jr.identify.AbstractSensor):
@@ -91,9 +92,10 @@ class AbstractSensor(Readable):
     degrees: ClassVar[int | None] = None
     unit_length: ClassVar[bool] = False
     depends_on_attitude: ClassVar[bool] = True
+    quantity: ClassVar[str] = "value"
 
     @abc.abstractmethod
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the value."""
 
     def difference(self, value: Array, predicted: Array) -> Array:
@@ -165,6 +167,7 @@ class Gyro(AbstractSensor):
     [0.1 0.  0. ]
     """
 
+    quantity: ClassVar[str] = "rate [rad/s]"
     depends_on_attitude: ClassVar[bool] = False
     bias: Float[Array, "3"] = _array("bias", (1, 0), _ZEROS, (3,))
     drift: Float[Array, "3"] = _array("drift", (2, 0), _ZEROS, (3,))
@@ -184,7 +187,7 @@ class Gyro(AbstractSensor):
         scale = jnp.broadcast_to(self.scale, (3,)).astype(dtype)
         return product("ij,j,kj->ik", self.matrix.astype(dtype), scale, turn)
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the reading [rad/s], without delay and limit."""
         dtype = state.omega.dtype
         since = 0.0 if self.since is None else self.since
@@ -244,11 +247,12 @@ class Accelerometer(AbstractSensor):
     [-10.   0.   0.]
     """
 
+    quantity: ClassVar[str] = "specific force [m/s$^2$]"
     depends_on_attitude: ClassVar[bool] = False
     lever: Float[Array, "3"] = _array("lever", (-2, 1), _ZEROS, (3,))
     bias: Float[Array, "3"] = _array("bias", (0, 1), _ZEROS, (3,))
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the specific force [m/s^2]."""
         omega = state.omega
         lever = self.lever.astype(omega.dtype)
@@ -268,12 +272,13 @@ class Magnetometer(AbstractSensor):
     >>> north = jr.identify.Magnetometer(jnp.array([20.0, 0.0, -40.0]))
     """
 
+    quantity: ClassVar[str] = "field, in the unit of the values"
     field: Float[Array, "3"] = eqx.field(
         converter=_vector("field"), metadata={"unit": (0, 1)}
     )
     bias: Float[Array, "3"] = _array("bias", (0, 1), _ZEROS, (3,))
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the field in body axes."""
         dtype = state.omega.dtype
         field = rotation.rotate_inverse(state.attitude, self.field.astype(dtype))
@@ -298,12 +303,13 @@ class AttitudeSensor(AbstractSensor):
     [0.  0.  0.1]
     """
 
+    quantity: ClassVar[str] = "attitude, quaternion"
     width: ClassVar[int | None] = 4
     degrees: ClassVar[int | None] = 3
     unit_length: ClassVar[bool] = True
     misalignment: Float[Array, "3"] = _array("misalignment", (0, 0), _ZEROS, (3,))
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the attitude of the sensor."""
         q = state.attitude
         return rotation.multiply(q, rotation.exp(self.misalignment.astype(q.dtype)))
@@ -336,6 +342,7 @@ class DirectionSensor(AbstractSensor):
     [-1.  0.  0.]
     """
 
+    quantity: ClassVar[str] = "direction, unit vector"
     degrees: ClassVar[int | None] = 2
     unit_length: ClassVar[bool] = True
     of: Float[Array, "3"] = eqx.field(converter=_vector("of"))
@@ -345,7 +352,7 @@ class DirectionSensor(AbstractSensor):
         """Raise ValueError for another frame."""
         check_option("frame", self.frame, ("body", "space"))
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the direction."""
         of = self.of.astype(state.omega.dtype)
         turn = rotation.rotate_inverse if self.frame == "body" else rotation.rotate
@@ -381,13 +388,14 @@ class MomentumSensor(AbstractSensor):
     [-1.  -4.   7.5]
     """
 
+    quantity: ClassVar[str] = "angular momentum [kg m$^2$/s]"
     frame: str = eqx.field(static=True, default="space")
 
     def __check_init__(self) -> None:
         """Raise ValueError for another frame."""
         check_option("frame", self.frame, ("space", "body"))
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the angular momentum."""
         if self.frame == "space":
             return system.angular_momentum(t, state, None)
@@ -433,6 +441,6 @@ class FunctionSensor(AbstractSensor):
         self.function = function
         self.depends_on_attitude = depends_on_attitude
 
-    def predict(self, t: Array, state: State, system: AbstractSystem) -> Array:
+    def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Return the result of the function."""
         return jnp.asarray(self.function(t, state, system), state.omega.dtype)

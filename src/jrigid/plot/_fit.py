@@ -15,13 +15,6 @@ _LAYOUT = [
     ["residuals"] * 2 + ["histogram"],
     ["spectrum"] * 2 + ["ratios"],
 ]
-_QUANTITIES = {
-    "Gyro": "rate [rad/s]",
-    "Accelerometer": "specific force [m/s$^2$]",
-    "AttitudeSensor": "attitude, quaternion",
-    "DirectionSensor": "direction, unit vector",
-    "MomentumSensor": "angular momentum [kg m$^2$/s]",
-}
 _POINTS = 5000  # times at which a model is drawn, at most
 _WAVES = 1000  # frequencies of a spectrum, at most
 _BANDS = 40  # averages of a spectrum, at most
@@ -116,8 +109,7 @@ def _record(ax: Axes, result: FitResult, record: int, trial: int) -> None:
     kind = type(sensor).__name__
     count = len(result.t0)
     which = f", trial {trial} of {count}" if count > 1 else ""
-    quantity = _QUANTITIES.get(kind, "value")
-    label(ax, f"{kind}{which}, and model", "time [s]", quantity)
+    label(ax, f"{kind}{which}, and model", "time [s]", sensor.quantity)
 
 
 def _of_equal_sign(
