@@ -14,6 +14,7 @@ motion, without the brightness.
 """
 
 import functools
+from typing import NamedTuple
 
 import bench_device
 import bench_lanes
@@ -36,10 +37,26 @@ MOTIONS = 521
 EXACT, JACOBIAN = "exact motion", "exact motion, with derivatives"
 SIMULATE = "`simulate`, rtol 1e-10"
 SCIPY = "DOP853 of scipy, rtol 1e-11"
+ATTITUDE = jnp.array([1.0, 0.0, 0.0, 0.0])
+OMEGA = ph.omega_from_periods(MOMENTS, 27.38 * HOUR, 263 * HOUR)
+LIGHT = 299792458.0  # m/s
+
+
+class Scene(NamedTuple):
+    """Epochs [s], and the Sun and the observer from the body [m], space components."""
+
+    ts: jax.Array
+    sun: jax.Array
+    observer: jax.Array
+
+    @property
+    def emitted(self):
+        """Times at which the light left the body [s]."""
+        return self.ts - jnp.linalg.norm(self.observer, axis=1) / LIGHT
 
 
 def observations():
-    """Epochs [s] in some nights of nine years, and directions to Sun and observer."""
+    """A scene of some nights of nine years."""
     rng = np.random.default_rng(0)
     nights = rng.uniform(0.0, 9 * YEAR, EPOCHS // 20)
     ts = np.sort(
@@ -48,11 +65,99 @@ def observations():
     angle = 2 * np.pi * ts / (0.9 * YEAR)
     sun = AU * np.stack([np.cos(angle), np.sin(angle), 0.05 * np.sin(2 * angle)], -1)
     earth = AU * np.stack([np.cos(ts / YEAR), np.sin(ts / YEAR), 0 * ts], -1)
-    return jnp.asarray(ts), jnp.asarray(sun), jnp.asarray(sun - 0.9 * earth)
+    return Scene(jnp.asarray(ts), jnp.asarray(sun), jnp.asarray(sun - 0.9 * earth))
+
+
+def exact(scene, omega):
+    """The curve by the exact motion."""
+    state = jr.State(ATTITUDE, omega)
+    return ph.light_curve(MOMENTS, state, *scene, SHAPE)
+
+
+@jax.jit
+@jax.vmap
+def brightness(attitude, sun, observer):
+    """Brightness of the ellipsoid in each attitude."""
+    to_sun = jr.rotation.rotate_inverse(attitude, sun)
+    to_observer = jr.rotation.rotate_inverse(attitude, observer)
+    return ph.brightness(SHAPE, to_sun, to_observer)
+
+
+def integrated(scene, omega, adjoint=None):
+    """The curve by `simulate`."""
+    # Light from farther away left earlier: the times may be out of order.
+    order = jnp.argsort(scene.emitted)
+    run = jr.simulate(
+        jr.RigidBody(MOMENTS),
+        jr.State(ATTITUDE, omega),
+        scene.emitted[order],
+        rtol=1e-10,
+        max_steps=1_000_000,
+        throw=False,
+        adjoint=adjoint,
+    )
+    attitudes = jnp.zeros((EPOCHS, 4)).at[order].set(run.states.attitude)
+    return brightness(attitudes, scene.sun, scene.observer)
+
+
+def rates(_, y):
+    """Rates of a quaternion and of the angular velocity, in numpy."""
+    q = y[:4]
+    w = y[4:]
+    turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+    moments = np.asarray(MOMENTS)
+    return np.concatenate([turn, np.cross(moments * w, w) / moments])
+
+
+def by_scipy(scene):
+    """The curve by DOP853."""
+    emitted = np.asarray(scene.emitted)
+    order = np.argsort(emitted)
+    # Zero is a knot, so that the state there is that of the other rows.
+    ts = np.concatenate([[0.0], emitted[order]])
+    start = np.concatenate([ATTITUDE, OMEGA])
+    run = solve_ivp(rates, ts[[0, -1]], start, "DOP853", ts, rtol=1e-11, atol=1e-13)
+    attitudes = np.empty((EPOCHS, 4))
+    attitudes[order] = run.y[:4, 1:].T
+    attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
+    return brightness(attitudes, scene.sun, scene.observer)
+
+
+def measured(scene):
+    """Least and median milliseconds, and the curve, of each way."""
+    forward = functools.partial(integrated, adjoint=diffrax.ForwardMode())
+    functions = {
+        EXACT: exact,
+        JACOBIAN: jax.jacfwd(exact, 1),
+        SIMULATE: integrated,
+        f"{SIMULATE}, with derivatives": jax.jacfwd(forward, 1),
+    }
+    cases = {
+        name: functools.partial(jax.jit(function), scene, OMEGA)
+        for name, function in functions.items()
+    }
+    times = common.timed(cases, repeats=5)
+    return times | common.timed({SCIPY: lambda: by_scipy(scene)}, repeats=1)
+
+
+def curves_table(times):
+    """Times of each way, and how far its curve is from that of the exact motion."""
+    reference = times[EXACT][2]
+    rows = []
+    for name, (least, median, curve) in times.items():
+        is_value = curve.shape == reference.shape
+        unit = times[EXACT if is_value else JACOBIAN][0]
+        error = float(np.max(np.abs(curve / reference - 1))) if is_value else None
+        rows.append([name, least, median, least / unit, error])
+    least, median, _ = times[SCIPY]
+    ratio = 4 * least / times[JACOBIAN][0]
+    rows.append([f"{SCIPY}, four curves", 4 * least, 4 * median, ratio, None])
+    columns = ["ms, min", "ms, median", "of the exact motion", "largest difference"]
+    return common.table(["curve", *columns], rows)
 
 
 def scan():
-    """Milliseconds of a scan of starting points over nine years, and their number."""
+    """Least milliseconds of a scan of starting points over nine years, and their number."""
     numbers, tasks = bench_device.starting_points(MOTIONS)
     few = _scan.fewer_epochs(bench_device.readings())
     few = few._replace(ts=few.ts * (9 * YEAR / few.span), span=np.asarray(9 * YEAR))
@@ -75,98 +180,12 @@ def starting_points_table(times):
 
 def main(write):
     """Measure and report."""
-    ts, sun, observer = observations()
-    omega = ph.omega_from_periods(MOMENTS, 27.38 * HOUR, 263 * HOUR)
-    attitude = jnp.array([1.0, 0.0, 0.0, 0.0])
-    emitted = ts - jnp.linalg.norm(observer, axis=1) / 299792458.0
-
-    def exact(omega):
-        state = jr.State(attitude, omega)
-        return ph.light_curve(MOMENTS, state, ts, sun, observer, SHAPE)
-
-    @jax.vmap
-    def seen(attitude, sun, observer):
-        to_sun = jr.rotation.rotate_inverse(attitude, sun)
-        to_observer = jr.rotation.rotate_inverse(attitude, observer)
-        return ph.brightness(SHAPE, to_sun, to_observer)
-
-    def integrated(omega, adjoint=None):
-        state = jr.State(attitude, omega)
-        order = jnp.argsort(emitted)
-        run = jr.simulate(
-            jr.RigidBody(MOMENTS),
-            state,
-            emitted[order],
-            rtol=1e-10,
-            max_steps=1_000_000,
-            throw=False,
-            adjoint=adjoint,
-        )
-        attitudes = jnp.zeros((EPOCHS, 4)).at[order].set(run.states.attitude)
-        return seen(attitudes, sun, observer)
-
-    moments = np.asarray(MOMENTS)
-
-    def rates(_, y):
-        q, w = y[:4], y[4:]
-        turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
-        return np.concatenate([turn, np.cross(moments * w, w) / moments])
-
-    def by_scipy():
-        order = np.argsort(emitted)
-        start = np.concatenate([attitude, omega])
-        span = float(emitted.min()), float(emitted.max())
-        first = solve_ivp(
-            rates, (0.0, span[0]), start, "DOP853", rtol=1e-11, atol=1e-13
-        )
-        run = solve_ivp(
-            rates,
-            span,
-            first.y[:, -1],
-            "DOP853",
-            np.asarray(emitted)[order],
-            rtol=1e-11,
-            atol=1e-13,
-        )
-        attitudes = np.empty((EPOCHS, 4))
-        attitudes[order] = run.y[:4].T
-        attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
-        return shine(attitudes, sun, observer)
-
-    shine = jax.jit(seen)
-    value, gradient = jax.jit(exact), jax.jit(jax.jacfwd(exact))
-    loop = jax.jit(integrated)
-    forward = functools.partial(integrated, adjoint=diffrax.ForwardMode())
-    loop_gradient = jax.jit(jax.jacfwd(forward))
-    cases = {
-        EXACT: lambda: value(omega),
-        JACOBIAN: lambda: gradient(omega),
-        SIMULATE: lambda: loop(omega),
-        f"{SIMULATE}, with derivatives": lambda: loop_gradient(omega),
-    }
-    times = common.timed(cases, repeats=5)
-    times |= common.timed({SCIPY: by_scipy}, repeats=1)
-    least, median, curve = times[SCIPY]
-    times[f"{SCIPY}, four curves"] = 4 * least, 4 * median, curve
-    reference = times[EXACT][2]
-    rows = []
-    for name, (least, median, answer) in times.items():
-        is_value = name in (EXACT, SIMULATE, SCIPY)
-        exact_least = times[EXACT if is_value else JACOBIAN][0]
-        error = float(np.max(np.abs(answer / reference - 1))) if is_value else None
-        rows.append([name, least, median, least / exact_least, error])
-    header = [
-        "curve",
-        "ms, min",
-        "ms, median",
-        "of the exact motion",
-        "largest difference",
-    ]
+    times = measured(observations())
     text = (
         "A tumbler with the periods of Apophis at 1,200 epochs over nine years, without "
-        "compilation.\n\n" + common.table(header, rows)
+        "compilation."
     )
-    text += "\n\n" + starting_points_table(times)
+    text = "\n\n".join([text, curves_table(times), starting_points_table(times)])
     packages = ["jax", "diffrax", "numpy", "scipy"]
     common.report("photometry", "Light curves", text, packages, write)
 

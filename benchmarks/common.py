@@ -76,14 +76,24 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
 
 
 def report(
-    name: str, title: str, text: str, packages: Sequence[str], write: bool
+    name: str,
+    title: str,
+    text: str,
+    packages: Sequence[str],
+    write: bool,
+    options: str = "",
 ) -> None:
-    """Print the machine and the table, and store them beside the code if asked to."""
+    """Print the machine and the table, and store them beside the code if asked to.
+
+    With options of the command line, the name of the file has the last word of them.
+    """
     print(machine(packages), text, sep="\n\n")
     if write:
-        path = pathlib.Path(__file__).parent / "results" / f"{name}.md"
+        file = "-".join([name, *options.split()[-1:]])
+        path = pathlib.Path(__file__).parent / "results" / f"{file}.md"
         path.parent.mkdir(exist_ok=True)
-        command = f"`python benchmarks/bench_{name}.py --write`"
+        command = " ".join([f"`python benchmarks/bench_{name}.py", options, "--write`"])
+        command = command.replace("  ", " ")
         path.write_text(f"# {title}\n\n{command} on {machine(packages)}.\n\n{text}\n")
 
 
