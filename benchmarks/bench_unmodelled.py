@@ -194,7 +194,7 @@ def main():
     text = "\n\n".join([*explained, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
     common.report(
-        "trials", "A hundred trials with what no model has", text, packages, given.write
+        "unmodelled", "A hundred trials with what no model has", text, packages, given.write
     )
 
 
