@@ -52,6 +52,7 @@ class _Listed(EnumerationMeta):
             if code.ndim and is_concrete(code):
                 # A text for each lane.
                 return np.array(cls.texts)[np.asarray(code)]
+        # The text of `successful` is empty in diffrax.
         return super().__getitem__(item) or "All went well."
 
     @property
@@ -147,7 +148,10 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
                 "Argument `inertia` must be three moments or a (3, 3) tensor, but it "
                 f"is a {type(value).__name__}: pass its `.inertia`."
             )
+    # `jnp.result_type` accepts arrays and numbers, but no lists.
     values = tuple(v if eqx.is_array_like(v) else np.asarray(v) for v in values)
+    # Under strict dtype promotion arguments of different dtypes would be an error.
+    # `float` makes floats of integers and leaves float32 as it is.
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*values, float)
     return tuple(jnp.asarray(value, dtype) for value in values)
@@ -155,8 +159,10 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
 
 def jumps_within(parts: PyTree) -> Float[Array, " jumps"]:
     """Times that the parts of a pytree declare by a property `jumps` [s]."""
+    # A part declares its jumps as a whole, so its own parts do not count again.
     leaves = jtu.tree_leaves(parts, is_leaf=lambda x: hasattr(x, "jumps"))
     declared = [x.jumps for x in leaves if hasattr(x, "jumps")]
+    # The empty array is the result where no part declares jumps.
     known = float_arrays(jnp.zeros(0), *declared)
     return jnp.concatenate([x.reshape(-1) for x in known])
 
@@ -309,6 +315,7 @@ def traced_by_jax(function: str) -> Generator[None, None, None]:
 def whole_number(name: str, value: Any, least: int = 1) -> int:
     """A Python integer, known when traced and at least `least`, or ValueError."""
     check_known(name, value)
+    # In Python True is an integer too.
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or value < least:
         raise ValueError(
@@ -407,6 +414,7 @@ def harmless(ok: Array, tree: Tree) -> Tree:
     def replaced(x: PyTree) -> PyTree:
         if not eqx.is_inexact_array(x):
             return x
+        # A tensor of ones would be singular.
         return jnp.where(ok, x, jnp.eye(3, dtype=x.dtype) if x.shape == (3, 3) else 1.0)
 
     return jtu.tree_map(replaced, tree)
@@ -462,6 +470,7 @@ class Findings:
             message: The sentence to report; by default that of the code.
             value: The value to show after it.
         """
+        # Only the first error of a lane sets its code.
         failed = self.ok & ~ok
         if code is not None:
             if not isinstance(failed, np.bool_):
@@ -540,6 +549,8 @@ def _diagnosis(
 ) -> _Diagnosis:
     """The diagnosis of a failed call, from its findings and its result code."""
     diagnosis = findings(*arguments).diagnosis_of(result)
+    # equinox raises the message of the largest index in a batch, which must not be that
+    # of a valid lane.
     first = jnp.where(bad, diagnosis.first, 0)
     values = jax.lax.stop_gradient(jtu.tree_map(jnp.asarray, diagnosis.values))
     return _Diagnosis(first, diagnosis.messages, values)
@@ -550,6 +561,7 @@ def _refuse(tree: Tree, bad: AnyBool, diagnose: Callable[[], _Diagnosis]) -> Tre
 
     The error is raised in Python if `bad` is known, also under vmap and grad.
     """
+    # Under vmap `bad` is a tracer, even where the values of all lanes are known.
     some = unvmap_any(bad)
     if isinstance(some, jax.core.Tracer):
         diagnosis = diagnose()
@@ -586,6 +598,7 @@ def _all_lanes(*values: Any) -> list[np.ndarray]:
         return [np.asarray(x) for x in values]
     arrays: list[np.ndarray] = []
 
+    # A tracer of vmap hides its values, but the rule of `custom_vmap` receives them.
     @jax.custom_batching.custom_vmap
     def look(*values: Any) -> Any:
         return values[0]
@@ -596,6 +609,7 @@ def _all_lanes(*values: Any) -> list[np.ndarray]:
             x if has else jnp.broadcast_to(x, (size, *x.shape))
             for x, has in zip(values, batched, strict=True)
         ]
+        # Under nested vmaps these values are tracers of the outer one.
         arrays.extend(_all_lanes(*spread))
         return values[0], batched[0]
 

@@ -109,6 +109,7 @@ class AbstractSystem(Readable):
         Raises:
             ValueError: The state does not have the internal parts of this body.
         """
+        # Shapes are compared when the vector field is traced, at no cost in a run.
         have = _shapes(state.internal)
         want = _shapes(self.torque.internal_at_rest(state))
         if have != want:
@@ -199,6 +200,7 @@ class RigidBody(AbstractSystem):
     @property
     def is_free(self) -> bool:
         """True of a body without torque."""
+        # `as_torque` makes an empty sum of None.
         return isinstance(self.torque, Sum) and not self.torque.terms
 
     def vector_field(

@@ -63,6 +63,7 @@ def some_at_a_time(
     """
     count = order.size
     width = width_of(count)
+    # The last lane is repeated to fill the last block, since blocks have one shape.
     order = order[jnp.minimum(jnp.arange(-(-count // width) * width), count - 1)]
 
     def block(numbers: Array) -> PyTree:
@@ -72,6 +73,7 @@ def some_at_a_time(
 
     def in_place(x: Array) -> Array:
         x = x.reshape(-1, *x.shape[2:])
+        # Repeated lanes have equal results, so the order of storing does not matter.
         return jnp.zeros((count, *x.shape[1:]), x.dtype).at[order].set(x)
 
     return jtu.tree_map(in_place, jax.lax.map(block, order.reshape(-1, width)))
@@ -97,6 +99,7 @@ def as_lanes(
             and tangents. If only tangents are batched, they alone are mapped.
         alone: Called as `alone(problem, *own)` in place of `function` without vmap.
     """
+    # `custom_vmap` takes arrays only.
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, structure = jtu.tree_flatten((arrays, own, tangents))
     motions = len(leaves) - len(jtu.tree_leaves(tangents))
@@ -107,6 +110,7 @@ def as_lanes(
     def _(size: int, batched: PyTree, *leaves: PyTree) -> tuple[PyTree, PyTree]:
         if not any(batched):
             return _without_axis(call.single(*leaves))
+        # A Jacobian has several tangents of one motion, which is integrated once.
         if not any(batched[:motions]):
             spread = [
                 x if has or i < motions else jnp.broadcast_to(x, (size, *x.shape))
@@ -207,6 +211,7 @@ class _Call(NamedTuple):
                 axes = [0 if has else None for has in again]
                 each = jax.vmap(lambda *x: self.of_all(x, batched), axes, (None, 0))
                 return _of_tangents(each(*leaves))
+            # Both axes together fill the blocks of lanes; the inner one alone may not.
             flags = list(zip(leaves, batched, again, strict=True))
             count = next(x.shape[1 if out else 0] for x, has, out in flags if has)
             flat = [_flat(*x, size, count) for x in flags]

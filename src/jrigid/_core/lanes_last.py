@@ -100,6 +100,8 @@ def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
     A part of the carry has lanes if an iteration gives it lanes.
     """
     flags = list(batched)
+    # Lanes may reach one more part of the carry in each iteration. A part has the same
+    # shape in all iterations, so it has its lanes from the start.
     while True:
         results = _results_vary(scan.body.jaxpr, flags)
         before = flags[scan.carry]
@@ -142,6 +144,7 @@ class _Evaluation:
         """The results of an operation, and whether they have lanes."""
         values = [x for x, _ in pairs]
         batched = [has for _, has in pairs]
+        # What lanes share is computed once.
         if not any(batched):
             alone = third_party.apply(eqn.primitive, eqn.params, *values)
             return [(x, False) for x in alone]
@@ -149,9 +152,11 @@ class _Evaluation:
         if scan is not None:
             return self.scan(scan, pairs)
         branches = third_party.branches_of(eqn)
+        # If lanes take different branches, vmap evaluates all branches and selects.
         if branches is not None and not batched[0]:
             return self.cond(branches, values, batched)
         arrays = third_party.dynamic_slice_of(eqn)
+        # A place that differs between lanes needs a gather, which is left to vmap.
         if arrays is not None and not any(batched[arrays:]):
             values = [
                 *(_in_lanes(*x, self.lanes) for x in pairs[:arrays]),
@@ -171,6 +176,7 @@ class _Evaluation:
         batched: tuple[bool, ...],
     ) -> list[tuple[Any, bool]]:
         """The results of a called function, which is traced once for all its calls."""
+        # The id stays valid, since the program that is evaluated holds `called`.
         key = id(called), batched
         if key not in self.functions:
             closed = isinstance(called, third_party.ClosedJaxpr)
@@ -180,6 +186,8 @@ class _Evaluation:
             @jax.jit
             def function(*values: Any) -> list:
                 results = self(inner, consts, zip(values, batched, strict=True))
+                # A jitted function returns arrays alone, so the flags are stored while
+                # it is traced.
                 flags[:] = [has for _, has in results]
                 return [x for x, _ in results]
 

@@ -40,7 +40,9 @@ def solve_reverse(engine: Engine, motion: Motion) -> Ends:
 
     def forwards(perturbed: Motion, motion: Motion) -> tuple[Ends, tuple[Array, Array]]:
         del perturbed
+        # The value takes the finer steps too, since its own steps are reversed.
         ends = solve(engine, guard_derivative(_with_fine_steps(motion)))
+        # The steps are not stored: the backward pass runs the motion again.
         return ends, (ends.t, ends.counts[1])
 
     def backwards(
@@ -135,6 +137,7 @@ def _pushed_forward(
 
         return of_states(*eqx.filter_jvp(ends, (varied,), (tangent,)))
 
+    # equinox passes None as the tangent of an array that has no derivative.
     perturbed = jtu.tree_map(lambda x: x is not None, tangent, is_leaf=_is_none)
     varied, rest = _split(_with_fine_steps(motion), perturbed, start=True)
     tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, varied))
@@ -169,6 +172,7 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
         t, h = place
         smooth = engine.smooth_field(motion, jump)
 
+        # Reverse mode stores a state for each step and computes the stages again.
         @jax.checkpoint
         def taken(y: Array) -> Array:
             # Under vmap lanes without a step are evaluated too. They start from the
@@ -176,6 +180,7 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
             y = jnp.where(h > 0, y, motion.y0)
             return engine.stepper.taken(smooth, motion.parameters, t, h, y)
 
+        # Except under vmap, a row of the record without a step costs no evaluation.
         after = jax.lax.cond(h > 0, taken, lambda y: y, y)
         y = jnp.where(h > 0, after, y)
         return y, y
@@ -183,6 +188,7 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
     y, after_steps = jax.lax.scan(step, motion.y0, (record.places, record.jumps))
     numbers = jnp.arange(len(after_steps))
     count = motion.times.size
+    # The entry after the last output time takes the steps that reach none.
     of_output = jnp.zeros(count + 1, numbers.dtype).at[record.outputs].set(numbers)
     ys = after_steps[of_output[:count]]
     ys = jnp.where((motion.times <= 0)[:, None], motion.y0, ys)
@@ -202,6 +208,7 @@ def moved_by(
     return y
 
 
+# With symbolic zeros the field is evaluated only where times have derivatives.
 @partial(moved_by.defjvp, symbolic_zeros=True)
 def _moved_by_jvp(field: Callable, primals: tuple, tangents: tuple) -> tuple:
     parameters, t, y, dt = primals
@@ -211,5 +218,6 @@ def _moved_by_jvp(field: Callable, primals: tuple, tangents: tuple) -> tuple:
     if not isinstance(y_dot, jax.custom_derivatives.SymbolicZero):
         total = total + y_dot
     if not isinstance(dt_dot, jax.custom_derivatives.SymbolicZero):
+        # `t + dt` and `value` depend on `dt`, so that higher derivatives are right too.
         total = total + field(parameters, t + dt, value) * dt_dot
     return value, total

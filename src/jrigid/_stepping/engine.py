@@ -96,6 +96,7 @@ def _progress_if(
     new_counts = jnp.stack([x.astype(progress.counts.dtype) for x in counts])
     return Progress(
         jnp.where(keep, trial.y1, progress.y),
+        # The direction of a motion that has ended is not read again.
         trial.direction,
         jnp.where(running, new_clock, progress.clock),
         jnp.where(running, new_counts, progress.counts),
@@ -125,6 +126,7 @@ class Engine(NamedTuple):
     @property
     def keeps_rates(self) -> bool:
         """Whether an attempt returns the rates of all stages."""
+        # The reverse of a step and the dense output at an event need them.
         return self.replays or self.conditions is not None
 
     def begin(self, motion: Motion) -> Progress:
@@ -133,6 +135,7 @@ class Engine(NamedTuple):
         zero = jnp.zeros_like(limits.end)
         first = limits.longest * self.stepper.first
         counts = [
+            # An invalid motion has the rate zero and ends at once: no lane waits.
             jnp.where((limits.end > 0) & (limits.start_rate > 0), RUNNING, ENDED),
             0,
             0,
@@ -177,6 +180,7 @@ class Engine(NamedTuple):
         t, step, _, end = progress.clock
         output = progress.counts[3]
         jump = progress.counts[4]
+        # Steps end at output times, since the order of dense output is lower.
         goal = jnp.minimum(_entry(motion.times, output), end)
         if motion.jumps.size:
             goal = jnp.minimum(goal, _entry(motion.jumps, jump))
@@ -206,6 +210,7 @@ class Engine(NamedTuple):
             passage = self._passage(self.conditions, motion, progress, taken, keep)
             keep, repeat, at_event, end, which, values = passage
             new_state = jnp.where(at_event, EVENT, new_state)
+            # A step that is repeated has not reached the end yet.
             new_state = jnp.where(repeat, RUNNING, new_state)
             following = jnp.where(repeat, step, following)
         too_many = (new_state == RUNNING) & (tried + 1 >= self.max_steps)
@@ -240,6 +245,7 @@ class Engine(NamedTuple):
         end = progress.clock[3]
         which = progress.counts[5]
         now = conditions.values(motion.observed, taken.t1, taken.y1)
+        # The end of a step has no derivative; `place_of_event` adds that of an event.
         now = jax.lax.stop_gradient(now)
         happened = conditions.happened(progress.values, now)
         # After the time of an event is known, the motion ends there.

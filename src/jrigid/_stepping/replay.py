@@ -135,6 +135,7 @@ class _Replay(NamedTuple):
             nothing = jnp.zeros_like(changes.ys[:1])
             of_output = jnp.concatenate([changes.ys, nothing])[step.output]
             motion: Motion = eqx.combine(fixed, varied)
+            # Steps end exactly at jumps, so the start determines the next jump.
             jump = jnp.sum(motion.jumps <= t)
             smooth = self.engine.smooth_field(motion, jump)
             change = change + of_output
@@ -172,6 +173,7 @@ class _Replay(NamedTuple):
             lambda x: x[start], (checkpoints.progress, checkpoints.attempts)
         )
         room = _CHECKPOINTS - checkpoints.count
+        # In the first run `back.attempt` is unknown, and larger than the estimate.
         left = jnp.minimum(back.attempt, self.estimate) - attempt
         # Checkpoints are spread over the rest of the run as far as they suffice.
         stretch = jnp.maximum(size, -(-left // (room + 1)))
@@ -182,6 +184,7 @@ class _Replay(NamedTuple):
         def one_attempt(carry: tuple) -> tuple:
             attempt, progress, log, until = carry
             progress, step = self.attempt(progress)
+            # The latest attempt replaces the earliest one in the log.
             log = _put(log, step, attempt % size)
             return attempt + 1, progress, log, until
 
@@ -229,6 +232,7 @@ class _Replay(NamedTuple):
             attempt, start, log, checkpoints = self.forwards(back, checkpoints, log)
             # The first run counts the attempts.
             back = back._replace(attempt=attempt)
+            # Attempts that the log has lost are run again later, from the checkpoint.
             first = jnp.maximum(
                 checkpoints.attempts[start], attempt - log.output.shape[0]
             )
@@ -240,6 +244,7 @@ class _Replay(NamedTuple):
         )
 
         def at_start(fixed: Motion, changes: Cotangents) -> Array:
+            # No step reaches an output time at the start.
             early = (fixed.times <= 0)[:, None]
             return jnp.sum(jnp.where(early, changes.ys, 0.0), axis=0)
 
@@ -309,6 +314,7 @@ def pull_alone(
     def over(function: Callable[..., Any], *arguments: Any) -> Any:
         return apart(function, tried >= 0, *arguments)
 
+    # The motion ends where the first run ended, so no event is sought again.
     engine = engine._replace(replays=True, conditions=None)
     return _Replay(engine, over, fixed, varied, changes, tried).pull()
 

@@ -185,6 +185,7 @@ class _Batch(NamedTuple):
 
     def take(self, number: Int[Array, " lanes"]) -> _Lanes:
         """Lanes with the motions of these numbers at their start."""
+        # An empty lane computes with the data of the last motion, without effect.
         own = jtu.tree_map(
             lambda x: jnp.moveaxis(x.at[number].get(mode="clip"), 0, -1), self.table
         )
@@ -221,6 +222,7 @@ class _Batch(NamedTuple):
             ends=results.ends.at[number].set(ends.T, mode="drop"),
             counts=results.counts.at[number].set(progress.counts.T, mode="drop"),
         )
+        # Each finished lane takes a motion of its own, or none if all have started.
         behind = jnp.cumsum(ended.astype(started.dtype))
         following = self.order.at[started + behind - 1].get(
             mode="fill", fill_value=self.count

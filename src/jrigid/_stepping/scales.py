@@ -29,6 +29,7 @@ def jacobian(
     component of the state.
     """
     largest = jnp.maximum(1.0, jnp.abs(y / scales))
+    # This step balances the rounding and the truncation error of a forward difference.
     step = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest
     # The first row is zero: the state itself.
     which = np.eye(y.size + 1, y.size, k=-1, dtype=y.dtype)
@@ -65,6 +66,7 @@ def rate_along(
         length = jnp.sqrt(jnp.sum(rates * rates))
         usable = (length > 0) & (length < jnp.inf)
         unit = rates / jnp.where(usable, length, 1.0)
+        # The geometric mean of both growths is the rate, also of an oscillation.
         return rate * jnp.sqrt(length), jnp.where(usable, unit, direction)
 
     return jax.lax.fori_loop(0, 2, change, (jnp.ones_like(nudge[0]), direction))
@@ -80,6 +82,7 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     def square(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, log_factor = carry
         largest = jnp.max(jnp.abs(matrix))
+        # Without the scale the high power of a matrix could overflow.
         scale = jnp.where(largest > 0, largest, 1.0)
         matrix = matrix / scale
         matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
@@ -158,6 +161,7 @@ class _Start(NamedTuple):
     def powers(self, length: Array, speed: Array) -> Array:
         """Scales of the components of the state, as powers of two."""
         scales = spread(self.system, self.state, self.rate, length, speed)
+        # Divisions by powers of two do not round.
         return power_of_two(scales)
 
     def fastest(self, scales: Array) -> Array:
@@ -169,6 +173,7 @@ class _Start(NamedTuple):
             return ravel_pytree(rates)[0]
 
         radius = self.fastest_of(jacobian(field, flat, scales))
+        # Beside a singularity of the field the differences may not be finite.
         return jnp.maximum(self.rate, jnp.where(jnp.isfinite(radius), radius, 0.0))
 
 

@@ -98,6 +98,7 @@ class _Sums(NamedTuple):
         """For each table, the coefficients of a row and the terms that they weight."""
         row = self.row(iteration)
         return [
+            # `equal_steps` evaluates one stage less than a table has columns.
             (_row(table[:, : len(x)], row, x.dtype), x)
             for table, x in zip(self.tables, terms, strict=True)
         ]
@@ -204,6 +205,7 @@ def _loop(
     t, h, y = step
 
     def next_row(i: Array) -> Array:
+        # The last iteration repeats the last row, which gives the result of the step.
         return jnp.minimum(i + 1, method.stages - 1)
 
     sums = _Sums((method.rows,), method.groups, next_row, in_lanes)
@@ -318,4 +320,5 @@ def _place_and_weighted(
     total: Array, total_back: Array, h: Array, y: Array
 ) -> tuple[Array, Array]:
     """The state at a stage, and the cotangent of the rate there."""
+    # The rates of a rejected step may be infinite, and zero times infinity is NaN.
     return y + jnp.where(h != 0, h * total, 0.0), h * total_back

@@ -136,6 +136,7 @@ class ErrorControlled(NamedTuple):
 
     def end(self, t: Array, step: Array, goal: Array) -> Float[Array, ""]:
         """The end of the step, or the goal if the step ends just before it."""
+        # Otherwise a step of a few roundings may be left before the goal.
         near = t + step > goal * (1 - 100 * jnp.finfo(t.dtype).eps)
         return jnp.where(near, goal, t + step)
 
@@ -160,6 +161,7 @@ class ErrorControlled(NamedTuple):
 
         def step_to(h: Array, y: Array) -> tuple[Array, ...]:
             rates, y1 = stages(self.method, rates_at, t, h, y, in_lanes)
+            # The fastest rate is found from the rate at the end alone.
             returned = rates if keeps_rates else rates[-1:]
             return y1, error_of(self.method, rates, h), returned
 
@@ -167,6 +169,7 @@ class ErrorControlled(NamedTuple):
         if in_lanes:
             y1, estimate, rates = step_to(h, y)
         else:
+            # A number of steps is never negative, so that the branch is always taken.
             y1, estimate, rates = apart(step_to, counts[1] >= 0, h, y)
         # The choice of steps is not differentiated.
         before, after, estimate, base = jax.lax.stop_gradient(
@@ -185,6 +188,7 @@ class ErrorControlled(NamedTuple):
     ) -> Float[Array, " n"]:
         """The state within a step, by the dense output of the method."""
         del parameters
+        # A stage that `method_of` adds is not part of the solver's dense output.
         increments = (step.t1 - step.t0) * step.rates[: self.method.own]
         curve = self.interpolation(
             t0=step.t0, t1=step.t1, y0=step.y0, y1=step.y1, k=increments
@@ -232,6 +236,7 @@ class EqualSteps(NamedTuple):
     def end(self, t: Array, step: Array, goal: Array) -> Float[Array, ""]:
         """The end of the first of the equal steps that reach the goal."""
         count = jnp.ceil((goal - t) / step - _RAGGED)
+        # The last of the steps ends at the goal itself, without rounding.
         return jnp.where(count <= 1, goal, t + (goal - t) / jnp.maximum(count, 1))
 
     def attempt(
@@ -249,6 +254,7 @@ class EqualSteps(NamedTuple):
         y1 = self.advance(motion.parameters, t, t1 - t, y)
         yes = jnp.array(True)
         no = jnp.array(False)
+        # Neither `state_at` nor `pull_back` uses rates of stages.
         none = jnp.zeros((0, *y.shape), y.dtype)
         return Trial(y1, direction, Verdict(yes, no, step, rate), no, none)
 

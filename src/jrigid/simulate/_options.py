@@ -20,6 +20,7 @@ from jrigid.systems import AbstractSystem, RigidBody
 _DEFAULT_RTOL = {8: 1e-8, 4: 1e-5}
 SMALLEST_RTOL = {8: 1e-14, 4: 1e-7}
 _DEFAULT_MAX_STEPS = 20_000_000
+# The record of `DirectAdjoint` has a row for each of these steps, taken or not.
 _DEFAULT_MAX_STEPS_DIRECT = 4096
 _ADJOINTS = (
     diffrax.RecursiveCheckpointAdjoint,
@@ -44,6 +45,7 @@ class Inputs(NamedTuple):
         if self.jumps.size == 0:
             return jnp.zeros(0, self.state0.omega.dtype)
         jumps = (self.jumps - self.t0).astype(self.state0.omega.dtype)
+        # Infinite jumps count as none (see `Motion`) and come last in the order.
         return jnp.sort(jnp.where(jnp.isfinite(jumps), jumps, jnp.inf))
 
     @property
@@ -133,6 +135,7 @@ def checked_options(
         warnings.warn(
             "simulate() runs in float32: errors of 1e-6 a radian are usual. Switch on "
             "`jax_enable_x64` and pass float64 arrays for more.",
+            # The warning points to the call of `simulate`.
             stacklevel=3,
         )
     return Options(

@@ -199,6 +199,7 @@ def _findings(
 ) -> Findings:
     """Errors in the arguments, and the time at which a torque became NaN."""
     findings, limits, _ = judged(inputs, options)
+    # The errors below are those of the run; `judged` has repeated the checks before.
     enough = result != RESULTS.max_steps_reached
     require_enough_steps(findings, enough, limits)
     stopped = result == RESULTS.nonfinite_torque
@@ -286,6 +287,7 @@ def _closed_form(given: Prepared) -> _Solved:
 
 def _by_diffrax(given: Prepared, options: Options) -> _Solved:
     """Integrate the motion by the loop of diffrax."""
+    # diffrax evaluates the field of invalid lanes, too.
     motion = given.harmless_motion
     event = options.event
     if event is not None:
@@ -335,6 +337,7 @@ def _integrated(
         solve = solve_forward
     if isinstance(options.adjoint, diffrax.DirectAdjoint):
         solve = solve_direct
+        # Under vmap the scan evaluates the steps of invalid lanes, too.
         motion = motion._replace(
             parameters=harmless(given.findings.ok, motion.parameters)
         )
@@ -367,6 +370,7 @@ def _end(
     if conditions is None or options.event is None:
         return _end_without_event(given.times, t, ends.y, ys, state == ENDED)
     which = ends.counts[5]
+    # A boolean has no slope, so its time has no derivative.
     is_number = ~jnp.array(conditions.boolean)[which]
     return place_of_event(
         partial(given.field, given.parameters),
@@ -382,6 +386,7 @@ def _end_without_event(
     times: Array, t: Array, y: Array, ys: Array, complete: Array
 ) -> tuple[Array, Array]:
     """Time and state at the end: those of the last output if the motion is complete."""
+    # The last output has derivatives in its time, which the end of the loop has not.
     t = jnp.where(complete, times[-1], t)
     return t, jnp.where(complete, ys[-1], y)
 
@@ -439,7 +444,10 @@ def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
     usable = given.inputs
 
     def state_at(reached: Array, y: Array) -> BodyState:
+        # diffrax fills rows that were not reached with infinities. Their derivatives
+        # may be NaN.
         state = given.to_state(harmless(reached, y))
+        # Runge-Kutta steps do not preserve the norm of a quaternion.
         state = dataclasses.replace(state, attitude=normalize(state.attitude))
         return nan_where(~reached, state)
 

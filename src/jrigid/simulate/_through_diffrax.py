@@ -71,6 +71,7 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
     ) -> tuple[Array, _ControllerState]:
         """The end of the first step, and the state of the controller."""
         del terms, t1, dt0, args, func, error_order
+        # For an implicit solver `longest` does not depend on the rate at the start.
         longest = jnp.minimum(
             self.limits.radians / self.limits.start_rate, self.limits.longest
         )
@@ -112,6 +113,7 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
         def field(y: Array) -> Array:
             return self.field(t, y)
 
+        # A power iteration finds the fastest motions, which may be damped ones.
         if self.damped:
             return undamped_rate(jacobian(field, y, self.scales)), direction
         return rate_along(field, y, field(y), direction, self.scales)
@@ -140,6 +142,7 @@ def solve_by_diffrax(
     fixed = constant(motion)
     limits = fixed.limits
     if event is not None and event.root_finder is None:
+        # A condition may change its sign in either direction.
         finder = optx.Bisection(_exactness(limits), _exactness(limits), flip="detect")
         event = dataclasses.replace(event, root_finder=finder)
     solution = diffrax.diffeqsolve(
@@ -181,6 +184,7 @@ def _controller(
     )
     return diffrax.ClipStepSizeController(
         controller,
+        # Otherwise diffrax interpolates, at a lower order than that of its steps.
         step_ts=fixed.times,
         jump_ts=fixed.jumps if fixed.jumps.size else None,
     )
@@ -188,6 +192,7 @@ def _controller(
 
 def _terms(field: Field, fixed: Motion, options: Options) -> diffrax.ODETerm:
     """The vector field as a term, with the parameters as `args`."""
+    # In forward mode NaN stays in the tangents of its own lane.
     if isinstance(options.adjoint, diffrax.ForwardMode):
 
         def rates(t: Array, y: Array, parameters: list[Array]) -> Array:

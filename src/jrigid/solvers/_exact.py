@@ -133,6 +133,8 @@ class ExactFree(diffrax.AbstractSolver):
     ) -> tuple[RotationState, None, dict[str, PyTree], None, diffrax.RESULTS]:
         """The state at t1, with no error estimate."""
         del args, solver_state, made_jump
+        # In a run backward in time `diffeqsolve` passes growing times, and the term
+        # holds the direction.
         term, direction = unwrapped_term(terms)
         direction = jnp.asarray(direction, y0.omega.dtype)
         info = {"y0": y0, "inertia": term.inertia, "direction": direction}

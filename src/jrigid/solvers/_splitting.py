@@ -63,6 +63,7 @@ def _kick(body: RigidBody, t: TimeLike, y: State, args: PyTree) -> State:
     """Rate of the state by the torque alone."""
     rest = jtu.tree_map(jnp.zeros_like, y)
     inertia = body.inertia.astype(y.omega.dtype)
+    # At zero rates Euler's equations have no term but the torque.
     rate = euler_equations(inertia, rest.omega, body.torque_on(t, y, args))
     return eqx.tree_at(lambda y: y.omega, rest, rate)
 
@@ -75,6 +76,7 @@ def _unbiased(
     The size of the angular momentum, the energy and the norm of the attitude become
     what they were before, to a rounding that is as often up as down.
     """
+    # The correction is of the size of rounding, so its derivative does not matter.
     old, new = jax.lax.stop_gradient((before.omega, after.omega))
     inertia = jax.lax.stop_gradient(inertia).astype(new.dtype)
     # The unit of the inertia cancels.
@@ -83,6 +85,8 @@ def _unbiased(
     mean = angular_momentum(inertia, new + old)
     momentum = angular_momentum(inertia, new)
     square = jnp.sum(momentum**2)
+    # Changes of |L|^2 / 2 and of the energy: a product of difference and sum loses
+    # fewer digits than a difference of squares.
     excess = 0.5 * jnp.sum(step * mean)
     energy = 0.5 * jnp.sum((new - old) * mean)
     safe = jnp.where(square > 0, square, 1.0)
@@ -90,6 +94,7 @@ def _unbiased(
     across = new - jnp.sum(new * momentum) / safe * momentum
     # Zero for rotation about a principal axis, where the energy needs no correction.
     width = jnp.sum(across**2) + 1e-20 * jnp.sum(new**2)
+    # To first order this change of L removes both errors: `across` is normal to L.
     change = (
         excess / safe * momentum + energy / jnp.where(width > 0, width, 1.0) * across
     )
@@ -223,6 +228,7 @@ class Splitting(diffrax.AbstractSolver):
         def kicked(y: RotationState, weight: Array, passed: TimeLike) -> RotationState:
             t = start + passed * h
             rate = torque.vf(t, y, args)
+            # Far from time 0 the difference of two times would lose digits of the step.
             change = torque.prod(rate, torque.contr(0 * h, weight * h))
             return jtu.tree_map(jnp.add, y, change)
 
@@ -247,7 +253,9 @@ def _fractions(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     There is a kick before each free motion and one after the last.
     """
     half = _HALVES[order]
+    # A symmetric composition is its own inverse backward in time.
     drifts = np.array([*half, *half[-2::-1]])
+    # Steps of order 2 begin and end with half a kick. Halves that meet are joined.
     kicks = 0.5 * (np.append(drifts, 0.0) + np.append(0.0, drifts))
     passed = np.append(0.0, np.cumsum(drifts)[:-1])
     return drifts, kicks, passed

@@ -64,6 +64,8 @@ def _of_couplings(
     moments, spin, rotor, *arrays = float_arrays(moments, spin, rotor, *others)
 
     def of_arrays(moments: Array, spin: Array, rotor: Array, *others: Array) -> Answer:
+        # Euler's equations with a rotor, linear in the two components across the axis
+        # (docs/stability.md). A cyclic order keeps the axes right-handed.
         own, first, second = jnp.roll(moments, -axis)
         towards = ((second - own) * spin - rotor) / first
         back = ((own - first) * spin + rotor) / second
@@ -244,6 +246,7 @@ def linearized(
 
     def small_wobble(towards: Array, back: Array, omega0: Array, t: Array) -> Array:
         spin, first, second = jnp.roll(omega0, -axis)
+        # Even functions of the rate give growth and oscillation by one formula.
         square = towards * back * t * t
         even = cosh_sqrt(square)
         odd = t * sinhc_sqrt(square)
@@ -452,10 +455,12 @@ def _satellite(moments: Array, n: Array) -> SatelliteStability:
     product = roll * yaw
     middle = 1 + 3 * roll + roll * yaw
     discriminant = middle * middle - 16 * product
+    # Until they are returned, rates are in units of the orbital rate.
     pitch = 3 * (a - b) / c
     squares, growth = _roll_and_yaw(product, middle, discriminant)
     growth = jnp.maximum(root_of_positive(pitch), growth)
     margins = jnp.stack([(b - a) / c, product, middle, discriminant])
+    # Where all margins are positive, roll and yaw have the same sign.
     stable = REGIONS.where(yaw > 0, REGIONS.Lagrange, REGIONS.DeBra_Delp)
     others = REGIONS.where(growth > 0, REGIONS.unstable, REGIONS.marginal)
     region = REGIONS.where(jnp.all(margins > 0), stable, others)

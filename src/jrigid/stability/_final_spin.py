@@ -119,6 +119,7 @@ def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     state = path.state(y)
     alignment = _alignment(path.motion.system.inertia, state.omega)
     alignment, state = verdict(findings, error, (alignment, state))
+    # From here on `findings` includes the accuracy, which `verdict` has noted.
     settled = jnp.abs(alignment) > math.cos(math.radians(_SETTLED))
     side = SIDES.where(alignment > 0, SIDES.along, SIDES.against)
     side = SIDES.where(settled, side, SIDES.not_settled)
@@ -129,6 +130,7 @@ def _final_spin(motion: Motion, steps: int) -> FinalSpin:
 def _alignment(inertia: Array, omega: Array) -> Scalar:
     """Cosine of the angle between spin and axis of largest moment; 0 at rest."""
     if inertia.ndim == 1:
+        # Given moments may be in any order; those of `principal_axes` ascend.
         axis = jnp.eye(3, dtype=omega.dtype)[jnp.argmax(inertia)]
     else:
         axis = principal_axes(inertia).axes[:, 2].astype(omega.dtype)

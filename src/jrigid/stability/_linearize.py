@@ -174,6 +174,8 @@ class _Frame(NamedTuple):
         state = self.motion.state0
         parts, unravel = ravel_pytree(state.internal)
         internal = unravel(parts.astype(x.dtype) + x[6:])
+        # q = exp(A t) q0 exp(x) exp(s t) and omega = R(-s t)(omega0 + y), with A =
+        # `across` and s = `own` (docs/stability.md).
         on = exp(later * self.own)
         seen = multiply(state.attitude, exp(x[:3]))
         attitude = multiply(exp(later * self.across), multiply(seen, on))
@@ -183,6 +185,7 @@ class _Frame(NamedTuple):
         """Rates of the small motion, some time later."""
         system, state, args, t0, *_ = self.motion
         rates = system.vector_field(t0 + later, self.state(x, later), args)
+        # Terms of second order in x are omitted: at an equilibrium `turning` is zero.
         spin = state.omega + x[3:6]
         seen = multiply(state.attitude, exp(x[:3]))
         turning = spin - self.own - rotate_inverse(seen, self.across)
@@ -206,6 +209,7 @@ class _Frame(NamedTuple):
         none = jnp.zeros(self.motion.dimension, rate.dtype)
         # The axis of symmetry of the system in space.
         along = jnp.where(safe_norm(self.up) > 0, self.up, self.across)
+        # These are the directions (R^-1 A, 0) and (s, omega0 x s) of docs/stability.md.
         turned = none.at[:3].set(rotate_inverse(state.attitude, along))
         slewed = none.at[:6].set(
             jnp.concatenate([own, jnp.cross(state.omega, own) / rate])
@@ -224,6 +228,7 @@ class _Frame(NamedTuple):
 
         Not of what damps it, beside which all the rest may be slow.
         """
+        # The angular acceleration for a turn of one radian has the unit 1/s^2.
         stiff = jnp.sqrt(jnp.max(jnp.abs(matrix[3:6, :3])))
         turns = (self.motion.state0.omega, self.own, self.across)
         return jnp.max(jnp.stack([*(safe_norm(v) for v in turns), stiff]))
@@ -312,6 +317,7 @@ def _classify(
     staying = jnp.sum(jnp.linalg.svd(matrix, compute_uv=False) <= tiny)
     on_axis = (jnp.abs(values.real) <= tiny) & ~zero
     gaps, alike = pairs(values, vectors)
+    # Motions grow like t where two frequencies share an eigenvector (Krein collision).
     shared = on_axis[:, None] & on_axis[None, :] & (gaps <= tiny) & alike
     drifts = (jnp.sum(zero) - staying > turning) | jnp.any(shared)
     steady = STABILITY.where(drifts, STABILITY.marginal, STABILITY.stable)

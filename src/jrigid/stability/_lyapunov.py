@@ -126,6 +126,8 @@ def _starting_vectors(
     dimension = motion.dimension
     if vectors is None:
         count = dimension if count is None else whole_number("count", count)
+        # A vector in a set that the motion keeps invariant would stay in it, and miss
+        # the growth across it.
         angles = np.outer(np.arange(1, count + 1), 0.9 * np.arange(dimension) + 0.45)
         vectors = np.cos(angles) + 0.3 * np.eye(count, dimension)
     rows = array_of_shape("vectors", vectors, count, dimension).astype(motion.t0.dtype)
@@ -172,6 +174,7 @@ def _follow(
     ) -> tuple[tuple[Array, _Growth, Array], None]:
         y, growth, error = carry
         y, local = path.follow(index * schedule.steps, schedule.steps, y)
+        # Otherwise all tangents would turn into the direction of fastest growth.
         rows, lengths = orthonormal(path.tangents(y))
         logs = jnp.log(lengths)
         number = (1 + index).astype(y.dtype)

@@ -172,6 +172,7 @@ class _Search(NamedTuple):
         small = 1e-3 * self.path.step
         ahead = self.value(t + small, y + small * self.path.rates(t, y))
         above = jnp.where(now == 0, ahead > now, now > 0)
+        # An invalid motion counts as one without a crossing, and so takes no step.
         return _Position(t, y, above, ok, jnp.zeros_like(t))
 
     def before_crossing(self, start: _Position) -> _Position:
@@ -180,6 +181,7 @@ class _Search(NamedTuple):
         def step(carry: tuple[_Position, Array]) -> tuple[_Position, Array]:
             (t, y, above, _, error), count = carry
             after, local = self.path.advance(t, y)
+            # In a product rounding does not add up, as it does in a sum of steps.
             later = start.t + self.path.step * (count + 1).astype(t.dtype)
             higher = self.value(later, after) >= 0
             crosses = (higher != above) & (
@@ -213,6 +215,7 @@ class _Search(NamedTuple):
         y = state_within(fraction)
         distance = jnp.abs(self.value(t, y))
         crossing = _Crossing(t, self.path.state(y), crosses, distance)
+        # At a crossing the sign of the condition is rounding, so it is not evaluated.
         return _Position(t, y, ~above, crosses, error), crossing
 
 

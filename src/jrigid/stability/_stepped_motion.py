@@ -120,11 +120,14 @@ class Walk(NamedTuple):
             turn, change = tangent[:3], units * tangent[3:]
             moved = jnp.concatenate([attitude_rate(state.attitude, turn), change])
             rates, growth = jax.jvp(lambda y: self.rates(t, y), (alone,), (moved,))
+            # x' = y - omega x x of docs/stability.md. A turn has three components,
+            # since the norm of the quaternion has no exponent.
             turning = change[:3] - jnp.cross(state.omega, turn)
             return rates, jnp.concatenate([turning, growth[4:] * (1 / units)])
 
         if len(tangents) == 1:
             return self.with_tangents(*beside(tangents[0]))
+        # All tangents share the rates of the motion, which are computed once.
         return self.with_tangents(*jax.vmap(beside, out_axes=(None, 0))(tangents))
 
     def _by_solver(self, t: Array, y: Array) -> tuple[Array, Array, Any]:
@@ -175,6 +178,7 @@ class Walk(NamedTuple):
             y, error = carry
             number = first + i
             t = self.motion.t0 + self.step * number.astype(y.dtype)
+            # `in_blocks` evaluates this loop in lanes, even for a single motion.
             y, local = self.advance(t, y, in_lanes=True)
             return (y, jnp.maximum(error, local)), None
 
@@ -208,6 +212,8 @@ def orthonormal(rows: Array) -> tuple[Array, Array]:
     lengths = []
     for row in rows:
         for other in done:
+            # In modified Gram-Schmidt each projection is of the row so far, which loses
+            # fewer digits.
             row = row - jnp.sum(row * other) * other
         lengths.append(jnp.sqrt(jnp.sum(row * row)))
         done.append(row / jnp.where(lengths[-1] > 0, lengths[-1], 1.0))

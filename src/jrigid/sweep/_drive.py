@@ -43,6 +43,7 @@ def outcomes(
             if outcome.error is None or trials[outcome.number] == _TRIALS:
                 yield outcome
             else:
+                # At the end of the queue a block that fails holds up no other.
                 waiting.append(outcome.number)
     except BrokenExecutor as error:
         raise RuntimeError(
@@ -50,6 +51,7 @@ def outcomes(
             "has is kept, and the same call with a new executor goes on from there."
         ) from error
     finally:
+        # After an error or an interrupt no further block begins.
         for future in running:
             future.cancel()
 
@@ -60,6 +62,7 @@ def _outcome(number: int, future: Future[Outcome]) -> Outcome:
     Raises:
         Exception: No other trial or block can do better.
     """
+    # `exception` of a cancelled future raises an error instead of returning it.
     if future.cancelled():
         return Outcome(number, error="The executor gave the block up.")
     error = future.exception()

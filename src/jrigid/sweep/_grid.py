@@ -91,6 +91,7 @@ class Grid(NamedTuple):
         """The same points in blocks of about that size, cut along the first axes."""
         block: list[int] = []
         for n in reversed(self.shape):
+            # With equal pieces few points are repeated to fill the last block.
             pieces = -(-n // max(min(size, n), 1))
             block.insert(0, -(-n // pieces))
             size //= block[0]
@@ -234,6 +235,7 @@ class Leaf(eqx.Module):
                 "flag_values": list(range(len(self.codes))),
                 "flag_meanings": " ".join(self.codes),
             }
+        # xarray shows NaN in place of this value.
         return {"_FillValue": int(self.fill)} if self.dtype.kind in "iu" else {}
 
     def dimensions(self, axes: tuple[str, ...]) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
     """Axes through the first points of all tiles and the last points of the grid."""
     lattice = {}
     for (name, x), width in zip(grid.axes.items(), grid.block, strict=True):
+        # Neighbouring tiles share their corners.
         lattice[name] = x[np.minimum(np.arange(0, x.size + width, width), x.size - 1)]
     return lattice
 
@@ -94,8 +95,10 @@ class RefinedMap:
     ) -> tuple[Failure, ...]:
         """Compute all tiles with a change of class, and return those that failed."""
         all_tiles = range(self._numbers.size)
+        # Finished tiles of a store show their classes without a computation.
         finished = filter(self._kept.has, all_tiles)
         waiting = {*self._with_change, *finished}
+        # Arrays in memory are not initialised, and some tiles are never computed.
         for number in all_tiles:
             self._kept.leave(number)
         computed: set[int] = set()

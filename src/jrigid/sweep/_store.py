@@ -70,6 +70,7 @@ def _digest(*values: Any) -> str:
             digest.update(value.encode())
         else:
             array = np.asarray(value)
+            # Arrays of other shapes or types may consist of the same bytes.
             digest.update(f"{array.dtype} {array.shape} ".encode())
             digest.update(array.tobytes())
     return digest.hexdigest()[:32]
@@ -87,6 +88,7 @@ def fingerprint(function: Callable[..., Any], jaxpr: ClosedJaxpr) -> dict[str, A
     Name and file of the function do not matter.
     """
     text = _ADDRESS.sub("", str(jaxpr))
+    # The arrays of an equinox.Module are arguments of the jaxpr, not constants.
     arrays = jtu.tree_leaves(eqx.filter(function, eqx.is_array))
     return {
         "function": _digest(text, *_constants(jaxpr), *arrays),
@@ -265,6 +267,7 @@ class Store:
             return None
         *values, valid = [self._read(leaf, number) for leaf in self.leaves]
         if valid is None or any(x is None for x in values):
+            # Without its mask the block is unfinished, for the next run too.
             self._chunk(VALID, number).unlink(missing_ok=True)
             return None
         mask = np.frombuffer(valid, bool).reshape(self.grid.block)
@@ -322,6 +325,7 @@ class Store:
                     f"{self.path} is of another: {'; '.join(differences)}. (Choose "
                     "another directory, or remove it.)"
                 )
+            # A new store has no coordinates yet.
             self._mend_axes()
             yield
 
@@ -343,6 +347,7 @@ class Store:
         try:
             try:
                 if fcntl is not None:
+                    # The system releases this lock when the process ends or is killed.
                     fcntl.flock(directory, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 text = f"Another process is writing to the store {self.path}."

@@ -283,6 +283,7 @@ class _Run:
         corners = _corners(self._work.function, grid, self._executor)
         refined = RefinedMap(grid, self._kept, structure, classify, corners)
         failures = refined.refine(self.compute)
+        # `valid` decides on a warning alone, so points may count twice.
         self.valid += int(np.sum(corners.valid))
         return failures, refined.classes
 
@@ -305,6 +306,7 @@ def _submitting(
         # Two for each device: one writes while the other computes.
         threads = 2 * len(worker.devices)
         with ThreadPoolExecutor(threads) as pool:
+            # Two more blocks wait, so that no thread does.
             yield lambda n: pool.submit(worker, n, work.grid.part(n)), threads + 2
     else:
         _prepare(executor)

@@ -138,6 +138,7 @@ def direction(name: str, *shape: int | None, optional: bool = False) -> dict[str
             return None
         vectors = array_of_shape(name, value, *shape)
         lengths = jnp.vectorize(safe_norm, signature="(n)->()")(vectors)[..., None]
+        # A zero vector stays zero and not NaN, so that an error can show it.
         return vectors / jnp.where(lengths > 0, lengths, 1.0)
 
     return {"converter": convert, "metadata": NOT_ZERO}
@@ -373,6 +374,7 @@ class Sum(AbstractTorque):
             terms: Torques and plain functions `(t, state, args) -> (3,)`, in any order.
         """
         torques = [as_torque(term) for term in terms]
+        # In a nested sum a plain function would see that sum's internal states alone.
         self.terms = sum((x.terms if isinstance(x, Sum) else (x,) for x in torques), ())
 
     def _views(self, state: BodyState) -> Iterator[tuple[AbstractTorque, BodyState]]:
@@ -390,6 +392,7 @@ class Sum(AbstractTorque):
         """Sum of the torques [N m], body components."""
         return sum(
             (x(t, own, args) for x, own in self._views(state)),
+            # The start value gives an empty sum its shape and dtype.
             jnp.zeros_like(state.omega),
         )
 

@@ -76,6 +76,7 @@ class InternalDamper(AbstractTorque):
     ) -> tuple[Vector]:
         """Rate of the sphere's angular velocity, in the turning axes of the body."""
         pull = self(t, state, args) / self.inertia.astype(state.omega.dtype)
+        # The axes of the components turn with the body, which adds the second term.
         return (-pull - jnp.cross(state.omega, *state.internal),)
 
     def internal_scale(self, rate: Scalar) -> tuple[Scalar]:
@@ -179,6 +180,7 @@ class SpinningMass(AbstractTorque):
     def internal_at_rest(self, state: BodyState) -> tuple[Scalar]:
         """The wheel turning with the body."""
         (axis,) = in_dtype_of(state, self.axis)
+        # The spin of a wheel is absolute: at rest in the body it is that of the body.
         return (jnp.sum(axis * state.omega),)
 
     def internal_rate(
