@@ -19,6 +19,7 @@ from jrigid._types import AnyArray
 
 Components = tuple[Array, ...]
 
+# Vectors and quaternions, the usual cases, have no more components.
 _FEW = 4
 _SERIES_BELOW = 0.5
 _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
@@ -26,6 +27,7 @@ _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
 def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     """Euclidean norm without overflow; value and gradient are 0 at the zero vector."""
+    # Squares of the quotients stay in range. A power of two adds no rounding.
     scale = power_of_two(_over_components(jnp.maximum, jnp.abs(vector)))
     return scale * root_of_positive(sum_of_squares(vector * (1 / scale)[..., None]))
 
@@ -66,6 +68,7 @@ def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
     """Root mean square length of the vectors that count; 1 if that is no size."""
     xp = vectors.__array_namespace__()
     shown = xp.where(there[..., None], vectors, 0.0)
+    # The scale keeps squares in range. It cancels, and with it its derivative.
     largest = without_gradient(or_one(xp.max(xp.abs(shown))))
     count = xp.maximum(xp.sum(there), 1).astype(vectors.dtype)
     square = xp.sum((shown / largest) ** 2) / count
@@ -76,11 +79,13 @@ def rms(vectors: AnyArray, there: AnyArray) -> AnyArray:
 def root_of_positive(square: Float[Array, "..."]) -> Float[Array, "..."]:
     """The square root of a positive number, else 0; the slope at 0 is 0."""
     positive = square > 0
+    # The inner `where` keeps the infinite slope of the root at 0 out of the derivative.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """`arctan2` without overflow; at the origin the value is 0 and the gradient 0."""
+    # The angle does not depend on a common factor, so that the scale has no derivative.
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))
     origin = largest == 0
     scale = jnp.where(origin, 1.0, largest)
@@ -97,11 +102,14 @@ def _series(coefficients: list[float], z: Array) -> Array:
 
 _COS = [(-1) ** k / math.factorial(2 * k) for k in range(_SERIES_TERMS + 1)]
 _SINC = [(-1) ** k / math.factorial(2 * k + 1) for k in range(_SERIES_TERMS + 1)]
+# For an eighth of a right angle, twelve terms reach the rounding of float64.
 _ARCTANC = [(-1) ** k / (2 * k + 1) for k in range(12)]
 
 
 def cos_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """cos(sqrt(z)) for z >= 0, analytic at z = 0."""
+    # Each branch gets an argument at which its derivatives are finite. NaN in the
+    # branch that is not taken would become NaN in the derivative.
     small = z < _SERIES_BELOW
     root = jnp.sqrt(jnp.where(small, 1.0, z))
     return jnp.where(small, _series(_COS, jnp.where(small, z, 0.0)), jnp.cos(root))
@@ -147,6 +155,7 @@ def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     info = jnp.finfo(x.dtype)
     least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
+    # With a larger exponent the inverse would no longer be a normal number.
     greatest = ((1 << info.nexp) - 4) * least
     bits = (
         jax.lax.bitcast_convert_type(jnp.abs(x), jnp.dtype(f"int{info.bits}")) & -least
@@ -154,6 +163,7 @@ def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     power = jax.lax.bitcast_convert_type(
         jnp.clip(bits, least, greatest) + least, x.dtype
     )
+    # A scale is piecewise constant, and cancels where it is used.
     return jax.lax.stop_gradient(jnp.where(x == 0, 1.0, power))
 
 
@@ -172,6 +182,8 @@ def materialize(*arrays: Array) -> tuple[Array, ...]:
     """
 
     def trip(i: Array, values: tuple[Array, ...]) -> tuple[Array, ...]:
+        # The condition never holds. It keeps the compiler from finding that the loop
+        # does nothing.
         return tuple(jnp.where(i == 2, -x, x) for x in values)
 
     return jax.lax.fori_loop(0, 2, trip, arrays)
@@ -189,6 +201,7 @@ def product(subscripts: str, *operands: AnyArray) -> AnyArray:
     if not all(isinstance(x, np.ndarray) for x in operands):
         return jnp.einsum(subscripts, *operands, precision=_EXACT)
     if _is_matrix_product(subscripts):
+        # This is a call of BLAS, which `einsum` without a plan does not use.
         return np.tensordot(*operands, axes=1)
     large = max(x.size for x in operands) > _WORTH_A_PLAN
     return np.einsum(subscripts, *operands, optimize=large)
@@ -220,6 +233,8 @@ def with_columns(function: Callable[..., Components]) -> Callable[..., Component
         arguments: Components, changes: Components
     ) -> tuple[Components, Components]:
         columns = jnp.eye(len(arguments), dtype=arguments[0].dtype)
+        # The values are the same for all columns, so that `out_axes=None` keeps one of
+        # them.
         values, jacobian = jax.vmap(
             lambda column: jax.jvp(function, arguments, tuple(column)),
             out_axes=(None, 0),
@@ -238,6 +253,8 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     factor = jnp.ones_like(z)
     for _ in range(3):
+        # tan(a / 2) = tan(a) / (1 + sqrt(1 + tan(a)^2)), where z is the square of the
+        # tangent.
         below = 1 + jnp.sqrt(1 + z)
         factor = factor * (2 / below)
         z = z / (below * below)

@@ -27,6 +27,8 @@ def _rotate(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
     """
     a11, a22, a33, a12, a13, a23, x1, x2, x3, y1, y2, y3, z1, z2, z3 = state
     gap = a22 - a11
+    # Of the two tangents the smaller one is taken. It turns by at most 45 degrees, so
+    # that the sweeps converge.
     below = jnp.abs(gap) + jnp.sqrt(gap * gap + 4 * a12 * a12)
     above = jnp.where(gap < 0, -2 * a12, 2 * a12)
     t = jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), 0.0)
@@ -36,11 +38,14 @@ def _rotate(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
     a11, a22 = a11 - t * a12, a22 + t * a12
 
     def turn(p: Array, q: Array) -> tuple[Array, Array]:
+        # This form of Numerical Recipes adds a small change, which rounds less than a
+        # product with the cosine.
         return p - sine * (q + tau * p), q + sine * (p - tau * q)
 
     (a13, a23), (x1, x2), (y1, y2), (z1, z2) = (
         turn(p, q) for p, q in ((a13, a23), (x1, x2), (y1, y2), (z1, z2))
     )
+    # The rotation makes this entry zero. Its rounding is not carried on.
     zero = jnp.zeros_like(a12)
     return a22, a33, a11, a23, zero, a13, x2, x3, x1, y2, y3, y1, z2, z3, z1
 
@@ -61,6 +66,7 @@ def eigh(
     1e-6 of the largest moment.
     """
     del distinct  # the derivatives need it
+    # The rotations square the entries, which must stay in the range of the dtype.
     unit = power_of_two(jnp.max(jnp.abs(tensor)))
     scaled = tensor / unit
     columns = _ascending(_diagonalized(0.5 * (scaled + scaled.T)))
@@ -100,6 +106,7 @@ def _signed_axes(first: Array, second: Array, third: Array) -> Array:
 def _sign(axis: Float[Array, "3"]) -> Float[Array, ""]:
     """Sign of the first component that has at least 0.9 of the largest magnitude."""
     x, y, z = axis
+    # With 1 in place of 0.9 the last bit would decide between two components that tie.
     enough = 0.9 * jnp.max(jnp.abs(axis))
     y_or_z = jnp.where(jnp.abs(y) >= enough, y, z)
     leading = jnp.where(jnp.abs(x) >= enough, x, y_or_z)
@@ -116,6 +123,7 @@ def _eigh_jvp(distinct: bool, primals: tuple, tangents: tuple) -> tuple:
     least_gap = 1e-6 if distinct else 4 * jnp.finfo(gap.dtype).eps
     resolved = jnp.abs(gap) > least_gap * jnp.max(jnp.abs(moments))
     substitute = jnp.nan if distinct else 0.0
+    # A unit vector does not change along itself.
     unresolved = jnp.where(np.eye(3, dtype=bool), 0.0, substitute)
     inverse = jnp.where(resolved, 1 / jnp.where(resolved, gap, 1.0), unresolved)
     return (moments, axes), (
@@ -200,6 +208,8 @@ def _difference(f: Callable[[Array], Array], *moments: Array) -> Array:
     first, *_, last = moments
     gap = last - first
     near = jnp.abs(gap) <= _CLOSE * jnp.maximum(jnp.abs(first), jnp.abs(last))
+    # Distant moments are replaced by the first one, so that the branch that is not
+    # taken stays finite.
     integral = _hermite_genocchi(f, *(jnp.where(near, x, first) for x in moments))
     quotient = _difference(f, *moments[1:]) - _difference(f, *moments[:-1])
     return jnp.where(near, integral, quotient / jnp.where(near, 1.0, gap))

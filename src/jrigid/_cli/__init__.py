@@ -156,6 +156,8 @@ def _trials(reading: records.Reading, by_flights: bool) -> list[records.Reading]
     if by_flights:
         trials = records.flights(reading)
         for trial in trials:
+            # The notes before the last one are those of the whole file, which are
+            # printed already.
             print(f"  - {trial.notes[-1]}")
     else:
         trials = [x for x in reading.pieces() if x.times.size >= _SHORTEST]
@@ -169,11 +171,13 @@ def _at_rest(reading: records.Reading) -> tuple[np.ndarray | None, np.ndarray]:
     try:
         rest = records.noise(reading)
     except ValueError:
+        # Nothing rests. Without a sigma `fit` takes the noise from the residuals.
         return None, np.zeros(3)
     # A filter's memory makes noise look smaller from reading to reading than it is.
     sigma = np.maximum(rest.sigma, rest.density / np.sqrt(rest.interval))
     shown = (", ".join(f"{x:.3g}" for x in numbers) for numbers in (sigma, rest.bias))
     print("  - at rest ({}): noise {}; bias {} rad/s".format(rest.notes[0], *shown))
+    # A coarse gyro may not change at rest. `fit` refuses a sigma of 0.
     return sigma if np.all(sigma > 0) else None, rest.bias
 
 
@@ -207,6 +211,7 @@ def _fit(options: argparse.Namespace) -> int:
 
     def fit(throw: bool) -> identify.FitResult:
         return identify.fit(
+            # Free motion determines ratios only, so that any trace will do.
             RigidBody(np.ones(3)),
             [identify.Record(gyro, x.times, x.rates, sigma) for x in trials],
             free=(lambda _, gyro: gyro.bias) if options.bias else None,
@@ -216,6 +221,7 @@ def _fit(options: argparse.Namespace) -> int:
             throw=throw,
         )
 
+    # A fit that went wrong is shown as well. The exit status says how it ended.
     result = fit(throw=False)
     if result.status == Status.BAD_INPUT:
         result = fit(throw=True)  # raises an error that says what is wrong
@@ -223,6 +229,7 @@ def _fit(options: argparse.Namespace) -> int:
     if options.save:
         identify.save(options.save, result)
     if options.plot:
+        # Agg draws without a display. matplotlib reads this when it is first imported.
         os.environ.setdefault("MPLBACKEND", "Agg")
         figure: Any = plot.fit(result)["record"].figure
         figure.savefig(options.plot)
@@ -232,15 +239,18 @@ def _fit(options: argparse.Namespace) -> int:
 
 def _light_curves(options: argparse.Namespace) -> int:
     """Run the command of light curves; returns the exit status."""
+    # Flushed, because a search of minutes follows the first lines.
     return _photometry.run(options, lambda text: print(_with_options(text), flush=True))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command `jrigid`; returns the exit status."""
     options = _parser().parse_args(arguments)
+    # JAX rounds to seven digits by default. This must precede the first array.
     jax.config.update("jax_enable_x64", True)
     try:
         return options.run(options)
+    # These come from files, arguments and missing extras. A bug keeps its traceback.
     except (ValueError, RuntimeError, OSError, ImportError) as error:
         print(f"jrigid: {_with_options(str(error))}", file=sys.stderr)
         return 1

@@ -114,6 +114,7 @@ def _elements(text: str) -> list[float]:
 def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
     """The light curves of the file."""
     path = pathlib.Path(options.path)
+    # A byte order mark would hide the first word, by which the format is recognised.
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = (line.strip() for line in text.splitlines())
     first = next((x for x in lines if x and not x.startswith("#")), "")
@@ -160,6 +161,7 @@ def _table(pairs: photometry.PeriodPairs) -> str:
 
 def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     """Read, search, say what was found and draw; returns the exit status."""
+    # This is refused before the search, which takes minutes.
     message = "Argument `--plot` needs `--report`, but it is not given."
     demand(options.report or not options.plot, message)
     curves = _curves(options)
@@ -180,9 +182,11 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     )
     say(found.report())
     if options.plot:
+        # Agg draws without a display. matplotlib reads this when it is first imported.
         os.environ.setdefault("MPLBACKEND", "Agg")
         figure: Any = plot.light_curves(curves, found)["unfolded"].figure
         figure.savefig(options.plot)
+    # A count of aliases means nothing where none of them follows the curves.
     if not found.follows:
         return _MISFIT
     return _DETERMINED if found.determined else _SEVERAL

@@ -57,9 +57,12 @@ def polhode(
     def curve(inertia: Array, omega: Array) -> Array:
         motion = invariants(*in_principal_axes(inertia, omega))
         square = motion.kap + motion.v
+        # On the separatrix the angular momentum approaches the axis as exp(-sqrt(Q) t),
+        # with Q = kap + v.
         endless = _ENDLESS_PHASE / jnp.sqrt(jnp.where(square > 0, square, 1.0))
         end = jnp.where(motion.circles, 4 * motion.quarter, endless)
         start = jnp.where(motion.circles, 0.0, -end)
+        # The invariants are in units in which rates are of order one.
         times = jnp.linspace(start, end, count) / motion.unit
 
         def at_time(t: Array) -> Array:
@@ -211,6 +214,8 @@ def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
         moments, omega = in_principal_axes(inertia, omega)
         momentum = safe_norm(angular_momentum(moments, omega))
         twice = 2 * kinetic_energy(moments, omega)
+        # This is sqrt(2 E). As a norm it has the gradient 0 at rest, where a root gives
+        # NaN.
         root = safe_norm(jnp.sqrt(moments) * omega)
         resting = momentum == 0
         distance = jnp.where(resting, 0.0, twice / jnp.where(resting, 1.0, momentum))

@@ -89,6 +89,8 @@ def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
 def _mean_rate(motion: Invariants) -> Scalar:
     """Mean precession rate in units of the motion."""
     quarter = jnp.where(motion.circles, motion.quarter, 1.0)
+    # This is the part with w of `phase` in `_jacobi_solution.py`, averaged over a
+    # quarter period.
     extra = motion.al * motion.v * motion.quarter_w / quarter
     over_momentum = 1 / motion.moments[1] + jnp.where(motion.circles, extra, 0.0)
     return safe_norm(jnp.stack(motion.momentum)) * over_momentum
@@ -189,6 +191,7 @@ def _parameter(motion: Invariants) -> Scalar:
     """P / Q, without the cancellation in either."""
     al, be = motion.al, motion.be
     l1, l2, _ = motion.momentum
+    # P = kap - u. Since al and be have one sign, this is a sum of non-negative numbers.
     p = al * ((al + be) * l1 * l1 + be * l2 * l2)
     q = p + (motion.u + motion.v)  # not kap + v: never below p
     return jnp.where(q > 0, p / jnp.where(q > 0, q, 1.0), 0.0)
@@ -240,10 +243,14 @@ def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
     i1, _, i3 = motion.moments
     l1, l2, l3 = motion.momentum
     al, be = motion.al, motion.be
+    # Rates of the angular momentum by Euler's equations, but for signs.
     rate = jnp.stack([be * l2 * l3, (al + be) * l3 * l1, al * l1 * l2])
     size = jnp.maximum(jnp.abs(al), jnp.abs(be)) * motion.momentum_square
+    # The two are equal where 2 E = |L|^2 / I2, which is the separatrix.
     first, third = jnp.abs(al) * l1 * l1, jnp.abs(be) * l3 * l3
     kind = REGIMES.where(i3 < i1, REGIMES.about_smallest, REGIMES.about_largest)
+    # A later case overrides an earlier one: a sphere, for example, always rotates
+    # steadily.
     for case, code in (
         (
             jnp.abs(first - third) <= rounding * jnp.maximum(first, third),

@@ -157,6 +157,7 @@ class Plan(Readable):
             return moments[1:] / moments[0]
 
         slopes = jax.jacfwd(ratios)(numbers)
+        # The derivatives have the numbers in their first columns, before the states.
         of_ratios = product("ij,jk->ik", slopes, root[: numbers.size])
         return Bound(
             covariance=product("ij,kj->ik", root, root),
@@ -222,11 +223,13 @@ def _unknowns(
         sizes_of(samples),
         plan.free,
         model,
+        # An absolute model holds the scale in its own numbers.
         plan.scale != "trace" and not model.absolute,
         typical_rate(None, plan.state, dtype),
         trials,
     )
     demand(
+        # `predictions` evaluates one body and one set of sensors for all trials.
         not any(x.own for x in unknowns.sought) and not unknowns.groups,
         "Argument `free` must pick nothing of `each` trial, but it does.",
     )
@@ -247,6 +250,7 @@ def _planned(plan: Plan) -> _Planned:
     """Derivatives of a record that agrees exactly with a plan."""
     system = plan.system
     records = of_trials(plan.observations)
+    # The values of a plan may be NaN, which would count as not observed.
     records = tuple(x.with_values(jnp.ones_like(x.values)) for x in records)
     one = jnp.ones((), records[0].ts.dtype)
     samples = samples_of(records, one)
@@ -257,6 +261,7 @@ def _planned(plan: Plan) -> _Planned:
     by_sensor = any(x.sensor.depends_on_attitude for x in records)
     options = problems.Options(system.is_free, by_sensor or needs_attitude(system))
     layout = whole(samples, 1, plan.t0)
+    # This noise weighs links only, and a plan has none.
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
     # Readings equal to the predictions, so that the residuals are zero. They are data:
     # derivatives of a plan do not go through them.
@@ -325,6 +330,7 @@ def _inverse_root(jacobian: Array) -> Array:
     It is computed from the derivatives themselves, because their squares lose digits.
     """
     square = jnp.sum(jacobian * jacobian, axis=0)
+    # The scale of the columns cancels in the result, and so does its derivative.
     size = or_one(jax.lax.stop_gradient(jnp.sqrt(square)))
     # Where nothing is determined the last rows keep the result finite, and very large.
     eye = jnp.eye(size.size, dtype=jacobian.dtype)
@@ -405,7 +411,10 @@ def _profile_settings(result: FitResult) -> Settings:
         kept=result.kept.astype(dtype),
         scales=result.diagnostics.scales,
         disturbance=no_disturbance(result.kept.shape[0], dtype),
+        # The layout has one segment for each trial, so that there are no links.
         weight=0 * one,
+        # Beyond 1 the whole record takes part, and nothing holds the fit near its
+        # start.
         horizon=2 * one,
         soft=np.asarray(False),
         enough=(ACCURACY * result.diagnostics.inflation).astype(dtype),
@@ -422,11 +431,14 @@ def _profile(
     dtype = result.numbers.dtype
     unknowns = result.unknowns
     inflation = result.diagnostics.inflation
+    # The search begins at a minimum, where one state for each trial suffices.
     options = result.problem.options._replace(
         shooting=False, unmodelled="none", nodes=1
     )
     problem = dataclasses.replace(result.problem, options=options)
     slope = np.asarray(_slope(unknowns, result.numbers, Static(function)))
+    # The residuals are in units of the stated noise, so that the inflation is taken
+    # off.
     variance = slope @ result.numbers_covariance @ slope / inflation
     # In this unit the residual that holds the function outweighs the record.
     unit = (_HELD_TO * np.sqrt(variance)).astype(dtype)
@@ -511,6 +523,8 @@ def residuals(
     attitude = jnp.broadcast_to(state.attitude, (trials, 4))
     omega = jnp.broadcast_to(state.omega, (trials, 3))
     times = jnp.broadcast_to(times, (trials,))
+    # The flow of a fit would be quicker, but its derivatives are inexact at close
+    # moments.
     options = problems.Options(
         free_motion=False, depends_on_attitude=True, motion=partial(_motion, adjoint)
     )

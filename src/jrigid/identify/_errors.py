@@ -105,6 +105,7 @@ def precision_of_rows(
     local = np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
     local = (root[..., None] * local).reshape(*flat, local.shape[-1])
     shared = root[..., None] * rows.of_border[..., own:]
+    # numpy's SVD raises an error for NaN. The status then follows from chi-square.
     shared = np.nan_to_num(shared.reshape(*flat, units.size) * units)
     states = _decomposed(np.nan_to_num(local))
     along = np.swapaxes(states.basis, 1, 2) @ shared
@@ -174,6 +175,7 @@ def _of_numbers(
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
     eps = np.finfo(units.dtype).eps
+    # The square of the inverse of 1e-150 is still a finite number.
     floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
     half = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
     return values, vt.T, half.T @ half
@@ -295,6 +297,7 @@ def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
     span = np.sum(np.where(layout.linked, layout.end - layout.start, 0.0))
     mean = span / max(np.sum(layout.linked), 1)
     size = np.trace(tensor) / 3
+    # A white torque of level s changes a rate by s sqrt(t) / I in a time t.
     return float(problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0))
 
 
@@ -391,6 +394,7 @@ def _spread_of_moments(
     """Covariance of moments, ratios and shares: as `FitResult.spread`."""
     size = problem.unknowns.of_inertia.stop
     unknown = np.full((8, 8), np.nan, numbers.dtype)
+    # A tensor without unknown numbers is known exactly.
     if not size:
         return np.zeros_like(unknown)
     if not np.all(np.isfinite(covariance[:size, :size])):
@@ -448,6 +452,7 @@ def _status(
 ) -> str:
     """The name of the status, after a look at the input, the ratios and the torque."""
     errors = errors_of(derived["ratios_covariance"])
+    # If I1 is nearly zero the ratios can be loose though each number is determined.
     loose = np.any(errors > LARGEST_ERROR * derived["ratios"])
     levels_known = np.isfinite([of_torque["level"], of_torque["level_errors"]])
     if not np.all(levels_known):
@@ -505,6 +510,8 @@ def _fields_of_record(
         "torque_numbers": np.asarray(0 if fit.torque is None else fit.torque.size),
         "problem": dataclasses.replace(
             problem,
+            # This is a static field. Other counts of nodes would give results of other
+            # structures, for which `predict` compiles anew.
             options=problem.options._replace(nodes=1),
             samples=_of_lengths(problem.samples, lengths),
         ),
@@ -587,6 +594,7 @@ def _with_larger_errors(
 ) -> np.ndarray:
     """The covariance with errors so many times larger along each direction."""
     directions = known.directions * units[:, None] / np.maximum(known.values, 1e-150)
+    # Variances add: a variance of f^2 is the old one and f^2 - 1 more of it.
     more = directions * np.sqrt(factors**2 - 1)
     return known.covariance + more @ more.T
 
@@ -606,6 +614,7 @@ def _scatter_of_trials(
         @ known.directions
         / np.maximum(known.values, 1e-150)
     )
+    # At the minimum the scores sum to zero, which takes one degree of freedom.
     return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1) / inflation)
 
 
@@ -613,9 +622,11 @@ def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
     """Correlation of neighbours, and how many standard deviations that is from 0."""
     left = np.concatenate([rows[:, x.start : x.stop - 1] for x in parts], axis=1)
     right = np.concatenate([rows[:, x.start + 1 : x.stop] for x in parts], axis=1)
+    # Residuals of samples that were not observed are zero.
     both = (left != 0) & (right != 0)
     square = np.sum(both * (left**2 + right**2) / 2)
     like = np.sum(left * right) / max(square, np.finfo(rows.dtype).tiny)
+    # The correlation of n white residuals scatters by 1 / sqrt(n).
     return like, np.abs(like) * np.sqrt(np.sum(both))
 
 
@@ -657,6 +668,8 @@ def _remainder(
     coloured = colour.stands_out(*band)
     more = less = False
     if problem.options.noise_known:
+        # Over n degrees of freedom the mean square of white noise scatters by
+        # sqrt(2/n).
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
         more = noise > 1 + gate or np.max(fit.scales) > 2
         less = 0 < noise < 1 - gate  # a plan has no residuals
@@ -686,6 +699,7 @@ def _chi_square(problem: Problem, fit: Fit, known: Precision) -> tuple[float, fl
     # The last rows only hold a fit near its start.
     prior = rows[:, fit.kept.shape[1] : rows.shape[1] - problem.held]
     takes_part = np.any(fit.kept > 0, axis=1)[:, None]
+    # A change of a state that the record does not show takes no degree of freedom.
     is_shown = known.of_state > SHOWN * known.of_state[:, :1]
     sought = fit.minimum.units.size + np.sum(is_shown & takes_part)
     freedom = sums.count + np.sum(prior != 0) - sought

@@ -61,7 +61,10 @@ from jrigid.identify._unknowns import Unknowns, unknowns_of
 from jrigid.systems import RigidBody
 
 # Radians of a segment, of free motion and of forced.
+# The exact flow holds over any length, and 3 is below half a turn. A forced segment is
+# a single Runge-Kutta step.
 _LENGTHS = {True: 3.0, False: 0.75}
+# After so many turns the valley of the minimum is so narrow that probes go slowly, too.
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
 
@@ -309,6 +312,7 @@ class _Bodies:
     @cached_property
     def _any(self) -> tuple[RigidBody, ...]:
         """The bodies, however many trials there are."""
+        # `_task` has called `of_trials` before it asks for anything else.
         return next(iter(self._systems.values()))
 
     @cached_property
@@ -324,6 +328,7 @@ class _Bodies:
     @cached_property
     def carry_parts(self) -> bool:
         """Whether parts move inside the body."""
+        # Only the structure of the state matters.
         still = State(jnp.zeros(4), jnp.zeros(3))
         return self._any[0].with_parts(still).internal is not None
 
@@ -417,6 +422,8 @@ def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
         torque = GaussMarkov(unmodelled)
     level = np.asarray(torque.level)
     time = np.asarray(torque.time)
+    # The whitener of the torque divides by its levels. A fit without any does not use
+    # it.
     good = np.all(level == 0) or np.all(level > 0)
     demand(bool(good and np.all(np.isfinite(level)) and np.all(time >= 0)), text)
     known = bool(np.any(level > 0))
@@ -487,6 +494,7 @@ def _observed(
     samples = samples_of(records, np.ones((), records[0].values.dtype))
     sizes = sizes_of(samples)
     if not records[0].states_noise:
+        # Only a single record may leave its noise unstated: see `_task`.
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     readings = direct_readings_of(records, samples, attitude0)
     rate = typical_rate(readings, state, samples.ts.dtype)
@@ -540,9 +548,11 @@ def _opening(
         cut, first_samples = segments(samples, readings, options.nodes, length)
         omega, attitude = node_states(readings, first_samples, cut.start)
         if attitude is None:
+            # Where no attitude is known nothing depends on it, so that any will do.
             attitude = np.zeros((trials, options.nodes, 4), dtype)
             attitude[..., 0] = 1
     else:
+        # `_shoots` has demanded a state where the records do not tell it.
         assert state is not None
         omega, attitude = (
             np.broadcast_to(
@@ -569,6 +579,7 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
     input_result = _judged(task, records, observed, throw)
+    # An unmodelled torque may act between any two samples, so that each has a node.
     length = 0.0 if options.dense else _LENGTHS[options.free_motion]
     if options.shooting and observed.readings is not None:
         count = observed.readings.ts.shape[1]
@@ -602,6 +613,7 @@ def _judged(
     task: _Task, records: tuple[Record, ...], observed: _Observed, throw: bool
 ) -> Any:
     """The result code of the input; RuntimeError for bad input if `throw`."""
+    # What the bodies alone decide is computed once for all fits that share them.
     from_bodies = task.tensor is None and task.state is None
     return judge(
         task.systems,
@@ -625,6 +637,7 @@ def _unknowns(
         observed.sizes,
         question.free,
         on_host(task.inertia_model),
+        # An absolute model holds the scale in its own numbers.
         question.scale != "trace" and not task.inertia_model.absolute,
         observed.rate,
         records[0].ts.shape[0],
@@ -641,10 +654,12 @@ def _unknowns(
 def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str, Any]]:
     """Fit records side by side: the fields of each result."""
     cases = [_case(x, effort, throw) for x in tasks]
+    # A record that cannot be used takes no steps, but its result has the same arrays.
     searches = [
         search(case) if is_good(result) else no_search(case) for case, result in cases
     ]
     columns = zip(*(_lengths(x.records) for x in tasks), strict=True)
+    # Results of many fits are stacked, so that all are as long as the longest record.
     lengths = [max(x) for x in columns]
     results = []
     for (case, input_result), best in zip(cases, run(searches), strict=True):

@@ -42,6 +42,7 @@ def _motion_and_columns(
     """Motion in principal axes, and its derivatives in moments and rates as columns."""
 
     def motion(point: Array) -> tuple[Array, Array]:
+        # `inlined` saves tracing time: a fit evaluates this under nested vmaps.
         return inlined(relative_rotation, point[:3], point[3:], t)
 
     def derivative(
@@ -49,6 +50,7 @@ def _motion_and_columns(
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         return jax.jvp(motion, (point,), (direction,))
 
+    # The motion is the same for all directions, and is computed once.
     return jax.vmap(derivative, out_axes=(None, -1))(jnp.eye(6, dtype=point.dtype))
 
 
@@ -89,6 +91,7 @@ def _free_flow_jvp(
     moments, axes = eigh(tensor)
     omega = product("ji,j->i", axes, omega)
     omega_change = product("ji,j->i", axes, omega_change)
+    # The turn of the axes divides by the gaps.
     moments = _kept_apart(moments)
     point = jnp.concatenate([moments, omega])
     (p, w), (p_columns, w_columns) = inlined(_motion_and_columns, point, t)
@@ -147,6 +150,7 @@ def forced_flow(
     if depends_on_attitude:
         start = jnp.concatenate([state.attitude, state.omega])
     end = equal_steps(method, rates, t0, (t1 - t0) / steps, start, steps)
+    # Runge-Kutta steps do not keep the norm of a quaternion.
     attitude = normalize(end[:4]) if depends_on_attitude else state.attitude
     return State(attitude, end[-3:])
 

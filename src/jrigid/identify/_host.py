@@ -22,6 +22,7 @@ def on_host(tree: Any) -> Any:
 
     Arrays that were the same object before are the same object after.
     """
+    # `_arrays_of` takes only identical arrays for those that trials share.
     converted: dict[int, np.ndarray] = {}
 
     def convert(leaf: Any) -> Any:
@@ -71,11 +72,13 @@ def exp(vectors: np.ndarray) -> np.ndarray:
 
 def log(q: np.ndarray) -> np.ndarray:
     """Rotation vectors, of length at most pi, of unit quaternions (..., 4)."""
+    # Of the two quaternions of an attitude this one gives the shorter turn.
     q = np.where(q[..., :1] < 0, -q, q)
     scalar = q[..., :1]
     vector = q[..., 1:]
     sine = np.sqrt(np.sum(vector * vector, axis=-1, keepdims=True))
     angle = 2 * np.arctan2(sine, scalar)
+    # The limit at the identity is 2, since a quaternion holds half the angle.
     return np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 2.0) * vector
 
 
@@ -95,6 +98,7 @@ def principal_axes(tensor: AnyArray) -> tuple[AnyArray, AnyArray]:
     if not isinstance(tensor, np.ndarray):
         return eigh(tensor)
     if not np.all(np.isfinite(tensor)):
+        # numpy may raise an error for NaN, where JAX returns NaN.
         return np.full(3, np.nan, tensor.dtype), np.full((3, 3), np.nan, tensor.dtype)
     moments, axes = np.linalg.eigh(tensor)
     for column in (0, 2):

@@ -38,6 +38,7 @@ def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:
     # The second moments are tr(I) / 2 - I. Their trace is half that of I.
     second = xp.eye(3, dtype=tensor.dtype) - 2 * tensor / xp.trace(tensor)
     values, axes = principal_axes(second)
+    # The numbers of a flat body are infinite, since they contain logarithms.
     values = xp.maximum(values, flattest)
     return product("ik,k,jk->ij", axes, values / xp.sum(values), axes)
 
@@ -197,7 +198,9 @@ class Symmetric(_InFrame):
         """Choose a frame whose axis 3 is the axis of symmetry."""
         xp = tensor.__array_namespace__()
         values, frame = principal_axes(real_body(tensor, flattest))
+        # The two closest values are taken for the equal ones.
         last = values[2] - values[1] > values[1] - values[0]
+        # The reversed axes are left-handed, which second moments do not notice.
         frame = xp.where(last, frame, frame[:, ::-1])
         values = xp.where(last, values, values[::-1])
         size = xp.log(2 * values[2:] / (values[0] + values[1]))
@@ -251,6 +254,7 @@ class Flat(_InFrame):
         """Choose a frame with the largest second moment first, the thickness last."""
         xp = tensor.__array_namespace__()
         values, frame = principal_axes(real_body(tensor, flattest))
+        # The numbers are those of L, and these are elements of L L^T.
         size = 0.5 * xp.log(values[1:2] / values[2:])
         return Flat(frame[:, ::-1]), xp.pad(size, (0, 3))
 
@@ -349,6 +353,8 @@ class LogCholesky(AbstractInertiaModel):
     def units(self) -> Array:
         """The size of the body for numbers in metres, 1 for the others."""
         body = _parameters.body_from_log_cholesky(self.parameters)
+        # Half the trace over the mass is the mean square distance from the centre of
+        # mass.
         about_center = 0.5 * jnp.trace(body.inertia) / body.mass
         size = jnp.sqrt(about_center + jnp.sum(body.center_of_mass**2))
         is_length = np.array([name[0] in "st" for name in self.names])

@@ -49,6 +49,8 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
         f"Argument `system` must hold one body for each of {trials} trials, but it "
         f"holds {len(systems)}.",
     )
+    # The arrays of trials are stacked, for which they need one length. Bodies of
+    # different kinds are refused by `_arrays_of`.
     alike = len(set(map(jtu.tree_structure, systems))) == 1
     return _padded(systems) if alike and len(systems) > 1 else systems
 
@@ -110,6 +112,7 @@ def refuse(
     """Raise ValueError for a scale that nothing sets, or that is set twice."""
     check_option("scale", scale, ("trace", "known", "rotor"))
     demand(
+        # `Fixed` is absolute too, but has no numbers, so that no scale is sought.
         not (inertia_model.absolute and inertia_model.names and scale == "trace"),
         "Argument `scale` must be 'known' or 'rotor' where `inertia_model` is a "
         f"{type(inertia_model).__name__}, whose numbers hold the scale, but it is "
@@ -143,6 +146,7 @@ def typical_rate(
     if readings is not None:
         return rms(readings.omega, readings.valid)
     assert state is not None
+    # This is a natural unit, whose choice must not change the derivatives of a plan.
     omega = without_gradient(state.omega.astype(dtype))
     xp = omega.__array_namespace__()
     return rms(omega, xp.ones(omega.shape[:-1], bool))
@@ -165,6 +169,8 @@ def noise_of(
     ]
     rates = [median for x, median in pairs if tells(x, "rates")]
     angles = [median for x, median in pairs if x.sensor.unit_length]
+    # Without attitudes the noise of a turn is that of a rate over the time of one
+    # radian.
     angle = [*angles, *(x / rate for x in rates), GUESS][0]
     noise = np.repeat([[*rates, angle * rate][0], angle], 3).astype(sigma.dtype)
     return np.where(np.isfinite(noise), noise, GUESS * rate)
@@ -207,6 +213,8 @@ def findings_of_records(
     """What is wrong with records, whose arrays are numpy's."""
     findings = Findings()
     check_records(findings, records)
+    # Attitudes may be sampled sparsely: their aliases are looked for by several
+    # attempts.
     known = any(tells(x, "attitude") for x in records)
     if readings is not None and readings.ts.shape[1] > 1 and not known:
         findings.require(_between(readings) < np.pi, RESULTS.undersampled_rates)
@@ -255,4 +263,5 @@ def _between(readings: DirectReadings) -> np.floating:
     ok = readings.valid[:, 1:] & readings.valid[:, :-1]
     speed = np.sqrt(np.sum(readings.omega[:, 1:] ** 2, axis=-1))
     turned = np.diff(readings.ts, axis=1) * speed
+    # In a median, gaps between samples do not matter.
     return np.nan_to_num(_median(turned[ok]))

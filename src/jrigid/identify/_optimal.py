@@ -18,6 +18,8 @@ from jrigid.identify._compile import quick_jit
 from jrigid.identify._design import Bound, Plan
 
 _FIRST_STEP = 0.1  # in units of the limits, along a gradient of length 1
+# The spectral step size is kept within bounds, as the method of Birgin, Martinez and
+# Raydan asks.
 _STEP_SIZES = (1e-6, 1e6)
 _DECREASE = 1e-4  # of what the slope predicts, for a step to be accepted (Armijo)
 
@@ -103,6 +105,7 @@ def optimal_trial(
         f"Argument `limits` must have an entry for each of {len(arrays)} arrays that "
         f"`choose` picks, but it has {len(entries)}.",
     )
+    # Numbers would be static, and each new limit would compile the search again.
     entries = jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), entries)
     return _optimum(plan, choose, entries, score, starts, steps)
 
@@ -222,6 +225,7 @@ def _stepped(
     slope, score = derive(now.x + move)
     # The step size of Barzilai and Borwein.
     bend = jnp.sum(move * (slope - now.slope))
+    # Where the score bends downward there is no such size, and a longer step is tried.
     size = jnp.where(bend > 0, jnp.sum(move**2) / or_one(bend), 10 * now.size)
     size = jnp.clip(size, *_STEP_SIZES)
     after = _Descent(now.x + move, score, slope, size, jnp.ones_like(now.share))
@@ -267,6 +271,7 @@ def _optimum(
 
     def scored(x: Array) -> tuple[Array, Array]:
         value = score(chosen.plan_at(x).bound)
+        # `jacfwd` returns a value only as an auxiliary output.
         return value, value
 
     # A motion under a torque has derivatives in forward mode only.
@@ -275,6 +280,7 @@ def _optimum(
 
     descend = partial(_descended, derive, project, steps)
     shape = (starts - 1, first.size)
+    # The key is fixed, so that the same call finds the same plan.
     others = jax.random.uniform(jax.random.key(0), shape, first.dtype, -1.0, 1.0)
     initial = jnp.concatenate([first[None], others])
     ends, history = jax.lax.map(descend, jax.vmap(project)(initial))

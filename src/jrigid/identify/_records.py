@@ -114,6 +114,8 @@ class Record(Readable):
         if self.sensor.degrees is None and self.covariance is None:
             return is_finite
         whole = xp.all(is_finite, axis=-1, keepdims=True)
+        # A residual may have fewer numbers than its value: that of a quaternion has
+        # three.
         return xp.repeat(whole, self.degrees, axis=-1)
 
     def with_values(self, values: Array) -> "Record":
@@ -166,6 +168,8 @@ def _sigma(sigma: Any, shape: tuple[int, ...], of: str) -> Array:
         f"Argument `sigma` {of} have shape (), ({k},), ({n},) or ({n}, {k}), but it "
         f"has shape {sigma.shape}.",
     )
+    # Where there are as many samples as components, one number for each component is
+    # meant.
     if sigma.shape in of_samples and sigma.shape != (k,):
         sigma = sigma[..., None]
     return _repeated(sigma, shape)
@@ -331,6 +335,8 @@ def samples_of(records: Sequence[Record], guess: AnyArray) -> Samples:
     xp = records[0].values.__array_namespace__()
     ts, whitener, weight, sign = (xp.concatenate(x, axis=1) for x in rest)
     is_seen = xp.any(weight > 0, axis=-1)
+    # Missing times become finite, since NaN would spread to the motion and its
+    # derivatives.
     ts = xp.where(is_seen, ts, first_and_last(ts, is_seen)[0][:, None])
     return Samples(ts, values, whitener, weight, sign)
 
@@ -444,8 +450,10 @@ def _with_arrays(record: Record, arrays: list[Any]) -> Record:
     ts = arrays[0]
     times = np.asarray(ts) if is_concrete(ts) else ts
     xp = times.__array_namespace__()
+    # The drift of a gyro counts from here.
     first = xp.min(xp.where(xp.isfinite(times), times, xp.inf))
     first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), times.dtype)
+    # `sigma` and `covariance` may be None, which is no leaf unless it is declared one.
     return eqx.tree_at(
         lambda x: [x.sensor, *_arrays(x)],
         record,
@@ -569,6 +577,7 @@ def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
         if x.sensor.unit_length:
             text = f"Argument `values` {of} be of unit length, but one is not."
             findings.require(_is_unit(x, is_seen), code, text)
+    # A tensor without its scale has 5 numbers, and a state has at most 6.
     enough = np.bool_(sum(np.sum(x.known) for x in records) >= 12)
     text = "hold more numbers than a body and its state have, but it holds too few."
     findings.require(enough, code, f"Argument `observations` must {text}")
@@ -576,6 +585,8 @@ def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
 
 def _is_ordered(x: Record, is_seen: np.ndarray) -> np.bool_:
     """Whether times of samples increase, and are there where values are."""
+    # Each time is compared with the latest one before, since samples between may be
+    # missing.
     before = np.maximum.accumulate(np.where(is_seen, x.ts, -np.inf), axis=1)
     increasing = np.all(~is_seen[:, 1:] | (x.ts[:, 1:] > before[:, :-1]))
     without_time = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
@@ -595,6 +606,7 @@ def _is_noise(x: Record, known: AnyArray) -> np.bool_:
         is_seen = np.any(known, axis=-1)[..., None, None]
         noise = np.where(is_seen, x.covariance, np.eye(x.degrees, dtype=x.values.dtype))
         even = np.abs(noise - np.swapaxes(noise, -1, -2)) <= 1e-6 * np.abs(noise)
+        # The factor is NaN where the covariance is not positive definite.
         return np.all(even) & np.all(np.isfinite(_inverse_factor(noise)))
     if x.sigma is None:
         return np.True_

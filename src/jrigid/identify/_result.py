@@ -267,12 +267,16 @@ class FitResult(eqx.Module):
         >>> print(found.interval(share).round(2))
         [0.44 0.44]
         """
+        # As an array: a Python number would be static, and each level would compile
+        # anew.
         level_ = jnp.asarray(level, self.numbers.dtype)
         return interval(function, self.inertia, self.inertia_covariance, level_)
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
         """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first."""
+        # The index is an array of a pytree, so that both ratios share one compiled
+        # program.
         ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
         return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
@@ -283,6 +287,8 @@ class FitResult(eqx.Module):
         diagnostics = self.diagnostics
         *lanes, trials, local, size = diagnostics.sensitivity.shape
         sensitivity = diagnostics.sensitivity.reshape(*lanes, trials * local, size)
+        # An error of the numbers moves the states by the sensitivity. The states of
+        # given numbers scatter independently.
         across = product("...ag,...gh->...ah", sensitivity, numbers)
         eye = jnp.eye(trials, dtype=numbers.dtype)
         blocks = product("ts,...tlm->...tlsm", eye, diagnostics.local_covariance)
@@ -357,6 +363,7 @@ class FitResult(eqx.Module):
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
         after = jnp.all(times >= self.t0[trial])
         options = self.problem.options
+        # The exact flow takes times before `t0`, and so may a motion of the user's own.
         backward = options.free_motion or options.motion is not None
         demand(
             backward or not is_concrete(after) or bool(after),
@@ -407,6 +414,7 @@ class FitResult(eqx.Module):
         used = self.kept[..., None] & (samples.weight > 0) & (samples.sign == 0)
         white = samples.whitener[:, samples.parts[record]]
         eye = jnp.eye(white.shape[-1], dtype=white.dtype)
+        # Rows that fill a narrower record up are zero, and have no inverse.
         white = jnp.where(jnp.any(white != 0, axis=-1, keepdims=True), white, eye)
         rows = self.diagnostics.residuals[:, samples.parts[record], :, None]
         residuals = jnp.linalg.solve(white, rows)[..., 0]
@@ -513,6 +521,7 @@ class FitResult(eqx.Module):
         first, second, third = jnp.moveaxis(self.moments, -1, 0)
         a = (second - third) / first
         b = (third - first) / second
+        # With I1 = 1 the mirrored moments obey I2 - I3 = -a and I3 - I1 = -b I2.
         other = (1 - a) / (1 + b)
         mirrored = jnp.stack([jnp.ones_like(a), other, other + a], axis=-1)
         total = jnp.sum(mirrored, axis=-1, keepdims=True)
@@ -521,6 +530,7 @@ class FitResult(eqx.Module):
     @property
     def null_directions(self) -> tuple[str, ...]:
         """What the record does not tell, in words; of a single fit, outside of jit."""
+        # `_words` imports this module.
         from jrigid.identify._words import null_directions
 
         return null_directions(self)
@@ -546,6 +556,7 @@ def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array
     system, *sensors = result.fitted(trial)
     sensor = sensors[record]
     none = jnp.zeros((ts.size, 0), ts.dtype)
+    # A prediction needs the times and their count, but no readings.
     samples = Samples(ts, (none,), none, none, none)
     state0, t0 = result.initial_state(trial)
     options = result.problem.options

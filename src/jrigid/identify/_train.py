@@ -229,6 +229,7 @@ def _trained(
     memory = task.optimizer.init(params)
     best = _Best(params, np.inf, 0)
     losses: list[tuple[Array, Array]] = []
+    # An epoch reports the validation loss before its first batch, hence one epoch more.
     for epoch in range(epochs + 1):
         after = _epoch(task, params, memory, jax.random.fold_in(key, epoch))
         losses.append((after.training, after.validation))
@@ -308,6 +309,7 @@ def _windows(record: Record, length: int) -> list[_Window]:
     for trial, (ts, known) in enumerate(pairs):
         observed = ts[np.any(known, axis=-1)]
         parts = np.array_split(observed, max(1, round(observed.size / length)))
+        # The outer edges are open, since other records may begin earlier or end later.
         edges = [-np.inf, *(x[0] for x in parts[1:]), np.inf]
         windows += [_Window(trial, start, end) for start, end in pairwise(edges)]
     return windows
@@ -484,6 +486,7 @@ def _chi_square(task: _Task, params: PyTree, segment: _Segments) -> tuple[Array,
 
     def rows_twice(move: Array) -> tuple[Array, Array]:
         residuals = rows(held, move)
+        # `jacfwd` returns a value only as an auxiliary output.
         return residuals, residuals
 
     def gauss_newton(_: Array | int, move: Array) -> Array:
@@ -510,6 +513,8 @@ def _motion(
     """States at the times, of which the first is that of the state."""
     del t0
 
+    # `in_any_order` has sorted the times, in which missing samples repeat the first
+    # one.
     def gap(before: State, times: tuple[Array, Array]) -> tuple[State, State]:
         start, end = times
         after = forced_flow(

@@ -34,6 +34,7 @@ from jrigid.torques import AbstractTorque, Sum, UniformGravity
 _LEAST = 1e-3  # smallest initial value of a positive number, in its unit
 
 
+# This is not a pytree, so that `tree_map` takes it for a leaf in `prior` and `each`.
 @dataclasses.dataclass(frozen=True)
 class _Pick:
     """What `free` is given in the place of an array: its index and how it is sought.
@@ -145,6 +146,7 @@ class AbstractSought(Readable):
 
     def log_volume(self, x: Array) -> Array:
         """Logarithm of the volume of arrays over that of the numbers they stand for."""
+        # A tensor has more elements than numbers, hence the root of a Gram determinant.
         slopes = jax.jacfwd(self.value)(x).reshape(self.base.size, self.size)
         return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
 
@@ -165,6 +167,7 @@ class _Real(AbstractSought):
         return self.base + self.unit * x.reshape(self.base.shape)
 
     def natural_units(self, x: Array) -> Array:
+        # An array that grew far beyond its initial value is judged by its new size.
         return jnp.maximum(jnp.abs(self.value(x)) / self.unit, 1.0).reshape(-1)
 
 
@@ -285,6 +288,8 @@ def _name(parts: Sequence[RigidBody | AbstractSensor], path: Sequence[Any]) -> s
         return field
     kinds = [type(x).__name__.lower() for x in parts]
     kind = kinds[index]
+    # Names are keys of dictionaries, so that two sensors of one kind need different
+    # ones.
     if kinds[1:].count(kind) > 1:
         kind = f"{kind}{index}"
     return f"{kind}.{field}"
@@ -300,6 +305,8 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
     accepts = inspect.signature(free).parameters.values()
     takes_all = any(x.kind == x.VAR_POSITIONAL for x in accepts)
     chosen = jtu.tree_leaves(free(*marked[: None if takes_all else len(accepts)]))
+    # A body that is picked as a whole contains the inertia, which the model seeks
+    # already.
     picks = {
         pick.index: pick
         for pick in chosen
@@ -582,6 +589,8 @@ def unknowns_of(
             x = _by_groups(x, groups[x.name].shape[1])
         sought.append(x)
     inertia = systems[0].inertia
+    # The inertia of a fit is known, and numpy compiles nothing. That of a plan is
+    # traced.
     if is_concrete(inertia):
         inertia = np.asarray(inertia, rate.dtype)
     inertia = inertia.astype(rate.dtype)

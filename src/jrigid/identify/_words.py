@@ -31,6 +31,7 @@ def _of_shape(result: FitResult, direction: np.ndarray) -> str:
     if np.abs(inside).max() < _FAINT * moments.max():
         return "thickness"
     relative = np.diag(inside) / moments
+    # A common factor of all moments does not change their ratios.
     relative = np.abs(relative - relative.mean())
     turns = np.abs(inside[[1, 2, 0], [2, 0, 1]] / moments.mean())
     if turns.max() > relative.max():
@@ -66,6 +67,7 @@ def _untold(result: FitResult, direction: np.ndarray) -> str:
     """A direction of the numbers, in words, the largest part first."""
     parts = result.unknowns.slices.items()
     sizes = {name: float(np.sqrt(np.sum(direction[s] ** 2))) for name, s in parts}
+    # Directions have unit length. Parts below 0.2 are too small to be named.
     texts = [
         (x, _of_part(result, name, direction)) for name, x in sizes.items() if x >= 0.2
     ]
@@ -123,6 +125,7 @@ def _undetermined_attitude(result: FitResult) -> list[str]:
     count = (of_state < 1e-6 * of_state[:, :1]).sum(axis=-1).max()
     if not (result.problem.options.depends_on_attitude and count):
         return []
+    # A weight shows the vertical, so that only the turn about it can be missing.
     return ["heading about the vertical" if count == 1 else "attitude in space"]
 
 
@@ -179,6 +182,7 @@ def _of_saturation(result: FitResult) -> list[tuple[Any, str]]:
         sizes = np.abs(values)
         largest = sizes.max()
         may_saturate = sensor.saturation() is None and not sensor.unit_length
+        # Readings seldom repeat their largest value, except at a limit of the sensor.
         count = np.sum(sizes >= largest * (1 - 1e-9))
         name = type(sensor).__name__
         text = f"{count} values of {name} are its largest: saturated? (`limit`)"
@@ -189,6 +193,7 @@ def _of_saturation(result: FitResult) -> list[tuple[Any, str]]:
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
     notes = _of_record(result)
+    # These models assume equal moments, or know them.
     if not isinstance(result.unknowns.inertia_model, Symmetric | Top | Fixed):
         notes += _of_ratios(result)
         notes += _of_mirror(result)
@@ -204,6 +209,8 @@ def _of_ratios(result: FitResult) -> list[tuple[Any, str]]:
     notes = [(loose, "the ratios are weakly constrained: errors of 3 % or more")]
     for i in (0, 1):
         (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
+        # This is the error of the difference of two moments, whose estimates are
+        # correlated.
         error = math.sqrt(max(first + second - 2 * across, 0.0))
         text = (
             f"I{i + 1} and I{i + 2} are equal within their errors: which is the "
@@ -232,10 +239,12 @@ def _with_error(value: np.floating, error: np.floating) -> str:
     """A number with as many digits as its error leaves it."""
     value = np.float64(value)
     error = np.float64(error)
+    # Written with `not`, so that an error of NaN prints the value alone.
     if not error > 1e-9 * abs(value):
         return f"{value:.6g}"
     if not error < 10 * max(abs(value), 1e-300):
         return f"{value:.3g} (not determined)"
+    # The error keeps two significant digits.
     digits = 1 - math.floor(math.log10(error))
     if digits > 6 and abs(value) < 1e-3:
         return f"{value:.6g} +- {error:.2g}"

@@ -58,6 +58,7 @@ def to_scipy(attitude: Attitudes, position: Positions | None = None) -> Any:
     """
     transform = extra("io", "scipy.spatial.transform")
     quaternions = np.asarray(_arrays(attitude, position)[0])
+    # Quaternions of scipy have the scalar last.
     turn = transform.Rotation.from_quat(np.roll(quaternions, -1, -1))
     if position is None:
         return turn
@@ -84,6 +85,7 @@ def from_scipy(rotation: Any) -> Float[Array, "*batch 4"] | Pose:
     [[1. 0. 0. 0.]
      [0. 1. 0. 0.]]
     """
+    # `RigidTransform` came with scipy 1.16, and older versions have no such type.
     turn = rotation.rotation if hasattr(rotation, "translation") else rotation
     _one_of("a scipy.spatial.transform.Rotation or RigidTransform", turn, "as_quat")
     attitude = jnp.roll(jnp.asarray(turn.as_quat()), 1, axis=-1)
@@ -213,6 +215,7 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
     """
     q = array_of_shape("attitude", attitude, 4)
     q = jnp.where(q[0] < 0, -q, q)
+    # tan(a / 4) = sin(a / 2) / (1 + cos(a / 2)), with the norm in place of 1.
     return q[1:] / (q[0] + jnp.sqrt(jnp.sum(q * q)))
 
 

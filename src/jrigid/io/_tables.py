@@ -69,6 +69,7 @@ def _of_trajectory(motion: Trajectory) -> Dataset:
         own = tuple(f"internal{i}_{j}" for j in range(x.ndim - ts.ndim))
         variables[f"internal{i}"] = _variable((*along, *own), x)
     text = RESULTS[motion.result]
+    # The code of a single motion is an attribute. Codes of many lanes are a variable.
     depth = np.ndim(code_of(motion.result))
     if depth:
         variables["result"] = _variable(lanes[:depth], text)

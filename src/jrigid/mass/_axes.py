@@ -293,6 +293,7 @@ def tensor_function(f: Callable[[Scalar], Scalar], inertia: InertiaLike) -> Matr
         raise ValueError(
             f"Argument `f` must map {moment} to the same, but it gives {shape}."
         )
+    # A custom derivative rule takes what f closes over only as an argument.
     hoisted, parameters = jax.closure_convert(f, jnp.zeros((), tensor.dtype))
     # In a bad lane f is evaluated at 1, which is in the domain of most functions.
     return where_defined(

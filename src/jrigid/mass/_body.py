@@ -256,7 +256,10 @@ def _joined(body: MassProperties, other: MassProperties) -> MassProperties:
     def joined(a: MassProperties, b: MassProperties) -> MassProperties:
         mass = a.mass + b.mass
         share = b.mass / mass
+        # The difference comes first, so that bodies far from the origin lose no digits.
         apart = b.center_of_mass - a.center_of_mass
+        # Both parallel-axis terms together are those of the reduced mass at the
+        # distance.
         tensor = a.inertia + b.inertia + a.mass * share * steiner(apart)
         return MassProperties.unchecked(mass, a.center_of_mass + share * apart, tensor)
 

@@ -40,6 +40,7 @@ class _Parser:
         self.line = 0
         self.sessions: list[_Session] = []
         self.session: _Session | None = None
+        # A byte of another encoding, in a name say, must not make the data unreadable.
         text = self.path.read_text(encoding="utf-8-sig", errors="replace")
         for self.line, line in enumerate(text.splitlines(), 1):
             if line.strip() and not line.startswith("#"):
@@ -197,6 +198,7 @@ def read_alcdef(
     parser = _Parser(path)
     zero = parser.sessions[0].dates[0]
     if epoch is not None:
+        # `repr` gives the digits that were typed, not those of the binary fraction.
         zero = Decimal(repr(float(epoch)))
     return [_curve(parser, session, positions, zero) for session in parser.sessions]
 
@@ -208,6 +210,8 @@ def _curve(
     is_corrected = parser.option(session, "LTCAPP", _CORRECTIONS) != "NONE"
     reduced = parser.option(session, "REDUCEDMAGS", _CORRECTIONS)
     dates = np.array(session.dates, dtype=float)
+    # The difference of decimals is exact, while floats do not hold all digits of a
+    # date.
     ts = np.array([float((date - zero) * _DAY) for date in session.dates])
     if is_corrected:
         to_sun, to_observer = _seen_later(positions, dates)

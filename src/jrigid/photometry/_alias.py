@@ -104,6 +104,7 @@ def alias_of(
         lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), of_numbers
     )
     there = readings.weights > 0
+    # The last row is no point, but the equation between the periods.
     residuals = np.asarray(rows)[:-1][there] / (readings.weights[there] * MAGNITUDE)
     return Alias(
         tumbler=_tumbler(numbers, task, estimates),
@@ -111,6 +112,7 @@ def alias_of(
         errors=errors,
         chi_square=float(np.sum(np.asarray(rows) ** 2)),
         weight=0.0,
+        # A magnitude falls where the logarithm of the brightness grows.
         residuals=-residuals,
         numbers=numbers,
         task=task,
@@ -142,6 +144,7 @@ def log_evidence(alias: Alias, growth: float) -> float:
     _, logarithm = np.linalg.slogdet(covariance / np.outer(size, size))
     numbers = unpacked(alias.numbers)
     spread = 0.5 * logarithm + np.sum(np.log(size))
+    # The prior is flat in solid angle and in ratios, not in latitude and in logits.
     of_directions = np.log(np.cos(numbers.pole[1]))
     ratios = 1 / (1 + np.exp(-numbers.shape))
     return float(
@@ -165,11 +168,14 @@ def _estimates(vector: Array, task: Task, span: Array) -> Estimates:
     pole = product("ij,i->j", task.frame, axes_of_momentum(numbers.pole)[2])
     logits = jnp.where(task.homogeneous, numbers.shape, numbers.inertia)
     inverse = inverse_moments(semi_axes(logits), task.mode == Mode.long_axis)
+    # At the largest tilt the angular momentum has components along the intermediate and
+    # the circled axis only.
     tangent2 = jnp.exp(2 * jnp.where(tumbles, numbers.log_tangent[0], 0.0))
     energy = (inverse[1] * tangent2 + inverse[2]) / (1 + tangent2)
     moments = 1 / inverse_moments(semi_axes(logits), jnp.asarray(False))
     return Estimates(
         precession_period=span / numbers.cycles[0],
+        # A steady rotation has no second frequency, by which derivatives would divide.
         rotation_period=jnp.where(
             tumbles, span / jnp.where(tumbles, numbers.cycles[1], 1.0), jnp.nan
         ),

@@ -188,6 +188,7 @@ def _legendre(
 
 def degrees_of_harmonics(count: int) -> np.ndarray:
     """The degree of each of so many harmonics."""
+    # The degrees 1 to n have (n + 1)^2 - 1 harmonics.
     return np.floor(np.sqrt(np.arange(1, count + 1))).astype(int)
 
 
@@ -206,6 +207,7 @@ def facets_of(vector: Float[Array, " numbers"], surface: Surface) -> Facets:
     """The body; the sum of its areas is that of a unit sphere."""
     numbers = unpacked_spin(vector)
     areas = _areas(numbers.shape, surface)
+    # Curves have unknown factors, so that the size of the body is arbitrary.
     areas = areas * (4 * jnp.pi / jnp.sum(areas))
     return Facets(areas, surface.normals, _albedo(numbers.albedo, surface))
 
@@ -244,6 +246,7 @@ def _directions(
     angle = 2 * jnp.pi * motion[0] * readings.ts[:, None] / readings.span
     cosine = jnp.cos(angle)
     sine = jnp.sin(angle)
+    # Seen from the body, directions in space turn the other way.
     return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
 
 
@@ -303,6 +306,7 @@ def _light_in_blocks(
 ) -> _Light:
     """Brightness at all epochs, a block of them at a time, which fits in the cache."""
     reflecting = _areas(numbers.shape, surface) * _albedo(numbers.albedo, surface)
+    # The logarithm of albedo times area is linear in the numbers, with these slopes.
     columns = jnp.concatenate([surface.normals, surface.harmonics], axis=1)
     of_block = functools.partial(
         _light,
@@ -311,6 +315,7 @@ def _light_in_blocks(
         columns * reflecting[:, None],
         surface.normals,
     )
+    # The readings are filled up to whole blocks of epochs.
     blocks = directions.reshape(-1, EPOCHS, 2, 3)
     light = jax.lax.map(of_block, blocks)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), light)
@@ -370,6 +375,7 @@ def spin_quadratic(
     of_shape = functools.partial(openness, surface=surface)
     shape = unpacked_spin(vector).shape
     gap = surface.closure * of_shape(shape)
+    # Three results depend on many numbers, hence reverse mode.
     of_gap = surface.closure * jax.jacrev(of_shape)(shape)
     of_gap = jnp.pad(of_gap, ((0, 0), (vector.size - shape.size, 0)))
     strain = surface.stiffness * (vector - surface.centre)

@@ -115,6 +115,8 @@ def lommel_seeliger_brightness(
     square = jnp.sum(sine * sine)
     # Product of the sines of the two angles.
     sines = square * s0 * s / sum_**2
+    # At a phase angle of 0 the sines vanish, and their product with the logarithm tends
+    # to 0.
     lit = square > 0
     cotangents = (1 + from_sun) * (1 + from_observer) / jnp.where(lit, sines, 1.0)
     bent = jnp.where(lit, sines * jnp.log(cotangents), 0.0)

@@ -142,11 +142,13 @@ def facets_from_mesh(
 
 def _hull(vertices: np.ndarray) -> np.ndarray:
     """Triangles of the convex hull, counter-clockwise seen from outside."""
+    # Imported where it is used: scipy would add a second to `import jrigid`.
     from scipy.spatial import ConvexHull
 
     found = ConvexHull(vertices)
     faces = found.simplices.copy()
     a, b, c = (vertices[faces[:, i]] for i in range(3))
+    # Qhull lists the corners of a triangle in either order.
     inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), found.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return faces

@@ -118,6 +118,7 @@ def read_light_curves(
     """
     lines = _Lines(path)
     (count,) = lines.integers(1, "the number of light curves")
+    # `repr` gives the digits that were typed, not those of the binary fraction.
     zero = None if epoch is None else Decimal(repr(float(epoch)))
     curves = []
     for index in range(count):
@@ -143,6 +144,7 @@ def read_light_curves(
             )
         curves.append(curve)
     if lines:
+        # No line that is kept is empty, so that this always raises an error.
         lines.next(0, f"the end of the file after {count} light curves")
     return curves
 

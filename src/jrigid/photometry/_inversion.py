@@ -158,6 +158,7 @@ def find_tumblers(
     span = float(readings.span)
     found = search(
         readings,
+        # The search counts frequencies in cycles within the span.
         span / longest,
         span / shortest,
         [MODES[mode] for mode in modes],
@@ -168,6 +169,7 @@ def find_tumblers(
         len(found.numbers) > 0,
         "Arguments `shortest` and `longest` hold no motion of these modes.",
     )
+    # Columns of zeros fill the array up to a few sizes.
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
     return _inversion(found, readings, epoch, points - factors, stated, threshold)
 
@@ -199,6 +201,8 @@ def _inversion(
     logarithms = np.array(
         [log_evidence(x, growth[i]) for i, x in enumerate(every[:near])]
     )
+    # Only ratios of weights matter. Without the largest one the exponentials stay in
+    # range.
     weights = np.exp(logarithms - logarithms.max())
     aliases = [
         dataclasses.replace(alias, weight=float(weight))
@@ -232,15 +236,18 @@ def _apart(
     readings, _ = readings_of([curve], noise)
     day = 86400.0
     shift = (curve.epoch - inversion.epoch) * day + curve.ts
+    # The numbers count cycles within the span of the inversion, from its epoch.
     ts = np.zeros_like(readings.ts)
     ts[: len(shift)] = shift
     readings = readings._replace(ts=ts, span=np.asarray(inversion.span))
+    # The last row is no point, but the equation between the periods.
     first, of_first = (
         np.asarray(x)[:-1] for x in rows_at(best.numbers, best.task, readings)
     )
     second, of_second = (
         np.asarray(x)[:-1] for x in rows_at(other.numbers, other.task, readings)
     )
+    # The rows are over the noise, which therefore has unit variance.
     spread = np.eye(len(first))
     for slopes, alias in ((of_first, best), (of_second, other)):
         spread = spread + slopes @ alias.covariance @ slopes.T

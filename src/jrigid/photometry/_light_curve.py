@@ -56,6 +56,7 @@ def brightness(
 
 def phase_angle(to_sun: Vector, to_observer: Vector) -> Scalar:
     """Angle between Sun and observer, seen from the body [rad]; its gradient at 0 is 0."""
+    # The arc cosine of a product would lose digits near 0, with an infinite slope.
     across = safe_norm(jnp.cross(to_sun, to_observer))
     return safe_arctan2(across, product("i,i->", to_sun, to_observer))
 
@@ -118,6 +119,7 @@ def light_curve(
     motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
     seen = functools.partial(_seen_from_space, shape, scattering)
     curve = jax.vmap(seen)(motion.attitude, to_sun, to_observer)
+    # Facets for which an attitude is NaN would count as dark, and the sum would be 0.
     return nan_where(motion.result != RESULTS.successful, curve)
 
 

@@ -91,6 +91,7 @@ def sought(task: Task) -> Bool[Array, " 11"]:
 
 def semi_axes(logits: Float[Array, "2"]) -> Vector:
     """Semi-axes of which the longest is 1, from logits of b/a and c/b."""
+    # Ratios below 1 keep the order of the axes, so that none changes its role in a fit.
     ratios = jax.nn.sigmoid(logits)
     return jnp.stack([jnp.ones_like(ratios[0]), ratios[0], ratios[0] * ratios[1]])
 
@@ -116,6 +117,7 @@ def motion_of(numbers: Numbers, task: Task) -> Wobble:
 def gap_of_periods(numbers: Numbers, motion: Wobble, task: Task) -> Scalar:
     """Logarithm of the ratio of the frequencies, over that of the motion."""
     tumbles = task.mode != Mode.principal_axis
+    # The second frequency of a steady rotation is 0 and has no logarithm.
     cycles = jnp.where(tumbles, numbers.cycles, 1.0)
     sought = jnp.log(cycles[0]) - jnp.log(cycles[1])
     given = jnp.log(motion.precession_rate) - jnp.log(motion.rotation_rate)
@@ -225,6 +227,7 @@ def rows_of(vector: Float[Array, "11"], task: Task, readings: Readings) -> Rows:
         return log_brightness(restored(flat), task.mode, time, sun, observer)
 
     each = jax.vmap(jax.value_and_grad(of_epoch), (None, 0, 0, 0))
+    # In this unit of time the frequencies are the cycles within the span.
     times = readings.ts / readings.span
     model, slopes = each(flat, times, readings.to_sun, readings.to_observer)
     slopes = product("eg,gn->en", slopes, flat_slopes)

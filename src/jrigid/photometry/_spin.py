@@ -48,6 +48,8 @@ _MOST_DEGREE = 12
 # orbit tells.
 _NEAR_MIRROR = 0.6
 _SAME_TURNS = 0.3
+# Within a curve the phase function is nearly constant, as is the factor that a relative
+# curve leaves open.
 _NEEDS_SCALE = ("amplitude", "width", "slope")
 
 
@@ -216,10 +218,13 @@ def find_spin(
     )
     surface = make(degree, facets)
     coarse = make(min(degree, COARSE_DEGREE), min(facets, COARSE_FACETS))
+    # This refuses curves with too few points before the search.
     freedom = _freedom(readings, surface)
     spins = search_spins(readings, surface, coarse, *turns)
     if noise is None:
         noise_found = _FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / freedom)
+        # Closure and expectations are weighed against the noise, so that the minimum
+        # moves with it.
         readings, epoch = readings_of(curves, float(noise_found))
         spins = settled(spins, surface, readings)
     return _inversion(spins, surface, readings, epoch, noise is not None, threshold)
@@ -370,6 +375,7 @@ def _spin(one: Spins, surface: Surface, readings: Readings, scale: float) -> Spi
         errors=errors,
         chi_square=float(one.quadratic.chi_square[0]),
         open_share=float(np.linalg.norm(openness(shape, surface))),
+        # A magnitude falls where the logarithm of the brightness grows.
         residuals=-residuals,
     )
 

@@ -100,6 +100,8 @@ class Tumbler(Readable):
             tilt = jnp.arctan2(momentum[1], momentum[2])
             upright = from_axis_angle(x, tilt)
         else:
+            # `swap` reverses y. With y reversed here too, the same turn makes both
+            # modes upright.
             omega = omega * jnp.asarray([1.0, -1.0, 1.0], omega.dtype)
             tilt = jnp.arctan2(momentum[1], momentum[0])
             half = jnp.sqrt(jnp.asarray(0.5, omega.dtype))

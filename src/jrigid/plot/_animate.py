@@ -164,6 +164,7 @@ class Animation(NamedTuple):
                 if marker is not None and self.curve is not None:
                     marker.set_data([time / scale], [self.curve.values[i]])
                 recorder.grab_frame()
+        # pyplot keeps each figure in memory until it is closed.
         plt.close(figure)
 
     def _figure(self, plt: Any) -> tuple[Any, Axes3D]:
@@ -191,6 +192,8 @@ class Animation(NamedTuple):
 
 def _draw_sun(ax: Axes3D, light: np.ndarray) -> list[Any]:
     """Draw a line towards the Sun; returns the artists."""
+    # The observer is on the x axis. Light from behind the body has a negative x there,
+    # and is drawn below the faces.
     style: dict[str, Any] = {"color": "#E69F00", "zorder": common.FRONT * light[0]}
     (line,) = ax.plot(*np.outer(light, [1.08, 1.25]), lw=2.5, **style)
     return [line, ax.text(*(1.3 * light), "Sun", **style)]
@@ -348,5 +351,6 @@ def _surface_of_shape(
 ) -> Surface:
     """The surface of a tumbler: its ellipsoid, or the mesh of its facets."""
     if mesh is None and isinstance(tumbler.shape, Ellipsoid):
+        # The homogeneous ellipsoid of these moments has the same ratios of semi-axes.
         return surface_of(tumbler.shape.moments, "ellipsoid")
     return surface_of(tuple(outline_of(tumbler, mesh)), "box")

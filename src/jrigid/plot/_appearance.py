@@ -27,6 +27,7 @@ _DARK = 0.13  # grey of what is not lit
 _REACH = 1.45  # of the picture, where the farthest corner is at 1
 _BEYOND = 0.22  # of the principal axes
 _SUN = "#E69F00"  # Okabe and Ito's orange
+# Cosine below which a face is not drawn: its brightness on the sky divides by it.
 _EDGE_ON = 1e-9
 _ALONG = 0.05  # sine of the angle between Sun and observer
 
@@ -103,6 +104,7 @@ def appearance(
     limits = (-_REACH, _REACH)
     ax.set(xlim=limits, ylim=limits, aspect="equal")
     ax.set_axis_off()
+    # Rounding may take the product of two unit vectors beyond 1.
     angle = np.degrees(np.arccos(np.clip(sun @ observer, -1, 1)))
     ax.set_title(f"phase angle {angle:.0f} degrees", loc="left")
     return ax
@@ -118,6 +120,8 @@ def outline_of(body: Tumbler | Ellipsoid | Mesh, mesh: Mesh | None) -> Outline:
             "which do not say where they are, but it is None."
         )
     if isinstance(shape, Ellipsoid):
+        # At a pole itself two corners of a face would coincide, and it would have no
+        # normal.
         polar = np.linspace(np.pi - 1e-3, 1e-3, _ROWS + 1)
         ball, faces = rings(np.sin(polar), np.cos(polar), 2 * _ROWS)
         vertices = ball * np.asarray(shape.semi_axes)
@@ -131,6 +135,7 @@ def sky_axes(observer: np.ndarray) -> np.ndarray:
     """Directions right, up and towards the observer, in rows."""
     north = np.array([0.0, 0.0, 1.0])
     if np.linalg.norm(np.cross(north, observer)) < 1e-6:
+        # Seen along the third axis, north has no direction on the sky.
         north = np.array([0.0, 1.0, 0.0])
     right = np.cross(north, observer)
     right = right / np.linalg.norm(right)
@@ -186,6 +191,7 @@ def _draw_faces(
     light = _surface_brightness(law, to_sun, to_observer[seen])
     greys = np.where(to_sun > 0, _DARK + (1 - _DARK) * light, _DARK)
     colours = np.repeat(greys[:, None], 3, axis=1)
+    # Edges of the same colour cover the seams between neighbouring faces.
     faces = PolyCollection(
         list(corners[seen, :, :2]), facecolors=colours, edgecolors=colours, lw=0.5
     )
@@ -197,8 +203,10 @@ def _surface_brightness(
 ) -> np.ndarray:
     """Brightness of a unit of area on the sky, over the largest; 0 where not lit."""
     lit = to_sun > 0
+    # A law may be singular outside of its domain.
     cos_sun = jnp.asarray(np.where(lit, to_sun, 1.0))
     of_area = jax.vmap(law.of_area)(cos_sun, jnp.asarray(to_observer))
+    # A piece of surface covers this cosine times its area on the sky.
     light = np.where(lit, np.asarray(of_area) / to_observer, 0.0)
     return light / max(float(np.max(light, initial=0.0)), np.finfo(float).tiny)
 
@@ -211,6 +219,7 @@ def _draw_axes(
     ends = turned(attitude, np.diag(reach + _BEYOND)) @ sky.T
     starts = turned(attitude, np.diag(reach)) @ sky.T
     for name, start, end in zip("123", starts, ends, strict=True):
+        # Collections of matplotlib, as that of the faces, have zorder 1.
         style: dict[str, Any] = {"color": "#0072B2", "zorder": 3 if end[2] > 0 else 0}
         ax.plot([start[0], end[0]], [start[1], end[1]], lw=1.2, **style)
         ax.text(1.1 * end[0], 1.1 * end[1], name, ha="center", va="center", **style)

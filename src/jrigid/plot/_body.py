@@ -22,6 +22,7 @@ _TOP = np.array(
     [[0.03, 0.4, 0.44, 0.36, 0.05, 0.04, 1e-3], [0, 0.45, 0.55, 0.64, 0.7, 0.98, 1]]
 )
 _SIDES = 16
+# At a pole itself two corners of a face would coincide, and it would have no normal.
 _POLAR = np.linspace(np.pi - 1e-3, 1e-3, 13)  # along the outline of a ball
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 _QUADS = np.array([int(x) for x in "013246750451237602641573"]).reshape(6, 4)
@@ -119,6 +120,8 @@ def _of_mesh(mesh: tuple[AnyArray, AnyArray]) -> _Outline:
 def _of_inertia(body: Body, kind: str) -> _Outline:
     """The box or ellipsoid that has an inertia, up to a factor."""
     moments, axes = common.principal(body)
+    # Second moments of the mass: of a box and of an ellipsoid they go as the squares of
+    # the sides.
     squares = np.sum(moments) / 2 - moments
     sides = np.sqrt(np.maximum(squares, _FLAT * np.max(squares)))
     vertices, faces = (_CORNERS, _QUADS) if kind == "box" else _BALL

@@ -112,6 +112,7 @@ def chart(
         sides = _sides(values_on.values, level, regions)
         ax = flat_axes(ax)
         _draw_numbers(ax, values_on, title)
+        # matplotlib warns of a level that the map does not reach.
         if min((np.any(x.mask) for x in sides), default=False):
             _draw_border(ax, values_on, values_on.values, level)
         _name(ax, values_on, sides, box_alpha=0.75)
@@ -122,6 +123,7 @@ def chart(
         codes, on_map = _regions(values_on, regions)
         ax = flat_axes(ax)
         _draw_codes(ax, values_on, codes)
+        # Each border of the last region is also one of another region.
         for region in on_map[:-1]:
             _draw_border(ax, values_on, region.mask, 0.5)
         _list_beside(ax, _name(ax, values_on, on_map, box_alpha=0.0))
@@ -169,6 +171,7 @@ def _name(
     ax: Axes, drawn: _Map, regions: list[_Region], box_alpha: float
 ) -> list[_Region]:
     """Write each region's name where it is widest; those without room are returned."""
+    # Imported where it is used: scipy would add a second to `import jrigid`.
     from scipy import ndimage
 
     box: dict[str, Any] = {"facecolor": "w", "alpha": box_alpha, "lw": 0}

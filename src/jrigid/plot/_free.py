@@ -48,6 +48,7 @@ def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int
     about = 2 if level <= rates[1] and rates[1] - rates[2] > _EQUAL * spread else 0
     other = 2 - about
     gaps = np.array([rates[other], rates[1]]) - rates[about]
+    # Rounding may put the level of a spin beyond that of its axis.
     wide, high = np.sqrt(np.clip((level - rates[about]) / gaps, 0, 1))
     curve = np.zeros((TURN.size, 3))
     curve[:, other] = wide * np.cos(TURN)
@@ -128,6 +129,7 @@ class _Surface(NamedTuple):
         """Draw L / |L| in principal axes; the ellipsoid's point is on the same ray."""
         length = np.linalg.norm(unit / self.semi_axes, axis=1, keepdims=True)
         points = unit / length
+        # This is the gradient of the ellipsoid's equation.
         normals = points / self.semi_axes**2
         on_surface(self.ax, points @ self.axes.T, normals @ self.axes.T, **style)
 
@@ -147,6 +149,8 @@ class _Surface(NamedTuple):
             for width in _FAMILY:
                 level = rates[about] + gap * np.sin(width) ** 2
                 self.draw(_cone(self.moments, level, side)[0], **style)
+        # Both families share the separatrix, which is drawn once. A symmetric body has
+        # none.
         if about and min(rates[0] - rates[1], gap) > _EQUAL * rates[0]:
             curve, _ = _cone(self.moments, rates[1], side)
             self.draw(curve, color="k", lw=1.6, label="separatrix")
@@ -286,6 +290,7 @@ def herpolhode(
     ax.plot(*plane.T, color=LOOKS[0][0], lw=0.9)
     ax.plot(*plane[0], LOOKS[1][1], color=LOOKS[1][0])
     ax.plot(0, 0, "+", color="k", ms=9)
+    # The curve of a pure spin is a point, but limits of axes must differ.
     edge = 1.08 * bounds[1] or 0.1 * np.linalg.norm(omega)
     ax.set(aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
     title = "Herpolhode, {:.3g} to {:.3g} rad/s from the momentum (+)".format(*bounds)
@@ -299,6 +304,7 @@ def _times_of_herpolhode(inertia: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """Times in which the curve shows its shape [s]."""
     turn = 2 * np.pi / float(mean_precession_rate(inertia, omega))
     periods = _PERIODS * float(polhode_period(inertia, omega))
+    # The period is infinite on the separatrix, and of a sphere.
     return np.linspace(0, min(periods, _PRECESSIONS * turn), _POINTS)
 
 
@@ -333,6 +339,7 @@ def _bounds_of_herpolhode(
     moments, axes = common.principal(inertia)
     unit = omega @ inertia @ axes / size
     polhode = unit[None]
+    # The angular momentum of a sphere does not move in the body.
     if np.ptp(moments):
         polhode, _ = _cone(moments, np.sum(unit**2 / moments), 1)
     radii = size * np.linalg.norm(np.cross(polhode, polhode / moments), axis=1)

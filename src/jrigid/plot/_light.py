@@ -135,6 +135,7 @@ def _stretches_of(points: Points, tumbler: Tumbler) -> _Stretches:
     starts = ts[np.concatenate([[0], after + 1])]
     ends = ts[np.concatenate([after, [len(ts) - 1]])]
     lengths = ends - starts
+    # Single points have no length.
     gap = _GAPS * (np.sum(lengths) or 1.0) / len(starts)
     places = np.concatenate([[0.0], np.cumsum(lengths + gap)[:-1]])
     return _Stretches(starts, ends, places, float(gap))
@@ -157,6 +158,7 @@ def _draw_unfolded(
     places = np.insert(stretches.place(ts), ends, np.nan)
     ax.plot(places, np.insert(magnitudes, ends, np.nan), color="0.4", lw=1.2)
     _draw_points(ax, points, stretches, points.magnitudes)
+    # Magnitudes grow as light fades.
     ax.invert_yaxis()
     _mark_times(ax, points, stretches)
     _draw_bar(ax, stretches)
@@ -272,6 +274,7 @@ def _draw_two_phases(ax: Axes, points: Points, tumbler: Tumbler) -> None:
     values = values.reshape(first.shape)
     moved = _at_one_geometry(points, tumbler, points.ts, middle) + points.residuals
     style: dict[str, Any] = {
+        # Reversed, since the small magnitudes are the bright ones.
         "cmap": "cividis_r",
         "vmin": min(values.min(), moved.min()),
         "vmax": max(values.max(), moved.max()),
@@ -366,6 +369,7 @@ def _draw_periods(ax: Axes, alias: Alias, is_rejected: bool) -> None:
     mode = alias.tumbler.mode
     colour, marker = _MODES[mode]
     name = f"{mode}, rejected" if is_rejected else mode
+    # A name occurs once in the legend, however many tumblers have this mode.
     known = ax.get_legend_handles_labels()[1]
     style: dict[str, Any] = {"color": colour, "label": None if name in known else name}
     first = float(alias.estimates.precession_period) / _HOUR
@@ -392,6 +396,8 @@ def _write_rank(ax: Axes, alias: Alias, rank: int) -> None:
     place: dict[str, Any] = {"xytext": offset, "textcoords": "offset points"}
     if alias.tumbler.mode == "principal-axis":
         place |= {"xytext": (7, 5), "xycoords": ax.get_xaxis_transform()}
+        # A steady rotation has no second period. The rank stands near the foot of its
+        # line.
         y = 0.02
     ax.annotate(str(rank), (x, y), **place)
 

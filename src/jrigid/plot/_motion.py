@@ -117,6 +117,7 @@ def _draw_drift(
             values = values @ np.asarray(along)[:, None] / np.linalg.norm(along)
         changes = _relative_changes(values)
         ax.plot(ts, changes, marker, color=colour, ms=3, label=name)
+    # This is the dtype of the states, which may be in single precision.
     eps = np.finfo(times.dtype).eps
     ax.axhline(eps, color="0.5", lw=1, ls=":", label="rounding")
     ax.set_yscale("log")

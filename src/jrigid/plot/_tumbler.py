@@ -102,6 +102,8 @@ def points_of(curves: Sequence[LightCurve], model: Model) -> Points:
     to_sun = np.concatenate([x.to_sun for x in curves])
     to_observer = np.concatenate([x.to_observer for x in curves])
     predicted = magnitudes_at(model.tumbler, ts, to_sun, to_observer)
+    # The unknown size of the body shifts all magnitudes, so that their mean is
+    # arbitrary.
     zero = float(np.mean(predicted))
     predicted = predicted - zero
     magnitudes = -2.5 * np.log10(light)
@@ -165,6 +167,7 @@ def _in_blocks(function: Callable[..., Array], *arrays: np.ndarray) -> np.ndarra
     count = len(arrays[0])
     done = []
     for first in range(0, count, _BLOCK):
+        # The last row is repeated to fill the last block.
         rows = np.minimum(np.arange(first, first + _BLOCK), count - 1)
         done.append(np.asarray(function(*(x[rows] for x in arrays))))
     return np.concatenate(done)[:count]

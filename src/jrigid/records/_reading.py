@@ -224,6 +224,7 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
         raise ValueError("Argument `reading` must have rates, but it has none.")
     size = max(4, round(_REST / reading.interval)) if times.size > 1 else 4
     ends = itertools.pairwise((0, *reading.breaks, times.size))
+    # No window reaches across a break.
     starts = np.concatenate([np.arange(a, b - size + 1, size) for a, b in ends])
     if not starts.size:
         return []
@@ -235,9 +236,11 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
     is_quiet = spreads <= min(most_spread, floor)
     is_quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < most_mean
     is_still = np.isin(np.arange(times.size), windows[is_quiet])
+    # Of n readings the times span n - 1 intervals.
     shortest = min_duration - reading.interval
     parts: list[Reading] = []
     for first, last in runs(is_still):
+        # Windows on both sides of a break make one run.
         parts += reading[first:last].pieces()
     return [part for part in parts if np.ptp(part.times) >= shortest]
 
@@ -280,6 +283,7 @@ def noise(
     [0.02 0.02 0.02] [0.01 0.01 0.01] [0.001 0.001 0.001]
     """
     pieces = reading.pieces() if at_rest else rests(reading, min_duration=min_duration)
+    # `allan` needs three readings.
     parts = [x.rates for x in pieces if x.rates is not None and x.times.size > 2]
     needed = f"rates at rest for {min_duration:g} s"
     demand(len(parts) > 0, f"Argument `reading` must have {needed}, but it has none.")

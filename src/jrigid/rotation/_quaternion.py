@@ -85,6 +85,7 @@ def random(key: PRNGKeyArray, dtype: DTypeLike | None = None) -> Quaternion:
     >>> print(attitudes.shape, jnp.linalg.norm(attitudes, axis=1))
     (5, 4) [1. 1. 1. 1. 1.]
     """
+    # Independent normal numbers of equal variance prefer no direction.
     return normalize(jax.random.normal(key, (4,), _dtype(dtype)))
 
 
@@ -183,6 +184,7 @@ def inverse(quaternion: QuaternionLike) -> Quaternion:
 
     def formula(q: Array) -> Array:
         unit = rescaled(q)
+        # conj(q) / |q|^2 in terms of unit = scale q, whose square stays in range.
         return conjugate(unit) / jnp.sum(unit * unit) * _scale(q)
 
     return where_defined(_spans(q), formula, q)
@@ -280,6 +282,7 @@ def exp(rotation_vector: VectorLike) -> Quaternion:
     [0. 1. 0. 0.]
     """
     v = array_of_shape("rotation_vector", rotation_vector, 3)
+    # The square of half the angle: cosine and sinc are even, hence analytic in it.
     z = 0.25 * jnp.sum(v * v)
     return jnp.concatenate([cos_sqrt(z)[None], 0.5 * sinc_sqrt(z) * v])
 
@@ -339,6 +342,7 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     0.001
     """
     p, q = shaped(p=(p, 4), q=(q, 4))
+    # The arc cosine of the scalar part would lose the digits of a small angle.
     return safe_norm(log(multiply(rescaled(conjugate(p)), rescaled(q))))
 
 
@@ -373,6 +377,7 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
 
     def formula(p: Array, q: Array, s: Array) -> Array:
         p = normalize(p)
+        # Of the two, only the norm of p enters the result.
         turn = multiply(conjugate(p), rescaled(q))
         return multiply(p, exp(s * log(turn)))
 
@@ -398,4 +403,5 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
     """
     v, a = shaped(axis=(axis, 3), angle=(angle,))
     vector_part = jnp.sin(0.5 * a) * _direction(v)
+    # For an axis of zero this makes the identity of (cos(a / 2), 0, 0, 0).
     return normalize(jnp.concatenate([jnp.cos(0.5 * a)[None], vector_part]))

@@ -104,6 +104,7 @@ def _integrals(
 ) -> Integrals:
     """The integrals of a body that is of the case."""
     strength = safe_norm(gravity.gravity)
+    # Without gravity no direction is vertical, and its angular momentum counts as 0.
     pulls = strength > 0
     down = rotate_inverse(
         state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0)
@@ -113,6 +114,7 @@ def _integrals(
     energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
     rate = gravity.mass * strength / inertia[2]
     w = jax.lax.complex(*state.omega[:2])
+    # The factor k of the docstring is part of c here.
     c = jax.lax.complex(*(rate * gravity.lever)[:2])
     g = jax.lax.complex(*up[:2])
     extra = None
@@ -148,6 +150,7 @@ def _is_of_case(
     if case in _RATIOS:
         of_case &= vanishes(i1 - _RATIOS[case] * i3, i1)
     if case == "goryachev-chaplygin":
+        # The extra integral is one only in motions without this angular momentum.
         vertical = _integrals(None, inertia, gravity, state).vertical_momentum
         of_case &= vanishes(vertical, inertia * state.omega)
     return of_case

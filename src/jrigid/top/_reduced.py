@@ -87,6 +87,7 @@ def conserved(top: SymmetricTop, state: State) -> Conserved:
     """
 
     def constants(top: SymmetricTop, state: State) -> Conserved:
+        # The vertical in body axes has no poles, which Euler angles have.
         up = rotate_inverse(
             state.attitude, jnp.array([0.0, 0.0, 1.0], state.omega.dtype)
         )
@@ -254,6 +255,7 @@ def reduced_vector_field(
         del t, args
         _, theta, _, theta_dot = y
         phi_dot, psi_dot = _angle_rates(i1, i3, mgl, theta, p_phi, p_psi)
+        # Lagrange's equation of theta, in which p_psi replaces I3 omega3.
         centrifugal = phi_dot * (i1 * phi_dot * jnp.cos(theta) - p_psi)
         theta_ddot = (mgl + centrifugal) * jnp.sin(theta) / i1
         return jnp.stack([phi_dot, theta_dot, psi_dot, theta_ddot])

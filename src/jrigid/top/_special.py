@@ -84,6 +84,8 @@ def _steady(
     slant = jnp.where(level, 0.0, i1 * cos)
     square = momentum * momentum - 4 * slant * mgl
     root = root_of_positive(square)
+    # Both terms have one sign, so that the sum does not cancel. The other root follows
+    # from the product of the roots.
     total = momentum + jnp.where(momentum < 0, -root, root)
     still = total == 0
     slow = jnp.where(still, 0.0, 2 * mgl / jnp.where(still, 1.0, total))
@@ -281,10 +283,13 @@ def initial_state(
         too_slow = _TOO_SLOW.format(spin_name)
         findings.require(~jnp.isnan(rate), RESULTS.invalid_state, too_slow, spin)
         findings.require(~jnp.isinf(rate), RESULTS.invalid_state, _LEVEL, theta)
+        # A rate that does not exist is NaN, which must not reach the derivatives of
+        # other lanes.
         rate = harmless(findings.ok, rate)
     angles = jnp.stack([phi, theta, psi])
     omega = euler_rates_to_omega(angles, jnp.stack([rate, theta_dot, spin]))
     if psi_dot is None:
+        # Only the third component depends on psi', for which omega3 was passed above.
         omega = omega.at[2].set(spin)
     return findings.guard(State(from_euler(angles), omega), throw)
 

@@ -106,6 +106,7 @@ class SymmetricTop(Readable):
         >>> print(jax.vmap(jr.top.sleeping_spin)(tops(jnp.array([1.0, -1.0]))))
         [ 4. nan]
         """
+        # equinox forbids a second constructor and assignments outside of the first.
         top = object.__new__(cls)
         values = shaped(I1=(I1,), I3=(I3,), mgl=(mgl,))
         for name, value in zip(("I1", "I3", "mgl"), values, strict=True):
@@ -160,6 +161,7 @@ class SymmetricTop(Readable):
         )
         findings = Findings()
         _require_symmetry(findings, mass, inertia, lever, gravity)
+        # The two may differ within the tolerance.
         transverse = 0.5 * (inertia[0, 0] + inertia[1, 1])
         transverse, axial, mass, length, pull = harmless(
             findings.ok, (transverse, inertia[2, 2], mass, lever[2], gravity[2])
@@ -177,6 +179,8 @@ class SymmetricTop(Readable):
         [1.  1.  0.5] [0. 0. 2.]
         """
         lever = jnp.pad(self.mgl[None], (2, 0))
+        # The motion depends on the product mgl alone, which is the lever at unit mass
+        # and gravity.
         gravity = UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
         return RigidBody(jnp.stack([self.I1, self.I1, self.I3]), gravity)
 
@@ -203,6 +207,8 @@ def _require_symmetry(
     """Note whether the body is symmetric about axis 3, and lever and gravity fit it."""
     (a, d, e), (_, b, f), (_, _, c) = inertia
     tolerance = jnp.sqrt(jnp.finfo(mass.dtype).eps)
+    # The moments of the top are about the fixed point, so that m l^2 is part of their
+    # size.
     size = jnp.maximum(a + b + c, mass * lever[2] ** 2)
     uneven = jnp.stack([a - b, d, e, f])
     symmetric = jnp.max(jnp.abs(uneven)) <= tolerance * size
