@@ -110,11 +110,11 @@ def simulate(
             below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). To this end the
             error of a step is at most half of rtol, and less in long runs or for a
             method of lower order. Where derivatives are taken, steps are shorter and
-            values more accurate. The fastest part of the motion determines phi: for a
-            body in flight that turns slowly, or not at all, it is the angle of the
-            orbit. Errors of position and velocity are relative to their initial
-            magnitudes, or, if these are zero, to those that they reach in the run or in
-            a radian.
+            values more accurate, except by implicit solvers. The fastest part of the
+            motion determines phi: for a body in flight that turns slowly, or not at
+            all, it is the angle of the orbit. Errors of position and velocity are
+            relative to their initial magnitudes, or, if these are zero, to those that
+            they reach in the run or in a radian.
         atol: The same for components near zero, as a fraction of the scale of their
             variable (the initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`,

@@ -217,7 +217,7 @@ class Leaf(eqx.Module):
         shape: Without the axes of the grid.
         dtype: Its numpy dtype.
         fill: Value of points that are not known: NaN; for codes `undefined`, for
-            integers the least one.
+            integers the least one, for unsigned ones the largest.
         codes: Names of the codes in their order, if it holds codes.
     """
 

@@ -137,7 +137,7 @@ def direction(name: str, *shape: int | None, optional: bool = False) -> dict[str
         if value is None and optional:
             return None
         vectors = array_of_shape(name, value, *shape)
-        lengths = jnp.vectorize(safe_norm, signature="(n)->()")(vectors)[..., None]
+        lengths = safe_norm(vectors)[..., None]
         # A zero vector stays zero and not NaN, so that an error can show it.
         return vectors / jnp.where(lengths > 0, lengths, 1.0)
 
