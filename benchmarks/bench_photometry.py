@@ -71,7 +71,8 @@ def observations():
 def exact(scene, omega):
     """The curve by the exact motion."""
     state = jr.State(ATTITUDE, omega)
-    return ph.light_curve(MOMENTS, state, *scene, SHAPE)
+    ts, sun, observer = scene
+    return ph.light_curve(MOMENTS, state, ts, sun, observer, SHAPE)
 
 
 @jax.jit

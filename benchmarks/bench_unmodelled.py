@@ -194,7 +194,11 @@ def main():
     text = "\n\n".join([*explained, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
     common.report(
-        "unmodelled", "A hundred trials with what no model has", text, packages, given.write
+        "unmodelled",
+        "A hundred trials with what no model has",
+        text,
+        packages,
+        given.write,
     )
 
 
