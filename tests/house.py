@@ -110,6 +110,26 @@ def reading(root=ROOT):
     }
 
 
+def public_modules():
+    """Public modules by their names."""
+    return {
+        name: module
+        for name, module in sorted(vars(jrigid).items())
+        if inspect.ismodule(module) and hasattr(module, "__all__")
+    }
+
+
+def public_objects(module):
+    """(name, object) of everything public in a module, and of what its classes add."""
+    for name in module.__all__:
+        value = getattr(module, name)
+        yield name, value
+        if inspect.isclass(value):
+            for key, member in vars(value).items():
+                if not key.startswith("_"):
+                    yield f"{name}.{key}", inspect.unwrap(member)
+
+
 def with_throw():
     """Public functions, constructors and methods that take `throw`."""
     parts = inspect.getmembers(jrigid, inspect.ismodule)

@@ -6,9 +6,8 @@ import json
 import re
 from pathlib import Path
 
+import house
 import pytest
-
-import jrigid
 
 ROOT = Path(__file__).parents[1]
 GLOSSARY = ROOT / "docs" / "contributing" / "glossary.md"
@@ -80,17 +79,6 @@ def found_in(text):
     ]
 
 
-def public_objects(module):
-    """(name, object) of everything public in a module, and of what its classes add."""
-    for name in module.__all__:
-        value = getattr(module, name)
-        yield name, value
-        if inspect.isclass(value):
-            for key, member in vars(value).items():
-                if not key.startswith("_"):
-                    yield f"{name}.{key}", inspect.unwrap(member)
-
-
 def parameters_of(value):
     """Names of the parameters of a function or a class."""
     try:
@@ -99,11 +87,7 @@ def parameters_of(value):
         return []
 
 
-MODULES = {
-    name: module
-    for name, module in sorted(vars(jrigid).items())
-    if inspect.ismodule(module) and hasattr(module, "__all__")
-}
+MODULES = house.public_modules()
 PAGES = [
     ROOT / "README.md",
     *(x for x in sorted((ROOT / "docs").rglob("*.md")) if x != GLOSSARY),
@@ -128,7 +112,7 @@ def test_every_retired_word_is_searched_for_or_known_to_be_ordinary():
 
 @pytest.mark.parametrize("name", MODULES)
 def test_public_names_hold_no_retired_word(name):
-    for label, value in public_objects(MODULES[name]):
+    for label, value in house.public_objects(MODULES[name]):
         for identifier in [*label.split("."), *parameters_of(value)]:
             words = identifier.lower().split("_")
             assert not RETIRED_IN_NAMES & set(words), (label, identifier)
@@ -138,7 +122,9 @@ def test_public_names_hold_no_retired_word(name):
 @pytest.mark.parametrize("name", MODULES)
 def test_docstrings_hold_no_retired_word(name):
     module = MODULES[name]
-    texts = {label: inspect.getdoc(x) or "" for label, x in public_objects(module)}
+    texts = {
+        label: inspect.getdoc(x) or "" for label, x in house.public_objects(module)
+    }
     texts["module"] = module.__doc__ or ""
     assert not {k: found_in(text) for k, text in texts.items() if found_in(text)}
 

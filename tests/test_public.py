@@ -5,17 +5,12 @@ import pydoc
 import re
 import types
 
+import house
 import pytest
 
 import jrigid as jr
 
-MODULES = [
-    x
-    for name, x in vars(jr).items()
-    if inspect.ismodule(x)
-    and x.__name__ == f"jrigid.{name}"
-    and not name.startswith("_")
-]
+MODULES = list(house.public_modules().values())
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
@@ -30,30 +25,18 @@ def test_dir_help_and_star_import_show_the_modules_own_names(module):
     assert first in pydoc.plain(pydoc.render_doc(module))
 
 
-def _documented():
-    """Public classes and functions, and public methods of the classes."""
-    for module in MODULES:
-        for name in module.__all__:
-            value = getattr(module, name)
-            if isinstance(value, type):
-                methods = vars(value).values()
-                yield from (x for x in methods if isinstance(x, types.FunctionType))
-            if isinstance(value, type | types.FunctionType):
-                yield value
-
-
-def _words_of_examples_and_results():
-    """Words in the examples of all docstrings, and in what functions return."""
+def _words_of_examples_and_results(objects):
+    """Words in the examples of docstrings, and in what functions return."""
     lines = [
         line
-        for value in _documented()
+        for value in objects
         for line in (value.__doc__ or "").splitlines()
         if line.strip().startswith((">>>", "..."))
     ]
     results = [
         str(inspect.signature(value).return_annotation)
-        for value in _documented()
-        if isinstance(value, types.FunctionType)
+        for value in objects
+        if inspect.isfunction(value)
     ]
     return set(re.findall(r"\w+", " ".join([*lines, *results])))
 
@@ -63,13 +46,15 @@ def test_every_public_class_and_function_has_an_example_that_runs():
 
     The examples are run by `make doctest`.
     """
-    known = _words_of_examples_and_results()
+    objects = [pair for module in MODULES for pair in house.public_objects(module)]
+    known = _words_of_examples_and_results([value for _, value in objects])
     without = {
-        x.__name__
-        for x in _documented()
-        if "." not in x.__qualname__
-        and ">>>" not in (x.__doc__ or "")
-        and x.__name__ not in known
+        name
+        for name, value in objects
+        if "." not in name
+        and isinstance(value, type | types.FunctionType)
+        and ">>>" not in (value.__doc__ or "")
+        and name not in known
     }
     assert not without, f"no example (`>>>`) in the docstring of {sorted(without)}"
 
