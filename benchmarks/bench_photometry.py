@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _scan
+from jrigid.photometry._orbit import SPEED_OF_LIGHT
 
 HOUR, YEAR, AU = 3600.0, 365.25 * 86400, 149597870700.0
 EPOCHS = 1200
@@ -39,7 +40,6 @@ SIMULATE = "`simulate`, rtol 1e-10"
 SCIPY = "DOP853 of scipy, rtol 1e-11"
 ATTITUDE = jnp.array([1.0, 0.0, 0.0, 0.0])
 OMEGA = ph.omega_from_periods(MOMENTS, 27.38 * HOUR, 263 * HOUR)
-LIGHT = 299792458.0  # m/s
 
 
 class Scene(NamedTuple):
@@ -52,7 +52,7 @@ class Scene(NamedTuple):
     @property
     def emitted(self):
         """Times at which the light left the body [s]."""
-        return self.ts - jnp.linalg.norm(self.observer, axis=1) / LIGHT
+        return self.ts - jnp.linalg.norm(self.observer, axis=1) / SPEED_OF_LIGHT
 
 
 def observations():

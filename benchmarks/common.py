@@ -92,9 +92,10 @@ def report(
         file = "-".join([name, *options.split()[-1:]])
         path = pathlib.Path(__file__).parent / "results" / f"{file}.md"
         path.parent.mkdir(exist_ok=True)
-        command = " ".join([f"`python benchmarks/bench_{name}.py", options, "--write`"])
-        command = command.replace("  ", " ")
-        path.write_text(f"# {title}\n\n{command} on {machine(packages)}.\n\n{text}\n")
+        script = f"benchmarks/bench_{name}.py"
+        command = " ".join(["python", script, *options.split(), "--write"])
+        where = machine(packages)
+        path.write_text(f"# {title}\n\n`{command}` on {where}.\n\n{text}\n")
 
 
 def report_by_jax(

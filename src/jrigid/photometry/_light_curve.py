@@ -13,10 +13,9 @@ from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.photometry._ellipsoid import Ellipsoid
 from jrigid.photometry._facets import Facets, as_unit
+from jrigid.photometry._orbit import SPEED_OF_LIGHT
 from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
 from jrigid.rotation import rotate_inverse
-
-SPEED_OF_LIGHT = 299792458.0  # m/s
 
 
 def brightness(
