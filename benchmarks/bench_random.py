@@ -23,13 +23,14 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests"))
 import worlds  # pyright: ignore[reportMissingImports]
 
 BLIND = jr.RigidBody(np.ones(3))
-TOGETHER = 100  # records fitted side by side
+TOGETHER = 500  # records fitted side by side
 FIVE = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
 MOST = 53.0
+BANDS = (5, 20), (20, 100), (100, 500), (500, 3001)  # of samples
 
 
 def rows_of(seeds):
-    """Status, squares of five numbers over their errors, ratios, samples."""
+    """Status, chi-square of five numbers, ratios off by how many errors, samples."""
     records = [worlds.random_record(np.random.default_rng([7, seed])) for seed in seeds]
     tensors = np.stack([3 * x.tensor / np.trace(x.tensor) for x in records])
     readings = [identify.Rates(x.ts, x.readings, x.sigma) for x in records]
@@ -54,51 +55,51 @@ def rows_of(seeds):
     )
 
 
-if __name__ == "__main__":
+def summary(rows, seconds):
+    """Text about records: the verdicts, and how far the bodies that are OK are off."""
+    names = {int(getattr(Status, x)): x for x in dir(Status) if x.isupper()}
+    counts = collections.Counter(names[int(code)] for code in rows[:, 0])
+    kinds = ", ".join(f"{count} {name}" for name, count in counts.most_common())
+    ok = rows[:, 0] == int(Status.OK)
+    off = (rows[:, 1] > MOST) | (rows[:, 2] > 6)
+    wrong = ", ".join(str(x) for x in np.flatnonzero(ok & off)) or "none"
+    heads = ["samples", "records", "OK", "of which wrong"]
+    for name in ("chi-square of 5", "ratios / error"):
+        heads += [f"{name}, {x}" for x in ("median", "99 %", "largest")]
+    lines = []
+    for least, beyond in BANDS:
+        inside = (rows[:, 3] >= least) & (rows[:, 3] < beyond)
+        if not np.any(inside & ok):
+            continue
+        cells = [f"{least} to {beyond - 1}"]
+        cells += [int(np.sum(x)) for x in (inside, inside & ok, inside & ok & off)]
+        for column in (1, 2):
+            values = rows[inside & ok, column]
+            cells += [float(np.quantile(values, q)) for q in (0.5, 0.99, 1.0)]
+        lines.append(cells)
+    return (
+        f"{len(rows)} records: {kinds}. OK and wrong, by seed: {wrong}.\n\n"
+        f"{common.table(heads, lines)}\n\n"
+        "Of five numbers within their errors the median is 4.4, and 99 % are below "
+        f"15.1. {seconds / len(rows) * 1e3:.0f} ms a record, all told."
+    )
+
+
+def main():
+    """Fit the records in parts, and report after each of them."""
     parser = common.arguments(__doc__)
     parser.add_argument("--records", type=int, default=100)
     options = parser.parse_args()
     start = time.perf_counter()
-    seeds = np.arange(options.records)
-    parts = np.array_split(seeds, -(-len(seeds) // TOGETHER))
-    rows = np.concatenate([rows_of(x) for x in parts])
-    names = {int(getattr(Status, x)): x for x in dir(Status) if x.isupper()}
-    counts = collections.Counter(names[int(code)] for code in rows[:, 0])
-    ok = rows[:, 0] == int(Status.OK)
-    off = (rows[:, 1] > MOST) | (rows[:, 2] > 6)
-    bands = [(5, 20), (20, 100), (100, 500), (500, 3001)]
-    inside = [(rows[:, 3] >= a) & (rows[:, 3] < b) for a, b in bands]
-    lines = [
-        (
-            f"{a} to {b - 1}",
-            int(x.sum()),
-            int((x & ok).sum()),
-            int((x & ok & off).sum()),
-            *(
-                float(np.quantile(rows[x & ok, k], q))
-                for k in (1, 2)
-                for q in (0.5, 0.99, 1.0)
-            ),
-        )
-        for (a, b), x in zip(bands, inside, strict=True)
-        if (x & ok).any()
-    ]
-    kinds = ", ".join(f"{count} {name}" for name, count in counts.most_common())
-    wrong = ", ".join(str(x) for x in np.flatnonzero(ok & off)) or "none"
-    heads = "samples", "records", "OK", "of which wrong"
-    heads += tuple(
-        f"{x}, {q}"
-        for x in ("chi-square of 5", "ratios / error")
-        for q in ("median", "99 %", "largest")
-    )
-    text = f"{len(rows)} records: {kinds}. OK and wrong, by seed: {wrong}.\n\n"
-    text += common.table(heads, lines)
-    text += (
-        "\n\nOf five numbers within their errors the median is 4.4, and 99 % are below "
-        "15.1. "
-    )
-    text += (
-        f"{(time.perf_counter() - start) / len(rows) * 1e3:.0f} ms a record, all told."
-    )
-    packages = "jax", "diffrax", "numpy", "scipy"
-    common.report("random", "Random records", text, packages, options.write)
+    rows = np.zeros((0, 4))
+    # An interrupted run has reported what it has done.
+    for first in range(0, options.records, TOGETHER):
+        seeds = range(first, min(first + TOGETHER, options.records))
+        rows = np.concatenate([rows, rows_of(seeds)])
+        text = summary(rows, time.perf_counter() - start)
+        packages = "jax", "diffrax", "numpy", "scipy"
+        common.report("random", "Random records", text, packages, options.write)
+
+
+if __name__ == "__main__":
+    main()

@@ -27,7 +27,13 @@ from jrigid.identify._flow import needs_attitude
 from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor, as_tensor
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
-from jrigid.identify._minimise import FIRST_DAMPING, STEPS, Minimum, Settings
+from jrigid.identify._minimise import (
+    FIRST_DAMPING,
+    FIRST_GROWTH,
+    STEPS,
+    Minimum,
+    Settings,
+)
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.identify._result import FitResult, result_of
@@ -420,6 +426,7 @@ def _profile_settings(result: FitResult) -> Settings:
         enough=(ACCURACY * result.diagnostics.inflation).astype(dtype),
         steps=np.asarray(STEPS),
         damping=FIRST_DAMPING * one,
+        growth=FIRST_GROWTH * one,
     )
 
 

@@ -31,11 +31,10 @@ from jrigid.identify._smoother import (
 )
 from jrigid.identify._unknowns import Unknowns
 
-# The most steps of one call. It must suffice for a stage, which may end elsewhere in a
-# bent valley if it is cut in two.
-STEPS = 400
+STEPS = 400  # the most of one call
 # As Madsen, Nielsen & Tingleff (2004), section 3.2, recommend for rough initial values.
 FIRST_DAMPING = 1e-3
+FIRST_GROWTH = 2.0  # by Nielsen's rule
 _LEAST_DAMPING = 1e-12
 # A search has converged only where it takes nearly undamped steps, and is given up
 # where steps fail even with this much damping.
@@ -63,6 +62,7 @@ class Settings(NamedTuple):
         enough: Gain in the sum of squares below which no step is taken.
         steps: The largest number of steps.
         damping: Damping of the first step.
+        growth: Factor of the damping if the first step fails.
     """
 
     kept: AnyArray
@@ -74,6 +74,7 @@ class Settings(NamedTuple):
     enough: AnyArray
     steps: AnyArray
     damping: AnyArray
+    growth: AnyArray
 
 
 class Minimum(NamedTuple):
@@ -91,6 +92,7 @@ class Minimum(NamedTuple):
         steps: How many steps were taken.
         history: `square` after each step, NaN beyond the last.
         damping: Damping of the next step.
+        growth: Factor of the damping if the next step fails.
         tensor: The inertia.
         units: Natural units of the numbers.
     """
@@ -105,6 +107,7 @@ class Minimum(NamedTuple):
     steps: AnyArray
     history: AnyArray
     damping: AnyArray
+    growth: AnyArray
     tensor: AnyArray
     units: AnyArray
 
@@ -258,14 +261,15 @@ def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array
 
     Nielsen's rule: the damping falls the more, the better the gain was predicted, and
     grows ever faster while steps fail. The first evaluation has nothing to be compared
-    with.
+    with, so that it changes neither.
     """
     first = jnp.isinf(loop.best.cost)
     gain = jnp.where(first | ~(loop.gain > 0), 1.0, loop.gain)
     ratio = jnp.where(first, 0.5, (loop.best.cost - cost) / gain)
     factor = jnp.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0)
     damping = loop.damping * jnp.where(better, factor, loop.growth)
-    growth = jnp.where(better, 2.0, 2 * loop.growth)
+    growth = jnp.where(better, FIRST_GROWTH, 2 * loop.growth)
+    growth = jnp.where(first & better, loop.growth, growth)
     return jnp.maximum(damping, _LEAST_DAMPING), growth
 
 
@@ -331,7 +335,7 @@ def _initial_loop(problem: Problem, point: Point, settings: Settings) -> _Loop:
         move=Move(jnp.zeros_like(point.numbers), jnp.zeros_like(point.own), still),
         gain=one,
         damping=settings.damping,
-        growth=2 * one,
+        growth=settings.growth,
         going=settings.steps > 0,
         settled=jnp.asarray(False),
         steps=jnp.asarray(0),
@@ -397,6 +401,7 @@ def _minimum(problem: Problem, loop: _Loop) -> Minimum:
         steps=loop.steps,
         history=loop.history,
         damping=loop.damping,
+        growth=loop.growth,
         tensor=problem.unknowns.inertia(best.point.numbers),
         units=problem.unknowns.natural_units(best.point.numbers),
     )

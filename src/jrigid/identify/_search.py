@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -22,7 +23,7 @@ from jrigid.identify._errors import Weakest, first_level, weakest
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
-    STEPS,
+    FIRST_GROWTH,
     Minimum,
     Settings,
     minimise,
@@ -53,7 +54,13 @@ _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
-LANES = 8  # records of one compiled call, where there are several
+_LANES = 8  # the most records of one compiled call, where there are several
+# Samples of all lanes together. On a CPU lanes only share the overhead of a call, which
+# is small for longer records: there each call takes one, as `fit` does.
+_SAMPLES = 512
+# Steps of one call. A call lasts until its slowest lane has ended, so that a record
+# which needs hundreds of steps makes others wait; but most stages end in one call.
+_IN_A_CALL = 32
 # Stages in which an unmodelled torque is sought, white and then of any form.
 _LEVELS = 12
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
@@ -290,6 +297,7 @@ def _settings(
         enough=np.asarray(stage.enough, dtype),
         steps=np.asarray(stage.steps),
         damping=np.asarray(FIRST_DAMPING, dtype),
+        growth=np.asarray(FIRST_GROWTH, dtype),
     )
 
 
@@ -350,7 +358,7 @@ class _Torque:
 
 
 def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.ndarray]]:
-    """Minimise in calls of `STEPS` steps.
+    """Minimise in calls of a few steps each, which end where a single call would.
 
     Returns:
         The minimum, and the sum of squares after each step.
@@ -358,16 +366,19 @@ def _stage(request: Request) -> Generator[Request, Minimum, tuple[Minimum, np.nd
     settings = request.settings
     allowed = int(settings.steps)
     histories = []
+    repeated = 0
     while True:
-        steps = np.asarray(min(allowed, STEPS))
+        # A call begins with an evaluation of the point where the last one ended.
+        steps = np.asarray(min(repeated + allowed, _IN_A_CALL))
         minimum = yield request._replace(settings=settings._replace(steps=steps))
         taken = int(minimum.steps)
-        histories.append(minimum.history[:taken])
-        allowed -= taken
+        histories.append(minimum.history[repeated:taken])
+        allowed -= taken - repeated
         if bool(minimum.settled) or taken < steps or not allowed:
             return minimum, np.concatenate(histories)
         request = request._replace(point=minimum.point)
-        settings = settings._replace(damping=minimum.damping)
+        settings = settings._replace(damping=minimum.damping, growth=minimum.growth)
+        repeated = 1
 
 
 def _progress(stage: Stage, fit: Fit) -> str:
@@ -433,6 +444,7 @@ def no_search(case: Case) -> Search:
         enough=one,
         steps=np.asarray(0),
         damping=one,
+        growth=one,
     )
     minimum = yield Request(case.problem, case.final, case.point, settings)
     return Fit(
@@ -525,33 +537,44 @@ def _error_by_probe(
 def run(searches: Iterable[Search]) -> list[Fit]:
     """Carry out a search, or many side by side: their requests share compiled calls."""
     searches = list(searches)
-    lanes = 1 if len(searches) == 1 else LANES
+    several = len(searches) > 1
     fits: list[Any] = [None] * len(searches)
-    answers: dict[int, Any] = dict.fromkeys(range(len(searches)))
-    while answers:
-        requests = {}
-        for index, answer in answers.items():
-            try:
-                requests[index] = searches[index].send(answer)
-            except StopIteration as end:
-                fits[index] = end.value
-        answers = {}
-        for group in _alike(requests):
-            for first in range(0, len(group), lanes):
-                part = group[first : first + lanes]
-                results = minima([requests[i] for i in part], lanes)
-                answers |= dict(zip(part, results, strict=True))
+    # What can be answered in one call, by shapes: requests by the index of the search.
+    waiting: dict[Any, dict[int, Request]] = {}
+
+    def go_on(index: int, answer: Minimum | None) -> None:
+        try:
+            request = searches[index].send(answer)
+        except StopIteration as end:
+            fits[index] = end.value
+        else:
+            waiting.setdefault(_shapes(request), {})[index] = request
+
+    for index in range(len(searches)):
+        go_on(index, None)
+    while any(waiting.values()):
+        # Lanes cost time whether they are used or not, so that the fullest call is
+        # next: a few requests wait until other searches ask for the same shapes.
+        requests = max(waiting.values(), key=len)
+        lanes = _lanes(next(iter(requests.values()))) if several else 1
+        indices = list(requests)[:lanes]
+        together = [requests.pop(i) for i in indices]
+        for index, minimum in zip(indices, minima(together, lanes), strict=True):
+            go_on(index, minimum)
     return fits
 
 
-def _alike(requests: dict[int, Request]) -> Iterable[Sequence[int]]:
-    """Requests that one compiled call can answer: of the same shapes."""
-    groups: dict[Any, list[int]] = {}
-    for index, request in requests.items():
-        leaves, tree = jtu.tree_flatten(request)
-        key = tree, tuple(np.shape(x) for x in leaves)
-        groups.setdefault(key, []).append(index)
-    return groups.values()
+def _lanes(request: Request) -> int:
+    """How many requests one call answers."""
+    if jax.default_backend() != "cpu":
+        return _LANES
+    return int(np.clip(_SAMPLES // request.problem.samples.ts.size, 1, _LANES))
+
+
+def _shapes(request: Request) -> Any:
+    """Equal for requests that one compiled call can answer."""
+    leaves, tree = jtu.tree_flatten(request)
+    return tree, tuple(np.shape(x) for x in leaves)
 
 
 def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
