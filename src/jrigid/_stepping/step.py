@@ -230,11 +230,12 @@ def equal_steps(
     t: Float[Array, ""],
     h: Float[Array, ""],
     y: Array,
-    count: int = 1,
+    count: int | Array = 1,
 ) -> Float[Array, " n"]:
-    """The state after a fixed number of equal steps, without an error estimate.
+    """The state after a number of equal steps, without an error estimate.
 
-    All loops have a known length, so JAX differentiates them as scans.
+    A number that is no array gives loops of known length, which JAX differentiates as
+    scans.
 
     Args:
         method: The method.
@@ -244,7 +245,7 @@ def equal_steps(
         y: The state at the start.
         count: Number of steps.
 
-    Gradients: in every mode, of every order.
+    Gradients: in every mode, of every order; forward alone where `count` is an array.
     """
     # Only the error estimate needs the rate of the last stage, at the end of a step.
     needed = method.stages - 1
@@ -253,7 +254,7 @@ def equal_steps(
         start = t + i.astype(h.dtype) * h
         return _loop(method, field, (start, h, y), needed, True, True)[1]
 
-    if count == 1:
+    if isinstance(count, int) and count == 1:
         return step(jnp.zeros((), int), y)
     return jax.lax.fori_loop(0, count, step, y)
 

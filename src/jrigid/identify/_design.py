@@ -308,6 +308,7 @@ def _minimum_at(
         steps=jnp.asarray(0),
         history=zero[None],
         damping=zero,
+        growth=zero,
         tensor=problem.unknowns.inertia(point.numbers),
         units=problem.unknowns.natural_units(point.numbers),
     )

@@ -46,6 +46,9 @@ class Diagnostics(eqx.Module):
         history: Sum of squares of residuals after each step, NaN beyond the last.
         pure_spin: Whether constant rates describe a gyro's record as well.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
+        integration_error: Largest error of the motion over a segment of the record, in
+            units of what is allowed. It is 0 where the motion is exact or `simulate`
+            integrates it.
         input_result: `jrigid.RESULTS` of the input.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -76,4 +79,5 @@ class Diagnostics(eqx.Module):
     history: Float[Array, " steps"]
     pure_spin: Bool[Array, ""]
     ambiguous: Bool[Array, ""]
+    integration_error: Scalar
     input_result: Any

@@ -21,6 +21,7 @@ from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples
+from jrigid.identify._resolution import UNRESOLVED, integration_error
 from jrigid.identify._result import (
     LARGEST_ERROR,
     Status,
@@ -431,9 +432,13 @@ def conclude(
     fields |= _fields_of_precision(problem, fit, known, judgement)
     fields |= _fields_of_record(problem, fit, lengths)
     fields["log_determinant"] = np.asarray(independent.log_determinant)
+    at_end = problem, fit.layout, fit.minimum.point
+    fields["integration_error"] = np.asarray(integration_error(*at_end))
     good = is_good(input_result)
     fields = _of_dtype(fields, good, fit.minimum.units.dtype)
     status = _status(judgement.status, good, derived, of_torque)
+    if good and fields["integration_error"] > UNRESOLVED:
+        status = "NOT_CONVERGED"
     return fields | {"status": getattr(Status, status), "input_result": input_result}
 
 

@@ -1,6 +1,7 @@
 """fit(): estimates of inertia and other parameters from observations."""
 
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -53,6 +54,7 @@ from jrigid.identify._records import (
     samples_of,
     tells,
 )
+from jrigid.identify._resolution import is_resolved
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
 from jrigid.identify._search import Case, Effort, Line, Starts, no_search, run, search
 from jrigid.identify._smoother import Point
@@ -64,6 +66,7 @@ from jrigid.systems import RigidBody
 # The exact flow holds over any length, and 3 is below half a turn. A forced segment is
 # a single Runge-Kutta step.
 _LENGTHS = {True: 3.0, False: 0.75}
+_STEPS = (4, 16, 64)  # of a segment, where one is too long for a torque
 # After so many turns the valley of the minimum is so narrow that probes go slowly, too.
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
@@ -579,23 +582,23 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         attitude0 = state.attitude.astype(dtype)
     observed = _observed(records, state, attitude0)
     input_result = _judged(task, records, observed, throw)
-    # An unmodelled torque may act between any two samples, so that each has a node.
-    length = 0.0 if options.dense else _LENGTHS[options.free_motion]
-    if options.shooting and observed.readings is not None:
-        count = observed.readings.ts.shape[1]
-        options = options._replace(nodes=segments_needed(observed.angle, count, length))
-    unknowns = _unknowns(task, records, observed)
-    opening = _opening(unknowns, observed, tensor, state, options, length)
-    # A probe holds a direction; here none is held, by a line of the same structure.
-    line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
-    unknowns = opening.unknowns.holding(line)
+    given = _unknowns(task, records, observed)
+    for division, length in _divisions(options, observed):
+        options = division
+        opening = _opening(given, observed, tensor, state, options, length)
+        # A probe holds a direction; here none is held, by a line of the same structure.
+        line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
+        unknowns = opening.unknowns.holding(line)
+        problem = Problem(options, unknowns, observed.samples, observed.noise)
+        if is_resolved(problem, opening.cut, opening.point):
+            break
     tensor = opening.tensor
     if options.dense:
         # A level is sought, in proportion to the tensor.
         numbers = np.stack([opening.starts[0]] * 2)
         tensor = np.asarray(tensors_at(unknowns, numbers))[0]
     case = Case(
-        problem=Problem(options, unknowns, observed.samples, observed.noise),
+        problem=problem,
         single=opening.single,
         cut=opening.cut,
         point=opening.point,
@@ -607,6 +610,30 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         effort=effort,
     )
     return case, input_result
+
+
+def _divisions(
+    options: Options, observed: _Observed
+) -> Iterator[tuple[Options, float]]:
+    """Ever finer divisions of a record into segments, and their lengths [rad].
+
+    A torque may change faster than the body turns. Then segments become shorter in
+    time, as long as they hold two samples, and are passed in several steps.
+    """
+    # An unmodelled torque may act between any two samples, so that each has a node.
+    length = 0.0 if options.dense else _LENGTHS[options.free_motion]
+    if not options.shooting or observed.readings is None:
+        yield options, length
+        return
+    count = observed.readings.ts.shape[1]
+    nodes = segments_needed(observed.angle, count, length)
+    yield options._replace(nodes=nodes), length
+    most = segments_needed(math.inf, count, length)
+    while nodes < most:
+        nodes = min(4 * nodes, most)
+        yield options._replace(nodes=nodes), 0.0
+    for steps in _STEPS:
+        yield options._replace(nodes=nodes, steps=steps), 0.0
 
 
 def _judged(

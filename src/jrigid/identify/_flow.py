@@ -120,11 +120,12 @@ def forced_flow(
     t1: Array,
     depends_on_attitude: bool,
     method: Method = ONE_STEP,
-    steps: int = 1,
+    steps: int | Array = 1,
 ) -> State:
     """State at t1, before or after t0, by equal steps without an error estimate.
 
-    The default is one step, which suffices for a part of a turn. If nothing depends on
+    The default is one step, which suffices for a part of a turn where the torque
+    changes no faster than the body turns. If nothing depends on
     the attitude, the attitude stays as it is.
 
     Args:
@@ -136,7 +137,7 @@ def forced_flow(
         method: Runge-Kutta method.
         steps: How many steps are made.
 
-    Gradients: in every mode, of every order.
+    Gradients: in every mode, of every order; forward alone where `steps` is an array.
     """
 
     def rates(t: Array, y: Array) -> Array:
@@ -149,7 +150,8 @@ def forced_flow(
     start = state.omega
     if depends_on_attitude:
         start = jnp.concatenate([state.attitude, state.omega])
-    end = equal_steps(method, rates, t0, (t1 - t0) / steps, start, steps)
+    pieces = steps if isinstance(steps, int) else steps.astype(t0.dtype)
+    end = equal_steps(method, rates, t0, (t1 - t0) / pieces, start, steps)
     # Runge-Kutta steps do not keep the norm of a quaternion.
     attitude = normalize(end[:4]) if depends_on_attitude else state.attitude
     return State(attitude, end[-3:])

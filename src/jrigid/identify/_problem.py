@@ -39,6 +39,7 @@ class Options(NamedTuple):
         depends_on_attitude: Whether the torque or a sensor depends on the attitude.
         shooting: Whether each segment has a state of its own, not only each trial.
         nodes: How many nodes a trial has.
+        steps: Runge-Kutta steps from a node to a sample, or to the next node.
         unmodelled: Whether there is a torque without a model: "none", "known" or
             "estimate".
         robust: Whether Cauchy's loss may be used.
@@ -51,6 +52,7 @@ class Options(NamedTuple):
     depends_on_attitude: bool
     shooting: bool = False
     nodes: int = 1
+    steps: int = 1
     unmodelled: str = "none"
     robust: bool = False
     noise_known: bool = True
@@ -132,7 +134,9 @@ def _flow(
     if not options.free_motion:
 
         def flow(state: State, start: Array, end: Array) -> State:
-            return forced_flow(system, state, start, end, options.depends_on_attitude)
+            on_attitude = options.depends_on_attitude
+            steps = options.steps
+            return forced_flow(system, state, start, end, on_attitude, steps=steps)
 
         return jax.vmap(flow)(before, start, end)
     turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(
@@ -444,7 +448,7 @@ def _linearised(
     return Rows(rows, rows_of_border, rows_of_state, node), links
 
 
-def _over_trials(
+def over_trials(
     function: Callable[..., Any], problem: Problem, layout: Layout
 ) -> Callable[..., Any]:
     """A function of a trial's point, leaves, data and changes, over all trials."""
@@ -474,11 +478,11 @@ def rows_at(problem: Problem, layout: Layout) -> Callable[[Point, Array], Array]
         numbers, own = point.numbers, point.own
         return _residuals(problem, numbers, own, move, point, leaves, trial)[0]
 
-    return _over_trials(trial, problem, layout)
+    return over_trials(trial, problem, layout)
 
 
 def evaluation(
     problem: Problem, layout: Layout
 ) -> Callable[[Point], tuple[Rows, Links]]:
     """Rows and links at a point, with derivatives in the border and the states."""
-    return _over_trials(partial(_linearised, problem), problem, layout)
+    return over_trials(partial(_linearised, problem), problem, layout)

@@ -11,6 +11,7 @@ import numpy as np
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
+from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
 from jrigid.identify._sensors import Gyro
 
@@ -32,6 +33,11 @@ def reason(result: FitResult) -> str:
         return (
             "Predictions are not finite at the initial values: `predict` of each sensor "
             "must be finite wherever there is a reading, and `simulate` from `start`."
+        )
+    if result.diagnostics.integration_error > UNRESOLVED:
+        return (
+            "The torque changes too fast for the steps of a fit. Pass its mean over a "
+            "step, or a motion of your own (`motion`, and `start`)."
         )
     if _is_nearly_a_sphere(result):
         return (

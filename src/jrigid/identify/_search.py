@@ -542,7 +542,7 @@ def run(searches: Iterable[Search]) -> list[Fit]:
     # What can be answered in one call, by shapes: requests by the index of the search.
     waiting: dict[Any, dict[int, Request]] = {}
 
-    def go_on(index: int, answer: Minimum | None) -> None:
+    def go_on(index: int, answer: Any) -> None:
         try:
             request = searches[index].send(answer)
         except StopIteration as end:
