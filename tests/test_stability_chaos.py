@@ -621,3 +621,29 @@ def test_float32_follows_the_motion_as_far_as_it_can():
     found = st.megno(body, start, 300.0, 1500)
     assert found.megno.dtype == np.float32
     assert st.ORDER[found.order] == "regular"
+
+
+class _Kick(jr.torques.AbstractTorque):
+    """A torque between two times, which it declares."""
+
+    start: float
+    end: float
+
+    def __call__(self, t, state, args):
+        del state, args
+        third = jnp.array([0.0, 0.0, 1.0])
+        return jnp.where((t > self.start) & (t < self.end), third, 0.0)
+
+    @property
+    def jumps(self):
+        return jnp.array([self.start, self.end])
+
+
+@pytest.mark.parametrize(
+    ("kick", "accurate"), [(_Kick(1.05, 1.07), False), (_Kick(-1.0, 60.0), True)]
+)
+def test_steps_longer_than_a_declared_pulse_are_refused(kick, accurate):
+    """Steps of 0.2 s, which the short pulse falls between."""
+    body = jr.RigidBody(MOMENTS, kick)
+    found = st.megno(body, state(TILTED, SPINNING), 4.0, steps=20, throw=False)
+    assert (found.result == jr.RESULTS.successful) == accurate

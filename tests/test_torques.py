@@ -77,6 +77,102 @@ def test_a_pulse_that_is_shorter_than_a_step_acts(way):
     np.testing.assert_allclose(motion.final_state.omega, expected, atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:simulate.. runs in float32")
+def test_a_pulse_early_in_a_long_run_acts_in_single_precision():
+    """The run is so long that its resolution at the end is coarser than the pulse."""
+    pulse = Pulse(*(np.float32(x) for x in ([0, 0, 20.0], 1.0, 1.02)))
+    body = jr.RigidBody(np.float32([1.0, 2.0, 1.0]), pulse)
+    start = jr.State(np.float32([1, 0, 0, 0]), np.float32([0, 0, 1e-3]))
+    motion = jr.simulate(body, start, np.float32(86400.0))
+    np.testing.assert_allclose(motion.final_state.omega, [0, 0, 0.401], rtol=1e-5)
+
+
+def test_splitting_keeps_its_order_at_a_pulse():
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), Pulse(PUSH, 3.0, 4.0))
+    start = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.5, 0.3, 0.8]))
+    expected = jr.simulate(body, start, 10.0, rtol=1e-12).final_state.omega
+
+    @quick_jit
+    def error(h):
+        solver = jr.solvers.Splitting(4)
+        motion = jr.simulate(body, start, 10.0, solver=solver, max_step=h)
+        return jnp.max(jnp.abs(motion.final_state.omega - expected))
+
+    assert error(0.1) < 1e-7
+    assert 12 < error(0.1) / error(0.05) < 20
+
+
+SWITCHED = 1.0
+
+
+def rising_from_one_second(t, state, args):
+    """Torques about the third axis: one that is switched on, and one that grows."""
+    del state, args
+    third = jnp.array([0.0, 0.0, 1.0])
+    return (jnp.where(t > SWITCHED, 3.0, 0.0) + 0.3 * t) * third
+
+
+@pytest.mark.parametrize(
+    "adjoint", [None, diffrax.ForwardMode(), diffrax.DirectAdjoint()], ids=str
+)
+def test_an_earlier_start_does_not_move_a_switch(adjoint):
+    """The rate at 2 s is w0 + (3 (2 - 1) + 0.15 (2^2 - t0^2)) / I3."""
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), rising_from_one_second)
+    max_steps = None if adjoint is None else 300
+
+    def rate(t0):
+        motion = jr.simulate(
+            body,
+            TURNING,
+            2.0,
+            t0=t0,
+            jumps=np.array([SWITCHED]),
+            adjoint=adjoint,
+            max_steps=max_steps,
+        )
+        return motion.final_state.omega[2]
+
+    derivative = jax.grad if adjoint is None else jax.jacfwd
+    np.testing.assert_allclose(derivative(rate)(0.2), -0.1 * 0.2, rtol=1e-6)
+    if isinstance(adjoint, diffrax.DirectAdjoint):
+        np.testing.assert_allclose(jax.hessian(rate)(0.2), -0.1, rtol=1e-6)
+
+
+def test_the_time_of_an_event_after_a_switch_does_not_move_with_the_start():
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), Pulse(3 * PUSH, SWITCHED, 9.0))
+    event = diffrax.Event(lambda _t, state, _args, **_: state.omega[2] - 0.51)
+
+    def end(t0):
+        return jr.simulate(body, TURNING, 2.0, t0=t0, event=event).final_time
+
+    time, slope = jax.value_and_grad(end)(0.2)
+    np.testing.assert_allclose([time, slope], [1.5, 0.0], atol=1e-7)
+
+
+@pytest.mark.filterwarnings("ignore:simulate.. runs in float32")
+def test_a_torque_of_time_is_not_given_times_that_its_precision_does_not_tell_apart():
+    """Seconds since 1970: neighbouring float32 numbers are 128 s apart."""
+    epoch = np.float64(1.7e9)
+    start = jr.State(np.float32([1, 0, 0, 0]), np.float32([0, 0, 1.0]))
+    moments = np.float32([1.0, 2.0, 3.0])
+
+    def run(torque):
+        body = jr.RigidBody(moments, torque)
+        return jr.simulate(body, start, epoch + np.arange(3.0), t0=epoch, throw=False)
+
+    steady = run(lambda *_: jnp.zeros(3, jnp.float32))
+    assert steady.result == jr.RESULTS.successful
+    pulse = Pulse(*(np.float32(x) for x in (PUSH, 0.0, 1.0)))
+    assert run(pulse).result == jr.RESULTS.unresolved_times
+
+
+def test_samples_in_no_order_and_no_samples_are_refused():
+    with pytest.raises(RuntimeError, match="in order"):
+        tq.Sampled(np.array([0.0, 2.0, 1.0]), np.zeros(3))
+    with pytest.raises(ValueError, match="not be empty"):
+        tq.Sampled(np.zeros(0), np.zeros(0))
+
+
 def test_jumps_are_collected_from_all_parts_of_a_torque_and_a_force():
     table = tq.Sampled(np.array([1.0, 2.0, 4.0]), np.ones((3, 3)), delay=0.5)
     light = tq.SolarPressure(np.ones(1), PUSH[None], PUSH[None], table)

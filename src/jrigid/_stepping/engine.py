@@ -162,13 +162,11 @@ class Engine(NamedTuple):
         """
         if motion.jumps.size == 0:
             return self.field
-        beside = motion.beside[0]
-        padded = jnp.concatenate(
-            [jnp.full_like(motion.jumps[:1], -jnp.inf), motion.jumps]
-        )
-        padded = jnp.append(padded, jnp.inf)
-        low = padded[jump] + beside
-        high = padded[jump + 1] - beside
+        # Before the first jump and after the last one nothing bounds the times.
+        after = jnp.pad(motion.jumps + motion.beside, 1, constant_values=-jnp.inf)
+        before = jnp.pad(motion.jumps - motion.beside, 1, constant_values=jnp.inf)
+        low = after[jump]
+        high = before[jump + 1]
 
         def field(parameters: list[Array], t: Array, y: Array) -> Array:
             return self.field(parameters, jnp.clip(t, low, high), y)

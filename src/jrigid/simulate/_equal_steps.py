@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,22 +29,32 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     solver = options.solver
     motion = given.motion
     limits = motion.limits
-    terms: Any
+
+    def terms_of(t: Array, h: Array) -> Any:
+        """What the solver integrates in a step."""
+        if not isinstance(solver, Splitting):
+            return FreeRotation(system.inertia.astype(motion.y0.dtype))
+
+        def torque(time: ScalarLike, state: BodyState, args: PyTree) -> Vector:
+            if motion.jumps.size:
+                # Kicks at the ends of a step belong to its own side of a jump.
+                beside = jnp.minimum(jnp.max(motion.beside), 0.25 * h)
+                time = jnp.clip(time, t + beside, t + h - beside)
+            return system.torque_on(given.start + time, state, args)
+
+        return solver.terms(RigidBody(system.inertia, torque))
+
     if isinstance(solver, Splitting):
         longest = options.max_step
-
-        def torque(t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
-            return system.torque_on(given.start + t, state, args)
-
-        _check_splitting(torque, limits.end, given.inputs.state0, args)
-        terms = solver.terms(RigidBody(system.inertia, torque))
+        torque = partial(system.torque_on, limits.end)
+        _check_splitting(torque, given.inputs.state0, args)
     else:
-        # Steps are short, so that an event misses no change of sign.
+        # Steps are short, so that an event rarely misses a change of sign.
         longest = jnp.minimum(SMALLEST_BOUND / given.fastest, options.max_step)
-        terms = FreeRotation(system.inertia.astype(motion.y0.dtype))
 
     def advance(t: Array, h: Array, y: Array) -> Array:
         state = given.to_state(y)
+        terms = terms_of(t, h)
         after = solver.step(terms, t, t + h, state, args, None, False)[0]
         return ravel_pytree(after)[0]
 
@@ -55,12 +66,12 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
 
 
 def _check_splitting(
-    torque: Callable[..., Vector], t: Array, state0: BodyState, args: PyTree
+    torque: Callable[..., Vector], state0: BodyState, args: PyTree
 ) -> None:
     """Raise ValueError for a torque that splitting cannot integrate."""
 
     def of_omega(omega: Array) -> Array:
-        return torque(t, dataclasses.replace(state0, omega=omega), args)
+        return torque(dataclasses.replace(state0, omega=omega), args)
 
     if depends_on(of_omega, state0.omega) or jtu.tree_leaves(state0.internal):
         raise ValueError(

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,15 +12,18 @@ from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import RESULTS, AnyBool, Findings, array_of_shape, harmless
 from jrigid._core.third_party import ClosedJaxpr, jaxpr_as_fun
-from jrigid._motion import check_motion, harmless_motion, resolves
+from jrigid._motion import check_motion, depends_on, harmless_motion, resolves
 from jrigid._stepping.control import Limits, largest_steps
+from jrigid._stepping.method import method_of
 from jrigid._stepping.motion import Motion, constant
 from jrigid._stepping.scales import units
+from jrigid._stepping.step import equal_steps
 from jrigid._types import BodyState
 from jrigid.simulate._options import SMALLEST_RTOL, Inputs, Options
 from jrigid.solvers import Splitting
 from jrigid.systems import AbstractSystem
 
+_STEP = method_of(diffrax.Tsit5())
 # One step may commit this fraction of rtol. The fraction is smaller for methods of an
 # order below 8, whose error estimates are as large as their errors.
 _FRACTION = 0.5
@@ -100,11 +104,48 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
     # Compiled code rounds differently in different lanes, which must take equal steps.
     bits = jnp.finfo(fastest.dtype).nexp
     fastest = jax.lax.reduce_precision(fastest, bits, _RATE_BITS)
-    findings.require(resolves(t0, fastest), RESULTS.unresolved_times, value=t0)
+    seen = t0
+    if t0.dtype != start.dtype and _depends_on_time(inputs, start):
+        # Torques are given times in the precision of the state.
+        seen = start
+    findings.require(resolves(seen, fastest), RESULTS.unresolved_times, value=t0)
     limits = limits_of(since_start[-1], fastest, options)
     if options.is_worth_foreseeing:
         require_enough_steps(findings, _can_be_enough(limits, options), limits)
     return findings, limits, scales
+
+
+def with_derivatives_of_start(inputs: Inputs) -> Inputs:
+    """The same motion, from a start that is held, in derivatives, where it is.
+
+    Times of a motion count from its start, so that an earlier start would move all
+    jumps of the torque along, and no derivative sees them move. But a motion that
+    starts at `t0` is also one that passes another state at the time that is held: the
+    state after a step of length zero, whose derivatives in `t0` are those of the
+    motion, up to the order of the method.
+    """
+    held = jax.lax.stop_gradient(inputs.t0)
+    start, to_state = ravel_pytree(inputs.state0)
+
+    def rates(t: Array, y: Array) -> Array:
+        field = inputs.system.vector_field(t, to_state(y), inputs.args)
+        return ravel_pytree(field)[0]
+
+    length = (held - inputs.t0).astype(start.dtype)
+    moved = equal_steps(_STEP, rates, inputs.t0.astype(start.dtype), length, start)
+    # What is wrong with an input is told of the input.
+    moved = jnp.where(jnp.isfinite(moved), moved, start)
+    return inputs._replace(state0=to_state(moved), t0=held)
+
+
+def _depends_on_time(inputs: Inputs, start: Array) -> bool:
+    """Whether a torque or a force is a function of time."""
+
+    def rates(t: Array) -> Array:
+        field = inputs.system.vector_field(t, inputs.state0, inputs.args)
+        return ravel_pytree(field)[0]
+
+    return depends_on(rates, start)
 
 
 def _check_values_of_options(
@@ -178,14 +219,13 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
     field, parameters = opened(rates, times[-1], y0)
     end = jax.lax.stop_gradient(times[-1])
     jumps = jax.lax.stop_gradient(inputs.jumps_since_start)
-    beside = _BESIDE * jnp.finfo(end.dtype).eps * (jnp.abs(start) + end)
     motion = Motion(
         parameters=parameters,
         observed=[],
         y0=y0,
         times=inputs.since_start,
         jumps=jumps,
-        beside=jnp.full_like(jumps, beside),
+        beside=_beside(jumps, jax.lax.stop_gradient(start), end),
         scales=scales,
         limits=limits._replace(
             start_rate=jnp.where(findings.ok, limits.start_rate, 0.0)
@@ -204,6 +244,28 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
         start=start,
         fastest=limits.start_rate,
     )
+
+
+def _beside(jumps: Array, start: Array, end: Array) -> Array:
+    """How far beside each jump the torque is evaluated, so that it is past the jump.
+
+    The times that a torque sees are rounded. Of a jump at time 0 they are not, but 0 is
+    not past it; so a part of the gap between jumps is added, which is the shorter one
+    of those before and after.
+
+    Args:
+        jumps: Times since the start, in order; infinite ones count as none.
+        start: Time of the start.
+        end: Time of the end since the start.
+    """
+    times = jnp.where(jnp.isfinite(jumps), jumps, end)
+    around = jnp.concatenate([jnp.zeros_like(end)[None], times, end[None]])
+    gaps = jnp.abs(jnp.diff(around))
+    gaps = jnp.where(gaps > 0, gaps, jnp.inf)
+    shorter = jnp.minimum(gaps[:-1], gaps[1:])
+    shorter = jnp.where(jnp.isfinite(shorter), shorter, 0.0)
+    eps = jnp.finfo(jumps.dtype).eps
+    return _BESIDE * eps * (jnp.abs(start) + jnp.abs(times) + shorter)
 
 
 def _place_of_omega(state: BodyState) -> int:

@@ -53,6 +53,7 @@ from jrigid.simulate._prepare import (
     opened,
     prepared,
     require_enough_steps,
+    with_derivatives_of_start,
 )
 from jrigid.simulate._through_diffrax import solve_by_diffrax
 from jrigid.simulate._trajectory import Trajectory
@@ -241,6 +242,8 @@ class _Solved(NamedTuple):
 @eqx.filter_jit
 def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     """Prepare, integrate, and convert to a trajectory."""
+    if inputs.jumps.size:
+        inputs = with_derivatives_of_start(inputs)
     given = prepared(inputs, options)
     differentiated = (given.motion, given.parameters, given.times)
     motion, parameters, times = guard_inputs(options.adjoint, differentiated)

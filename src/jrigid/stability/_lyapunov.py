@@ -222,7 +222,7 @@ def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators
     counts = (schedule.intervals * samples).astype(rows.dtype)
     ts = path.step * schedule.steps * counts
     values = (ts, logarithms / ts[:, None], indicator / counts, path.state(y))
-    ts, exponents, means, state = verdict(findings, error, values)
+    ts, exponents, means, state = verdict(findings, path, error, values)
     mean = means[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)

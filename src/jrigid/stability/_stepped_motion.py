@@ -196,12 +196,23 @@ def walk(motion: Motion, steps: int, ok: Array) -> Walk:
     return Walk(motion, duration / steps, scales)
 
 
-def verdict(findings: Findings, error: Array, values: Any) -> Any:
+def _may_miss_a_pulse(path: Walk) -> Array:
+    """Whether two jumps that the torque declares fit into one step."""
+    jumps = path.motion.system.jumps
+    inside = jnp.isfinite(jumps) & (jumps >= path.motion.t0)
+    # What is before the start, or nowhere, is moved to where it makes no short gap.
+    ordered = jnp.sort(jnp.where(inside, jumps, path.motion.t0 - path.step))
+    gaps = jnp.diff(ordered)
+    return jnp.any((gaps > 0) & (gaps < path.step))
+
+
+def verdict(findings: Findings, path: Walk, error: Array, values: Any) -> Any:
     """The values, or NaN where something is wrong.
 
     It notes two more findings: a motion that is inaccurate, and one that is not finite.
     """
-    findings.require(error <= _LARGEST_ERROR[error.dtype.itemsize], RESULTS.inaccurate)
+    accurate = error <= _LARGEST_ERROR[error.dtype.itemsize]
+    findings.require(accurate & ~_may_miss_a_pulse(path), RESULTS.inaccurate)
     findings.require(all_finite(values), RESULTS.nonfinite_state)
     return nan_where(~findings.ok, values)
 

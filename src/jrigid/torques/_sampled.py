@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._checks import check_shape, float_arrays
+from jrigid._checks import check_shape, float_arrays, is_concrete
 from jrigid._types import Readable, ScalarLike
 from jrigid.torques._base import FINITE, POSITIVE, array, refuse_known_parameters
 
@@ -18,6 +19,10 @@ class Sampled(Readable):
     in `Rotor(Sampled(ts, momenta))`. `jrigid.identify.fit` can estimate its scale, its
     delay and its values.
 
+    It is for a quantity that is smooth on the scale of the samples. At a step, or where
+    a short interval follows a long one, a cubic overshoots: a torque that is switched
+    is better a function of time, with `jumps`.
+
     Attributes:
         ts: Times [s] (n,), increasing; the last one may be repeated as padding.
         values: One row for each time (n, ...).
@@ -27,9 +32,13 @@ class Sampled(Readable):
             they measure.
 
     Raises:
-        RuntimeError: The scale is not positive, and known when the object is built.
+        ValueError: There are no samples.
+        RuntimeError: The scale is not positive or times are not in order, and they are
+            known when the object is built.
 
-    Gradients: those of the cubics, in everything; the second derivative in time jumps.
+    Gradients: those of the cubics, in everything. The second derivative in time jumps
+    at the samples, and at the first and the last one the first derivative too: that of
+    a motion in `delay` or `ts` misses this jump, where an end lies within the run.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts, values = jnp.array([0.0, 1.0, 2.0]), jnp.array([[0.0], [1.0], [4.0]])
@@ -48,9 +57,13 @@ class Sampled(Readable):
     )
 
     def __check_init__(self) -> None:
-        """Raise an error for shapes that do not match or a scale that is refused."""
+        """Raise an error for shapes, a scale or an order of times that is refused."""
         refuse_known_parameters(self)
         check_shape("values", self.values, (*self.ts.shape, *self.values.shape[1:]))
+        if self.ts.size == 0:
+            raise ValueError("Argument `ts` must not be empty, but it is.")
+        if is_concrete(self.ts) and np.any(np.diff(np.asarray(self.ts)) < 0):
+            raise RuntimeError("Argument `ts` must be in order, but it is not.")
 
     @property
     def jumps(self) -> Float[Array, " n"]:
