@@ -320,6 +320,23 @@ def test_a_clipped_gyro_whose_limit_is_given_is_ok(rng):
         covers(found, tensor)
 
 
+@pytest.mark.parametrize("turned", [1.0, np.pi])
+def test_attitudes_that_leap_are_left_out_wherever_they_are(rng, turned):
+    """As where markers of a camera are swapped; some leaps begin a segment."""
+    ts = np.arange(120) / 30
+    start = jr.State(np.array([1.0, 0, 0, 0]), np.array([4.0, 6.0, 3.0]))
+    moments = np.array([1.0, 1.12, 1.3])
+    attitudes = np.array(jr.free_rotation(moments, start, ts).states.attitude)
+    leaps = [7, 20, 55, 90]
+    turns = 0.01 * rng.normal(size=(120, 3))
+    turns[leaps] = [0.0, turned, 0.0]
+    seen = jax.vmap(jr.rotation.multiply)(attitudes, jax.vmap(jr.rotation.exp)(turns))
+    found = identify.fit(BLIND, identify.Attitudes(ts, seen, 0.01), loss="robust")
+    assert is_in(found, (Status.OK,)), words(found)
+    assert list(np.flatnonzero(~np.asarray(found.kept)[0])) == leaps
+    covers(found, 3 * np.diag(moments) / np.sum(moments))
+
+
 @pytest.mark.slow  # a program of its own
 def test_robust_does_not_trial_all_away_where_the_model_is_wrong(rng):
     """A torque moves the rates by 65 times the noise."""

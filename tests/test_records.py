@@ -833,6 +833,14 @@ def test_rows_written_twice_and_late():
     )
 
 
+def test_a_table_with_its_newest_row_first_is_reversed():
+    times = np.arange(40) * 0.01
+    clock = jr.records.repair(times[::-1])
+    np.testing.assert_allclose(clock.times, times)
+    np.testing.assert_array_equal(clock.rows, np.arange(40)[::-1])
+    assert clock.notes == ("rows had the newest first, and were reversed",)
+
+
 def test_a_reset_clock_goes_on_after_a_break():
     times = np.concatenate([10 + np.arange(100) * 0.01, np.arange(50) * 0.01])
     clock = jr.records.repair(times)

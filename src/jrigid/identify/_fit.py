@@ -491,7 +491,10 @@ class _Observed(NamedTuple):
 
 
 def _observed(
-    records: tuple[Record, ...], state: State | None, attitude0: np.ndarray | None
+    records: tuple[Record, ...],
+    state: State | None,
+    attitude0: np.ndarray | None,
+    robust: bool,
 ) -> _Observed:
     """Read the records of one fit, whose arrays are numpy's."""
     samples = samples_of(records, np.ones((), records[0].values.dtype))
@@ -499,7 +502,7 @@ def _observed(
     if not records[0].states_noise:
         # Only a single record may leave its noise unstated: see `_task`.
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
-    readings = direct_readings_of(records, samples, attitude0)
+    readings = direct_readings_of(records, samples, attitude0, robust)
     rate = typical_rate(readings, state, samples.ts.dtype)
     angle = 0.0
     coarse = False
@@ -580,7 +583,7 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     attitude0 = None
     if state is not None and options.depends_on_attitude:
         attitude0 = state.attitude.astype(dtype)
-    observed = _observed(records, state, attitude0)
+    observed = _observed(records, state, attitude0, options.robust)
     input_result = _judged(task, records, observed, throw)
     given = _unknowns(task, records, observed)
     for division, length in _divisions(options, observed):

@@ -14,6 +14,9 @@ from jrigid.identify._records import Record, Samples, first_and_last, tells
 from jrigid.identify._sensors import AbstractSensor
 
 MOST_NODES = 2000  # of a trial, where each sample has one
+# An attitude so many times as far from the path of its neighbours as others are from
+# that of theirs is no place to begin a segment.
+_LONE = 8.0
 
 
 class Layout(NamedTuple):
@@ -191,8 +194,31 @@ def _first_series(
     return None
 
 
+def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray:
+    """Which attitudes of a trial leap from the path of those before and after them."""
+    place = np.flatnonzero(valid)
+    t = ts[place]
+    q = attitude[place]
+    if t.size < 5:
+        return np.zeros_like(valid)
+    span = t[2:] - t[:-2]
+    part = (t[1:-1] - t[:-2]) / np.where(span > 0, span, 1.0)
+    turn = log(multiply(conjugate(q[:-2]), q[2:]))
+    path = multiply(q[:-2], exp(part[:, None] * turn))
+    off = np.linalg.norm(log(multiply(conjugate(path), q[1:-1])), axis=1)
+    # A leap also bends the paths at its neighbours, by half as much.
+    around = np.pad(off, 1)
+    largest = (off >= around[:-2]) & (off >= around[2:])
+    result = np.zeros_like(valid)
+    result[place[1:-1]] = largest & (off > _LONE * np.median(off))
+    return result
+
+
 def direct_readings_of(
-    records: tuple[Record, ...], samples: Samples, attitude0: np.ndarray | None
+    records: tuple[Record, ...],
+    samples: Samples,
+    attitude0: np.ndarray | None,
+    robust: bool = False,
 ) -> DirectReadings | None:
     """Return the rates and attitudes that records give directly, None without either.
 
@@ -201,9 +227,13 @@ def direct_readings_of(
         samples: Samples of the records.
         attitude0: Attitude at the first sample of each trial, for dead reckoning where
             none was observed.
+        robust: Whether attitudes that leap for a single sample are passed over.
     """
     rates = _first_series(records, samples, "rates")
     attitudes = _first_series(records, samples, "attitude")
+    if attitudes is not None and robust:
+        lone = _for_each_trial(_lone, *attitudes)
+        attitudes = attitudes._replace(valid=attitudes.valid & ~lone)
     if rates is None:
         if attitudes is None:
             return None

@@ -148,6 +148,8 @@ def without_outliers(
     for part in problem.samples.parts:  # a trial that one record excludes is excluded
         bad = np.sum(np.where(good, 0.0, kept)[:, part], axis=1)
         spoilt |= bad > _SPOILT * np.sum(kept[:, part], axis=1)
+    # A fit of nothing says nothing: if all trials are bad, each keeps what is good.
+    spoilt &= ~np.all(spoilt)
     return np.where(good & ~spoilt[:, None], kept, 0.0)
 
 

@@ -84,6 +84,7 @@ def repair(
     check_shape("times", np.asarray(times), (None,))
     kept = _Rows(times)
     kept.keep(np.isfinite(kept.times), "without a time")
+    kept.put_oldest_first()
     steps = np.diff(kept.times)
     if not (steps > 0).any():
         notes = (*kept.notes, "all rows are of one time")
@@ -127,6 +128,15 @@ class _Rows:
         _say(self.notes, int(np.sum(~is_good)), f"{others} dropped")
         self.times = self.times[is_good]
         self.rows = self.rows[is_good]
+
+    def put_oldest_first(self) -> None:
+        """Reverse rows of which nearly all are earlier than the row before."""
+        steps = np.diff(self.times)
+        if np.sum(steps < 0) <= np.sum(steps > 0):
+            return
+        self.notes.append("rows had the newest first, and were reversed")
+        self.times = self.times[::-1].copy()
+        self.rows = self.rows[::-1]
 
     def sort(self) -> None:
         """Put the rows in the order of their times."""
