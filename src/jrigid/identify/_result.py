@@ -37,9 +37,9 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "see `null_directions`."
     )
     MISFIT = (
-        "The fit follows the record, but what is left is no noise of the size stated: "
-        "a torque that the model has not, or a sensor's error (see `unmodelled`, "
-        "`free`), or the noise is not as stated. The errors are those of what is left."
+        "The fit follows the record, but its residuals are not the stated noise: a "
+        "torque that the model has not, or a sensor's error (see `unmodelled`, "
+        "`free`), or the noise is not as stated. The errors are those of the residuals."
     )
     WRONG_BASIN = (
         "The fit does not describe the record: it ended in a wrong minimum, or the "

@@ -348,16 +348,17 @@ def _of_fit(result: FitResult) -> list[str]:
     samples = f"{np.sum(result.kept)} samples"
     if trials > 1:
         samples += f" of {trials} trials"
-    noise = ""
-    if not result.problem.options.noise_known:
-        rms = jnp.sqrt(jnp.nanmean(result.residuals() ** 2))
-        noise = f" (noise taken from the residuals: {rms:.3g} rms)"
+    # A chi-square in units of a noise that nobody stated would say nothing.
+    rms = jnp.sqrt(jnp.nanmean(result.residuals() ** 2))
+    sum_of_squares = f"noise taken from the residuals: {rms:.3g} rms,"
+    if result.problem.options.noise_known:
+        sum_of_squares = f"chi-square {result.chi_square:.1f} for"
     name = names_of(Status)[int(np.asarray(result.status))]
     sentences = [f"{name}: {Status[result.status]}", reason(result)]
     return [
         " ".join(filter(None, sentences)),
-        f"  {samples}, {steps} steps; chi-square {result.chi_square:.1f} for "
-        f"{result.degrees_of_freedom} degrees of freedom{noise}",
+        f"  {samples}, {steps} steps; {sum_of_squares} "
+        f"{result.degrees_of_freedom} degrees of freedom",
     ]
 
 
