@@ -198,7 +198,9 @@ def walk(motion: Motion, steps: int, ok: Array) -> Walk:
 
 def _may_miss_a_pulse(path: Walk) -> Array:
     """Whether two jumps that the torque declares fit into one step."""
-    jumps = path.motion.system.jumps
+    jumps = path.motion.system.jumps.astype(path.step.dtype)
+    if jumps.size < 2:
+        return jnp.asarray(False)
     inside = jnp.isfinite(jumps) & (jumps >= path.motion.t0)
     # What is before the start, or nowhere, is moved to where it makes no short gap.
     ordered = jnp.sort(jnp.where(inside, jumps, path.motion.t0 - path.step))
