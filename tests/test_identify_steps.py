@@ -6,7 +6,6 @@ scipy, with Euler's equations written out here.
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -74,7 +73,7 @@ def test_a_wheel_that_turns_faster_than_the_body(rng):
 
 
 def test_a_pendulum_that_swings_many_times_in_a_small_angle(rng):
-    """It swings 20 times, each time by 0.06 radians, and turns by 5 radians in all."""
+    """Its segments of 0.75 radians would be longer than a period."""
     weight = 9.8 * np.array([0.0, 0.0, -0.02])
 
     def torque(_, attitude, omega):
@@ -82,21 +81,23 @@ def test_a_pendulum_that_swings_many_times_in_a_small_angle(rng):
         down = attitude.inv().apply([0, 0, 1.0])
         return np.cross(weight, down) * -1.0
 
-    ts = np.arange(400) * 0.025
-    attitudes, rates = motion(ts, np.array([0.15, 0.1, 0.02]), torque)
+    ts = np.arange(120) * 0.05
+    attitudes, rates = motion(ts, np.array([0.15, 0.1, 0.3]), torque)
     noise = 1e-3
+    turns = Rotation.from_rotvec(noise * rng.normal(size=rates.shape))
+    seen = Rotation.from_quat(attitudes, scalar_first=True) * turns
     record = (
         identify.Rates(ts, rates + noise * rng.normal(size=rates.shape), noise),
-        identify.Attitudes(ts, attitudes, noise),
+        identify.Attitudes(ts, seen.as_quat(scalar_first=True), noise),
     )
     gravity = jr.torques.UniformGravity(
         1.0, jnp.array([0, 0, -0.02]), jnp.array([0, 0, -9.8])
     )
     found = identify.fit(jr.RigidBody(GUESS, gravity), record, scale="known")
+    assert found.status == Status.OK
     assert found.diagnostics.integration_error < 1
     assert np.max(np.abs(judged(found))) < 4
-    true = identify.residuals(found.system, found.state, record, t0=found.t0)
-    assert found.chi_square == pytest.approx(float(jnp.sum(true**2)), rel=1e-3)
+    assert 0.8 < found.reduced_chi_square < 1.2
 
 
 def test_a_torque_too_fast_for_any_steps_is_told(rng):
