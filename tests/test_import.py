@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+LARGEST = 0.5  # processor time of the import, over that of its dependencies
 LOOK = """
 import sys, time
 start = time.process_time()
@@ -21,9 +22,12 @@ print(*sorted(new - sys.stdlib_module_names), took)
 
 @pytest.fixture(scope="module")
 def imported():
-    """The packages, and the least ratio of three processes: one varies by a fifth."""
-    ratios = []
-    for _ in range(3):
+    """The packages, and the least ratio of some processes, ten at most.
+
+    Other processes make the ratio larger by up to a third, and nothing makes it smaller.
+    """
+    least = float("inf")
+    for _ in range(10):
         # There is no such platform: whatever is computed at import fails.
         out = subprocess.run(
             [sys.executable, "-W", "error", "-c", LOOK],
@@ -33,8 +37,10 @@ def imported():
             text=True,
         )
         *packages, took = out.stdout.split()
-        ratios.append(float(took))
-    return packages, min(ratios)
+        least = min(least, float(took))
+        if least < LARGEST:
+            break
+    return packages, least
 
 
 def test_nothing_is_computed_and_no_other_package_imported(imported):
@@ -45,4 +51,4 @@ def test_nothing_is_computed_and_no_other_package_imported(imported):
 def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
     """The ratio of the processor times is the same on an idle and on a busy machine."""
     _, took = imported
-    assert took < 0.5
+    assert took < LARGEST
