@@ -24,7 +24,7 @@ print(*sorted(new - sys.stdlib_module_names), took)
 def imported():
     """The packages, and the least ratio of some processes, ten at most.
 
-    Other processes make the ratio larger by up to a third, and nothing makes it smaller.
+    Other work makes the ratio larger by up to a third, and nothing makes it smaller.
     """
     least = float("inf")
     for _ in range(10):
