@@ -432,13 +432,13 @@ def conclude(
     fields |= _fields_of_precision(problem, fit, known, judgement)
     fields |= _fields_of_record(problem, fit, lengths)
     fields["log_determinant"] = np.asarray(independent.log_determinant)
-    at_end = problem, fit.layout, fit.minimum.point
-    fields["integration_error"] = np.asarray(integration_error(*at_end))
     good = is_good(input_result)
+    error = 0.0
+    if good:
+        error = integration_error(problem, fit.layout, fit.minimum.point)
+    fields["integration_error"] = np.asarray(error)
     fields = _of_dtype(fields, good, fit.minimum.units.dtype)
-    status = _status(judgement.status, good, derived, of_torque)
-    if good and fields["integration_error"] > UNRESOLVED:
-        status = "NOT_CONVERGED"
+    status = _status(judgement.status, good, error, derived, of_torque)
     return fields | {"status": getattr(Status, status), "input_result": input_result}
 
 
@@ -452,15 +452,24 @@ def _white(fit: Fit, independent: Independent) -> np.ndarray:
 def _status(
     status: str,
     good_input: bool,
+    error: float,
     derived: dict[str, np.ndarray],
     of_torque: dict[str, np.ndarray],
 ) -> str:
-    """The name of the status, after a look at the input, the ratios and the torque."""
+    """The name of the status, after a look at what else may be wrong.
+
+    Args:
+        status: By the residuals.
+        good_input: Whether the record could be used.
+        error: Of the integration, in units of what is allowed.
+        derived: Fields of the tensor.
+        of_torque: Fields of the unmodelled torque.
+    """
     errors = errors_of(derived["ratios_covariance"])
     # If I1 is nearly zero the ratios can be loose though each number is determined.
     loose = np.any(errors > LARGEST_ERROR * derived["ratios"])
     levels_known = np.isfinite([of_torque["level"], of_torque["level_errors"]])
-    if not np.all(levels_known):
+    if not np.all(levels_known) or error > UNRESOLVED:
         return "NOT_CONVERGED"
     if not good_input:
         return "BAD_INPUT"

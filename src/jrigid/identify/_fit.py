@@ -64,7 +64,7 @@ from jrigid.systems import RigidBody
 
 # Radians of a segment, of free motion and of forced.
 # The exact flow holds over any length, and 3 is below half a turn. A forced segment is
-# a single Runge-Kutta step.
+# a single Runge-Kutta step, unless its torque asks for shorter ones.
 _LENGTHS = {True: 3.0, False: 0.75}
 _STEPS = (4, 16, 64)  # of a segment, where one is too long for a torque
 # After so many turns the valley of the minimum is so narrow that probes go slowly, too.
@@ -593,7 +593,9 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
         unknowns = opening.unknowns.holding(line)
         problem = Problem(options, unknowns, observed.samples, observed.noise)
-        if is_resolved(problem, opening.cut, opening.point):
+        # Of a record that cannot be used nothing is calculated.
+        usable = is_good(input_result)
+        if not usable or is_resolved(problem, opening.cut, opening.point):
             break
     tensor = opening.tensor
     if options.dense:

@@ -128,8 +128,7 @@ def with_derivatives_of_start(inputs: Inputs) -> Inputs:
     start, to_state = ravel_pytree(inputs.state0)
 
     def rates(t: Array, y: Array) -> Array:
-        field = inputs.system.vector_field(t, to_state(y), inputs.args)
-        return ravel_pytree(field)[0]
+        return _rates(inputs, t, to_state(y))
 
     length = (held - inputs.t0).astype(start.dtype)
     moved = equal_steps(_STEP, rates, inputs.t0.astype(start.dtype), length, start)
@@ -138,14 +137,14 @@ def with_derivatives_of_start(inputs: Inputs) -> Inputs:
     return inputs._replace(state0=to_state(moved), t0=held)
 
 
+def _rates(inputs: Inputs, t: Array, state: BodyState) -> Array:
+    """The vector field as one array."""
+    return ravel_pytree(inputs.system.vector_field(t, state, inputs.args))[0]
+
+
 def _depends_on_time(inputs: Inputs, start: Array) -> bool:
     """Whether a torque or a force is a function of time."""
-
-    def rates(t: Array) -> Array:
-        field = inputs.system.vector_field(t, inputs.state0, inputs.args)
-        return ravel_pytree(field)[0]
-
-    return depends_on(rates, start)
+    return depends_on(lambda t: _rates(inputs, t, inputs.state0), start)
 
 
 def _check_values_of_options(
@@ -212,9 +211,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
     start = usable.t0.astype(y0.dtype)
 
     def rates(t: Array, y: Array) -> Array:
-        since_zero = inputs.t0.astype(y0.dtype) + t
-        rates = inputs.system.vector_field(since_zero, to_state(y), inputs.args)
-        return ravel_pytree(rates)[0]
+        return _rates(inputs, inputs.t0.astype(y0.dtype) + t, to_state(y))
 
     field, parameters = opened(rates, times[-1], y0)
     end = jax.lax.stop_gradient(times[-1])
