@@ -61,6 +61,26 @@ def test_decimal_commas_in_quotes_between_commas():
     np.testing.assert_array_equal(reading.rates[0], [1.5, 2.0, 3.0])
 
 
+def test_columns_between_spaces_under_names_after_a_hash():
+    names = "# time (s)  gx (deg/s) gy (deg/s)   gz (deg/s)\n"
+    reading = read(names + " 0.5   90 -180  0 \n 0.6 90 -180 45\n0.7 90 -180 45\n")
+    np.testing.assert_array_equal(reading.times, [0.5, 0.6, 0.7])
+    rates = np.pi * np.array([[0.5, -1, 0], [0.5, -1, 0.25], [0.5, -1, 0.25]])
+    np.testing.assert_allclose(reading.rates, rates, rtol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_a_file_of_unicode_text_of_a_spreadsheet(tmp_path, encoding):
+    text = PHYPHOX.replace('"', "").replace(",", "\t") + "\n"
+    text += scientific(ROWS, "\t", ",")
+    mark = "\ufeff" if encoding.endswith("e") else ""  # the others write one
+    path = tmp_path / "sheet.txt"
+    path.write_bytes((mark + text).encode(encoding))
+    np.testing.assert_allclose(
+        jr.records.read(path).rates, ROWS[:, 1:], rtol=0, atol=1e-9
+    )
+
+
 def test_phyphox_zip_with_a_clock_for_each_sensor(tmp_path):
     forces = [[0.005 + 0.02 * i, 0.0, 2.0 * i, GRAVITY] for i in range(3)]
     header = PHYPHOX.replace("Gyroscope", "Acceleration").replace("rad/s", "m/s^2")

@@ -344,12 +344,23 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.nda
 
 
 def derive(
-    problem: Problem, numbers: np.ndarray, covariance: np.ndarray
+    problem: Problem,
+    numbers: np.ndarray,
+    covariance: np.ndarray,
+    probes: Sequence[quality.Probe],
 ) -> dict[str, np.ndarray]:
-    """Moments, axes and ratios, with errors, from the numbers and their covariance."""
+    """Moments, axes and ratios, with errors, from the numbers and their covariance.
+
+    Args:
+        problem: The record.
+        numbers: The estimate.
+        covariance: Of the numbers.
+        probes: Bodies along the weakest direction.
+    """
     tensor, moments, axes, slopes = map(np.asarray, spectrum(problem.unknowns, numbers))
     elements = slopes.reshape(9, numbers.size)
     spread = _spread_of_moments(problem, numbers, covariance)
+    spread = _at_least_probed(spread, moments, probes)
     return {
         "inertia": tensor,
         "inertia_covariance": elements @ covariance @ elements.T,
@@ -407,6 +418,27 @@ def _spread_of_moments(
     return spread_of(_of_moments(np.linalg.eigvalsh(tensors)), scales)
 
 
+def _at_least_probed(
+    spread: np.ndarray, moments: np.ndarray, probes: Sequence[quality.Probe]
+) -> np.ndarray:
+    """The covariance with errors as large as probes show them.
+
+    In a valley that bends, a ratio may rest at the estimate and move far beyond it. Its
+    derivative, and the covariance, know nothing of that. A probe is a body `growth`
+    away in chi-square, so that it may be off by no more than the root of it in errors.
+    """
+    estimate = _of_moments(moments)
+    errors = errors_of(spread)
+    factors = np.ones_like(errors)
+    for probe in probes:
+        move = np.abs(_of_moments(np.linalg.eigvalsh(probe.tensor)) - estimate)
+        error = move / np.sqrt(max(probe.growth, quality.LEAST_GROWTH))
+        # What is known exactly has no error, and no probe moves it beyond rounding.
+        ratio = error / np.where(errors > 0, errors, np.inf)
+        factors = np.fmax(factors, ratio)
+    return factors[:, None] * spread * factors
+
+
 @np.errstate(all="ignore")  # what is not finite is judged below
 def conclude(
     problem: Problem,
@@ -425,7 +457,8 @@ def conclude(
     independent = independent_rows(problem, fit)
     known = precision(problem, fit)
     judgement = _judgement(problem, fit, known, _white(fit, independent))
-    derived = derive(problem, fit.minimum.point.numbers, judgement.covariance)
+    numbers = fit.minimum.point.numbers
+    derived = derive(problem, numbers, judgement.covariance, fit.probes)
     of_torque = _of_torque(problem, fit, judgement.remainder.inflation)
     fields = derived | of_torque
     fields |= _fields_of_judgement(judgement)
@@ -795,9 +828,10 @@ def _inflated(
     units = fit.minimum.units
     factors = np.maximum(scatter, 1.0)
     covariance = inflation * _with_larger_errors(known, factors, units)
-    if fit.probed_error > 0:
+    if fit.probes:
         judged = problem.unknowns.judged
-        covariance = _with_error(judged, covariance, units, fit.probed_error)
+        probed = max(x.error for x in fit.probes)
+        covariance = _with_error(judged, covariance, units, probed)
     return covariance
 
 

@@ -20,12 +20,27 @@ from jrigid.identify._problem import Problem
 from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
+LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
 # Whitened square of a sample, above its degrees of freedom, that is no noise.
 _REJECTED = 16.0
 _SPOILT = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
+
+
+class Probe(NamedTuple):
+    """The best fit with one direction held: a body that describes the record less well.
+
+    Attributes:
+        tensor: Of that body.
+        growth: Of chi-square, in units of the noise: the square of standard errors.
+        error: Of the direction held, in natural units, as this probe shows it.
+    """
+
+    tensor: np.ndarray
+    growth: float
+    error: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +56,7 @@ class Fit:
         torque: The same as it was sought, None where it was known.
         history: Sums of squares after each step of all stages.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
-        probed_error: Error of the weakest direction, by probes, in natural units.
+        probes: Bodies along the weakest direction, within six standard errors.
         computed: Values of functions marked `once_for_each_fit`, by function.
     """
 
@@ -53,7 +68,7 @@ class Fit:
     torque: Any
     history: np.ndarray
     ambiguous: bool = False
-    probed_error: float = 0.0
+    probes: tuple[Probe, ...] = ()
     computed: dict[Any, tuple[Problem, Any]] = dataclasses.field(default_factory=dict)
 
     @property
@@ -71,7 +86,7 @@ def once_for_each_fit(
     """Keep the value of a function of the minimum with the fit.
 
     The search and the conclusion ask the same questions. The function must not depend
-    on `ambiguous` and `probed_error`, which change after the value was computed.
+    on `ambiguous` and `probes`, which change after the value was computed.
     """
 
     @wraps(function)

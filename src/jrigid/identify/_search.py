@@ -32,7 +32,9 @@ from jrigid.identify._minimise import (
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import (
     FOLLOWED,
+    LEAST_GROWTH,
     Fit,
+    Probe,
     is_at_boundary,
     is_pure,
     misfit,
@@ -480,12 +482,12 @@ def _attempts(
 
 
 def _probed(case: Case, best: Fit, at: Weakest) -> Search:
-    """The same fit, with the error of its weakest direction as probes see it."""
+    """The same fit, with what probes show of its weakest direction."""
     problem = case.problem
     if not _WEAK < at.error < LARGEST_ERROR or is_pure(problem, best, at.noise):
         return best
     before = best.minimum.point.numbers
-    largest = 0.0
+    probes: list[Probe] = []
     for step in _PROBES:
         numbers = before + step * at.direction
         normal = _HARD * at.normal
@@ -494,13 +496,15 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         end = yield from attempt(case, held, numbers, slow=case.long)
         growth = (weakest(problem, end).square - at.square) / at.noise
         error = _error_by_probe(problem, best, end, at.direction, step, growth)
+        # Beyond six standard errors a probe says nothing of those that are stated.
         if growth < _SURE:
-            largest = max(largest, error)
+            probes.append(Probe(end.minimum.tensor, growth, error))
+        largest = max((x.error for x in probes), default=0.0)
         if largest > _BENT * at.error:
-            return dataclasses.replace(best, ambiguous=True, probed_error=largest)
+            return dataclasses.replace(best, ambiguous=True, probes=tuple(probes))
         if largest >= LARGEST_ERROR:
             break
-    return dataclasses.replace(best, probed_error=largest)
+    return dataclasses.replace(best, probes=tuple(probes))
 
 
 def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
@@ -530,7 +534,7 @@ def _error_by_probe(
     square = np.sum(slope * slope)
     if square > 0:
         step = float(np.sum((end.minimum.tensor - tensor) * slope) / square)
-    return abs(step) / np.sqrt(max(growth, 1e-6))
+    return abs(step) / np.sqrt(max(growth, LEAST_GROWTH))
 
 
 @np.errstate(all="ignore")  # attempts may run out of the range of numbers

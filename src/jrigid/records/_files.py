@@ -1,5 +1,6 @@
 """Read files as tables, with the units that their formats do not state."""
 
+import codecs
 import csv
 import io
 import itertools
@@ -62,10 +63,7 @@ def tables_of(path: Source, log: int) -> list[Table]:
 
     Of several files those without a table are passed over.
     """
-    texts = {
-        name: data.decode("utf-8-sig", errors="replace")
-        for name, data in _files_of(path).items()
-    }
+    texts = {name: _text_of(data) for name, data in _files_of(path).items()}
     # Sensor Logger writes this file beside those of the sensors.
     metadata = texts.get("Metadata", "").splitlines()
     about = next(csv.DictReader(metadata, restval=""), {})
@@ -96,6 +94,14 @@ def _files_of(path: Source) -> dict[str, bytes]:
             names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
             return {pathlib.PurePath(n).stem: archive.read(n) for n in names}
     return {path.stem: path.read_bytes()}
+
+
+def _text_of(data: bytes) -> str:
+    """The text of a file: of UTF-8, or of UTF-16 where a byte order mark says so."""
+    # Spreadsheets write "Unicode text" so.
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors="replace")
+    return data.decode("utf-8-sig", errors="replace")
 
 
 def _blackbox(path: str, name: str, log: int) -> Table:
@@ -130,7 +136,14 @@ def _parse(text: str, name: str) -> Table:
     """Parse a text with any separator, decimal sign and lines above the header."""
     lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
     separator = _separator(lines)
-    rows = [[x.strip() for x in row] for row in csv.reader(lines, delimiter=separator)]
+    if separator == " ":
+        # The trajectories of many data sets are like this, with names after a "#". A
+        # unit in brackets belongs to the name before it.
+        lines = [x.strip().removeprefix("#").lstrip() for x in lines]
+        lines = [re.sub(r"\s+(?=[(\[])", "", x) for x in lines]
+    # Several spaces are one separator.
+    cells = csv.reader(lines, delimiter=separator, skipinitialspace=separator == " ")
+    rows = [[x.strip() for x in row] for row in cells]
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
     head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
     demand(
@@ -164,7 +177,7 @@ def _parse(text: str, name: str) -> Table:
 def _separator(lines: list[str]) -> str:
     """The separator of columns: one that most of the last lines have."""
     last = lines[-50:]
-    for separator in "\t;,":
+    for separator in "\t;, ":
         if sum(separator in x for x in last) > len(last) / 2:
             return separator
     return ","
