@@ -35,6 +35,9 @@ def elementwise(*values: ValuesLike | None) -> list[Array] | Arrays:
 
 def _steps(x: Array) -> int:
     """Steps that bring a quotient of roots of 1e-300 (float32: 1e-38) to 1e-3 of 1."""
+    # A step halves the logarithm of a quotient that is far from 1, so that 10 steps
+    # (float32: 7) bring it to order one. After that a step divides the deviation from 1
+    # by 4.
     return 15 if x.dtype == jnp.float64 else 11
 
 
@@ -84,6 +87,8 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
 
     def step(_: Array, carry: Arrays) -> Arrays:
         a, b, c, weight, total = carry
+        # R_D(x, y, z) = 2 R_D(x + lambda, y + lambda, z + lambda) + 3 / (sqrt(z) (z +
+        # lambda)), and z + lambda is (c + a)(c + b).
         total = total + weight / (c * (c + a) * (c + b))
         return *_next_roots(a, b, c), 0.25 * weight, total
 
@@ -91,6 +96,7 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     total = 1 / ((c + a) * (c + b))
     start = (*_next_roots(a, b, c), 0.25 * c, total)
     a, b, c, weight, total = jax.lax.fori_loop(1, _steps(a), step, start)
+    # R_D is R_J with p = z, so that one series serves both.
     remainder = weight * _rj_series(a * a, b * b, c * c, c * c) / 3
     return _rf_series(a, b, c), total + remainder
 
@@ -98,6 +104,8 @@ def _rf_g_kernel(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
 def _rc_of_one(root: Array) -> Array:
     """R_C(1, root^2), differentiable as it stands; DLMF 19.2.17, 19.2.18."""
     e = (root - 1) * (root + 1)
+    # R_C diverges like a logarithm at root = 0, where the halvings and the series in e
+    # fail. So the half near there has a formula of its own.
     low = e < -0.5
     down = jnp.sqrt(jnp.where(low, -e, 0.75))
     root = jnp.where(low, root, 0.5)
@@ -196,6 +204,8 @@ def _along_axes(kernel: Kernel) -> Kernel:
             functools.partial(jax.jvp, kernel, list(roots)), out_axes=(None, 0)
         )
         values, partials = along(axes)
+        # Both values fall as a root grows, so at a pole their slope is -inf. The loop,
+        # which ran on ones there, cannot give it.
         slopes = jax.tree.map(
             lambda x, d: jnp.where(x == jnp.inf, -jnp.inf, d), values, partials
         )
@@ -231,6 +241,7 @@ def rc_of(a: Array, b: Array) -> Array:
     gap = jnp.abs(b - a)
     # Where a = b any other value of `root` will do.
     safe = (gap > 0) & (b > 0) & jnp.isfinite(a + b)
+    # The root of |b^2 - a^2|, as a product since the squares may leave the range.
     root = jnp.where(safe, jnp.sqrt(gap) * jnp.sqrt(b + a), 1.0)
     circular = jnp.arctan2(root, a) / root
     hyperbolic = jnp.log1p((a - b + root) / jnp.where(b > 0, b, 1.0)) / root
@@ -282,6 +293,8 @@ def rf_rj_signed(a: Array, b: Array, c: Array, p: Array) -> tuple[Array, Array]:
     replaced by the q of DLMF 19.21.12, (p - x)(q - x) = (y - x)(z - x), where x is the
     middle, or the largest, of the three arguments.
     """
+    # The root of p counts with a small factor: a huge p then does not overflow, and the
+    # other roots do not vanish beside it.
     size = _scale(a, b, c, 1e-10 * jnp.sqrt(jnp.abs(p)))
     size = jnp.where(jnp.isinf(size), 1.0, size)
     # Products, since XLA makes x / size / size / size into x / size^3, which overflows.

@@ -44,6 +44,8 @@ def _hyperbolic(u: Array) -> tuple[Array, Array]:
 
 def _sides(cotangent: Array) -> tuple[Array, Array]:
     """Sine and cosine, divided by the larger one of them."""
+    # The larger side is 1, so that squares stay in range for any cotangent, an infinite
+    # one too.
     flat = jnp.abs(cotangent) <= 1
     tangent = 1 / jnp.where(flat, 1.0, cotangent)
     return jnp.where(flat, 1.0, tangent), jnp.where(flat, cotangent, 1.0)
@@ -60,6 +62,7 @@ def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
 
     def down(carry: Arrays, _: None) -> tuple[Arrays, Array]:
         quotient, mean = carry
+        # The means a and b become (a + b) / 2 and sqrt(a b).
         half = 0.5 * (1 + quotient)
         return (jnp.sqrt(quotient) / half, mean * half), quotient
 
@@ -79,10 +82,12 @@ def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
         cc = half * (cosine * cosine)
         return (cotangent * half * dn, (quotient * ss + cc) / (ss + cc)), None
 
+    # The cotangent of |angle| is infinite at 0; `_sides` makes (0, 1) of it.
     start = (jnp.cos(angle) / jnp.abs(jnp.sin(angle)), jnp.ones_like(angle))
     (cotangent, dn), _ = jax.lax.scan(up, start, quotients, reverse=True)
     sine, cosine = _sides(jnp.abs(cotangent))
     norm = jax.lax.rsqrt(sine * sine + cosine * cosine)
+    # The sine of |angle| gets its sign back.
     return jnp.copysign(sine * norm, angle), cosine * norm, dn, turns
 
 
@@ -90,6 +95,8 @@ def _landen(u: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
 def _reduced(u: Array, m: Array, mc: Array) -> tuple[Array, Array, Array, Array]:
     """`_landen`, with m = 1 and derivatives; NaN for mc < 0."""
     del m  # its derivatives need it
+    # At m = 1 the functions are hyperbolic and K is infinite: there are no turns to
+    # take off, and the means would vanish.
     end = mc == 0
     values = _landen(jnp.where(end, 0.0, u), jnp.where(end, 1.0, mc))
     sine, cosine = _hyperbolic(u)
@@ -108,6 +115,7 @@ def _reduced_rule(primals: Arrays, tangents: Arrays) -> tuple[Arrays, Arrays]:
     one = jnp.ones_like(s)
     # Without turns a harmless value replaces the infinite slopes of K.
     root = jnp.sqrt(jnp.where(turns == 0, 1.0, mc))
+    # cn and dn underflow to 0 at m = 1 and large u, where G of two zeros is infinite.
     tiny = jnp.finfo(s.dtype).tiny
     low = jnp.maximum(dn, 4 * tiny)
     reduced = 0.5 * s * s * s * g_of(jnp.maximum(c, 4 * tiny), one, low)
@@ -135,6 +143,8 @@ def _ellipj(u: Array, m: Array, mc: Array) -> JacobiFunctions:
     sn = sign * s / k
     cn = jnp.where(above, d, sign * c)
     dn = jnp.where(above, sign * c, d)
+    # Above m = 1 cn and dn change places. The amplitude then oscillates within a
+    # quarter turn, so no half turns are added to it.
     am = jnp.arctan2(jnp.where(above, sn, s), jnp.where(above, d, c))
     return JacobiFunctions(sn, cn, dn, am + jnp.where(above, 0.0, turns * jnp.pi))
 

@@ -40,6 +40,8 @@ def with_parameters(
 def reduce_amplitude(phi: Array) -> tuple[Array, Array, Array]:
     """Half turns j, and sine and non-negative cosine of phi - j pi."""
     turns = jax.lax.stop_gradient(jnp.round(phi / jnp.pi))
+    # A shift by j pi changes nothing but the sign. The difference phi - j pi itself
+    # would lose the digits that sin and cos keep.
     sign = 1 - 2 * jnp.mod(turns, 2.0)
     sine = sign * jnp.sin(phi)
     cosine = sign * jnp.cos(phi)
@@ -66,6 +68,8 @@ def _of_any_turns(
     # its infinite slopes.
     *others, mc = (jnp.where(turns == 0, 0.0, x) for x in parameters)
     whole = _complete(integral, *others, jnp.where(turns == 0, 1.0, mc))
+    # The integrand has the period pi, over which the integral is twice the complete
+    # one.
     return integral(sine, cosine, *parameters) + 2 * turns * whole
 
 
@@ -74,6 +78,7 @@ def _of_any_turns(
 
 def _delta(sine: Array, cosine: Array, mc: Array) -> Array:
     """sqrt(1 - m sin^2 phi)."""
+    # For m <= 1 this sum keeps its digits where m sin^2 phi is near 1.
     return jnp.sqrt(cosine * cosine + mc * sine * sine)
 
 
@@ -108,6 +113,7 @@ def _e(s: Array, c: Array, m: Array, mc: Array) -> Array:
     middle = mc * s * rf + m * s * (c / last) + m * mc * cube * (g / last)
     above = s * d / last - mc * cube * (g / last)
     value = jnp.where(low, s * rf - m * cube * g, jnp.where(high, above, middle))
+    # E is sin phi at m = 1. At a quarter turn the terms above are 0 times infinity.
     return jnp.where((c == 0) & (mc == 0), s, value)
 
 
@@ -129,6 +135,8 @@ def _pi(sine: Array, cosine: Array, n: Array, m: Array, mc: Array) -> Array:
     n = n / (k * k)
     mc = jnp.where(above, -mc / (k * k), mc)
     value = _pi_over_sine(s, c, d, n, mc)
+    # At m = 1 the complete integral diverges like log(mc) / (2 (n - 1)). The logarithm
+    # gives its sign, and an infinite slope in mc.
     infinite = jnp.where(n > 1, 0.5, -0.5) * jnp.log(jnp.where(end, mc, 1.0))
     return jnp.where(end, infinite, s / k * value)
 
@@ -300,6 +308,7 @@ def _pi_incomplete_rule(primals: Arrays, tangents: Arrays) -> tuple[Array, Array
     d_phi, d_n, _, d_mc = tangents
     _, sine, cosine = reduce_amplitude(phi)
     pole = (cosine * cosine + (1 - n) * sine * sine) * _delta(sine, cosine, mc)
+    # m changes by -d_mc, whichever of the two was given.
     _, by_parameters = jax.jvp(
         functools.partial(_of_any_turns, _pi, phi), (n, m, mc), (d_n, -d_mc, d_mc)
     )
