@@ -113,6 +113,7 @@ def from_matrix(matrix: MatrixLike) -> Quaternion:
 def _is_rotation(matrix: Array) -> Bool[Array, ""]:
     """Whether a matrix is orthogonal to `_ORTHOGONAL` and right-handed."""
     excess = product("ki,kj->ij", matrix, matrix) - jnp.eye(3, dtype=matrix.dtype)
+    # A reflection is orthogonal too. Its determinant is -1.
     first, second, third = matrix
     determinant = jnp.sum(jnp.cross(first, second) * third)
     return jnp.all(jnp.abs(excess) <= _ORTHOGONAL) & (determinant > 0)
@@ -246,6 +247,7 @@ def to_euler(attitude: QuaternionLike) -> Vector:
     """
     w, x, y, z = rescaled(array_of_shape("attitude", attitude, 4))
     # q = (c cos(plus), s cos(minus), s sin(minus), c sin(plus)), as in `from_euler`.
+    # A plain norm would have a NaN derivative at a pole, where one of the two is 0.
     c = safe_norm(jnp.stack([w, z]))
     s = safe_norm(jnp.stack([x, y]))
     plus = safe_arctan2(z, w)
@@ -259,6 +261,7 @@ def to_euler(attitude: QuaternionLike) -> Vector:
 
 def _wrap(angle: Array) -> Array:
     """The same angle in [-pi, pi]."""
+    # `round` is piecewise constant, so the derivative is that of the angle.
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
@@ -284,6 +287,8 @@ def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     [0. 0. 1.]
     """
     half = 0.5 * array_of_shape("angles", angles, 3)
+    # The quaternions of the three rotations are (c, 0, 0, r), (b, 0, q, 0) and (a, p,
+    # 0, 0), and this is their product in that order.
     (a, b, c), (p, q, r) = jnp.cos(half), jnp.sin(half)
     return jnp.stack(
         [

@@ -221,7 +221,9 @@ def _dead_reckon(
     h = step[:, None]
     turns = 0.5 * h * (a + b) + (3**0.5 / 12) * h * h * jnp.cross(a, b)
     quaternions = jnp.concatenate([start[None], jax.vmap(exp)(turns)])
+    # The product is associative, so a scan of logarithmic depth serves a long record.
     products = jax.lax.associative_scan(jax.vmap(multiply), quaternions)
+    # The norm drifts by rounding in each of the products.
     return jax.vmap(normalize)(products)
 
 
