@@ -74,6 +74,7 @@ def second_moment(inertia: Matrix) -> Matrix:
     >>> print(jnp.diag(jr.mass.second_moment(jnp.diag(jnp.array([5.0, 4.0, 3.0])))))
     [1. 2. 3.]
     """
+    # I = tr(S) 1 - S has the trace 2 tr(S).
     return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
 
 
@@ -99,6 +100,8 @@ def is_semidefinite(tensor: Matrix, scale: Scalar) -> Bool[Array, ""]:
         row = remainder[k]
         pivot = row[k]
         is_fine = is_fine & (pivot >= 0)
+        # In a semi-definite tensor the row of a zero pivot is zero. If it is not, what
+        # it subtracts makes a later pivot negative.
         divisor = jnp.where(pivot > 0, pivot, 1.0)
         remainder = remainder - row[:, None] * row[None, :] / divisor
         remaining = remaining & (jnp.arange(3) != k)
@@ -112,6 +115,8 @@ def is_physical(tensor: Matrix) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     (unit,) = scaled_together(tensor)
     trace = jnp.trace(unit)
     is_positive = is_symmetric(tensor) & is_semidefinite(unit, trace)
+    # The second moments are (I2 + I3 - I1) / 2 and so on, so the triangle inequality
+    # holds exactly where none is negative.
     obeys_triangle = is_semidefinite(second_moment(unit), trace)
     return is_positive, obeys_triangle
 

@@ -235,6 +235,7 @@ def _symmetrised(tensor: Matrix) -> Matrix:
 
 
 def _in_one_dtype(*trees: Any) -> Any:
+    # Under strict promotion a float32 body and a float64 vector would be an error.
     leaves, structure = jtu.tree_flatten(trees)
     return jtu.tree_unflatten(structure, float_arrays(*leaves))
 

@@ -72,6 +72,7 @@ def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
 
 def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array, ""]:
     """As `is_closed`, at run time."""
+    # Three edges a face and two faces an edge make the number of faces even.
     if faces.shape[0] % 2:
         return jnp.asarray(False)
     start = faces.T.ravel()
@@ -147,15 +148,22 @@ def _mesh_integrals(
     a = corners(0)
     b = corners(1)
     c = corners(2)
+    # Six times the volume of each tetrahedron, negative where the face looks towards
+    # the origin.
     six_volumes = _triple_product(a, b, c)
     s = [a[i] + b[i] + c[i] for i in range(3)]
 
     def second_moment(i: int, j: int) -> Scalar:
+        # The integral of r r^T over a tetrahedron with a corner at 0 is a twentieth of
+        # its volume times this; 120 is 6 times 20.
         squares = a[i] * a[j] + b[i] * b[j] + c[i] * c[j] + s[i] * s[j]
         return lane_sum(six_volumes * squares) / 120
 
     volume = lane_sum(six_volumes) / 6
+    # Volumes of both signs cancel in the sum, so its rounding is measured by that of
+    # the magnitudes.
     magnitude = lane_sum(jnp.abs(jax.lax.stop_gradient(six_volumes))) / 6
+    # The centre of a tetrahedron is at s / 4; 24 is 6 times 4.
     first = jnp.stack([lane_sum(six_volumes * s[i]) for i in range(3)]) / 24
     second = symmetric(second_moment(i, j) for i, j in PAIRS)
     center = first / jnp.where(volume == 0, 1.0, volume)
@@ -222,6 +230,8 @@ def from_mesh(
     volume, magnitude, center, tensor = _mesh_integrals(vertices, indices)
     rounding = ULPS * jnp.finfo(volume.dtype).eps * magnitude
     findings.require(jax.lax.stop_gradient(volume) > rounding, None, _INSIDE_OUT)
+    # Parts of negative volume can leave a positive volume, but also a second moment
+    # that no mass has.
     is_positive, obeys_triangle = is_physical(tensor)
     findings.require(is_positive & obeys_triangle, None, _CUTS_ITSELF)
     body = MassProperties.unchecked(density * volume, center, density * tensor)

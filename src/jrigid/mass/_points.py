@@ -95,6 +95,8 @@ def _moments_jvp(
     m = _finite_or_zero(weights)
     r = _finite_or_zero(positions - place[None, :])
     first = jnp.sum(dm[:, None] * r + m[:, None] * dr, axis=0)
+    # The change of m r r^T is this matrix plus its transpose, so half of the term in dm
+    # is in each.
     half = product("na,nb->ab", 0.5 * dm[:, None] * r + m[:, None] * dr, r)
     return _moments(*primals), (first, half + half.T)
 
@@ -107,6 +109,7 @@ def _finite_or_zero(x: Array) -> Array:
 def _cloud(masses: Array, positions: Array) -> MassProperties:
     """The body of points, in one pass over them, or in two for an uneven mass."""
     mass = lane_sum(masses)
+    # Callers refuse a mass of zero later. Until then nothing may become NaN.
     divisor = jnp.where(mass == 0, 1.0, mass)
     # Sums are about a place amid 64 points, which is usually near the centre of mass.
     some = positions[:: -(-len(positions) // 64)]
@@ -244,6 +247,7 @@ def _quadrature(
     order: int, dtype: np.dtype
 ) -> tuple[Float[Array, "nodes 3"], Float[Array, " nodes"]]:
     """Nodes and weights of Gauss-Legendre quadrature in the cube from -1 to 1."""
+    # On the host, so that nodes in float32 are rounded from float64.
     x, w = np.polynomial.legendre.leggauss(order)
     nodes = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
     weights = np.einsum("i,j,k->ijk", w, w, w).ravel()
@@ -287,6 +291,7 @@ def from_density(
     1.0 [0.666667 0.5      0.5     ]
     """
     lower, upper = shaped(lower=(lower, 3), upper=(upper, 3))
+    # A single node would make the body a point.
     order = whole_number("order", order, 2)
     shape = jax.eval_shape(density, jax.ShapeDtypeStruct((3,), lower.dtype))
     if getattr(shape, "shape", None) != ():
@@ -306,6 +311,8 @@ def from_density(
     [(is_fine, value), _] = _examined(*jax.lax.stop_gradient((values, positions)))
     message = "Argument `density` must be finite and non-negative, but it is not."
     findings.require(is_fine, None, message, value)
+    # The product of the half-lengths is the Jacobian of the map from the cube to the
+    # box.
     masses = harmless(is_fine, values) * jnp.prod(half) * weights
     body = _cloud(masses, positions)
     message = "Argument `density` must not be zero, but it is."
