@@ -41,6 +41,8 @@ def solid(
 
     def body(mass: Array, *sizes: Array) -> MassProperties:
         x, y, z = mean_squares(*sizes)
+        # About the centre, in principal axes: I1 is the mass times the mean of y^2 +
+        # z^2.
         moments = mass * jnp.stack([y + z, x + z, x + y])
         return MassProperties.unchecked(mass, jnp.zeros(3, mass.dtype), moments)
 

@@ -32,6 +32,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> print(jnp.diag(jr.solids.sphere(5.0, 1.0).inertia))
     [2. 2. 2.]
     """
+    # The mean of |r|^2 over a ball is 3 R^2 / 5, a third of it for each coordinate.
     return solid(lambda r: _round(r * r / 5, r * r / 5), mass, radius=radius)
 
 
@@ -174,6 +175,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     [96. 96. 96.]
     """
     return solid(
+        # About the centre of mass: the mean of z^2 about the apex is 3 h^2 / 5, less
+        # the square of the distance 3 h / 4.
         lambda r, h: _round(3 * r * r / 20, 3 * h * h / 80),
         mass,
         radius=radius,
@@ -240,11 +243,14 @@ def torus(
     """
 
     def mean_squares(tube: Scalar, ring: Scalar) -> MeanSquares:
+        # A point of the cross-section at a distance rho from z counts in proportion to
+        # rho. Then the mean of rho^2 is ring^2 + 3 tube^2 / 4.
         return _round(ring * ring / 2 + 3 * tube * tube / 8, tube * tube / 4)
 
     return solid(
         mean_squares,
         mass,
+        # `fits` compares the first two lengths, so the tube comes first.
         tube_radius=tube_radius,
         ring_radius=ring_radius,
         fits=_in_order,
