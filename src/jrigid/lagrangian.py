@@ -71,6 +71,7 @@ def _equations(lagrangian: _Bound, q: Array, q_dot: Array) -> tuple[Array, Array
     # dp/dt at constant rates, (d^2 L / dq_dot dq) q_dot, without the mixed Hessian.
     _, carried = jax.jvp(lambda q: momenta(q, q_dot), (q,), (q_dot,))
     force = jax.grad(lagrangian)(q, q_dot) - carried
+    # The entries ij and ji round differently.
     return 0.5 * (mass + mass.T), force
 
 
@@ -199,6 +200,7 @@ def vector_field(
         y: tuple[CoordinatesLike, CoordinatesLike],
         args: Any,
     ) -> tuple[Coordinates, Coordinates]:
+        # A named tuple is a single parameter, and must not be taken apart.
         if args is not None and type(args) not in (tuple, list):
             raise ValueError(
                 "Argument `args` must be a tuple of the Lagrangian's parameters or "
@@ -329,6 +331,8 @@ def cyclic_coordinates(
     steps = np.random.default_rng(0).uniform(-1, 1, (2, _PROBES, q.size))
     places, changes = jnp.asarray(steps, q.dtype)
     moving = q_dot[None] + changes * speed
+    # At rest a weak potential stands alone. Beside fast motion its slope may be below
+    # the tolerance.
     rates = jnp.stack([moving, jnp.zeros_like(moving)])
 
     def flat(place: Array, q_dot: Array) -> Array:
@@ -346,6 +350,8 @@ def _is_flat(
     value, (slope, momentum) = value_and_slopes(q, q_dot)
     # Changes of L over the reach can be compared between coordinates of any unit.
     change = jnp.abs(slope) * spread
+    # The terms p q_dot are a measure of the kinetic energy, whose rounding a slope
+    # carries.
     largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
     tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
     return (change <= tolerance * largest) & jnp.isfinite(value)
