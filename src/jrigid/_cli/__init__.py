@@ -20,6 +20,7 @@ from jrigid._cli import _photometry
 from jrigid.identify import Status
 from jrigid.systems import RigidBody
 
+# The initial values of a fit need four samples.
 _SHORTEST = 4  # rows of a piece that is fitted
 # 1 is for what cannot be used, 2 for what argparse does not understand.
 _EXIT = {
@@ -33,7 +34,8 @@ _EXIT = {
 # Classes of `jrigid.identify`, in lower case.
 _INERTIA_MODELS = ("tensor", "moments", "symmetric", "top", "flat")
 # Patterns of what reports and errors say of arguments in Python, and the options of the
-# command line that set them. They are applied in this order.
+# command line that set them. They are applied in this order: a pattern that contains a
+# later one precedes it.
 _OPTIONS = (
     (r"\(`free`\), by `free=[^`]*bias`", "by `--bias`"),
     (r"`free(=[^`]*bias)?`", "`--bias`"),
@@ -185,6 +187,7 @@ def _unit(text: str) -> tuple[str, str | float]:
     """What a unit is of, and its name or the factor that it stands for."""
     kind, _, unit = text.rpartition("=")
     try:
+        # Without `=` all of the text is the unit, and it is that of the rates.
         return kind or "rates", float(unit)
     except ValueError:
         return kind or "rates", unit
@@ -233,6 +236,7 @@ def _fit(options: argparse.Namespace) -> int:
         os.environ.setdefault("MPLBACKEND", "Agg")
         figure: Any = plot.fit(result)["record"].figure
         figure.savefig(options.plot)
+    # Bad input is not among these, since it has raised an error above.
     codes = (x for name, x in _EXIT.items() if result.status == getattr(Status, name))
     return next(codes)
 

@@ -13,6 +13,7 @@ from jrigid._checks import demand
 
 _HOUR = 3600.0
 _DAY = 86400.0
+# Exact, by the definition of the International Astronomical Union of 2012.
 _AU = 149597870700.0  # m
 # Of the first word of an ALCDEF file.
 _ALCDEF = "STARTMETADATA"
@@ -115,6 +116,7 @@ def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
     """The light curves of the file."""
     path = pathlib.Path(options.path)
     # A byte order mark would hide the first word, by which the format is recognised.
+    # Only the first word counts here, so bytes of another encoding do no harm.
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = (line.strip() for line in text.splitlines())
     first = next((x for x in lines if x and not x.startswith("#")), "")
@@ -143,6 +145,7 @@ def _summary(curves: list[photometry.LightCurve]) -> str:
     """What was read, in a sentence."""
     ts = np.concatenate([x.ts for x in curves])
     relative = sum(x.is_relative for x in curves)
+    # All curves of a file have the same epoch.
     first = curves[0].epoch + ts.min() / _DAY
     return (
         f"{len(curves)} light curves, of which {relative} are relative, with {len(ts)} "
