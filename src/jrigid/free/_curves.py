@@ -20,7 +20,8 @@ from jrigid.free._free_rotation import (
 from jrigid.free._jacobi_solution import invariants
 from jrigid.rotation import rotate
 
-# The polhode of an endless motion is drawn within this phase of the start.
+# The polhode of an endless motion is drawn within this phase of the start. exp(-20) is
+# 2e-9, so from a point well off the intermediate axis both ends reach that axis.
 _ENDLESS_PHASE = 20.0
 
 
@@ -159,6 +160,8 @@ def separatrix(inertia: InertiaLike) -> Separatrix:
 def _planes(i1: Array, i2: Array, i3: Array) -> Separatrix:
     """The planes of a body that is no sphere."""
     # Roots of products would have NaN slopes in the third moment where two are equal.
+    # On the separatrix al L1^2 = be L3^2, in the letters of `_jacobi_solution.py`, so
+    # |L3 / L1| = sqrt(I3 (I2 - I1) / (I1 (I3 - I2))).
     low = jnp.sqrt(i2 - i1)
     high = jnp.sqrt(i3 - i2)
     up = low * jnp.sqrt(i3)

@@ -101,6 +101,7 @@ def _check(findings: Findings, inertia: Array) -> None:
 def _flow(inertia: Array, state0: State, t: Array) -> tuple[Array, Array]:
     """Attitude and angular velocity at a time t after `state0`."""
     turn, omega = _turn(inertia, state0.omega, t)
+    # The rotation since the start is in body axes, so it is the factor on the right.
     return multiply(normalize(state0.attitude), turn), omega
 
 
@@ -163,6 +164,7 @@ def in_principal_axes(inertia: Array, omega: Array) -> tuple[Array, Array]:
     if inertia.ndim == 1:
         return inertia, omega
     moments, axes = eigh(inertia)
+    # The columns of `axes` are the principal axes, so this is axes^T omega.
     return moments, product("ji,j->i", axes, omega)
 
 
@@ -193,6 +195,7 @@ def _of_tensor_jvp(primals: tuple, tangents: tuple) -> tuple:
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     omega, omega_change = (product("ji,j->i", axes, x) for x in (omega, omega_change))
     value, slopes = _with_slopes(moments, omega, t)
+    # In the order of the axes about which they turn the body.
     elements = jnp.stack([inside[1, 2], inside[2, 0], inside[0, 1]])
     changes = jnp.concatenate(
         [jnp.diagonal(inside), omega_change, t_change[None], elements]
@@ -276,6 +279,8 @@ def _evaluate(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
         known: _Interpolation, node_and_weight: Array
     ) -> tuple[_Interpolation, None]:
         node, weight = node_and_weight
+        # Under vmap a condition of each lane would turn `cond` into a select, which
+        # evaluates both sides. This one is common to all lanes.
         needed = (node == 0) | unvmap_any(known.widening != 0)
         return jax.lax.cond(needed, evaluate, skip, node, weight, known), None
 
@@ -299,6 +304,7 @@ def _slopes_at(moments: Array, omega: Array, t: Array) -> tuple[Array, Array, Ar
     directions = jnp.eye(7, dtype=t.dtype)
     arguments = jnp.concatenate([moments, omega, t[None]])
     value, columns = jax.vmap(along, out_axes=(None, 0))(directions)
+    # I2 - I3, I3 - I1 and I1 - I2, for the elements 23, 31 and 12.
     gaps = jnp.roll(moments, -1) - jnp.roll(moments, -2)
     quotients = jax.vmap(_turned, (0, 0, None, None, None))(
         directions[:3, :3],
@@ -317,6 +323,7 @@ def _steepest(slopes: Array) -> Array:
 
 def _close_pairs(widening: Array) -> Array:
     """Which pairs of moments, 23, 31 and 12, have a close gap."""
+    # The gap between I1 and I3 is close only where both others are.
     low, _, high = widening != 0
     return jnp.stack([high, low & high, low])[:, None]
 
@@ -332,6 +339,7 @@ def _widening(
     """Changes of the moments that widen the close gaps; zero where none is close."""
     low = moments[:2]
     phase = safe_norm(omega) * jnp.abs(t)
+    # A gap x turns the motion by about x times the sum in this denominator.
     reach = _CLOSE[t.dtype.itemsize] / ((1 + phase) / low + steepness)
     distance = _PROBE * low / (1 + phase * phase) if probing else reach
     low, high = jnp.where(moments[1:] - moments[:2] < reach, distance, 0.0)
@@ -342,6 +350,8 @@ def _turned(
     axis: Array, gap: Array, omega: Array, value: Array, columns: Array
 ) -> Array:
     """Effect on the motion of a turn of the body's axes, divided by a gap."""
+    # A small turn R changes the element 23 of a diagonal tensor by its angle about axis
+    # 1 times I2 - I3. The motion F obeys F(R I R^T, omega) = R F(I, R^T omega).
     turned = jnp.cross(axis, value[1:].reshape(2, 3)).reshape(6)
     change = product("k,kn->n", jnp.cross(axis, omega), columns)
     return jnp.concatenate([-change[:1], turned - change[1:]]) / gap

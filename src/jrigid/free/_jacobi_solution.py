@@ -45,17 +45,22 @@ from jrigid._numerics import (
 from jrigid._types import Quaternion, Scalar, Vector
 from jrigid.rotation import multiply, rotate_inverse
 
+# The longest phase over 2^11 is 0.04. There the next term of the series is below 0.01 x
+# 0.04^10 = 1e-16 of s, which is its rounding.
 _DOUBLINGS = 11
 _MEANS = 11  # arithmetic-geometric means: quadratic convergence, from a ratio of 1e-60
 # Closer to the separatrix than this fraction, no half-period ends in any time. Beyond
 # the longest phase the momentum is taken to stay: it would leave only then, from within
 # 1e-60 (float32: 1e-18) of the unstable axis.
 _ON_SEPARATRIX = {8: 1e-120, 4: 1e-36}
+# Half of the quarter period at the limit, log(4 / 1e-60) / 2 = 70 (float32: 21), is
+# below it.
 _LONGEST_PHASE = {8: 80.0, 4: 24.0}
 
 
 def _short_time(kap: Array, p: Array, q: Array, h: Array) -> Components:
     """Functions s, cP, cQ and w after a short time: a series and a quadrature."""
+    # The Taylor series of s'^2 = 1 - (P + Q) s^2 + P Q s^4.
     a = (p + q) * h * h
     b = p * q * h**4
     c1 = -a / 6
@@ -63,6 +68,7 @@ def _short_time(kap: Array, p: Array, q: Array, h: Array) -> Components:
     c3 = -a * (a * a + 132 * b) / 5040
     c4 = (a**4 + 1224 * a * a * b + 3024 * b * b) / 362880
     s = h * (1 + (c1 + (c2 + (c3 + c4))))
+    # The integral over s instead of the time, with dt = ds / (cP cQ).
     nodes, weights = gauss_legendre(5, s.dtype)
     z = (s * nodes) ** 2
     w = jnp.sum(s * z * weights / ((1 - kap * z) * jnp.sqrt((1 - p * z) * (1 - q * z))))
@@ -77,6 +83,7 @@ def _twice(kap: Array, u: Array, v: Array, at_half: Components) -> Components:
     s2 = s * s
     cp2 = cp * cp
     cq2 = cq * cq
+    # The denominator 1 - P Q s^4 of the addition theorems, as a sum of positive terms.
     inverse = 2 / (cp2 * (1 + q * s2) + cq2 * (1 + p * s2))
 
     def cosine(m: Array, own: Array, other: Array, spread: Array) -> Array:
@@ -185,6 +192,7 @@ class Invariants(NamedTuple):
 def invariants(moments: Vector, omega: Vector) -> Invariants:
     """The labels, the invariants and the period of a motion."""
     unit = power_of_two(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))
+    # The motion depends on ratios of the moments alone.
     i = moments / power_of_two(jax.lax.stop_gradient(jnp.max(moments)))
     labels, i, w, excess = _labelled(i, omega / unit)
     i1, i2, i3 = i
@@ -221,6 +229,7 @@ def _labelled(
     moments: Array, omega: Array
 ) -> tuple[Labels, Components, Components, Array]:
     """Labels, moments and rates by the new names of the axes, and 2 E - a2 |L|^2."""
+    # The middle moment is not above both others, nor below both.
     first, second = (
         (moments[j] - moments[j - 1]) * (moments[j] - moments[j - 2]) <= 0
         for j in range(2)
@@ -228,7 +237,11 @@ def _labelled(
     labels = Labels(first, second, jnp.array(False))
     i1, i2, i3 = labels.shift(moments)
     w1, w2, w3 = labels.shift(omega)
+    # Differences of the moments come first: the difference of 2 E and a2 |L|^2 would
+    # lose digits, and its sign decides the regime.
     excess = ((i2 - i1) * i1 * w1 * w1 - (i3 - i2) * i3 * w3 * w3) / i2
+    # The angular momentum circles axis 3 where u = -al C2 >= 0, and al has the sign of
+    # I3 - I1.
     labels = labels._replace(reverse=(i3 - i1) * excess > 0)
     return labels, labels.flip((i1, i2, i3), 1), labels.flip((w1, w2, w3)), excess
 
@@ -247,6 +260,7 @@ def _at_half(motion: Invariants, t: Array) -> _Half:
     """The functions at half of a time, which is in units of the motion."""
     # At a change of their number both neighbours give the same motion.
     half_periods = jnp.where(motion.circles, jnp.round(t / (2 * motion.quarter)), 0.0)
+    # For a sphere and at rest this is 0, and then no phase is too long.
     growth = root_of_positive(jax.lax.stop_gradient(motion.kap + motion.v))
     longest = _LONGEST_PHASE[jnp.dtype(t.dtype).itemsize] / growth
     h = jnp.clip(0.5 * t - half_periods * motion.quarter, -longest, longest)
@@ -285,6 +299,8 @@ def after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:
     half = _at_half(motion, t * motion.unit)
     back = _back_to_start(motion, half)
     l1, l2, l3 = motion.momentum
+    # The half-angle about L is |L| times this phase. Even functions of it need no |L|,
+    # which has no derivative at rest.
     z = motion.momentum_square * half.phase * half.phase
     turn = sinc_sqrt(z) * half.phase
     about = jnp.stack([cos_sqrt(z), turn * l1, turn * l2, turn * l3])

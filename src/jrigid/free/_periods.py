@@ -118,6 +118,7 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """
 
     def angle(motion: Invariants) -> Scalar:
+        # Both factors are in units of the motion, which cancel in an angle.
         turned = 4 * motion.quarter * _mean_rate(motion)
         return jnp.where(motion.circles, turned, jnp.inf)
 

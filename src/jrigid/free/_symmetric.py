@@ -45,6 +45,8 @@ def _where_symmetric(
         tensor = inertia if inertia.ndim == 2 else jnp.diag(inertia)
         i1, i2, i3 = jnp.diagonal(tensor)
         uneven = jnp.stack([i1 - i2, tensor[0, 1], tensor[0, 2], tensor[1, 2]])
+        # With the mean of I1 and I2 the wobble rate is right to second order in their
+        # difference. So sqrt(eps) of I3 - I1 leaves an error of rounding.
         eps = jnp.finfo(tensor.dtype).eps
         tolerance = jnp.sqrt(eps) * jnp.abs(i3 - i1) + 16 * eps * jnp.max(
             jnp.abs(tensor)
@@ -131,6 +133,7 @@ def cone_angles(inertia: InertiaLike, omega: VectorLike) -> ConeAngles:
     """
 
     def angles(i1: Array, i3: Array, w: Array) -> ConeAngles:
+        # Without wobble a plain norm would have a NaN derivative.
         across = safe_norm(w[:2])
         along = w[2]
         # tan(alpha - theta), without the difference of two angles
