@@ -110,6 +110,7 @@ def _integrals(
         state.attitude, gravity.gravity / jnp.where(pulls, strength, 1.0)
     )
     up = jnp.where(pulls, -down, 0.0)
+    # Body components. The product with `up` is the component along the vertical.
     momentum = angular_momentum(inertia, state.omega)
     energy = kinetic_energy(inertia, state.omega) + gravity.potential(0.0, state, None)
     rate = gravity.mass * strength / inertia[2]
@@ -121,10 +122,15 @@ def _integrals(
     if case == "euler":
         extra = product("i,i->", momentum, momentum)
     elif case == "lagrange":
+        # With I1 = I2 and the lever along axis 3 no torque acts about that axis.
         extra = momentum[2]
     elif case == "kovalevskaya":
+        # Euler's and Poisson's equations give (w^2 - c g)' = -i omega3 (w^2 - c g),
+        # which changes the phase alone.
         extra = square_of(w * w - c * g)
     elif case == "goryachev-chaplygin":
+        # Its rate is proportional to the vertical angular momentum, so it is constant
+        # only where that is zero.
         extra = state.omega[2] * square_of(w) - up[2] * (jnp.conj(c) * w).real
     return Integrals(energy, product("i,i->", momentum, up), extra)
 
@@ -145,6 +151,8 @@ def _is_of_case(
             gravity.mass * safe_norm(gravity.gravity) * safe_norm(gravity.lever) == 0
         )
     elif case is not None:
+        # The lever is along axis 3 in the case of Lagrange, and across it in the other
+        # two.
         off = gravity.lever[:2] if case == "lagrange" else gravity.lever[2]
         of_case &= vanishes(i1 - i2, i1) & vanishes(off, gravity.lever)
     if case in _RATIOS:

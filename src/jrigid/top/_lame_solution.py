@@ -44,6 +44,7 @@ from jrigid.dynamics import State
 from jrigid.rotation import normalize
 from jrigid.top._symmetric_top import SymmetricTop
 
+# The longest phase over 2^11 is 0.03, where the series of s is good to rounding.
 _DOUBLINGS = 11
 # Quadratures over a short time: 5 nodes are enough if mu s^2 shows no pole nearby.
 _NODES = 5
@@ -54,6 +55,8 @@ _MEANS = 9  # arithmetic-geometric means: quadratic convergence, from a ratio of
 # phase a top is taken to stay upright: it would leave only then, from a tilt below
 # exp(-phase).
 _ON_SEPARATRIX = {8: 1e-100, 4: 1e-15}
+# At the limit a quarter of a nutation has a phase of log(4 / 2e-25) = 58 (float32:
+# 9.3), which is below it.
 _LONGEST_PHASE = {8: 60.0, 4: 10.0}
 # Nutations that last longer than some 1e20 (1e6) radians are not counted.
 _SLOWEST = {8: 1e-80, 4: 1e-24}
@@ -78,6 +81,7 @@ def _short_time(mu: Array, a: Array, b: Array, g: Array, h: Array) -> Components
     p = a * x
     q = b * x * x
     r = -((g * x) ** 2) * x
+    # The Taylor series of s'^2 = 1 + A s^2 + B s^4 - G^2 s^6.
     c1 = p / 6
     c2 = (p * p + 12 * q) / 120
     c3 = (p**3 + 132 * p * q + 360 * r) / 5040
@@ -122,6 +126,7 @@ def _elapsed(
 def _largest_root(a: Array, b: Array, square: Array) -> Array:
     """Initial value for Newton's method: largest root of X^3 + A X^2 + B X - G^2."""
     m = jnp.sqrt(jnp.maximum(a * a - 3 * b, 0.0))
+    # Viete's formula for three real roots.
     cosine = (9 * a * b + 27 * square - 2 * a**3) / jnp.where(m > 0, 2 * m**3, 1.0)
     far = (2 * m * jnp.cos(jnp.arccos(jnp.clip(cosine, -1, 1)) / 3) - a) / 3
     # Where the two largest roots are close to each other and to zero, a quadratic.
@@ -239,8 +244,10 @@ def _start(
     q0, q1, q2, q3 = attitude
     upright_alpha = jax.lax.complex(q0, q3)
     upright_beta = jax.lax.complex(q1, q2)
+    # The quaternion i q: space makes half a turn about its first axis.
     alpha = jnp.where(hangs, -jnp.conj(upright_beta), upright_alpha)
     beta = jnp.where(hangs, jnp.conj(upright_alpha), upright_beta)
+    # q' = q (0, omega) / 2 in complex numbers. omega is that of the spherical top.
     across = jax.lax.complex(0.5 * w1, 0.5 * w2)
     along = jax.lax.complex(jnp.zeros_like(spin), 0.5 * spin)
     d_alpha = along * alpha - beta * jnp.conj(across)
@@ -336,6 +343,7 @@ def _at_half(motion: Invariants, t: Scalar) -> _Half:
     phase = t * motion.unit
     nutations = jnp.where(motion.nutates, jnp.round(phase / motion.period), 0.0)
     h = 0.5 * (phase - nutations * motion.period)
+    # A motion that nutates gets the rate 0, so its phase is not limited.
     growth = root_of_positive(jax.lax.stop_gradient(jnp.where(motion.nutates, 0.0, a)))
     longest = _LONGEST_PHASE[jnp.dtype(t.dtype).itemsize] / growth
     stop = jnp.clip(h, -longest, longest)
@@ -372,6 +380,7 @@ def state_after(motion: Invariants, t: Scalar) -> tuple[Quaternion, Vector]:
     across = _times(2 * motion.unit, across * turn_beta * jnp.conj(turn_alpha))
     upright_alpha = alpha * turn_alpha
     upright_beta = beta * turn_beta
+    # The quaternion -i q, the inverse of what `_start` did.
     alpha = jnp.where(motion.hangs, jnp.conj(upright_beta), upright_alpha)
     beta = jnp.where(motion.hangs, -jnp.conj(upright_alpha), upright_beta)
     q = jnp.stack([alpha.real, beta.real, beta.imag, alpha.imag])

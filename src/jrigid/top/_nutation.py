@@ -139,6 +139,7 @@ def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
 
     def tilts(motion: Invariants) -> NutationBounds:
         of_beta, of_alpha, _ = _bounds(motion)
+        # The arc cosine of cos theta would lose half the digits of a small tilt.
         both = 2 * safe_arctan2(root_of_positive(of_beta), root_of_positive(of_alpha))
         return NutationBounds(*jnp.where(motion.hangs, jnp.pi - both[::-1], both))
 
@@ -176,9 +177,12 @@ def nutation_period(top: SymmetricTop, state: State) -> Scalar:
 def _advance(motion: Invariants) -> Advance:
     """Advance in one nutation; zero where no nutation ends."""
     momentum_alpha, momentum_beta = motion.momenta
+    # Each argument makes its half turn in the sense of its constant momentum. If that
+    # is zero, both senses are as good, and their mean is 0.
     of_alpha = motion.advance_alpha + jnp.pi * jnp.sign(momentum_alpha)
     of_beta = motion.advance_beta + motion.half_turn * jnp.sign(momentum_beta)
     phi = jnp.where(motion.hangs, -1.0, 1.0) * (of_alpha + of_beta)
+    # The rotation of the body about its axis against the spherical top.
     slip = (motion.omega3 - motion.spin) / motion.unit * motion.period
     psi = of_alpha - of_beta + slip
     return Advance(
@@ -234,6 +238,8 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
     """
 
     def rate(motion: Invariants) -> Array:
+        # The axis comes to the vertical, round which it goes at half the spin of the
+        # spherical top.
         endless = jnp.where(motion.hangs, -0.5, 0.5) * motion.spin
         mean = motion.unit * _advance(motion).phi / motion.period
         return jnp.where(motion.nutates, mean, endless)
@@ -278,6 +284,7 @@ def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     rate = jnp.sqrt(mu + square_of(d_alpha) + square_of(d_beta))
     rate = jnp.where(rate > 0, rate, 1.0)
     pairs = (alpha, d_alpha), (beta, d_beta)
+    # A sleeping top has beta = 0 (upright) or alpha = 0 (hanging), at rest.
     away = jnp.minimum(*(rate**2 * square_of(x) + square_of(dx) for x, dx in pairs))
     turns = _turns(motion, bounds, tolerance)
     upright = of_beta[0] <= tolerance * of_beta[1]
@@ -305,6 +312,8 @@ def _turns(motion: Invariants, bounds: _Bounds, tolerance: ScalarLike) -> Array:
     # phi' sin^2 / 4 at both bounds
     of_alpha = momentum_alpha * bounds.of_beta
     of_beta = momentum_beta * bounds.of_alpha
+    # |alpha|^2 and |beta|^2 are (1 +- cos theta) / 2, and the momenta are (p_phi +-
+    # p_psi) / (4 I1): this is (p_phi - p_psi cos theta) / (4 I1).
     turning = of_alpha + of_beta
     rounding = tolerance * (jnp.abs(of_alpha) + jnp.abs(of_beta))
     return jnp.prod(jnp.where(jnp.abs(turning) <= rounding, 0.0, jnp.sign(turning)))

@@ -107,6 +107,8 @@ def _over(momentum: Array, side: Array) -> Array:
 def _angle_rates(
     i1: Array, i3: Array, _mgl: Array, theta: Array, p_phi: Array, p_psi: Array
 ) -> AngleRates:
+    # p_phi - p_psi cos theta = (p_phi - p_psi) cos^2 + (p_phi + p_psi) sin^2 of half
+    # the angle, over sin^2 theta = 4 sin^2 cos^2.
     sin = jnp.sin(0.5 * theta)
     cos = jnp.cos(0.5 * theta)
     # The part that is large near upright, and the part that is large near upside down.
@@ -180,7 +182,8 @@ def effective_potential(
     ) -> Array:
         sin = jnp.sin(0.5 * theta)
         cos = jnp.cos(0.5 * theta)
-        # (p_phi - p_psi cos theta) / sin theta
+        # (p_phi - p_psi cos theta) / sin theta, split as in `_angle_rates`, so that no
+        # part has a pole where the axis can pass.
         across = _over(p_phi - p_psi, sin) * cos + _over(p_phi + p_psi, cos) * sin
         return 0.5 * across * across / i1 + mgl * jnp.cos(theta)
 

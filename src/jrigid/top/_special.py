@@ -79,9 +79,11 @@ def _steady(
     i1 = i1 - i3 if of_psi else i1
     eps = jnp.finfo(theta.dtype).eps
     cos = jnp.cos(theta)
-    # A level axis has one rate only.
+    # A level axis has one rate only. So has any axis where psi_dot is given and I1 =
+    # I3: the equation for p is linear.
     level = (jnp.abs(cos) <= 4 * eps) | (i1 == 0)
     slant = jnp.where(level, 0.0, i1 * cos)
+    # The discriminant of slant p^2 - momentum p + mgl = 0.
     square = momentum * momentum - 4 * slant * mgl
     root = root_of_positive(square)
     # Both terms have one sign, so that the sum does not cancel. The other root follows
@@ -197,6 +199,8 @@ def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyro
         i1: Array, i3: Array, mgl: Array, theta: Array, omega3: Array
     ) -> Gyroscopic:
         momentum = i3 * omega3
+        # Released from rest, a top falls from the cusp by twice the amplitude of the
+        # small nutation about steady precession.
         fall = 2 * mgl * i1 * jnp.sin(theta) / (momentum * momentum)
         return Gyroscopic(mgl / momentum, momentum / i1, fall)
 

@@ -166,6 +166,8 @@ class SymmetricTop(Readable):
         transverse, axial, mass, length, pull = harmless(
             findings.ok, (transverse, inertia[2, 2], mass, lever[2], gravity[2])
         )
+        # `pull` is negative where gravity acts along -z. The sign makes mgl positive
+        # for a centre of mass on the positive side of axis 3.
         numbers = transverse + mass * length * length, axial, -mass * pull * length
         _require_valid(findings, *jax.lax.stop_gradient(numbers))
         return findings.guard(cls.unchecked(*numbers), throw)

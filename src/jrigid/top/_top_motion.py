@@ -57,6 +57,8 @@ def top_motion(
     check_type("top", top, SymmetricTop)
     numbers = top.I1, top.I3, top.mgl, ts, t0
     state0, (i1, i3, mgl, ts, t0) = plain_state("state0", state0, *numbers)
+    # The same top in the dtype that it has in common with the state and the times.
+    # `_check` looks at its values.
     top = SymmetricTop.unchecked(i1, i3, mgl)
     return exact_motion(_check, _flow, throw, top, state0, ts, t0)
 
