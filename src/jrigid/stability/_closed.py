@@ -206,6 +206,8 @@ def _modes(towards: Array, back: Array) -> Modes:
     upper = jnp.where(of_first, towards.astype(rates.dtype), rates)
     lower = jnp.where(of_first, rates, back.astype(rates.dtype))
     square = jnp.abs(wobble.growth_rate_squared)
+    # The square of the magnitude of the rate is |square|, so this is the longer of the
+    # two vectors.
     length = root_of_positive(square + jnp.maximum(towards**2, back**2))
     length = jnp.where(length > 0, length, 1.0).astype(rates.dtype)
     shapes = jnp.stack([upper, lower], axis=1) / length
@@ -325,6 +327,8 @@ def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
     """
 
     def formula(i1: Array, i3: Array, mgl: Array, spin: Array) -> TopStability:
+        # z = exp(i s t) gives I1 s^2 - I3 omega3 s + mgl = 0, with the roots half +-
+        # split.
         half = i3 * spin / (2 * i1)
         square = mgl / i1 - half * half
         split = root_of_positive(-square)
@@ -379,6 +383,8 @@ def precession_stability(
     ) -> tuple[Array, Array]:
         steady = steady_precession(SymmetricTop.unchecked(i1, i3, mgl), tilt, spin)
         rates = jnp.stack([steady.slow, steady.fast])
+        # The frequency of a small nutation is the hypotenuse of these two rates, so no
+        # steady precession is unstable.
         azimuthal = rates * jnp.sin(tilt)
         polar = i3 * spin / i1 - 2 * rates * jnp.cos(tilt)
         return rates, -(azimuthal**2) - polar**2
@@ -440,6 +446,7 @@ def satellite_stability(
     """
     moments, n = shaped(moments=(moments, 3), orbital_rate=(orbital_rate,))
     ok = all_positive(moments) & jnp.isfinite(n)
+    # The largest moment of a body is at most the sum of the other two.
     real = 2 * jnp.max(moments) <= jnp.sum(moments) * (
         1 + _FLAT * jnp.finfo(moments.dtype).eps
     )

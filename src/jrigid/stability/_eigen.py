@@ -91,12 +91,14 @@ def _slopes(matrix: Array, values: Array, change: Array) -> Array:
     identity = jnp.eye(n, dtype=real)[None, None]
     resolvents = jnp.linalg.inv(points * identity - matrix[None, None])
     traces = product("ipjk,kj->ip", resolvents, change.astype(values.dtype))
+    # On the circle dz / (2 pi i) is spokes dtheta / (2 pi).
     return jnp.sum(spokes * traces, axis=1) / (_POINTS * count)
 
 
 def _clusters(values: Array, distance: Array) -> Array:
     """Which eigenvalues count as one; neighbours of neighbours belong together."""
     close = jnp.abs(values[:, None] - values[None, :]) <= distance
+    # Each pass doubles the length of the chains that are joined.
     for _ in range(max(values.size - 1, 1).bit_length()):
         close = jnp.any(close[:, :, None] & close[None, :, :], axis=1)
     return close
@@ -108,6 +110,8 @@ def _contour_radius(values: Array, centre: Array, close: Array, size: Array) -> 
     inner = jnp.max(distance, axis=1, initial=0.0, where=close)
     # No eigenvalue is as far as the initial value.
     outer = jnp.min(distance, axis=1, initial=4 * size, where=~close)
+    # The error is about (inner / radius)^48 + (radius / outer)^48. Half way to the
+    # others both terms are small, and the geometric mean makes them equal.
     return jnp.where(inner < 0.25 * outer, 0.5 * outer, jnp.sqrt(inner * outer))
 
 
@@ -148,6 +152,7 @@ def _without_symmetries(
     """
     blind = jnp.all(matrix[3:, :3] == 0)
     away = -jnp.eye(3, len(matrix), dtype=matrix.dtype)
+    # The turn then has the eigenvalue -1 three times and is coupled to nothing.
     matrix = matrix.at[:3].set(jnp.where(blind, away, matrix[:3]))
     conserved = conserved.at[:, :3].set(jnp.where(blind, 0.0, conserved[:, :3]))
     directions = (
@@ -174,6 +179,7 @@ def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> 
     values, vectors = eigensystem(matrix)
     known = jax.lax.stop_gradient(values)
     free = known.real > -0.5
+    # The mirror image of s about the imaginary axis is -conj(s).
     mirrored = jnp.abs(known[:, None] + jnp.conj(known)[None, :]) <= tiny
     undamped = jnp.all(~free | jnp.any(mirrored, axis=1))
     damped = -jnp.max(jnp.where(free, values.real, -1.0))
@@ -181,6 +187,7 @@ def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> 
     mean = 0.5 * (values[i] + values[j])
     shifted = matrix.astype(mean.dtype) - mean * jnp.eye(len(matrix), dtype=mean.dtype)
     squares, _ = eigensystem(product("ij,jk->ik", shifted, shifted))
+    # Both s - mean and s' - mean have this square.
     apart = 0.25 * (known[i] - known[j]) ** 2
     place = jnp.argmin(jnp.abs(jax.lax.stop_gradient(squares) - apart))
     return jnp.where(undamped, -squares[place].real * size, damped) * size

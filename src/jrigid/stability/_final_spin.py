@@ -123,6 +123,7 @@ def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     settled = jnp.abs(alignment) > math.cos(math.radians(_SETTLED))
     side = SIDES.where(alignment > 0, SIDES.along, SIDES.against)
     side = SIDES.where(settled, side, SIDES.not_settled)
+    # A comparison with NaN is False, which would read as not settled.
     side = SIDES.where(findings.ok, side, SIDES.undefined)
     return FinalSpin(side, alignment, state, error, findings.result)
 
@@ -133,6 +134,7 @@ def _alignment(inertia: Array, omega: Array) -> Scalar:
         # Given moments may be in any order; those of `principal_axes` ascend.
         axis = jnp.eye(3, dtype=omega.dtype)[jnp.argmax(inertia)]
     else:
+        # The inertia of a system need not have the dtype of the state.
         axis = principal_axes(inertia).axes[:, 2].astype(omega.dtype)
     rate = safe_norm(omega)
     return jnp.sum(omega * axis) / jnp.where(rate > 0, rate, 1.0)

@@ -60,6 +60,9 @@ def _flips(inertia: Array, omega: Array) -> Bool[Array, ""]:
     twice = 2 * kinetic_energy(inertia, omega)
     # Where |w2| is largest, the component on the side of the separatrix that the
     # motion does not circle is 0, and w2^2 must exceed the square of the third.
+    # With w1 = 0, for example, i2 (i3 - i2) w2^2 = 2 E i3 - |L|^2 and i3 (i3 - i2) w3^2
+    # = |L|^2 - 2 E i2.
     outer = jnp.where(square > twice * i2, i3, i1)
     faster = jnp.abs(twice * outer - square) * outer > jnp.abs(square - twice * i2) * i2
+    # A body with two equal moments has no intermediate axis.
     return faster & (i1 < i2) & (i2 < i3)

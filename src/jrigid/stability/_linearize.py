@@ -196,6 +196,7 @@ class _Frame(NamedTuple):
     def look(self, later: Array) -> tuple[Array, Array]:
         """What is linear about the motion some time later, and how it moves."""
         still = jnp.zeros(self.motion.dimension, later.dtype)
+        # The second one is passed through as a value, so one evaluation gives both.
         return jax.jacfwd(lambda x: (self.rates(x, later),) * 2, has_aux=True)(still)
 
     def symmetries(self, rate: Scalar) -> tuple[Array, Array]:
@@ -266,12 +267,15 @@ def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
     rate = jnp.where(jnp.isfinite(rate) & ~rests, rate, 1.0)
     units = frame.units(rate)
     accuracy = _accuracy(rate.dtype)
+    # In these units an entry is an angle for an angle, per radian of the motion.
     size = units[None, :] / units[:, None] / rate
     largest = jnp.where(rests, 0.0, accuracy) * units * rate
     stays = jnp.all(jnp.abs(known(moves)) <= largest)
     findings.require(stays, RESULTS.no_equilibrium, _NO_EQUILIBRIUM)
     others, moves = known(jax.vmap(frame.look)(jnp.asarray(_LATER, rate.dtype) / rate))
     change = jnp.abs((others - fixed[None]) * size[None])
+    # The change of an entry below 1, which is slower than the motion, is compared with
+    # the rate of the motion.
     same = jnp.all(change <= accuracy * jnp.maximum(jnp.abs(fixed * size), 1.0)[None])
     same = same & jnp.all(jnp.abs(moves) <= largest[None])
     findings.require(same, RESULTS.no_equilibrium, _NOT_STATIONARY)
@@ -286,6 +290,7 @@ def _linearize(frame: _Frame) -> Linearization:
     accuracy = _accuracy(rate.dtype)
     known = jax.lax.stop_gradient
     eye = jnp.eye(units.size, dtype=units.dtype)
+    # NaN of a bad lane would reach the derivatives of what lanes share.
     plain = jnp.where(ok, matrix * units[None, :] / units[:, None] / rate, eye)
     values, vectors = eigensystem(plain)
     neutral, conserved = frame.symmetries(rate)
@@ -314,6 +319,8 @@ def _classify(
     turning = jnp.sum(jnp.any(null_directions(neutral, matrix.T, tiny) != 0, axis=1))
     # A zero with an eigenvector of its own stays where it is; the others drift.
     zero = jnp.abs(values) <= tiny
+    # Zero has as many eigenvectors as the matrix has singular values of zero. They are
+    # fewer than its eigenvalues of zero where the motion drifts.
     staying = jnp.sum(jnp.linalg.svd(matrix, compute_uv=False) <= tiny)
     on_axis = (jnp.abs(values.real) <= tiny) & ~zero
     gaps, alike = pairs(values, vectors)

@@ -32,6 +32,7 @@ from jrigid.stability._stepped_motion import (
 from jrigid.systems import RigidBody
 
 # A MEGNO below the first is regular and above the second chaotic.
+# In the limit a regular motion has 2, and a chaotic one grows without bound.
 _REGULAR = 3.0
 _CHAOTIC = 5.0
 # A small motion is independent of those before it if its part orthogonal to them has a
@@ -115,7 +116,10 @@ def _schedule(steps: int, every: int, samples: int) -> _Schedule:
     steps = whole_number("steps", steps)
     every = whole_number("every", every)
     samples = min(whole_number("samples", samples), steps)
+    # An interval is not longer than a sample.
     every = min(every, -(-steps // samples))
+    # The duration is kept, so more steps are shorter ones, and no result is less
+    # accurate than was asked for.
     return _Schedule(samples, -(-steps // (samples * every)), every)
 
 
@@ -130,6 +134,7 @@ def _starting_vectors(
         # the growth across it.
         angles = np.outer(np.arange(1, count + 1), 0.9 * np.arange(dimension) + 0.45)
         vectors = np.cos(angles) + 0.3 * np.eye(count, dimension)
+    # A count that was given must be that of the vectors.
     rows = array_of_shape("vectors", vectors, count, dimension).astype(motion.t0.dtype)
     if len(rows) > dimension:
         raise ValueError(
@@ -176,6 +181,7 @@ def _follow(
         y, local = path.follow(index * schedule.steps, schedule.steps, y)
         # Otherwise all tangents would turn into the direction of fastest growth.
         rows, lengths = orthonormal(path.tangents(y))
+        # The rows had length 1 at the start of the interval.
         logs = jnp.log(lengths)
         number = (1 + index).astype(y.dtype)
         weighted = growth.weighted + number * logs[0]
@@ -193,6 +199,8 @@ def _follow(
         carry, _ = jax.lax.scan(interval, carry, indices)
         return carry, carry[1]
 
+    # Two nested scans store the growth at the samples only, and not after each
+    # interval.
     zero = jnp.zeros((), y.dtype)
     no_growth = _Growth(jnp.zeros(len(path.tangents(y)), y.dtype), zero, zero)
     firsts = schedule.intervals * jnp.arange(schedule.samples)
@@ -221,6 +229,7 @@ def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators
     samples = 1 + jnp.arange(schedule.samples)
     counts = (schedule.intervals * samples).astype(rows.dtype)
     ts = path.step * schedule.steps * counts
+    # MEGNO is the mean of the indicator over the intervals so far.
     values = (ts, logarithms / ts[:, None], indicator / counts, path.state(y))
     ts, exponents, means, state = verdict(findings, path, error, values)
     mean = means[-1]
@@ -230,6 +239,7 @@ def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators
     end = (state, error, findings.result)
     return _Indicators(
         LyapunovSpectrum(exponents[-1], ts, exponents, *end),
+        # For chaos MEGNO grows as the exponent times half the time.
         Megno(mean, 2 * mean / ts[-1], order, ts, means, *end),
         findings.result,
     )

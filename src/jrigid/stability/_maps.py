@@ -84,6 +84,7 @@ def place_of_root(
         zero + 0.5,
         args,
         options={"lower": zero, "upper": zero + 1},
+        # Each step halves an interval of length 1.
         max_steps=1 - math.floor(math.log2(tolerance)),
         throw=False,
     ).value
@@ -136,6 +137,7 @@ def boundary(
     ends = jax.lax.stop_gradient(jnp.stack([lower, upper]))
     values = [array_of_shape("function", function(x, *fixed)) for x in ends]
     known = jax.lax.stop_gradient(jnp.stack(values).astype(lower.dtype))
+    # A zero at an end of the interval is a boundary, too.
     ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     falls = known[0] > known[1]
 

@@ -183,12 +183,15 @@ class _Search(NamedTuple):
             after, local = self.path.advance(t, y)
             # In a product rounding does not add up, as it does in a sum of steps.
             later = start.t + self.path.step * (count + 1).astype(t.dtype)
+            # The surface itself counts as above it, so a step that ends there crosses
+            # it once.
             higher = self.value(later, after) >= 0
             crosses = (higher != above) & (
                 self.direction is None or higher == self.direction
             )
             here = (t, y, above)
             ahead = (later, after, higher)
+            # The step with the crossing is not taken: the root is sought within it.
             t, y, above = jtu.tree_map(partial(jnp.where, crosses), here, ahead)
             return _Position(t, y, above, crosses, jnp.maximum(error, local)), count + 1
 
@@ -203,10 +206,12 @@ class _Search(NamedTuple):
     def next_crossing(self, start: _Position, _: None) -> tuple[_Position, _Crossing]:
         """The next crossing, and the position just after it."""
         t, y, above, crosses, error = self.before_crossing(start)
+        # The step is repeated for its interpolation, which the others do not need.
         state_within = self.path.within(t, y)
 
         def rising(fraction: Array, _: None) -> Array:
             ahead = self.value(t + fraction * self.path.step, state_within(fraction))
+            # A motion that is above the surface falls through it.
             return jnp.where(above, -ahead, ahead)
 
         tolerance = _CROSSING_TOLERANCE[y.dtype.itemsize]

@@ -93,6 +93,7 @@ class Walk(NamedTuple):
 
     def tangents(self, y: Array) -> Array:
         """The tangents, a row each."""
+        # A turn has three components where the quaternion has four.
         return y[self.scales.size :].reshape(-1, self.scales.size - 1)
 
     def with_tangents(self, y: Array, rows: Array) -> Array:
@@ -101,6 +102,7 @@ class Walk(NamedTuple):
 
     def on_sphere(self, y: Array) -> Array:
         """The state with a quaternion of norm 1."""
+        # A step changes the norm by its error, and no later rate corrects that.
         return jnp.concatenate([normalize(y[:4]), y[4:]])
 
     def rates(self, t: Array, y: Array) -> Array:
@@ -148,6 +150,7 @@ class Walk(NamedTuple):
             return self._by_solver(t, y)
         method = method_of(self.motion.solver)
         rates, after = stages(method, self._together, t, self.step, y, in_lanes)
+        # diffrax interpolates from increments instead of rates.
         known = self.step * rates[: method.own]
         return (
             after,
@@ -177,6 +180,7 @@ class Walk(NamedTuple):
         def step(carry: tuple, i: Array) -> tuple[tuple, None]:
             y, error = carry
             number = first + i
+            # In a product rounding does not add up, as it does in a sum of steps.
             t = self.motion.t0 + self.step * number.astype(y.dtype)
             # `in_blocks` evaluates this loop in lanes, even for a single motion.
             y, local = self.advance(t, y, in_lanes=True)
