@@ -104,6 +104,7 @@ class MassProperties(Readable):
         findings.require(is_positive, None, _NOT_A_BODY, inertia)
         findings.require(obeys_triangle, RESULTS.unphysical_inertia, value=inertia)
         tensor, self.mass, self.center_of_mass = findings.guard(values, throw)
+        # The check allows rounding, which would otherwise stay in the tensor.
         self.inertia = _symmetrised(tensor)
 
     @classmethod
@@ -248,6 +249,7 @@ def _rotated(body: MassProperties, attitude: Quaternion) -> MassProperties:
         tensor = product("ij,jk,lk->il", turn, body.inertia, turn)
         return MassProperties.unchecked(body.mass, center, tensor)
 
+    # The rotation of a zero quaternion is 0 / 0.
     ok = all_finite((body, attitude)) & jnp.any(attitude != 0)
     return where_defined(ok, turned, body, attitude)
 
