@@ -244,7 +244,7 @@ def _evaluate(moments: Array, omega: Array, t: Array) -> tuple[Array, Array]:
     The derivatives are those in the moments, which ascend, in `omega` and t, and in the
     elements 23, 31 and 12 of the tensor. Each of the last three is the effect of a turn
     of the body's axes divided by the gap of two moments. Both vanish together. Across a
-    close gap the quotient is interpolated from wider ones, which costs six more
+    close gap the quotient is interpolated from wider ones, which costs seven more
     evaluations of the motion, unless no lane needs them. Which gaps are close depends
     on how fast the motion changes with a gap; the first two evaluations measure it.
     """

@@ -23,9 +23,9 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
         matrix: Any square matrix, whose entries are of comparable size.
 
     Returns:
-        Its eigenvalues. Real parts closer than 1e-5 of the matrix's norm count as
-        equal, and there the larger imaginary part comes first. NaN for a matrix that is
-        not finite.
+        Its eigenvalues. Real parts are rounded to 1e-5 of the matrix's norm to order
+        them, and where they are then equal the larger imaginary part comes first. NaN
+        for a matrix that is not finite.
 
     Gradients: exact for an isolated eigenvalue. Eigenvalues closer than 8 sqrt(eps) of
     the matrix's norm (1e-7 in float64) count as one. Each gets the derivative of their
