@@ -561,6 +561,9 @@ def test_wrong_arguments_of_the_field_and_of_reach_are_errors(untyped):
         field(0.0, (TWO, THREE), (1.0, 1.0))
     with pytest.raises(ValueError, match=r"Argument `reach` must have shape \(2,\)"):
         lagrangian.cyclic_coordinates(oscillator, TWO, TWO, 1.0, 1.0, reach=THREE)
+    for reach in (0.0, np.array([1.0, -0.1]), np.inf):
+        with pytest.raises(ValueError, match="Argument `reach` must be positive"):
+            lagrangian.cyclic_coordinates(oscillator, TWO, TWO, 1.0, 1.0, reach=reach)
 
 
 def test_integers_are_promoted():

@@ -344,6 +344,19 @@ def test_density_by_quadrature_is_exact_for_polynomials():
     np.testing.assert_allclose(slope, 1 / 3, rtol=8 * EPS)
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_a_few_uneven_points_in_their_masses(mode):
+    """The centre of mass is far from the mean of the points, so sums are made twice."""
+    masses = jnp.array([1e-3, 1e-3, 1.0])
+    positions = jnp.array([[0.0, 0, 0], [1.0, 2, 0], [10.0, 0, 3]])
+
+    def center(masses):
+        return jr.from_points(masses, positions).center_of_mass
+
+    exact = (positions - center(masses)[None]).T / jnp.sum(masses)
+    np.testing.assert_allclose(mode(center)(masses), exact, rtol=1e-13, atol=1e-14)
+
+
 def test_a_cavity_is_a_surface_turned_inward():
     vertices = np.concatenate([4 * CUBE, 2 * CUBE + 1])
     faces = np.concatenate([CUBE_FACES, CUBE_FACES[:, ::-1] + 8])

@@ -408,6 +408,47 @@ def test_sections_of_many_lanes_and_of_starts_on_the_surface():
     assert found.valid.all()
 
 
+@pytest.mark.parametrize("direction", [None, True])
+def test_a_start_on_the_surface_at_rest_is_no_crossing(direction):
+    """A pendulum that is let go returns to where it was after its period."""
+    down = jnp.array([0.0, 0.0, -1.0])
+    pendulum = jr.RigidBody(
+        jnp.array([1.0, 1.0, 0.2]), jr.torques.UniformGravity(1.0, down, down)
+    )
+    angle = 0.8
+    start = jr.State(
+        jr.rotation.from_axis_angle(jnp.array([1.0, 0.0, 0.0]), angle), jnp.zeros(3)
+    )
+    level = float(start.attitude[1])
+
+    def condition(_, state):
+        return state.attitude[1] - 0.5 * level
+
+    def at_start(_, state):
+        return state.attitude[1] - level
+
+    found = st.poincare_section(
+        pendulum, start, condition, 2, 0.05, steps=400, direction=False
+    )
+    period = float(np.diff(found.ts)[0])
+    exact = 4 * float(jr.elliptic.ellipk(np.sin(angle / 2) ** 2))
+    np.testing.assert_allclose(period, exact, rtol=1e-7)
+    again = st.poincare_section(
+        pendulum, start, at_start, 1, 0.05, steps=150, direction=direction, throw=False
+    )
+    assert not again.valid.any() or again.ts[0] > 0.9 * period, again.ts
+
+
+def test_float32_times_that_cannot_be_told_apart_are_refused():
+    body = jr.RigidBody(MOMENTS.astype(np.float32))
+    omega = np.array([0.5, 0.3, 0.8], np.float32)
+    start = jr.State(UP.astype(np.float32), omega)
+    found = st.poincare_section(
+        body, start, lambda _, s: s.omega[0], 2, 0.1, t0=1e9, throw=False
+    )
+    assert found.result == jr.RESULTS.unresolved_times
+
+
 @pytest.mark.parametrize("unit", [1e-7, 1e4])
 def test_nothing_depends_on_the_unit_of_time(unit):
     body, omega = jr.RigidBody(MOMENTS), unit * np.array([0.5, 0.3, 0.8])
@@ -640,7 +681,16 @@ class _Kick(jr.torques.AbstractTorque):
 
 
 @pytest.mark.parametrize(
-    ("kick", "accurate"), [(_Kick(1.05, 1.07), False), (_Kick(-1.0, 60.0), True)]
+    ("kick", "accurate"),
+    [
+        (_Kick(1.05, 1.07), False),
+        (_Kick(-1.0, 60.0), True),
+        # Before the start and after the end nothing is missed.
+        (_Kick(-1.0, -0.99), True),
+        (_Kick(60.0, 60.01), True),
+        # The second one is at the start, which a step reaches but for rounding.
+        (_Kick(-4.6, 0.0), True),
+    ],
 )
 def test_steps_longer_than_a_declared_pulse_are_refused(kick, accurate):
     """Steps of 0.2 s, which the short pulse falls between."""

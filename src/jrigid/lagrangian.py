@@ -17,7 +17,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jrigid._checks import (
     all_finite,
     check_shape,
+    demand,
     float_arrays,
+    is_concrete,
     nan_where,
     shaped,
     where_defined,
@@ -301,6 +303,9 @@ def cyclic_coordinates(
         reach: How far the points lie from `q`, at most [coordinate units], one number
             or one a coordinate. By default (1 + |q_i|) / 4, which suits angles.
 
+    Raises:
+        ValueError: reach is not positive.
+
     Returns:
         True for a cyclic coordinate. `jnp.where(cyclic, p, 0)` with p of `momenta` are
         then constants of the motion. False where something is NaN.
@@ -325,6 +330,12 @@ def cyclic_coordinates(
         spread = float_arrays(reach)[0].astype(q.dtype)
         if spread.ndim > 0:
             check_shape("reach", spread, q.shape)
+        # Points at no distance tell nothing. NaN makes the answer False.
+        spread = jnp.where(spread > 0, spread, jnp.nan)
+        demand(
+            not is_concrete(spread) or bool(jnp.all(jnp.isfinite(spread))),
+            "Argument `reach` must be positive and finite, but it is not.",
+        )
     fastest = jnp.max(jnp.abs(q_dot))
     speed = jnp.where(fastest == 0, 1.0, fastest)
     # The same numbers at every call: the verdict must not depend on chance.

@@ -115,7 +115,8 @@ def _cloud(masses: Array, positions: Array) -> MassProperties:
     some = positions[:: -(-len(positions) // 64)]
     place = jax.lax.stop_gradient(jnp.mean(some, axis=0))
     sums = _moments(masses, positions, place)
-    offset = jax.lax.stop_gradient(sums[0]) / divisor
+    # The new place is a constant for `_moments`, so it may not depend on masses here.
+    offset = jax.lax.stop_gradient(sums[0] / divisor)
     # The difference of second moments loses digits if most of them is the offset's.
     is_far = 2 * mass * jnp.sum(offset * offset) > jnp.trace(sums[1])
     place = place + jnp.where(is_far, offset, 0.0)

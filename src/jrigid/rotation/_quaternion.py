@@ -291,7 +291,8 @@ def log(attitude: QuaternionLike) -> Vector:
     """Rotation vector, of length at most pi, of a quaternion.
 
     Args:
-        attitude: Unit quaternion; its norm drops out, and q and -q give the same.
+        attitude: Unit quaternion; its norm drops out, and q and -q give the same, but
+            for the sign of the axis of an exact half turn.
 
     Returns:
         Axis times angle [rad]; zero for the zero quaternion.
@@ -392,8 +393,8 @@ def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
         angle: Angle [rad], right-handed about the axis.
 
     Returns:
-        Unit quaternion; the identity, with gradient zero in `axis`, if the axis is
-        zero.
+        Unit quaternion; the identity, as (1, 0, 0, 0) or (-1, 0, 0, 0), with gradient
+        zero in `axis`, if the axis is zero.
 
     Gradients: finite everywhere.
 

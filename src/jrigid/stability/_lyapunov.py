@@ -53,7 +53,8 @@ class LyapunovSpectrum(NamedTuple):
     """Lyapunov exponents and their convergence.
 
     Attributes:
-        exponents: Mean rates of growth over the whole time, the largest first [1/s].
+        exponents: Mean rates of growth over the whole time [1/s]. After a long time the
+            largest is first; exponents that are nearly equal may change places.
         ts: Times since the start [s].
         history: Exponents up to each of these times [1/s].
         final_state: State at the end.

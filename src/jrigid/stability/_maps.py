@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, ArrayLike
 
-from jrigid._checks import Findings, all_finite, array_of_shape, shaped
+from jrigid._checks import Findings, all_finite, array_of_shape, demand, shaped
 from jrigid._types import Scalar, ScalarLike
 from jrigid.sweep import SweepResult, sweep
 
@@ -113,6 +113,7 @@ def boundary(
         The parameter at the boundary.
 
     Raises:
+        ValueError: rtol is not between 0 and 1.
         RuntimeError: The function has the same sign at both ends, is not finite there,
             or jumps where its sign changes, as at a pole.
 
@@ -145,6 +146,10 @@ def boundary(
     rising = eqx.Partial(_rising, function)
     interval = lower, upper, ok, falls
     tolerance = 64 * float(jnp.finfo(lower.dtype).eps) if rtol is None else rtol
+    demand(
+        0 < tolerance < 1,
+        f"Argument `rtol` must be between 0 and 1, but it is {rtol}.",
+    )
     place = place_of_root(rising, (interval, args), tolerance, lower.dtype)
     # At a pole, or a jump, or where it is NaN between the ends, there is no root.
     at_root = rising(jax.lax.stop_gradient(place), (interval, fixed))

@@ -169,8 +169,12 @@ class _Search(NamedTuple):
         # A start on the surface is no crossing. The side that counts there is the one
         # to which the motion goes.
         now = self.value(t, y)
-        small = 1e-3 * self.path.step
-        ahead = self.value(t + small, y + small * self.path.rates(t, y))
+        small = jnp.finfo(y.dtype).eps ** 0.25 * self.path.step
+        # A midpoint step, since at rest only the second derivative tells the side.
+        half = 0.5 * small
+        middle = y + half * self.path.rates(t, y)
+        moved = y + small * self.path.rates(t + half, middle)
+        ahead = self.value(t + small, moved)
         above = jnp.where(now == 0, ahead > now, now > 0)
         # An invalid motion counts as one without a crossing, and so takes no step.
         return _Position(t, y, above, ok, jnp.zeros_like(t))

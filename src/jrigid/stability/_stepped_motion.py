@@ -11,7 +11,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, all_positive, nan_where
-from jrigid._motion import check_motion, harmless_motion, motion_arguments, solver_of
+from jrigid._motion import (
+    check_motion,
+    harmless_motion,
+    motion_arguments,
+    resolves,
+    solver_of,
+)
+from jrigid._numerics import safe_norm
 from jrigid._stepping.method import method_of
 from jrigid._stepping.scales import units
 from jrigid._stepping.step import error_of, stages
@@ -62,6 +69,8 @@ def findings_of(motion: Motion) -> Findings:
     findings = Findings()
     message = "Argument `t0` must be finite, but it is not."
     findings.require(jnp.isfinite(t0), RESULTS.invalid_times, message, t0)
+    resolved = resolves(t0, safe_norm(state0.omega))
+    findings.require(resolved, RESULTS.unresolved_times, value=t0)
     message = (
         "Argument `duration` (or `step`) must be positive and finite, but it is not."
     )
@@ -205,9 +214,10 @@ def _may_miss_a_pulse(path: Walk) -> Array:
     jumps = path.motion.system.jumps.astype(path.step.dtype)
     if jumps.size < 2:
         return jnp.asarray(False)
-    inside = jnp.isfinite(jumps) & (jumps >= path.motion.t0)
-    # What is before the start, or nowhere, is moved to where it makes no short gap.
-    ordered = jnp.sort(jnp.where(inside, jumps, path.motion.t0 - path.step))
+    t0 = path.motion.t0
+    inside = (jumps >= t0) & (jumps <= t0 + path.motion.duration)
+    # What is outside is moved to where it makes no short gap, rounding included.
+    ordered = jnp.sort(jnp.where(inside, jumps, t0 - 2 * path.step))
     gaps = jnp.diff(ordered)
     return jnp.any((gaps > 0) & (gaps < path.step))
 

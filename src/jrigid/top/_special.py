@@ -32,8 +32,8 @@ _TOO_SLOW = (
     "not. (See `steady_precession`.)"
 )
 _LEVEL = (
-    "Argument `theta` must not be level for the fast precession, which is infinite, "
-    "but it is."
+    "Argument `theta` must not be level for the fast precession, nor I1 = I3 where "
+    "`psi_dot` is given: it is infinite."
 )
 
 
