@@ -38,6 +38,8 @@ def loudest_band(residuals: np.ndarray, parts: Sequence[slice]) -> tuple[float, 
     for part in parts:
         for spectrum, count in _spectra(residuals[:, part]):
             width = 1
+            # A band of more than half of the frequencies hardly differs from all of
+            # them, whose mean is 1 by construction.
             while width <= spectrum.size // 2:
                 band_power, band_deviations = _loudest_of(spectrum, count, width)
                 if band_deviations > deviations:
@@ -67,6 +69,9 @@ def _spectra(residuals: np.ndarray) -> list[tuple[np.ndarray, int]]:
             continue
         # Removing gaps keeps white noise white.
         rows = trial[observed][:, np.any(trial != 0, axis=0)]
+        # Powers at zero frequency and at half the sampling rate are squares of one real
+        # number. All others are sums of two squares, which are exponentially
+        # distributed in white noise.
         power = np.abs(np.fft.rfft(rows, axis=0)[1:-1]) ** 2
         mean = np.mean(power)
         if not mean > 0:
@@ -83,5 +88,7 @@ def _deviations(power: float, count: int) -> float:
 
     Source: E. B. Wilson, M. M. Hilferty, PNAS 17 (1931) 684.
     """
+    # The mean of n exponential numbers is chi-square of 2 n degrees of freedom over 2
+    # n. Its cube root is nearly normal.
     spread = 1 / (3 * np.sqrt(count))
     return (power ** (1 / 3) - (1 - spread**2)) / spread

@@ -131,6 +131,8 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     # -2 log of the likelihood, up to a constant, at the most likely noise if that is
     # not stated.
     misfit = chi_square if noise_known else n * jnp.log(chi_square / n)
+    # The kicks of the torque are in chi-square, so that this makes it -2 log of the
+    # likelihood of the readings.
     misfit = misfit + jnp.stack([x.diagnostics.log_determinant for x in fits])
     k = unknowns.astype(n.dtype)
     return Comparison(
@@ -155,10 +157,14 @@ def _with_estimates(result: FitResult, body: RigidBody | None) -> RigidBody:
     if body is None:
         return result.system
     unknowns = result.unknowns
+    # `parts` expects the arrays of a system and of the sensors. Those of the sensors
+    # only keep their places here, since the system alone is returned.
     sensors = unknowns.original(0)[1:]
     leaves = jtu.tree_leaves(eqx.filter((body, *sensors), eqx.is_inexact_array))
     # The trial of this body was not in the fit, so that it belongs to no group.
     leaves += [jnp.zeros_like(x[0]) for x in unknowns.groups.values()]
+    # An array that is sought anew in each trial is not known in a trial that was left
+    # out. The first trial lends its own.
     own = result.own_numbers[0]
     return unknowns.parts(result.numbers, own, tuple(leaves))[0]
 
@@ -187,6 +193,8 @@ def _fit_of_states(result: FitResult, trials: list[Any]) -> FitResult:
         unmodelled=GaussMarkov(level, result.correlation_time),
         loss="robust" if options.robust else "squares",
         motion=options.motion,
+        # A trial that the others do not describe is no error: its chi-square is what is
+        # asked for.
         throw=False,
     )
 

@@ -51,6 +51,8 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @cache
     def quick() -> Any:
+        # The options ask for the backend, and asking starts it. This must not happen
+        # while modules are imported.
         options: dict[str, Any] = {"compiler_options": _options(_LEVEL)}
         return eqx.filter_jit(function, **options)
 
@@ -88,6 +90,8 @@ def program(function: Callable[..., Any], level: int = _LEVEL) -> Any:
         leaves, structure = jtu.tree_flatten(arguments)
         # Functions, of a `FunctionSensor` say, fix what is compiled.
         others = tuple(x if callable(x) else None for x in leaves)
+        # The same functions in the same structure make equal arguments for `jax.jit`,
+        # which then compiles nothing.
         arrays = [None if callable(x) else x for x in leaves]
         return compiled()(arrays, Static((structure, others)))
 

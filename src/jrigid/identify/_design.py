@@ -258,6 +258,7 @@ def _planned(plan: Plan) -> _Planned:
     records = of_trials(plan.observations)
     # The values of a plan may be NaN, which would count as not observed.
     records = tuple(x.with_values(jnp.ones_like(x.values)) for x in records)
+    # A plan states its noise, so that this guess of it has no effect.
     one = jnp.ones((), records[0].ts.dtype)
     samples = samples_of(records, one)
     trials, _ = samples.ts.shape
@@ -464,6 +465,7 @@ def _profile(
     requests = [request(x) for x in np.asarray(values)]
     growth = []
     for minimum in minima(requests, len(requests)):
+        # The noise that errors go by has the variance `inflation` in these units.
         added = (minimum.square - result.chi_square) / inflation
         growth.append(added if minimum.settled else np.nan)
     return jnp.asarray(np.asarray(growth, dtype))

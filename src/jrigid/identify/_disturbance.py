@@ -108,6 +108,8 @@ def _torque_over_a_step(steps: Array) -> tuple[Array, Array]:
     short = _covariance_of_short_steps(a, root)
     long = _covariance_of_long_steps(a, x, root)
     covariance = jnp.where((a < 1)[..., None, None], short, long)
+    # The torque fades as exp(-t / time). These are its integral, the integral of that,
+    # and its value after the step, from a torque of one rms at its start.
     response = jnp.stack([x / root, (a - x) / (root * a), 1 - x], axis=-1)
     return covariance, response
 
@@ -118,6 +120,8 @@ def _covariance_of_short_steps(a: Array, root: Array) -> Array:
     # Responses to a kick that came a fraction r of the step before its end.
     r = jnp.asarray(0.5 + 0.5 * points, a.dtype)
     r = jnp.broadcast_to(r, (*a.shape, r.size))
+    # The two terms of r - faded / a cancel to a r^2 / 2, so that the shortest steps
+    # would lose their digits.
     faded = -jnp.expm1(-a[..., None] * r)
     responses = jnp.stack(
         [faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1
@@ -131,6 +135,7 @@ def _covariance_of_long_steps(a: Array, x: Array, root: Array) -> Array:
 
     These are the same integrals in closed form, which loses its digits in short steps.
     """
+    # Each entry is the integral over r of a product of two of the responses to a kick.
     momentum = (2 * a - 2 * x - x**2) / (2 * a)
     across = (a - x) ** 2 / (2 * a**2)
     integral = (x * (2 - x) - 2 * a - 2 * a**2 + 2 * a**3 / 3 + 4 * a * x) / (2 * a**3)
@@ -169,7 +174,11 @@ def push_of(
     # Rates, turns and torques, of which the state may have no turns.
     kinds = [0, 1, 2] if depends_on_attitude else [0, 2]
     entries = [[covariance[..., i, j] for j in kinds] for i in kinds]
+    # How the motion changes a kick within a link is neglected. Links are short: each
+    # reading has a node, up to `MOST_NODES`.
     level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
+    # These turn the units of `_torque_over_a_step` into SI units, except for the
+    # torque, which stays in units of its rms.
     units = [level, level * dt[..., None], jnp.ones_like(level)]
     units = [units[i] for i in kinds]
     # Angular momentum over inertia is a rate; a torque stays as it is.
@@ -264,6 +273,7 @@ def with_torque(
     """
     local = links.gap.shape[-1]
     linked = jnp.any(push.whitener != 0, axis=(-2, -1))[..., None]
+    # The last node has no link: `roll` would bring it the torque of the first one.
     next_torque = jnp.where(linked, jnp.roll(torque, -1, axis=1), 0.0)
     gap = jnp.pad(links.gap, [(0, 0), (0, 0), (0, 3)])
     gap = gap + product("tnij,tnj->tni", push.carried, torque)

@@ -43,6 +43,7 @@ _TRIED = 0.03
 
 def condensed(rows: Rows, links: Links) -> Rows:
     """Rows in the first state of each trial, as if nothing acted between segments."""
+    # Where each trial has one node its rows are in the first state already.
     if not np.any(rows.node):
         return rows
     trials, nodes, local = links.gap.shape
@@ -51,6 +52,8 @@ def condensed(rows: Rows, links: Links) -> Rows:
     state = np.zeros((trials, local, border + local), links.gap.dtype)
     state[:, :, border:] = np.eye(local)
     states = np.zeros((trials, nodes, local, border + local), links.gap.dtype)
+    # The end of a segment is the start of the next one, so that derivatives chain from
+    # node to node.
     for node in range(nodes):
         states[:, node] = state
         state = links.of_state[:, node] @ state
@@ -147,6 +150,8 @@ def _decomposed(local: np.ndarray) -> _States:
 
     What the record does not show has large errors.
     """
+    # Rates, turns and own numbers have different units, which would decide what counts
+    # as small beside the largest singular value.
     scale = quality.or_one(np.linalg.norm(local, axis=1))
     basis, values, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
     shown = values > SHOWN * values[:, :1]
@@ -173,6 +178,7 @@ def _of_numbers(
     trials, count, _ = rest.shape
     # There may be no numbers, so no length can be left to numpy.
     r = np.linalg.qr(rest.reshape(trials * count, units.size), mode="r")
+    # The triangle has the singular values of all rows and is small.
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
     eps = np.finfo(units.dtype).eps
@@ -263,6 +269,7 @@ def weakest(problem: Problem, fit: Fit) -> Weakest:
     if not problem.options.noise_known:
         trials, _, local = minimum.links.gap.shape
         count = quality.sums_of(problem, fit).count
+        # A noise that is not known has the variance of the residuals.
         noise = square / max(count - units.size - local * trials, 1.0)
     covariance = precision(problem, fit).covariance
     error, normal, direction = weakest_of(problem.unknowns.judged, covariance, units)
@@ -321,11 +328,14 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.nda
         level = np.asarray(fit.disturbance.level[0], float)
         torque = levels.known(level, np.asarray(fit.disturbance.time, float))
     faint = search.are_faint(torque)
+    # The likelihood hardly changes with the logarithm of a faint level, so that errors
+    # are taken at a level that could be seen.
     tried = torque.with_levels(np.where(faint, _TRIED * first, torque.levels))
     typical = tried.typical
     errors = search.errors(tried, fit)
     of_levels, of_times = np.split(errors, [torque.form.levels])
     # Near none the likelihood is quadratic in the level squared: the least to be seen.
+    # An error e of the logarithm is an error 2 e of the level squared, relative to it.
     of_levels = np.where(faint, np.sqrt(2 * of_levels), of_levels)
     # A level was relative to a noise that was not known.
     size = 1.0 if problem.options.noise_known else np.sqrt(inflation)
@@ -357,6 +367,8 @@ def derive(
         covariance: Of the numbers.
         probes: Bodies along the weakest direction.
     """
+    # Linear propagation is enough for the elements, which are smooth in the numbers.
+    # Sorted moments are not: they have kinks where two are equal.
     tensor, moments, axes, slopes = map(np.asarray, spectrum(problem.unknowns, numbers))
     elements = slopes.reshape(9, numbers.size)
     spread = _spread_of_moments(problem, numbers, covariance)
@@ -385,6 +397,7 @@ def _errors_of_axes(
     """
     gaps = np.roll(moments, -1) - np.roll(moments, 1)
     floor = np.finfo(gaps.dtype).eps * moments[2]
+    # Equal moments would give errors that are not finite.
     gaps = np.where(np.abs(gaps) > floor, gaps, floor)
     following = np.roll(axes, -1, axis=1)
     preceding = np.roll(axes, 1, axis=1)
@@ -514,6 +527,7 @@ def _fields_of_precision(
 ) -> dict[str, np.ndarray]:
     """Fields that say what determines the numbers and the states."""
     minimum = fit.minimum
+    # Without an unmodelled torque all errors are those of the sensors.
     sensors = known
     if problem.options.dense:
         # What the sensors alone would determine, without an unmodelled torque.
@@ -601,6 +615,8 @@ def _resized(
     """
     resized = []
     for part, n in zip(parts, lengths, strict=True):
+        # `part` includes the samples that fill the record up, and a result has none of
+        # them.
         own = x[:, part][:, :n]
         if own.shape[1] < n:
             missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
@@ -656,6 +672,8 @@ def _scatter_of_trials(
     trials = np.sum(alive)
     if trials < _FEWEST or not np.all(np.isfinite(known.scores)):
         return np.ones(units.size)
+    # The variance of a score along a direction is the square of its value. If trials
+    # scatter by their noise alone, the squares of these sum to about one.
     along = (
         (known.scores[alive] * units)
         @ known.directions

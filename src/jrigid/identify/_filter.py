@@ -199,6 +199,8 @@ def _innovations_of_trial(
     # Samples of several sensors are not in the order of time.
     order = jnp.argsort(rows.node, stable=True)
     node = rows.node[order]
+    # Where a torque is unmodelled each node has a sample, so that a sample never
+    # crosses more than one link.
     before = jnp.concatenate([jnp.zeros(1, node.dtype), node[:-1]])
     samples = _Sample(
         residual=(root * residuals)[order],
@@ -273,6 +275,8 @@ def _minus_two_log_likelihood(
     # Numbers are eliminated as in least squares: first those of each trial.
     own = record.links.gap.shape[-1] + record.own.shape[-1]
     products, log_of_own = jax.vmap(lambda x: _without_own(own, x))(products)
+    # With the determinants of what is eliminated the likelihood is the restricted one
+    # (REML), whose levels are not too low where unknowns are many.
     logs = log_determinant + log_of_own
     chi_square, log_of_numbers = _at_best_numbers(jnp.sum(products, axis=0))
     # An unknown noise has in each trial the size that is most likely for all.
@@ -281,6 +285,8 @@ def _minus_two_log_likelihood(
     of_trials = TrialLikelihoods(
         together=products[:, 0, 0] / noise + logs, alone=alone / noise + logs
     )
+    # At the most likely noise chi-square over it is constant, and the logarithm of the
+    # noise remains.
     of_noise = freedom * jnp.log(jnp.maximum(chi_square, 1e-30))
     of_residuals = jnp.where(noise_known, chi_square, of_noise)
     return of_residuals + jnp.sum(logs) + log_of_numbers, of_trials

@@ -266,6 +266,7 @@ def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
     except ModuleNotFoundError:
         yield _late_lines()
         return
+    # The number of stages is not known beforehand, so that the bar has no end.
     with tqdm(unit=" stages", delay=_PATIENCE, leave=False) as bar:
 
         def show(line: str) -> None:
@@ -387,6 +388,8 @@ def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -
         "several, but one has neither `sigma` nor `covariance`: they cannot be "
         "weighed.",
     )
+    # Without anything that depends on it the attitude is left out of the states: three
+    # numbers instead of six for each segment.
     of_sensors = any(x.sensor.depends_on_attitude for x in records)
     options = Options(
         free_motion=systems[0].is_free and question.motion is None,
@@ -453,6 +456,8 @@ def _shoots(
         "observed, but it does not.",
     )
     observed = by_attitude or any(tells(x, "rates") for x in records)
+    # The state of a part inside the body is not read directly, so that a segment could
+    # not begin with it.
     shooting = observed and options.motion is None and not bodies.carry_parts
     demand(
         shooting or state is not None,
@@ -500,7 +505,9 @@ def _observed(
     samples = samples_of(records, np.ones((), records[0].values.dtype))
     sizes = sizes_of(samples)
     if not records[0].states_noise:
-        # Only a single record may leave its noise unstated: see `_task`.
+        # Only a single record may leave its noise unstated: see `_task`. The guess sets
+        # the unit of chi-square and the weights of the links. Errors follow from the
+        # residuals.
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     readings = direct_readings_of(records, samples, attitude0, robust)
     rate = typical_rate(readings, state, samples.ts.dtype)
@@ -508,6 +515,8 @@ def _observed(
     coarse = False
     if readings is not None:
         angle = float(np.max(angle_turned(readings)[:, -1]))
+        # Readings more than half a turn apart are also those of another motion, an
+        # alias.
         coarse = longest_turn(readings) > np.pi
     noise = noise_of(records, samples, rate)
     return _Observed(samples, readings, rate, sizes, angle, coarse, noise)
@@ -586,6 +595,9 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     observed = _observed(records, state, attitude0, options.robust)
     input_result = _judged(task, records, observed, throw)
     given = _unknowns(task, records, observed)
+    # The first division whose steps follow the torque is taken, since finer ones cost
+    # more time. If none does, the last one is, and `integration_error` of the result
+    # says how well it does.
     for division, length in _divisions(options, observed):
         options = division
         opening = _opening(given, observed, tensor, state, options, length)
@@ -633,6 +645,7 @@ def _divisions(
     count = observed.readings.ts.shape[1]
     nodes = segments_needed(observed.angle, count, length)
     yield options._replace(nodes=nodes), length
+    # From here on a length of zero spreads the nodes evenly over the readings.
     most = segments_needed(math.inf, count, length)
     while nodes < most:
         nodes = min(4 * nodes, most)

@@ -2,8 +2,9 @@
 
 The derivative of free motion in a tensor is assembled from those in moments and rates.
 This takes a tenth of the time of `free_rotation`'s derivative, which is exact at
-repeated moments too. Here moments nearer to each other than a ten-millionth are taken
-to be that far apart, in the derivatives only.
+repeated moments too. Here moments nearer to each other than a ten-millionth (in float32
+a thousandth) are taken to be that far apart wherever a derivative is formed, also in
+the value that is computed with it.
 """
 
 import diffrax
@@ -95,11 +96,14 @@ def _free_flow_jvp(
     moments = _kept_apart(moments)
     point = jnp.concatenate([moments, omega])
     (p, w), (p_columns, w_columns) = inlined(_motion_and_columns, point, t)
+    # `eigh` reads the symmetric part of a tensor alone.
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
     turn = _turn_of_axes(moments, inside)
     columns = jnp.concatenate(
         [jnp.diagonal(inside), omega_change - jnp.cross(turn, omega)]
     )
+    # The columns are derivatives in the frame of the axes. The turn of that frame
+    # follows.
     p_change = product("ij,j->i", p_columns, columns)
     w_change = product("ij,j->i", w_columns, columns)
     vector = p_change[1:] + jnp.cross(turn, p[1:])

@@ -101,6 +101,7 @@ def principal_axes(tensor: AnyArray) -> tuple[AnyArray, AnyArray]:
         # numpy may raise an error for NaN, where JAX returns NaN.
         return np.full(3, np.nan, tensor.dtype), np.full((3, 3), np.nan, tensor.dtype)
     moments, axes = np.linalg.eigh(tensor)
+    # As in `eigh`, 0.9 keeps rounding from deciding between two components that tie.
     for column in (0, 2):
         size = np.abs(axes[:, column])
         leading = axes[np.argmax(size >= 0.9 * np.max(size)), column]

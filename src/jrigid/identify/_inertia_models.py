@@ -124,6 +124,8 @@ class Tensor(AbstractInertiaModel):
         """Return the numbers of the nearest real body."""
         xp = tensor.__array_namespace__()
         sigma = real_body(tensor, flattest)
+        # The root of the first second moment is L11, which becomes one: the scale is
+        # left out.
         lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
         logarithms = xp.log(xp.diagonal(lower)[1:])
         return self, xp.concatenate([logarithms, lower[_parameters.SIDES]])
@@ -146,6 +148,8 @@ class _InFrame(AbstractInertiaModel):
 
     def sigma(self, numbers: Array) -> Array:
         """Second moments in the frame, by default with logarithms as the numbers."""
+        # The scale has no effect, so that the first axes may have second moments of
+        # one.
         return jnp.diag(jnp.exp(jnp.pad(numbers, (3 - numbers.size, 0))))
 
     def inertia(self, numbers: Array) -> Array:
@@ -357,6 +361,8 @@ class LogCholesky(AbstractInertiaModel):
         # mass.
         about_center = 0.5 * jnp.trace(body.inertia) / body.mass
         size = jnp.sqrt(about_center + jnp.sum(body.center_of_mass**2))
+        # The triangle without its factor exp(alpha) is that of second moments over the
+        # mass, so that s and t are lengths.
         is_length = np.array([name[0] in "st" for name in self.names])
         return jnp.where(is_length, size, 1.0)
 

@@ -163,6 +163,7 @@ def noise_of(
 ) -> np.ndarray:
     """Noise of rates [rad/s] and of turns [rad], (6,), as far as records state it."""
     white = np.diagonal(samples.whitener, axis1=-2, axis2=-1)
+    # For independent components the diagonal of the whitener is 1 / sigma.
     sigma = np.where(samples.weight > 0, 1 / or_one(white), np.nan)
     pairs = [
         (x, _median(sigma[:, y])) for x, y in zip(records, samples.parts, strict=True)
@@ -172,6 +173,7 @@ def noise_of(
     # Without attitudes the noise of a turn is that of a rate over the time of one
     # radian.
     angle = [*angles, *(x / rate for x in rates), GUESS][0]
+    # Without rates the noise of one is that of a turn over the same time.
     noise = np.repeat([[*rates, angle * rate][0], angle], 3).astype(sigma.dtype)
     return np.where(np.isfinite(noise), noise, GUESS * rate)
 
@@ -247,6 +249,7 @@ def judge(
         settle(_Judged(result), throw, findings_of_start, systems, tensor, state)
         return result
     findings = findings_of_records(records, readings)
+    # These values are concrete, so that the error is raised in Python.
     if throw and not findings.ok:
         findings.guard(None, throw)
     return findings.result

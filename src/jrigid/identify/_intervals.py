@@ -73,6 +73,9 @@ class _Tensors(NamedTuple):
         """
         for _ in range(_NEWTON):
             moments, axes = jnp.linalg.eigh(self.at(point))
+            # Two moments coincide where their difference and the element between their
+            # axes vanish. In principal axes the element is zero already, and its slope
+            # keeps it so.
             slopes = product("ia,ijk,jb->abk", axes, self.root, axes).reshape(9, 6)
             gaps = product("ij,j->i", equal, jnp.diag(moments).ravel())
             inverse = jnp.linalg.pinv(product("ij,jk->ik", equal, slopes))
@@ -126,6 +129,8 @@ def _path(value: Callable[[Array], Array], tensors: _Tensors, sign: Array) -> Ar
         slope = heights[best, _UP] - heights[best, _DOWN]
         return (candidates[best], slope), candidates[best]
 
+    # The first round knows no slope yet and makes no step along one. Its point is left
+    # out.
     _, points = jax.lax.scan(step, (cross[0], cross[0]), None, _STEPS + 1)
     return points[1:]
 
@@ -145,6 +150,8 @@ def _from_quantiles(values: Array, tail: Array) -> Array:
     low, high, inner_low, inner_high = jax.lax.cummax(quantiles, axis=1)
     # An estimate beyond those of all true tensors is moved, so that no interval is
     # empty.
+    # The lower limit is the true value whose estimates exceed the actual one with the
+    # probability `tail`.
     lower = jnp.interp(jnp.minimum(estimate, inner_high[-1]), high, truths)
     upper = jnp.interp(jnp.maximum(estimate, inner_low[0]), low, truths)
     return jnp.stack([lower, upper])

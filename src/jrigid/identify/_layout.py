@@ -81,6 +81,8 @@ def _index_after(valid: np.ndarray) -> np.ndarray:
 
 def _nearest_before(ts: np.ndarray, valid: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Index of the last valid sample up to each t, or of the first one."""
+    # The search needs ordered times: where there is no reading the latest one is
+    # repeated.
     times = np.maximum.accumulate(np.where(valid, ts, -np.inf))
     after = np.searchsorted(times, t, side="right")
     latest = _index_before(np.append(valid, False))[after]
@@ -116,6 +118,8 @@ def _rates_from_attitudes(
 ) -> np.ndarray:
     """Rates of a trial: at each sample the mean of the rates before and after it."""
     index = np.arange(ts.size)
+    # A turn between samples divided by its time is the rate in their middle. The mean
+    # of both sides is more accurate at the sample itself.
     left, has_left = _mean_rates(ts, attitude, _index_before(valid), index)
     right, has_right = _mean_rates(ts, attitude, index, _index_after(valid))
     return (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
@@ -144,6 +148,7 @@ def _dead_reckoning(
     attitude: np.ndarray,
 ) -> np.ndarray:
     """Attitudes of a trial at times of rates, each from the last observed attitude."""
+    # Before the first attitude the motion is followed back from it.
     latest = _nearest_before(attitude_ts, attitude_valid, ts)
     observed = _turned_by(attitude[latest], omega, ts - attitude_ts[latest])
     # The first rate after a new attitude starts anew; the others add their turns.
@@ -158,6 +163,7 @@ def _running_products(factors: np.ndarray, is_first: np.ndarray) -> np.ndarray:
     They are formed by doubling: after k rounds each is the product of the last 2^k
     factors, or of all since the first one.
     """
+    # Doubling takes log2(n) products of whole arrays, a loop over samples n products.
     product = factors.copy()
     complete = is_first
     shift = 1
@@ -284,6 +290,8 @@ def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
     ts = samples.ts
     xp = ts.__array_namespace__()
     first, last = first_and_last(ts, samples.seen)
+    # Unused nodes keep the arrays of all layouts equal in shape, so that one program
+    # serves them.
     is_first = xp.broadcast_to(xp.arange(nodes) == 0, (ts.shape[0], nodes))
     begin = xp.broadcast_to(first if t0 is None else xp.asarray(t0), first.shape)
     start = xp.where(is_first, begin[:, None], 0.0)
@@ -385,6 +393,7 @@ def node_states(
     omega = readings.omega[trial, reading]
     if readings.attitude is None:
         return omega, None
+    # Zero, except at the first node, which stands at the first sample of any record.
     late = start - readings.ts[trial, reading]
     return omega, _turned_by(readings.attitude[trial, reading], omega, late)
 

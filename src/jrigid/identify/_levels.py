@@ -129,8 +129,10 @@ class Likelihood:
         )
         layout = fit.layout
         shortest = np.min((layout.end - layout.start)[layout.linked], initial=1.0)
-        # White torque has a correlation time far below all steps.
+        # White torque has a correlation time far below all steps, where the covariance
+        # of a step no longer depends on it.
         self._time_of_white = np.log(1e-7 * shortest)
+        # Each link has a kick along each of three axes.
         self.kicks = 2.0 * max(3 * np.sum(layout.linked), 1)
 
     def __call__(
@@ -308,9 +310,13 @@ class Search:
         if np.all(self.are_faint(best)):
             return best
         if spins.size > 1:
+            # Such sizes follow from the spins and cost no number, so that any gain
+            # decides for them.
             proportional = best._replace(trials=np.log(spins) - np.mean(np.log(spins)))
             best = self._better(best, self._descended(proportional, likelihood))
         for form in (Form(1, 1), Form(3, 0), Form(3, 1), Form(3, 3)):
+            # Each form begins at the best torque so far, which must be a special case
+            # of it.
             if form.times < best.form.times or form.levels < best.form.levels:
                 continue
             wider = self._descended(self._widened(best, form), likelihood)
@@ -370,6 +376,8 @@ class Search:
         fall = Likelihood(self._problem, fit).as_of_another_body(torque)
         # Under a torque that is not quite of this form all trials differ.
         usual = max(float(np.median(fall[used])) / numbers, 1.0)
+        # In a trial of the same body the fall is about chi-square of as many degrees of
+        # freedom as there are numbers.
         foreign = used & (fall > usual * (numbers + _FOREIGN))
         most = used.size * _MOST_FOREIGN
         return foreign if np.sum(foreign | ~used) <= most else none

@@ -191,6 +191,7 @@ def _robust_weights(
     width = jnp.sum(problem.samples.weight, axis=-1)
     size = of_samples(problem, settings.scales**2)[None]
     # Samples without a reading have no width.
+    # The square of a sample is a sum over its numbers and grows with their count.
     bend = jnp.maximum(_BEND * width * size, 1e-30)
     known = square.shape[1] - bend.shape[1]
     bend = jnp.pad(bend, ((0, 0), (0, known)), constant_values=jnp.inf)
@@ -265,6 +266,7 @@ def _next_damping(loop: _Loop, better: Array, cost: Array) -> tuple[Array, Array
     """
     first = jnp.isinf(loop.best.cost)
     gain = jnp.where(first | ~(loop.gain > 0), 1.0, loop.gain)
+    # A ratio of one half leaves the damping as it is.
     ratio = jnp.where(first, 0.5, (loop.best.cost - cost) / gain)
     factor = jnp.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0)
     damping = loop.damping * jnp.where(better, factor, loop.growth)
@@ -433,6 +435,8 @@ def minimise(
     (1999).
     """
     over_lanes = jax.vmap if settings.steps.shape[0] > 1 else _over_one_lane
+    # The weights of the links are those of the tensor at the start. If they followed
+    # it, the sum of squares could fall by a change of the weights alone.
     push = over_lanes(push_over)(problem, layout, point.numbers, settings)
 
     def iteration(loop: _Loop) -> _Loop:

@@ -41,6 +41,7 @@ def coloured_covariance(
     >>> print(jr.identify.coloured_covariance(jnp.ones((4, 1)), lambda row: 2 * row))
     [[1.]]
     """
+    # With A the influence, B^T times a row of A is a row of A B.
     root = jax.vmap(colour)(_influence(jacobian))
     return root @ root.T
 
@@ -88,10 +89,12 @@ def block_bootstrap(
         f"{block}.",
     )
     influence = _influence(jacobian.reshape(times * outputs, params))
+    # A mean would move all redrawn records alike, which is no scatter.
     centred = residuals - jnp.mean(residuals, axis=0, keepdims=True)
     blocks = -(-times // block)  # rounded up
 
     def shift(key: Array) -> Array:
+        # The upper bound is exclusive: the last block ends at the last residual.
         starts = jax.random.randint(key, (blocks,), 0, times - block + 1)
         rows = (starts[:, None] + jnp.arange(block)[None, :]).reshape(-1)[:times]
         return influence @ centred[rows].reshape(-1)

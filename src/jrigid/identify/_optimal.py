@@ -192,6 +192,7 @@ def _chosen(
     pairs = zip(entries, jtu.tree_leaves(arrays_of(given)), strict=True)
     limits = [_limit(entry, array) for entry, array in pairs]
     middle = _vector(x.middle for x in limits)
+    # Where both limits of an element coincide its unit has no effect.
     unit = or_one(_vector(x.size for x in limits))
     chosen = _Chosen(plan, choose, arrays_of, limits, middle, unit)
     return chosen, (given - middle) / unit
@@ -229,6 +230,7 @@ def _stepped(
     size = jnp.where(bend > 0, jnp.sum(move**2) / or_one(bend), 10 * now.size)
     size = jnp.clip(size, *_STEP_SIZES)
     after = _Descent(now.x + move, score, slope, size, jnp.ones_like(now.share))
+    # A score that is not a number is never better, so that the step is shortened.
     better = score <= now.score + _DECREASE * jnp.sum(now.slope * move)
     shorter = now._replace(share=now.share / 4)
     return jtu.tree_map(lambda a, b: jnp.where(better, a, b), after, shorter)
@@ -286,5 +288,6 @@ def _optimum(
     ends, history = jax.lax.map(descend, jax.vmap(project)(initial))
     index = jnp.argmin(ends.score)
     best = jtu.tree_map(lambda y: y[index], ends)
+    # Projected, the gradient step has no part that leads out of the limits.
     slope = jnp.linalg.norm(project(best.x - best.slope) - best.x)
     return Optimum(chosen.plan_at(best.x), best.score, history[0, 0], slope, history)

@@ -73,6 +73,7 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
     (parameters,) = shaped(parameters=(parameters, 6))
 
     def tensor(p: Array) -> Matrix:
+        # The first number multiplies all of L, hence the 0 in its place below.
         scale = jnp.exp(p[0])
         sizes = jnp.exp(p[:3].at[0].set(0))
         return inertia_of_second_moment(squared(scale * sizes, scale * p[3:]))
@@ -105,6 +106,8 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     (inertia,) = shaped(inertia=(inertia, *INERTIA))
     tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
     second = second_moment(0.5 * (tensor + tensor.T))
+    # The second moments of a body with extent in three directions are positive
+    # definite, as an inertia is, so that one check serves both.
     solid = is_inertia(tensor) & is_inertia(second)
 
     def numbers(second: Matrix) -> Array:

@@ -121,6 +121,8 @@ class _Memory(NamedTuple):
 
 def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
     """States at unordered times, of a motion that takes ordered ones."""
+    # Samples of several records stand side by side, so that their times are not
+    # ordered.
     order = jnp.argsort(ts)
     states = motion(ts[order])
     back = jnp.argsort(order)
@@ -180,6 +182,7 @@ def _picked(state: State, index: Array | slice | int) -> State:
 def _memory_of(sensor: AbstractSensor, part: slice, dtype: Any) -> _Memory:
     """The states that a sensor's readings of some samples depend on."""
     lag, weight = sensor.memory() or (jnp.zeros(1), jnp.ones(1))
+    # Samples vary fastest, as `_reading` takes them apart again.
     return _Memory(
         sample=jnp.tile(jnp.arange(part.start, part.stop), lag.size),
         lag=jnp.repeat(lag.astype(dtype), part.stop - part.start),
@@ -224,6 +227,7 @@ def _states(
     # The lags of a sensor are short, so that one step from its samples suffices.
     if lag is not None:
         states = _flow(options, system, states, ts, times)
+    # A trial with one node has no links, so that these ends have no effect.
     return states, nodes
 
 
@@ -313,6 +317,8 @@ def _unlikely(rows: Array, sign: Array) -> Array:
     reading beyond the limit.
     """
     beyond = jnp.where(sign != 0, jnp.clip(sign * rows, -1e3, _SURE), 0.0)
+    # In float64 and in float32 the bounds of `beyond` keep the root and its slope
+    # finite.
     size = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
     return jnp.where(sign != 0, -sign * size, rows)
 

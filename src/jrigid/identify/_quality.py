@@ -170,6 +170,8 @@ def without_outliers(
 
 def weights_of(problem: Problem, kept: np.ndarray) -> np.ndarray:
     """1 for each number that is there, is kept and is not saturated, else 0."""
+    # The residual of a saturated number is the root of a -2 log probability, whose
+    # variance is not one.
     samples = problem.samples
     return np.where(samples.sign == 0, samples.weight, 0.0) * kept[..., None]
 
@@ -210,6 +212,7 @@ def misfit(problem: Problem, fit: Fit) -> float:
     """0 for a fit that may be kept; else how wrong it is."""
     sums = sums_of(problem, fit)
     numbers = fit.minimum.point.numbers.size
+    # An approximate count: of a trial's own unknowns only its three rates.
     freedom = max(sums.count - numbers - 3.0 * fit.kept.shape[0], 1.0)
     ratio = sums.residual / freedom
     good = bool(fit.minimum.settled) and np.isfinite(ratio)
@@ -218,6 +221,8 @@ def misfit(problem: Problem, fit: Fit) -> float:
         if good and not problem.options.dense:
             good = not stands_out(*loudest_band_of(problem, fit))
     if good:
+        # So small a number that a good fit inside replaces this one, but no misfit
+        # does.
         return _AT_BOUNDARY if is_at_boundary(problem, fit) else 0.0
     return ratio if np.isfinite(ratio) else np.finfo(float).max
 
@@ -262,6 +267,8 @@ def is_at_boundary(problem: Problem, fit: Fit) -> bool:
     tensor = np.asarray(fit.minimum.tensor, float)
     if not np.all(np.isfinite(tensor)):
         return False
+    # The second moments of mass, of trace one, are 1 - 2 I / trace(I). The least one
+    # belongs to the largest moment.
     shares = np.linalg.eigvalsh(tensor) / np.trace(tensor)
     return bool(1 - 2 * shares[-1] < BOUNDARY)
 
@@ -276,7 +283,8 @@ def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
     if not _may_be_pure(problem, fit):
         return False
     sums = sums_of(problem, fit)
-    # Five numbers gain this from noise.
+    # Five numbers gain chi-square of five degrees of freedom from noise: its mean is 5
+    # and its standard deviation sqrt(10).
     chance = 5 + GATE * 10**0.5 + 4 * np.log(max(sums.count, 1.0))
     return bool(sums.signal - sums.residual < noise * chance)
 

@@ -106,7 +106,8 @@ def _swing(result: FitResult) -> float:
         return 0.0
     power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
     peak = int(np.argmax(power))
-    # The samples may have gaps; a factor of 57 does not.
+    # n samples stand for n steps, one more than lie between the first and the last. A
+    # gap in the samples matters little beside a factor of 57.
     duration = float(ts[-1] - ts[0]) * ts.size / (ts.size - 1)
     size = math.sqrt(np.mean(np.sum(rates**2, axis=1)))
     return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
@@ -178,6 +179,7 @@ def _of_noise(result: FitResult) -> str:
     residuals = f"The residuals are {size:.2g} times the stated noise"
     if size < 1:
         degrees = ""
+        # The noise in rad/s over the same noise in deg/s is pi / 180 = 0.017.
         if 0.01 < size < 0.03:
             degrees = " (it is 57 times too large if it is in deg/s)"
         return (

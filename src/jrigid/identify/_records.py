@@ -82,6 +82,8 @@ class Record(Readable):
             f"Arguments `sigma` and `covariance` {of} not both be given, but they are.",
         )
         demand(
+            # The probability of a saturated number is computed for that number alone,
+            # which asks for independent noise.
             covariance is None or sensor.saturation() is None,
             f"Argument `covariance` {of} not be given beside a sensor's `limit`, but "
             "it is: give `sigma`.",
@@ -375,6 +377,7 @@ def _whitener(record: Record, known: AnyArray, guess: AnyArray) -> AnyArray:
     if record.covariance is not None:
         is_seen = xp.any(known, axis=-1)[..., None, None]
         return _inverse_factor(xp.where(is_seen, record.covariance, eye))
+    # The noise of what was not seen may be NaN.
     sigma = xp.where(known, guess if record.sigma is None else record.sigma, 1.0)
     return eye / sigma[..., None].astype(dtype)
 
@@ -450,7 +453,7 @@ def _with_arrays(record: Record, arrays: list[Any]) -> Record:
     ts = arrays[0]
     times = np.asarray(ts) if is_concrete(ts) else ts
     xp = times.__array_namespace__()
-    # The drift of a gyro counts from here.
+    # The drift of a gyro counts from here, in all trials from the same time.
     first = xp.min(xp.where(xp.isfinite(times), times, xp.inf))
     first = jnp.asarray(xp.where(xp.isfinite(first), first, 0.0), times.dtype)
     # `sigma` and `covariance` may be None, which is no leaf unless it is declared one.

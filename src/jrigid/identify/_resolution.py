@@ -88,6 +88,8 @@ def integration_error(problem: Problem, layout: Layout, point: Point) -> float:
         return 0.0
     layout = _to_last_samples(layout, problem.samples.seen)
     reference = np.clip(_TOGETHER // layout.start.size, _FEWEST, _MOST)
+    # The method is of order 8: four times as many steps have an error 4^8 times
+    # smaller.
     reference = max(reference, 4 * options.steps)
     states = partial(_states_after, problem, layout, point)
     (attitude, omega), (true_attitude, true_omega) = (

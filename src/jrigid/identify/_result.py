@@ -445,6 +445,7 @@ class FitResult(eqx.Module):
         # A noise that was not stated is that of the residuals.
         known = self.problem.options.noise_known
         size = 1.0 if known else jnp.sqrt(self.reduced_chi_square)
+        # A residual of exactly zero is one of a number that was not seen.
         residuals = self.diagnostics.residuals[:, part, :width] / size
         return Observations(
             times=samples.ts[:, part],
@@ -477,6 +478,7 @@ class FitResult(eqx.Module):
         first = self.diagnostics.sensitivity.shape[1] - self.own_numbers.shape[1]
         local = slice(first + part.start, first + part.stop)
         sensitivity = self.diagnostics.sensitivity[:, local]
+        # Errors of the numbers of all trials move those of each trial, too.
         shared = product("tlg,gh,tmh->tlm", sensitivity, numbers, sensitivity)
         alone = self.diagnostics.local_covariance[:, local, local]
         return self.own_numbers[:, part], shared + alone
@@ -582,6 +584,7 @@ def _spread(
     def of_numbers(x: Array) -> Array:
         return function(unknowns.inertia(x))
 
+    # The numbers of the tensor come first, and the others do not change it.
     points, scales = sigma_points(numbers, covariance, unknowns.of_inertia.stop)
     return spread_of(jax.vmap(of_numbers)(points), scales)
 

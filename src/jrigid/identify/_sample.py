@@ -54,6 +54,8 @@ def _log_volume(model: AbstractInertiaModel, numbers: Array) -> Array:
     # A model of a body has more numbers than a tensor. Its prior is flat in these.
     if model.body(numbers) is not None:
         return jnp.zeros((), numbers.dtype)
+    # A change relative to the trace makes the volume that of the logarithm of the
+    # scale. A tensor has nine elements, hence the Gram determinant.
     slopes = jax.jacfwd(tensor)(numbers).reshape(9, -1) / jnp.trace(tensor(numbers))
     return 0.5 * jnp.linalg.slogdet(product("ki,kj->ij", slopes, slopes))[1]
 

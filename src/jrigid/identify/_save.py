@@ -66,6 +66,7 @@ def load(path: str | os.PathLike[str]) -> FitResult:
     data = Path(path).read_bytes()
     try:
         result = pickle.loads(data)
+    # Unpickling runs code of other packages, which may raise any error.
     except Exception as error:
         raise ValueError(
             "Argument `path` must be a file that `save` wrote, whose functions and "

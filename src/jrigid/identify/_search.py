@@ -216,6 +216,8 @@ Search = Generator[Request, Minimum, Fit]
 def stages_of(case: Case, slow: bool) -> list[Stage]:
     """The stages of an attempt."""
     options = case.problem.options
+    # The exact flow holds over a whole trial. Under a torque the segments stay, held
+    # together by links of the largest weight.
     whole = not options.dense and (options.free_motion or not options.shooting)
     largest = _LARGEST[case.point.omega.dtype.itemsize]
     end = Stage(largest, case.effort.max_steps, ACCURACY, whole=whole, last=True)
@@ -258,6 +260,7 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
         if torque.at_rest and not stage.last:
             continue
         if options.robust and minimum is not None:
+            # Rows of prior knowledge follow those of the samples.
             residual = minimum.rows.residual[:, : kept.shape[1]]
             scales = scales_of(problem, residual, kept)
             if stage.reject:
@@ -338,6 +341,8 @@ class _Torque:
         torque = self._current.disturbance
         if self._kind == "known":
             known = self._case.torque
+            # From a level that moves a rate by its noise between nodes, in equal ratios
+            # to the known one.
             level = self._first * (known.level / self._first) ** stage.weight
             torque = Disturbance(np.broadcast_to(level, torque.level.shape), known.time)
         self.disturbance = Disturbance(*(x.astype(self._dtype) for x in torque))
@@ -414,6 +419,7 @@ def search(case: Case) -> Search:
         other = yield from attempt(case, problem, case.starts[index], slow=True)
         other_wrong = misfit(problem, other)
         other_weak = weakest(problem, other)
+        # Squares are compared in units of the noise, which may not have been stated.
         fall = (weak.square - other_weak.square) / other_weak.noise
         better = other_wrong < wrong or (other_wrong <= wrong and fall > 0)
         error = max(weak.error, other_weak.error)
@@ -490,6 +496,7 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
     probes: list[Probe] = []
     for step in _PROBES:
         numbers = before + step * at.direction
+        # A miss of one natural unit along the direction is a residual of this weight.
         normal = _HARD * at.normal
         line = Line(normal, np.sum(normal * numbers))
         held = dataclasses.replace(problem, unknowns=problem.unknowns.holding(line))
@@ -534,6 +541,7 @@ def _error_by_probe(
     square = np.sum(slope * slope)
     if square > 0:
         step = float(np.sum((end.minimum.tensor - tensor) * slope) / square)
+    # Chi-square grows as the square of a move over its error.
     return abs(step) / np.sqrt(max(growth, LEAST_GROWTH))
 
 
@@ -583,6 +591,7 @@ def _shapes(request: Request) -> Any:
 
 def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
     """Minimise side by side; unused lanes repeat the first one, without steps."""
+    # The compiled call has a fixed number of lanes. Without steps a lane ends at once.
     idle = requests[0]._replace(
         settings=requests[0].settings._replace(steps=np.asarray(0))
     )

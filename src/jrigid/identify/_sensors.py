@@ -183,6 +183,8 @@ class Gyro(AbstractSensor):
 
     def _matrix(self, dtype: DTypeLike) -> Array:
         """The matrix that turns rates into a reading without bias."""
+        # The columns of this rotation are the axes of the sensor, so that its transpose
+        # takes components along them.
         turn = rotation.to_matrix(rotation.exp(self.misalignment.astype(dtype)))
         scale = jnp.broadcast_to(self.scale, (3,)).astype(dtype)
         return product("ij,j,kj->ik", self.matrix.astype(dtype), scale, turn)
@@ -207,6 +209,8 @@ class Gyro(AbstractSensor):
         weights = jnp.ones(1)
         if self.time_constant is not None:
             dtype = self.time_constant.dtype
+            # A first-order filter shows the mean of the past, weighted by exp(-u) for a
+            # lag of u time constants.
             lags = jnp.asarray(_FADING_LAGS, dtype) * self.time_constant
             weights = jnp.asarray(_FADING_WEIGHTS, dtype)
         if self.delay is not None:
@@ -249,6 +253,7 @@ class Accelerometer(AbstractSensor):
 
     quantity: ClassVar[str] = "specific force [m/s$^2$]"
     depends_on_attitude: ClassVar[bool] = False
+    # A lever times the square of a rate is an acceleration.
     lever: Float[Array, "3"] = _array("lever", (-2, 1), _ZEROS, (3,))
     bias: Float[Array, "3"] = _array("bias", (0, 1), _ZEROS, (3,))
 
@@ -368,6 +373,8 @@ class DirectionSensor(AbstractSensor):
         a = -1 / (sign + z)
         first = jnp.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x])
         second = jnp.stack([x * y * a, sign + y * y * a, -y])
+        # Across the observed direction a prediction at an angle x has the length
+        # sin(x). Over cos(x / 2), the root of this, it is the chord 2 sin(x / 2).
         half = jnp.maximum(0.5 * (1 + jnp.sum(value * predicted)), 1e-6)
         chord = predicted / jnp.sqrt(half)
         return jnp.stack([jnp.sum(first * chord), jnp.sum(second * chord)])
@@ -399,6 +406,8 @@ class MomentumSensor(AbstractSensor):
         """Predict the angular momentum."""
         if self.frame == "space":
             return system.angular_momentum(t, state, None)
+        # The angular momentum of the system in space has that of internal parts
+        # already.
         internal = system.torque.internal_momentum(t, state, None)
         inertia = system.inertia.astype(state.omega.dtype)
         return angular_momentum(inertia, state.omega) + internal

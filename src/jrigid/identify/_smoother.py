@@ -165,6 +165,7 @@ def _sums_over_rows(nodes: int, rows: Rows, weight: Array) -> tuple[Array, ...]:
         return jax.ops.segment_sum(of_rows, node, nodes)
 
     # Samples of one node are added; those of different nodes have no product.
+    # The weight is that of the square, so that one of the two factors has it.
     state = product("n,ndi->ndi", weight, of_state)
     border = product("n,ndi->ndi", weight, of_border)
     return (
@@ -276,6 +277,8 @@ def _eliminate_state(
     side = blocks.side - after.side
     right = (blocks.right - after.right)[:, None]
     columns = jnp.concatenate([coupling.T, side, right], axis=1)
+    # The coupling with the state before is one more block of columns: how the solution
+    # depends on that state.
     solved, log_determinant = solve_positive(blocks.state - after.state, columns)
     before = product("ji,jk->ik", columns[:, :local], solved)
     border = product("ij,ik->jk", columns[:, local:-1], solved[:, local:])
@@ -393,6 +396,7 @@ def moved(point: Point, move: Move) -> Point:
     """Return a point after a move."""
     states = move.states
     attitude = point.attitude
+    # States without an attitude have three numbers beside the torque.
     local = states.shape[-1] - point.torque.shape[-1]
     if local == 6:
         # Turns about body axes multiply from the right.

@@ -42,8 +42,8 @@ _FEW = (
     "Argument `omegas` must hold four samples that are finite at least, but it holds "
     "fewer."
 )
-# A tensor is this times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz); the last five rows are without
-# a trace.
+# A tensor is `_OF_SIX` times (Ixx, Iyy, Izz, Ixy, Ixz, Iyz). The rows of `_TRACELESS`
+# span tensors without a trace.
 _OF_SIX = np.eye(6)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 _TRACELESS = np.eye(6)[1:]
 _TRACELESS[:2, :3] = [[6**-0.5, 6**-0.5, -2 * 6**-0.5], [0.5**0.5, -(0.5**0.5), 0]]
@@ -108,6 +108,7 @@ def _weak_rows(
     )
     centers = xp.linspace(ts[0] + half, ts[-1] - half, windows)
     step = xp.pad(xp.diff(ts), 1)
+    # Weights of the trapezium rule: half of the steps on both sides.
     samples = ts, 0.5 * (step[1:] + step[:-1]), known, omega, rotor, torque
     if not isinstance(ts, np.ndarray):
         return _rows_of_windows(centers, half, *samples)
@@ -145,9 +146,12 @@ def _rows_of_windows(
     cube = weight * height * height * height
     bump = cube * height
     fall = cube * 8 * s / half  # less the derivative of the bump
+    # The bump vanishes at both ends, so that by parts the derivative of I omega + h
+    # becomes minus one of the bump.
     parts = xp.concatenate([_momenta(omega), rotor[..., None]], axis=-1)
     turned = xp.cross(omega[..., None], parts, axis=1)
     rows = product("wn,nij->wij", fall, parts) + product("wn,nij->wij", bump, turned)
+    # The angular momentum of the rotor is known and belongs on the right.
     right = product("wn,ni->wi", bump, torque) - rows[..., 6]
     return xp.concatenate([rows[..., :6], right[..., None]], axis=-1).reshape(-1, 7)
 
@@ -317,6 +321,8 @@ def _momentum(
     unit = jnp.zeros_like(attitudes).at[..., 0].set(1)
     attitudes = jnp.where(known, attitudes, unit)
     turns = jnp.vectorize(rotation.to_matrix, signature="(4)->(3,3)")(attitudes)
+    # Angular momenta of unit rates make the columns of the tensor as large as those of
+    # the total.
     turned = _momenta(omegas, turns) / size
     total = jnp.broadcast_to(-jnp.eye(3, dtype=ts.dtype), (*ts.shape, 3, 3))
     rows = jnp.where(known[..., None], jnp.concatenate([turned, total], axis=-1), 0.0)
@@ -425,6 +431,8 @@ def linear_starts(
         or not linear
         or options.motion is not None
     ):
+        # Without linear equations the search begins at the tensor that is given or
+        # known, and then half way to a sphere.
         first = known if given is None else given.astype(dtype)
         return np.stack([first, _rounder(first)])
     free = options.free_motion
@@ -479,7 +487,10 @@ def _plain_bodies(readings: DirectReadings, like: np.ndarray) -> np.ndarray:
     They are as large as the body whose tensor is given.
     """
     shown = np.where(readings.valid[..., None], readings.omega, 0.0).reshape(-1, 3)
+    # These are the principal axes of the second moments of the rates.
     axes = np.linalg.eigh(shown.T @ shown)[1]
+    # Moments in the ratios 1 : 2 : 2 and 3 : 2 : 2, each axis in turn being the odd
+    # one.
     shapes = np.concatenate([np.ones((1, 3)), 1 - 0.5 * np.eye(3), 1 + 0.5 * np.eye(3)])
     shapes = (shapes / shapes.sum(axis=1, keepdims=True)).astype(axes.dtype)
     return product("ik,sk,jk->sij", axes, np.trace(like) * shapes, axes)
@@ -540,6 +551,8 @@ def _least_squares(
     def tensor(weights: np.ndarray) -> np.ndarray:
         return _tensor(size * sphere + weights @ vt @ basis)
 
+    # Along a direction that the rows show less than their misfit, this stays near the
+    # sphere.
     leaning = tensor(values * along / or_one(values * values + floor * floor))
     plain = tensor(best / np.where(determined, values, 1.0))
     good = np.all(np.linalg.eigvalsh(plain) > 0)

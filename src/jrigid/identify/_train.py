@@ -373,6 +373,8 @@ def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
     if readings is None:
         return _Observed(None, False, 0.0)
     trial = np.arange(len(readings.ts))
+    # A segment begins at its first sample of any record. Where its first rate comes
+    # later, the Gauss-Newton steps make up for that.
     first = np.argmax(readings.valid, axis=1)
     if readings.attitude is None:
         attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(trial), 1))
@@ -406,6 +408,7 @@ def _prepared(system: RigidBody, records: tuple[Record, ...]) -> _Prepared:
             "torque or sensor depends on them, attitudes, without parts that move "
             "inside the body, but it does not."
         )
+    # The loss divides by the degrees of freedom: numbers less those of the state.
     numbers = np.sum(observed.segments.samples.weight, axis=(1, 2))
     demand(
         bool(np.min(numbers) > (6 if depends_on_attitude else 3)),
@@ -457,6 +460,7 @@ def _epoch(task: _Task, params: PyTree, memory: PyTree, key: Array) -> _AfterEpo
             params = eqx.apply_updates(params, updates)
         return (params, memory), value
 
+    # The scan needs batches of one size.
     count = task.trained.size // task.batch * task.batch
     order = jax.random.permutation(key, task.trained)[:count].reshape(-1, task.batch)
     validation = loss(params, task.judged)

@@ -435,6 +435,8 @@ class Unknowns(eqx.Module):
             self.inertia_model.start(tensor, known, least)
             for tensor, least in zip(tensors, flattest, strict=True)
         ]
+        # The number of the scale is the logarithm of a factor of the trace that was
+        # given.
         factors = xp.trace(tensors, axis1=1, axis2=2) / self.trace
         scales = xp.log(xp.where(factors > 0, factors, 1.0))
         others = [x.start() for x in self.shared]

@@ -33,6 +33,7 @@ def _of_shape(result: FitResult, direction: np.ndarray) -> str:
     relative = np.diag(inside) / moments
     # A common factor of all moments does not change their ratios.
     relative = np.abs(relative - relative.mean())
+    # An element off the diagonal turns the two axes that it stands between.
     turns = np.abs(inside[[1, 2, 0], [2, 0, 1]] / moments.mean())
     if turns.max() > relative.max():
         i, j = sorted({1, 2, 3} - {int(turns.argmax()) + 1})
@@ -300,6 +301,7 @@ def _of_torque(result: FitResult) -> list[str]:
         memory = f"correlation time {_with_errors(times[axes], errors)} s"
     own = np.diagonal(np.asarray(result.diagnostics.sensor_covariance))
     shares = own / _diagonal(result.numbers_covariance)
+    # These are shares of variances, and the report states one of errors.
     part = 100 * np.sqrt(np.median(shares)) if own.size else 100
     lines = [
         f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would "
