@@ -91,6 +91,8 @@ def largest_steps(order: int, rtol: Float[Array, ""]) -> Float[Array, "2"]:
 
     The second number holds where derivatives are taken.
     """
+    # A method of this order omits the term x^(order + 1) / (order + 1)! of a step of x
+    # radians. This is x^order / (order + 1)! for each radian.
     error = math.factorial(order + 1) * rtol * jnp.array(_TOLERANCES, rtol.dtype)
     largest = jnp.array(_LARGEST_BOUNDS, rtol.dtype)
     return jnp.clip(error ** (1 / order), SMALLEST_BOUND, largest)
@@ -103,6 +105,8 @@ def in_tolerances(
     size = jnp.maximum(jnp.abs(y0 / scales), jnp.abs(y1 / scales))
     multiples = (error / scales) / (limits.atol + size * limits.rtol)
     norm = jnp.sqrt(jnp.mean(multiples * multiples))
+    # An infinite error shrinks the next step as far as is allowed. NaN would become the
+    # length of that step.
     return jnp.where(jnp.isnan(norm), jnp.inf, norm)
 
 
@@ -129,7 +133,10 @@ def _judge_error(
     small = (error < share) | (error * limits.rtol < noise)
     error = error / share
     beyond_noise = jnp.maximum(error * limits.rtol, noise) / limits.rtol
+    # The error estimate of a pair of orders p and p - 1 grows with h^p.
     factor = _SAFETY * beyond_noise ** (-1 / order)
+    # By its error an accepted step never shortens the next one, and a rejected one
+    # always does.
     factor = jnp.where(
         small, jnp.clip(factor, 1.0, _GROW), jnp.clip(factor, _SHRINK, _SAFETY)
     )
@@ -181,6 +188,7 @@ def judge(
     # A step that was cut short at an output time says little about the next one.
     following = jnp.where(small & (h < step), jnp.maximum(following, step), following)
     following = jnp.minimum(following, limits.longest)
+    # Below a quarter of the shortest step a length might not change the time.
     stuck = ~small & (4 * following <= limits.shortest)
     # Where a torque jumps, differences yield a rate without bound, which must not
     # reduce the steps to zero.

@@ -140,6 +140,7 @@ def _pushed_forward(
     # equinox passes None as the tangent of an array that has no derivative.
     perturbed = jtu.tree_map(lambda x: x is not None, tangent, is_leaf=_is_none)
     varied, rest = _split(_with_fine_steps(motion), perturbed, start=True)
+    # The start is among the varied arrays even if only parameters have tangents.
     tangent = eqx.combine(tangent, jtu.tree_map(jnp.zeros_like, varied))
     return as_lanes(together, rest, varied, tangents=tangent, alone=alone)
 
@@ -191,6 +192,7 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
     # The entry after the last output time takes the steps that reach none.
     of_output = jnp.zeros(count + 1, numbers.dtype).at[record.outputs].set(numbers)
     ys = after_steps[of_output[:count]]
+    # No step reaches an output time at the start.
     ys = jnp.where((motion.times <= 0)[:, None], motion.y0, ys)
     return Ends(ys, end.t, y, end.counts)
 
@@ -212,6 +214,7 @@ def moved_by(
 @partial(moved_by.defjvp, symbolic_zeros=True)
 def _moved_by_jvp(field: Callable, primals: tuple, tangents: tuple) -> tuple:
     parameters, t, y, dt = primals
+    # In a time of zero neither the parameters nor the time have an effect.
     _, _, y_dot, dt_dot = tangents
     value = moved_by(field, parameters, t, y, dt)
     total = jnp.zeros_like(y)

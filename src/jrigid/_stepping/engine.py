@@ -139,6 +139,8 @@ class Engine(NamedTuple):
             jnp.where((limits.end > 0) & (limits.start_rate > 0), RUNNING, ENDED),
             0,
             0,
+            # States at the start are stored without a step, and jumps there have
+            # passed.
             jnp.sum(motion.times <= 0),
             jnp.sum(motion.jumps <= 0),
             0,
@@ -163,6 +165,8 @@ class Engine(NamedTuple):
         if motion.jumps.size == 0:
             return self.field
         # Before the first jump and after the last one nothing bounds the times.
+        # The entry in front shifts the indices by one: `after[jump]` belongs to the
+        # jump that the motion has passed last.
         after = jnp.pad(motion.jumps + motion.beside, 1, constant_values=-jnp.inf)
         before = jnp.pad(motion.jumps - motion.beside, 1, constant_values=jnp.inf)
         low = after[jump]
@@ -213,6 +217,7 @@ class Engine(NamedTuple):
             following = jnp.where(repeat, step, following)
         too_many = (new_state == RUNNING) & (tried + 1 >= self.max_steps)
         new_state = jnp.where(too_many, TOO_MANY_STEPS, new_state)
+        # A step that is repeated up to an event has reached no output time.
         hit = hit & keep
         reached = jnp.where(hit, output, motion.times.size)
         clock = [jnp.where(keep, t1, t), following, trial.verdict.rate, end]
@@ -257,6 +262,7 @@ class Engine(NamedTuple):
             sought,
         )
         repeat = sought & (exact < taken.t1)
+        # Only the time of an event is before the end that the limits set.
         reached = keep & (taken.t1 >= end) & (end < motion.limits.end)
         keep = keep & ~repeat
         return _Passage(

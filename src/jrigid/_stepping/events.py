@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 # Halvings of a step that find the time of an event, by the size of a number in bytes.
+# They exceed the 53 and 24 bits of a mantissa, so that rounding alone limits the time.
 _BISECTIONS = {8: 60, 4: 31}
 
 
@@ -83,5 +84,7 @@ class Conditions(NamedTuple):
 
         count = jnp.where(sought, _BISECTIONS[t0.dtype.itemsize], 0)
         bracket = jax.lax.fori_loop(0, count, halve, (t0, t1))
+        # A condition has changed at the upper end of the bracket, and none at the
+        # lower.
         exact = jax.lax.stop_gradient(bracket[1])
         return exact, changed(exact)

@@ -62,6 +62,7 @@ _cotangent = _primitive("jrigid_reverse_only_cotangent")
 ad.defjvp(_reverse_only, lambda tangent, _: _tangent.bind(tangent))
 ad.deflinear2(_tangent, lambda cotangent, _: [_cotangent.bind(cotangent)])
 ad.primitive_jvps[_tangent] = ad.primitive_jvps[_cotangent] = _refuse
+# `jax.jacfwd` maps the tangents with vmap before anything evaluates them.
 set_vmap_rule(_tangent, _refuse)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 # Number of groups in which the rows of a tableau are summed, by the largest number of
-# stages for which it holds.
+# stages for which it holds. More groups have fewer terms, but each is a branch that is
+# compiled.
 _GROUPS = {4: 1, 8: 2}
 _MOST_GROUPS = 4
 
@@ -55,6 +56,7 @@ def method_of(solver: diffrax.AbstractERK) -> Method:
     order: Any = solver.order(None)
     rows = [np.zeros(0), *tableau.a_lower]
     times = [0.0, *tableau.c]
+    # With `ssal` the last stage of the solver is already at the new state.
     if not tableau.ssal or len(rows[-1]) != len(tableau.b_sol) - 1:
         # The new state becomes a stage of its own.
         rows.append(tableau.b_sol)
@@ -107,6 +109,7 @@ def _groups(first: int, *tables: np.ndarray) -> Groups:
             length * sum(map(len, columns)) for _, columns, length in divided(cuts)
         )
 
+    # All divisions are tried: of the 17 stages of `Verner9` there are 455.
     best = min(itertools.combinations(range(1, count), groups - 1), key=terms)
     # A sum has at least one term, if necessary one with the coefficient zero.
     return tuple(

@@ -51,6 +51,7 @@ def constant(tree: Tree) -> Tree:
 
 def steps_fixed(motion: Motion) -> Motion:
     """The motion, of which only the parameters and the start have derivatives."""
+    # What keeps its derivatives is left out here and put back below.
     fixed = constant(motion._replace(parameters=[], y0=motion.y0[:0]))
     return fixed._replace(parameters=motion.parameters, y0=motion.y0)
 
@@ -88,6 +89,7 @@ class Progress(NamedTuple):
 
 def first_direction(y: Float[Array, " n"]) -> Float[Array, " n"]:
     """A direction of length 1 that is no eigenvector of a usual motion."""
+    # The cosines of whole numbers of radians are all different, and none is zero.
     direction = np.cos(np.arange(y.size))
     return jnp.asarray(direction / np.linalg.norm(direction), y.dtype)
 
@@ -105,5 +107,6 @@ def fastest_rate(scales: Array, omega: int, y: Array, other: Array) -> Array:
     unit = scales[omega]
     turning = unit * jnp.sqrt(jnp.sum((y[omega : omega + 3] / unit) ** 2))
     rate = jnp.maximum(other, turning)
+    # Lengths of steps are angles divided by this rate, so it must not be zero.
     tiny = jnp.finfo(rate.dtype).tiny
     return jnp.maximum(jnp.where(jnp.isfinite(rate), rate, 0.0), tiny)

@@ -176,6 +176,8 @@ class _Replay(NamedTuple):
         # In the first run `back.attempt` is unknown, and larger than the estimate.
         left = jnp.minimum(back.attempt, self.estimate) - attempt
         # Checkpoints are spread over the rest of the run as far as they suffice.
+        # The log reaches back `size` attempts, so that closer checkpoints are of no
+        # use.
         stretch = jnp.maximum(size, -(-left // (room + 1)))
 
         def continues(attempt: Array, progress: Progress) -> Array:
@@ -312,6 +314,7 @@ def pull_alone(
     """
 
     def over(function: Callable[..., Any], *arguments: Any) -> Any:
+        # A number of attempts is never negative, so that the branch is always taken.
         return apart(function, tried >= 0, *arguments)
 
     # The motion ends where the first run ended, so no event is sought again.
@@ -343,6 +346,7 @@ def pull_in_lanes(
 
             return lanes_last(of_lane, fixed, *arguments)
 
+        # The lanes of a block run together until the longest motion has ended.
         replay = _Replay(engine, over, rest, varied, changes, jnp.max(tried))
         return replay.pull()
 

@@ -22,7 +22,8 @@ from jrigid._core.lanes_last import lanes_last
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import EMPTY, Motion, Progress, steps_fixed
 
-# Largest number of steps between two searches for finished lanes.
+# Largest number of steps between two searches for finished lanes. A larger number
+# saves searches, but finished lanes are idle for longer.
 _STEPS = 8
 
 #: The parts of a motion that are its own: numbers in one array, and other arrays.
@@ -248,6 +249,8 @@ class _Batch(NamedTuple):
             before, ys = carry
 
             def none_to_store(some: _Some) -> Array:
+                # At least one step is taken, since `output` is arbitrary before the
+                # first.
                 none = ~any_of(some.output < times) | (some.taken == before.taken)
                 return (some.taken < _STEPS) & none
 
@@ -302,6 +305,7 @@ def run_in_lanes(engine: Engine, shared: Motion, each: Motion) -> Ends:
 
     def at_start(own: _Packed) -> tuple[Array, Array]:
         motion = motion_of(own)
+        # The radians of the fastest rate stand for the number of steps.
         return _states_at_start(motion), motion.limits.end * motion.limits.start_rate
 
     ys, radians = jax.vmap(at_start)(table)

@@ -58,6 +58,7 @@ def rate_along(
         scales: Of the components.
     """
     largest = jnp.maximum(1.0, jnp.max(jnp.abs(y / scales)))
+    # The step of a forward difference, as in `jacobian`.
     nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest * scales
 
     def change(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -103,6 +104,7 @@ def undamped_rate(matrix: Array) -> Array:
     """
     matrix = jax.lax.stop_gradient(matrix)
     values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
+    # The amplitude falls by more than a factor of e within a radian of its oscillation.
     damped = -values.real > jnp.abs(values.imag)
     return jnp.max(jnp.where(damped, 0.0, jnp.abs(values)))
 
@@ -148,7 +150,7 @@ class _Start(NamedTuple):
         t0: The time.
         args: Of torques and forces.
         rate: Rate of turning [rad/s].
-        fastest_of: The fastest rate that a Jacobian tells.
+        fastest_of: Returns the fastest rate of a transposed Jacobian.
     """
 
     system: AbstractSystem
@@ -218,6 +220,7 @@ def _units_in_flight(
         safe_norm(x) for x in (state0.position, state0.velocity, acceleration)
     )
     time = jnp.minimum(span, 1 / start.rate)
+    # The time in which the pull changes the velocity by its own magnitude.
     bend = jnp.where(pull > 0, velocity / jnp.where(pull > 0, pull, 1.0), time)
     way = jnp.maximum(position, velocity * jnp.minimum(time, bend))
     speed = jnp.where(velocity > 0, velocity, pull * time)

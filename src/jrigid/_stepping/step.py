@@ -86,6 +86,7 @@ class _Sums(NamedTuple):
 
             return branch
 
+        # The group of a row is the number of later groups that begin at or before it.
         group = jnp.zeros((), jnp.int32)
         for first, _ in self.groups[1:]:
             group = group + (self.row(iteration) >= first).astype(group.dtype)
@@ -220,6 +221,8 @@ def _loop(
         rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
         return rates, sums.then(place_of, i, (rates,), h, y)
 
+    # Outside of lanes a sum includes the stages to come, with coefficients of zero.
+    # Their rates must be finite.
     rates = jnp.zeros((count, *y.shape), y.dtype)
     return jax.lax.fori_loop(0, count, stage, (rates, y))
 

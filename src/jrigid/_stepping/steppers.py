@@ -181,6 +181,7 @@ class ErrorControlled(NamedTuple):
         )
         rate1 = fastest_rate(motion.scales, self.omega, after, fastest)
         verdict = judge(limits, self.method.order, step, h, error, rate0, rate1)
+        # `in_tolerances` makes infinity of an error that is NaN.
         return Trial(y1, along, verdict, ~(error < jnp.inf), rates)
 
     def state_at(
