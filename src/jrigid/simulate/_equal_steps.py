@@ -38,6 +38,7 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
         def torque(time: ScalarLike, state: BodyState, args: PyTree) -> Vector:
             if motion.jumps.size:
                 # Kicks at the ends of a step belong to its own side of a jump.
+                # In a very short step the two ends must not change places.
                 beside = jnp.minimum(jnp.max(motion.beside), 0.25 * h)
                 time = jnp.clip(time, t + beside, t + h - beside)
             return system.torque_on(given.start + time, state, args)
@@ -46,6 +47,7 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
 
     if isinstance(solver, Splitting):
         longest = options.max_step
+        # The time does not matter here, since only the dependence on omega is examined.
         torque = partial(system.torque_on, limits.end)
         _check_splitting(torque, given.inputs.state0, args)
     else:
@@ -58,7 +60,9 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
         after = solver.step(terms, t, t + h, state, args, None, False)[0]
         return ravel_pytree(after)[0]
 
+    # A motion has derivatives in the arrays that are its parameters.
     plain, parameters = opened(advance, limits.end, limits.end, motion.y0)
+    # The rate of an invalid motion may be NaN. It takes no step.
     longest = jnp.where(given.findings.ok, longest, 1.0)
     limits = limits._replace(longest=longest)
     motion = motion._replace(parameters=parameters, limits=limits)

@@ -104,6 +104,8 @@ def place_of_event(
     else:
         for _ in range(_NEWTON_STEPS):
             now, slope = jax.jvp(distance, (dt,), (jnp.ones_like(dt),))
+            # A condition that jumps between constants has no slope. The time of the
+            # bisection is then the result.
             usable = met & (slope != 0)
             dt = dt - jnp.where(usable, now / jnp.where(usable, slope, 1.0), 0.0)
     return t + dt, later(dt)

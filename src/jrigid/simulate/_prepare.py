@@ -23,6 +23,7 @@ from jrigid.simulate._options import SMALLEST_RTOL, Inputs, Options
 from jrigid.solvers import Splitting
 from jrigid.systems import AbstractSystem
 
+# The method of a step of length zero, whose derivatives are right up to its order.
 _STEP = method_of(diffrax.Tsit5())
 # One step may commit this fraction of rtol. The fraction is smaller for methods of an
 # order below 8, whose error estimates are as large as their errors.
@@ -116,13 +117,13 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
 
 
 def with_derivatives_of_start(inputs: Inputs) -> Inputs:
-    """The same motion, from a start that is held, in derivatives, where it is.
+    """The same motion, whose derivatives in `t0` are in its initial state alone.
 
-    Times of a motion count from its start, so that an earlier start would move all
-    jumps of the torque along, and no derivative sees them move. But a motion that
-    starts at `t0` is also one that passes another state at the time that is held: the
-    state after a step of length zero, whose derivatives in `t0` are those of the
-    motion, up to the order of the method.
+    Times of a motion count from its start. Thus an earlier start would move all jumps
+    of the torque along, and derivatives do not see jumps move. Therefore the time of
+    the start is fixed, and the state there is that after a step of length zero from
+    `t0` to this time. Its derivatives in `t0` are those of the motion, up to the order
+    of the method.
     """
     held = jax.lax.stop_gradient(inputs.t0)
     start, to_state = ravel_pytree(inputs.state0)
@@ -132,7 +133,8 @@ def with_derivatives_of_start(inputs: Inputs) -> Inputs:
 
     length = (held - inputs.t0).astype(start.dtype)
     moved = equal_steps(_STEP, rates, inputs.t0.astype(start.dtype), length, start)
-    # What is wrong with an input is told of the input.
+    # A check must report the state that was passed, and not one that is NaN because of
+    # the torque.
     moved = jnp.where(jnp.isfinite(moved), moved, start)
     return inputs._replace(state0=to_state(moved), t0=held)
 
@@ -163,6 +165,7 @@ def _check_times(findings: Findings, inputs: Inputs, since_start: Array) -> None
     """Note times that are not finite, decrease, or are before the start."""
     flat = inputs.ts.reshape(-1)
     before = jnp.concatenate([inputs.t0[None], flat[:-1]])
+    # Every comparison with NaN is false, so that this form finds NaN too.
     wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
     value = flat[jnp.argmax(wrong)]
     findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=value)
@@ -182,6 +185,7 @@ def _can_be_enough(limits: Limits, options: Options) -> Array:
     longest = (
         options.max_step if isinstance(options.solver, Splitting) else limits.longest
     )
+    # The result is True for NaN, which other findings report.
     return ~((1 - _SAVED) * limits.end > options.max_steps * longest)
 
 
@@ -210,6 +214,7 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
     times = jnp.where(findings.ok, inputs.since_start, 0.0)
     start = usable.t0.astype(y0.dtype)
 
+    # With `usable`, which depends on the findings, lanes could not share parameters.
     def rates(t: Array, y: Array) -> Array:
         return _rates(inputs, inputs.t0.astype(y0.dtype) + t, to_state(y))
 
@@ -244,11 +249,11 @@ def prepared(inputs: Inputs, options: Options) -> Prepared:
 
 
 def _beside(jumps: Array, start: Array, end: Array) -> Array:
-    """How far beside each jump the torque is evaluated, so that it is past the jump.
+    """Distance from each jump at which the torque is evaluated, to be past the jump.
 
-    The times that a torque sees are rounded. Of a jump at time 0 they are not, but 0 is
-    not past it; so a part of the gap between jumps is added, which is the shorter one
-    of those before and after.
+    A torque receives rounded times, so the distance is a few eps of the time. For a
+    jump at time 0 this would be zero. Therefore as many eps of a gap between jumps are
+    added, the shorter one of those before and after.
 
     Args:
         jumps: Times since the start, in order; infinite ones count as none.
@@ -294,6 +299,7 @@ def limits_of(end: Array, fastest: Array, options: Options) -> Limits:
     share = jnp.minimum(fraction, _RADIANS / jnp.maximum(radians, _RADIANS))
     tolerances = jnp.stack([options.rtol, options.atol])
     rtol, atol = jnp.maximum(share * tolerances, _NOISE * eps)
+    # `ExactFree` has no order. The bounds of order 8 serve it.
     span, fine = largest_steps(order or 8, share * options.rtol)
     # The rate at the start does not bound an implicit solver, which may step over it.
     longest = jnp.inf if options.is_implicit else span / fastest

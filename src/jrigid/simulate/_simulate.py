@@ -242,6 +242,7 @@ class _Solved(NamedTuple):
 @eqx.filter_jit
 def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     """Prepare, integrate, and convert to a trajectory."""
+    # Without jumps the vector field as a function of `t0` has the right derivatives.
     if inputs.jumps.size:
         inputs = with_derivatives_of_start(inputs)
     given = prepared(inputs, options)
@@ -356,6 +357,7 @@ def _with_derivatives_in_times(given: Prepared, times: Array, ys: Array) -> Arra
     """States at the output times, whose derivatives in these times are the rates."""
     fixed = jax.lax.stop_gradient(times)
     later = jax.vmap(partial(moved_by, given.field, given.parameters))
+    # The difference is zero, but its derivatives are those of the times.
     return later(fixed, ys, times - fixed)
 
 

@@ -115,6 +115,7 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
 
         # A power iteration finds the fastest motions, which may be damped ones.
         if self.damped:
+            # The whole Jacobian needs no direction, which stays as it is.
             return undamped_rate(jacobian(field, y, self.scales)), direction
         return rate_along(field, y, field(y), direction, self.scales)
 
@@ -154,6 +155,8 @@ def solve_by_diffrax(
         motion.y0,
         motion.parameters,
         saveat=diffrax.SaveAt(
+            # The end is saved too, since an event may end the motion between output
+            # times.
             subs=[diffrax.SubSaveAt(ts=fixed.times), diffrax.SubSaveAt(t1=True)]
         ),
         stepsize_controller=_controller(field, fixed, omega, options),

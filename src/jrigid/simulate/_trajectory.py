@@ -86,6 +86,7 @@ class Trajectory(Readable):
             values = jax.vmap(lambda t, state: fn(system, t, state, args))(times, flat)
             return values.reshape(*ts.shape, *values.shape[1:])
 
+        # Each `jax.vmap` around the call of `simulate` has given the code one axis.
         for _ in range(lanes):
             one = eqx.filter_vmap(one)
         return one(self.ts, self.states, self.system, self.args)
