@@ -24,6 +24,8 @@ from jrigid.systems import RigidBody
 # Lengths of the steps of order 2 that make one of a higher order: the first half of
 # them and the middle one. M. Suzuki, Phys. Lett. A 146 (1990) 319; W. Kahan, R.-C. Li,
 # Math. Comp. 66 (1997) 1089.
+# Steps of length s, s, 1 - 4 s, s, s have no error of third order: this is the solution
+# of 4 s^3 + (1 - 4 s)^3 = 0.
 _SUZUKI = 1 / (4 - 4 ** (1 / 3))
 _HALVES = {
     2: [1.0],
@@ -90,7 +92,9 @@ def _unbiased(
     excess = 0.5 * jnp.sum(step * mean)
     energy = 0.5 * jnp.sum((new - old) * mean)
     safe = jnp.where(square > 0, square, 1.0)
+    # The correction along L changes the energy as well, by this amount to first order.
     energy = energy - excess / safe * jnp.sum(new * momentum)
+    # The part of omega normal to L: a change of L along it changes the energy alone.
     across = new - jnp.sum(new * momentum) / safe * momentum
     # Zero for rotation about a principal axis, where the energy needs no correction.
     width = jnp.sum(across**2) + 1e-20 * jnp.sum(new**2)
@@ -98,6 +102,7 @@ def _unbiased(
     change = (
         excess / safe * momentum + energy / jnp.where(width > 0, width, 1.0) * across
     )
+    # At zero rates Euler's equations return I^-1 times the change of L.
     omega = after.omega - euler_equations(inertia, 0 * new, change)
     return dataclasses.replace(after, attitude=normalize(after.attitude), omega=omega)
 

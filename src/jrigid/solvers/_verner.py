@@ -142,11 +142,13 @@ def _row(start: int, coefficients: list[float], length: int) -> np.ndarray:
     """A row of the tableau, from an entry of the tables above."""
     row = np.zeros(length)
     row[0] = coefficients[0]
+    # The tables count stages from 1.
     row[start - 1 : start - 2 + len(coefficients)] = coefficients[1:]
     return row
 
 
 _A = tuple(_row(*row, length) for length, row in enumerate(_ROWS, 1))
+# The last stage is at the new state, so its row is also that of the solution.
 _TABLEAU = diffrax.ButcherTableau(
     c=np.array(_C), a_lower=_A, b_sol=np.append(_A[-1], 0.0), b_error=_row(*_ERROR, 17)
 )
@@ -167,6 +169,7 @@ class _Interpolation(Dense):
         step = jnp.asarray(self.t1 - self.t0)
         none = step == 0
         x = 2 * jnp.where(none, 0.0, t - self.t0) / jnp.where(none, 1.0, step) - 1
+        # Chebyshev polynomials from -1 to 1: T_(n+1) = 2 x T_n - T_(n-1).
         polynomials = [jnp.ones_like(x), x]
         for _ in range(6):
             polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
