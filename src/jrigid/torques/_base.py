@@ -381,6 +381,7 @@ class Sum(AbstractTorque):
         """Each term, and the state with the entries of that term."""
         first = 0
         for term in self.terms:
+            # Parts at rest have as many entries as parts in motion.
             last = first + len(term.internal_at_rest(state))
             view = state
             if last > first:

@@ -40,7 +40,8 @@ from jrigid.torques._base import (
     vector_or_function,
 )
 
-# Total irradiance [W/m^2] over the speed of light [m/s].
+# Total solar irradiance at 1 au [W/m^2] (nominal value of IAU 2015 Resolution B3) over
+# the speed of light [m/s].
 _PRESSURE_AT_EARTH = 1361 / 299_792_458
 
 
@@ -146,6 +147,8 @@ class GravityGradient(AbstractTorque):
         distance = safe_norm(position)
         # Divided three times, since r^3 can overflow in float32.
         strength = mu / distance / distance / distance
+        # This direction is opposite to n. Torque and energy are even in n, so that its
+        # sign has no effect.
         return inertia, rotate_inverse(state.attitude, position / distance), strength
 
     def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
@@ -277,6 +280,8 @@ class SolarPressure(AbstractTorque):
         n, areas, pressure = in_dtype_of(state, self.normals, self.areas, self.pressure)
         specular, diffuse = in_dtype_of(state, self.specular, self.diffuse)
         cosine = jnp.sum(n * s, axis=-1)
+        # At 0 `jnp.maximum` would have half the slope of the bright side, not the slope
+        # 0 of the dark side.
         cosine = jnp.where(cosine > 0, cosine, 0.0)
         pushed = -pressure * areas * cosine
         along = pushed * (1 - specular)
@@ -345,6 +350,7 @@ _DISSIPATIVE: dict[str, Any] = {
 
 def _linear_drag(coefficient: Array, state: BodyState) -> Vector:
     """The torque -c omega of a number, numbers for the body axes, or a tensor."""
+    # `angular_momentum` multiplies omega by three numbers or by a tensor.
     (c,) = in_dtype_of(state, coefficient)
     return -(angular_momentum(c, state.omega) if c.ndim else c * state.omega)
 
@@ -447,4 +453,6 @@ class CoulombFriction(AbstractTorque):
         if self.axis is not None:
             axis = self.axis.astype(omega.dtype)
             omega = axis * jnp.sum(axis * omega)
+        # The root of |omega|^2 + width^2 is the norm of these four numbers. It cannot
+        # overflow, and it is positive.
         return -magnitude * (omega / safe_norm(jnp.append(omega, width)))

@@ -125,6 +125,7 @@ class Rotor(AbstractTorque):
         def momentum_at(t: Scalar) -> Vector:
             return self.internal_momentum(t, state, args)
 
+        # Forward mode returns h and h' of a user's function by one evaluation.
         momentum, rate = jax.jvp(momentum_at, (time,), (jnp.ones_like(time),))
         return -rate - jnp.cross(state.omega, momentum)
 
@@ -174,6 +175,7 @@ class SpinningMass(AbstractTorque):
     def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
         (axis,) = in_dtype_of(state, self.axis)
+        # The motor is fixed to the body, which takes up its reaction.
         push = -self._motor(t, state, args) * axis
         return push - jnp.cross(state.omega, self.internal_momentum(t, state, args))
 

@@ -40,6 +40,7 @@ class KeplerOrbit(eqx.Module):
     @property
     def mean_motion(self) -> Float[Array, ""]:
         """Mean motion n = sqrt(mu / a^3) [rad/s]."""
+        # The cube of an axis in metres can overflow in float32.
         return jnp.sqrt(self.mu / self.semi_major_axis) / self.semi_major_axis
 
     def __call__(self, t: ScalarLike) -> Vector:
@@ -47,6 +48,7 @@ class KeplerOrbit(eqx.Module):
         a = self.semi_major_axis
         e = self.eccentricity
         mean = self.mean_motion * jnp.asarray(t, a.dtype)
+        # The start below is for mean anomalies from -pi to pi.
         mean = mean - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(mean / (2 * jnp.pi)))
         anomaly = _eccentric_anomaly(mean, e)
         x = a * (jnp.cos(anomaly) - e)
@@ -74,7 +76,10 @@ def _without_derivatives(mean: Scalar, e: Scalar) -> Scalar:
     alpha = (1 - e) / scale
     beta = 0.5 * jnp.abs(mean) / scale
     z = jnp.cbrt(beta + jnp.sqrt(alpha**3 + beta * beta))
+    # The sine s of a third of E, so that sin E = 3 s - 4 s^3. This quotient is
+    # Mikkola's z - alpha / z without its cancellation at small anomalies.
     sine = 2 * beta / (z * z + alpha + (alpha / z) ** 2)
+    # Mikkola's correction for what the cubic neglects.
     sine = sine - 0.078 * sine**5 / (1 + e)
     anomaly = mean + jnp.sign(mean) * e * (3 * sine - 4 * sine**3)
     # Each step is of fourth order.

@@ -78,6 +78,8 @@ class Sampled(Readable):
             jnp.asarray(t, ts.dtype) - self.delay.astype(ts.dtype), ts[0], ts[-1]
         )
         last = ts.size - 1
+        # For a single sample i is -1, which is that sample, and all intervals are
+        # empty.
         i = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, last - 1)
         intervals = [self._interval(i + k) for k in (-1, 0, 1)]
         _, (mean, b), _ = intervals
@@ -85,6 +87,8 @@ class Sampled(Readable):
         since = (t - ts[i]).astype(values.dtype)
         u = jnp.where(b > 0, since / jnp.where(b > 0, b, 1.0), 0.0)
         bend = u * (1 - u) * b
+        # Hermite's cubic: the chord, and a part that is zero at both ends and gives the
+        # slopes there.
         value = values[i] + u * b * mean
         value = value + bend * ((1 - u) * (left - mean) - u * (right - mean))
         return self.scale.astype(values.dtype) * value
@@ -117,6 +121,7 @@ def _end_slopes(
     slope, b = within
     slope_after, c = after
     ab, bc = (jnp.where(x > 0, x + b, 1.0) for x in (a, c))
+    # Second divided differences, half the second derivatives of the two parabolas.
     bend_before = jnp.where(a > 0, (slope - slope_before) / ab, 0.0)
     bend_after = jnp.where(c > 0, (slope_after - slope) / bc, 0.0)
     left = slope - b * jnp.where(a > 0, bend_before, bend_after)
