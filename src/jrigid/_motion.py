@@ -136,6 +136,7 @@ _BLUR = 0.1
 def resolves(t0: Array, rate: Array) -> Array:
     """Whether the dtype of `t0` resolves times near it, for a body with this rate."""
     blur = (jnp.finfo(t0.dtype).eps * jnp.abs(t0)).astype(rate.dtype)
+    # The result is True for NaN, which other checks report.
     return ~(blur * rate > _BLUR)
 
 
@@ -191,6 +192,7 @@ def check_motion(
     _check_state(findings, state)
     field = system.vector_field(t, state, args)
     turning, spinning_up = safe_norm(jnp.stack([state.omega, field.omega]))
+    # A torque that is NaN or infinite is reported below, as what it is.
     rate = jnp.maximum(
         turning, jnp.where(spinning_up < jnp.inf, jnp.sqrt(spinning_up), 0.0)
     )
@@ -199,6 +201,8 @@ def check_motion(
     info = np.finfo(rate.dtype)
     slowest = float(info.tiny / info.eps) ** 0.5
     fastest = float(info.max * info.eps) ** 0.5
+    # The rate is zero where nothing turns the body. `simulate` then takes its rate from
+    # the length of the run.
     in_range = (rate == 0) | ((rate > slowest) & (rate < fastest))
     findings.require(in_range, RESULTS.rate_out_of_range, value=rate)
     # The rate of the attitude is finite where the state is.

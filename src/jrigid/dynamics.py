@@ -94,6 +94,8 @@ def _inverse_times(inertia: Array, vector: Array) -> Array:
         return vector / inertia
     # In units of the largest moment, since a product of three moments can be out of the
     # range of float32.
+    # The largest entry of a positive definite tensor is on its diagonal. The unit
+    # cancels, so that it needs no derivative.
     unit = jax.lax.stop_gradient(jnp.max(jnp.diagonal(inertia)))
     inertia = inertia / unit
     vector = vector / unit
@@ -204,6 +206,7 @@ def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
     shift = inertia[2, 2]
     p = (i[0, 0] - shift) * a + i[0, 1] * b + i[0, 2] * c
     q = i[1, 0] * a + (i[1, 1] - shift) * b + i[1, 2] * c
+    # The shift makes the third entry of the diagonal zero.
     r = i[2, 0] * a + i[2, 1] * b
     return jnp.stack([q * c - r * b, r * a - p * c, p * b - q * a])
 

@@ -119,6 +119,7 @@ class AbstractSystem(Readable):
                 f"holds {have}: `system.with_parts(state)` adds parts at rest to a "
                 "state that has none."
             )
+        # The precision of a run is that of the state, whatever that of the body.
         inertia = self.inertia.astype(state.omega.dtype)
         return inertia, self.torque.of_body(inertia)
 
@@ -393,6 +394,7 @@ class FloatingBody(AbstractSystem):
             check_shape("force", force, (3,))
         acceleration = force / self.mass_properties.mass.astype(force.dtype)
         turning = self.rotation.vector_field(t, state, args)
+        # The fields of `State` have the same names in `FloatingState`.
         return FloatingState(state.velocity, acceleration, **vars(turning))
 
     def translational_energy(self, state: FloatingState) -> Scalar:
