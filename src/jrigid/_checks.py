@@ -205,6 +205,7 @@ def _hint(
     name: str, shape: tuple[int, ...], wanted: Sequence[tuple[int | None, ...]]
 ) -> str:
     """A hint at the usual mistake behind a wrong shape."""
+    # If the last axes are right, those before them are a batch.
     if any(x and shape[len(shape) - len(x) :] == x for x in wanted):
         return " (For many, `jax.vmap`.)"
     if wanted == INERTIA and shape == (6,):
@@ -235,6 +236,8 @@ def shaped(**arguments: tuple[Any, ...]) -> tuple[Array, ...]:
     """
     arrays = float_arrays(*(value for value, *_ in arguments.values()))
     for array, (name, (_, *shape)) in zip(arrays, arguments.items(), strict=True):
+        # `vector=(vector, 3)` has the lengths of one shape, `inertia` has several
+        # shapes.
         several = bool(shape) and isinstance(shape[0], tuple)
         check_shape(name, array, *(shape if several else [tuple(shape)]))
     return arrays
@@ -297,6 +300,7 @@ def traced_by_jax(function: str) -> Generator[None, None, None]:
             f"Use `jax.numpy` in {function}, not numpy (`jnp.sin`, not `np.sin`): its "
             "arguments are traced by JAX and have no values yet."
         ) from error
+    # This error is also a `ConcretizationTypeError`, so that it must come first.
     except jax.errors.TracerBoolConversionError as error:
         raise ValueError(
             f"Use `jnp.where` or `jax.lax.cond` in {function}, not `if`, `and` or "
@@ -501,6 +505,7 @@ class Findings:
         first = jnp.where(
             self.ok, len(self._failed) + code, _first_failed(self._failed)
         )
+        # The messages of the result codes follow those of the conditions.
         messages = (*self._messages, *RESULTS.texts)
         values = (*self._values, *[None] * len(RESULTS.texts))
         return _Diagnosis(first, messages, values)
@@ -577,6 +582,7 @@ def _refuse(tree: Tree, bad: AnyBool, diagnose: Callable[[], _Diagnosis]) -> Tre
 def _message(bad: AnyBool, diagnosis: _Diagnosis) -> str:
     """The error message for the first bad lane, with the value and the lane."""
     is_bad, firsts = _all_lanes(bad, diagnosis.first)
+    # Without vmap the lane is the empty tuple.
     lane = tuple(np.argwhere(is_bad)[0].tolist())
     first = int(firsts[lane])
     details = []

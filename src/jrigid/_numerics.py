@@ -21,6 +21,8 @@ Components = tuple[Array, ...]
 
 # Vectors and quaternions, the usual cases, have no more components.
 _FEW = 4
+# Derivatives of the closed forms divide by powers of z, and lose digits near 0. Below
+# this z the series are used.
 _SERIES_BELOW = 0.5
 _SERIES_TERMS = 9  # 0.5^9 / 19! < 1e-19
 
@@ -89,6 +91,7 @@ def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array,
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), jnp.abs(y)))
     origin = largest == 0
     scale = jnp.where(origin, 1.0, largest)
+    # At x = 1, y = 0 the derivatives are finite, and the outer `where` drops them.
     angle = jnp.arctan2(y / scale, jnp.where(origin, 1.0, x / scale))
     return jnp.where(origin, 0.0, angle)
 
@@ -157,6 +160,8 @@ def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     least = 1 << info.nmant  # as bits: the smallest exponent, no mantissa
     # With a larger exponent the inverse would no longer be a normal number.
     greatest = ((1 << info.nexp) - 4) * least
+    # -least has ones in the bits of sign and exponent alone. To add `least` to the bits
+    # doubles the power.
     bits = (
         jax.lax.bitcast_convert_type(jnp.abs(x), jnp.dtype(f"int{info.bits}")) & -least
     )

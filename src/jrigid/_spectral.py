@@ -119,6 +119,7 @@ def _eigh_jvp(distinct: bool, primals: tuple, tangents: tuple) -> tuple:
     (change,) = tangents
     moments, axes = eigh(tensor)
     inside = product("ki,kl,lj->ij", axes, 0.5 * (change + change.T), axes)
+    # First-order perturbation: d axes = axes C with C_ij = inside_ij / (m_j - m_i).
     gap = moments[None, :] - moments[:, None]
     least_gap = 1e-6 if distinct else 4 * jnp.finfo(gap.dtype).eps
     resolved = jnp.abs(gap) > least_gap * jnp.max(jnp.abs(moments))
@@ -180,6 +181,8 @@ def _expansion(f: Callable[..., Array], tensor: Array, *parameters: Array) -> Ar
 
     def differences(count: int) -> Array:
         """Divided differences of all sets of `count` moments, each computed once."""
+        # A divided difference does not depend on the order of its moments.
+        # `_difference` needs them ascending.
         wanted = np.sort(np.moveaxis(np.indices((3,) * count), 0, -1), axis=-1)
         sets, which = np.unique(wanted.reshape(-1, count), axis=0, return_inverse=True)
         values = jax.vmap(functools.partial(_difference, g))(
@@ -211,6 +214,7 @@ def _difference(f: Callable[[Array], Array], *moments: Array) -> Array:
     # Distant moments are replaced by the first one, so that the branch that is not
     # taken stays finite.
     integral = _hermite_genocchi(f, *(jnp.where(near, x, first) for x in moments))
+    # f[a, ..., z] = (f[b, ..., z] - f[a, ..., y]) / (z - a) of moments a to z.
     quotient = _difference(f, *moments[1:]) - _difference(f, *moments[:-1])
     return jnp.where(near, integral, quotient / jnp.where(near, 1.0, gap))
 
