@@ -88,7 +88,7 @@ def meter(
     """Show how many points are done: a bar if tqdm is installed, else lines.
 
     Yields:
-        A function that is told of points that have been finished.
+        A function to call with a number of points that have been finished.
     """
     if not shown:
         yield lambda _: None

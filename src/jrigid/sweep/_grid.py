@@ -143,6 +143,7 @@ def _list_of(points: PyTree) -> Grid:
             "and call `jax.random.key` in the function.)"
         )
     lengths = {x.shape[:1] for x in leaves}
+    # A single number has no axis of points, and an empty axis has no points.
     if len(lengths) != 1 or lengths <= {(), (0,)}:
         raise ValueError(
             "Argument `points` must hold arrays with the same number of points in "
@@ -190,6 +191,7 @@ def on_block(
         points = part
         shape = jtu.tree_leaves(part)[0].shape[:1]
     else:
+        # The last axis runs fastest, as in `Grid.corner`.
         spread = jnp.meshgrid(*part, indexing="ij")
         points = {name: x.reshape(-1) for name, x in zip(names, spread, strict=True)}
         shape = tuple(x.size for x in part)

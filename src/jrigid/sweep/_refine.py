@@ -44,6 +44,7 @@ def _changes(corners: SweepResult, lattice: np.ndarray) -> np.ndarray:
     for failure in corners.failures:
         ends = zip(failure.first, failure.last, strict=True)
         failed[tuple(slice(first, last + 1) for first, last in ends)] = True
+    # Along each axis a tile lies between two neighbouring points of the lattice.
     sides = (slice(0, -1), slice(1, None))
     of_tile = [*itertools.product(*[sides] * lattice.ndim)]
     ends = np.stack([lattice[x] for x in of_tile])
@@ -111,6 +112,8 @@ class RefinedMap:
                 if self._grid.corner(number) not in failed:
                     self._classify_tile(number)
             computed |= waiting
+            # A boundary that leaves a tile shows at its edge, so that the next tile is
+            # computed.
             beside = self._neighbours(waiting) - computed
             waiting = set(filter(self._is_entered, beside))
         return failures
@@ -135,4 +138,5 @@ class RefinedMap:
         """Say whether a point beside a tile has another class than its first corner."""
         region = self._grid.region(number)
         wider = tuple(slice(max(x.start - 1, 0), x.stop + 1) for x in region)
+        # A tile that was not computed has one class, that of its first corner.
         return bool(np.any(self.classes[wider] != self.classes[region].flat[0]))

@@ -203,6 +203,7 @@ class Store:
 
     def _create(self, about: dict[str, Any], attributes: Attributes) -> None:
         """Write the metadata of all arrays, in a directory that appears at once."""
+        # The directory is beside the store, since a rename needs the same file system.
         partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
         try:
             self._describe(partial, about, attributes)
@@ -366,8 +367,11 @@ class Store:
         place = self.path / "zarr.json"
         known = json.loads(place.read_text())
         failed = [x._asdict() for x in failures]
+        # A resumed run may have computed the blocks that failed before.
         if known["attributes"][_KEY].setdefault("failures", []) != failed:
             known["attributes"][_KEY]["failures"] = failed
+            # As for a chunk, a killed process leaves the old description or the new
+            # one.
             new = place.with_suffix(".partial")
             new.write_text(json.dumps(known))
             new.replace(place)

@@ -118,6 +118,8 @@ def sweep(
     """
     grid = grid_of(axes, points)
     path = None if store is None else Path(store).absolute()
+    # One point shows shapes and types of the values, on which the default size of a
+    # block depends.
     values, about = traced(function, grid.names, grid.cut(1).part(0))
     leaves = leaves_of(values, grid.axes)
     grid = _cut(grid, block_size, path, refine is not None, leaves)

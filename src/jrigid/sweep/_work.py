@@ -107,6 +107,7 @@ class Worker:
             values = self._computed(number, part)
         except Exception as error:
             return Outcome(number, error=in_words(error))
+        # Points that are repeated to fill the last block of an axis do not count.
         count = int(np.count_nonzero(values[-1][self.work.grid.inside(number)]))
         if self.kept is None:
             return Outcome(number, count, values)
@@ -184,6 +185,8 @@ def packed(work: Work) -> bytes:
     except ModuleNotFoundError:
         from pickle import dumps
     try:
+        # Each call carries the points of its own block, and the work only names the
+        # axes.
         axes = None if work.grid.names is None else dict.fromkeys(work.grid.names)
         return dumps(work._replace(grid=work.grid._replace(points=axes)))
     except Exception as error:
