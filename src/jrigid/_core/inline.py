@@ -44,6 +44,7 @@ def _evaluate(
 
     for equation in jaxpr.eqns:
         inputs = [read(x) for x in equation.invars]
+        # The operations of a call are evaluated in its place, so that no call remains.
         called = third_party.called_program(equation)
         if called is None:
             results = third_party.apply(equation.primitive, equation.params, *inputs)

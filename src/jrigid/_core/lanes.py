@@ -102,6 +102,7 @@ def as_lanes(
     # `custom_vmap` takes arrays only.
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, structure = jtu.tree_flatten((arrays, own, tangents))
+    # The tangents are the last of the leaves.
     motions = len(leaves) - len(jtu.tree_leaves(tangents))
     call = _Call(function, alone, static, structure, motions, tangents is not None)
     of_one = jax.custom_batching.custom_vmap(call.single)
@@ -170,6 +171,7 @@ class _Call(NamedTuple):
             def along(tangent: PyTree) -> PyTree:
                 return self.called(shared, each, own[:-1], tangent)
 
+            # The first axis is that of lanes. The values are the same for all tangents.
             return jax.vmap(along, in_axes=1, out_axes=(None, 1))(own[-1])
 
         def push_alone(problem: PyTree, *own: PyTree) -> PyTree:
@@ -184,6 +186,7 @@ class _Call(NamedTuple):
 
     def of_all(self, leaves: PyTree, batched: PyTree) -> PyTree:
         """The result for lanes, from leaves of which `batched` have lanes in front."""
+        # All batched leaves have the same number of lanes.
         count = next(x.shape[0] for x, has in zip(leaves, batched, strict=True) if has)
         problem, *own = self.structure.unflatten(leaves)
         problem_has, *own_has = self.structure.unflatten(batched)

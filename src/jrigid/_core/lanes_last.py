@@ -105,6 +105,8 @@ def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
     while True:
         results = _results_vary(scan.body.jaxpr, flags)
         before = flags[scan.carry]
+        # After the carry, `results` has the rows that the scan stacks, which do not
+        # count.
         carried = [a or b for a, b in zip(before, results, strict=False)]
         if carried == before:
             return carried + results[len(carried) :]
@@ -222,6 +224,8 @@ class _Evaluation:
 
         def step(carry: list, values: list) -> tuple[list, list]:
             carried = zip(carry, varies, strict=False)
+            # Rows are along the first axis and lanes along the last, so a row keeps its
+            # lanes.
             row = zip(values, (has for _, has in rows), strict=True)
             arguments = [*consts, *carried, *row]
             results = in_lanes(self(scan.body.jaxpr, scan.body.consts, arguments))
@@ -243,6 +247,8 @@ class _Evaluation:
 
         def branch(closed: third_party.ClosedJaxpr) -> Callable[..., list]:
             def results(*values: Any) -> list:
+                # All branches must return arrays of the same shapes, so each result
+                # gets lanes.
                 return self.whole(closed, zip(values, batched[1:], strict=True))
 
             return results

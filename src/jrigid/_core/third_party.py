@@ -294,6 +294,7 @@ def dynamic_slice_of(equation: core.JaxprEqn) -> int | None:
 def slice_with_last_axis(equation: core.JaxprEqn, size: int, *values: Any) -> Any:
     """A slice, read or written, of arrays with one more axis at their end."""
     arrays = _DYNAMIC_SLICES[equation.primitive]
+    # The slice takes all lanes, so that it starts at the first one.
     starts = [*values[arrays:], jax.numpy.zeros_like(values[-1])]
     if arrays == 1:
         sizes = (*equation.params["slice_sizes"], size)
