@@ -207,6 +207,8 @@ def _curve(
     parser: _Parser, session: _Session, positions: Positions, zero: Decimal
 ) -> LightCurve:
     """A session as a relative light curve."""
+    # AVERAGE takes one light time off a whole session, which serves as well: in a night
+    # that of an asteroid changes by a few seconds.
     is_corrected = parser.option(session, "LTCAPP", _CORRECTIONS) != "NONE"
     reduced = parser.option(session, "REDUCEDMAGS", _CORRECTIONS)
     dates = np.array(session.dates, dtype=float)
@@ -262,6 +264,8 @@ def _seen_later(
 ) -> tuple[Vectors, Vectors]:
     """Vectors for dates at which the light left the body."""
     to_sun, to_observer = _vectors(positions, dates)
+    # `positions` takes dates of observation. These are later by the light time, which
+    # depends on them in turn.
     for _ in range(_LIGHT_TIME_STEPS):
         light_days = light_time(to_observer) / _DAY
         to_sun, to_observer = _vectors(positions, dates + light_days)

@@ -124,10 +124,15 @@ rows_at = jax.jit(rows_of)
 
 
 def inverse_normal(normal: np.ndarray) -> np.ndarray:
-    """Inverse of a normal matrix, by its scale; infinite along what is not determined."""
+    """Inverse of a normal matrix, by its scale.
+
+    Along what is not determined it is finite, and at most 1e15 in units in which the
+    diagonal of the matrix is 1.
+    """
     size = np.sqrt(np.diag(normal))
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    # Rounding may make the least eigenvalues negative.
     values = np.maximum(values, _LEAST)
     return (vectors / values) @ vectors.T / np.outer(size, size)
 
@@ -143,6 +148,7 @@ def log_evidence(alias: Alias, growth: float) -> float:
     size = np.sqrt(np.diag(covariance))
     _, logarithm = np.linalg.slogdet(covariance / np.outer(size, size))
     numbers = unpacked(alias.numbers)
+    # Half the logarithm of the determinant of the covariance: the volume of the peak.
     spread = 0.5 * logarithm + np.sum(np.log(size))
     # The prior is flat in solid angle and in ratios, not in latitude and in logits.
     of_directions = np.log(np.cos(numbers.pole[1]))
@@ -171,6 +177,8 @@ def _estimates(vector: Array, task: Task, span: Array) -> Estimates:
     # At the largest tilt the angular momentum has components along the intermediate and
     # the circled axis only.
     tangent2 = jnp.exp(2 * jnp.where(tumbles, numbers.log_tangent[0], 0.0))
+    # This is 2 E / L^2. `inverse` is 1 for the largest moment, so that E0 has the
+    # value 1.
     energy = (inverse[1] * tangent2 + inverse[2]) / (1 + tangent2)
     moments = 1 / inverse_moments(semi_axes(logits), jnp.asarray(False))
     return Estimates(

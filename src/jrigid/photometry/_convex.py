@@ -118,6 +118,7 @@ def surface_of(
         centre=np.concatenate([np.zeros(6), given, np.zeros(coefficients)]),
         stiffness=np.concatenate(
             [
+                # Nothing is known beforehand of the period and the pole.
                 np.zeros(3),
                 np.full(3, 1 / _SPREAD_OF_ALBEDO),
                 1 / np.array(_SPREAD_OF_SCATTERING),
@@ -136,6 +137,7 @@ def even_directions(count: int) -> Float[np.ndarray, "many 3"]:
     """
     half = (count + 1) // 2
     index = np.arange(half) + 0.5
+    # Equal steps of the height cut the sphere into zones of equal area.
     height = 1 - index / half
     longitude = np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - height**2)
@@ -160,9 +162,13 @@ def real_harmonics(
     highest = np.ones_like(z)
     for m in range(degree + 1):
         if m > 0:
+            # The mean of sin(polar angle)^(2 m) on the sphere is 2 m / (2 m + 1) of
+            # that of the order before.
             highest = highest * np.sqrt((2 * m + 1) / (2 * m))
+        # Squares of cosines and sines have the mean 1/2, hence the root of 2.
         turned = (x + 1j * y) ** m * (1 if m == 0 else np.sqrt(2))
         for n, legendre in enumerate(_legendre(highest, z, m, degree), m):
+            # The cosine is stored last: order 0 has one key for both, and no sine.
             columns[n, -m] = legendre * turned.imag
             columns[n, m] = legendre * turned.real
     order = [(n, m) for n in range(1, degree + 1) for m in range(-n, n + 1)]
@@ -284,6 +290,7 @@ def _light(
     cos_observer = jnp.maximum(product("ei,fi->ef", directions[:, 1], normals), 0.0)
     both = cos_sun * cos_observer
     counted = both > 0
+    # Where a facet is neither lit nor visible the sum of the cosines is 0.
     inverse = 1 / jnp.where(counted, cos_sun + cos_observer, 1.0)
     of_area = both * (inverse + lambert)
     # The derivative of mu0 mu / (mu0 + mu) in mu0 is (mu / (mu0 + mu))^2.
@@ -338,6 +345,8 @@ def spin_rows(
     motion = vector[_MOTION]
     directions = placed(motion)
     light = _light_in_blocks(numbers, surface, directions)
+    # The phase angle is that of the vectors in space: the motion does not change it, so
+    # that `of_motion` has no part from the phase function.
     angles = jax.vmap(phase_angle)(readings.to_sun, readings.to_observer)
     phases = jax.vmap(_log_phase, (None, 0))(numbers.scattering, angles)
     of_phases = jax.vmap(jax.jacfwd(_log_phase), (None, 0))(numbers.scattering, angles)
@@ -346,6 +355,7 @@ def spin_rows(
         of_directions[..., None] * jax.jacfwd(placed)(motion), axis=(1, 2)
     )
     lambert = law_of(numbers.scattering).lambert
+    # The readings are logarithms, whose derivatives are those of the light over it.
     inverse = 1 / light.value[:, None]
     # Lambert's weight is the first number of the scattering.
     of_lambert = jnp.pad(light.of_lambert[:, None] * lambert, ((0, 0), (0, 3)))
@@ -378,6 +388,7 @@ def spin_quadratic(
     # Three results depend on many numbers, hence reverse mode.
     of_gap = surface.closure * jax.jacrev(of_shape)(shape)
     of_gap = jnp.pad(of_gap, ((0, 0), (vector.size - shape.size, 0)))
+    # Numbers that are not sought never leave the centre, and add nothing.
     strain = surface.stiffness * (vector - surface.centre)
     rows = jnp.concatenate([residuals, gap])
     slopes = jnp.where(sought, jnp.concatenate([slopes, of_gap]), 0.0)

@@ -32,6 +32,7 @@ class Ellipsoid(Readable):
     def moments(self) -> Vector:
         """Principal moments of inertia of a homogeneous ellipsoid of mass 1 [m^2]."""
         square = self.semi_axes**2
+        # About the axis a of an ellipsoid the moment is m (b^2 + c^2) / 5.
         return (jnp.sum(square) - square) / 5
 
     def facets(self, rows: int = 64) -> Facets:
@@ -81,6 +82,7 @@ def _sphere(rows: int) -> tuple[np.ndarray, np.ndarray]:
     right = np.roll(index, -1, axis=1)
     upper, lower = index[:-1], index[1:]
     upper_right, lower_right = right[:-1], right[1:]
+    # Corners run counter-clockwise seen from outside, as `facets_from_mesh` takes them.
     faces = [
         np.stack([np.full(columns, north), index[0], right[0]], axis=-1),
         np.stack([upper, lower, upper_right], axis=-1).reshape(-1, 3),
@@ -118,6 +120,7 @@ def lommel_seeliger_brightness(
     # At a phase angle of 0 the sines vanish, and their product with the logarithm tends
     # to 0.
     lit = square > 0
+    # (1 + cos a) / sin a is the cotangent of a / 2. This is the product of two of them.
     cotangents = (1 + from_sun) * (1 + from_observer) / jnp.where(lit, sines, 1.0)
     bent = jnp.where(lit, sines * jnp.log(cotangents), 0.0)
     lune = from_sun + from_observer - bent

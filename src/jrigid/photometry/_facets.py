@@ -149,6 +149,7 @@ def _hull(vertices: np.ndarray) -> np.ndarray:
     faces = found.simplices.copy()
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Qhull lists the corners of a triangle in either order.
+    # The first three columns of its equations are outward normals.
     inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), found.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return faces
@@ -156,6 +157,7 @@ def _hull(vertices: np.ndarray) -> np.ndarray:
 
 def _demand_convex(corners: np.ndarray, normals: np.ndarray) -> None:
     """Raise ValueError unless all corners lie behind the planes of all triangles."""
+    # Vertices that no triangle has are not a part of the body.
     used = np.unique(corners.reshape(-1, 3), axis=0)
     size = np.max(np.ptp(used, axis=0))
     for first in range(0, len(normals), _AT_A_TIME):

@@ -48,6 +48,7 @@ class _Lines:
         text = self.path.read_text(encoding="utf-8-sig")
         lines = enumerate(text.splitlines(), 1)
         self._left = [(number, line.split()) for number, line in lines if line.strip()]
+        # `pop` takes lines off the end.
         self._left.reverse()
         self.number = 0
 
@@ -197,6 +198,7 @@ def read_shape(path: str | pathlib.Path, *, hull: bool = False) -> Facets:
     """
     lines = _Lines(path)
     vertex_count, face_count = lines.integers(2, "numbers of vertices and triangles")
+    # A tetrahedron has the fewest of both.
     if min(vertex_count, face_count) < 4:
         raise lines.error("a body must have at least 4 vertices and 4 triangles.")
     vertices = [lines.numbers(3, "a vertex") for _ in range(vertex_count)]

@@ -23,7 +23,7 @@ from jrigid.photometry._search import Found, search
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.
 _FIRST_NOISE = 0.02
-# A tumbler has up to ten numbers.
+# A tumbler has up to eleven numbers, with one equation between them.
 _LEAST_POINTS = 12
 _HOUR = 3600.0
 
@@ -192,6 +192,8 @@ def _inversion(
     )
     least = float(found.quadratic.chi_square[0])
     reduced = least / freedom
+    # A stated noise may be too small, and the errors grow with the misfit. It is never
+    # reduced.
     scale = max(reduced, 1.0) if stated else reduced
     every = []
     for numbers, task in zip(found.numbers, tasks, strict=True):
@@ -206,10 +208,13 @@ def _inversion(
     weights = np.exp(logarithms - logarithms.max())
     aliases = [
         dataclasses.replace(alias, weight=float(weight))
+        # `weights` has only the first tumblers, those near the least chi-square.
         for alias, weight in zip(every, weights / weights.sum(), strict=False)
     ]
-    # Within the noise, chi-square has this spread.
+    # Within the noise, chi-square over its degrees of freedom has the standard
+    # deviation sqrt(2 / freedom). Five of them are allowed.
     follows = not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)
+    # Rows that only fill the arrays have no weight, hence the maximum.
     noise = 1 / (MAGNITUDE * float(readings.weights.max()))
     return Inversion(
         aliases=aliases,
@@ -319,6 +324,7 @@ def _described(rank: int, alias: Alias) -> list[str]:
 
 def in_hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
     """A period in hours with its error."""
+    # The error is shown with two digits.
     digits = int(np.clip(1 - np.floor(np.log10(error / _HOUR)), 0, 9))
     return f"{period / _HOUR:.{digits}f} +- {error / _HOUR:.{digits}f} h"
 

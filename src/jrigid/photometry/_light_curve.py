@@ -115,6 +115,7 @@ def light_curve(
     )
     if light_time:
         ts = ts - safe_norm(to_observer) / SPEED_OF_LIGHT
+    # An invalid motion raises no error here: its curve is NaN below.
     motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
     seen = functools.partial(_seen_from_space, shape, scattering)
     curve = jax.vmap(seen)(motion.attitude, to_sun, to_observer)

@@ -65,6 +65,8 @@ class Task(NamedTuple):
         link: Weight of the equation between the periods, the tilt and the moments.
     """
 
+    # Near the x axis longitude and latitude are regular. At the poles of these axes a
+    # step of the longitude would move nothing.
     frame: Float[AnyArray, "*lanes 3 3"]
     mode: Int[AnyArray, "*lanes"]
     homogeneous: Bool[AnyArray, "*lanes"]
@@ -99,6 +101,7 @@ def semi_axes(logits: Float[Array, "2"]) -> Vector:
 def inverse_moments(axes: Vector, long_axis: Bool[Array, ""]) -> Vector:
     """1 / I of the axes other, middle, circled; that of the shortest semi-axis is 1."""
     square = axes * axes
+    # Those of a homogeneous ellipsoid but for m / 5, which the quotient loses.
     moments = jnp.sum(square) - square
     inverse = moments[2] / moments
     return jnp.where(long_axis, inverse[::-1], inverse)
@@ -108,6 +111,8 @@ def motion_of(numbers: Numbers, task: Task) -> Wobble:
     """The series of the motion; of a tumbler of no matter what for the others."""
     tumbles = task.mode != Mode.principal_axis
     logits = jnp.where(task.homogeneous, numbers.shape, numbers.inertia)
+    # Axes of equal length give NaN, which would reach the derivatives of a steady
+    # rotation although it does not use the series. It takes those of another body.
     logits = jnp.where(tumbles, logits, 0.0)
     log_tangent = jnp.where(tumbles, numbers.log_tangent[0], 0.0)
     inverse = inverse_moments(semi_axes(logits), task.mode == Mode.long_axis)
@@ -169,6 +174,8 @@ def directions_of_axes(geometry: Geometry, mode: Array, time: Scalar) -> Matrix:
 
     Row i is the direction of axis i.
     """
+    # The two frequencies are numbers of the fit, not those of `motion`. The gap between
+    # them is a row of the residuals.
     angles = 2 * jnp.pi * geometry.cycles * time + geometry.angles
     tumbling = body_axes(geometry.motion, angles[1], angles[0])
     # A long-axis mode circles x, and y is turned so that the axes stay right-handed.
@@ -221,6 +228,7 @@ def rows_of(vector: Float[Array, "11"], task: Task, readings: Readings) -> Rows:
 
     flat, gap = of_vector(vector)
     flat_slopes, gap_slopes = jax.jacfwd(of_vector)(vector)
+    # `jacfwd` passes on arrays alone, so the inverse of the flattening is made here.
     _, restored = ravel_pytree(geometry_of(unpacked(vector), task))
 
     def of_epoch(flat: Array, time: Array, sun: Array, observer: Array) -> Array:

@@ -133,6 +133,7 @@ def earth_position(julian_dates: Float[np.ndarray, " epochs"]) -> Vectors:
         inclination,
         node,
         perihelion,
+        # The mean anomaly is the mean longitude less that of the perihelion.
         longitude - perihelion,
     )
 
@@ -185,6 +186,7 @@ def _position(
 ) -> Vectors:
     """Positions on ellipses, from their elements."""
     anomaly = _eccentric_anomaly(mean_anomaly, eccentricity)
+    # In the plane of the orbit, from the Sun, with x towards the perihelion.
     x = axis * (np.cos(anomaly) - eccentricity)
     y = axis * np.sqrt(1 - eccentricity**2) * np.sin(anomaly)
     along = np.cos(argument) * x - np.sin(argument) * y
@@ -211,6 +213,7 @@ def _eccentric_anomaly(
     """
     wrapped = np.remainder(mean_anomaly + np.pi, 2 * np.pi) - np.pi
     size = np.abs(wrapped)
+    # E = M + e sin E is at most M + e, and for M up to pi it is at most pi.
     anomaly = np.minimum(size + eccentricity, np.pi)
     for _ in range(_NEWTON_STEPS):
         excess = anomaly - eccentricity * np.sin(anomaly) - size

@@ -100,6 +100,7 @@ def period_pairs(
     >>> print(pairs.explained.round(2).max())
     1.0
     """
+    # Any noise will do: it drops out of the fraction that is explained.
     readings, _ = readings_of(curves, noise=0.01)
     span = float(readings.span)
     pairs, powers = frequency_pairs(readings, span / longest, span / shortest, count)
@@ -135,6 +136,7 @@ def strongest_lines(
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """Lines of the ordinary periodogram, in cycles within the span, and their power."""
     step = 1 / _OVERSAMPLING_OF_LINES
+    # The line 2 f_phi + 2 f_psi reaches up to four times the highest frequency.
     frequencies = np.arange(2 * max(lowest, 1.0), 4 * highest, step)
     powers = _in_blocks(_LINE, readings, frequencies[:, None])
     chosen = unlike(frequencies[:, None], powers, _LINES_APART, _LINES)
@@ -171,6 +173,7 @@ def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
     size = np.sqrt(np.mean(along**2, axis=0))
     columns = np.zeros((len(readings.ts), 3))
     columns[there, 0] = 1
+    # Division by infinity leaves a column of zeros, for which `_RIDGE` is there too.
     columns[there, 1:] = along / np.where(size > _LEAST_MOTION, size, np.inf)
     return columns
 
@@ -223,6 +226,8 @@ def _power(
     inside = product("ef,ec->fc", basis, columns)
     # The values have no part along the basis already.
     slope = product("ec,e->c", columns, readings.values.astype(jnp.float32))
+    # The normal matrix of the columns less their parts along the basis, which is
+    # orthonormal.
     normal = product("ec,ed->cd", columns, columns) - product(
         "fc,fd->cd", inside, inside
     )

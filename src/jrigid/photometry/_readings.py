@@ -73,6 +73,8 @@ def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, f
     )
     epoch = curves[0].epoch
     ts = np.concatenate([x.ts + (x.epoch - epoch) * _DAY for x in curves])
+    # Seen from the middle of the span, errors of the frequencies are hardly correlated
+    # with those of the phases.
     middle = (ts.min() + ts.max()) / 2
     brightness = np.concatenate([x.brightness for x in curves])
     demand(
@@ -117,6 +119,8 @@ def _basis(curves: Sequence[LightCurve], weights: np.ndarray) -> np.ndarray:
     known = sorted(set(keys))
     of_curve = np.array([known.index(key) for key in keys])
     of_point = np.repeat(of_curve, [len(x.ts) for x in curves])
+    # A factor adds a constant to the logarithms, which whitening multiplies by the
+    # weights. No point has two factors, so that the columns are orthogonal.
     columns = (of_point[:, None] == np.arange(len(known))) * weights[:, None]
     return columns / np.linalg.norm(columns, axis=0)
 

@@ -93,10 +93,13 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     moves = jax.vmap(damped_step)(loop.at, loop.damping)
     numbers = loop.numbers + moves
     new = evaluate(numbers)
+    # Chi-square may be finite where its derivatives are not, and the next step needs
+    # both.
     finite = jnp.isfinite(new.chi_square) & jnp.all(
         jnp.isfinite(new.normal), axis=(1, 2)
     )
     gain = loop.at.chi_square - new.chi_square
+    # A gain of 0 counts: else a lane at its minimum would go on until it is stuck.
     better = loop.going & finite & (gain >= 0)
     factor = jnp.where(better, _FALL, _RISE)
     damping = jnp.maximum(loop.damping * factor, _LEAST_DAMPING)
@@ -120,5 +123,7 @@ def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, " numb
     # In units in which the diagonal is 1 the equations are well scaled.
     scale = 1 / jnp.sqrt(diagonal)
     normal = at.normal * scale[None] * scale[:, None]
+    # The row of a number of no effect is zero, and 1 on its diagonal keeps the matrix
+    # well conditioned.
     normal = normal + jnp.diag(damping + jnp.where(diagonal > _FLOOR, 0.0, 1.0))
     return -scale * jnp.linalg.solve(normal, scale * at.slope)

@@ -46,6 +46,8 @@ def orientations() -> Float[np.ndarray, "many 3 3"]:
     from scipy.spatial.transform import Rotation
 
     index = np.arange(_POLES) + 0.5
+    # Equal steps of the sine of the latitude are equal areas of the sphere, and the
+    # golden ratio spreads the longitudes.
     latitude = np.arcsin(1 - 2 * index / _POLES)
     longitude = np.pi * (1 + 5**0.5) * index
     turns = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
@@ -62,6 +64,7 @@ def fewer_epochs(readings: Readings, count: int = EPOCHS) -> Readings:
     there = np.flatnonzero(readings.weights)
     even = np.linspace(0, len(there) - 1, min(count, len(there)))
     chosen = there[even.astype(int)]
+    # Some rows of orthonormal columns are not orthonormal.
     left, sizes, _ = np.linalg.svd(readings.basis[chosen], full_matrices=False)
     basis = left * (sizes > _LEAST_SIZE)
     values = readings.values[chosen]
@@ -102,6 +105,8 @@ def best_orientations(
         vector, task = lane
         geometry = geometry_of(unpacked(vector), task)
         of_time = functools.partial(directions_of_axes, geometry, task.mode)
+        # The phases count many turns and are evaluated in full precision. Directions
+        # need less.
         axes = jax.vmap(of_time)(times).astype(jnp.float32)
         semi_axes = geometry.axes.astype(jnp.float32)
         each = functools.partial(_chi_square, semi_axes, axes, few)

@@ -87,6 +87,8 @@ def search(
     found = []
     for mode in modes:
         if mode == Mode.principal_axis:
+            # An ellipsoid looks the same after half a turn, so that its strongest line
+            # is at twice its frequency.
             candidates = np.concatenate([lines, lines / 2])
             candidates = np.stack([candidates, np.zeros_like(candidates)], axis=1)
         else:
@@ -193,6 +195,7 @@ def _log_ratios(logits: Array, tilts: Array, mode: Array) -> Array:
         numbers = unpacked(jnp.ones(COUNT, tilt.dtype))
         numbers = numbers._replace(log_tangent=tilt[None], shape=logits)
         task = Task(jnp.eye(3), mode, jnp.asarray(True), jnp.ones_like(tilt))
+        # Both frequencies are 1 here, so the gap is minus the logarithm of the motion.
         return -gap_of_periods(numbers, motion_of(numbers, task), task)
 
     return jax.vmap(at)(tilts)
@@ -237,6 +240,7 @@ def _settled(readings: Readings, found: Found, homogeneous: bool) -> Found:
     found = _best(found, len(found.numbers))
     if not homogeneous:
         numbers = found.numbers.copy()
+        # The search for the moments begins at those of the ellipsoid that is seen.
         numbers[:, 9:11] = numbers[:, 7:9]
         tasks = found.tasks._replace(homogeneous=np.zeros(len(numbers), bool))
         found = _minimised(readings, numbers, tasks, _LAST_STEPS)
@@ -262,6 +266,7 @@ def _in_blocks(
     blocks = []
     for first in range(0, len(numbers), lanes):
         rows = np.arange(first, min(first + lanes, len(numbers)))
+        # The last block repeats its rows, so that all blocks have one shape.
         block = _rows((numbers, tasks), np.resize(rows, lanes))
         blocks.append(_rows(function(*block), np.arange(len(rows))))
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)

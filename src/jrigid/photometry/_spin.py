@@ -338,7 +338,8 @@ def _inversion(
         noise=1 / (MAGNITUDE * float(readings.weights.max())),
         reduced_chi_square=reduced,
         degrees_of_freedom=freedom,
-        # Within the noise, chi-square has this spread.
+        # Within the noise, chi-square over its degrees of freedom has the standard
+        # deviation sqrt(2 / freedom). Five of them are allowed.
         follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)),
     )
 
@@ -346,6 +347,7 @@ def _inversion(
 def _index_of_mirror(spins: Spins) -> int | None:
     """Which solution is the mirror of the first one, if one is."""
     poles = spins.poles()
+    # Half a turn about the third axis of space.
     apart = np.linalg.norm(poles - poles[0] * [-1.0, -1.0, 1.0], axis=1)
     turns = np.abs(spins.numbers[:, 0] - spins.numbers[0, 0])
     near = np.flatnonzero((apart < _NEAR_MIRROR) & (turns < _SAME_TURNS))
@@ -415,6 +417,7 @@ def _body(
     return Tumbler(
         moments=jnp.ones(3, axes.dtype),
         precession_period=estimates.period,
+        # It has no meaning in this mode.
         rotation_period=estimates.period,
         longitude=estimates.longitude,
         latitude=estimates.latitude,
@@ -503,6 +506,7 @@ def _described(head: str, spin: Spin) -> list[str]:
         if spread > 0:
             lines.append(f"   {name} {value:.3f} +- {spread:.3f}")
     if np.any(error.albedo > 0):
+        # The logarithm of the albedo runs from minus to plus the length of this slope.
         contrast = np.exp(2 * np.linalg.norm(x.albedo))
         lines.append(f"   albedo varies by a factor of {contrast:.2f}")
     return lines

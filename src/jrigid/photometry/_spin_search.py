@@ -158,6 +158,7 @@ def _lifted(
     numbers: Float[np.ndarray, "many coarse"], surface: Surface
 ) -> Float[np.ndarray, "many numbers"]:
     """Numbers of a coarse body as those of a finer one."""
+    # Harmonics are in the order of their degrees: those of the coarse body come first.
     lifted = np.zeros((len(numbers), surface.centre.size))
     lifted[:, : numbers.shape[1]] = numbers
     return lifted
@@ -180,6 +181,7 @@ def best(spins: Spins, count: int) -> Spins:
     """The best points, unlike in their periods or their poles."""
     chi_square = spins.quadratic.chi_square
     spins = spins.rows(np.flatnonzero(np.isfinite(chi_square)))
+    # In this scale one threshold serves the turns and the poles.
     poles = spins.poles() * _APART / _APART_IN_POLE
     places = np.column_stack([spins.numbers[:, 0], poles])
     return spins.rows(unlike(places, -spins.quadratic.chi_square, _APART, count))
@@ -262,6 +264,8 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     moves = jax.vmap(damped_step)(loop.at, loop.damping)
     numbers = loop.numbers + moves
     new = evaluate(numbers)
+    # A step m changes chi-square of the quadratic model by 2 m.s + m.N m, since the
+    # slope s is half its gradient.
     bent = product("ln,lnm,lm->l", moves, loop.at.normal, moves)
     predicted = -2 * product("ln,ln->l", moves, loop.at.slope) - bent
     gain = loop.at.chi_square - new.chi_square

@@ -97,6 +97,7 @@ class Tumbler(Readable):
         # The momentum lies in the plane of the circled axis and of the middle one.
         momentum = self.moments * omega
         if self.mode == "short-axis":
+            # This turn about x takes the angular momentum to z.
             tilt = jnp.arctan2(momentum[1], momentum[2])
             upright = from_axis_angle(x, tilt)
         else:

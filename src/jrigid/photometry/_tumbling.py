@@ -195,6 +195,8 @@ def _of_periods(
     found = jnp.isfinite(y)
     # Derivatives of other lanes stay clean.
     omega = _at_largest_tilt(moments, jnp.where(found, y, 0.0), long_axis)
+    # The ratio of the periods fixes the direction of the angular momentum, and its size
+    # scales both.
     period = 2 * jnp.pi / mean_precession_rate(moments, omega)
     omega = omega * period / precession_period
     return jnp.where(found, product("ij,j->i", principal.axes, omega), jnp.nan)
@@ -213,6 +215,8 @@ _EXCESS = {mode: functools.partial(_excess, mode) for mode in (False, True)}
 
 def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
     """Angular velocity for a unit angular momentum whose tilt has the tangent exp(y)."""
+    # The squares of sine and cosine are 1 / (1 + exp(-2 y)) and 1 / (1 + exp(2 y)):
+    # neither is a difference, so that both keep their digits at all tilts.
     sine = jnp.sqrt(jax.nn.sigmoid(2 * y))
     cosine = jnp.sqrt(jax.nn.sigmoid(-2 * y))
     zero = jnp.zeros_like(y)

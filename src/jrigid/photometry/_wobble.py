@@ -36,6 +36,7 @@ _TERMS = 8
 _VALUES = 32
 _MEANS = 6  # arithmetic-geometric means, from a ratio of 1e-10
 _ODD = 2 * np.arange(_TERMS) + 1
+# The rate of the precession repeats after half a turn of the polhode.
 _PHASES = np.pi * np.arange(_VALUES) / _VALUES
 _MULTIPLES = 2 * np.arange(1, _VALUES // 2)
 
@@ -76,11 +77,14 @@ def wobble(inverse_moments: Vector, log_tangent: Scalar) -> Wobble:
     tangent = jnp.exp(log_tangent)
     cosine = 1 / jnp.sqrt(1 + tangent**2)
     sine = tangent * cosine
+    # The moduli k' and k. As a product, k keeps its digits where it is small.
     complement = 1 / jnp.sqrt(1 + (1 - rho) * tangent**2)
     modulus = tangent * jnp.sqrt(1 - rho) * complement
     quarter = _quarter_period(complement)
+    # q = exp(-pi K' / K), where K' is K of the other modulus.
     nome = jnp.exp(-jnp.pi * _quarter_period(modulus) / quarter)
 
+    # The series of sd, cd and nd in the nome: Abramowitz and Stegun 16.23.
     n = jnp.asarray(np.arange(_TERMS), dtype)
     sign = jnp.asarray((-1.0) ** np.arange(_TERMS), dtype)
     root = sign * nome ** (n + 0.5) * 2 * jnp.pi / (modulus * quarter)
@@ -91,6 +95,7 @@ def wobble(inverse_moments: Vector, log_tangent: Scalar) -> Wobble:
     power = nome ** (n + 1)
     third_swing = -4 * third * sign * power / (1 + power**2)
 
+    # du/dt, from Euler's equation M1' = (a3 - a2) M2 M3 at the largest tilt, u = 0.
     rate = cosine * jnp.sqrt((a2 - a3) * (a1 - a3)) / complement
     rotation_rate = jnp.pi * rate / (2 * quarter)
     square1 = product("vt,t->v", _constant(np.sin, _PHASES, _ODD, dtype), first) ** 2
@@ -105,6 +110,7 @@ def wobble(inverse_moments: Vector, log_tangent: Scalar) -> Wobble:
         second=second,
         third=third,
         third_swing=third_swing,
+        # Coefficients of the rate, integrated over time term by term.
         precession=2 * swing / (_VALUES * multiples * rotation_rate),
         rotation_rate=rotation_rate,
         precession_rate=jnp.mean(precession),
@@ -145,6 +151,7 @@ def body_axes(motion: Wobble, phase: Scalar, precession_angle: Scalar) -> Matrix
     angle = precession_angle + jnp.sum(sin_even * motion.precession)
     # Euler's angles: the momentum is (sin psi sin theta, cos psi sin theta, cos theta).
     sine = jnp.sqrt(m1 * m1 + m2 * m2)
+    # The tilt is never 0, since its tangent is an exponential.
     sin_psi = m1 / sine
     cos_psi = m2 / sine
     sin_phi = jnp.sin(angle)
