@@ -52,6 +52,8 @@ class Curve(NamedTuple):
         """The faintest and the brightest magnitude of a picture."""
         both = np.concatenate([self.values, self.points])
         margin = _MARGIN * float(np.ptp(both))
+        # The larger one first: magnitudes grow as light fades, hence the axis is
+        # reversed.
         return float(np.max(both)) + margin, float(np.min(both)) - margin
 
 
@@ -105,6 +107,8 @@ class Animation(NamedTuple):
 
     def _repr_html_(self) -> str:
         """For notebooks."""
+        # In a frame of its own the page keeps its styles and names apart from those
+        # of the notebook.
         frame = (
             '<iframe width="480" height="540" style="border:0" srcdoc="{}"></iframe>'
         )
@@ -148,6 +152,7 @@ class Animation(NamedTuple):
         lines = [ax.plot([], [], [], color="#D55E00", lw=1.5)[0] for _ in self.trace]
         marker = None if self.curve is None else self._draw_curve(figure, self.curve)
         scale, unit = self.unit
+        # By points of the body first, and then by frames.
         trails = np.moveaxis(common.turned(self.attitudes, self.trace), 1, 0)
         drawn = []
         with recorder.saving(figure, path, dpi=100):
@@ -155,6 +160,7 @@ class Animation(NamedTuple):
                 clock.set_text(f"t = {time / scale:.3g} {unit}")
                 for line, trail in zip(lines, trails, strict=True):
                     line.set_data_3d(*trail[: i + 1].T)
+                # Colours of faces and the axes in front change with the attitude.
                 for artist in drawn:
                     artist.remove()
                 light = None if self.lights is None else self.lights[i]
@@ -170,6 +176,8 @@ class Animation(NamedTuple):
     def _figure(self, plt: Any) -> tuple[Any, Axes3D]:
         """A figure with axes of three dimensions, and room for the curve if any."""
         low = 0.0 if self.curve is None else 0.3
+        # A curve makes the figure higher, so that the body has the same square with
+        # and without one.
         figure = plt.figure(figsize=(4.6, 4.6 / (1 - low)))
         elevation, azimuth = np.degrees(self.view)
         place_of_body: Any = (0, low, 1, 1 - low)
@@ -261,6 +269,7 @@ def animate(
 
 def _at(times: np.ndarray, ts: np.ndarray, attitudes: np.ndarray) -> np.ndarray:
     """Attitudes at other times, between those at `ts`."""
+    # No interval begins at the last state. That before it serves its time, too.
     before = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
     # Times may repeat, as at an event.
     steps = np.maximum(np.diff(ts)[before], np.finfo(float).tiny)

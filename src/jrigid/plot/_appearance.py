@@ -180,6 +180,7 @@ def _draw_faces(
     """Draw the faces that are seen, the far ones first."""
     from matplotlib.collections import PolyCollection
 
+    # In the axes right, up and towards the observer, of which the third is the depth.
     corners = (turned(attitude, outline.vertices) @ sky.T)[outline.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(across, axis=1)
@@ -208,6 +209,7 @@ def _surface_brightness(
     of_area = jax.vmap(law.of_area)(cos_sun, jnp.asarray(to_observer))
     # A piece of surface covers this cosine times its area on the sky.
     light = np.where(lit, np.asarray(of_area) / to_observer, 0.0)
+    # If nothing is lit, this is 0 over a small number and not over 0.
     return light / max(float(np.max(light, initial=0.0)), np.finfo(float).tiny)
 
 
@@ -215,6 +217,7 @@ def _draw_axes(
     ax: Axes, outline: Outline, attitude: np.ndarray, sky: np.ndarray
 ) -> None:
     """Draw principal axes, of which the ends that point away are behind the body."""
+    # The outline is in principal axes, which leave it near its largest coordinates.
     reach = np.max(np.abs(outline.vertices), axis=0)
     ends = turned(attitude, np.diag(reach + _BEYOND)) @ sky.T
     starts = turned(attitude, np.diag(reach)) @ sky.T
@@ -234,6 +237,7 @@ def _draw_sun(ax: Axes, direction: np.ndarray) -> None:
     inner = 1.1 * across
     outer = 1.25 * across
     ax.plot([inner[0], outer[0]], [inner[1], outer[1]], color=_SUN, lw=2.5)
+    # Beside the line, the text must not run back over it.
     side = {-1: "right", 0: "center", 1: "left"}[round(across[0])]
     where = 1.32 * across
     ax.text(where[0], where[1], "Sun", color=_SUN, ha=side, va="center")

@@ -25,6 +25,8 @@ _SIDES = 16
 # At a pole itself two corners of a face would coincide, and it would have no normal.
 _POLAR = np.linspace(np.pi - 1e-3, 1e-3, 13)  # along the outline of a ball
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+# Corner 4 i + 2 j + k has the signs i, j, k of x, y, z. Each four of these digits are a
+# face, counter-clockwise from outside.
 _QUADS = np.array([int(x) for x in "013246750451237602641573"]).reshape(6, 4)
 
 
@@ -102,6 +104,8 @@ def _of_top() -> _Outline:
     """A top that stands on its tip."""
     vertices, faces = rings(_TOP[0], _TOP[1], _SIDES)
     radius = _TOP[0, 2]
+    # Then the third axis leaves the top at its upper end, and the others leave it near
+    # the widest ring.
     center = np.array([0, 0, 1 - radius])
     return _Outline(vertices, faces, center, np.eye(3), np.full(3, radius))
 
@@ -125,6 +129,7 @@ def _of_inertia(body: Body, kind: str) -> _Outline:
     squares = np.sum(moments) / 2 - moments
     sides = np.sqrt(np.maximum(squares, _FLAT * np.max(squares)))
     vertices, faces = (_CORNERS, _QUADS) if kind == "box" else _BALL
+    # From principal to body components, of vectors in rows.
     return _Outline(vertices * sides @ axes.T, faces, np.zeros(3), axes, sides)
 
 
@@ -144,10 +149,12 @@ def surface_of(body: Any, kind: str) -> Surface:
         outline = _of_inertia(body, kind)
     vertices, faces, center, axes, sides = outline
     size = np.max(np.linalg.norm(vertices, axis=1))
+    # Three corners of a face give its plane.
     first, second, third = np.moveaxis(vertices[faces[:, :3]], 1, 0)
     normals = np.cross(second - first, third - first)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.maximum(lengths, np.finfo(float).tiny)
+    # Faces have the colour of the principal axis that is nearest to their normal.
     kinds = np.argmax(np.abs(normals @ axes), axis=1)
     reaches = np.stack([sides / size, sides / size + 0.25], axis=1)
     ends = reaches[..., None] * axes.T[:, None]

@@ -136,6 +136,7 @@ def _sides(
     values: np.ndarray, level: float | None, names: Sequence[str]
 ) -> list[_Region]:
     """What is below and above a level, if there is one."""
+    # NaN is on neither side.
     masks = [] if level is None else [values <= level, values > level]
     needed = "must name what is below and above a `level`"
     message = f"Argument `regions` {needed}, but it does not."
@@ -157,6 +158,7 @@ def _draw_codes(ax: Axes, drawn: _Map, codes: np.ndarray) -> None:
     """Draw each code in its tint."""
     from matplotlib.colors import ListedColormap
 
+    # Then code k is in the middle of tint k.
     colours: dict[str, Any] = {"vmin": -0.5, "vmax": len(_TINTS) - 0.5}
     colours["cmap"] = ListedColormap(_TINTS)
     ax.pcolormesh(*drawn.points, codes.T, rasterized=True, **colours)
@@ -182,6 +184,7 @@ def _name(
         room: Any = ndimage.distance_transform_edt(np.pad(region.mask, 1))
         if np.max(room) > _NARROW * min(drawn.values.shape):
             place = np.unravel_index(np.argmax(room), room.shape)
+            # The padding has moved all places by one.
             x, y = (x[k - 1] for x, k in zip(drawn.points, place, strict=True))
             if region.name:
                 ax.text(x, y, region.name, ha="center", va="center", bbox=box)
@@ -208,6 +211,7 @@ def _regions(drawn: _Map, names: Sequence[str]) -> tuple[np.ndarray, list[_Regio
         message = "Argument `regions` must be left out for texts, but it is not."
         demand(not names, message)
         kinds, values = np.unique(values, return_inverse=True)
+        # The shape of the inverse depends on the version of NumPy.
         values = values.reshape(drawn.values.shape)
     present, ranks = np.unique(values.astype(int), return_inverse=True)
     message = f"Argument `values` must be of few regions, but it has {present.size}."

@@ -89,6 +89,7 @@ def space_axes(ax: Axes3D | None, size: float, elevation: float = _VIEW[0]) -> A
     message = "Argument `ax` must be 3-d (projection='3d'), but it is not."
     demand(space.name == "3d", message)
     limits = (-size, size)
+    # Without perspective, all points are seen from one direction: that of `eye`.
     space.set(proj_type="ortho", xlim=limits, ylim=limits, zlim=limits)
     space.set_box_aspect((1, 1, 1), zoom=1.45)
     space.set_axis_off()
@@ -162,6 +163,7 @@ def turned(attitudes: AnyArray, vectors: AnyArray) -> np.ndarray:
     """Body components (..., n, 3) in space, of attitudes (..., 4)."""
     q = np.asarray(attitudes)[..., None, :]
     v = np.asarray(vectors)
+    # For q = (w, u) this is v + w (2 u x v) + u x (2 u x v).
     across = 2 * np.cross(q[..., 1:], v)
     return v + q[..., :1] * across + np.cross(q[..., 1:], across)
 
@@ -185,6 +187,7 @@ def circles(tilts: AnyArray) -> np.ndarray:
 
 def globe(ax: Axes3D, semi_axes: np.ndarray, axes: np.ndarray) -> None:
     """Draw an ellipsoid as a pale surface."""
+    # `TURN` has steps of 1 degree: polar angles in steps of 4, and 5 around.
     points = circles(TURN[:181:4])[:, ::5] * semi_axes @ axes.T
     x, y, z = np.moveaxis(points, -1, 0)
     style: dict[str, Any] = {"color": "0.92", "alpha": 0.4, "lw": 0, "shade": False}
@@ -211,6 +214,7 @@ def on_surface(
         far.set_data_3d(*np.where(is_near, np.nan, points).T)
 
     hide()
+    # Turning a picture with the mouse sends this event.
     ax.figure.canvas.mpl_connect("motion_notify_event", hide)
 
 

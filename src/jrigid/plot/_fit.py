@@ -137,6 +137,7 @@ def _followed(
     model = np.full_like(values, np.nan)
     if result.fitted(trial)[1 + record].degrees is None:
         residuals = np.asarray(result.residuals(record))[trial, rows]
+        # Residuals are predicted less observed.
         model[kept] = (values + residuals)[kept]
     return model
 
@@ -161,6 +162,7 @@ def _spectrum(ax: Axes, result: FitResult, record: int, _: int) -> None:
     """Power of the residuals, averaged over bands of frequencies."""
     since, residuals = _white(result, record)
     length, step = _length_and_step(since, residuals)
+    # Up to half the rate of sampling, beyond which frequencies repeat.
     last = max(int(0.5 * length / step) - 1, 1)
     waves = np.unique(np.round(np.geomspace(1, last, _WAVES)))
     power = _periodogram(since, residuals, waves, length)
@@ -262,6 +264,8 @@ def _draw_ellipses(ax: Axes, result: FitResult) -> None:
     ellipses = [("68 %", "-", colour, _SQUARE_68), ("95 %", "--", colour, _SQUARE_95)]
     inflation = float(result.diagnostics.inflation)
     if inflation > 1:
+        # The covariance has the inflation as a factor. Division of the square of the
+        # radius takes it out.
         ellipses.append(("bound", ":", "k", _SQUARE_95 / inflation))
     values, vectors = np.linalg.eigh(result.ratios_covariance)
     unit = vectors * np.sqrt(np.maximum(values, 0)) @ [np.cos(TURN), np.sin(TURN)]

@@ -45,8 +45,12 @@ def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int
     """
     rates = 1 / moments
     spread = rates[0] - rates[2]
+    # The separatrix has the level 1 / I2. Below it the motion is about the axis of the
+    # largest moment.
     about = 2 if level <= rates[1] and rates[1] - rates[2] > _EQUAL * spread else 0
     other = 2 - about
+    # With n = L / |L| and a = 1 / I, the sum of a n^2 is the level, and that of n^2 is
+    # 1. Hence n_other^2 (a_other - a_about) + n_2^2 (a_2 - a_about) = level - a_about.
     gaps = np.array([rates[other], rates[1]]) - rates[about]
     # Rounding may put the level of a spin beyond that of its axis.
     wide, high = np.sqrt(np.clip((level - rates[about]) / gaps, 0, 1))
@@ -167,6 +171,7 @@ class _Surface(NamedTuple):
         if momentum.ndim == 1 and is_free:
             level = np.sum(path**2 * self.rates)
             curve, about = _cone(self.moments, level, 1)
+            # Of the two ends of the axis, the one that the motion circles.
             curve[:, about] *= np.sign(path[0, about])
             path = curve
         self.draw(path, color=colour, lw=1.8 if momentum.ndim == 1 else 0.9)
@@ -342,6 +347,7 @@ def _bounds_of_herpolhode(
     # The angular momentum of a sphere does not move in the body.
     if np.ptp(moments):
         polhode, _ = _cone(moments, np.sum(unit**2 / moments), 1)
+    # The part of omega across L has the length |L x omega| / |L|.
     radii = size * np.linalg.norm(np.cross(polhode, polhode / moments), axis=1)
     bounds = np.array([np.min(radii), np.max(radii)])
     bounds[bounds < _EQUAL * np.linalg.norm(omega)] = 0.0

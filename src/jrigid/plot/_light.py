@@ -265,6 +265,8 @@ def _draw_two_phases(ax: Axes, points: Points, tumbler: Tumbler) -> None:
     first, second = np.meshgrid(centers, centers, indexing="ij")
     # At these times the rotation has its phases, and the precession has gone on.
     ts = (second * periods[1]).ravel()
+    # Sun and observer, turned about the pole by the surplus of the precession, are seen
+    # from the body as without it.
     back = 2 * np.pi * (ts / periods[0] - first.ravel())
     pole = _pole_of(tumbler)
     directions = []

@@ -128,6 +128,7 @@ def effective_potential(
     ax = common.flat_axes(ax)
     margin = max(0.6 * np.ptp(bounds), _LEAST)
     ends = [np.min(bounds) - margin, np.max(bounds) + margin]
+    # At the vertical the potential may be infinite.
     ends = np.clip(ends, 1e-3, np.pi - 1e-3)
     tilts = np.linspace(ends[0], ends[1], 400)
     heights = []
@@ -135,6 +136,7 @@ def effective_potential(
     for (colour, marker), (state, band) in common.looks(pairs):
         p_phi, p_psi, energy = conserved(top, state)
         well = np.asarray(potential(top, tilts, p_phi, p_psi))
+        # The energy of the spin about the axis is constant and not in the potential.
         level = float(energy - p_psi**2 / (2 * top.I3))
         ax.plot(np.degrees(tilts), well, color=colour, lw=1.2)
         style = {"color": colour, "lw": 2, "clip_on": False, "label": _words(band)}
