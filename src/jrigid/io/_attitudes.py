@@ -29,6 +29,7 @@ def _one_of(kinds: str, rotation: object, method: str) -> None:
 def _arrays(attitude: Attitudes, position: Positions | None) -> tuple[Array, ...]:
     """Convert attitudes, and as many positions if there are any."""
     arrays = float_arrays(*(x for x in (attitude, position) if x is not None))
+    # Without a position there is one array for two names.
     for name, length, x in zip(("attitude", "position"), (4, 3), arrays, strict=False):
         check_shape(name, x, (*arrays[0].shape[:-1], length))
     return arrays
@@ -214,6 +215,8 @@ def to_mrp(attitude: QuaternionLike) -> Vector:
     [0. 0. 1.]
     """
     q = array_of_shape("attitude", attitude, 4)
+    # Of q and -q, the same attitude, w >= 0 is the shorter turn. It also keeps the sum
+    # below away from 0.
     q = jnp.where(q[0] < 0, -q, q)
     # tan(a / 4) = sin(a / 2) / (1 + cos(a / 2)), with the norm in place of 1.
     return q[1:] / (q[0] + jnp.sqrt(jnp.sum(q * q)))
@@ -261,4 +264,6 @@ def from_mrp(mrp: VectorLike) -> Quaternion:
     """
     p = array_of_shape("mrp", mrp, 3)
     square = jnp.sum(p * p)
+    # With t = tan(a / 4), cos(a / 2) is (1 - t^2) / (1 + t^2), and sin(a / 2) is
+    # 2 t / (1 + t^2).
     return jnp.concatenate([(1 - square)[None], 2 * p]) / (1 + square)

@@ -99,6 +99,7 @@ def _sdf(inertial: ET.Element, _: ET.Element) -> _Stated:
     known = {x.tag: _text_of(x) for x in inertial.iter()}
     about = getattr(inertial.find("pose"), "attrib", {})
     position, turn, options = _sdf_pose(known.get("pose", ""), about)
+    # SDF takes the identity where a moment or a product is absent, and a mass of 1.
     six = [known.get(k) or f"{i == j:d}" for k, (i, j) in _SIX.items()]
     attributes = {
         "mass": known.get("mass") or "1",
@@ -141,6 +142,7 @@ def _mjcf(inertial: ET.Element, root: ET.Element) -> _Stated:
     demand(not from_shapes, "`inertiafromgeom` makes MuJoCo overlook it.")
     for name in _MASS_OPTIONS:
         advice = f"{_SAVED}, delete `{name}` there and read that."
+        # Zero and negative values, MuJoCo's defaults, switch these options off.
         is_set = _number(options.get(name, "0")) > 0
         demand(not is_set, f"`{name}` makes MuJoCo change it: {advice}")
     known = inertial.attrib
@@ -149,6 +151,7 @@ def _mjcf(inertial: ET.Element, root: ET.Element) -> _Stated:
     given = [k for k in rivals if k in known]
     demand(len(given) <= 1, f"MuJoCo takes only one of {', '.join(given)}.")
     _texts(known, "mass", "pos", "fullinertia" if is_full else "diaginertia")
+    # This gives way to the `fullinertia` of the file, if it has one.
     full = {"fullinertia": f"{known.get('diaginertia')} 0 0 0"}
     return _Stated(full | known, options)
 
@@ -199,12 +202,15 @@ def _turn(stated: _Stated) -> "Rotation":
         return rotations.from_rotvec(axis / np.linalg.norm(axis) * angle * unit)
     if text := attributes.get("xyaxes"):
         x, y = _numbers(text, 6).reshape(2, 3)
+        # MuJoCo keeps the direction of x and makes y orthogonal to it.
         z = np.cross(x, y)
         axes = [v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)]
         return rotations.from_matrix(np.stack(axes, axis=1))
     if text := attributes.get("zaxis"):
         # The shortest turn to that axis; of half a turn that about x.
         x, y, z = _numbers(text, 3)
+        # Scalar last, as scipy takes it. The shortest turn from unit z to v has the
+        # quaternion (|v| + z . v, z x v), up to its norm.
         half = [-y, x, 0.0, np.linalg.norm([x, y, z]) + z]
         return rotations.from_quat(half if np.any(half) else [1.0, 0.0, 0.0, 0.0])
     angles = _numbers(attributes.get("euler") or "0 0 0", 3) * unit
@@ -221,6 +227,7 @@ def _read(
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass, tensor about it in the axes of the link."""
     stated = _FORMATS[root.tag](inertial, root)
+    # MJCF's order: xx yy zz xy xz yz.
     a, b, c, d, e, f = _numbers(stated.attributes["fullinertia"], 6)
     turn = _turn(stated).as_matrix()
     tensor = turn @ np.array([[a, d, e], [d, b, f], [e, f, c]]) @ turn.T
@@ -235,6 +242,8 @@ def _links(root: ET.Element) -> dict[str, ET.Element]:
     """
     check_option("path", root.tag, tuple(_FORMATS))
     scopes = {root: ""}
+    # In the order of the document a model comes before those within, which need its
+    # name.
     for parent in root.iter() if root.tag == "sdf" else ():
         outer = scopes.get(parent, "")
         for model in parent.iterfind("model"):
@@ -244,6 +253,7 @@ def _links(root: ET.Element) -> dict[str, ET.Element]:
     for model, scope in scopes.items():
         elements = model.iterfind(".//body" if root.tag == "mujoco" else "link")
         for i, element in enumerate(elements, 1):
+            # Bodies of MJCF may have no name.
             name = element.get("name", f"body {i}")
             name = name if is_one_model else scope + name
             message = f"Names of links must be unique, but {name!r} is not."

@@ -48,9 +48,11 @@ def mesh_arrays(
     advice = "(`jrigid.from_mesh` takes arrays.)"
     is_mesh = hasattr(mesh, "merge_vertices")
     demand(is_mesh, f"{needed}, but it is {kind_of(mesh)}. {advice}")
+    # `merge_vertices` changes a mesh in place.
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     faces = np.asarray(merged.faces, np.int64)
+    # A face has collapsed where two of its corners are one vertex now.
     is_line = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
     return np.asarray(merged.vertices, float), faces[~is_line]
 
@@ -108,6 +110,7 @@ def _joined(
             advice = f" {_ADVICE}" if "`faces`" in str(error) else ""
             message = f"Part {names[0]!r} of {whole}: {error}{advice}"
             raise ValueError(message) from error
+    # `sum` begins at 0, which is no body, unless it gets a first term.
     return sum(bodies[1:], bodies[0])
 
 

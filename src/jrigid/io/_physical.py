@@ -31,6 +31,7 @@ _MISTAKEN = 0.7
 def _is_real(tensor: np.ndarray) -> bool:
     """Whether the second moment of the mass is positive semi-definite, to rounding."""
     trace = np.trace(tensor)
+    # The second moment is S = (tr I / 2) 1 - I.
     least = np.linalg.eigvalsh(0.5 * trace * np.eye(3) - tensor)[0]
     return bool(trace >= 0 and least >= -_ULPS * np.finfo(tensor.dtype).eps * trace)
 
@@ -43,6 +44,7 @@ def _shift(mass: float, center: np.ndarray) -> np.ndarray:
 
 def _explanations(tensor: np.ndarray, mass: float, center: np.ndarray) -> str:
     """Name the usual mistakes that would explain why no body has a tensor."""
+    # In this order they are xx xy xz yy yz zz.
     (a, b, c), (_, d, e), (_, _, f) = tensor
     guesses = {
         "its products of inertia are negated (CAD programs print +sum m x y; ixy of "
@@ -108,6 +110,7 @@ def doubts(mass: float, center: np.ndarray, tensor: np.ndarray) -> tuple[str, ..
     """Say what looks mistaken in the numbers of a real body, and what to do."""
     if np.trace(tensor) <= 0:
         return ()
+    # Half the trace is the sum of m r^2, with r the distance from the centre of mass.
     radius = np.sqrt(0.5 * np.trace(tensor) / mass)
     distance = np.linalg.norm(center)
     shift = _shift(mass, center)

@@ -216,5 +216,7 @@ def _columns(variable: DataArray, name: str, keep: int = 0) -> dict[str, AnyArra
     """
     labels = product(*(variable[d].values for d in variable.dims[keep:]))
     names = ["_".join([name, *map(str, x)]) for x in labels]
+    # The last axis runs over the labels in the order of `product`: the last dimension
+    # fastest.
     columns = np.moveaxis(variable.values.reshape(*variable.shape[:keep], -1), -1, 0)
     return dict(zip(names, columns, strict=True))

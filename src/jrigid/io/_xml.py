@@ -94,6 +94,7 @@ def around_root(source: Document) -> tuple[str, str]:
             # ElementTree keeps `ns0`, `ns1`, ... for itself.
             if x[0].strip("0123456789") not in ("", "ns"):
                 ET.register_namespace(*x)
+        # No element is open outside of the root.
         elif depth == 0:
             line = ET.tostring(x, "unicode").strip() + "\n"
             before += "" if has_begun else line
@@ -109,6 +110,8 @@ def _parsed(source: Document) -> ET.Element:
     # An unknown encoding is a LookupError, one that expat cannot decode a ValueError.
     except (ET.ParseError, LookupError, ValueError) as error:
         raise ValueError(f"{source.name} cannot be parsed as XML: {error}.") from error
+    # ElementTree puts the address of a namespace in braces before a tag, as xacro's.
+    # Tags of comments are functions, hence `str`.
     demand(not any("/xacro}" in str(x.tag) for x in root.iter()), _MACROS)
     return root
 
@@ -136,6 +139,7 @@ def _include(root: ET.Element, source: Document, includes: _Includes) -> None:
     MuJoCo takes a file once in all, which also rules out cycles. Source: MuJoCo, XML
     reference, `include`.
     """
+    # A list, because the loop changes the tree. What it puts in has no includes left.
     for parent in list(root.iter()):
         for child in parent.findall("include"):
             tree = _included(child, source, includes)
@@ -156,6 +160,7 @@ def _included(element: ET.Element, source: Document, includes: _Includes) -> ET.
     is_empty = not len(element) and not (element.text or "").strip()
     include = f"`<include file={name!r}>`"
     demand(is_empty, f"{source.name} has an {include} with children: delete them.")
+    # A name counts from the folder of the main file, or else of the including one.
     beside_main = includes.main.parent / name
     path = beside_main if beside_main.exists() else source.path.parent / name
     demand(path.is_file(), f"{source.name} has an {include}, but that is no file.")
