@@ -89,11 +89,13 @@ def repair(
     if not (steps > 0).any():
         notes = (*kept.notes, "all rows are of one time")
         return Clock(kept.times[:1], kept.rows[:1], (), notes)
+    # Repeated times have steps of 0, which say nothing of the interval.
     interval = float(np.median(steps[steps > 0]))
     resets = _resets(kept.times, interval, kept.notes)
     kept.sort()
     if values is not None:
         kept.drop_copies(values)
+    # The first row is new: NaN differs from every number.
     is_new = np.diff(kept.times, prepend=np.nan) != 0
     # Many equal times are those of a coarse clock, which is put on a line below.
     if clock == "recorded" or np.mean(~is_new) <= _SEVERAL:
@@ -103,6 +105,7 @@ def repair(
     if clock != "recorded":
         kept.times = _evened(kept.times, breaks, clock == "uniform", kept.notes)
     is_new = ~(np.diff(kept.times, prepend=np.nan) <= 0)
+    # The numbers of these rows among those that are kept next.
     breaks = np.cumsum(is_new)[breaks] - 1
     kept.keep(is_new, _REPEATED)
     return Clock(kept.times, kept.rows, tuple(breaks.tolist()), tuple(kept.notes))
@@ -175,7 +178,9 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
     """Undo wraps and resets in place; the times at which a reset clock goes on."""
     resets = []
     for row in np.flatnonzero(np.diff(t) < 0) + 1:
+        # What was added before was added to both rows, so this is as recorded.
         back = t[row - 1] - t[row]
+        # A counter that wraps goes back by 2^32 ticks less one interval.
         wrapped = _COUNTERS[np.abs(_COUNTERS - back - interval) < _LATE * interval]
         if wrapped.size:
             t[row:] += wrapped[0]
@@ -194,6 +199,7 @@ def _evened(
     """Put each piece on its line if asked to, or if that only undoes rounding."""
     ticks = (t - t[0])[:, None] / _DIGITS
     is_whole = np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3
+    # The coarsest digit of which all times are multiples, 0 if there is none.
     digit = _DIGITS[is_whole].max(initial=0.0)
     pieces = np.split(t, breaks)
     beside: list[tuple[float, float]] = []
@@ -234,6 +240,7 @@ def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:
             phase += _LOCK * (t[row] - phase)
         counts.append(np.cumsum(ticks))
     lines = [_line_of(count, t) for count in counts]
+    # Lost readings are believed only where the line fits better with them.
     return min(lines, key=lambda line: np.median(np.abs(t - line[0])))
 
 

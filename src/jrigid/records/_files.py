@@ -177,7 +177,9 @@ def _parse(text: str, name: str) -> Table:
 def _separator(lines: list[str]) -> str:
     """The separator of columns: one that most of the last lines have."""
     last = lines[-50:]
-    for separator in "\t;, ":
+    # The comma comes after those beside which it may be the decimal sign. Spaces come
+    # last, since they stand within the cells of other tables.
+    for separator in "	;, ":
         if sum(separator in x for x in last) > len(last) / 2:
             return separator
     return ","
@@ -191,6 +193,7 @@ def _is_header(names: list[str], numbers: list[str]) -> bool:
     """Names without a number above at least two numbers."""
     words = [x for x in names if x]
     known = [x for x in numbers if x.lower() == "nan" or not np.isnan(_number(x))]
+    # A separator at the end of a line makes one more cell.
     fits = min(len(known), len(words)) > 1 and len(numbers) <= len(names) + 1
     return fits and all(np.isnan(_number(x)) for x in words)
 
@@ -217,6 +220,8 @@ def _with_units_of_sensor_logger(table: Table) -> Table:
     about = table.about
     ios = about.get("platform") == "ios" and about.get("standardisation") != "true"
     sign = -1.0 if ios else 1.0
+    # The first rule that fits counts. `acc` fits totals and uncalibrated readings, too,
+    # which include gravity.
     rules = [
         ("^gyro|^rotationrate", "{} (rad/s)", 1.0),
         ("^magnetometer", "{} (uT)", 1.0),
@@ -226,6 +231,7 @@ def _with_units_of_sensor_logger(table: Table) -> Table:
         ("^seconds", "{} (s)", 1.0),
     ]
     for j, header in enumerate(table.headers):
+        # Columns are called x, y and z, and the file after the sensor.
         name = f"{table.name} {header}" if len(header) == 1 else header
         fits = [rule for rule in rules if re.search(rule[0], name, re.IGNORECASE)]
         for _, new, factor in fits[:1]:
@@ -295,6 +301,7 @@ def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
     `flightlog_parser.js` and `flightlog_fields_presenter.js`.
     """
     text = about.get("gyro_scale", about.get("gyro.scale", "1"))
+    # Betaflight writes hexadecimal digits, as 0x3f800000, which have no point or sign.
     scale = float(int(text, 0) if text.isalnum() else text)
     if scale > 1 << 20:  # a float written as the integer of the same bits
         scale = float(np.uint32(scale).view(np.float32))

@@ -157,6 +157,7 @@ def _by_momentum(
     reach = max(1, round(_REACH["momentum"] / reading.interval))
     law = _of_a_tensor(reading.times, rates, reach)
     _forget_breaks(law, reading, reach)
+    # Equations at the ends of a flight look beyond it, so that fewer of them hold.
     shortest = max(2, round(min_duration / reading.interval)) - 2 * reach
     free = _consensus(law, size, shortest)
     # An equation holds for all that it looks at, and hardly for its ends.
@@ -260,6 +261,7 @@ class _Part(NamedTuple):
             reach = max(1, round(_REACH["forces"] / reading.interval))
             hole = round(_HOLE / reading.interval)
         slopes = [_slope(t, rates, reach), *_one_sided(t, rates, reach)]
+        # omega' x r + omega x (omega x r), as a matrix that acts on the lever r.
         models = np.array([_cross(x) + _cross(rates) @ _cross(rates) for x in slopes])
         jumps = np.zeros(t.size, bool)
         if reach == 1:
@@ -282,6 +284,7 @@ class _Part(NamedTuple):
         for _ in range(_ROUNDS):
             fit = self.fit(core)
             residuals = self.residuals(fit)
+            # At an end of a flight only one of the slopes is made of readings in it.
             least = residuals.min(axis=0)
             median = float(np.median(least[core]))
             allowed = min(max(_QUIET, _NOISY[0] * median), _NOISY[1])
@@ -373,6 +376,7 @@ def _jumps(
     """Rows before which rates change by more than the slopes on either side explain."""
     before, after = slopes
     steps = np.diff(t)[:, None]
+    # The trapezoidal rule, with slopes that do not look across the step.
     beside = np.diff(rates, axis=0) - steps / 2 * (before[:-1] + after[1:])
     size = np.append(0.0, np.nan_to_num(np.linalg.norm(beside, axis=1)))
     usual = float(np.median(size[free])) if free.any() else 0.0
@@ -429,6 +433,7 @@ def _at_the_end(forces: np.ndarray) -> np.ndarray:
 
 def _cross(vectors: np.ndarray) -> np.ndarray:
     """Matrices that take the cross product with vectors, one for each row."""
+    # Row i is e_i x v, and (e_i x v) . r is component i of v x r.
     return np.cross(np.eye(3), vectors[:, None])
 
 
@@ -457,6 +462,7 @@ def _from_one_side(t: np.ndarray, rates: np.ndarray, shift: int) -> np.ndarray:
     t2 = np.roll(t, 2 * shift)
     w1 = np.roll(rates, shift, axis=0)
     w2 = np.roll(rates, 2 * shift, axis=0)
+    # Derivatives at t of Lagrange's three polynomials.
     a = (2 * t - t1 - t2) / ((t - t1) * (t - t2))
     b = (t - t2) / ((t1 - t) * (t1 - t2))
     c = (t - t1) / ((t2 - t) * (t2 - t1))
@@ -497,16 +503,19 @@ def _of_a_tensor(t: np.ndarray, rates: np.ndarray, reach: int) -> _Law:
     off = [np.outer(a, b) + np.outer(b, a) for a, b in ((x, y), (x, z), (y, z))]
     tensors = np.array([np.eye(3) / 3, np.diag(x - y), np.diag(y - z), *off])
     momenta = np.einsum("kij,tj->tik", tensors, rates)
+    # Euler's equation with drag, I omega' + omega x I omega + c omega = 0, integrated.
     turning = np.cross(rates[:, :, None], momenta, axis=1)
     in_space = momenta + _integral(t, turning)
     dragged = _integral(t, rates)
     whole = np.concatenate([in_space, dragged[..., None]], axis=2)
     spin = np.linalg.norm(rates, axis=1)
     relative, times_noise = _KEPT
+    # The moments of a sphere of trace 1 are 1/3.
     tolerance = (relative * spin + times_noise * _noise_of(rates)) / 3
     tolerance = np.where(spin > _SPIN, tolerance, np.nan)
     change = _across(whole, reach) / tolerance[:, None, None]
     bound = _MomentumBound(tensors, rates, spin)
+    # The sphere has the coefficient 1, which fixes the trace: its part is known.
     return _Law(change[..., 1:], -change[..., 0], bound)
 
 
@@ -586,6 +595,7 @@ def _consensus(law: _Law, size: int, shortest: int) -> np.ndarray:
     equations = _Equations.of(law, shortest)
     count = len(equations.known)
     firsts = range(0, count - size, max(size // 2, count // _GUESSES))
+    # Zeros are a guess, too: an accelerometer in the mass centre, or a sphere.
     guesses = [np.zeros(equations.unknowns)]
     for window in (slice(first, first + size) for first in firsts):
         guess = equations.solve(window)
@@ -593,4 +603,5 @@ def _consensus(law: _Law, size: int, shortest: int) -> np.ndarray:
         if equations.explained(guess, window).mean() >= _SOUND:
             guesses.append(guess)
     best = max(map(equations.in_runs, guesses), key=np.sum)
+    # A fit to all rows that are explained may explain fewer than the guess.
     return max(equations.in_runs(equations.solve(best)), best, key=np.sum)

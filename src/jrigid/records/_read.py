@@ -93,6 +93,7 @@ class _Units(NamedTuple):
     ) -> float | None:
         """The factor to SI from the caller, the file or the numbers, else None."""
         table = sensor.table
+        # The first column has the times. The first axis speaks for all three.
         column = sensor.columns[0 if kind == "times" else 1]
         _, unit = _split(table.headers[column])
         scale = table.scales.get(column, 1.0)
@@ -119,6 +120,7 @@ class _Units(NamedTuple):
         if kind == "rates":
             said += _range_checked(values, factor, "rates" in self.asked)
         self.notes.append(f"{what} {said}")
+        # rad/s and deg/s differ by a factor of 57: within 5 the file and gravity agree.
         if turned and not 0.2 < factor / scale / _UNITS["rates"][turned] < 5:
             # Headers can be wrong.
             self.notes.append(
@@ -249,6 +251,7 @@ def _chosen(
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns)
     sensors = [x for table in tables for x in _sensors(table, columns)]
+    # Calibrated sensors come first, and the first of a kind is taken.
     sensors.sort(key=lambda x: "uncal" in x[1].label.lower())
     chosen = dict(reversed(sensors))  # the first of a kind
     if "specific_forces" in chosen:
@@ -465,6 +468,7 @@ def _onto(times: np.ndarray, other: Clock, values: np.ndarray) -> np.ndarray:
     """Values at other times; NaN before, after and in breaks."""
     after = np.searchsorted(other.times, times, side="left")
     silent = (times < other.times[0]) | (times > other.times[-1])
+    # A time is in a break where the next row of the other clock begins a piece.
     silent |= np.isin(after, other.breaks) & ~np.isin(times, other.times)
     columns = [np.interp(times, other.times, column) for column in values.T]
     return np.where(silent[:, None], np.nan, np.stack(columns, axis=1))
@@ -514,6 +518,7 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     square = np.sum(by_rates**2)
     if product <= _LIKE * np.sqrt(square * np.sum(seen**2)):
         return ""
+    # Least squares for seen = ratio by_rates: the unit of the rates in rad/s.
     ratio = product / square
 
     def misfit(unit: str) -> float:
@@ -532,6 +537,7 @@ def _kind(name: str) -> str | None:
 def _split(header: str) -> tuple[str, str | None]:
     """Split the unit off a header such as `gyro x (deg/s)`, `t [ms]`, `gyro_x_dps`."""
     match = _UNIT.search(header) or _SUFFIX.search(header)
+    # A header that is all unit is a name.
     if not match or not match.start():
         return header, "s" if header == "seconds_elapsed" else None
     return header[: match.start()], _plain(match[1])

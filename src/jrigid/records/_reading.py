@@ -71,6 +71,7 @@ class Reading(Readable):
         arrays = (self.rates, self.specific_forces, self.magnetic_fields)
         rates, forces, fields = (None if x is None else x[first:last] for x in arrays)
         columns = {name: column[first:last] for name, column in self.columns.items()}
+        # A break before the first row is not in this part.
         breaks = tuple(row - first for row in self.breaks if first < row < last)
         times = self.times[first:last]
         return Reading(times, rates, forces, fields, columns, breaks, self.notes)
@@ -105,6 +106,7 @@ class Reading(Readable):
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """First and last plus one of each run of True."""
+    # The difference of booleans is their exclusive or, which marks both ends of a run.
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -193,6 +195,7 @@ def allan(
         sums = np.cumsum(piece - piece.mean(axis=0), axis=0)
         sums = np.concatenate([np.zeros((1, piece.shape[1])), sums])
         for i, m in enumerate(averaged[2 * averaged < len(sums)]):
+            # The interval drops out: sums are integrals in its units.
             second = sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m]
             squares[i] += np.sum(second**2, axis=0)
             counts[i] += len(second)
@@ -255,6 +258,7 @@ def _density(curve: Allan, lowest: np.ndarray) -> np.ndarray:
     logs = np.log(np.maximum(curve.deviations, np.finfo(float).tiny))
     run = np.diff(np.log(times), axis=0, append=np.nan)
     slopes = np.diff(logs, axis=0, append=np.nan) / run
+    # Where the first deviation is the lowest one, it counts alone.
     is_early = np.arange(len(times))[:, None] < np.maximum(lowest, 1)
     is_white = is_early & (np.abs(slopes + 0.5) < 0.1)
     used = np.where(is_white.any(axis=0), is_white, is_early)
