@@ -109,6 +109,7 @@ def earth_pole() -> EarthPole:
     with ITRF 2020; Bizouard et al., J. Geodesy 93, 621 (2019).
     """
     iers = extra("data", "astropy_iers_data")
+    # MJD, x, y and the errors of x and y. Before them stand year, month, day and hour.
     columns = np.loadtxt(
         iers.IERS_B_FILE, usecols=(4, 5, 6, 13, 14), encoding="ascii", unpack=True
     )
@@ -141,6 +142,7 @@ def toutatis_1992() -> ToutatisRecord:
     with path.open(encoding="ascii") as file:
         # The first six lines are remarks and the names of the columns.
         table = np.loadtxt(file, delimiter=",", skiprows=6)
+    # The published fit: Euler angles z-x-z [deg] and spin [deg/day] at the epoch.
     epoch_angles = np.array([145.498, 65.865, 241.524])
     epoch_spin = np.array([14.51, 33.529, -98.709])
     return ToutatisRecord(
@@ -193,6 +195,7 @@ def _tumble(
     times: Float[np.ndarray, " samples"],
 ) -> Float[np.ndarray, "samples 3"]:
     """Angular velocities of a free body at the times, with a relative error of 1e-8."""
+    # Euler's equations: I1 omega1' = (I2 - I3) omega2 omega3, and so on in turn.
     differences = np.roll(moments, -1) - np.roll(moments, -2)
 
     def rate(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
