@@ -47,7 +47,7 @@ class _Passage(NamedTuple):
         repeat: Whether the step is repeated.
         ended: Whether the motion ends with the step.
         end: Time at which the motion ends.
-        which: Index of the condition that ends it.
+        which: Index of the condition whose zero ends it; -1 if none is zero.
         values: Of the conditions after the step.
     """
 
@@ -143,7 +143,7 @@ class Engine(NamedTuple):
             # passed.
             jnp.sum(motion.times <= 0),
             jnp.sum(motion.jumps <= 0),
-            0,
+            -1,
         ]
         values = jnp.zeros(0, motion.y0.dtype)
         if self.conditions is not None:
@@ -183,10 +183,12 @@ class Engine(NamedTuple):
         output = progress.counts[3]
         jump = progress.counts[4]
         # Steps end at output times, since the order of dense output is lower.
-        goal = jnp.minimum(_entry(motion.times, output), end)
+        goal = jnp.minimum(_entry(motion.times, output), motion.times[-1])
         if motion.jumps.size:
             goal = jnp.minimum(goal, _entry(motion.jumps, jump))
-        t1 = self.stepper.end(t, step, goal)
+        # The time of an event cuts a step off. It does not divide the way to it anew,
+        # since a second run, which knows that time, must take the steps of the first.
+        t1 = jnp.minimum(self.stepper.end(t, step, goal), end)
         field = self.smooth_field(motion, jump)
         trial = self.stepper.attempt(
             field, motion, progress, t1, self.in_lanes, self.keeps_rates
@@ -253,10 +255,10 @@ class Engine(NamedTuple):
         happened = conditions.happened(progress.values, now)
         # After the time of an event is known, the motion ends there.
         sought = keep & (end == motion.limits.end) & jnp.any(happened)
-        exact, crossed = conditions.crossing(
+        exact, zero = conditions.crossing(
             motion.observed,
             happened,
-            now,
+            (progress.values, now),
             (taken.t0, taken.t1),
             lambda t: self.stepper.state_at(motion.parameters, taken, t),
             sought,
@@ -270,6 +272,6 @@ class Engine(NamedTuple):
             repeat=repeat,
             ended=(sought & ~repeat) | reached,
             end=jnp.where(repeat, exact, end),
-            which=jnp.where(sought, jnp.argmax(crossed).astype(which.dtype), which),
+            which=jnp.where(sought, zero, which),
             values=jnp.where(keep, now, progress.values),
         )

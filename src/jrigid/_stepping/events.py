@@ -10,6 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 # Halvings of a step that find the time of an event, by the size of a number in bytes.
 # They exceed the 53 and 24 bits of a mantissa, so that rounding alone limits the time.
 _BISECTIONS = {8: 60, 4: 31}
+# Of its value at the ends of a step, what a condition that jumps has at least where it
+# changes its sign.
+_JUMP = 0.1
 
 
 class Conditions(NamedTuple):
@@ -36,7 +39,8 @@ class Conditions(NamedTuple):
             if boolean:
                 each.append(new[i] > 0)
             elif up is None:
-                each.append(old[i] != new[i])
+                # A condition that is NaN at the start has no sign that could change.
+                each.append((old[i] != new[i]) & ~jnp.isnan(old[i]))
             elif up:
                 each.append((old[i] <= 0) & (new[i] > 0))
             else:
@@ -47,11 +51,11 @@ class Conditions(NamedTuple):
         self,
         observed: list[Array],
         happened: Bool[Array, " conditions"],
-        last: Float[Array, " conditions"],
+        values: tuple[Array, Array],
         ends: tuple[Array, Array],
         state_at: Callable[[Array], Float[Array, " n"]],
         sought: Bool[Array, ""],
-    ) -> tuple[Float[Array, ""], Bool[Array, " conditions"]]:
+    ) -> tuple[Float[Array, ""], Int[Array, ""]]:
         """The time at which the first of the conditions is met within a step.
 
         There a number changes its sign, or a boolean becomes true. Bisection finds the
@@ -60,18 +64,22 @@ class Conditions(NamedTuple):
         Args:
             observed: Arrays that the conditions depend on.
             happened: Which conditions are met in the step.
-            last: Values of the conditions at the end of the step.
+            values: Of the conditions at the start and at the end of the step.
             ends: Times at which the step starts and ends.
             state_at: The state within the step, as a function of time.
             sought: Whether the time is needed; if not, there is no bisection.
 
         Returns:
-            The time, and the conditions that hold there.
+            The time, and the index of the condition that is zero there; -1 where it is
+            a boolean, or jumps.
         """
         t0, t1 = ends
+        first, last = values
 
-        def changed(t: Array) -> Bool[Array, " conditions"]:
-            values = self.values(observed, t, state_at(t))
+        def at(t: Array) -> Float[Array, " conditions"]:
+            return self.values(observed, t, state_at(t))
+
+        def changed(values: Array) -> Bool[Array, " conditions"]:
             return happened & (jnp.sign(values) == jnp.sign(last))
 
         def halve(
@@ -79,7 +87,7 @@ class Conditions(NamedTuple):
         ) -> tuple[Array, Array]:
             low, high = bracket
             middle = low + 0.5 * (high - low)
-            late = jnp.any(changed(middle))
+            late = jnp.any(changed(at(middle)))
             return jnp.where(late, low, middle), jnp.where(late, middle, high)
 
         count = jnp.where(sought, _BISECTIONS[t0.dtype.itemsize], 0)
@@ -87,4 +95,10 @@ class Conditions(NamedTuple):
         # A condition has changed at the upper end of the bracket, and none at the
         # lower.
         exact = jax.lax.stop_gradient(bracket[1])
-        return exact, changed(exact)
+        found = at(exact)
+        which = jnp.argmax(changed(found)).astype(jnp.int32)
+        size = jnp.maximum(jnp.abs(first), jnp.abs(last))
+        # The value of a continuous condition is almost zero here. NaN is no jump: the
+        # motion will end with a state that is not finite.
+        jumps = (jnp.abs(found) > _JUMP * size) | jnp.array(self.boolean)
+        return exact, jnp.where(jumps[which], -1, which)

@@ -65,8 +65,8 @@ class Progress(NamedTuple):
         clock: The time; the length of the next step; the fastest rate; the time at
             which the motion ends, which an event may change.
         counts: One of the states above; steps tried; steps accepted; index of the next
-            output time; index of the next jump; index of the condition that ends the
-            motion.
+            output time; index of the next jump; index of the condition whose zero
+            ends the motion, -1 if none is zero.
         values: Of the conditions of an event.
     """
 

@@ -64,7 +64,9 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     plain, parameters = opened(advance, limits.end, limits.end, motion.y0)
     # The rate of an invalid motion may be NaN. It takes no step.
     longest = jnp.where(given.findings.ok, longest, 1.0)
-    limits = limits._replace(longest=longest)
+    # Derivatives are those of the same steps.
+    fine = jnp.full_like(limits.fine, jnp.inf)
+    limits = limits._replace(longest=longest, fine=fine)
     motion = motion._replace(parameters=parameters, limits=limits)
     return Engine(given.field, EqualSteps(plain), options.max_steps), motion
 

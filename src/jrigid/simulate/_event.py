@@ -86,7 +86,7 @@ def place_of_event(
         finder: A root finder to use in place of Newton's method.
         t: The time; it has no derivatives.
         y: The state at that time.
-        met: Whether such a condition ended the motion.
+        met: Whether a zero of the condition ended the motion.
     """
 
     def later(dt: Array) -> Array:

@@ -346,8 +346,20 @@ def _integrated(
             parameters=harmless(given.findings.ok, motion.parameters)
         )
     ends = solve(engine, motion)
-    ys = _with_derivatives_in_times(given, given.times, ends.ys)
-    t, y = _end(given, options, engine.conditions, motion, ends, ys)
+    ys = ends.ys
+    if conditions is None:
+        ys = _with_derivatives_in_times(given, given.times, ys)
+        complete = ends.counts[0] == ENDED
+        t = jax.lax.stop_gradient(ends.t)
+        t, y = _end_without_event(given.times, t, ends.y, ys, complete)
+    else:
+        t, y = _end_at_event(given, options, conditions, motion, ends)
+        # Output times within rounding of the event, or several at it, have no state of
+        # their own.
+        number = jnp.arange(given.times.size)
+        missing = (number >= ends.counts[3]) & (given.times <= t)
+        ys = jnp.where(missing[:, None], ends.y[None], ys)
+        ys = _with_derivatives_in_times(given, given.times, ys)
     reached = jax.lax.stop_gradient(given.times) <= jax.lax.stop_gradient(t)
     result = _result_of(ends.counts[0])
     return _Solved(ys, reached, t, y, result, ends.counts[1], ends.counts[2])
@@ -361,29 +373,25 @@ def _with_derivatives_in_times(given: Prepared, times: Array, ys: Array) -> Arra
     return later(fixed, ys, times - fixed)
 
 
-def _end(
+def _end_at_event(
     given: Prepared,
     options: Options,
-    conditions: Conditions | None,
+    conditions: Conditions,
     motion: Motion,
     ends: Ends,
-    ys: Array,
 ) -> tuple[Array, Array]:
-    """Time and state at the end of a motion, with their derivatives."""
-    t = jax.lax.stop_gradient(ends.t)
-    state = ends.counts[0]
-    if conditions is None or options.event is None:
-        return _end_without_event(given.times, t, ends.y, ys, state == ENDED)
+    """Time and state at the end of a motion, with the derivatives of an event's."""
     which = ends.counts[5]
-    # A boolean has no slope, so its time has no derivative.
-    is_number = ~jnp.array(conditions.boolean)[which]
+    finder = None if options.event is None else options.event.root_finder
+    # The time of a condition that jumps, as a boolean does, has no derivative.
+    has_zero = (ends.counts[0] == EVENT) & (which >= 0)
     return place_of_event(
         partial(given.field, given.parameters),
         lambda t, y: conditions.values(motion.observed, t, y)[which],
-        options.event.root_finder,
-        t,
+        finder,
+        jax.lax.stop_gradient(ends.t),
         ends.y,
-        (state == EVENT) & is_number,
+        has_zero,
     )
 
 
