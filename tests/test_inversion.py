@@ -10,9 +10,11 @@ import tumbler_reference
 
 import jrigid as jr
 from jrigid import photometry as ph
+from jrigid.photometry import _alias as alias
 from jrigid.photometry import _model as model
 from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
+from jrigid.photometry import _search as search
 from jrigid.photometry import _wobble as wobble
 
 HOUR = 3600.0
@@ -204,6 +206,29 @@ def test_a_report_says_which_tumblers_explain_the_curves(inversion):
     assert report.startswith("One tumbler explains the light curves: ")
     assert "1. long-axis" in report
     assert "P_psi" in report
+
+
+def test_the_weight_of_an_alias_does_not_depend_on_how_its_periods_are_linked(
+    inversion,
+):
+    curves, _, found = inversion
+    data, _ = readings.readings_of(curves, 0.02)
+    best = found.aliases[0]
+    evidence = []
+    for link in (1e4, 1e6):
+        task = best.task._replace(link=np.asarray(link))
+        same = alias.alias_of(best.numbers, task, data, 1.0)
+        evidence.append(alias.log_evidence(same, 0.0, 50.0))
+    np.testing.assert_allclose(evidence[1], evidence[0], atol=1e-3)
+    # A second frequency and a second angle lie anywhere in ranges beforehand.
+    wider = alias.log_evidence(same, 0.0, 100.0)
+    np.testing.assert_allclose(evidence[1] - wider, 2 * np.log(2), atol=1e-9)
+
+
+def test_neighbours_of_a_principal_axis_rotation_have_no_second_frequency():
+    near = search._neighbours(np.array([[7.0, 0.0]]), model.Mode.principal_axis)
+    np.testing.assert_array_equal(near, [[6.5, 0.0], [7.0, 0.0], [7.5, 0.0]])
+    assert len(search._neighbours(np.array([[7.0, 3.0]]), model.Mode.long_axis)) == 9
 
 
 def test_a_planned_curve_tells_the_best_alias_from_a_rejected_one(inversion):

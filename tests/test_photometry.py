@@ -279,6 +279,20 @@ def test_inverse_has_derivatives_of_two_orders():
         assert np.max(np.abs(slope - difference) / scale) < tolerance
 
 
+@pytest.mark.parametrize(
+    ("moments", "omega", "tangent"),
+    [
+        ([1.0, 1.0, 2.0], [0.1, 0.0, 1.0], 0.05),
+        ([1.0, 1.0, 2.0], [0.06, 0.08, -1.0], 0.05),
+        ([1.0, 2.0, 2.0], [1.0, 0.1, 0.0], 0.2),
+    ],
+)
+def test_the_tilt_of_an_exactly_symmetric_body_is_constant(moments, omega, tangent):
+    terms = ph.tumbling(jnp.array(moments), jnp.array(omega))
+    tilts = np.array([terms.tilt_min, terms.tilt_max])
+    np.testing.assert_allclose(tilts, np.arctan(tangent), rtol=1e-14)
+
+
 def test_steady_rotation_has_no_tilt_and_no_excess():
     terms = ph.tumbling(APOPHIS, np.array([0.0, 0.0, 2.0]))
     np.testing.assert_allclose([terms.tilt_min, terms.tilt_max], 0.0, atol=1e-12)

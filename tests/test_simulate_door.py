@@ -193,6 +193,58 @@ def test_an_event_ends_the_motion_in_si_units():
     assert list(reached) == [True, False]
 
 
+@pytest.mark.parametrize("solver", [None, jr.solvers.ExactFree()])
+def test_a_condition_that_jumps_ends_the_motion_where_it_jumps(solver):
+    """The yaw jumps from pi to -pi. By its slope there it would be zero at 0 or 2 pi."""
+
+    def yaw(t, state, args, **_):
+        x, y, _ = jr.rotation.rotate(state.attitude, jnp.array([1.0, 0.0, 0.0]))
+        return jnp.arctan2(y, x)
+
+    motion = jr.simulate(
+        BODY,
+        jr.State(UPRIGHT, np.array([0.0, 0.0, 1.0])),
+        np.array([1.0, 3.0, 5.0]),
+        event=diffrax.Event(yaw, direction=False),
+        solver=solver,
+    )
+    np.testing.assert_allclose(motion.final_time, np.pi, atol=1e-7)
+    reached = np.isfinite(motion.states.omega[:, 2])
+    np.testing.assert_array_equal(reached, [True, True, False])
+
+
+def test_a_condition_that_is_nan_at_the_start_has_not_changed_its_sign():
+    event = diffrax.Event(lambda t, _state, _args, **_: jnp.sin(t) / t)
+    motion = jr.simulate(BODY, jr.State(UPRIGHT, OMEGA), 10.0, event=event)
+    np.testing.assert_allclose(motion.final_time, np.pi, atol=1e-9)
+
+
+def test_outputs_at_the_time_of_an_event_have_its_state():
+    event = diffrax.Event(lambda t, _state, _args, **_: t - 1.0)
+    state0 = jr.State(UPRIGHT, np.array([0.0, 0.0, 1.0]))
+    motion = jr.simulate(BODY, state0, np.array([0.5, 1.0, 1.0]), event=event)
+    turned = [np.cos(0.5), 0.0, 0.0, np.sin(0.5)]
+    np.testing.assert_allclose(motion.states.attitude[1:], [turned] * 2, atol=1e-12)
+
+    # Rounding decides whether the event is before or after the first output time.
+    @quick_jit
+    @jax.vmap
+    def run(time):
+        level = jnp.cos(time / 4)
+        event = diffrax.Event(lambda _t, state, args, **_: state.attitude[0] - args)
+        times = jnp.stack([time / 2, time])
+        return jr.simulate(BODY, state0, times, level, event=event, throw=False)
+
+    times = jnp.linspace(0.3, 2.9, 200)
+    found = run(times)
+    np.testing.assert_allclose(found.final_time, times / 2, rtol=1e-10)
+    reached = np.asarray(found.final_time >= times / 2)
+    assert 0 < reached.sum() < 200
+    first = np.asarray(found.states.omega[:, 0, 2])
+    np.testing.assert_allclose(first[reached], 1.0, rtol=1e-12)
+    assert np.isnan(first[~reached]).all()
+
+
 # Runs that are too long
 # ----------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 methods of high order."""
 
 import warnings
+from functools import partial
 
 import diffrax
 import jax
@@ -417,6 +418,43 @@ def test_splitting_has_events_and_lanes():
     times, happened = ends(jnp.stack([STATE.omega, STATE.omega * jnp.nan]))
     assert float(times[0]) == pytest.approx(float(exact.final_time), abs=1e-7)
     np.testing.assert_array_equal(happened, [True, False])
+
+
+def test_derivatives_of_splitting_are_those_of_its_own_steps():
+    """Of `max_step`, whatever a derivative needs of a Runge-Kutta method."""
+
+    def end(omega):
+        state0 = jr.State(STATE.attitude, omega)
+        motion = split(TOP, 3.0, 2, 0.35, state0)
+        return motion.final_state.omega[0], motion.stats["num_steps"]
+
+    value, steps = end(STATE.omega)
+    (same, again), _ = jax.value_and_grad(end, has_aux=True)(STATE.omega)
+    assert int(steps) == int(again) == 9
+    np.testing.assert_allclose(same, value, rtol=1e-14)
+
+
+def test_reverse_mode_of_splitting_reverses_the_steps_to_an_event():
+    """They divide the time to the next output, and not the time to the event."""
+    event = diffrax.Event(lambda t, _state, _args, **_: t - 3.17)
+
+    def end(omega, adjoint):
+        motion = jr.simulate(
+            TOP,
+            jr.State(STATE.attitude, omega),
+            10.0,
+            solver=jr.solvers.Splitting(2),
+            max_step=0.35,
+            event=event,
+            adjoint=adjoint,
+        )
+        return motion.final_state.omega[0]
+
+    slopes = [
+        quick_jit(jax.grad(partial(end, adjoint=adjoint)))(STATE.omega)
+        for adjoint in (None, diffrax.DirectAdjoint())
+    ]
+    np.testing.assert_allclose(*slopes, rtol=1e-9)
 
 
 def test_splitting_takes_a_compiled_torque_and_one_with_branches():

@@ -16,9 +16,11 @@ from jrigid.photometry._model import (
     COUNT,
     Geometry,
     Mode,
+    Numbers,
     Task,
     axes_of_momentum,
     geometry_of,
+    independent,
     inverse_moments,
     rows_of,
     semi_axes,
@@ -137,25 +139,39 @@ def inverse_normal(normal: np.ndarray) -> np.ndarray:
     return (vectors / values) @ vectors.T / np.outer(size, size)
 
 
-def log_evidence(alias: Alias, growth: float) -> float:
+def log_evidence(alias: Alias, growth: float, width: float) -> float:
     """Logarithm of the evidence of an alias, but for a constant, by Laplace's method.
 
-    All numbers have flat priors: cycles and angles, directions, ratios of axes. The
-    equation between the periods fixes the tilt.
+    The priors are flat: in the frequencies between the limits of the search, in angles,
+    directions and ratios of axes. They decide between motions with different counts of
+    numbers. The tilt follows from the frequencies and has no prior.
+
+    Args:
+        alias: The alias.
+        growth: Of its chi-square over that of the best one.
+        width: Of the range of frequencies [cycles].
     """
-    seeks = np.asarray(sought(alias.task))
+    seeks = np.asarray(independent(alias.task))
     covariance = alias.covariance[np.ix_(seeks, seeks)]
     size = np.sqrt(np.diag(covariance))
     _, logarithm = np.linalg.slogdet(covariance / np.outer(size, size))
     numbers = unpacked(alias.numbers)
     # Half the logarithm of the determinant of the covariance: the volume of the peak.
     spread = 0.5 * logarithm + np.sum(np.log(size))
+    # The integral over a peak of n numbers has the factor (2 pi)^(n / 2).
+    peak = spread + 0.5 * len(size) * np.log(2 * np.pi)
     # The prior is flat in solid angle and in ratios, not in latitude and in logits.
-    of_directions = np.log(np.cos(numbers.pole[1]))
-    ratios = 1 / (1 + np.exp(-numbers.shape))
-    return float(
-        -growth / 2 + spread + of_directions + np.sum(np.log(ratios * (1 - ratios)))
+    ratios = 1 / (1 + np.exp(-np.stack([numbers.shape, numbers.inertia])))
+    densities = Numbers(
+        cycles=np.full(2, 1 / width),
+        angles=np.full(2, 1 / (2 * np.pi)),
+        pole=np.array([1.0, np.cos(numbers.pole[1])]),
+        log_tangent=np.ones(1),
+        shape=(ratios * (1 - ratios))[0],
+        inertia=(ratios * (1 - ratios))[1],
     )
+    prior = np.sum(np.log(np.concatenate(densities)[seeks]))
+    return float(-growth / 2 + peak + prior)
 
 
 @jax.jit

@@ -16,7 +16,7 @@ from jrigid.photometry._alias import (
     rows_at,
 )
 from jrigid.photometry._files import LightCurve
-from jrigid.photometry._model import Task, sought
+from jrigid.photometry._model import Task, independent
 from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
 from jrigid.photometry._search import Found, search
 
@@ -171,7 +171,10 @@ def find_tumblers(
     )
     # Columns of zeros fill the array up to a few sizes.
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
-    return _inversion(found, readings, epoch, points - factors, stated, threshold)
+    width = span / shortest - span / longest
+    return _inversion(
+        found, readings, epoch, points - factors, stated, threshold, width
+    )
 
 
 def _inversion(
@@ -181,10 +184,21 @@ def _inversion(
     points: int,
     stated: bool,
     threshold: float,
+    width: float,
 ) -> Inversion:
-    """The table of what a search found."""
+    """The table of what a search found.
+
+    Args:
+        found: What the search found.
+        readings: The light curves.
+        epoch: Time 0 of the readings.
+        points: Their number, less the factors of the curves.
+        stated: Whether the noise is known.
+        threshold: Largest growth of chi-square of an alias.
+        width: Of the range of frequencies that were searched [cycles].
+    """
     tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
-    freedom = points - int(np.count_nonzero(sought(tasks[0])))
+    freedom = points - int(np.count_nonzero(independent(tasks[0])))
     demand(
         freedom > 0,
         "Argument `curves` must hold more points than the tumbler has numbers, but it "
@@ -201,7 +215,7 @@ def _inversion(
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
     logarithms = np.array(
-        [log_evidence(x, growth[i]) for i, x in enumerate(every[:near])]
+        [log_evidence(x, growth[i], width) for i, x in enumerate(every[:near])]
     )
     # Only ratios of weights matter. Without the largest one the exponentials stay in
     # range.

@@ -91,6 +91,14 @@ def sought(task: Task) -> Bool[Array, " 11"]:
     )
 
 
+def independent(task: Task) -> Bool[Array, " 11"]:
+    """Which of the numbers that a lane seeks do not follow from the others.
+
+    The two frequencies of a tumbler determine its tilt.
+    """
+    return sought(task).at[_SLICES.log_tangent].set(False)
+
+
 def semi_axes(logits: Float[Array, "2"]) -> Vector:
     """Semi-axes of which the longest is 1, from logits of b/a and c/b."""
     # Ratios below 1 keep the order of the axes, so that none changes its role in a fit.

@@ -90,6 +90,7 @@ def search(
             # An ellipsoid looks the same after half a turn, so that its strongest line
             # is at twice its frequency.
             candidates = np.concatenate([lines, lines / 2])
+            candidates = candidates[(lowest <= candidates) & (candidates <= highest)]
             candidates = np.stack([candidates, np.zeros_like(candidates)], axis=1)
         else:
             candidates = cycles
@@ -98,14 +99,17 @@ def search(
     # The best periods are looked at again, from more starting points.
     for mode in modes:
         of_mode = best.tasks.mode[:_AGAIN] == mode
-        candidates = _neighbours(best.numbers[:_AGAIN, :2][of_mode])
+        candidates = _neighbours(best.numbers[:_AGAIN, :2][of_mode], mode)
         found += _from_candidates(readings, candidates, mode, _MANY_STARTS)
     return _settled(readings, _joined(found), homogeneous)
 
 
-def _neighbours(candidates: np.ndarray) -> np.ndarray:
+def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
     """Candidates with frequencies half a cycle to each side."""
-    beside = np.array([(x, y) for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
+    either = (-0.5, 0.0, 0.5)
+    # A principal-axis rotation has no second frequency.
+    second = (0.0,) if mode == Mode.principal_axis else either
+    beside = np.array([(x, y) for x in either for y in second])
     return (candidates[:, None] + beside).reshape(-1, 2)
 
 

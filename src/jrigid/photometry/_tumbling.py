@@ -123,8 +123,9 @@ def _tilts_and_energy(
         ]
     )
     # The motion is about the smallest moment's axis where its energy is above that of
-    # rotation about the middle axis.
-    long_axis = about_largest[1] > about_smallest[1]
+    # rotation about the middle axis. The quotients do not show this if two moments are
+    # equal.
+    long_axis = above > largest / middle - 1
     sines = jnp.clip(jnp.where(long_axis, about_smallest, about_largest), 0.0, 1.0)
     tilts = safe_arctan2(root_of_positive(sines), root_of_positive(1 - sines))
     return tilts, jnp.where(size > 0, 1 + above, jnp.nan)

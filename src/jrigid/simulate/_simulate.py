@@ -356,7 +356,7 @@ def _integrated(
         t, y = _end_at_event(given, options, conditions, motion, ends)
         # Output times within rounding of the event, or several at it, have no state of
         # their own.
-        number = jnp.arange(given.times.size)
+        number = jnp.arange(given.times.size, dtype=ends.counts.dtype)
         missing = (number >= ends.counts[3]) & (given.times <= t)
         ys = jnp.where(missing[:, None], ends.y[None], ys)
         ys = _with_derivatives_in_times(given, given.times, ys)
