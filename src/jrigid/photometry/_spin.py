@@ -81,7 +81,8 @@ class Spin:
             law. The sum of the areas is that of a unit sphere. The moments of inertia
             are not known and have no effect: they are given as equal.
         estimates: Its period, pole and scattering.
-        errors: Their standard errors. They hold if the errors of the points are
+        errors: Their standard errors, near this minimum of chi-square: they know
+            nothing of other solutions. They hold if the errors of the points are
             independent and the surface is as assumed, and are enlarged where chi-square
             is too large.
         chi_square: Sum of squares of the residuals over the noise, and of what the areas

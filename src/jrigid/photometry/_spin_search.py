@@ -26,7 +26,8 @@ from jrigid.photometry._scan import fewer_epochs
 # Chi-square has a minimum about every half turn within the span: half turns of an
 # elongated body look alike.
 STRIDE = 0.4
-_POLES = 12
+# Minima of chi-square are 40 degrees apart and more.
+_POLES = 24
 # The scan uses a coarse body and a part of the epochs.
 COARSE_DEGREE = 3
 COARSE_FACETS = 128
@@ -34,11 +35,11 @@ _EPOCHS = 512
 # A body that is nearly round says little of its pole, so the shape goes first.
 _SHAPE_STEPS = 3
 _SCAN_STEPS = 7
-_SURVIVORS = 48
+_SURVIVORS = 96
 _COARSE_STEPS = 40
-_FINALISTS = 8
+_FINALISTS = 24
 _FULL_STEPS = 25
-_BEST = 4
+_BEST = 12
 _LAST_STEPS = 200
 # Solutions are one if their turns within the span differ by less than this, and their
 # poles by less than a quarter of a radian.
