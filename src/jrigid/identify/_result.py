@@ -607,14 +607,19 @@ def sigma_points(
         function between them are too small, as no point is moved by more than `_FAR`.
     """
     xp = numbers.__array_namespace__()
-    values, axes = xp.linalg.eigh(covariance[:size, :size])
-    errors = xp.sqrt(xp.maximum(values, 0.0) * size)
+    covariance = covariance[:size, :size]
+    # A number that is not determined would leave the others no digits: it gets a unit
+    # of its own.
+    unit = xp.maximum(errors_of(covariance) / _FAR, 1.0)
+    values, axes = xp.linalg.eigh(covariance / (unit[:, None] * unit))
+    moves = unit[:, None] * axes * xp.sqrt(xp.maximum(values, 0.0) * size)[None]
+    lengths = xp.sqrt(xp.sum(moves * moves, axis=0))
     # What is determined worse is continued as a straight line.
-    near = xp.minimum(errors, _FAR)
-    steps = xp.pad(axes * near[None], ((0, numbers.size - size), (0, 0))).T
+    parts = xp.minimum(lengths, _FAR) / xp.where(lengths > 0, lengths, 1.0)
+    steps = xp.pad(moves * parts[None], ((0, numbers.size - size), (0, 0))).T
     still = xp.zeros_like(numbers)[None]
     points = numbers[None] + xp.concatenate([steps, -steps, still])
-    scales = xp.tile(errors / xp.where(near > 0, near, 1.0), 2)
+    scales = xp.tile(1 / xp.where(parts > 0, parts, 1.0), 2)
     return points.astype(numbers.dtype), scales
 
 

@@ -204,20 +204,21 @@ def remarks(result: FitResult) -> tuple[str, ...]:
 def _of_ratios(result: FitResult) -> list[tuple[Any, str]]:
     """Notes on ratios with large errors, and on moments that may be equal."""
     ratios = np.asarray(result.ratios)
-    moments = np.asarray(result.moments)
-    covariance = np.asarray(result.moments_covariance)
+    # Shares of the trace are known where the scale of the moments is not.
+    shares = np.asarray(result.shares)
+    covariance = np.asarray(result.shares_covariance)
     loose = (np.asarray(result.ratios_errors) > 0.03 * ratios).any()
     notes = [(loose, "the ratios are weakly constrained: errors of 3 % or more")]
     for i in (0, 1):
         (first, across), (_, second) = covariance[i : i + 2, i : i + 2]
-        # This is the error of the difference of two moments, whose estimates are
+        # This is the error of the difference of two shares, whose estimates are
         # correlated.
         error = math.sqrt(max(first + second - 2 * across, 0.0))
         text = (
             f"I{i + 1} and I{i + 2} are equal within their errors: which is the "
             "larger, and the axes of each, are not determined"
         )
-        notes.append((moments[i + 1] - moments[i] < 2 * error, text))
+        notes.append((shares[i + 1] - shares[i] < 2 * error, text))
     return notes
 
 
