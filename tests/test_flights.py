@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jrigid as jr
 
@@ -93,6 +94,31 @@ def test_an_accelerometer_that_lags(thrown):
         errors, false = bench_flights.compare(x, jr.records.flights(delayed))
         assert not np.isnan(errors).any()
         assert false == 0
+
+
+@pytest.mark.parametrize("delay", [-0.008, -0.004, 0.004, 0.008])
+def test_a_delay_of_either_sign_at_a_fast_clock(delay, rng):
+    """Euler's equations in flight, read at 500 Hz."""
+    times = np.arange(0, 3, 0.002)
+    moments = np.array([1.0, 2.0, 2.5])
+    lever = np.array([0.05, 0.03, 0.02])
+
+    def slope(_, omega):
+        return -np.cross(omega, moments * omega) / moments
+
+    start = 37.0 * np.array([0.5, 0.7, 0.51])
+    motion = solve_ivp(slope, (1.0, 1.8), start, rtol=1e-9, dense_output=True)
+    free = (times >= 1.0) & (times < 1.8)
+    rates = np.where(free[:, None], motion.sol(times).T, 0.0)
+    turned = np.cross(slope(0, rates), lever)
+    forces = turned + np.cross(rates, np.cross(rates, lever))
+    forces = np.where(free[:, None], forces, [0.0, 0.0, 9.8])
+    forces = forces + 0.1 * rng.normal(size=forces.shape)
+    late = [np.interp(times - delay, times, column) for column in forces.T]
+    reading = jr.records.Reading(times, rates, np.stack(late, axis=1))
+    [flight] = jr.records.flights(reading)
+    assert 0.99 < flight.times[0] < 1.03
+    assert 1.77 < flight.times[-1] < 1.81
 
 
 def test_a_bias_is_no_contact_and_gravity_is_no_bias():

@@ -314,6 +314,8 @@ def test_blackbox_unfiltered_rates_alone_are_recognised():
     ("scale", "factor"),
     [
         ("0x3d79c190", 1 / 16.4),  # degrees per second for each count
+        ("3d79c190", 1 / 16.4),  # the same without a prefix
+        ("1031389584", 1 / 16.4),  # the same in decimal digits
         ("0x3295ec32", 1.0),  # radians per microsecond: of 1 deg/s
         ("0x30924418", 1 / 16.4),  # radians per microsecond: of one count
     ],
@@ -323,6 +325,22 @@ def test_blackbox_scales_of_old_firmware(scale, factor):
     reading = read(text)
     np.testing.assert_allclose(reading.rates[:, 0], values * factor * DEGREE, rtol=1e-4)
     assert any("gyro_scale" in x for x in reading.notes)
+
+
+@pytest.mark.parametrize("scale", ["null", "0", "nan", ""])
+def test_a_blackbox_scale_that_is_none(scale):
+    text, values = raw_counts(900, f'"gyro_scale","{scale}"\n')
+    reading = read(text)
+    np.testing.assert_allclose(reading.rates[:, 0], values * DEGREE, rtol=1e-9)
+    said(reading, f"gyro_scale is {scale!r}, which is no scale: 1 is taken")
+
+
+@pytest.mark.parametrize("one", ["0", "null", "nan", ""])
+def test_a_blackbox_log_without_an_accelerometer(one):
+    reading = read(f'"acc_1G","{one}"\n' + blackbox_csv())
+    np.testing.assert_allclose(reading.rates[:, 2], 180 * DEGREE, rtol=1e-9)
+    assert reading.specific_forces is None
+    said(reading, "left out: their unit is not stated")
 
 
 def test_blackbox_high_resolution_logs_tenths():
@@ -695,6 +713,42 @@ def test_the_unit_is_recognised_by_how_gravity_turns(unit, rng):
         read(table(["t", "gx", "gy", "gz", "ax", "ay", "az"], rows))
 
 
+def test_a_file_of_one_row():
+    names = "t (s),gx (rad/s),gy (rad/s),gz (rad/s),ax (m/s^2),ay (m/s^2),az (m/s^2)"
+    reading = read(f"{names}\n0.5,1,2,3,0,0,9.8\n")
+    np.testing.assert_array_equal(reading.rates, [[1, 2, 3]])
+    np.testing.assert_array_equal(reading.specific_forces, [[0, 0, 9.8]])
+
+
+def test_times_by_name_in_one_file_of_a_folder(tmp_path):
+    """In the other file the times are recognised."""
+    rows = "".join(f"{0.01 * i:.2f},{i},2,9.8\n" for i in range(5))
+    gyro = "stamp (s),gx (rad/s),gy (rad/s),gz (rad/s)\n"
+    forces = "time (s),ax (m/s^2),ay (m/s^2),az (m/s^2)\n"
+    (tmp_path / "gyro.csv").write_text(gyro + rows)
+    (tmp_path / "acc.csv").write_text(forces + rows)
+    reading = jr.records.read(tmp_path, columns={"times": "stamp"})
+    np.testing.assert_allclose(reading.times, 0.01 * np.arange(5))
+    np.testing.assert_allclose(reading.rates, reading.specific_forces)
+
+
+def test_capital_suffixes_and_equal_names(tmp_path):
+    """A folder may hold `.CSV`, and folders of an archive files of the same name."""
+    gyro = PHYPHOX + "\n" + scientific(ROWS)
+    forces = gyro.replace("Gyroscope", "Acceleration").replace("rad/s", "m/s^2")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "GYRO.CSV").write_text(gyro)
+    archive = tmp_path / "both.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("gyro/data.csv", gyro)
+        file.writestr("acc/data.csv", forces)
+    np.testing.assert_allclose(jr.records.read(folder).rates, ROWS[:, 1:], atol=1e-9)
+    reading = jr.records.read(archive)
+    np.testing.assert_allclose(reading.rates, ROWS[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(reading.specific_forces, ROWS[:, 1:], atol=1e-9)
+
+
 def test_what_read_refuses(tmp_path):
     rates = ["t", "gx", "gy", "gz"]
     good = table(rates, ROWS)
@@ -926,6 +980,38 @@ def test_stamps_far_out_do_not_tilt_the_line(rng):
     times[-60:] += 0.004
     late = jr.records.repair(times, clock="uniform").times - true
     assert np.abs(late).max() < 1e-4
+
+
+def test_a_piece_whose_line_ends_late_does_not_reach_into_the_next():
+    """Three stamps that come together are three readings of an even clock."""
+    crowded = np.concatenate([np.arange(31.0), [30.03, 30.06, 30.1]])
+    clock = jr.records.repair(
+        np.concatenate([crowded, np.arange(10.0)]), clock="uniform"
+    )
+    np.testing.assert_allclose(clock.times, np.arange(44.0), atol=1e-9)
+    assert clock.breaks == (34,)
+    assert "a piece put 2.9 s later" in clock.notes[-1]
+
+
+@pytest.mark.parametrize("clock", [None, "uniform", "recorded"])
+def test_times_increase_whatever_the_clock_did(clock, rng):
+    """Steps of any size, resets and rounding."""
+    for _ in range(300):
+        count = int(rng.integers(2, 60))
+        times = np.cumsum(rng.choice([0.0, 0.01, 1.0, 1.0, 1.0, 1.1, 30.0], count))
+        for row in rng.integers(0, count, size=2):
+            times[row:] -= rng.choice([0.0, times[row], 1.5, rng.uniform(0, 50)])
+        repaired = jr.records.repair(np.round(times, rng.integers(0, 4)), clock=clock)
+        assert np.all(np.diff(repaired.times) > 0)
+        edges = (0, *repaired.breaks, repaired.times.size)
+        assert np.all(np.diff(edges) > 0)
+
+
+def test_a_piece_of_equal_times_has_no_line():
+    times = np.array([0.0, 0, 0, 0, 10, 11, 12, 13])
+    clock = jr.records.repair(times, clock="uniform")
+    np.testing.assert_array_equal(clock.times, [0, 10, 11, 12, 13])
+    assert clock.breaks == (1,)
 
 
 def test_times_that_say_nothing():

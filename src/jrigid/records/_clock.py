@@ -103,7 +103,9 @@ def repair(
     gaps = _gaps(kept.times, gap * interval, kept.notes)
     breaks = np.union1d(gaps, np.searchsorted(kept.times, resets))
     if clock != "recorded":
-        kept.times = _evened(kept.times, breaks, clock == "uniform", kept.notes)
+        pieces = np.split(kept.times, breaks)
+        pieces = _evened(pieces, clock == "uniform", kept.notes)
+        kept.times = np.concatenate(_in_turn(pieces, interval, kept.notes))
     is_new = ~(np.diff(kept.times, prepend=np.nan) <= 0)
     # The numbers of these rows among those that are kept next.
     breaks = np.cumsum(is_new)[breaks] - 1
@@ -194,18 +196,19 @@ def _resets(t: np.ndarray, interval: float, notes: list[str]) -> list[float]:
 
 
 def _evened(
-    t: np.ndarray, breaks: np.ndarray, asked: bool, notes: list[str]
-) -> np.ndarray:
+    pieces: list[np.ndarray], asked: bool, notes: list[str]
+) -> list[np.ndarray]:
     """Put each piece on its line if asked to, or if that only undoes rounding."""
-    ticks = (t - t[0])[:, None] / _DIGITS
+    ticks = (np.concatenate(pieces) - pieces[0][0])[:, None] / _DIGITS
     is_whole = np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3
     # The coarsest digit of which all times are multiples, 0 if there is none.
     digit = _DIGITS[is_whole].max(initial=0.0)
-    pieces = np.split(t, breaks)
+    evened = list(pieces)
     beside: list[tuple[float, float]] = []
     for i, piece in enumerate(pieces):
         steps = np.diff(piece)
-        if piece.size < 4 or np.ptp(steps) < 1e-9 * np.ptp(piece):
+        # Times that are all equal have no line.
+        if piece.size < 4 or np.ptp(steps) <= 1e-9 * np.ptp(piece):
             continue
         line, interval = _line(piece, asked)
         jitter = np.abs(piece - line)
@@ -213,14 +216,31 @@ def _evened(
         is_coarse = digit > _COARSE * interval
         is_rounding = jitter.max() < _ROUND * digit
         if asked or (is_uneven and is_coarse and is_rounding):
-            pieces[i] = line
+            evened[i] = line
             beside.append((interval, float(np.sqrt(np.mean(jitter**2)))))
     if beside:
         intervals, jitters = 1e3 * np.transpose(beside)
         why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"
         note = f"times put on an even clock of {intervals.mean():.5g} ms: {why}, "
         notes.append(f"{note}{jitters.max():.3g} ms rms beside it")
-    return np.concatenate(pieces)
+    return evened
+
+
+def _in_turn(
+    pieces: list[np.ndarray], interval: float, notes: list[str]
+) -> list[np.ndarray]:
+    """Move pieces that begin before the last one ends to one interval after its end.
+
+    The line of a piece may end later than its times do.
+    """
+    moved = [pieces[0]]
+    for piece in pieces[1:]:
+        end = moved[-1][-1]
+        late = max(0.0, end + interval - piece[0]) if piece[0] <= end else 0.0
+        if late:
+            notes.append(f"a piece put {late:.3g} s later, after the one before")
+        moved.append(piece + late)
+    return moved
 
 
 def _line(t: np.ndarray, lost: bool) -> tuple[np.ndarray, float]:

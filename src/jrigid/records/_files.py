@@ -31,6 +31,10 @@ _OVER = 1.05
 _MOST_COUNTS = 1 << 15
 # Smaller scales are in radians per microsecond, as Baseflight has them.
 _PER_MICROSECOND = 1e-6
+# The bits of a float in hexadecimal digits.
+_BITS = re.compile("(0x)?[0-9a-f]{8}", re.IGNORECASE)
+# Numbers beyond this one are the bits of a float.
+_LEAST_BITS = 1 << 20
 
 
 class Table(NamedTuple):
@@ -63,12 +67,12 @@ def tables_of(path: Source, log: int) -> list[Table]:
 
     Of several files those without a table are passed over.
     """
-    texts = {name: _text_of(data) for name, data in _files_of(path).items()}
+    texts = [(name, _text_of(data)) for name, data in _files_of(path)]
     # Sensor Logger writes this file beside those of the sensors.
-    metadata = texts.get("Metadata", "").splitlines()
+    metadata = dict(texts).get("Metadata", "").splitlines()
     about = next(csv.DictReader(metadata, restval=""), {})
     tables: list[Table] = []
-    for name, text in texts.items():
+    for name, text in texts:
         try:
             if text.startswith(_BLACKBOX):
                 table = _blackbox(str(path), name, log)
@@ -82,18 +86,22 @@ def tables_of(path: Source, log: int) -> list[Table]:
     return tables
 
 
-def _files_of(path: Source) -> dict[str, bytes]:
-    """Contents of an open text, a file, or the CSV files of a folder or an archive."""
+def _files_of(path: Source) -> list[tuple[str, bytes]]:
+    """Names and contents of a text, a file, or the CSV files of a folder or an archive.
+
+    Files in different folders of an archive may have the same name.
+    """
     if isinstance(path, io.TextIOBase):
-        return {str(getattr(path, "name", "text")): path.read().encode()}
+        return [(str(getattr(path, "name", "text")), path.read().encode())]
     path = pathlib.Path(path)
     if path.is_dir():
-        return {p.stem: p.read_bytes() for p in sorted(path.glob("*.csv"))}
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".csv")
+        return [(p.stem, p.read_bytes()) for p in files]
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             names = [n for n in archive.namelist() if n.lower().endswith(".csv")]
-            return {pathlib.PurePath(n).stem: archive.read(n) for n in names}
-    return {path.stem: path.read_bytes()}
+            return [(pathlib.PurePath(n).stem, archive.read(n)) for n in names]
+    return [(path.stem, path.read_bytes())]
 
 
 def _text_of(data: bytes) -> str:
@@ -254,10 +262,12 @@ def _with_units_of_blackbox(table: Table) -> Table:
     scale, said = _gyro_scale(table.about)
     scales = {}
     sources = {}
-    if "acc_1G" in table.about:
+    one_g = _number(table.about.get("acc_1G", ""))
+    # A log without an accelerometer may state 0.
+    if 0 < one_g < np.inf:
         for j in _columns(table, "accSmooth"):
             table.headers[j] += " (g)"
-            scales[j] = 1 / float(table.about["acc_1G"])
+            scales[j] = 1 / one_g
     gyros = [*_columns(table, "gyroADC"), *_columns(table, "gyroUnfilt")]
     values = table.values[:, gyros]
     values = values[np.isfinite(values)]
@@ -294,6 +304,19 @@ def _columns(table: Table, stem: str) -> list[int]:
     return [j for j, header in enumerate(table.headers) if fits.match(header)]
 
 
+def _single(text: str) -> float:
+    """A number, or the float of single precision whose bits are written; else NaN."""
+    # Betaflight writes the bits as 0x3f800000. The prefix may be missing.
+    if _BITS.fullmatch(text):
+        bits = int(text, 16)
+    else:
+        number = _number(text)
+        if not _LEAST_BITS < number < 1 << 32:
+            return number
+        bits = int(number)
+    return float(np.uint32(bits).view(np.float32))
+
+
 def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
     """Degrees per second of the number 1, and a note unless the settings are usual.
 
@@ -301,12 +324,12 @@ def _gyro_scale(about: Mapping[str, str]) -> tuple[float, str]:
     `flightlog_parser.js` and `flightlog_fields_presenter.js`.
     """
     text = about.get("gyro_scale", about.get("gyro.scale", "1"))
-    # Betaflight writes hexadecimal digits, as 0x3f800000, which have no point or sign.
-    scale = float(int(text, 0) if text.isalnum() else text)
-    if scale > 1 << 20:  # a float written as the integer of the same bits
-        scale = float(np.uint32(scale).view(np.float32))
+    scale = _single(text)
     said = ""
-    if 0 < scale < _PER_MICROSECOND:
+    if not 0 < scale < np.inf:
+        scale = 1.0
+        said = f"gyro_scale is {text!r}, which is no scale: 1 is taken"
+    elif scale < _PER_MICROSECOND:
         scale = float(np.degrees(1e6 * scale))
         # Single precision leaves a little beside a scale of 1.
         scale = 1.0 if abs(scale - 1) < 1e-5 else scale

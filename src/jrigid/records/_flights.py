@@ -178,7 +178,7 @@ def _by_forces(
     shortest = max(2, round(min_duration / 2 / reading.interval)) - 2 * reach
     best = np.zeros(t.size, bool)
     delay = 0.0
-    for tried in _DELAYS[::2] if reach > 1 else _DELAYS:
+    for tried in _DELAYS:
         shifted = _shifted(reading, forces, tried)
         law = _of_a_lever(t, rates, shifted, reach)
         _forget_breaks(law, reading, reach)

@@ -370,7 +370,8 @@ def _sensors(table: Table, columns: Columns) -> list[tuple[str, _Sensor]]:
             triples.setdefault(match[1], {}).setdefault(match[2].lower(), j)
         elif _kind(names[j]) == "times":
             times.append(j)
-    if "times" in columns:
+    # Another file may have the column that the caller names.
+    if "times" in columns and "times" in names:
         times = [names.index("times")]
     sensors: list[tuple[str, _Sensor]] = []
     for stem, axes in triples.items():
@@ -503,6 +504,9 @@ def _recognised_rates(values: np.ndarray, turned: str) -> tuple[str, str]:
 
 def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
     """The unit in which gravity obeys df/dt = -omega x f; empty if unclear."""
+    # A single row does not turn.
+    if times.size < 2:
+        return ""
     lag = max(1, round(_TURN / float(np.median(np.diff(times)))))
     steps = np.nan_to_num(np.cross(forces, rates) * np.gradient(times)[:, None])
     sums = np.cumsum(steps, axis=0) - steps / 2
