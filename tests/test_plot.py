@@ -134,6 +134,31 @@ def test_bodies_of_revolution_and_spheres_have_polhodes(moments):
     ax.figure.canvas.draw()
 
 
+@pytest.mark.parametrize(
+    ("moments", "omega"),
+    [
+        ((1.0, 2.0, 3.0), (0.0, 1.0, 0.0)),  # about the middle axis
+        ((1.0, 1.0, 2.0), (0.7, 0.2, 0.0)),  # across the axis of revolution
+        ((1.0, 2.0, 2.0), (0.0, 0.7, 0.2)),
+    ],
+)
+def test_the_polhode_of_an_equilibrium_is_a_point(moments, omega):
+    """L x omega is 0 there, so that L stays."""
+    ax = jr.plot.polhode(jnp.array(moments), jnp.array(omega))
+    momentum = np.multiply(moments, omega)
+    at = [line.get_label() for line in ax.lines].index("motion 1") // 2
+    for curve in curves(ax)[at : at + 2]:
+        unit = momentum / np.linalg.norm(momentum)
+        np.testing.assert_allclose(curve, unit[None], atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3)])
+def test_a_spin_about_any_axis_has_a_herpolhode(axis):
+    ax = jr.plot.herpolhode(MOMENTS, jr.State(START.attitude, jnp.asarray(axis)))
+    for line in ax.lines[2:]:
+        np.testing.assert_allclose(line.get_xydata(), 0, atol=1e-12)
+
+
 def bounds_of_herpolhode(inertia, omega):
     path = np.asarray(jr.free.polhode(inertia, omega, 4001))
     plane = jr.free.poinsot(inertia, omega).plane_distance

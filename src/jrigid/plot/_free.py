@@ -45,9 +45,14 @@ def _cone(moments: np.ndarray, level: float, side: int) -> tuple[np.ndarray, int
     """
     rates = 1 / moments
     spread = rates[0] - rates[2]
-    # The separatrix has the level 1 / I2. Below it the motion is about the axis of the
-    # largest moment.
-    about = 2 if level <= rates[1] and rates[1] - rates[2] > _EQUAL * spread else 0
+    if rates[1] - rates[2] <= _EQUAL * spread:
+        about = 0
+    elif rates[0] - rates[1] <= _EQUAL * spread:
+        about = 2
+    else:
+        # The separatrix has the level 1 / I2. Below it the motion is about the axis of
+        # the largest moment.
+        about = 2 if level <= rates[1] else 0
     other = 2 - about
     # With n = L / |L| and a = 1 / I, the sum of a n^2 is the level, and that of n^2 is
     # 1. Hence n_other^2 (a_other - a_about) + n_2^2 (a_2 - a_about) = level - a_about.
@@ -129,6 +134,12 @@ class _Surface(NamedTuple):
         """Whether angular momenta move: not in a body of equal moments."""
         return bool(self.rates[0] - self.rates[2] > _EQUAL * self.rates[0])
 
+    def rests(self, unit: np.ndarray) -> bool:
+        """Whether L / |L|, in principal axes, stays where it is: at an equilibrium."""
+        turning = np.cross(unit, self.rates * unit)
+        spread = self.rates[0] - self.rates[2]
+        return bool(np.linalg.norm(turning) <= _EQUAL * spread)
+
     def draw(self, unit: np.ndarray, **style: Any) -> None:
         """Draw L / |L| in principal axes; the ellipsoid's point is on the same ray."""
         length = np.linalg.norm(unit / self.semi_axes, axis=1, keepdims=True)
@@ -168,7 +179,7 @@ class _Surface(NamedTuple):
         path = np.atleast_2d(momentum / np.where(sizes > 0, sizes, np.nan)) @ self.axes
         start = path[np.isfinite(path[:, 0])][:1]
         self.draw(start, color=colour, marker=marker, ls="none", label=name)
-        if momentum.ndim == 1 and is_free:
+        if momentum.ndim == 1 and is_free and not self.rests(path[0]):
             level = np.sum(path**2 * self.rates)
             curve, about = _cone(self.moments, level, 1)
             # Of the two ends of the axis, the one that the motion circles.
@@ -333,7 +344,7 @@ def _across(up: np.ndarray, first: np.ndarray, omega: np.ndarray) -> np.ndarray:
     across = np.cross(up, first)
     # A pure spin is along the angular momentum: any vector across it will do.
     if np.linalg.norm(across) < _EQUAL * np.linalg.norm(omega):
-        across = np.cross(up, np.roll(up, 1) + np.eye(3)[0])
+        across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     return across / np.linalg.norm(across)
 
 
