@@ -715,6 +715,15 @@ FULL = "<inertial mass='1' pos='0 0 0' fullinertia='1 1 1 0 0 0' {}/>"
             "takes only one of quat, euler",
         ),
         (mjcf(FULL.format("zaxis='0 0 1'")), "takes only one of zaxis, fullinertia"),
+        *(
+            (mjcf(DIAGONAL.format(f"{name}='{numbers}'")), f"`{name}` must state a dir")
+            for name, numbers in (
+                ("axisangle", "0 0 0 40"),
+                ("xyaxes", "0.1 0.2 0.3 0.3 0.6 0.9"),
+                ("xyaxes", "0 0 0 0 1 0"),
+                ("zaxis", "0 0 0"),
+            )
+        ),
         (
             mjcf(FULL.format("diaginertia='1 1 1'")),
             "takes only one of fullinertia, diaginertia",
@@ -1036,6 +1045,20 @@ def test_a_trajectory_as_tables():
             ValueError, match=r"shape \(n,\), but they have .*: use `to_xarray`"
         ):
             jr.io.to_pandas(several)
+
+
+def test_a_trajectory_with_a_time_that_is_nan():
+    """Of a `simulate` run with `throw=False`; its one lane has one clock."""
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    state = jr.State(jr.rotation.identity(), jnp.array([0.1, 1.0, 0.2]))
+    ts = jnp.array([0.0, jnp.nan, 2.0])
+    moved = jr.simulate(body, state, ts, throw=False)
+    table = jr.io.to_pandas(moved)
+    np.testing.assert_array_equal(table.index, moved.ts)
+    np.testing.assert_array_equal(table["omega_x"], moved.states.omega[:, 0])
+    assert jr.io.to_xarray(moved).omega.dims == ("time", "axis")
 
 
 def test_a_flight_with_a_wheel_as_tables():

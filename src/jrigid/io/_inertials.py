@@ -58,6 +58,8 @@ _MADE = (
 _MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")
 # MJCF's ways to state a rotation.
 _TURNS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
+# MuJoCo refuses directions that are shorter than this.
+_LEAST_LENGTH = 1e-14
 # Python's `float` also takes `1_0` and digits of other scripts; simulators do not.
 _NUMBER = re.compile(
     r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity)",
@@ -190,6 +192,14 @@ def _numbers(text: str, count: int) -> np.ndarray:
     return values
 
 
+def _direction(vector: np.ndarray, name: str) -> np.ndarray:
+    """A vector of an attribute over its length."""
+    size = np.linalg.norm(vector)
+    message = f"`{name}` must state a direction, but a vector is 0 or two are parallel."
+    demand(bool(size > _LEAST_LENGTH), message)
+    return vector / size
+
+
 def _turn(stated: _Stated) -> "Rotation":
     """The rotation from the axes of the tensor to those of the link."""
     attributes, options = stated
@@ -199,19 +209,18 @@ def _turn(stated: _Stated) -> "Rotation":
         return rotations.from_quat(np.roll(_numbers(text, 4), -1))
     if text := attributes.get("axisangle"):
         axis, angle = np.split(_numbers(text, 4), [3])
-        return rotations.from_rotvec(axis / np.linalg.norm(axis) * angle * unit)
+        return rotations.from_rotvec(_direction(axis, "axisangle") * angle * unit)
     if text := attributes.get("xyaxes"):
-        x, y = _numbers(text, 6).reshape(2, 3)
+        x, y = (_direction(v, "xyaxes") for v in _numbers(text, 6).reshape(2, 3))
         # MuJoCo keeps the direction of x and makes y orthogonal to it.
-        z = np.cross(x, y)
-        axes = [v / np.linalg.norm(v) for v in (x, np.cross(z, x), z)]
-        return rotations.from_matrix(np.stack(axes, axis=1))
+        z = _direction(np.cross(x, y), "xyaxes")
+        return rotations.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
     if text := attributes.get("zaxis"):
         # The shortest turn to that axis; of half a turn that about x.
-        x, y, z = _numbers(text, 3)
-        # Scalar last, as scipy takes it. The shortest turn from unit z to v has the
-        # quaternion (|v| + z . v, z x v), up to its norm.
-        half = [-y, x, 0.0, np.linalg.norm([x, y, z]) + z]
+        x, y, z = _direction(_numbers(text, 3), "zaxis")
+        # Scalar last, as scipy takes it. The shortest turn from unit z to unit v has
+        # the quaternion (1 + z . v, z x v), up to its norm.
+        half = [-y, x, 0.0, 1 + z]
         return rotations.from_quat(half if np.any(half) else [1.0, 0.0, 0.0, 0.0])
     angles = _numbers(attributes.get("euler") or "0 0 0", 3) * unit
     turn = rotations.identity()

@@ -56,7 +56,7 @@ def _of_trajectory(motion: Trajectory) -> Dataset:
     lanes = tuple(f"lane{i or ''}" for i in range(ts.ndim - 1))
     first = ts[(0,) * len(lanes)]
     # Lanes with times of their own have no common coordinate `time`.
-    is_shared = bool(np.all(ts == first))
+    is_shared = np.array_equal(ts, np.broadcast_to(first, ts.shape), equal_nan=True)
     last = ("time" if is_shared else "sample",) if ts.ndim else ()
     along = (*lanes, *last)
     variables: dict[str, _Variable] = {}
@@ -178,6 +178,12 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> DataFrame:
     rad/s
     """
     pandas = extra("io", "pandas")
+    if isinstance(x, Trajectory):
+        demand(
+            x.ts.ndim == 1,
+            "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), "
+            f"but they have shape {x.ts.shape}: use `to_xarray`.",
+        )
     dataset = to_xarray(x)
     if isinstance(x, SweepResult):
         return dataset.to_dataframe()
@@ -188,11 +194,6 @@ def to_pandas(x: Trajectory | FitResult | SweepResult) -> DataFrame:
             values |= _columns(dataset[name], name)
             errors |= _columns(dataset[f"{name}_error"], name)
         return pandas.DataFrame({"value": values, "error": errors})
-    demand(
-        x.ts.ndim == 1,
-        "Argument `x` must be a trajectory of one lane, its `ts` of shape (n,), but "
-        f"they have shape {x.ts.shape}: use `to_xarray`.",
-    )
     table: dict[str, AnyArray] = {}
     units: dict[str, str] = {}
     for name in dataset:
