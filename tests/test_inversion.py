@@ -16,6 +16,7 @@ from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
 from jrigid.photometry import _search as search
 from jrigid.photometry import _wobble as wobble
+from jrigid.photometry._inversion import in_hours
 
 HOUR = 3600.0
 SEMI_AXES = jnp.array([1.0, 0.7, 0.45])
@@ -262,6 +263,14 @@ def test_mistakes_in_an_inversion_say_what_to_pass():
         ph.find_tumblers([], shortest=1.0, longest=2.0)
     with pytest.raises(ValueError, match="in this order"):
         ph.find_tumblers([curve], shortest=2.0, longest=1.0)
+    with pytest.raises(ValueError, match="must be positive periods"):
+        ph.find_tumblers([curve], shortest=0.0, longest=1.0)
+    with pytest.raises(ValueError, match="must span more than half of `shortest`"):
+        ph.period_pairs([curve], 40.0, 80.0)
+    with pytest.raises(ValueError, match="`noise` must be positive"):
+        ph.find_tumblers([curve], 0.0, shortest=1.0, longest=2.0)
+    with pytest.raises(ValueError, match="`modes` must name a motion"):
+        ph.find_tumblers([curve], shortest=1.0, longest=2.0, modes=[])
     with pytest.raises(ValueError, match="`modes` must be"):
         ph.find_tumblers([curve], shortest=1.0, longest=2.0, modes=["spin"])
     dark = ph.LightCurve(0.0, np.arange(20.0), np.zeros(20), far, far, is_relative=True)
@@ -270,3 +279,22 @@ def test_mistakes_in_an_inversion_say_what_to_pass():
     few = ph.LightCurve(0.0, np.arange(5.0), np.ones(5), far[:5], far[:5], True)
     with pytest.raises(ValueError, match="at least 12 points"):
         ph.find_tumblers([few], shortest=1.0, longest=2.0)
+
+
+def test_periods_that_no_motion_has_are_named():
+    """About the shortest axis, P_psi is longer than P_phi by more than a third."""
+    ts = np.linspace(0.0, 19.0, 60)
+    far = np.stack([np.cos(ts / 9), np.sin(ts / 9), 1 + 0 * ts], axis=1)
+    light = 1 + 0.1 * np.cos(4 * np.pi * ts / 1.1)
+    curve = ph.LightCurve(0.0, ts, light, far, far, is_relative=True)
+    with pytest.raises(ValueError, match="must hold the periods of a motion of these"):
+        ph.find_tumblers(
+            [curve], shortest=1.0, longest=1.3, modes=["short-axis"], pairs=3
+        )
+    with pytest.raises(ValueError, match="must hold a pair of periods"):
+        ph.period_pairs([curve], 19 / 0.51, 19 / 0.505)
+
+
+@pytest.mark.parametrize("error", [np.nan, np.inf, 0.0])
+def test_a_period_is_written_whatever_its_error(error):
+    assert in_hours(np.asarray(7200.0), np.asarray(error)).startswith("2.0000 +- ")

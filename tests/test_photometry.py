@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
+from helpers import central_difference
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -150,6 +152,59 @@ def test_the_ellipsoid_has_derivatives_at_opposition():
     near = jax.grad(lambda y: ph.brightness(shape, x, y))(x * (1 + 1e-9))
     assert np.all(np.isfinite(same))
     np.testing.assert_allclose(same, near, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-2, 0.5, 2.0, np.pi])
+def test_the_ellipsoid_keeps_its_digits_with_the_sun_behind_it(angle):
+    """Lommel's and Seeliger's phase function of a sphere, of which numbers of order 1
+    cancel. The Sun is at `angle` beside straight behind."""
+    x, y, _ = np.eye(3)
+    observer = -np.cos(angle) * x + np.sin(angle) * y
+    ball = ph.Ellipsoid(np.ones(3))
+    value = ph.brightness(ball, x, observer)
+    exact = float(angle == np.pi)
+    if 0 < angle < np.pi:
+        with mpmath.workdps(50):
+            half = (mpmath.pi - mpmath.mpf(angle)) / 2
+            logarithm = mpmath.log(mpmath.cot(half / 2))
+            exact = 1 - mpmath.sin(half) * mpmath.tan(half) * logarithm
+    exact = np.pi / 2 * float(exact)
+    np.testing.assert_allclose(float(value), exact, rtol=1e-12, atol=1e-32)
+    slope = jax.grad(lambda y: ph.brightness(ball, x, y))(jnp.asarray(observer))
+    assert np.all(np.isfinite(slope))
+
+
+def test_second_derivatives_at_opposition_grow_as_the_logarithm():
+    """By a factor of ten in the angle they grow by the same each time."""
+    shape = ph.Ellipsoid(SEMI_AXES)
+    x, y, _ = jnp.eye(3)
+
+    def across(angle):
+        observer = jnp.cos(angle) * x + jnp.sin(angle) * y
+        return ph.brightness(shape, x, observer)
+
+    second = jax.vmap(jax.grad(jax.grad(across)))(jnp.array([1e-3, 1e-4, 1e-5]))
+    first, then = np.diff(second)
+    np.testing.assert_allclose(first, then, rtol=1e-3)
+    assert then < -1
+    assert np.isfinite(jax.grad(jax.grad(across))(0.0))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("bad", [np.nan, 0.0])
+def test_directions_that_are_none_have_no_brightness(law, bad):
+    cube = ph.Facets(np.ones(6), np.concatenate([np.eye(3), -np.eye(3)]))
+    x, nowhere = np.eye(3)[0], np.full(3, bad)
+    for directions in ((x, nowhere), (nowhere, x)):
+        assert np.isnan(ph.brightness(cube, *directions, LAWS[law]))
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_laws_broadcast(law):
+    one, many = jnp.asarray(0.5), jnp.full(3, 0.5)
+    each = LAWS[law].of_area(one, one)
+    for cosines in ((one, many), (many, one)):
+        np.testing.assert_allclose(LAWS[law].of_area(*cosines), [each] * 3)
 
 
 def tumbler():
@@ -318,6 +373,7 @@ def test_steady_rotation_has_no_tilt_and_no_excess():
         ),
         ("1\n1 0\n2450000.5 nan 1 0 0 1 0 0\n", "line 3: .* must be finite"),
         ("0\n1 0\n", "line 2: the end of the file"),
+        ("-1\n", "line 1: the number of light curves must not be -1"),
     ],
 )
 def test_a_malformed_file_of_light_curves_is_named_by_line(text, message, tmp_path):
@@ -343,6 +399,19 @@ def test_a_body_that_is_not_convex_is_refused_or_wrapped():
     wrapped = ph.facets_from_mesh(dented, faces, hull=True)
     # Half of the octahedron, and the square that closes it.
     np.testing.assert_allclose(np.sum(wrapped.areas), 2 * np.sqrt(3) + 2)
+    inside = np.concatenate([dented, [[0.1, 0.1, -0.4]]])
+
+    def area(vertices):
+        return jnp.sum(ph.facets_from_mesh(vertices, faces, hull=True).areas)
+
+    slope = jax.grad(area)(jnp.asarray(inside))
+    outward = np.zeros(inside.shape)
+    outward[0] = 1, 2, 3
+    step = central_difference(area, inside, outward)
+    np.testing.assert_allclose(np.sum(slope * outward), step, rtol=1e-8)
+    np.testing.assert_array_equal(slope[-1], 0)
+    with pytest.raises(ValueError, match="`vertices` must be known when it is comp"):
+        jax.jit(area)(inside)
     # The areas of a closed surface, as vectors, have the sum 0.
     closed = np.asarray(wrapped.areas) @ np.asarray(wrapped.normals)
     np.testing.assert_allclose(closed, 0.0, atol=1e-12)
@@ -355,6 +424,8 @@ def test_mistakes_say_what_to_pass_instead(untyped):
         ph.brightness(ball, x, x, ph.Lambert())
     with pytest.raises(ValueError, match="must have one entry for each facet"):
         ph.Facets(np.ones(2), np.eye(3))
+    with pytest.raises(RuntimeError, match="`moments` must be in rising order"):
+        ph.Tumbler(np.array([3.0, 2.0, 1.0]), 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, ball)
     state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), x)
     with pytest.raises(ValueError, match="must have one entry for each epoch"):
         ph.light_curve(np.ones(3), state, np.zeros(2), x[None], x[None], ball)

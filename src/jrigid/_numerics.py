@@ -96,7 +96,8 @@ def safe_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array,
     return jnp.where(origin, 0.0, angle)
 
 
-def _series(coefficients: list[float], z: Array) -> Array:
+def polynomial(coefficients: list[float], z: Array) -> Array:
+    """A polynomial of these coefficients, that of the lowest power first."""
     total = jnp.full_like(z, coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         total = coefficient + z * total
@@ -115,7 +116,7 @@ def cos_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     # branch that is not taken would become NaN in the derivative.
     small = z < _SERIES_BELOW
     root = jnp.sqrt(jnp.where(small, 1.0, z))
-    return jnp.where(small, _series(_COS, jnp.where(small, z, 0.0)), jnp.cos(root))
+    return jnp.where(small, polynomial(_COS, jnp.where(small, z, 0.0)), jnp.cos(root))
 
 
 def sinc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -123,7 +124,7 @@ def sinc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
     small = z < _SERIES_BELOW
     root = jnp.sqrt(jnp.where(small, 1.0, z))
     return jnp.where(
-        small, _series(_SINC, jnp.where(small, z, 0.0)), jnp.sin(root) / root
+        small, polynomial(_SINC, jnp.where(small, z, 0.0)), jnp.sin(root) / root
     )
 
 
@@ -263,7 +264,7 @@ def arctanc_sqrt(z: Float[Array, "..."]) -> Float[Array, "..."]:
         below = 1 + jnp.sqrt(1 + z)
         factor = factor * (2 / below)
         z = z / (below * below)
-    return factor * _series(_ARCTANC, z)
+    return factor * polynomial(_ARCTANC, z)
 
 
 @arctanc_sqrt.defjvp

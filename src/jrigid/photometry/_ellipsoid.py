@@ -6,10 +6,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import array_of_shape, demand, whole_number
-from jrigid._numerics import safe_norm
+from jrigid._numerics import polynomial, safe_norm, sum_of_squares
 from jrigid._types import Readable, Scalar, Vector
 from jrigid.photometry._facets import Facets, facets_from_mesh
 from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
+
+# (r - (1 - r^2) artanh r) / r^3 in powers of r^2. Below this r^2 the closed form loses
+# digits, and so many terms reach the rounding of float64.
+_SERIES_BELOW = 0.1
+_LUNE = [2 / ((2 * k + 1) * (2 * k + 3)) for k in range(15)]
 
 
 class Ellipsoid(Readable):
@@ -56,6 +61,10 @@ class Ellipsoid(Readable):
             to_sun: Unit vector to the Sun, body axes.
             to_observer: Unit vector to the observer, body axes.
 
+        Gradients: exact. Where Sun and observer are in the same direction the second
+        derivatives in it grow without bound, as the logarithm of the phase angle; at a
+        phase angle of 0 itself finite ones are returned. Where the Sun is straight
+        behind the body, the value and the gradient are 0.
         Source: K. Muinonen and K. Lumme, Astron. Astrophys. 584 (2015) A23, eq. 13;
         derived again from the integral over the unit sphere.
         """
@@ -101,28 +110,35 @@ def lommel_seeliger_brightness(
     of the semi-axes; an element of the surface with its normal is |A| A^-1 n dn. With
     unit vectors u0 and u along A^-1 e0 and A^-1 e, of lengths s0 and s, the integrand is
     |A| s0 s (u0 n) (u n) / (s0 u0 n + s u n): a lune of the sphere between two great
-    circles, over which the integral is elementary.
+    circles, over which the integral is elementary. With the ratio
+    r = |s0 u0 + s u| / (s0 + s) it is
+    pi / 4 |A| s0 s / (s0 + s) |u0 + u|^2 (r - (1 - r^2) artanh r) / r^3.
     """
     sun = to_sun / semi_axes
     observer = to_observer / semi_axes
     s0 = safe_norm(sun)
     s = safe_norm(observer)
-    cosine = jnp.sum(sun * observer) / (s0 * s)
-    sum_ = safe_norm(sun + observer)
-    # Cosines of the angles from s0 u0 + s u to u0 and to u.
-    from_sun = (s0 + s * cosine) / sum_
-    from_observer = (s + s0 * cosine) / sum_
-    # The square of the sine of the angle between u0 and u, without a difference.
-    sine = jnp.cross(sun, observer) / (s0 * s)
-    square = jnp.sum(sine * sine)
-    # Product of the sines of the two angles.
-    sines = square * s0 * s / sum_**2
-    # At a phase angle of 0 the sines vanish, and their product with the logarithm tends
-    # to 0.
-    lit = square > 0
-    # (1 + cos a) / sin a is the cotangent of a / 2. This is the product of two of them.
-    cotangents = (1 + from_sun) * (1 + from_observer) / jnp.where(lit, sines, 1.0)
-    bent = jnp.where(lit, sines * jnp.log(cotangents), 0.0)
-    lune = from_sun + from_observer - bent
+    sun = sun / s0
+    observer = observer / s
+    weight = s0 * s / (s0 + s)
+    # 1 - r^2, by |u0 - u|^2: a difference of numbers near 1 would lose digits.
+    rest = weight / (s0 + s) * sum_of_squares(sun - observer)
     volume = jnp.prod(semi_axes)
-    return jnp.pi / 2 * volume * s0 * s / sum_ * lune
+    light = sum_of_squares(sun + observer) * _share_of_lune(rest)
+    return jnp.pi / 4 * volume * weight * light
+
+
+def _share_of_lune(rest: Scalar) -> Scalar:
+    """(r - (1 - r^2) artanh r) / r^3 for 1 - r^2 from 0 to 1, analytic at r = 0.
+
+    The slope in 1 - r^2 is infinite at r = 1, where that of the closed form without the
+    logarithm is returned.
+    """
+    square = 1 - rest
+    small = square < _SERIES_BELOW
+    series = polynomial(_LUNE, jnp.where(small, square, 0.0))
+    rest = jnp.where(small, 0.5, rest)
+    r = jnp.sqrt(1 - rest)
+    # artanh r is this less half the logarithm of 1 - r^2.
+    artanh = jnp.log1p(r) - jnp.log(jnp.where(rest > 0, rest, 1.0)) / 2
+    return jnp.where(small, series, (r - rest * artanh) / r**3)

@@ -2,11 +2,19 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jrigid._checks import demand, is_concrete, shaped
+from jrigid._checks import (
+    all_finite,
+    check_known,
+    demand,
+    is_concrete,
+    nan_where,
+    shaped,
+)
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Readable, Real, Scalar, Vector
 from jrigid.photometry._scattering import AbstractScattering
@@ -68,6 +76,9 @@ class Facets(Readable):
             scattering: The law.
             to_sun: Unit vector to the Sun, body axes.
             to_observer: Unit vector to the observer, body axes.
+
+        Returns:
+            The brightness [m^2]; NaN where a direction or a normal is not finite.
         """
         cos_sun = product("fi,i->f", self.normals, to_sun)
         cos_observer = product("fi,i->f", self.normals, to_observer)
@@ -76,7 +87,9 @@ class Facets(Readable):
         cos_sun = jnp.where(counted, cos_sun, 1.0)
         cos_observer = jnp.where(counted, cos_observer, 1.0)
         of_area = scattering.of_area(cos_sun, cos_observer)
-        return jnp.sum(jnp.where(counted, self.albedo * self.areas * of_area, 0.0))
+        total = jnp.sum(jnp.where(counted, self.albedo * self.areas * of_area, 0.0))
+        # NaN is not positive and would count as dark.
+        return nan_where(~all_finite((to_sun, to_observer, self.normals)), total)
 
 
 def facets_from_mesh(
@@ -101,9 +114,11 @@ def facets_from_mesh(
 
     Raises:
         ValueError: A mesh that is not convex (where `vertices` is known at trace time):
-            its parts would cast shadows on each other.
+            its parts would cast shadows on each other. With `hull=True`, `vertices` that
+            `jit` or `vmap` traces.
 
-    Gradients: exact in the vertices; those of a hull are of the triangles at hand.
+    Gradients: exact in the vertices; those of a hull are of the triangles at hand, and
+    those in vertices inside of it are 0.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> corners = jnp.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
@@ -130,7 +145,10 @@ def facets_from_mesh(
         "Argument `albedo` must be None where `hull` is True, but it is not.",
     )
     if hull:
-        faces = _hull(np.asarray(vertices))
+        # Which corners span the hull has no derivative.
+        known = jax.lax.stop_gradient(vertices)
+        check_known("vertices", known)
+        faces = _hull(np.asarray(known))
     corners = vertices[faces]
     across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = safe_norm(across)

@@ -119,6 +119,8 @@ def read_light_curves(
     """
     lines = _Lines(path)
     (count,) = lines.integers(1, "the number of light curves")
+    if count < 0:
+        raise lines.error(f"the number of light curves must not be {count}.")
     # `repr` gives the digits that were typed, not those of the binary fraction.
     zero = None if epoch is None else Decimal(repr(float(epoch)))
     curves = []

@@ -17,6 +17,7 @@ from jrigid.photometry._alias import (
 )
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._model import Task, independent
+from jrigid.photometry._periodogram import cycles_within
 from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
 from jrigid.photometry._search import Found, search
 
@@ -26,6 +27,8 @@ _FIRST_NOISE = 0.02
 # A tumbler has up to eleven numbers, with one equation between them.
 _LEAST_POINTS = 12
 _HOUR = 3600.0
+# Digits of a period in hours whose error is not known.
+_USUAL_DIGITS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,6 +144,7 @@ def find_tumblers(
     6.0
     """
     check_option("inertia", inertia, _INERTIA)
+    demand(len(modes) > 0, "Argument `modes` must name a motion, but it is empty.")
     for mode in modes:
         check_option("modes", mode, tuple(MODES))
     whole_number("pairs", pairs)
@@ -155,19 +159,14 @@ def find_tumblers(
     )
     stated = noise is not None
     readings, epoch = readings_of(curves, noise if stated else _FIRST_NOISE)
-    span = float(readings.span)
+    lowest, highest = cycles_within(float(readings.span), shortest, longest)
     found = search(
         readings,
-        # The search counts frequencies in cycles within the span.
-        span / longest,
-        span / shortest,
+        lowest,
+        highest,
         [MODES[mode] for mode in modes],
         inertia == "homogeneous",
         pairs,
-    )
-    demand(
-        len(found.numbers) > 0,
-        "Arguments `shortest` and `longest` hold no motion of these modes.",
     )
     # Columns of zeros fill the array up to a few sizes.
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
@@ -338,8 +337,10 @@ def _described(rank: int, alias: Alias) -> list[str]:
 
 def in_hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
     """A period in hours with its error."""
-    # The error is shown with two digits.
-    digits = int(np.clip(1 - np.floor(np.log10(error / _HOUR)), 0, 9))
+    # An error that is known is shown with two digits.
+    is_known = np.isfinite(error) and error > 0
+    last = 1 - np.floor(np.log10(error / _HOUR)) if is_known else _USUAL_DIGITS
+    digits = int(np.clip(last, 0, 9))
     return f"{period / _HOUR:.{digits}f} +- {error / _HOUR:.{digits}f} h"
 
 

@@ -34,9 +34,11 @@ def brightness(
 
     Returns:
         Sum over the lit and visible surface [m^2], times the phase function. The light
-        that arrives is this over the squares of both distances, times a constant.
+        that arrives is this over the squares of both distances, times a constant. NaN
+        for a direction that is 0 or not finite.
 
-    Gradients: exact. A facet that turns dark or out of sight has a slope from one side;
+    Gradients: exact, of any order but at a phase angle of 0: the second derivatives of
+    an ellipsoid have no bound there, and finite ones are returned. A facet that turns dark or out of sight has a slope from one side;
     half the sum of both is what a central difference sees.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -94,8 +96,8 @@ def light_curve(
         Brightness at unit distances [m^2], as by `brightness`. NaN for an inertia, a
         state or times that no body has.
 
-    Gradients: exact in all arguments, of any order, as those of `free_rotation` and
-    `brightness`.
+    Gradients: exact in all arguments, as those of `free_rotation` and `brightness`.
+    They are of any order, but for an ellipsoid at a phase angle of 0 of first order.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> cigar = jr.photometry.Ellipsoid(jnp.array([3.0, 1.0, 1.0]))
@@ -119,7 +121,7 @@ def light_curve(
     motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
     seen = functools.partial(_seen_from_space, shape, scattering)
     curve = jax.vmap(seen)(motion.attitude, to_sun, to_observer)
-    # Facets for which an attitude is NaN would count as dark, and the sum would be 0.
+    # Some invalid motions have finite attitudes.
     return nan_where(motion.result != RESULTS.successful, curve)
 
 

@@ -40,6 +40,8 @@ _LEAST_MOTION = 0.02
 # Added to the diagonal of the normal equations, as a fraction of its mean: some series
 # hold the same line twice.
 _RIDGE = 1e-4
+# Least frequency of the rotation that is tried [cycles within the span].
+_LEAST_CYCLES = 0.5
 _LANES = 64  # series fitted at once
 _BLOCK = 4096  # candidates in a call, so that a search compiles one program
 
@@ -86,7 +88,8 @@ def period_pairs(
         `find_tumblers` tells them apart by the physics.
 
     Raises:
-        ValueError: Curves without a point, or periods out of order.
+        ValueError: Curves without a point, periods out of order, or curves that span
+            less than half of the shortest period.
 
     Source: P. Pravec et al., Icarus 173 (2005) 108, section 3.
 
@@ -103,22 +106,34 @@ def period_pairs(
     # Any noise will do: it drops out of the fraction that is explained.
     readings, _ = readings_of(curves, noise=0.01)
     span = float(readings.span)
-    pairs, powers = frequency_pairs(readings, span / longest, span / shortest, count)
+    lowest, highest = cycles_within(span, shortest, longest)
+    pairs, powers = frequency_pairs(readings, lowest, highest, count)
     explained = powers / float(np.sum(readings.values**2))
     return PeriodPairs(span / pairs[:, 0], span / pairs[:, 1], explained)
+
+
+def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, float]:
+    """Lowest and highest frequency of periods, in cycles within the span."""
+    demand(
+        bool(0 < shortest < longest),
+        "Arguments `shortest` and `longest` must be positive periods in this order, but "
+        f"they are {shortest} and {longest}.",
+    )
+    demand(
+        bool(span > _LEAST_CYCLES * shortest),
+        "Argument `curves` must span more than half of `shortest`, but they span "
+        f"{span:.4g} s.",
+    )
+    return span / longest, span / shortest
 
 
 def frequency_pairs(
     readings: Readings, lowest: float, highest: float, count: int
 ) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, " pairs"]]:
     """Pairs of frequencies, in cycles within the span, and chi-square they explain."""
-    demand(
-        0 < lowest < highest,
-        "Arguments `shortest` and `longest` must be periods in this order.",
-    )
     lines, _ = strongest_lines(readings, lowest, highest)
     step = 1 / _OVERSAMPLING
-    rotation = np.arange(max(lowest, 0.5), highest, step)
+    rotation = np.arange(max(lowest, _LEAST_CYCLES), highest, step)
     rows = []
     for line in lines:
         for k, m in _STRONGEST:
@@ -126,6 +141,11 @@ def frequency_pairs(
             inside = (precession > lowest) & (precession < highest)
             rows.append(np.stack([precession[inside], rotation[inside]], axis=1))
     pairs = np.concatenate(rows)
+    demand(
+        len(pairs) > 0,
+        "Arguments `shortest` and `longest` must hold a pair of periods of the curves' "
+        "strongest lines, but they do not: choose a wider range.",
+    )
     powers = _in_blocks(_SERIES, readings, pairs)
     chosen = unlike(pairs, powers, _APART, count)
     return pairs[chosen], powers[chosen]

@@ -71,6 +71,10 @@ def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, f
     demand(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
+    demand(
+        bool(0 < noise < np.inf),
+        f"Argument `noise` must be positive and finite, but it is {noise}.",
+    )
     epoch = curves[0].epoch
     ts = np.concatenate([x.ts + (x.epoch - epoch) * _DAY for x in curves])
     # Seen from the middle of the span, errors of the frequencies are hardly correlated

@@ -98,7 +98,8 @@ class Geometric(AbstractScattering):
         self, cos_sun: Float[Array, "..."], cos_observer: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Brightness of a unit of area."""
-        return jnp.broadcast_to(cos_observer, jnp.broadcast_shapes(cos_sun.shape))
+        shape = jnp.broadcast_shapes(cos_sun.shape, cos_observer.shape)
+        return jnp.broadcast_to(cos_observer, shape)
 
 
 class Mixture(AbstractScattering):

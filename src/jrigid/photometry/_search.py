@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jrigid._checks import demand
 from jrigid.photometry._model import (
     COUNT,
     Mode,
@@ -81,6 +82,9 @@ def search(
         modes: Kinds of motion to try.
         homogeneous: Whether moments are those of the ellipsoid that is seen.
         pairs: Pairs of frequencies to try.
+
+    Raises:
+        ValueError: No candidate is a motion of these modes.
     """
     cycles, _ = frequency_pairs(readings, lowest, highest, pairs)
     lines, _ = strongest_lines(readings, lowest, highest)
@@ -95,6 +99,11 @@ def search(
         else:
             candidates = cycles
         found += _from_candidates(readings, candidates, mode, _STARTS)
+    demand(
+        len(found) > 0,
+        "Arguments `shortest` and `longest` must hold the periods of a motion of these "
+        "`modes`, but they do not: choose a wider range.",
+    )
     best = _settled(readings, _joined(found), homogeneous=True)
     # The best periods are looked at again, from more starting points.
     for mode in modes:

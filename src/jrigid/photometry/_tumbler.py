@@ -5,9 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import array_of_shape, check_option
+from jrigid._checks import array_of_shape, check_option, is_concrete
 from jrigid._types import Readable, Real
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
@@ -47,6 +48,11 @@ class Tumbler(Readable):
         mode: "short-axis", "long-axis" or "principal-axis", the steady rotation about
             the axis of the largest moment.
 
+    Raises:
+        ValueError: A mode that does not exist, or an array of a wrong shape.
+        RuntimeError: The moments are not in rising order, and they are known when the
+            object is built.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> shape = jr.photometry.Ellipsoid(jnp.array([3.0, 2.0, 1.5]))
     >>> body = jr.photometry.Tumbler(
@@ -74,8 +80,13 @@ class Tumbler(Readable):
     mode: str = eqx.field(static=True, default="short-axis")
 
     def __check_init__(self) -> None:
-        """Raise ValueError for a mode that does not exist."""
+        """Raise an error for a mode that does not exist, or moments out of order."""
         check_option("mode", self.mode, MODES)
+        if is_concrete(self.moments) and np.any(np.diff(np.asarray(self.moments)) < 0):
+            raise RuntimeError(
+                "Argument `moments` must be in rising order, but it is not: turn the "
+                "body axes, and `shape` with them."
+            )
 
     @property
     def state(self) -> State:
