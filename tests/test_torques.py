@@ -173,6 +173,18 @@ def test_samples_in_no_order_and_no_samples_are_refused():
         tq.Sampled(np.zeros(0), np.zeros(0))
 
 
+def test_a_time_that_occurs_twice_is_a_step():
+    """t^2 before, 5 - t^2 from it on: the cubics are exact on both sides."""
+    ts = np.array([0.0, 0.5, 1.0, 1.0, 1.5, 2.0])
+    table = tq.Sampled(ts, np.where(np.arange(6) < 3, ts**2, 5 - ts**2))
+    times = np.array([0.2, 0.7, 1 - 1e-12, 1.0, 1.2, 1.9])
+    expected = np.where(times < 1, times**2, 5 - times**2)
+    found = jax.vmap(table)(times)
+    np.testing.assert_allclose(found, expected, atol=ulps(float, 16))
+    padded = tq.Sampled(np.append(ts, [2.0, 2.0]), np.append(table.values, [1.0, 1.0]))
+    np.testing.assert_allclose(padded(3.0), 1.0, atol=ulps(float, 16))
+
+
 def test_jumps_are_collected_from_all_parts_of_a_torque_and_a_force():
     table = tq.Sampled(np.array([1.0, 2.0, 4.0]), np.ones((3, 3)), delay=0.5)
     light = tq.SolarPressure(np.ones(1), PUSH[None], PUSH[None], table)

@@ -19,12 +19,14 @@ class Sampled(Readable):
     in `Rotor(Sampled(ts, momenta))`. `jrigid.identify.fit` can estimate its scale, its
     delay and its values.
 
-    It is for a quantity that is smooth on the scale of the samples. At a step, or where
-    a short interval follows a long one, a cubic overshoots: a torque that is switched
-    is better a function of time, with `jumps`.
+    It is for a quantity that is smooth on the scale of the samples. Where it rises
+    within an interval that is short beside its neighbours, a cubic overshoots. A step
+    is a time that occurs twice: the function has the first of the two values before it
+    and the second one from it on, and no cubic reaches across.
 
     Attributes:
-        ts: Times [s] (n,), increasing; the last one may be repeated as padding.
+        ts: Times [s] (n,), in order. One that occurs twice is a step; repetitions of
+            the last one are padding, with its value.
         values: One row for each time (n, ...).
         scale: Factor of the values, positive.
         delay: Time by which the function is later than the samples [s]: positive for a
@@ -37,8 +39,9 @@ class Sampled(Readable):
             known when the object is built.
 
     Gradients: those of the cubics, in everything. The second derivative in time jumps
-    at the samples, and at the first and the last one the first derivative too: that of
-    a motion in `delay` or `ts` misses this jump, where an end lies within the run.
+    at the samples, at the first and the last one the first derivative too, and at a
+    step the value: the derivative of a motion in `delay` or `ts` misses what a step or
+    an end within the run adds to it. For that, use a function of time with `jumps`.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts, values = jnp.array([0.0, 1.0, 2.0]), jnp.array([[0.0], [1.0], [4.0]])
