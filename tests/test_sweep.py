@@ -401,8 +401,16 @@ def test_a_block_that_fails_is_tried_thrice_recorded_and_the_others_go_on(
         assert np.sum(~found.valid[...]) == 3
         assert np.isnan(found.values[...][2, 3:]).all()
     assert "not this one" in found.to_xarray().attrs["jrigid"]["failures"][0]["error"]
+    description = tmp_path / "s" / "zarr.json"
+    before = description.stat()
+    half = tmp_path / "s" / "zarr.partial"
+    half.write_text("half")  # of a process that was killed
     with pytest.warns(UserWarning, match="failed three times"):
         quiet(picky, axes, store=tmp_path / "s")  # what failed is tried again
+    # The same blocks failed, so that the description stays as it is.
+    assert description.stat().st_ino == before.st_ino
+    assert description.stat().st_mtime_ns == before.st_mtime_ns
+    assert not half.exists()
 
 
 def test_a_worker_that_dies_or_lacks_jrigid_is_said():

@@ -353,11 +353,17 @@ class Store:
             except BlockingIOError as error:
                 text = f"Another process is writing to the store {self.path}."
                 raise RuntimeError(text) from error
-            for partial in self.path.glob("**/c/**/*.partial"):
+            chunks = self.path.glob("**/c/**/*.partial")
+            for partial in (*chunks, self._new_description):
                 partial.unlink(missing_ok=True)
             yield
         finally:
             os.close(directory)
+
+    @property
+    def _new_description(self) -> Path:
+        """Where the description is written before it replaces the old one."""
+        return self.path / "zarr.partial"
 
     def leave(self, _: int) -> None:
         """Do nothing: zarr fills blocks that have no chunk."""
@@ -366,12 +372,12 @@ class Store:
         """Write to the attributes which blocks failed."""
         place = self.path / "zarr.json"
         known = json.loads(place.read_text())
-        failed = [x._asdict() for x in failures]
+        # JSON has lists in place of tuples.
+        failed = json.loads(json.dumps([x._asdict() for x in failures]))
         # A resumed run may have computed the blocks that failed before.
         if known["attributes"][_KEY].setdefault("failures", []) != failed:
             known["attributes"][_KEY]["failures"] = failed
             # As for a chunk, a killed process leaves the old description or the new
             # one.
-            new = place.with_suffix(".partial")
-            new.write_text(json.dumps(known))
-            new.replace(place)
+            self._new_description.write_text(json.dumps(known))
+            self._new_description.replace(place)
