@@ -170,7 +170,7 @@ def find_tumblers(
     )
     # Columns of zeros fill the array up to a few sizes.
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
-    width = span / shortest - span / longest
+    width = highest - lowest
     return _inversion(
         found, readings, epoch, points - factors, stated, threshold, width
     )

@@ -142,16 +142,7 @@ def _blackbox(path: str, name: str, log: int) -> Table:
 
 def _parse(text: str, name: str) -> Table:
     """Parse a text with any separator, decimal sign and lines above the header."""
-    lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
-    separator = _separator(lines)
-    if separator == " ":
-        # The trajectories of many data sets are like this, with names after a "#". A
-        # unit in brackets belongs to the name before it.
-        lines = [x.strip().removeprefix("#").lstrip() for x in lines]
-        lines = [re.sub(r"\s+(?=[(\[])", "", x) for x in lines]
-    # Several spaces are one separator.
-    cells = csv.reader(lines, delimiter=separator, skipinitialspace=separator == " ")
-    rows = [[x.strip() for x in row] for row in cells]
+    separator, rows = _cells(text)
     pairs = itertools.pairwise(rows[:_MOST_ABOVE])
     head = next((i for i, pair in enumerate(pairs) if _is_header(*pair)), -1)
     demand(
@@ -182,12 +173,27 @@ def _parse(text: str, name: str) -> Table:
     return Table(name, headers, values, about, notes)
 
 
+def _cells(text: str) -> tuple[str, list[list[str]]]:
+    """The separator of a text, and the cells of its lines."""
+    lines = [x for x in text.removeprefix("\ufeff").splitlines() if x.strip(" \t,;")]
+    separator = _separator(lines)
+    if separator == " ":
+        # The trajectories of many data sets are like this, with names after a "#". A
+        # unit in brackets belongs to the name before it.
+        lines = [x.strip().removeprefix("#").lstrip() for x in lines]
+        lines = [re.sub(r"\s+(?=[(\[])", "", x) for x in lines]
+    # Several spaces are one separator.
+    cells = csv.reader(lines, delimiter=separator, skipinitialspace=separator == " ")
+    rows = [[x.strip() for x in row] for row in cells]
+    return separator, rows
+
+
 def _separator(lines: list[str]) -> str:
     """The separator of columns: one that most of the last lines have."""
     last = lines[-50:]
     # The comma comes after those beside which it may be the decimal sign. Spaces come
     # last, since they stand within the cells of other tables.
-    for separator in "	;, ":
+    for separator in "\t;, ":
         if sum(separator in x for x in last) > len(last) / 2:
             return separator
     return ","
