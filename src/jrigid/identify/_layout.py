@@ -150,9 +150,12 @@ def _dead_reckoning(
     """Attitudes of a trial at times of rates, each from the last observed attitude."""
     # Before the first attitude the motion is followed back from it.
     latest = _nearest_before(attitude_ts, attitude_valid, ts)
+    # A missing rate has no time. It continues from the attitude of the rate before it,
+    # and from none (-1) before the first rate.
+    latest = np.maximum.accumulate(np.where(valid, latest, -1))
     observed = _turned_by(attitude[latest], omega, ts - attitude_ts[latest])
     # The first rate after a new attitude starts anew; the others add their turns.
-    is_first = np.diff(latest, prepend=-1) != 0
+    is_first = np.diff(latest, prepend=-2) != 0
     factors = np.where(is_first[:, None], observed, exp(_turns(ts, valid, omega)))
     return normalize(_running_products(factors, is_first))
 
