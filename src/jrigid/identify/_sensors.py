@@ -373,11 +373,18 @@ class DirectionSensor(AbstractSensor):
         a = -1 / (sign + z)
         first = jnp.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x])
         second = jnp.stack([x * y * a, sign + y * y * a, -y])
-        # Across the observed direction a prediction at an angle x has the length
-        # sin(x). Over cos(x / 2), the root of this, it is the chord 2 sin(x / 2).
-        half = jnp.maximum(0.5 * (1 + jnp.sum(value * predicted)), 1e-6)
-        chord = predicted / jnp.sqrt(half)
-        return jnp.stack([jnp.sum(first * chord), jnp.sum(second * chord)])
+        across = jnp.stack([jnp.sum(first * predicted), jnp.sum(second * predicted)])
+        cosine = jnp.sum(value * predicted)
+        # At an angle x this has the length sin(x), which over cos(x / 2) is the chord
+        # 2 sin(x / 2). Beyond a right angle it is scaled to that length: there both
+        # fall to zero, and opposite directions have a chord of 2 along the first axis.
+        is_near = cosine > 0
+        half = jnp.where(is_near, 0.5 * (1 + cosine), 1.0)
+        opposite = jnp.array([1.0, 0.0], across.dtype)
+        across = jnp.where(is_near | jnp.any(across != 0), across, opposite)
+        length = jnp.sqrt(jnp.where(is_near, 1.0, jnp.sum(across * across)))
+        chord = jnp.sqrt(jnp.where(is_near, 1.0, 2 - 2 * cosine))
+        return across * chord / (length * jnp.sqrt(half))
 
 
 class MomentumSensor(AbstractSensor):
