@@ -182,6 +182,11 @@ class _Positive(AbstractSought):
     def value(self, x: Array) -> Array:
         return self.unit * jax.nn.softplus(x.reshape(self.base.shape))
 
+    def natural_units(self, x: Array) -> Array:
+        # In the linear part an array is judged by its new size. In the exponential part
+        # a number is the logarithm of its array.
+        return jnp.maximum(jax.nn.softplus(x), 1.0)
+
 
 class _Definite(AbstractSought):
     """A symmetric, positive definite tensor L L^T.
@@ -206,6 +211,11 @@ class _Definite(AbstractSought):
 
     def value(self, x: Array) -> Array:
         return jnp.max(self.unit) * squared(jnp.exp(x[:3]), x[3:])
+
+    def natural_units(self, x: Array) -> Array:
+        # The other entries of L are judged by the largest of its diagonal.
+        largest = jnp.maximum(jnp.max(jnp.exp(x[:3])), 1.0)
+        return jnp.concatenate([jnp.ones_like(x[:3]), jnp.full_like(x[3:], largest)])
 
 
 class _Arrays(NamedTuple):
