@@ -230,14 +230,19 @@ def misfit(problem: Problem, fit: Fit) -> float:
 def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
     """What is to be explained, in units of the noise.
 
-    It is a radian for attitudes, and the variation of values for others.
+    It is a radian for attitudes and directions, and the variation of values for others.
     """
     white = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
+    sensors = problem.unknowns.original(0)[1:]
+    samples = problem.samples
     signals = []
-    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
+    for sensor, part, values in zip(
+        sensors, samples.parts, samples.values, strict=True
+    ):
         w = weight[:, part]
         unit = white[:, part]
-        if values.shape[-1] > w.shape[-1]:  # quaternions
+        # Attitudes and directions have more values than degrees of freedom.
+        if sensor.degrees not in (None, values.shape[-1]):
             signals.append(unit)
             continue
         values = np.pad(values, ((0, 0), (0, 0), (0, w.shape[-1] - values.shape[-1])))
