@@ -15,7 +15,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid import rotation
-from jrigid._checks import RESULTS, Findings, demand, settle, shaped, whole_number
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    demand,
+    nan_where,
+    settle,
+    shaped,
+    whole_number,
+)
 from jrigid._numerics import or_one, product, rms
 from jrigid._types import AnyArray, Matrix, Readable, Real, Vector
 from jrigid.dynamics import State
@@ -355,7 +363,8 @@ def gyrostat(
 
     Returns:
         The tensor [kg m^2], singular values, and errors by how trials, or the parts of
-        a single one, scatter.
+        a single one, scatter. The errors are NaN where the equations, three for each
+        window, are no more than the six unknowns.
 
     Raises:
         ValueError: Fewer than four samples.
@@ -378,9 +387,12 @@ def gyrostat(
 
 def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -> tuple:
     trials = ts.shape[0]
+    windows, _ = size
     rows_of_trials = jax.vmap(partial(_weak_rows, *size))
     rows = rows_of_trials(ts, known, omegas, rotor, jnp.zeros_like(rotor))
     rows = rows.reshape(-1, 7)
+    # A single window has fewer equations than unknowns.
+    rows = jnp.pad(rows, ((0, max(6 - rows.shape[0], 0)), (0, 0)))
     rows = rows / or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows[:, :6]))))
     left, values, vt, determined = _singular(rows[:, :6])
     inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1.0), 0.0)
@@ -389,11 +401,14 @@ def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -
     misfit = rows[:, 6] - product("rj,j->r", rows[:, :6], six)
     # Errors of neighbouring windows hang together: trials, or eight parts of one, are
     # independent.
-    clusters = trials if trials > 1 else 8
+    clusters = trials if trials > 1 else min(8, windows)
     whole = misfit.size // clusters * clusters
     parts = (left * misfit[:, None])[:whole].reshape(clusters, -1, 6).sum(axis=1)
     shift = product("jk,ck->jc", half, parts)
-    covariance = product("ic,jc->ij", shift, shift) * clusters / (clusters - 1)
+    covariance = product("ic,jc->ij", shift, shift) * clusters / max(clusters - 1, 1)
+    # Equations that are no more than the unknowns leave no misfit to scatter.
+    equations = jnp.sum(jnp.any(rows != 0, axis=1))
+    covariance = nan_where(equations <= 6, covariance)
     return _tensor(six), values, None, covariance
 
 
