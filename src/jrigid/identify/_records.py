@@ -592,7 +592,7 @@ def _is_ordered(x: Record, is_seen: np.ndarray) -> np.bool_:
     # missing.
     before = np.maximum.accumulate(np.where(is_seen, x.ts, -np.inf), axis=1)
     increasing = np.all(~is_seen[:, 1:] | (x.ts[:, 1:] > before[:, :-1]))
-    without_time = np.isnan(x.ts) & np.all(np.isfinite(x.values), axis=-1)
+    without_time = ~np.isfinite(x.ts) & np.all(np.isfinite(x.values), axis=-1)
     return increasing & ~np.any(without_time)
 
 
