@@ -352,6 +352,24 @@ def test_profile_is_the_parabola_of_the_errors_near_the_minimum(one_fit):
     np.testing.assert_allclose(growth, moves**2, rtol=0.05, atol=1e-3)
 
 
+@pytest.mark.slow  # a program of its own
+def test_the_profile_of_a_clipped_gyro_is_zero_at_the_fit(rng):
+    """Saturated readings are in the sum that is minimised, and not in chi-square."""
+    _, omegas, _ = rates(ASYMMETRIC)
+    values = omegas + 0.01 * rng.normal(size=omegas.shape)
+    limit = 0.8 * np.abs(omegas).max()
+    gyro = identify.Gyro(limit=limit)
+    record = identify.Record(gyro, TS, np.clip(values, -limit, limit), 0.01)
+    found = identify.fit(BLIND, record)
+    assert np.sum(np.asarray(found.problem.samples.sign) != 0) > 10
+    best, error = float(found.moments[0]), float(found.moments_covariance[0, 0] ** 0.5)
+    moves = np.array([-1.0, 0.0, 1.0])
+    growth = identify.profile(
+        found, lambda i: jnp.linalg.eigvalsh(i)[0], best + error * moves
+    )
+    np.testing.assert_allclose(growth, moves**2, rtol=0.1, atol=1e-3)
+
+
 def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit):
     tensor, _, found = one_fit
     tensor = 3 * tensor / np.trace(tensor)

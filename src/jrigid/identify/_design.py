@@ -146,7 +146,7 @@ class Plan(Readable):
         The state of each trial counts by its rates and, if it has an effect, a small
         turn of its attitude.
         """
-        jacobian = _jacobian(_planned(self).minimum.rows)
+        jacobian = _jacobian(_planned(self).minimum)
         return product("ri,rj->ij", jacobian, jacobian)
 
     @property
@@ -156,7 +156,7 @@ class Plan(Readable):
         planned = _planned(self)
         unknowns = planned.problem.unknowns
         numbers = planned.minimum.point.numbers
-        root = _inverse_root(_jacobian(planned.minimum.rows))
+        root = _inverse_root(_jacobian(planned.minimum))
 
         def ratios(numbers: Array) -> Array:
             moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
@@ -315,13 +315,17 @@ def _minimum_at(
     )
 
 
-def _jacobian(rows: Rows) -> Array:
-    """Derivatives of all residuals in the numbers and in the state of each trial."""
+def _jacobian(minimum: Minimum) -> Array:
+    """Weighted derivatives of all residuals in the numbers and each trial's state."""
+    rows = minimum.rows
     trials, samples, width = rows.residual.shape
     count = samples * width
     states = rows.of_state.shape[-1]
-    of_numbers = rows.of_border.reshape(trials, count, rows.of_border.shape[-1])
-    of_state = rows.of_state.reshape(trials, count, states)
+    # Rows that would hold a fit near its start weigh nothing: they are no knowledge.
+    root = jnp.sqrt(minimum.weight)[..., None, None]
+    of_numbers = root * rows.of_border
+    of_numbers = of_numbers.reshape(trials, count, rows.of_border.shape[-1])
+    of_state = (root * rows.of_state).reshape(trials, count, states)
     # Residuals of a trial depend on its own state alone.
     eye = jnp.eye(trials, dtype=of_state.dtype)
     blocks = eye[:, None, :, None] * of_state[:, :, None, :]
@@ -415,6 +419,9 @@ def _profile_settings(result: FitResult) -> Settings:
     """Settings of a minimisation that begins at a fit."""
     dtype = result.numbers.dtype
     one = np.ones((), dtype)
+    # A noise that is not stated is taken from the residuals by the minimisation itself.
+    noise_known = result.problem.options.noise_known
+    noise = result.diagnostics.inflation if noise_known else one
     return Settings(
         kept=result.kept.astype(dtype),
         scales=result.diagnostics.scales,
@@ -425,7 +432,7 @@ def _profile_settings(result: FitResult) -> Settings:
         # start.
         horizon=2 * one,
         soft=np.asarray(False),
-        enough=(ACCURACY * result.diagnostics.inflation).astype(dtype),
+        enough=(ACCURACY * noise).astype(dtype),
         steps=np.asarray(STEPS),
         damping=FIRST_DAMPING * one,
         growth=FIRST_GROWTH * one,
@@ -463,10 +470,14 @@ def _profile(
         return Request(at_value, layout, point, settings)
 
     requests = [request(x) for x in np.asarray(values)]
+    # The sums that are minimised count saturated readings, which chi-square leaves out.
+    is_bound = problem.samples.sign != 0
+    of_bounds = np.sum(np.where(is_bound, result.diagnostics.residuals**2, 0.0))
+    least = result.chi_square + of_bounds
     growth = []
     for minimum in minima(requests, len(requests)):
         # The noise that errors go by has the variance `inflation` in these units.
-        added = (minimum.square - result.chi_square) / inflation
+        added = (minimum.square - least) / inflation
         growth.append(added if minimum.settled else np.nan)
     return jnp.asarray(np.asarray(growth, dtype))
 
