@@ -1,5 +1,6 @@
 """Comparison of models by criteria, and by trials that are not in the fit."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -223,3 +224,15 @@ def test_trials_with_a_wheel_of_their_own_are_left_out_in_turn(rng):
     squares = np.asarray(identify.cross_validate(fit, pairs))
     freedom = 3 * ts.size - 3
     assert np.all(np.abs(squares - freedom) < 6 * np.sqrt(2 * freedom)), squares
+
+
+def test_saturated_numbers_count_neither_in_chi_square_nor_in_its_size(rng):
+    fits = of_axes(trials(rng)[0])
+    sign_of = lambda x: x.problem.samples.sign  # noqa: E731
+    first = fits["any axes"]
+    sign = np.zeros_like(sign_of(first))
+    sign[:, :10, 1] = 1
+    fits = {name: eqx.tree_at(sign_of, x, sign) for name, x in fits.items()}
+    table = identify.compare(fits)
+    cost = np.log(240 - 10) * np.asarray(table.unknowns)
+    np.testing.assert_allclose(table.bic - table.chi_square, cost)

@@ -125,7 +125,10 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
         "Argument `results` must be fits of the same samples, with the noise stated in "
         "all or in none, but they are not.",
     )
-    n = jnp.sum(jnp.where(first.kept[..., None], first.problem.samples.weight, 0.0))
+    samples = first.problem.samples
+    # As in chi-square, saturated numbers do not count.
+    counted = first.kept[..., None] & (samples.sign == 0)
+    n = jnp.sum(jnp.where(counted, samples.weight, 0.0))
     unknowns = jnp.stack([_unknowns(x) for x in fits])
     chi_square = jnp.stack([x.chi_square for x in fits])
     # -2 log of the likelihood, up to a constant, at the most likely noise if that is
