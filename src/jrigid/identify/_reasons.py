@@ -11,6 +11,7 @@ import numpy as np
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
+from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
 from jrigid.identify._sensors import Gyro
@@ -175,9 +176,12 @@ def _of_noise(result: FitResult) -> str:
     """What residuals of another size, or of a colour, say."""
     if not (result.status == Status.MISFIT and result.problem.options.noise_known):
         return ""
-    size = math.sqrt(result.reduced_chi_square)
-    residuals = f"The residuals are {size:.2g} times the stated noise"
-    if size < 1:
+    square = float(result.reduced_chi_square)
+    # The mean square of n white residuals scatters by sqrt(2 / n).
+    chance = GATE * math.sqrt(2 / max(int(result.degrees_of_freedom), 1))
+    size = math.sqrt(square)
+    residuals = f"The residuals are {size:.3g} times the stated noise"
+    if square < 1 - chance:
         degrees = ""
         # The noise in rad/s over the same noise in deg/s is pi / 180 = 0.017.
         if 0.01 < size < 0.03:
@@ -199,7 +203,7 @@ def _of_noise(result: FitResult) -> str:
             f"{residuals}, and neighbours correlate by {like:.2f}: see `unmodelled` "
             "and `free`."
         )
-    if size < 1.1:
+    if square <= 1 + chance:
         return (
             "Trials differ by more than their errors say: they may be of different "
             "bodies."
