@@ -18,11 +18,13 @@ from jrigid._numerics import product
 from jrigid._types import AnyArray, Real
 from jrigid.identify._smoother import Links, Rows
 
-# Steps, in correlation times, beyond which the torque counts as white, or as constant.
+# Steps, in correlation times, beyond which the torque counts as white, or as constant:
+# over `MOST_NODES` of the shortest steps its variance changes by less than 1 %.
 _LONGEST = 1e6
-_SHORTEST = 1e-4
+_SHORTEST = 1e-6
 # Points of a quadrature that is exact to rounding for steps below a correlation time.
 _POINTS = 8
+_TERMS = 18  # of a series that is exact to rounding for the same steps
 
 
 class GaussMarkov(eqx.Module):
@@ -30,7 +32,8 @@ class GaussMarkov(eqx.Module):
 
     Its spectral density is level^2 at low frequencies, and half of that at 1 / time
     [rad/s]. The rms of the torque is level / sqrt(2 time). A time of zero means white
-    torque.
+    torque. A time above a million steps counts as a million steps of a torque with the
+    same rms, which is constant over any record.
 
     Args:
         level: Root of the spectral density [N m sqrt(s)], for all axes or for each.
@@ -105,27 +108,36 @@ def _torque_over_a_step(steps: Array) -> tuple[Array, Array]:
     a = jnp.clip(steps, _SHORTEST, _LONGEST)
     x = -jnp.expm1(-a)
     root = jnp.sqrt(2 * a)
-    short = _covariance_of_short_steps(a, root)
+    is_short = a < 1
+    short_a = jnp.where(is_short, a, 1.0)
+    short = _covariance_of_short_steps(short_a)
     long = _covariance_of_long_steps(a, x, root)
-    covariance = jnp.where((a < 1)[..., None, None], short, long)
+    covariance = jnp.where(is_short[..., None, None], short, long)
     # The torque fades as exp(-t / time). These are its integral, the integral of that,
     # and its value after the step, from a torque of one rms at its start.
-    response = jnp.stack([x / root, (a - x) / (root * a), 1 - x], axis=-1)
+    second = jnp.where(is_short, _integral_of_fading(short_a), (a - x) / a) / root
+    response = jnp.stack([x / root, second, 1 - x], axis=-1)
     return covariance, response
 
 
-def _covariance_of_short_steps(a: Array, root: Array) -> Array:
-    """Covariance over steps of lengths a, by quadrature; root is that of 2 a."""
+def _integral_of_fading(z: Array) -> Array:
+    """1 - (1 - exp(-z)) / z for z from 0 to 1, the mean of 1 - exp(-s) up to z."""
+    # The terms of the formula cancel at small z. Those of its power series do not.
+    series = jnp.ones_like(z)
+    for n in range(_TERMS, 2, -1):
+        series = 1 - z / n * series
+    return 0.5 * z * series
+
+
+def _covariance_of_short_steps(a: Array) -> Array:
+    """Covariance over steps of lengths a, at most 1, by quadrature."""
     points, weights = np.polynomial.legendre.leggauss(_POINTS)
     # Responses to a kick that came a fraction r of the step before its end.
     r = jnp.asarray(0.5 + 0.5 * points, a.dtype)
     r = jnp.broadcast_to(r, (*a.shape, r.size))
-    # The two terms of r - faded / a cancel to a r^2 / 2, so that the shortest steps
-    # would lose their digits.
-    faded = -jnp.expm1(-a[..., None] * r)
-    responses = jnp.stack(
-        [faded, r - faded / a[..., None], root[..., None] * (1 - faded)], axis=-1
-    )
+    z = a[..., None] * r
+    torque = jnp.sqrt(2 * a)[..., None] * jnp.exp(-z)
+    responses = jnp.stack([-jnp.expm1(-z), r * _integral_of_fading(z), torque], axis=-1)
     weights = jnp.asarray(0.5 * weights, a.dtype)
     return product("r,...ri,...rj->...ij", weights, responses, responses)
 
@@ -177,6 +189,8 @@ def push_of(
     # How the motion changes a kick within a link is neglected. Links are short: each
     # reading has a node, up to `MOST_NODES`.
     level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
+    # A correlation time that is shortened keeps the rms of the torque, not its level.
+    level = level * jnp.sqrt(jnp.minimum(steps / _SHORTEST, 1.0))
     # These turn the units of `_torque_over_a_step` into SI units, except for the
     # torque, which stays in units of its rms.
     units = [level, level * dt[..., None], jnp.ones_like(level)]

@@ -431,7 +431,8 @@ def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
     # The whitener of the torque divides by its levels. A fit without any does not use
     # it.
     good = np.all(level == 0) or np.all(level > 0)
-    demand(bool(good and np.all(np.isfinite(level)) and np.all(time >= 0)), text)
+    finite = np.all(np.isfinite(level)) and np.all(np.isfinite(time))
+    demand(bool(good and finite and np.all(time >= 0)), text)
     known = bool(np.any(level > 0))
     demand(
         noise_known or not known,
