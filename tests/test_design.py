@@ -164,3 +164,29 @@ def test_a_wheel_s_profile_is_chosen_within_its_limits():
     assert np.abs(profile).max() <= 0.3 + 1e-12
     assert float(best.score) < float(best.start_score) - 1
     assert bool(best.plan.predicted.status == identify.Status.OK)
+
+
+def test_a_plan_knows_nothing_of_what_it_seeks_beforehand():
+    """Without a prior all errors are proportional to the noise, however large it is."""
+
+    def covariance(noise):
+        start = jr.State(UNTURNED, np.array([0.3, 0.5, 0.9]))
+        record = identify.Rates(TS, None, noise)
+        free = lambda _, gyro: gyro.bias  # noqa: E731
+        plan = identify.Plan(NEARLY_SYMMETRIC, start, record, free=free)
+        return np.asarray(plan.bound.covariance)
+
+    small, large = covariance(NOISE), covariance(1e3 * NOISE)
+    assert np.all(np.diagonal(large)[5:8] > 1)
+    units = np.sqrt(np.diagonal(large))
+    off = (large - 1e6 * small) / units / units[:, None]
+    assert np.max(np.abs(off)) < 1e-6
+
+
+def test_a_plan_at_rest_determines_nothing_in_float32():
+    start = jr.State(UNTURNED.astype(np.float32), np.zeros(3, np.float32))
+    body = jr.RigidBody(NEARLY_SYMMETRIC.inertia.astype(np.float32))
+    record = identify.Rates(TS.astype(np.float32), None, np.float32(NOISE))
+    found = identify.Plan(body, start, record).predicted
+    assert found.numbers.dtype == np.float32
+    assert found.status == identify.Status.UNIDENTIFIABLE

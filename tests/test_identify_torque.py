@@ -26,7 +26,7 @@ LEVELS = np.array([0.02, 0.03, 0.05])
 NOISE = 5e-3
 
 
-@pytest.mark.parametrize("steps", [1e-3, 0.1, 0.999, 1.001, 7.0, 300.0])
+@pytest.mark.parametrize("steps", [1e-6, 1e-3, 0.1, 0.999, 1.001, 7.0, 300.0])
 def test_what_a_torque_adds_in_a_step_is_its_integral(steps):
     """White noise drives the torque, the torque the momentum, and the momentum the turn."""
     found, along = disturbances._torque_over_a_step(jnp.array(steps))
@@ -264,11 +264,16 @@ def test_errors_stated_are_those_made_where_torques_have_a_memory(rng):
 
 
 def test_a_torque_that_is_given_is_used(rng):
-    (record,) = some_trials(rng, 1)
-    torque = identify.GaussMarkov(LEVELS, 0.1)
-    found = identify.fit(BLIND, record, unmodelled=torque, throw=False)
+    records = some_trials(rng, 2)
+    record = records[0]
+    torque = identify.GaussMarkov(
+        LEVELS, np.array([0.1, 0.1, 0.0])
+    )  # white along one axis
+    found = identify.fit(BLIND, records, unmodelled=torque, throw=False)
     np.testing.assert_allclose(found.level, LEVELS)
-    np.testing.assert_allclose(found.correlation_time, 0.1)
+    np.testing.assert_allclose(found.correlation_time, [0.1, 0.1, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(found.level_by_trial, [1.0, 1.0])
+    assert np.all(np.isfinite(found.level_errors))
     assert np.all(np.abs(off(found)) < 5)
     with pytest.raises(ValueError, match="unmodelled"):
         identify.fit(BLIND, record, unmodelled=identify.GaussMarkov(LEVELS, -0.1))
@@ -299,3 +304,29 @@ def test_a_level_without_bound_is_a_failed_fit():
             with pytest.raises(RuntimeError, match="not converged"):
                 identify.fit(BLIND, readings, **options)
     assert any(failed)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("time", [10.0, 1e3, 1e6, 1e10])
+def test_a_torque_of_a_long_memory_keeps_its_rms(time, dtype):
+    """A constant torque of the rms level / sqrt(2 time) adds that times the step."""
+    step = 0.01
+    torque = disturbances.Disturbance(
+        LEVELS[None].astype(dtype), np.full(3, time, dtype)
+    )
+    push = disturbances.push_of(
+        torque,
+        jnp.full((1, 1), step, dtype),
+        jnp.ones((1, 1), bool),
+        jnp.diag(MOMENTS.astype(dtype)),
+        True,
+    )
+    rms = LEVELS / np.sqrt(2 * time)
+    added = np.concatenate(
+        [np.diag(rms * step / MOMENTS), np.diag(rms * step**2 / 2 / MOMENTS), np.eye(3)]
+    )
+    np.testing.assert_allclose(push.carried[0, 0], added, rtol=2e-3)
+    assert np.all(np.isfinite(push.whitener))
+    # The variance of what the torque itself changes by, in units of its own.
+    changes = np.diagonal(push.covariance[0, 0])[6:]
+    np.testing.assert_allclose(changes, 2 * max(step / time, 1e-6), rtol=1e-2)

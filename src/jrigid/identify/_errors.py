@@ -182,10 +182,15 @@ def _of_numbers(
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
     eps = np.finfo(units.dtype).eps
-    # The square of the inverse of 1e-150 is still a finite number.
-    floor = 16 * eps * np.max(values, initial=0.0) + 1e-150
+    floor = 16 * eps * np.max(values, initial=0.0) + _least_value(units.dtype)
     half = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
     return values, vt.T, half.T @ half
+
+
+def _least_value(dtype: np.dtype) -> float:
+    """The least singular value to divide by: the square of the inverse is finite."""
+    # The factor leaves room for sums of such squares.
+    return 1e4 * float(np.sqrt(np.finfo(dtype).tiny))
 
 
 class Independent(NamedTuple):
@@ -294,7 +299,7 @@ def weakest_of(
     values, axes = np.linalg.eigh(inside)
     normal[part] = axes[:, -1] / units[part]
     # Others follow as far as they are known to, and no farther than a start need be.
-    change = covariance @ normal / max(values[-1], 1e-300)
+    change = covariance @ normal / max(values[-1], np.finfo(units.dtype).tiny)
     direction = np.clip(change, -units, units)
     direction[part] = axes[:, -1] * units[part]
     return float(np.sqrt(max(values[-1], 0.0))), normal, direction
@@ -326,7 +331,8 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.nda
     torque = fit.torque
     if torque is None:
         level = np.asarray(fit.disturbance.level[0], float)
-        torque = levels.known(level, np.asarray(fit.disturbance.time, float))
+        time = np.asarray(fit.disturbance.time, float)
+        torque = levels.known(level, time, fit.kept.shape[0])
     faint = search.are_faint(torque)
     # The likelihood hardly changes with the logarithm of a faint level, so that errors
     # are taken at a level that could be seen.
@@ -656,7 +662,8 @@ def _with_larger_errors(
     known: Precision, factors: np.ndarray, units: np.ndarray
 ) -> np.ndarray:
     """The covariance with errors so many times larger along each direction."""
-    directions = known.directions * units[:, None] / np.maximum(known.values, 1e-150)
+    values = np.maximum(known.values, _least_value(units.dtype))
+    directions = known.directions * units[:, None] / values
     # Variances add: a variance of f^2 is the old one and f^2 - 1 more of it.
     more = directions * np.sqrt(factors**2 - 1)
     return known.covariance + more @ more.T
@@ -674,11 +681,8 @@ def _scatter_of_trials(
         return np.ones(units.size)
     # The variance of a score along a direction is the square of its value. If trials
     # scatter by their noise alone, the squares of these sum to about one.
-    along = (
-        (known.scores[alive] * units)
-        @ known.directions
-        / np.maximum(known.values, 1e-150)
-    )
+    values = np.maximum(known.values, _least_value(units.dtype))
+    along = (known.scores[alive] * units) @ known.directions / values
     # At the minimum the scores sum to zero, which takes one degree of freedom.
     return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1) / inflation)
 
@@ -692,7 +696,7 @@ def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
     square = np.sum(both * (left**2 + right**2) / 2)
     like = np.sum(left * right) / max(square, np.finfo(rows.dtype).tiny)
     # The correlation of n white residuals scatters by 1 / sqrt(n).
-    return like, np.abs(like) * np.sqrt(np.sum(both))
+    return float(like), float(np.abs(like) * np.sqrt(np.sum(both)))
 
 
 def _kicks(problem: Problem, fit: Fit) -> float:
@@ -767,9 +771,9 @@ def _chi_square(problem: Problem, fit: Fit, known: Precision) -> tuple[float, fl
     # A change of a state that the record does not show takes no degree of freedom.
     is_shown = known.of_state > SHOWN * known.of_state[:, :1]
     sought = fit.minimum.units.size + np.sum(is_shown & takes_part)
-    freedom = sums.count + np.sum(prior != 0) - sought
-    chi_square = sums.residual + np.sum(prior**2) + _kicks(problem, fit)
-    return chi_square, freedom
+    freedom = sums.count + problem.priors(int(np.sum(takes_part))) - sought
+    chi_square = sums.residual + float(np.sum(prior**2)) + _kicks(problem, fit)
+    return chi_square, float(freedom)
 
 
 def _band(problem: Problem, fit: Fit, white: np.ndarray) -> tuple[float, float]:

@@ -101,12 +101,12 @@ class Torque(NamedTuple):
         return GaussMarkov(of_mean.level[0], of_mean.time)
 
 
-def known(level: np.ndarray, time: np.ndarray) -> Torque:
-    """A torque of given levels and times."""
+def known(level: np.ndarray, time: np.ndarray, trials: int) -> Torque:
+    """A torque of given levels and times, of the same size in all trials."""
     tiny = np.finfo(float).tiny
-    form = Form(3, 3 if np.all(time > 0) else 0)
+    form = Form(3, 3 if np.any(time > 0) else 0)
     numbers = np.concatenate([level, time[: form.times]])
-    return Torque(form, np.log(np.maximum(numbers, tiny)), np.zeros(1))
+    return Torque(form, np.log(np.maximum(numbers, tiny)), np.zeros(trials))
 
 
 class Likelihood:
@@ -167,6 +167,8 @@ class Likelihood:
         levels, times = np.split(numbers, [form.levels])
         if not form.times:
             times = np.array([self._time_of_white])
+        # The time of an axis with white torque is zero, which has no logarithm.
+        times = np.maximum(times, self._time_of_white)
         torque = np.broadcast_to(levels, 3), np.broadcast_to(times, 3), trials
         results = likelihood(*self._arguments, *(x.astype(self._dtype) for x in torque))
         return jtu.tree_map(lambda x: np.asarray(x, float), results)

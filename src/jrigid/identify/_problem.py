@@ -89,6 +89,13 @@ class Problem(eqx.Module):
         known = sum(x.base.size for x in unknowns.sought if x.sigma is not None)
         return known + (unknowns.hold is not None) + self.held
 
+    def priors(self, trials: int) -> int:
+        """How many residuals of prior knowledge there are, of so many trials."""
+        known = [x for x in self.unknowns.sought if x.sigma is not None]
+        own = sum(x.base.size for x in known if x.own)
+        shared = sum(x.base.size for x in known if not x.own)
+        return trials * own + shared + (self.unknowns.hold is not None)
+
     @property
     def held(self) -> int:
         """How many rows hold a fit near its start while part of the record is used."""
