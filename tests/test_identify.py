@@ -9,6 +9,13 @@ from scipy.spatial.transform import Rotation
 
 import jrigid as jr
 from jrigid import identify
+from jrigid.identify._flow import free_flow
+from jrigid.identify._inputs import sizes_of
+from jrigid.identify._layout import direct_readings_of
+from jrigid.identify._problem import Options, Problem
+from jrigid.identify._quality import signal_of
+from jrigid.identify._records import of_trials, samples_of
+from jrigid.identify._unknowns import unknowns_of
 
 
 def second_moments(tensor):
@@ -349,3 +356,146 @@ def test_a_bad_lane_of_samples_is_named_or_marked(free_samples):
     assert list(found.result == jr.RESULTS.invalid_state) == [False, True]
     assert list(np.isnan(found.momentum).any(axis=1)) == [False, True]
     np.testing.assert_allclose(found.inertia[0], RATIOS, atol=1e-12)
+
+
+def test_few_windows_have_no_errors(wheel_samples):
+    """Each window has three equations for six unknowns: one and two have no misfit."""
+    for windows in (1, 2):
+        found = identify.gyrostat(TS, *wheel_samples, windows=windows)
+        assert found.inertia.shape == (3, 3)
+        assert np.all(np.isnan(found.covariance))
+    found = identify.gyrostat(TS, *wheel_samples, windows=5)
+    assert np.all(np.diagonal(found.covariance) > 0)
+
+
+@pytest.mark.parametrize("missing", [[], [400], [0, 1, 2], [79, 80, 81]])
+def test_attitudes_between_two_observed_ones_follow_the_rates(missing):
+    """A missing rate does not send the path back to the attitude before it."""
+    ts = np.linspace(0, 20, 801)
+    motion = jr.free_rotation(RATIOS, STATE, ts).states
+    omegas = np.array(motion.omega)
+    omegas[missing] = np.nan
+    attitudes = np.array(motion.attitude)
+    observed = [0, 80]
+    records = of_trials(
+        (
+            identify.Rates(ts, omegas, 0.01),
+            identify.Attitudes(ts[observed], attitudes[observed], 0.01),
+        )
+    )
+    records = jax.tree.map(np.asarray, records)
+    readings = direct_readings_of(records, samples_of(records, np.ones(())), None)
+    seen = readings.valid[0]
+    assert np.sum(seen) == 801 - len(missing)
+    turn = Rotation.from_quat(attitudes[seen], scalar_first=True).inv()
+    turn *= Rotation.from_quat(readings.attitude[0][seen], scalar_first=True)
+    assert np.max(turn.magnitude()) < 2e-3
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_flow_has_the_same_value_with_its_derivative(dtype):
+    """Also of a symmetric body, whose moments are moved apart in the derivative."""
+    omega = np.array([0.5, 1.0, 0.3], dtype)
+    tensor = np.diag(np.array([1.0, 1.0, 1.5], dtype))
+    arguments = tuple(map(jnp.asarray, (tensor, omega, dtype(100.0))))
+    turn, rates = jax.jvp(free_flow, arguments, arguments)[0]
+    # The rates of a symmetric body turn about its axis by this angle.
+    angle = (1.5 - 1) * 0.3 * 100.0
+    wanted = Rotation.from_rotvec([0, 0, angle]).apply(omega)
+    bar = 300 * np.finfo(dtype).eps
+    np.testing.assert_allclose(rates, wanted, atol=bar)
+    exact_turn, exact_rates = free_flow(*arguments)
+    np.testing.assert_allclose(turn, exact_turn, atol=bar)
+    np.testing.assert_allclose(rates, exact_rates, atol=bar)
+
+
+@pytest.mark.parametrize(
+    "off", [1e-9, 1e-3, 1.0, 1.6, np.pi - 2e-3, np.pi - 1e-5, np.pi]
+)
+def test_the_residual_of_a_direction_is_the_chord(off, rng):
+    value = rng.normal(size=3)
+    value /= np.linalg.norm(value)
+    across = np.cross(value, [0.3, -0.8, 0.5])
+    across /= np.linalg.norm(across)
+    predicted = np.cos(off) * value + np.sin(off) * across
+    sensor = identify.DirectionSensor(jnp.ones(3))
+    chord = sensor.difference(jnp.array(value), jnp.array(predicted))
+    exact = 2 * np.sin(off / 2)
+    np.testing.assert_allclose(np.linalg.norm(chord), exact, rtol=1e-7, atol=1e-15)
+
+
+def test_the_residual_of_an_opposite_direction_is_two_with_a_finite_derivative():
+    sensor = identify.DirectionSensor(jnp.ones(3))
+    value = jnp.array([0.0, 0.0, 1.0])
+    chord = sensor.difference(value, -value)
+    assert float(jnp.linalg.norm(chord)) == 2.0
+    assert np.all(np.isfinite(jax.jacfwd(sensor.difference, 1)(value, -value)))
+
+
+def a_problem(*records, free=None):
+    """The problem of a fit of records."""
+    records = of_trials(records)
+    samples = samples_of(jax.tree.map(np.asarray, records), np.ones(()))
+    body = jr.RigidBody(np.ones(3), jr.torques.LinearDrag(1e-5))
+    sensors = [x.sensor for x in records]
+    unknowns = unknowns_of(
+        (body,),
+        sensors,
+        sizes_of(samples),
+        free,
+        identify.Tensor(),
+        True,
+        np.ones(()),
+        1,
+    )
+    return Problem(Options(False, True), unknowns, samples, np.ones(6))
+
+
+def test_the_signal_of_a_sensor_does_not_depend_on_the_others(rng):
+    """A radian for attitudes and directions, the variation of values for the others."""
+    ts, sigma = np.arange(20.0), 0.01
+    attitudes = Rotation.random(20, rng=rng).as_quat(scalar_first=True)
+    directions = Rotation.from_quat(attitudes, scalar_first=True).apply([1, 0, 0])
+    four = rng.normal(size=(20, 4))
+    records = (
+        identify.Attitudes(ts, attitudes, sigma),
+        identify.Directions(ts, directions, sigma, of=np.ones(3)),
+        identify.Observed(lambda *_: four[0], ts, four, sigma),
+    )
+    problem = a_problem(*records)
+    signal = signal_of(problem, problem.samples.weight)[0]
+    np.testing.assert_allclose(signal[:20], [[100, 100, 100, 0]] * 20)
+    np.testing.assert_allclose(signal[20:40], [[100, 100, 0, 0]] * 20)
+    np.testing.assert_allclose(signal[40:], (four - four.mean(axis=0)) / sigma)
+
+
+def test_a_positive_number_that_grew_is_judged_by_its_new_size(rng):
+    record = identify.Rates(np.arange(20.0), rng.normal(size=(20, 3)), 0.01)
+    unknowns = a_problem(record, free=lambda body: body.torque.coefficient).unknowns
+    (drag,) = unknowns.sought
+    for value in (1e-5, 0.02):
+        x = jnp.log(jnp.expm1(jnp.full(1, value / 1e-5)))
+        x = jnp.where(value == 0.02, value / 1e-5, x)
+        slope = jax.grad(lambda y: jnp.sum(drag.value(y)))(x)
+        relative = float(slope[0]) * float(drag.natural_units(x)[0]) / value
+        assert 0.5 < relative < 1.01, value
+
+
+def test_priors_are_counted_once_or_in_each_trial(rng):
+    record = identify.Rates(np.arange(20.0), rng.normal(size=(20, 3)), 0.01)
+
+    def free(body, gyro):
+        return (
+            identify.prior(gyro.bias, 0.1),
+            identify.prior(identify.each(gyro.scale), 0.1),
+            body.torque.coefficient,
+        )
+
+    assert a_problem(record, free=free).priors(trials=5) == 3 + 5
+
+
+def test_a_time_that_is_not_finite_beside_a_value_is_refused():
+    ts = np.append(np.arange(19.0), np.inf)
+    record = identify.Rates(ts, np.ones((20, 3)), 0.01)
+    with pytest.raises(RuntimeError, match="finite where there are values"):
+        identify.fit(jr.RigidBody(np.ones(3)), record)
