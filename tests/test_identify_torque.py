@@ -329,4 +329,5 @@ def test_a_torque_of_a_long_memory_keeps_its_rms(time, dtype):
     assert np.all(np.isfinite(push.whitener))
     # The variance of what the torque itself changes by, in units of its own.
     changes = np.diagonal(push.covariance[0, 0])[6:]
-    np.testing.assert_allclose(changes, 2 * max(step / time, 1e-6), rtol=1e-2)
+    shortest = 1e-6 if dtype == np.float64 else 1e-4
+    np.testing.assert_allclose(changes, 2 * max(step / time, shortest), rtol=1e-2)

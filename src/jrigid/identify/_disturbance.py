@@ -18,10 +18,12 @@ from jrigid._numerics import product
 from jrigid._types import AnyArray, Real
 from jrigid.identify._smoother import Links, Rows
 
-# Steps, in correlation times, beyond which the torque counts as white, or as constant:
-# over `MOST_NODES` of the shortest steps its variance changes by less than 1 %.
+# Steps, in correlation times, beyond which the torque counts as white, or as constant,
+# by the size of the dtype in bytes. Over `MOST_NODES` of the shortest steps a torque in
+# float64 changes by 6 % of its rms. In float32 the gaps of shorter steps, which are
+# whitened by what little such a torque adds at random, would be rounding errors.
 _LONGEST = 1e6
-_SHORTEST = 1e-6
+_SHORTEST = {8: 1e-6, 4: 1e-4}
 # Points of a quadrature that is exact to rounding for steps below a correlation time.
 _POINTS = 8
 _TERMS = 18  # of a series that is exact to rounding for the same steps
@@ -32,8 +34,8 @@ class GaussMarkov(eqx.Module):
 
     Its spectral density is level^2 at low frequencies, and half of that at 1 / time
     [rad/s]. The rms of the torque is level / sqrt(2 time). A time of zero means white
-    torque. A time above a million steps counts as a million steps of a torque with the
-    same rms, which is constant over any record.
+    torque. A time above a million steps (in float32 ten thousand) counts as so many
+    steps, of a torque with the same rms.
 
     Args:
         level: Root of the spectral density [N m sqrt(s)], for all axes or for each.
@@ -105,7 +107,7 @@ def _torque_over_a_step(steps: Array) -> tuple[Array, Array]:
         torque at the start. Units are level dt^(1/2) for the momentum, level dt^(3/2)
         for its integral and the rms for the torque.
     """
-    a = jnp.clip(steps, _SHORTEST, _LONGEST)
+    a = jnp.clip(steps, _SHORTEST[steps.dtype.itemsize], _LONGEST)
     x = -jnp.expm1(-a)
     root = jnp.sqrt(2 * a)
     is_short = a < 1
@@ -190,7 +192,8 @@ def push_of(
     # reading has a node, up to `MOST_NODES`.
     level = disturbance.level[:, None, :] * jnp.sqrt(dt)[..., None]
     # A correlation time that is shortened keeps the rms of the torque, not its level.
-    level = level * jnp.sqrt(jnp.minimum(steps / _SHORTEST, 1.0))
+    shortened = jnp.minimum(steps / _SHORTEST[steps.dtype.itemsize], 1.0)
+    level = level * jnp.sqrt(shortened)
     # These turn the units of `_torque_over_a_step` into SI units, except for the
     # torque, which stays in units of its rms.
     units = [level, level * dt[..., None], jnp.ones_like(level)]
