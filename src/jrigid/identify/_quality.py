@@ -291,7 +291,8 @@ def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
     # Five numbers gain chi-square of five degrees of freedom from noise: its mean is 5
     # and its standard deviation sqrt(10).
     chance = 5 + GATE * 10**0.5 + 4 * np.log(max(sums.count, 1.0))
-    return bool(sums.signal - sums.residual < noise * chance)
+    # Both sides are zero for constant readings, whose noise was not stated.
+    return bool(sums.signal - sums.residual <= noise * chance)
 
 
 @once_for_each_fit

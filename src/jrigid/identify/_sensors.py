@@ -157,8 +157,9 @@ class Gyro(AbstractSensor):
             against a revolution; None without one.
         limit: Size () or (3,) at which readings are saturated [rad/s], so that they are
             lower bounds; None without one.
-        since: Time at which the bias is `bias` [s]; None for the first sample of the
-            record.
+        since: Time at which the bias is `bias` [s]; None for the first sample, of
+            several trials the earliest one. With a bias for each trial, give each trial
+            times of its own that begin near zero.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> gyro = jr.identify.Gyro(bias=jnp.array([0.1, 0.0, 0.0]))

@@ -161,16 +161,20 @@ def log_evidence(alias: Alias, growth: float, width: float) -> float:
     # The integral over a peak of n numbers has the factor (2 pi)^(n / 2).
     peak = spread + 0.5 * len(size) * np.log(2 * np.pi)
     # The prior is flat in solid angle and in ratios, not in latitude and in logits.
-    ratios = 1 / (1 + np.exp(-np.stack([numbers.shape, numbers.inertia])))
+    # A ratio r of the logit x has dr / dx = r (1 - r), which may underflow.
+    slopes = [
+        -np.logaddexp(0, x) - np.logaddexp(0, -x)
+        for x in (numbers.shape, numbers.inertia)
+    ]
     densities = Numbers(
-        cycles=np.full(2, 1 / width),
-        angles=np.full(2, 1 / (2 * np.pi)),
-        pole=np.array([1.0, np.cos(numbers.pole[1])]),
-        log_tangent=np.ones(1),
-        shape=(ratios * (1 - ratios))[0],
-        inertia=(ratios * (1 - ratios))[1],
+        cycles=np.full(2, -np.log(width)),
+        angles=np.full(2, -np.log(2 * np.pi)),
+        pole=np.array([0.0, np.log(np.cos(numbers.pole[1]))]),
+        log_tangent=np.zeros(1),
+        shape=slopes[0],
+        inertia=slopes[1],
     )
-    prior = np.sum(np.log(np.concatenate(densities)[seeks]))
+    prior = np.sum(np.concatenate(densities)[seeks])
     return float(-growth / 2 + peak + prior)
 
 
