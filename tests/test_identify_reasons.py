@@ -116,6 +116,28 @@ class Blinded(identify.AbstractSensor):
         return value
 
 
+def test_noise_about_a_constant_rate_is_no_swing(rng):
+    ts = np.arange(200) * 0.05
+    values = np.array([0.3, -0.2, 0.4]) + 0.01 * rng.normal(size=(200, 3))
+    found = identify.fit(
+        jr.RigidBody(np.ones(3)), identify.Rates(ts, values, 0.01), throw=False
+    )
+    assert found.status == Status.UNIDENTIFIABLE
+    assert found.determined == {"inertia": False}
+    assert "swing" not in str(found)
+
+
+def test_constant_rates_without_a_noise_tell_no_ratios():
+    ts = np.arange(100) * 0.1
+    found = identify.fit(
+        jr.RigidBody(np.ones(3)),
+        identify.Rates(ts, np.tile([0.0, 2.0, 0.0], (100, 1))),
+        throw=False,
+    )
+    assert found.status == Status.UNIDENTIFIABLE
+    assert "spin is pure" in str(found)
+
+
 def test_predictions_that_are_not_finite_matter_only_where_there_is_a_reading(readings):
     seen = np.where(np.abs(readings) > 2.5, readings, np.nan)
     assert 50 < np.sum(np.isnan(seen)) < 150

@@ -20,6 +20,9 @@ from jrigid.identify._sensors import Gyro
 _NEARLY_A_SPHERE = 1.03
 # Radians of a swing while the body turns by one: no free body does that.
 _TOO_FAST = 3.0
+_LOUD = 0.2  # part of the power that a swing has at its frequency
+# Gain of chi-square by the three numbers of a bias that is no chance.
+_GAINED = 36.0
 _EXPLAINED = 0.5  # part of what the fit does not explain, for a bias to be named
 _WHITE = 0.1  # correlation of neighbours
 _WHITE_SURE = 5.0  # standard deviations of that
@@ -27,9 +30,23 @@ _FEWEST = 16  # samples whose spectrum says something
 
 
 def reason(result: FitResult) -> str:
-    """The sentence, or an empty one where there is nothing to say; of a single fit."""
+    """The sentences, or an empty text where there is nothing to say; of a single fit."""
+    sentences = [_reason(result)]
+    if result.numbers.dtype == np.float32 and result.status == Status.MISFIT:
+        sentences.append(
+            "It was computed in float32, whose rounding may be more than the noise: "
+            'try `jax.config.update("jax_enable_x64", True)`.'
+        )
+    return " ".join(filter(None, sentences))
+
+
+def _reason(result: FitResult) -> str:
+    """What is wrong first of all."""
     if result.status == Status.BAD_INPUT:
-        return RESULTS[result.diagnostics.input_result]
+        return (
+            f"{RESULTS[result.diagnostics.input_result]} With `throw=True` an error "
+            "says which argument it is."
+        )
     if not np.any(np.isfinite(np.asarray(result.diagnostics.history))):
         return (
             "Predictions are not finite at the initial values: `predict` of each sensor "
@@ -107,6 +124,9 @@ def _swing(result: FitResult) -> float:
         return 0.0
     power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
     peak = int(np.argmax(power))
+    # In noise about a constant rate no frequency stands out.
+    if power[peak] < _LOUD * np.sum(power):
+        return 0.0
     # n samples stand for n steps, one more than lie between the first and the last. A
     # gap in the samples matters little beside a factor of 57.
     duration = float(ts[-1] - ts[0]) * ts.size / (ts.size - 1)
@@ -134,8 +154,13 @@ def _bias(result: FitResult) -> np.ndarray | None:
     slopes = columns[:, :-1]
     residual = columns[:, -1]
     solution = np.linalg.lstsq(slopes, -residual, rcond=1e-12)[0]
-    after = np.sum((residual + slopes @ solution) ** 2)
-    return solution[-3:] if before - after > _EXPLAINED * excess else None
+    bias = solution[-3:]
+    gain = before - np.sum((residual + slopes @ solution) ** 2)
+    fastest = np.nanmax(np.abs(result.problem.samples.values[gyros[0]]))
+    # A bias as large as the readings only imitates them.
+    if gain < max(_EXPLAINED * excess, _GAINED) or np.max(np.abs(bias)) > fastest:
+        return None
+    return bias
 
 
 def _slopes_in_bias(

@@ -490,7 +490,8 @@ class FitResult(eqx.Module):
         An array is determined where its errors are below 0.3 of its size, or of its
         natural unit if that is larger; one that is sought anew in each trial, where it
         is in every trial that took part. The inertia, where `status` does not say
-        otherwise. Of a single fit.
+        otherwise. A fit that ended neither OK nor MISFIT nor UNIDENTIFIABLE determines
+        nothing. Of a single fit.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
@@ -500,7 +501,9 @@ class FitResult(eqx.Module):
         >>> print(found.determined)
         {'inertia': True, 'gyro.bias': True}
         """
-        verdicts = {"inertia": bool(self.status != Status.UNIDENTIFIABLE)}
+        described = bool((self.status == Status.OK) | (self.status == Status.MISFIT))
+        has_errors = described or bool(self.status == Status.UNIDENTIFIABLE)
+        verdicts = {"inertia": described}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
             units_of = jax.vmap(x.natural_units) if x.own else x.natural_units
@@ -508,7 +511,7 @@ class FitResult(eqx.Module):
             if x.own:
                 took_part = jnp.any(self.kept, axis=-1)
                 errors = errors[took_part]
-            verdicts[x.name] = bool(jnp.all(errors <= LARGEST_ERROR))
+            verdicts[x.name] = has_errors and bool(jnp.all(errors <= LARGEST_ERROR))
         return verdicts
 
     @property

@@ -237,14 +237,17 @@ def _of_mirror(result: FitResult) -> list[tuple[Any, str]]:
     ]
 
 
-def _with_error(value: np.floating, error: np.floating) -> str:
-    """A number with as many digits as its error leaves it."""
+def _with_error(value: np.floating, error: np.floating, unit: float = 0.0) -> str:
+    """A number with as many digits as its error leaves it.
+
+    An error of ten times the number, or of ten units, means that it is not determined.
+    """
     value = np.float64(value)
     error = np.float64(error)
     # Written with `not`, so that an error of NaN prints the value alone.
     if not error > 1e-9 * abs(value):
         return f"{value:.6g}"
-    if not error < 10 * max(abs(value), 1e-300):
+    if not error < 10 * max(abs(value), unit, 1e-300):
         return f"{value:.3g} (not determined)"
     # The error keeps two significant digits.
     digits = 1 - math.floor(math.log10(error))
@@ -254,9 +257,12 @@ def _with_error(value: np.floating, error: np.floating) -> str:
     return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
-def _with_errors(values: AnyArray, errors: AnyArray, between: str = ", ") -> str:
+def _with_errors(
+    values: AnyArray, errors: AnyArray, between: str = ", ", unit: float = 0.0
+) -> str:
     """Numbers with their errors."""
-    return between.join(map(_with_error, np.ravel(values), np.ravel(errors)))
+    pairs = zip(np.ravel(values), np.ravel(errors), strict=True)
+    return between.join(_with_error(*x, unit) for x in pairs)
 
 
 def _of_tensor(result: FitResult) -> list[str]:
@@ -371,7 +377,7 @@ def _of_estimates(result: FitResult) -> list[str]:
     # Arrays of each trial are too many to print.
     own = {x.name for x in result.unknowns.sought if x.own and x.base.ndim}
     lines = [
-        f"  {name} = {_with_errors(*pair)}"
+        f"  {name} = {_with_errors(*pair, unit=1.0)}"
         for name, pair in result.estimates.items()
         if is_single or name not in own
     ]
