@@ -138,6 +138,7 @@ def changed(line, text):
         ([*GOOD, "DATA=2457100.5|15"], 10, "'DATA' is outside of a block"),
         (changed(6, []), 6, "put ENDMETADATA before it"),
         (changed(7, ["DATA=24571OO.5|15"]), 7, "the Julian date must be a number"),
+        (changed(7, ["DATA=57100.5|15"]), 7, "is no Julian date of this age"),
         (changed(7, ["DATA=2457100.5|bright"]), 7, "the magnitude must be a number"),
         (changed(7, ["DATA=2457100.5|inf"]), 7, "the magnitude must be a number"),
         (changed(7, ["DATA=2457100.5|"]), 7, "the magnitude is missing"),

@@ -232,6 +232,17 @@ def test_neighbours_of_a_principal_axis_rotation_have_no_second_frequency():
     assert len(search._neighbours(np.array([[7.0, 3.0]]), model.Mode.long_axis)) == 9
 
 
+def test_a_report_says_where_a_body_is_round_about_the_axis_it_circles(inversion):
+    _, _, found = inversion
+    best = found.aliases[0]
+    assert "nearly round" not in found.report()
+    ratios = np.array([best.estimates.axis_ratios[0], 0.995])
+    estimates = best.estimates._replace(axis_ratios=ratios)
+    round_one = dataclasses.replace(best, estimates=estimates)
+    assert best.tumbler.mode == "long-axis"
+    assert "nearly round" in dataclasses.replace(found, aliases=[round_one]).report()
+
+
 def test_a_planned_curve_tells_the_best_alias_from_a_rejected_one(inversion):
     curves, _, found = inversion
     both = dataclasses.replace(found, aliases=[found.aliases[0], found.rejected[0]])
@@ -259,7 +270,7 @@ def test_candidates_hold_the_pair_of_a_tumbler(inversion):
 def test_mistakes_in_an_inversion_say_what_to_pass():
     far = np.ones((20, 3))
     curve = ph.LightCurve(0.0, np.arange(20.0), np.ones(20), far, far, is_relative=True)
-    with pytest.raises(ValueError, match="`curves` must hold a light curve"):
+    with pytest.raises(ValueError, match="at least 12 points"):
         ph.find_tumblers([], shortest=1.0, longest=2.0)
     with pytest.raises(ValueError, match="in this order"):
         ph.find_tumblers([curve], shortest=2.0, longest=1.0)

@@ -75,9 +75,9 @@ def _parser() -> argparse.ArgumentParser:
         help="inertia from a file with a gyro's record of free motion",
         description="Inertia from a file with a gyro's record of free motion, of one "
         "trial or several; units, clocks and repairs are said.",
-        epilog=f"Exit status: {codes}; 1 for a file that cannot be used, 2 for these "
-        "arguments. `--flights` takes noise and bias from where the body rests; "
-        "without a sigma the noise is taken from the residuals.",
+        epilog=f"Exit status: {codes}; 1 for a file or a value that cannot be used, 2 "
+        "for arguments that cannot be read. `--flights` takes noise and bias from "
+        "where the body rests; without a sigma the noise is taken from the residuals.",
     )
     command.set_defaults(run=_fit)
     _add_options_of_reading(command)

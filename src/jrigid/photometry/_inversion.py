@@ -17,16 +17,20 @@ from jrigid.photometry._alias import (
 )
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._model import Task, independent
-from jrigid.photometry._periodogram import cycles_within
+from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
 from jrigid.photometry._search import Found, search
 
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.
 _FIRST_NOISE = 0.02
-# A tumbler has up to eleven numbers, with one equation between them.
-_LEAST_POINTS = 12
 _HOUR = 3600.0
+# Of the ratio of two axes: the light of such a body hardly changes as it rotates.
+_NEARLY_ROUND = 0.02
+_ROUND = (
+    "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
+    "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
+)
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -148,15 +152,7 @@ def find_tumblers(
     for mode in modes:
         check_option("modes", mode, tuple(MODES))
     whole_number("pairs", pairs)
-    demand(
-        len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
-    )
-    points = sum(len(x.ts) for x in curves)
-    demand(
-        points >= _LEAST_POINTS,
-        f"Argument `curves` must hold at least {_LEAST_POINTS} points, but it holds "
-        f"{points}.",
-    )
+    points = points_of(curves)
     stated = noise is not None
     readings, epoch = readings_of(curves, noise if stated else _FIRST_NOISE)
     lowest, highest = cycles_within(float(readings.span), shortest, longest)
@@ -332,7 +328,17 @@ def _described(rank: int, alias: Alias) -> list[str]:
     lines = [head, periods, pole, f"   {shape}"]
     if mode != "principal-axis":
         lines.append(f"   E/E0 {x.energy_ratio:.4f} +- {error.energy_ratio:.4f}")
+        if _is_round(alias):
+            lines.append(_ROUND)
     return lines
+
+
+def _is_round(alias: Alias) -> bool:
+    """Whether the body looks the same from all sides of the axis that it circles."""
+    # The axes other than the longest, or other than the shortest.
+    which = 1 if alias.tumbler.mode == "long-axis" else 0
+    ratio = alias.estimates.axis_ratios[which]
+    return bool(1 - ratio < max(2 * alias.errors.axis_ratios[which], _NEARLY_ROUND))
 
 
 def in_hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:

@@ -42,6 +42,8 @@ _LEAST_MOTION = 0.02
 _RIDGE = 1e-4
 # Least frequency of the rotation that is tried [cycles within the span].
 _LEAST_CYCLES = 0.5
+# A tumbler has up to eleven numbers, with one equation between them.
+_LEAST_POINTS = 12
 _LANES = 64  # series fitted at once
 _BLOCK = 4096  # candidates in a call, so that a search compiles one program
 
@@ -88,8 +90,8 @@ def period_pairs(
         `find_tumblers` tells them apart by the physics.
 
     Raises:
-        ValueError: Curves without a point, periods out of order, or curves that span
-            less than half of the shortest period.
+        ValueError: Fewer points than a tumbler has numbers, periods out of order, or curves that
+            span less than half of the shortest period.
 
     Source: P. Pravec et al., Icarus 173 (2005) 108, section 3.
 
@@ -103,6 +105,7 @@ def period_pairs(
     >>> print(pairs.explained.round(2).max())
     1.0
     """
+    points_of(curves)
     # Any noise will do: it drops out of the fraction that is explained.
     readings, _ = readings_of(curves, noise=0.01)
     span = float(readings.span)
@@ -110,6 +113,21 @@ def period_pairs(
     pairs, powers = frequency_pairs(readings, lowest, highest, count)
     explained = powers / float(np.sum(readings.values**2))
     return PeriodPairs(span / pairs[:, 0], span / pairs[:, 1], explained)
+
+
+def points_of(curves: Sequence[LightCurve]) -> int:
+    """How many points curves have.
+
+    Raises:
+        ValueError: They are fewer than the numbers of a tumbler.
+    """
+    points = sum(len(x.ts) for x in curves)
+    demand(
+        points >= _LEAST_POINTS,
+        f"Argument `curves` must hold at least {_LEAST_POINTS} points, but it holds "
+        f"{points}.",
+    )
+    return points
 
 
 def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, float]:

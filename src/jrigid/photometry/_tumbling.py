@@ -157,8 +157,8 @@ def omega_from_periods(
     Returns:
         Angular velocity, body components [rad/s], at the largest tilt: the angular
         momentum is in the plane of the circled axis and the middle one. NaN where no
-        motion has these periods, and outside positive definite inertia and positive
-        periods.
+        motion has these periods, where the only one is within rounding of the
+        separatrix, and outside positive definite inertia and positive periods.
 
     Gradients: right to second order, in all arguments.
     Source: the formulas of `free.polhode_period` and `free.mean_precession_rate`,
