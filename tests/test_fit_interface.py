@@ -78,6 +78,19 @@ def test_times_of_a_prediction_may_have_any_shape(found):
     np.testing.assert_allclose(inside, flat, atol=1e-12)
 
 
+def test_masked_values_were_not_seen():
+    values = np.ma.masked_array(np.ones((4, 3)), mask=False)
+    values[1] = np.ma.masked
+    values[2, 0] = np.ma.masked
+    seen = np.isfinite(identify.Rates(np.arange(4.0), values, 0.1).values)
+    np.testing.assert_array_equal(seen, ~values.mask)
+
+
+def test_groups_of_trials_are_whole_numbers(untyped):
+    with pytest.raises(ValueError, match="`groups` must be an integer"):
+        identify.each(jnp.zeros(3), ["first", "second"])
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -30,11 +30,12 @@ Noise = Real[_ArrayLike, "..."] | None
 class Record(Readable):
     """Times, values and noise of one sensor, in one trial or in several.
 
-    NaN stands for "not seen". It may stand in a component of `values`, in a whole row,
-    or in `ts` and its row (padding, which brings trials to one length). Then that
-    number is left out, or the whole sample where its components belong together: in
-    attitudes, in directions and beside a `covariance`. What was not seen weighs
-    nothing, and its `sigma` may be NaN. It costs as much time as any sample.
+    NaN, or an entry that numpy masks, stands for "not seen". It may stand in a
+    component of `values`, in a whole row, or in `ts` and its row (padding, which brings
+    trials to one length). Then that number is left out, or the whole sample where its
+    components belong together: in attitudes, in directions and beside a `covariance`.
+    What was not seen weighs nothing, and its `sigma` may be NaN. It costs as much time
+    as any sample.
 
     Attributes:
         sensor: What showed the values.
@@ -143,6 +144,9 @@ def _times_and_values(
         (ts,) = float_arrays(ts)
         # Of unit length, for sensors whose values are.
         values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
+    if isinstance(values, np.ma.MaskedArray):
+        # JAX would drop the mask and take the numbers below it.
+        values = values.astype(float).filled(np.nan)
     ts, values = float_arrays(ts, values)
     demand(
         ts.ndim in (1, 2)

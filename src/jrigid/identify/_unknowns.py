@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, PyTree
 
-from jrigid._checks import demand, is_concrete
+from jrigid._checks import demand, is_concrete, whole_number
 from jrigid._numerics import or_one, product, without_gradient
 from jrigid._types import AnyArray, Readable, Real
 from jrigid.identify._host import cholesky
@@ -89,8 +89,10 @@ def each(array: PyTree, groups: Sequence[int] | None = None) -> PyTree:
     >>> sessions = [-1, -1, -1, 0, 0, 0, 1, 1]  # of eight trials
     >>> free = lambda body, gyro: jr.identify.each(gyro.misalignment, sessions)
     """
-    groups = None if groups is None else tuple(int(x) for x in groups)
-    change = {"own": True} if groups is None else {"groups": groups}
+    change: dict[str, Any] = {"own": True}
+    if groups is not None:
+        numbers = tuple(whole_number("groups", x, least=-1) for x in groups)
+        change = {"groups": numbers}
     return jtu.tree_map(lambda x: dataclasses.replace(x, **change), array)
 
 
