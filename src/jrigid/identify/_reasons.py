@@ -30,7 +30,7 @@ _FEWEST = 16  # samples whose spectrum says something
 
 
 def reason(result: FitResult) -> str:
-    """The sentences, or an empty text where there is nothing to say; of a single fit."""
+    """The sentences about a single fit, or an empty text without any."""
     sentences = [_reason(result)]
     if result.numbers.dtype == np.float32 and result.status == Status.MISFIT:
         sentences.append(

@@ -3,11 +3,12 @@
 A body reflects sunlight. Its shape and its scattering law give its brightness for any
 directions of the Sun and of the observer; the motion of the body turns these directions
 in body axes. All functions are pure, and `jit`, `vmap` and derivatives work: of any
-order, but for an ellipsoid at a phase angle of 0 of first order. Vectors to the Sun and to the observer start at the body. They are in space axes
-where a state is given, and in body axes where a shape alone is. Bodies are convex:
-nothing here casts a shadow. `find_tumblers` goes the other way: it finds the tumblers
-that explain light curves. `find_spin` finds the pole, the period and the convex shape of
-a body that rotates steadily.
+order, but for an ellipsoid at a phase angle of 0 of first order. Vectors to the Sun and
+to the observer start at the body. They are in space axes where a state is given, and in
+body axes where a shape alone is. Bodies are convex: nothing here casts a shadow.
+`find_tumblers` goes the other way: it finds the tumblers that explain light curves.
+`find_spin` finds the pole, the period and the convex shape of a body that rotates
+steadily.
 """
 
 from jrigid.photometry._alcdef import read_alcdef as read_alcdef

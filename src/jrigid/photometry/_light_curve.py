@@ -38,8 +38,9 @@ def brightness(
         for a direction that is 0 or not finite.
 
     Gradients: exact, of any order but at a phase angle of 0: the second derivatives of
-    an ellipsoid have no bound there, and finite ones are returned. A facet that turns dark or out of sight has a slope from one side;
-    half the sum of both is what a central difference sees.
+    an ellipsoid have no bound there, and finite ones are returned. A facet that turns
+    dark or out of sight has a slope from one side; half the sum of both is what a
+    central difference sees.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ball = jr.photometry.Ellipsoid(jnp.ones(3))
