@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 _BISECTIONS = {8: 60, 4: 31}
 # Of its value at the ends of a step, what a condition that jumps has at least where it
 # changes its sign.
-_JUMP = 0.1
+_JUMP = 0.5
 
 
 class Conditions(NamedTuple):

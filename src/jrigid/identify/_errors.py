@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid._checks import RESULTS, is_good
+from jrigid._numerics import or_one
 from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
@@ -152,7 +153,7 @@ def _decomposed(local: np.ndarray) -> _States:
     """
     # Rates, turns and own numbers have different units, which would decide what counts
     # as small beside the largest singular value.
-    scale = quality.or_one(np.linalg.norm(local, axis=1))
+    scale = or_one(np.linalg.norm(local, axis=1))
     basis, values, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
     shown = values > SHOWN * values[:, :1]
     eps = np.finfo(local.dtype).eps

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from jrigid._numerics import or_one
 from jrigid.identify._colour import loudest_band, stands_out
 from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import Linearised
@@ -128,11 +129,6 @@ def columns_of_prior(fit: Fit) -> np.ndarray:
     of_state = np.zeros((*residual.shape[:-1], local), residual.dtype)
     columns = [residual, of_state, minimum.rows.of_border[:, count:]]
     return root * np.concatenate(columns, axis=-1)
-
-
-def or_one(size: np.ndarray) -> np.ndarray:
-    """A size to divide by: 1 where it is not positive."""
-    return np.where(size > 0, size, 1.0)
 
 
 def of_samples(problem: Problem, of_records: np.ndarray) -> np.ndarray:

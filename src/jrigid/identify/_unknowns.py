@@ -143,14 +143,14 @@ class AbstractSought(Readable):
         """The array and its standard errors."""
         slopes = jax.jacfwd(self.value)(x)
         # Linear propagation of errors.
-        square = jnp.einsum("...n,nm,...m->...", slopes, covariance, slopes)
+        square = product("...n,nm,...m->...", slopes, covariance, slopes)
         return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
 
     def log_volume(self, x: Array) -> Array:
         """Logarithm of the volume of arrays over that of the numbers they stand for."""
         # A tensor has more elements than numbers, hence the root of a Gram determinant.
         slopes = jax.jacfwd(self.value)(x).reshape(self.base.size, self.size)
-        return 0.5 * jnp.linalg.slogdet(slopes.T @ slopes)[1]
+        return 0.5 * jnp.linalg.slogdet(product("in,im->nm", slopes, slopes))[1]
 
     def prior_rows(self, x: Array) -> Array:
         """Residuals of prior knowledge of the array, none without any."""
