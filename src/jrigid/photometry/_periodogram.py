@@ -135,7 +135,7 @@ def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, 
     demand(
         bool(0 < shortest < longest),
         "Arguments `shortest` and `longest` must be positive periods in this order, but "
-        f"they are {shortest} and {longest}.",
+        f"they are {shortest:g} s and {longest:g} s.",
     )
     demand(
         bool(span > _LEAST_CYCLES * shortest),
