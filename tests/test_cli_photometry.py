@@ -158,7 +158,7 @@ def test_the_best_tumbler_is_drawn(damit, tmp_path, monkeypatch):
         (["few.txt", "--report"], "Argument `path` must hold at least 12 points"),
         (
             ["curves.txt", "--longest", "3"],
-            "Arguments `--shortest` and `--longest` must be positive periods in this order",
+            "Arguments `--shortest` and `--longest` must be positive periods in this",
         ),
         (
             ["curves.txt", "--report", "--pairs", "0"],
