@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jrigid as jr
 from jrigid import identify
+from jrigid.identify import _starts as starts
 from jrigid.identify._flow import free_flow
 from jrigid.identify._inputs import sizes_of
 from jrigid.identify._layout import direct_readings_of
@@ -366,6 +367,13 @@ def test_few_windows_have_no_errors(wheel_samples):
         assert np.all(np.isnan(found.covariance))
     found = identify.gyrostat(TS, *wheel_samples, windows=5)
     assert np.all(np.diagonal(found.covariance) > 0)
+
+
+def test_equations_without_a_known_torque_keep_the_trace(rng):
+    """They hold for any multiple of a tensor, and so for none at all."""
+    rows = np.pad(rng.normal(size=(30, 6)), ((0, 0), (0, 1)))
+    tensors = starts._least_squares(rows, None, np.float64(3.3))
+    np.testing.assert_allclose([np.trace(x) for x in tensors], 3.3, rtol=1e-12)
 
 
 @pytest.mark.parametrize("missing", [[], [400], [0, 1, 2], [79, 80, 81]])

@@ -546,6 +546,9 @@ def _least_squares(
     right = rows[:, 6]
     rows = rows[:, :6]
     sphere = np.asarray([1.0, 1, 1, 0, 0, 0], rows.dtype) / 3
+    if trace is None and not np.any(right):
+        # Without a known torque the equations hold for any multiple of a tensor.
+        trace = like
     if trace is None:
         # The sphere that does best, or one like the system's own.
         basis = np.eye(6, dtype=rows.dtype)
