@@ -458,7 +458,9 @@ class FitResult(eqx.Module):
     def estimates(self) -> dict[str, tuple[Array, Array]]:
         """Value and error of each array that `free` picked, by name; of a single fit.
 
-        An array that is sought anew in each trial has an axis of trials in front.
+        An array that is sought anew in each trial has an axis of trials in front. One
+        that may not be negative and ended at zero has an infinite error: the record
+        only bounds it from above.
         """
         estimates = {}
         for x in self.unknowns.sought:

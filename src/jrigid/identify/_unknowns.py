@@ -32,6 +32,8 @@ from jrigid.systems import RigidBody
 from jrigid.torques import AbstractTorque, Sum, UniformGravity
 
 _LEAST = 1e-3  # smallest initial value of a positive number, in its unit
+# A number of a positive array below which the array is zero: exp(-25) of its unit.
+_ZERO = -25.0
 
 
 # This is not a pytree, so that `tree_map` takes it for a leaf in `prior` and `each`.
@@ -188,6 +190,13 @@ class _Positive(AbstractSought):
         # In the linear part an array is judged by its new size. In the exponential part
         # a number is the logarithm of its array.
         return jnp.maximum(jax.nn.softplus(x), 1.0)
+
+    def with_errors(self, x: Array, covariance: Array) -> tuple[Array, Array]:
+        values, errors = super().with_errors(x, covariance)
+        # At zero the slope, and with it the propagated error, is zero. The record only
+        # bounds such an array from above.
+        is_zero = (x < _ZERO).reshape(self.base.shape)
+        return values, jnp.where(is_zero, jnp.inf, errors)
 
 
 class _Definite(AbstractSought):
