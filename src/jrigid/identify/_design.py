@@ -508,7 +508,8 @@ def residuals(
     Args:
         system: The body.
         state: Its state at `t0`, of one trial, or with an axis of trials in front.
-        observations: As for `fit`.
+        observations: As for `fit`. Their sensors predict as they are given: put those
+            that a fit found, `result.fitted()[1:]`, into its records.
         t0: Time of the state [s], or of that of each trial. For the state of a fit it
             is `result.t0`. Under a torque it must not be later than the first sample.
         adjoint: Passed to `jrigid.simulate`, which computes a motion under a torque.

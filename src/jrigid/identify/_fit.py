@@ -108,7 +108,8 @@ def fit(
             sensors that picks arrays of theirs,
             `lambda body, gyro: (body.torque.coefficient, gyro.bias)`. Of those,
             `prior(array, sigma)` is known beforehand, and `each(array)` is sought anew
-            in each trial. Drags, and what else cannot be negative, are kept positive.
+            in each trial, `each(array, groups)` in each group of trials. Drags, and
+            what else cannot be negative, are kept positive.
         scale: What sets the scale of the tensor. "trace": nothing, it keeps the trace
             of the system's tensor; "known": a torque or a momentum whose size is known;
             "rotor": the known momentum of a `torques.Rotor`.
@@ -122,13 +123,15 @@ def fit(
             enough.
         unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
             torque, for all body axes or for each (its spectral density is the level
-            squared); a `GaussMarkov`, which has a correlation time; or "estimate".
-            Then the likelihood selects one of white torques and those with a
+            squared); a `GaussMarkov`, which has a correlation time; or "estimate". A
+            level that is given asks for a noise that is stated. With "estimate"
+            the likelihood selects one of white torques and those with a
             correlation time, with levels and times for all axes or for each, and with
             levels in proportion to the spin of a trial or of its own.
         loss: "squares" or "robust". A robust fit begins with Cauchy's loss. Then
-            samples beyond four standard deviations are left out, and trials with more
-            than a quarter of such samples altogether. The rest is fitted by squares.
+            samples are left out whose whitened square exceeds its degrees of freedom
+            by 16, and trials with more than a quarter of such samples altogether. The
+            rest is fitted by squares.
         absolute_sigma: False: the stated noise is relative, and its level is that of
             the residuals.
         motion: `(system, state, ts, t0) -> State` in place of the exact flow or
@@ -148,7 +151,7 @@ def fit(
 
     Raises:
         ValueError: A request that no record could answer.
-        RuntimeError: A failed fit.
+        RuntimeError: A failed fit, or bad values of a record or a body.
 
     Gradients: none to be relied on; `residuals` and `Plan.bound` have theirs.
     Source: H. G. Bock, multiple shooting (1983); J. J. More, Levenberg-Marquardt
@@ -216,6 +219,7 @@ def fit_each(
     Raises:
         ValueError: A request that no record could answer, or records of different
             kinds.
+        RuntimeError: With `throw=True`, a failed fit or bad values.
 
     Gradients: none.
 

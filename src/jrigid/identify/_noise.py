@@ -29,7 +29,9 @@ def coloured_covariance(
     """Return the covariance of an unweighted fit whose noise has a known covariance.
 
     Args:
-        jacobian: Derivatives of the residuals, as fitted.
+        jacobian: Derivatives of the residuals, as fitted, one row for each number: of
+            `jacobian, _ = result.linearization()` it is
+            `jacobian.reshape(-1, jacobian.shape[-1])`.
         colour: Function that multiplies a vector of rows by `B^T`. The noise is `B`
             times independent numbers of unit variance: its covariance is `B B^T`.
 

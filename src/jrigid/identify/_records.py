@@ -203,6 +203,8 @@ def _repeated(x: Array, shape: tuple[int, ...]) -> Array:
 def Rates(ts: Times, values: Values, sigma: Noise = None, **noise: Any) -> Record:
     """The record of a perfect `Gyro`: angular velocities along its axes [rad/s].
 
+    Times are in seconds and `sigma` is in rad/s, as for `Record`.
+
     >>> import jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> print(jr.identify.Rates(record.times, record.omegas, record.sigma).values.shape)
@@ -234,6 +236,9 @@ def Directions(
     **noise: Any,
 ) -> Record:
     """The record of a `DirectionSensor`: unit vectors, noise in radians across them.
+
+    With `frame="body"` the values are body components of `of`, a vector in space axes;
+    with `frame="space"` space components of `of`, a vector in body axes.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> star = jnp.array([1.0, 0.0, 0.0])

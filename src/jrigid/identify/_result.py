@@ -91,7 +91,7 @@ class Observations(NamedTuple):
     Attributes:
         times: [s]
         values: What was read; NaN where nothing was.
-        kept: Whether a robust fit kept the sample.
+        kept: Whether the sample took part in the fit.
         residuals: Predicted less observed over the noise; NaN where there is none. A
             noise that was not stated is that of the residuals.
     """
@@ -106,8 +106,8 @@ class FitResult(eqx.Module):
     """Inertia, state and what else was sought, with errors.
 
     `fit_each` returns one with an axis of fits in front. `print` shows it in words.
-    Errors are standard errors. If no noise was stated, or it does not explain the
-    residuals, their level is that of the residuals.
+    Errors are standard errors. If no noise was stated, or the residuals exceed it,
+    their level is that of the residuals.
 
     Attributes:
         status: A `jrigid.identify.Status`.
@@ -214,7 +214,7 @@ class FitResult(eqx.Module):
 
     @property
     def rejected_trials(self) -> Bool[Array, "*fits trials"]:
-        """Trials that a robust fit gave up."""
+        """Trials that were left out: by a robust fit, or as trials of another body."""
         return jnp.any(self.problem.samples.seen, axis=-1) & ~jnp.any(
             self.kept, axis=-1
         )

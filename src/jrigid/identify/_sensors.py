@@ -66,7 +66,8 @@ class AbstractSensor(Readable):
 
     A subclass defines `predict`, and other methods and class variables where their
     defaults do not hold. `fit(..., free=...)` picks arrays of sensors as it picks those
-    of the system.
+    of the system. The field of such an array states its natural unit, as powers of the
+    rms rate [rad/s] and of the rms value: `eqx.field(metadata={"unit": (1, 0)})`.
 
     Attributes:
         width: Length of a value; None for any.

@@ -260,6 +260,7 @@ def weak_form(
 
     Raises:
         ValueError: Fewer than four samples.
+        RuntimeError: Times that do not increase, or fewer than four finite samples.
 
     Gradients: those of the singular vector, where the last two singular values differ.
     Source: the weak form of system identification, D. A. Messenger, D. M. Bortz,
@@ -307,6 +308,7 @@ def momentum(
 
     Raises:
         ValueError: Fewer than four samples.
+        RuntimeError: Times that do not increase, or fewer than four finite samples.
 
     Gradients: those of the singular vector, where the last two singular values differ.
 
@@ -368,6 +370,7 @@ def gyrostat(
 
     Raises:
         ValueError: Fewer than four samples.
+        RuntimeError: Times that do not increase, or fewer than four finite samples.
 
     Gradients: those of the least-squares solution, where it is unique.
 

@@ -186,7 +186,8 @@ def read(
     A folder or a zip may hold a file for each sensor. Units are those that `unit` says,
     else those that the file says (headers, or the format), else recognised where only
     one makes sense: times by the interval, accelerations by gravity, rates by the range
-    of gyros or by how fast gravity turns in the body. All of it is in `notes`. The
+    of gyros or by how fast gravity turns in the body. Accelerations and magnetic fields
+    whose unit nobody says are left out. All of it is in `notes`. The
     clock is the gyro's, put right by `repair`; sensors with times of their own are
     brought to it by linear interpolation, which is said too.
 
