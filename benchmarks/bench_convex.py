@@ -170,7 +170,7 @@ def main(package, repeats, write):
         + common.table(header, table)
         + f"\n\nRange of periods: {SHORTEST} to {LONGEST} h, in which period_scan "
         f"takes {periods} trial periods with 6 poles and 50 steps, and `find_spin` 17 "
-        "with 12 poles. Neighbouring minima of chi-square are "
+        "with 24 poles. Neighbouring minima of chi-square are "
         f"{1e6 * separation:.0f}e-6 h apart. convexinv then takes 300 steps from each "
         f"of 6 poles. Times: {repeats} runs in turns, of `find_spin` without the first "
         f"one, which compiles and took {first:.0f} CPU s."

@@ -247,7 +247,8 @@ def _without_own(own: int, products: Array) -> tuple[Array, Array]:
     rest = jnp.concatenate([jnp.arange(1), jnp.arange(1 + own, products.shape[0])])
     across = products[inside][:, rest]
     solved, log_determinant = solve_positive(products[inside, inside], across)
-    return products[rest][:, rest] - across.T @ solved, log_determinant
+    explained = product("ki,kj->ij", across, solved)
+    return products[rest][:, rest] - explained, log_determinant
 
 
 def _at_best_numbers(products: Array) -> tuple[Array, Array]:

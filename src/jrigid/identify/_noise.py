@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jrigid._checks import demand
+from jrigid._numerics import product
 from jrigid._types import RandomKey
 
 _AT_ONCE = 50  # redrawn records that are held in memory
@@ -45,7 +46,7 @@ def coloured_covariance(
     """
     # With A the influence, B^T times a row of A is a row of A B.
     root = jax.vmap(colour)(_influence(jacobian))
-    return root @ root.T
+    return product("ik,jk->ij", root, root)
 
 
 def block_bootstrap(
@@ -99,6 +100,6 @@ def block_bootstrap(
         # The upper bound is exclusive: the last block ends at the last residual.
         starts = jax.random.randint(key, (blocks,), 0, times - block + 1)
         rows = (starts[:, None] + jnp.arange(block)[None, :]).reshape(-1)[:times]
-        return influence @ centred[rows].reshape(-1)
+        return product("in,n->i", influence, centred[rows].reshape(-1))
 
     return jax.lax.map(shift, jax.random.split(key, samples), batch_size=_AT_ONCE)

@@ -39,7 +39,7 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     MISFIT = (
         "The fit follows the record, but its residuals are not the stated noise: a "
         "torque that the model has not, or a sensor's error (see `unmodelled`, "
-        "`free`), or the noise is not as stated. The errors are those of the residuals."
+        "`free`), or the noise is not as stated. Errors are enlarged by larger residuals."
     )
     WRONG_BASIN = (
         "The fit does not describe the record: it ended in a wrong minimum, or the "

@@ -647,9 +647,11 @@ def _sought(
     base = arrays.values[pick.index].astype(dtype)
     is_of_system = path[0].idx == 0
     if is_of_system:
-        # An array of zeros has no size to be measured by.
-        unit = or_one(xp.max(xp.abs(base)).astype(dtype))
-    unit = xp.broadcast_to(xp.asarray(unit, dtype), base.shape).astype(dtype)
+        unit = xp.max(xp.abs(base))
+    # An array of zeros has no size to be measured by, nor has one of a sensor that
+    # states no unit.
+    unit = or_one(xp.asarray(unit, dtype))
+    unit = xp.broadcast_to(unit, base.shape).astype(dtype)
     kind = _Real
     if _field_metadata(arrays.parts, path).get("positive"):
         kind = _Definite if base.shape == (3, 3) else _Positive

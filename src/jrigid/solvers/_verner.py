@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jrigid._numerics import product
 from jrigid._types import TimeLike
 from jrigid.solvers._dense import Dense
 
@@ -173,10 +174,14 @@ class _Interpolation(Dense):
         polynomials = [jnp.ones_like(x), x]
         for _ in range(6):
             polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
-        weights = jnp.asarray(_DENSE, x.dtype) @ jnp.stack(polynomials)
+        coefficients = jnp.asarray(_DENSE, x.dtype)
+        weights = product("sp,p->s", coefficients, jnp.stack(polynomials))
 
         def moved(y0: Array, k: Array) -> Array:
-            return y0 + jnp.tensordot(weights.astype(y0.dtype), k[_DENSE_STAGES], 1)
+            of_stages = product(
+                "s,s...->...", weights.astype(y0.dtype), k[_DENSE_STAGES]
+            )
+            return y0 + of_stages
 
         return jtu.tree_map(moved, self.y0, self.k)
 
