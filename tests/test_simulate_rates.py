@@ -18,6 +18,22 @@ SINGLE = UPRIGHT.astype(np.float32)
 BODY = jr.MassProperties(2.0, np.zeros(3), SYMMETRIC)
 
 
+def _at(omega):
+    return jr.State(UPRIGHT, omega)
+
+
+def test_reverse_jacobian_in_the_initial_state():
+    """Of one motion, whose lanes differ in their cotangents alone."""
+    exact = jax.jacfwd(lambda w: jr.free_rotation(MOMENTS, _at(w), 5.0).attitude)
+
+    def end(omega):
+        return jr.simulate(jr.RigidBody(MOMENTS), _at(omega), 5.0).final_state.attitude
+
+    np.testing.assert_allclose(jax.jacrev(end)(OMEGA), exact(OMEGA), atol=1e-7)
+    many = quick_jit(jax.vmap(jax.jacrev(end)))(np.stack([OMEGA, 0.5 * OMEGA]))
+    np.testing.assert_allclose(many[1], exact(0.5 * OMEGA), atol=1e-7)
+
+
 # Orbits
 # --------------------------------------------------------------------------------------
 

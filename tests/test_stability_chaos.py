@@ -697,3 +697,22 @@ def test_steps_longer_than_a_declared_pulse_are_refused(kick, accurate):
     body = jr.RigidBody(MOMENTS, kick)
     found = st.megno(body, state(TILTED, SPINNING), 4.0, steps=20, throw=False)
     assert (found.result == jr.RESULTS.successful) == accurate
+
+
+def test_sections_refuse_steps_longer_than_a_pulse_on_the_way():
+    """The motion lasts for many steps, of which one is its `step`."""
+    found = [
+        st.poincare_section(
+            jr.RigidBody(MOMENTS, kick),
+            state(TILTED, SPINNING),
+            lambda _, s: s.omega[0],
+            3,
+            0.1,
+            steps=400,
+            throw=False,
+        )
+        for kick in (_Kick(3.02, 3.05), _Kick(1e4, 1e4 + 0.01))
+    ]
+    assert found[0].result == jr.RESULTS.inaccurate
+    assert found[1].result == jr.RESULTS.successful
+    assert float(found[1].ts[-1]) > 3.1

@@ -341,10 +341,12 @@ def pull_in_lanes(
         rest: Motion, varied: Motion, changes: Cotangents, tried: Array
     ) -> tuple[Motion, Array]:
         def over(function: Callable[..., Any], fixed: Motion, *arguments: Any) -> Any:
-            def of_lane(fixed: Motion, *arguments: Any) -> Any:
+            def of_lane(_: Array, fixed: Motion, *arguments: Any) -> Any:
                 return function(eqx.combine(fixed, shared), *arguments)
 
-            return lanes_last(of_lane, fixed, *arguments)
+            # Where motions differ in their cotangents alone, `fixed` and the arguments
+            # may have no arrays, and `tried` tells how many lanes there are.
+            return lanes_last(of_lane, tried, fixed, *arguments)
 
         # The lanes of a block run together until the longest motion has ended.
         replay = _Replay(engine, over, rest, varied, changes, jnp.max(tried))

@@ -90,11 +90,14 @@ class Problem(eqx.Module):
         return known + (unknowns.hold is not None) + self.held
 
     def priors(self, trials: int) -> int:
-        """How many residuals of prior knowledge there are, of so many trials."""
+        """How many residuals of prior knowledge there are, of so many trials.
+
+        A direction that is held is none: it restricts the numbers.
+        """
         known = [x for x in self.unknowns.sought if x.sigma is not None]
         own = sum(x.base.size for x in known if x.own)
         shared = sum(x.base.size for x in known if not x.own)
-        return trials * own + shared + (self.unknowns.hold is not None)
+        return trials * own + shared
 
     @property
     def held(self) -> int:

@@ -146,7 +146,7 @@ def _times_and_values(
         values = jnp.ones((*ts.shape, width or 0), ts.dtype) / (width or 1) ** 0.5
     if isinstance(values, np.ma.MaskedArray):
         # JAX would drop the mask and take the numbers below it.
-        values = values.astype(float).filled(np.nan)
+        values = np.ma.filled(values.astype(float), np.nan)
     ts, values = float_arrays(ts, values)
     demand(
         ts.ndim in (1, 2)

@@ -118,7 +118,7 @@ def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     y, error = in_blocks(end_of, path, path.start)
     state = path.state(y)
     alignment = _alignment(path.motion.system.inertia, state.omega)
-    alignment, state = verdict(findings, path, error, (alignment, state))
+    alignment, state = verdict(findings, path, path.end, error, (alignment, state))
     # From here on `findings` includes the accuracy, which `verdict` has noted.
     settled = jnp.abs(alignment) > math.cos(math.radians(_SETTLED))
     side = SIDES.where(alignment > 0, SIDES.along, SIDES.against)

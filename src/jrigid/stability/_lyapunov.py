@@ -232,7 +232,7 @@ def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators
     ts = path.step * schedule.steps * counts
     # MEGNO is the mean of the indicator over the intervals so far.
     values = (ts, logarithms / ts[:, None], indicator / counts, path.state(y))
-    ts, exponents, means, state = verdict(findings, path, error, values)
+    ts, exponents, means, state = verdict(findings, path, path.end, error, values)
     mean = means[-1]
     order = ORDER.where(mean > _REGULAR, ORDER.undecided, ORDER.regular)
     order = ORDER.where(mean > _CHAOTIC, ORDER.chaotic, order)

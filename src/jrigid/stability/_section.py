@@ -242,7 +242,9 @@ def _section(
     last, each = jax.lax.scan(
         search.next_crossing, search.start(findings.ok), None, length=crossings
     )
-    ts, states = verdict(findings, search.path, last.error, (each.t, each.state))
+    ts, states = verdict(
+        findings, search.path, last.t, last.error, (each.t, each.state)
+    )
     valid = each.valid & findings.ok
     ts, states = jax.vmap(nan_where)(~valid, (ts, states))
     error = jnp.max(jnp.where(valid, each.distance, 0))

@@ -92,6 +92,11 @@ class Walk(NamedTuple):
     scales: Array
 
     @property
+    def end(self) -> Array:
+        """The time after the duration of the motion."""
+        return self.motion.t0 + self.motion.duration
+
+    @property
     def start(self) -> Array:
         """The state at the start."""
         return ravel_pytree(self.motion.state0)[0]
@@ -209,26 +214,35 @@ def walk(motion: Motion, steps: int, ok: Array) -> Walk:
     return Walk(motion, duration / steps, scales)
 
 
-def _may_miss_a_pulse(path: Walk) -> Array:
-    """Whether two jumps that the torque declares fit into one step."""
+def _may_miss_a_pulse(path: Walk, end: Array) -> Array:
+    """Whether two jumps that the torque declares up to a time fit into one step."""
     jumps = path.motion.system.jumps.astype(path.step.dtype)
     if jumps.size < 2:
         return jnp.asarray(False)
     t0 = path.motion.t0
-    inside = (jumps >= t0) & (jumps <= t0 + path.motion.duration)
+    inside = (jumps >= t0) & (jumps <= end)
     # What is outside is moved to where it makes no short gap, rounding included.
     ordered = jnp.sort(jnp.where(inside, jumps, t0 - 2 * path.step))
     gaps = jnp.diff(ordered)
     return jnp.any((gaps > 0) & (gaps < path.step))
 
 
-def verdict(findings: Findings, path: Walk, error: Array, values: Any) -> Any:
+def verdict(
+    findings: Findings, path: Walk, end: Array, error: Array, values: Any
+) -> Any:
     """The values, or NaN where something is wrong.
 
     It notes two more findings: a motion that is inaccurate, and one that is not finite.
+
+    Args:
+        findings: What is wrong with the arguments.
+        path: The motion.
+        end: Time at which it ended.
+        error: Largest local error of a step.
+        values: What was computed.
     """
     accurate = error <= _LARGEST_ERROR[error.dtype.itemsize]
-    findings.require(accurate & ~_may_miss_a_pulse(path), RESULTS.inaccurate)
+    findings.require(accurate & ~_may_miss_a_pulse(path, end), RESULTS.inaccurate)
     findings.require(all_finite(values), RESULTS.nonfinite_state)
     return nan_where(~findings.ok, values)
 
