@@ -284,7 +284,7 @@ def _back_to_start(motion: Invariants, half: _Half) -> Array:
     z = -be * half3 * s * cp
     norm = jnp.sqrt(x * x + y * y + z * z)
     x, y, z = materialize(x / norm, y / norm, z / norm)
-    # Each half-period of the momentum is a half turn about the second axis.
+    # Each half-period of the momentum is a half turn about the third axis.
     quarters = half.half_periods - 4 * jnp.floor(
         half.half_periods / 4
     )  # of 720 degrees
