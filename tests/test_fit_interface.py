@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import importlib
 import inspect
 import os
 import re
@@ -583,7 +584,10 @@ def is_doc(node):
 
 def test_no_reason_or_status_names_an_argument_that_has_an_option():
     """What the report of a fit may say, from the source: it may be reworded there."""
-    sources = [inspect.getsource(sys.modules[f"jrigid.identify.{x}"]) for x in REPORTS]
+    sources = [
+        inspect.getsource(importlib.import_module(f"jrigid.identify.{x}"))
+        for x in REPORTS
+    ]
     nodes = [node for text in sources for node in ast.walk(ast.parse(text))]
     docs = {x.body[0].value for x in nodes if getattr(x, "body", None) and is_doc(x)}
     texts = {x.value for x in nodes if isinstance(x, ast.Constant) and x not in docs}

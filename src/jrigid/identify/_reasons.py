@@ -44,8 +44,8 @@ def _reason(result: FitResult) -> str:
     """What is wrong first of all."""
     if result.status == Status.BAD_INPUT:
         return (
-            f"{RESULTS[result.diagnostics.input_result]} With `throw=True` an error "
-            "says which argument it is."
+            f"{RESULTS[result.diagnostics.input_result]} The error that a fit raises by "
+            "default says which argument it is."
         )
     if not np.any(np.isfinite(np.asarray(result.diagnostics.history))):
         return (

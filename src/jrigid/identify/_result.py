@@ -616,7 +616,7 @@ def sigma_points(
     # A number that is not determined would leave the others no digits: it gets a unit
     # of its own.
     unit = xp.maximum(errors_of(covariance) / _FAR, 1.0)
-    values, axes = xp.linalg.eigh(covariance / (unit[:, None] * unit))
+    values, axes = xp.linalg.eigh(covariance / (unit[:, None] * unit[None]))
     moves = unit[:, None] * axes * xp.sqrt(xp.maximum(values, 0.0) * size)[None]
     lengths = xp.sqrt(xp.sum(moves * moves, axis=0))
     # What is determined worse is continued as a straight line.
