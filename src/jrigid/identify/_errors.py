@@ -444,15 +444,15 @@ def _at_least_probed(
     """The covariance with errors as large as probes show them.
 
     In a valley that bends, a ratio may rest at the estimate and move far beyond it. Its
-    derivative, and the covariance, know nothing of that. A probe is a body `growth`
-    away in chi-square, so that it may be off by no more than the root of it in errors.
+    derivative, and the covariance, know nothing of that. A probe is a body
+    some standard errors away, so that no moment or ratio may be off by more of its own.
     """
     estimate = _of_moments(moments)
     errors = errors_of(spread)
     factors = np.ones_like(errors)
     for probe in probes:
         move = np.abs(_of_moments(np.linalg.eigvalsh(probe.tensor)) - estimate)
-        error = move / np.sqrt(max(probe.growth, quality.LEAST_GROWTH))
+        error = move / probe.distance
         # What is known exactly has no error, and no probe moves it beyond rounding.
         ratio = error / np.where(errors > 0, errors, np.inf)
         factors = np.fmax(factors, ratio)

@@ -21,7 +21,6 @@ from jrigid.identify._problem import Problem
 from jrigid.identify._smoother import Rows
 
 GATE = 5.0  # standard deviations of chi-square
-LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
 # Whitened square of a sample, above its degrees of freedom, that is no noise.
 _REJECTED = 16.0
@@ -35,12 +34,12 @@ class Probe(NamedTuple):
 
     Attributes:
         tensor: Of that body.
-        growth: Of chi-square, in units of the noise: the square of standard errors.
+        distance: From the fit, in standard errors: the root of the growth of chi-square.
         error: Of the direction held, in natural units, as this probe shows it.
     """
 
     tensor: np.ndarray
-    growth: float
+    distance: float
     error: float
 
 

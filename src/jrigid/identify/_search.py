@@ -32,7 +32,6 @@ from jrigid.identify._minimise import (
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import (
     FOLLOWED,
-    LEAST_GROWTH,
     Fit,
     Probe,
     is_at_boundary,
@@ -74,6 +73,7 @@ _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other st
 _PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
+_LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _APART = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
@@ -502,10 +502,11 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         held = dataclasses.replace(problem, unknowns=problem.unknowns.holding(line))
         end = yield from attempt(case, held, numbers, slow=case.long)
         growth = (weakest(problem, end).square - at.square) / at.noise
-        error = _error_by_probe(problem, best, end, at.direction, step, growth)
+        distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
+        error = _error_by_probe(problem, best, end, at.direction, step, distance)
         # Beyond six standard errors a probe says nothing of those that are stated.
         if growth < _SURE:
-            probes.append(Probe(end.minimum.tensor, growth, error))
+            probes.append(Probe(end.minimum.tensor, distance, error))
         largest = max((x.error for x in probes), default=0.0)
         if largest > _BENT * at.error:
             return dataclasses.replace(best, ambiguous=True, probes=tuple(probes))
@@ -530,7 +531,7 @@ def _error_by_probe(
     end: Fit,
     direction: np.ndarray,
     step: float,
-    growth: float,
+    distance: float,
 ) -> float:
     """In natural units, by how far the tensor moved: numbers are logarithms."""
     tensor = best.minimum.tensor
@@ -542,7 +543,7 @@ def _error_by_probe(
     if square > 0:
         step = float(np.sum((end.minimum.tensor - tensor) * slope) / square)
     # Chi-square grows as the square of a move over its error.
-    return abs(step) / np.sqrt(max(growth, LEAST_GROWTH))
+    return abs(step) / distance
 
 
 @np.errstate(all="ignore")  # attempts may run out of the range of numbers

@@ -90,8 +90,8 @@ def period_pairs(
         `find_tumblers` tells them apart by the physics.
 
     Raises:
-        ValueError: Fewer points than a tumbler has numbers, periods out of order, or curves that
-            span less than half of the shortest period.
+        ValueError: Fewer points than a tumbler has numbers, periods out of order, or
+            curves that span less than half of the shortest period.
 
     Source: P. Pravec et al., Icarus 173 (2005) 108, section 3.
 
