@@ -83,9 +83,17 @@ def test_names_tell_session_and_axis(worlds_found):
     assert names[8] == "gyro.misalignment[1][0]"
 
 
-@pytest.mark.parametrize("groups", [[0, 1], [0] * 8 + [2], [-1] * 9, [0] * 8 + [-2]])
-def test_groups_that_are_none_are_an_error(groups, rng):
-    with pytest.raises(ValueError, match="Argument `groups` of `each`"):
+@pytest.mark.parametrize(
+    ("groups", "told"),
+    [
+        ([0, 1], "Argument `groups` of `each` must number the groups of 9 trials"),
+        ([0] * 8 + [2], "Argument `groups` of `each` must number the groups"),
+        ([-1] * 9, "Argument `groups` of `each` must number the groups"),
+        ([0] * 8 + [-2], "Argument `groups` must be an integer and at least -1"),
+    ],
+)
+def test_groups_that_are_none_are_an_error(groups, told, rng):
+    with pytest.raises(ValueError, match=told):
         identify.fit(
             BLIND,
             trials(rng, np.zeros((2, 3))),
