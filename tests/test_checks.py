@@ -45,6 +45,11 @@ def work(inertia, x, throw=True):
 XS = jnp.array([1.0, -2.0, -3.0])
 
 
+def test_complex_numbers_are_an_error_where_real_ones_are_due():
+    with pytest.raises(ValueError, match="must be real numbers, but one is complex"):
+        _checks.float_arrays(MOMENTS, np.array(MOMENTS) + 0.1j)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -188,6 +188,16 @@ MISTAKES = {
         lambda: forced(lambda t, state, args: None),
         "`torque` must return an array, but it returns None",
     ),
+    "a complex torque": (
+        lambda: forced(
+            lambda t, state, args: jax.lax.complex(state.omega, state.omega)
+        ),
+        "`torque` must return real numbers, but it returns complex ones",
+    ),
+    "complex moments": (
+        lambda: jr.RigidBody(np.array([1.0, 2.0, 2.5 + 0.1j])),
+        "must be real numbers, but one is complex128",
+    ),
     "a torque of two arguments": (
         lambda: jr.RigidBody(MOMENTS, lambda t, state: state.omega),
         r"`torque` must be a callable \(t, state, args\) -> \(3,\), but it does not "

@@ -154,6 +154,8 @@ def float_arrays(*values: Any) -> tuple[Array, ...]:
     # `float` makes floats of integers and leaves float32 as it is.
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*values, float)
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        raise ValueError(f"Arguments must be real numbers, but one is {dtype}.")
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 

@@ -40,7 +40,10 @@ def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
     >>> print(pair(4.0), jax.jacfwd(pair)(4.0), abs(jax.jacfwd(pair)(0.0)).round(9))
     [ 2. -2.] [ 0.25 -0.25] [0. 0.]
     """
-    (matrix,) = float_arrays(matrix)
+    matrix = jnp.asarray(matrix)
+    # `float_arrays` makes floats of integers, but refuses a complex matrix.
+    if not jnp.iscomplexobj(matrix):
+        (matrix,) = float_arrays(matrix)
     check_shape("matrix", matrix, (matrix.shape[:1] or (None,)) * 2)
     return where_defined(all_finite(matrix), eigensystem, matrix)[0]
 

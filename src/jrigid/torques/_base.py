@@ -170,6 +170,10 @@ def value_of(
         f"Argument `{name}` must return an array, but it returns None: "
         "without `return`?",
     )
+    demand(
+        not np.iscomplexobj(result),
+        f"Argument `{name}` must return real numbers, but it returns complex ones.",
+    )
     value = jnp.asarray(result, state.omega.dtype)
     check_shape(name, value, shape)
     return value
