@@ -37,7 +37,7 @@ sys.path.append(str(pathlib.Path(__file__).parent.parent / "tests"))
 import nonsmooth_reference  # pyright: ignore[reportMissingImports]
 
 KINDS = nonsmooth_reference.KINDS
-RTOLS, DURATIONS = (1e-6, 1e-8, 1e-10, 1e-11), (5.0, 500.0)
+RTOLS, DURATIONS = (1e-8, 1e-11), (5.0, 500.0)
 MOTIONS = 16
 SOLVERS = {"default": None, "dopri8": diffrax.Dopri8(), "tsit5": diffrax.Tsit5()}
 QUANTITIES = ("energy", "momentum", "state")
@@ -224,7 +224,8 @@ def main(options: Any) -> None:
     text += common.table(HEADER, rows)
     title = "Torques that are not smooth: errors in units of the promise"
     packages = ("jrigid", "jax", "diffrax", "scipy")
-    common.report("nonsmooth", title, text, packages, options.write)
+    option = "--declare" if options.declare else ""
+    common.report("nonsmooth", title, text, packages, options.write, option)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,8 @@ def report(
     """
     print(machine(packages), text, sep="\n\n")
     if write:
-        file = "-".join([name, *options.split()[-1:]])
+        last = [x.lstrip("-") for x in options.split()[-1:]]
+        file = "-".join([name, *last])
         path = pathlib.Path(__file__).parent / "results" / f"{file}.md"
         path.parent.mkdir(exist_ok=True)
         script = f"benchmarks/bench_{name}.py"

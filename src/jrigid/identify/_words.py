@@ -131,15 +131,15 @@ def _undetermined_attitude(result: FitResult) -> list[str]:
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
-    """The diagonal, positive."""
-    return np.maximum(np.diagonal(np.asarray(matrix)), 1e-300)
+    """The diagonal, positive, in float64: 1e-300 is zero in float32."""
+    return np.maximum(np.diagonal(np.asarray(matrix, np.float64)), 1e-300)
 
 
 def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     """Notes on residuals, prior knowledge and saturation, and whether each holds."""
     diagnostics = result.diagnostics
     noise_known = result.problem.options.noise_known
-    by_trial = np.asarray(diagnostics.chi_square_by_trial)
+    by_trial = np.asarray(diagnostics.chi_square_by_trial, np.float64)
     size = max(math.sqrt(result.reduced_chi_square), float(np.max(diagnostics.scales)))
     like, sure = diagnostics.whiteness
     low, high = np.maximum(np.quantile(by_trial, [0.1, 0.9]), 1e-300)
