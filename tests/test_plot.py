@@ -375,6 +375,17 @@ def test_what_is_not_known_is_white():
     assert colour_at(ax, 0.9, 0.1) == "#ffffff" != colour_at(ax, -0.9, 0.1)
 
 
+def test_infinite_numbers_are_white_and_colours_run_over_the_others():
+    # Of a map of flip times most may be infinite.
+    times = np.where(MAP < 0.7, np.inf, MAP)
+    ax = jr.plot.chart(times, AREA)
+    limits = np.percentile(MAP[MAP >= 0.7], (2, 98))
+    np.testing.assert_allclose(ax.collections[0].get_clim(), limits)
+    assert colour_at(ax, -0.9, 0.1) == "#ffffff" != colour_at(ax, 0.9, 0.1)
+    nothing = jr.plot.chart(MAP * np.nan, AREA)
+    assert colour_at(nothing, 0.9, 0.1) == "#ffffff"
+
+
 # Motions and bodies
 
 

@@ -78,8 +78,8 @@ def chart(
     Args:
         values: A `SweepResult` of one quantity (of several
             `result._replace(values=...)`), an `xarray.DataArray`, or an array (n, m):
-            numbers, codes of an enumeration, texts, integers or booleans. NaN is left
-            white.
+            numbers, codes of an enumeration, texts, integers or booleans. NaN and
+            infinity are left white.
         grid: Of an array names (with units) and points of its axes, as for
             `stability_map`; of others new names.
         ax: Axes.
@@ -148,8 +148,11 @@ def _sides(
 
 def _draw_numbers(ax: Axes, drawn: _Map, title: str) -> None:
     """Draw numbers by colour, with a colour bar."""
-    low, high = np.nanpercentile(drawn.values, _PERCENTILES)
-    colours: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": "cividis"}
+    colours: dict[str, Any] = {"cmap": "cividis"}
+    # A percentile beside infinity would be infinite or NaN.
+    finite = drawn.values[np.isfinite(drawn.values)]
+    if finite.size:
+        colours["vmin"], colours["vmax"] = np.percentile(finite, _PERCENTILES)
     mesh = ax.pcolormesh(*drawn.points, drawn.values.T, rasterized=True, **colours)
     ax.figure.colorbar(mesh, ax=ax, label=title, extend="both")
 
