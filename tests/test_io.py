@@ -529,6 +529,17 @@ def test_a_template_keeps_what_is_around_its_root_and_its_prefixes(
     assert lines[-1] == after
 
 
+def test_a_batch_or_a_number_that_is_not_finite_is_not_written(tmp_path):
+    path = tmp_path / "bodies.urdf"
+    boxes = jax.vmap(lambda mass: jr.solids.box(mass, jnp.ones(3)))(jnp.ones(2))
+    with pytest.raises(ValueError, match="must be one body, but it is a batch of 2"):
+        jr.io.write_inertials(path, {"b": boxes})
+    odd = jr.MassProperties.unchecked(1.0, jnp.zeros(3), jnp.eye(3) * jnp.nan)
+    with pytest.raises(ValueError, match=r"`bodies\['b'\]` must be finite"):
+        jr.io.write_inertials(path, {"b": odd})
+    assert not path.exists()
+
+
 def test_sdf_written_is_read(rng, tmp_path):
     known = bodies(rng)
     jr.io.write_inertials(tmp_path / "bodies.sdf", known)

@@ -366,6 +366,18 @@ def _joined(value: object) -> str:
     return " ".join(map(str, np.ravel(np.asarray(value))))
 
 
+def _check_body(name: str, body: object) -> None:
+    """Raise ValueError unless an argument is one body with finite numbers."""
+    check_type(name, body, MassProperties)
+    assert isinstance(body, MassProperties)
+    mass = np.asarray(body.mass)
+    numbers = (mass, body.center_of_mass, body.inertia)
+    message = f"Argument `{name}` must be one body, but it is a batch of {mass.size}."
+    demand(mass.shape == (), message)
+    are_finite = all(np.all(np.isfinite(x)) for x in numbers)
+    demand(are_finite, f"Argument `{name}` must be finite, but it is not.")
+
+
 def write_inertials(
     path: str | Path,
     bodies: Mapping[str, MassProperties],
@@ -389,8 +401,9 @@ def write_inertials(
             needs.
 
     Raises:
-        ValueError: A suffix of no format, a link that the template has not, or a
-            template that `read_inertials` could not read (macros, broken XML).
+        ValueError: A suffix of no format, a batch of bodies, a number that is not
+            finite, a link that the template has not, or a template that
+            `read_inertials` could not read (macros, broken XML).
 
     >>> import jrigid as jr
     >>> from tempfile import TemporaryDirectory
@@ -402,7 +415,7 @@ def write_inertials(
     """
     check_type("bodies", bodies, Mapping)
     for name, body in bodies.items():
-        check_type(f"bodies[{name!r}]", body, MassProperties)
+        _check_body(f"bodies[{name!r}]", body)
     if template is None:
         check_option("path", Path(path).suffix, tuple(_NEW))
         file, link = _NEW[Path(path).suffix]
