@@ -146,6 +146,20 @@ def test_a_store_opens_in_xarray_with_names_units_and_meanings(tmp_path):
     assert memory["a"].attrs == {"units": "rad/s"}
 
 
+def test_a_store_keeps_its_attributes_and_takes_more(tmp_path):
+    store = tmp_path / "s"
+    first = {"a": {"units": "rad/s"}, "product": {"units": "J"}}
+    quiet(tree, AXES, store=store, attributes=first)
+    assert quiet(tree, AXES, store=store).attributes == first
+    more = {"product": {"units": "mJ"}, "order": {"long_name": "kind"}}
+    assert quiet(tree, AXES, store=store, attributes=more).attributes == first | more
+    dataset = xarray.open_zarr(store)
+    assert dataset["a"].units == "rad/s"
+    assert dataset["product"].units == "mJ"
+    assert dataset["order"].long_name == "kind"
+    assert dataset["order"].flag_meanings.split()[0] == "regular"
+
+
 def test_a_store_that_is_half_finished_opens_and_plots(tmp_path):
     plt = pytest.importorskip("matplotlib.pyplot")
     axes = {"x": np.linspace(0, 1, 8), "y": np.linspace(0, 2, 4)}
@@ -636,6 +650,12 @@ def test_arguments_that_are_wrong_are_named():
         quiet(lambda x: ("x", x), axes)
     with pytest.raises(ValueError, match="extent"):
         _ = quiet(lambda x: x, axes).extent
+
+
+def test_arguments_of_another_type_are_named(untyped):
+    axes = {"x": np.linspace(0, 1, 5)}
+    with pytest.raises(ValueError, match=r"`attributes\['x'\]` must be a Mapping"):
+        quiet(lambda x: x, axes, attributes={"x": "rad/s"})
 
 
 def test_nothing_valid_is_said():

@@ -120,6 +120,15 @@ def _identity_of(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def _consolidate(path: Path) -> None:
+    """Copy the metadata of all arrays to that of their group."""
+    with warnings.catch_warnings():
+        # xarray opens consolidated metadata by one read. zarr warns that version 3 of
+        # the format does not specify them yet.
+        warnings.simplefilter("ignore")
+        extra("sweep", "zarr").consolidate_metadata(path)
+
+
 def _is_new(path: Path) -> bool:
     return not path.exists() or (path.is_dir() and not any(path.iterdir()))
 
@@ -136,13 +145,15 @@ class Memory:
         """Make arrays that take no memory before blocks are written."""
         self.grid = grid
         self.fills = [x.fill for x in leaves]
+        self.attributes: dict[str, dict[str, Any]] = {}
         self.arrays = {
             x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves
         }
 
     @contextlib.contextmanager
-    def opened(self, *_: object) -> Generator[None, None, None]:
-        """Do nothing: no other process can write to this memory."""
+    def opened(self, _: object, attributes: Attributes) -> Generator[None, None, None]:
+        """Take the attributes: no other process can write to this memory."""
+        self.attributes = {name: dict(x) for name, x in attributes.items()}
         yield
 
     def has(self, _: int) -> bool:
@@ -247,11 +258,7 @@ class Store:
                 attributes={**leaf.flags, **attributes.get(leaf.name, {})},
                 compressors=[checksum],
             )
-        with warnings.catch_warnings():
-            # xarray opens consolidated metadata by one read. zarr warns that version 3
-            # of the format does not specify them yet.
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(path)
+        _consolidate(path)
 
     def _chunk(self, leaf: Leaf, number: int) -> Path:
         """The file of a block of an array, as zarr names it."""
@@ -328,6 +335,7 @@ class Store:
                 )
             # A new store has no coordinates yet.
             self._mend_axes()
+            self._add_attributes(attributes)
             yield
 
     def _mend_axes(self) -> None:
@@ -340,6 +348,31 @@ class Store:
                 is_same = False
             if not is_same:
                 self._axes[name][...] = x
+
+    @property
+    def attributes(self) -> dict[str, dict[str, Any]]:
+        """Attributes of axes and values, without those that explain codes."""
+        flags = {leaf.name: leaf.flags for leaf in self.leaves}
+        of_arrays = {}
+        for name, array in (self.arrays | self._axes).items():
+            own = flags.get(name, {})
+            rest = {key: x for key, x in array.attrs.items() if key not in own}
+            if rest:
+                of_arrays[name] = rest
+        return of_arrays
+
+    def _add_attributes(self, attributes: Attributes) -> None:
+        """Write the attributes that the store does not have, in place of others."""
+        # JSON has lists in place of tuples.
+        given = json.loads(json.dumps(attributes))
+        known = self.attributes
+        flags = {leaf.name: leaf.flags for leaf in self.leaves}
+        new = {name: x for name, x in given.items() if known.get(name, {}) != x}
+        for name, about in new.items():
+            array = (self.arrays | self._axes)[name]
+            array.attrs.put(flags.get(name, {}) | about)
+        if new:
+            _consolidate(self.path)
 
     @contextlib.contextmanager
     def _locked(self) -> Generator[None, None, None]:

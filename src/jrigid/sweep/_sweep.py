@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from jrigid._checks import whole_number
+from jrigid._checks import check_type, whole_number
 from jrigid.sweep._drive import Submit, meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import RefinedMap, corners_of
@@ -84,7 +84,8 @@ def sweep(
             between 256 and 2^18 points and at most 16 MB of values; or the block of an
             existing store.
         attributes: Attributes of axes and values by name, such as
-            `{"units": "rad/s"}`.
+            `{"spin": {"units": "rad/s"}}`. A store keeps those of earlier calls unless
+            others are given for the same name.
         refine: Maps the values of one point to its class, an integer, boolean or code.
             Then only blocks that hold a change of class are computed. They are found
             from the corners of all blocks and followed from block to block. The blocks
@@ -142,7 +143,7 @@ def sweep(
         valid=np.asarray(valid[...]),
         axes=grid.axes,
         failures=failures,
-        attributes=descriptions,
+        attributes=kept.attributes,
         store=None if path is None else str(path),
         classes=classes,
     )
@@ -152,7 +153,10 @@ def _descriptions(
     attributes: Mapping[str, Mapping[str, Any]] | None, grid: Grid, leaves: list[Leaf]
 ) -> dict[str, dict[str, Any]]:
     """Return the attributes, after a check that they belong to axes or values."""
-    descriptions = {name: dict(x) for name, x in (attributes or {}).items()}
+    attributes = attributes or {}
+    for name, about in attributes.items():
+        check_type(f"attributes[{name!r}]", about, Mapping)
+    descriptions = {name: dict(x) for name, x in attributes.items()}
     unknown = descriptions.keys() - {*grid.axes, *(x.name for x in leaves)}
     if unknown:
         raise ValueError(
