@@ -138,7 +138,8 @@ def test_a_store_opens_in_xarray_with_names_units_and_meanings(tmp_path):
         assert dataset["a"].attrs["units"] == "rad/s"
         assert dataset["product"].attrs["long_name"] == "a product"
         assert dataset["order"].attrs["flag_meanings"].split()[0] == "regular"
-        assert dataset.attrs["jrigid"]["versions"]["jax"] == jax.__version__
+        made_by = json.loads(dataset.attrs["jrigid"])["versions"]
+        assert made_by["jax"] == jax.__version__
         np.testing.assert_array_equal(dataset["valid"], c <= 1)
         np.testing.assert_array_equal(dataset["product"].sel(b=3.0), (a * b + c)[:, 3])
     memory = quiet(tree, AXES, attributes=about).to_xarray()
@@ -236,7 +237,9 @@ def test_a_store_of_another_sweep_is_refused_with_what_differs(tmp_path):
     with jax.enable_x64(False), pytest.raises(ValueError, match="of another"):
         quiet(lambda x: factor * x, axes, store=store)
     described = json.loads((store / "zarr.json").read_text())
-    described["attributes"]["jrigid"]["versions"]["jaxlib"] = "0.1"
+    about = json.loads(described["attributes"]["jrigid"])
+    about["versions"]["jaxlib"] = "0.1"
+    described["attributes"]["jrigid"] = json.dumps(about)
     (store / "zarr.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=r"versions \(.*0\.1"):
         quiet(lambda x: factor * x, axes, store=store)
@@ -414,7 +417,8 @@ def test_a_block_that_fails_is_tried_thrice_recorded_and_the_others_go_on(
         assert "not this one" in failure.error
         assert np.sum(~found.valid[...]) == 3
         assert np.isnan(found.values[...][2, 3:]).all()
-    assert "not this one" in found.to_xarray().attrs["jrigid"]["failures"][0]["error"]
+    about = json.loads(found.to_xarray().attrs["jrigid"])
+    assert "not this one" in about["failures"][0]["error"]
     description = tmp_path / "s" / "zarr.json"
     before = description.stat()
     half = tmp_path / "s" / "zarr.partial"
@@ -566,6 +570,25 @@ def test_a_refined_map_finds_the_boundary_at_a_part_of_the_points(tmp_path):
     again = quiet(function, axes, refine=inside, store=tmp_path / "s")
     assert chunks(tmp_path / "s") == before
     np.testing.assert_array_equal(again.classes, found.classes)
+
+
+def test_integers_not_computed_are_nan_in_xarray_and_all_goes_to_netcdf(tmp_path):
+    axes = {"x": np.linspace(-1, 1, 24), "y": np.linspace(-1, 1, 24)}
+    number = lambda x, y: {"sum": x + y, "n": jnp.int32(3)}  # noqa: E731
+    about = {"sum": {"units": "s"}}
+    for more in ({}, {"store": tmp_path / "s"}):
+        refine = lambda values: values["sum"] > 1.6  # noqa: E731
+        found = quiet(
+            number, axes, refine=refine, block_size=16, attributes=about, **more
+        )
+        found.to_xarray().to_netcdf(tmp_path / "map.nc")
+        with xarray.open_dataset(tmp_path / "map.nc", decode_timedelta=False) as file:
+            for dataset in (file, found.to_xarray()):
+                known = dataset["valid"].values.astype(bool)
+                assert 0 < known.mean() < 1
+                np.testing.assert_array_equal(dataset["n"], np.where(known, 3, np.nan))
+                assert dataset["sum"].dtype == float
+                assert dataset["sum"].units == "s"
 
 
 def test_a_boundary_that_no_corner_shows_is_followed_from_block_to_block():

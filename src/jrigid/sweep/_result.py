@@ -78,13 +78,15 @@ class SweepResult(NamedTuple):
         """Convert to an `xarray.Dataset` with named dimensions and coordinates.
 
         It has a variable for each array, and `valid`. With a store it is lazy.
+        Integers are floats, NaN where they are not known; codes stay integers.
 
         Raises:
             ImportError: Without the extra `jrigid[sweep]`.
         """
         xarray = extra("sweep", "xarray")
         if self.store is not None:
-            dataset = xarray.open_zarr(self.store)
+            # Older versions of xarray take a unit of time for that of a timedelta64.
+            dataset = xarray.open_zarr(self.store, decode_timedelta=False)
         else:
             dataset = self._dataset(xarray)
         if self.classes is not None:
@@ -101,4 +103,5 @@ class SweepResult(NamedTuple):
         for leaf, array in zip(leaves, arrays, strict=True):
             about = leaf.flags | attributes.get(leaf.name, {})
             dataset[leaf.name] = leaf.dimensions(self.labels), array, about
-        return dataset
+        # Integers that are not known become NaN.
+        return xarray.decode_cf(dataset, decode_timedelta=False)

@@ -36,7 +36,8 @@ except ModuleNotFoundError:  # on Windows
 
 # Addresses in the text of a jaxpr, which differ from run to run.
 _ADDRESS = re.compile(r"0x[0-9a-f]+")
-# Attribute of the store that holds what it was made for.
+# Attribute of the store that holds what it was made for: a JSON text, since netCDF has
+# no nested attributes.
 _KEY = "jrigid"
 _CONVENTIONS = {"Conventions": "CF-1.11"}
 
@@ -112,7 +113,8 @@ def identity(grid: Grid, leaves: list[Leaf]) -> dict[str, Any]:
 def _identity_of(path: Path) -> dict[str, Any]:
     """Fingerprint and identity of the sweep that made a store."""
     try:
-        return json.loads((path / "zarr.json").read_text())["attributes"][_KEY]
+        about = json.loads((path / "zarr.json").read_text())["attributes"][_KEY]
+        return json.loads(about)
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(
             "Argument `store` must be a new directory or one that a sweep has "
@@ -235,7 +237,8 @@ class Store:
         zarr = extra("sweep", "zarr")
         checksum = extra("sweep", "zarr.codecs").Crc32cCodec()
         grid = self.grid
-        group = zarr.create_group(path, attributes=_CONVENTIONS | {_KEY: about})
+        known = _CONVENTIONS | {_KEY: json.dumps(about)}
+        group = zarr.create_group(path, attributes=known)
         for name, x in grid.axes.items():
             group.create_array(
                 name,
@@ -403,13 +406,14 @@ class Store:
 
     def record(self, failures: Iterable[Failure]) -> None:
         """Write to the attributes which blocks failed."""
-        place = self.path / "zarr.json"
-        known = json.loads(place.read_text())
+        about = _identity_of(self.path)
         # JSON has lists in place of tuples.
         failed = json.loads(json.dumps([x._asdict() for x in failures]))
         # A resumed run may have computed the blocks that failed before.
-        if known["attributes"][_KEY].setdefault("failures", []) != failed:
-            known["attributes"][_KEY]["failures"] = failed
+        if about.get("failures", []) != failed:
+            place = self.path / "zarr.json"
+            known = json.loads(place.read_text())
+            known["attributes"][_KEY] = json.dumps(about | {"failures": failed})
             # As for a chunk, a killed process leaves the old description or the new
             # one.
             self._new_description.write_text(json.dumps(known))
