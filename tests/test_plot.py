@@ -330,6 +330,20 @@ def test_a_sweep_an_xarray_and_an_array_of_regions_give_one_map():
     assert [ax.get_xlabel() for ax in drawn] == ["a [kg m^2]", "a [kg m^2]", "first"]
 
 
+def test_a_refined_map_is_drawn_by_its_classes():
+    axes = {"a": np.linspace(-1.0, 1.0, 64), "b": np.linspace(0.02, 2.0, 64)}
+    style = {"refine": lambda region: region, "block_size": 16, "progress": False}
+    refined = jr.sweep(sorted_by, axes, **style)
+    assert not refined.valid.all()
+    ax = jr.plot.chart(refined)
+    wanted = jr.stability.stability_map(sorted_by, axes)
+    other = jr.plot.chart(wanted)
+    drawn, whole = (x.collections[0].get_array() for x in (ax, other))
+    np.testing.assert_array_equal(drawn, whole)
+    names = {text.get_text().replace("_", "-") for text in ax.texts}
+    assert names == {text.get_text() for text in other.texts}
+
+
 def test_narrow_regions_are_named_beside_the_map():
     kinds = np.where(np.abs(MAP) < 0.05, 2, MAP > 0)
     ax = jr.plot.chart(kinds, AREA, regions=("left", "right", "between"))
@@ -549,6 +563,10 @@ WRONG = {
         r"two at least, but its shape is \(41, 1\)",
     ),
     "two quantities": (lambda: PLOT.chart({"u": MAP, "v": MAP}, AREA), "several: u, v"),
+    "quantities of a named tuple": (
+        lambda: PLOT.chart(jr.stability.top_stability(TOP, 3.0), AREA),
+        "several: growth_rate_squared, growth_rate",
+    ),
     "too many regions": (
         lambda: PLOT.chart(np.arange(41 * 31).reshape(41, 31), AREA),
         "of few regions, but it has 1271",

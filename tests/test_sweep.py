@@ -640,6 +640,8 @@ def test_codes_and_numbers_are_classes_and_others_are_refused():
     code = lambda x, y: ORDER.where(x > y, ORDER.chaotic, ORDER.regular)  # noqa: E731
     found = quiet(code, axes, refine=lambda value: value, block_size=16)
     np.testing.assert_array_equal(found.classes == 2, axes["x"][:, None] > axes["y"])
+    assert found.class_names == ("regular", "undecided", "chaotic", "undefined")
+    assert found.to_xarray()["classes"].flag_meanings.split()[2] == "chaotic"
     with pytest.raises(ValueError, match="`refine` must return one"):
         quiet(lambda x, y: x - y, axes, refine=lambda value: value)
     with pytest.raises(ValueError, match="`refine` is for a grid"):

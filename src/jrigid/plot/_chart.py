@@ -79,7 +79,7 @@ def chart(
         values: A `SweepResult` of one quantity (of several
             `result._replace(values=...)`), an `xarray.DataArray`, or an array (n, m):
             numbers, codes of an enumeration, texts, integers or booleans. NaN and
-            infinity are left white.
+            infinity are left white. Of a refined map the classes are drawn.
         grid: Of an array names (with units) and points of its axes, as for
             `stability_map`; of others new names.
         ax: Axes.
@@ -232,19 +232,28 @@ def _regions(drawn: _Map, names: Sequence[str]) -> tuple[np.ndarray, list[_Regio
     return values, [_Region(text, values == x, _TINTS[x]) for text, x in tinted]
 
 
+def _demand_one_quantity(values: object) -> None:
+    """Raise ValueError for several quantities: a mapping or a named tuple of them."""
+    # Also xarray's Dataset is a mapping.
+    names = values if isinstance(values, Mapping) else getattr(values, "_fields", ())
+    several = ", ".join(names)
+    message = f"Argument `values` must be one quantity, but it is several: {several}."
+    demand(not several, message)
+
+
 def _map_of(values: object, grid: Mapping[str, AnyArray] | None) -> _Map:
     """The axes and values of a map, checked."""
     axes: Mapping[str, Any] = grid or {}
     about: Mapping[str, Mapping[str, str]] = {}
-    kinds = None
+    kinds: Any = None
     if isinstance(values, SweepResult):
         axes = values.axes
         about = values.attributes
-        values = values.values
-    # Also xarray's Dataset is a mapping.
-    several = ", ".join(values) if isinstance(values, Mapping) else ""
-    message = f"Argument `values` must be one quantity, but it is several: {several}."
-    demand(not several, message)
+        # The values of a refined map are not known everywhere.
+        is_refined = values.classes is not None
+        kinds = values.class_names or None
+        values = values.classes if is_refined else values.values
+    _demand_one_quantity(values)
     if isinstance(values, _DataArray):
         axes = {x: values[x].values for x in values.dims}
         about = {x: values[x].attrs for x in values.dims}

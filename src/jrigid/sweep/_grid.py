@@ -210,6 +210,16 @@ def on_block(
     return jtu.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
+def flags_of(codes: tuple[str, ...]) -> dict[str, Any]:
+    """Attributes that explain codes, by the conventions CF-1.11; none of no codes."""
+    if not codes:
+        return {}
+    return {
+        "flag_values": list(range(len(codes))),
+        "flag_meanings": " ".join(codes),
+    }
+
+
 class Leaf(eqx.Module):
     """Description of one array of the tree that a function returns.
 
@@ -233,10 +243,7 @@ class Leaf(eqx.Module):
     def flags(self) -> dict[str, Any]:
         """Attributes that explain its numbers, by the conventions CF-1.11."""
         if self.codes:
-            return {
-                "flag_values": list(range(len(self.codes))),
-                "flag_meanings": " ".join(self.codes),
-            }
+            return flags_of(self.codes)
         # xarray shows NaN in place of this value.
         return {"_FillValue": int(self.fill)} if self.dtype.kind in "iu" else {}
 

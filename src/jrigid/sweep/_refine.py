@@ -3,13 +3,14 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from jrigid._core.third_party import EnumerationItem, enumeration_of, names_of
 from jrigid.sweep._grid import Grid
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store
@@ -24,18 +25,33 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
     return lattice
 
 
+class _Classes(NamedTuple):
+    """Classes of some points.
+
+    Attributes:
+        numbers: The class of each point.
+        names: Of the classes, in the order of their numbers, if they are codes.
+    """
+
+    numbers: np.ndarray
+    names: tuple[str, ...]
+
+
 def _classes(
     classify: Callable[[PyTree], Any], values: PyTree, shape: tuple[int, ...]
-) -> np.ndarray:
+) -> _Classes:
     """Return the classes of values that have axes of this shape in front."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
-    leaves = jtu.tree_leaves(classify(flat))
+    classes = classify(flat)
+    leaves = jtu.tree_leaves(classes)
     if len(leaves) != 1 or leaves[0].ndim != 1 or leaves[0].dtype.kind not in "iub":
         raise ValueError(
             "Argument `refine` must return one integer, boolean or code for a point, "
             f"but it returns {[(x.shape[1:], str(x.dtype)) for x in leaves]}."
         )
-    return np.asarray(leaves[0]).reshape(shape)
+    is_code = isinstance(classes, EnumerationItem)
+    names = names_of(enumeration_of(classes)) if is_code else ()
+    return _Classes(np.asarray(leaves[0]).reshape(shape), names)
 
 
 def _changes(corners: SweepResult, lattice: np.ndarray) -> np.ndarray:
@@ -58,6 +74,7 @@ class RefinedMap:
     Attributes:
         classes: Class of every point. In a tile that was not computed, or failed, it is
             that of the first corner.
+        names: Of the classes, if they are codes.
     """
 
     def __init__(
@@ -82,7 +99,8 @@ class RefinedMap:
         self._structure = structure
         self._classify = jax.jit(jax.vmap(classify))
         lattice_shape = tuple(n + 1 for n in grid.blocks)
-        lattice = _classes(self._classify, corners.values, lattice_shape)
+        lattice, names = _classes(self._classify, corners.values, lattice_shape)
+        self.names = names
         tile = [
             np.arange(n) // width
             for n, width in zip(grid.shape, grid.block, strict=True)
@@ -123,7 +141,7 @@ class RefinedMap:
         region = self._grid.region(number)
         *arrays, valid = (x[region] for x in self._kept.arrays.values())
         values = jtu.tree_unflatten(self._structure, arrays)
-        self.classes[region] = _classes(self._classify, values, valid.shape)
+        self.classes[region] = _classes(self._classify, values, valid.shape).numbers
 
     def _neighbours(self, tiles: Iterable[int]) -> set[int]:
         """Return the tiles that share a face, an edge or a corner with one of these."""

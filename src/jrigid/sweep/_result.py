@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jrigid._extra import extra
-from jrigid.sweep._grid import leaves_of
+from jrigid.sweep._grid import flags_of, leaves_of
 
 
 class Failure(NamedTuple):
@@ -40,6 +40,8 @@ class SweepResult(NamedTuple):
         store: The directory of the store, if there is one.
         classes: The class of every point of a refined map, also of points that were not
             evaluated.
+        class_names: Names of the classes in the order of their numbers, if they are
+            codes.
     """
 
     values: PyTree
@@ -49,6 +51,7 @@ class SweepResult(NamedTuple):
     attributes: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     store: str | None = None
     classes: np.ndarray | None = None
+    class_names: tuple[str, ...] = ()
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -90,7 +93,8 @@ class SweepResult(NamedTuple):
         else:
             dataset = self._dataset(xarray)
         if self.classes is not None:
-            dataset["classes"] = self.labels, self.classes
+            flags = flags_of(self.class_names)
+            dataset["classes"] = self.labels, self.classes, flags
         return dataset
 
     def _dataset(self, xarray: Any) -> Any:

@@ -130,11 +130,14 @@ def sweep(
     run = _Run(work, kept, executor, progress)
     structure = jtu.tree_structure(values)
     classes = None
+    names = ()
     with kept.opened(about | identity(grid, leaves), descriptions):
         if refine is None:
             failures = run.compute(range(math.prod(grid.blocks)))
         else:
-            failures, classes = run.refine(refine, structure)
+            failures, refined = run.refine(refine, structure)
+            classes = refined.classes
+            names = refined.names
         kept.record(failures)
     _warn(failures, run.valid, grid)
     *arrays, valid = kept.arrays.values()
@@ -146,6 +149,7 @@ def sweep(
         attributes=kept.attributes,
         store=None if path is None else str(path),
         classes=classes,
+        class_names=names,
     )
 
 
@@ -283,15 +287,15 @@ class _Run:
 
     def refine(
         self, classify: Callable[[PyTree], Any], structure: Any
-    ) -> tuple[tuple[Failure, ...], np.ndarray]:
-        """Compute the tiles with a change of class; return failures and all classes."""
+    ) -> tuple[tuple[Failure, ...], RefinedMap]:
+        """Compute the tiles with a change of class; return failures and the map."""
         grid = self._work.grid
         corners = _corners(self._work.function, grid, self._executor)
         refined = RefinedMap(grid, self._kept, structure, classify, corners)
         failures = refined.refine(self.compute)
         # `valid` decides on a warning alone, so points may count twice.
         self.valid += int(np.sum(corners.valid))
-        return failures, refined.classes
+        return failures, refined
 
 
 def _failure(grid: Grid, number: int, error: str) -> Failure:
