@@ -1,5 +1,6 @@
 """Sweeps: blocks, stores, executors, refined maps, and what may go wrong on the way."""
 
+import dataclasses
 import importlib
 import json
 import multiprocessing
@@ -661,6 +662,16 @@ def test_arguments_that_are_wrong_are_named():
         quiet(lambda p: p[0], points=(np.ones(3), np.ones(4)))
     with pytest.raises(ValueError, match="same number of points in front"):
         quiet(jnp.sin, points=1.0)
+    records = np.zeros(3, [("mass", float)])
+    for points in (dataclasses.make_dataclass("P", ["a"])(np.ones(3)), records):
+        with pytest.raises(
+            ValueError, match="must hold arrays of numbers, but it hold"
+        ):
+            quiet(lambda p: p.a, points=points)
+    with pytest.raises(ValueError, match="`points` must hold a point, but it is empty"):
+        quiet(jnp.sum, points=np.zeros((0, 3)))
+    with pytest.raises(ValueError, match="`axes` must hold points, but 'x' is empty"):
+        quiet(jnp.sin, {"x": np.zeros(0)})
     with pytest.raises(ValueError, match="must name at least one"):
         quiet(lambda: 1.0, {})
     with pytest.raises(ValueError, match="could say so"):

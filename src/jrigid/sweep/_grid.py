@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
-from jrigid._checks import all_finite, float_arrays
+from jrigid._checks import all_finite, demand, float_arrays, kind_of
 from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of, names_of
 
 
@@ -110,7 +110,8 @@ def grid_of(axes: Mapping[str, ArrayLike] | None, points: PyTree) -> Grid:
             raise ValueError(
                 f"Argument `axes` must name arguments, but {name!r} can be none."
             )
-        if x.ndim != 1 or x.size == 0 or x.dtype.kind not in "iuf":
+        demand(x.size > 0, f"Argument `axes` must hold points, but {name!r} is empty.")
+        if x.ndim != 1 or x.dtype.kind not in "iuf":
             raise ValueError(
                 "Argument `axes` must hold arrays of numbers of shape (n,), but "
                 f"{name!r} has shape {x.shape} and type {x.dtype}."
@@ -131,25 +132,37 @@ def _native(values: ArrayLike) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
+def _numbers_of(leaf: Any) -> jax.Array:
+    """Convert an array of a tree of points, or raise ValueError if it is none."""
+    if isinstance(leaf, jax.Array):
+        return leaf
+    array = _native(np.asarray(leaf))
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.number, jnp.bool_)):
+        raise ValueError(
+            "Argument `points` must hold arrays of numbers, but it holds "
+            f"{kind_of(leaf)}. (Pass a dict of arrays, or register a class by "
+            "`jax.tree_util.register_dataclass`.)"
+        )
+    return jnp.asarray(array)
+
+
 def _list_of(points: PyTree) -> Grid:
     """Check a tree of arrays with the points in front."""
-    leaves = [
-        jnp.asarray(_native(x) if isinstance(x, np.ndarray) else x)
-        for x in jtu.tree_leaves(points)
-    ]
+    leaves = [_numbers_of(x) for x in jtu.tree_leaves(points)]
     if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in leaves):
         raise ValueError(
             "Argument `points` must hold numbers, but it has keys. (Pass integers, "
             "and call `jax.random.key` in the function.)"
         )
     lengths = {x.shape[:1] for x in leaves}
-    # A single number has no axis of points, and an empty axis has no points.
-    if len(lengths) != 1 or lengths <= {(), (0,)}:
+    # A single number has no axis of points.
+    if len(lengths) != 1 or () in lengths:
         raise ValueError(
             "Argument `points` must hold arrays with the same number of points in "
             f"front, but they have the shapes {[x.shape for x in leaves]}."
         )
     (shape,) = lengths
+    demand(shape != (0,), "Argument `points` must hold a point, but it is empty.")
     arrays = jtu.tree_unflatten(jtu.tree_structure(points), map(np.asarray, leaves))
     return Grid(arrays, None, shape, shape)
 
