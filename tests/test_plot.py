@@ -531,6 +531,34 @@ WRONG = {
         lambda: PLOT.herpolhode(MOMENTS, DRAGGED),
         "must be free and keep",
     ),
+    "axes of another name": (
+        lambda: PLOT.motion(DRAGGED, {"drifts": None}),
+        "`axes` must be one of 'omega', 'drift', but it is 'drifts'",
+    ),
+    "along no vector": (
+        lambda: PLOT.motion(DRAGGED, along=(0.0, 1.0)),
+        r"`along` must have shape \(3,\)",
+    ),
+    "along nothing": (
+        lambda: PLOT.motion(DRAGGED, along=(0.0, 0.0, 0.0)),
+        "`along` must be a direction",
+    ),
+    "no time to play": (
+        lambda: PLOT.animate(MOMENTS, DRAGGED, seconds=-1.0),
+        "`seconds` must be positive and finite, but it is -1.0",
+    ),
+    "trace of two numbers": (
+        lambda: PLOT.animate(MOMENTS, DRAGGED, trace=np.ones(2)),
+        r"`trace` must have shape \(3,\) or \(n, 3\)",
+    ),
+    "polhodes of no body": (
+        lambda: PLOT.polhode(jnp.array([0.0, 1.0, 1.0]), OMEGA),
+        "`body` must have positive moments",
+    ),
+    "polhode of NaN": (
+        lambda: PLOT.polhode(MOMENTS, OMEGA * jnp.nan),
+        "`motions` must have a finite state",
+    ),
     "swapped": (
         lambda: PLOT.polhode(START, MOMENTS),
         "`body` must have or be an inertia, but it is a State",

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import check_option, demand
+from jrigid._checks import check_option, check_shape, demand
 from jrigid._types import AnyArray
 from jrigid.photometry import Ellipsoid, Inversion, LightCurve, Tumbler
 from jrigid.plot import _common as common
@@ -257,14 +257,23 @@ def animate(
     demand(len(known_times) > 1, message)
     message = "Argument `ts` must not decrease, but it does."
     demand(bool(np.all(np.diff(known_times) >= 0)), message)
-    demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
-    frames = max(round(seconds * fps), 2)
+    frames = _number_of_frames(seconds, fps)
     times = np.linspace(known_times[0], known_times[-1], frames)
     attitudes = _at(times, known_times, attitudes)
     if trace is None:
         trace = np.eye(3)[2:] if isinstance(body, SymmetricTop) else np.empty((0, 3))
-    points = np.reshape(np.asarray(trace, float), (-1, 3))
+    points = np.asarray(trace, float)
+    check_shape("trace", points, (3,), (None, 3))
+    points = points.reshape(-1, 3)
     return Animation(surface_of(body, kind), times, attitudes, points, fps)
+
+
+def _number_of_frames(seconds: float, fps: float) -> int:
+    """How many frames a film has: two at least."""
+    for name, value in (("seconds", seconds), ("fps", fps)):
+        message = f"Argument `{name}` must be positive and finite, but it is {value!r}."
+        demand(0 < value < np.inf, message)
+    return max(round(seconds * fps), 2)
 
 
 def _at(times: np.ndarray, ts: np.ndarray, attitudes: np.ndarray) -> np.ndarray:
@@ -324,8 +333,7 @@ def animate_light_curve(
     first, last = points.ts[[0, -1]]
     message = "Argument `curve` must have points at two times at least, but it has not."
     demand(bool(last > first), message)
-    demand(fps > 0, f"Argument `fps` must be positive, but it is {fps!r}.")
-    ts = np.linspace(first, last, max(round(seconds * fps), 2))
+    ts = np.linspace(first, last, _number_of_frames(seconds, fps))
     to_sun = between(ts, points.ts, points.to_sun)
     to_observer = between(ts, points.ts, points.to_observer)
     values = magnitudes_at(shown.tumbler, ts, to_sun, to_observer) - points.zero

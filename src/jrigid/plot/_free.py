@@ -83,6 +83,8 @@ class _Momentum(NamedTuple):
         states = None if np.ndim(motion) else states_of(motion)
         omega = np.asarray(motion if states is None else states.omega, float)
         check_shape("motions", omega, (3,), (None, 3))
+        message = "Arguments `motions` must have a finite state, but one has none."
+        demand(bool(np.any(np.all(np.isfinite(omega), axis=-1))), message)
         message = "Arguments `motions` must turn, but one is at rest."
         demand(bool(np.any(omega)), message)
         of_body = omega @ common.tensor_of(body)
@@ -225,7 +227,8 @@ def polhode(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
-        ValueError: Axes of two dimensions, no such surface, or a motion at rest.
+        ValueError: Axes of two dimensions, no such surface, moments that are not
+            positive, or a motion at rest or without a finite state.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ax = jr.plot.polhode(jnp.array([1.0, 2.0, 3.0]), jnp.array([0.05, 1.0, 0.0]))
@@ -234,6 +237,8 @@ def polhode(
     """
     check_option("surface", surface, ("sphere", "ellipsoid"))
     moments, axes = common.principal(body)
+    message = f"Argument `body` must have positive moments, but they are {moments}."
+    demand(bool(np.all(moments > 0) & np.all(np.isfinite(moments))), message)
     momenta = [_Momentum.of(body, x) for x in motions]
     has_parts = any(x.has_parts for x in momenta)
     is_sphere = has_parts or surface == "sphere"

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jrigid._checks import check_option, check_shape, demand
 from jrigid._motion import HasRigidBody
 from jrigid._types import AnyArray, VectorLike
 from jrigid.plot._common import (
@@ -52,7 +53,8 @@ def motion(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
-        ValueError: No system, no times, or more than one motion.
+        ValueError: No system, no times, more than one motion, axes of another name, or
+            no direction.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> state0 = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 1.0, 0.2]))
@@ -61,6 +63,13 @@ def motion(
     >>> print(axes["drift"].get_ylabel())
     relative change
     """
+    for name in axes or {}:
+        check_option("axes", name, ("omega", "drift"))
+    if along is not None:
+        along = np.asarray(along, float)
+        check_shape("along", along, (3,))
+        message = "Argument `along` must be a direction, but its length is 0 or NaN."
+        demand(bool(np.linalg.norm(along) > 0), message)
     body = _system_of(motion, system)
     times = times_of(motion, ts)
     omegas = np.asarray(states_of(motion).omega)
