@@ -182,19 +182,26 @@ def test_mistakes_are_said_in_a_sentence(
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "words"),
     [
-        ["photometry"],
-        ["photometry", "a.txt", "--shortest", "1"],
-        ["photometry", "a.txt", *PERIODS, "--mode", "spin"],
-        ["photometry", "a.txt", *PERIODS, "--orbit", "1,2,3"],
+        (["photometry"], "required: path"),
+        (["photometry", "a.txt", "--shortest", "1"], "required: --longest"),
+        (["photometry", "a.txt", *PERIODS, "--mode", "spin"], "invalid choice"),
+        (["photometry", "a.txt", *PERIODS, "--orbit", "1,2,3"], "seven numbers"),
+        (["photometry", "a.txt", *PERIODS, "--orbit", "a,b"], "seven numbers"),
+        (
+            ["photometry", "a.txt", *PERIODS, "--report", "--plot", "none/a.png"],
+            "argument --plot: its folder must exist, but 'none' does not",
+        ),
     ],
 )
-def test_wrong_arguments_are_left_to_argparse(arguments, capsys):
+def test_wrong_arguments_are_left_to_argparse(arguments, words, capsys):
     with pytest.raises(SystemExit) as stop:
         _cli.main(arguments)
     assert stop.value.code == 2
-    assert "usage: jrigid photometry" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "usage: jrigid photometry" in said
+    assert words in said
 
 
 def test_no_text_of_the_search_names_an_argument_that_has_an_option():

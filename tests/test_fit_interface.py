@@ -508,6 +508,10 @@ def test_the_exit_status_is_the_fits(readings, tmp_path, capsys):
             "Argument `--columns` must name columns",
         ),
         (
+            ["good.csv", "--columns", "rates"],
+            "Argument `--columns` must be NAME=HEADERS, but it is 'rates'",
+        ),
+        (
             ["held.csv", "--flights"],
             "Argument `path` must hold flights, but it has none",
         ),
@@ -536,20 +540,25 @@ def test_what_cannot_be_used_is_said_in_a_sentence(
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "words"),
     [
-        [],
-        ["fit"],
-        ["fit", "a", "--unmodelled", "some"],
-        ["fit", "a", "--unmodelled", "1,2,3"],
-        ["fit", "a", "--inertia-model", "cube"],
+        ([], "required"),
+        (["fit"], "required: path"),
+        (["fit", "a", "--unmodelled", "some"], "must be `estimate`, or one or two"),
+        (["fit", "a", "--unmodelled", "1,2,3"], "two numbers from 0, between commas"),
+        (["fit", "a", "--unmodelled", "-1"], "from 0, between commas, but it is '-1'"),
+        (["fit", "a", "--inertia-model", "cube"], "invalid choice"),
+        (["fit", "a", "--save", "none/a.pkl"], "argument --save: its folder must"),
+        (["fit", "a", "--plot", "none/a.png"], "argument --plot: its folder must"),
     ],
 )
-def test_wrong_arguments_are_argparses_to_tell(arguments, capsys):
+def test_wrong_arguments_are_argparses_to_tell(arguments, words, capsys):
     with pytest.raises(SystemExit) as stop:
         _cli.main(arguments)
     assert stop.value.code == 2
-    assert "usage: jrigid" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "usage: jrigid" in said
+    assert words in said
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import numpy as np
 from jrigid import identify, plot, records
 from jrigid._checks import demand
 from jrigid._cli import _photometry
+from jrigid._cli._arguments import numbers, output
 from jrigid.identify import Status
 from jrigid.systems import RigidBody
 
@@ -59,8 +60,12 @@ def _torque(text: str) -> str | identify.GaussMarkov:
     """An unmodelled torque: `estimate`, a level, or a level and a correlation time."""
     if text == "estimate":
         return text
-    numbers = [float(x) for x in text.split(",")]
-    return identify.GaussMarkov(*numbers)
+    values = numbers(text)
+    # A NaN is not 0 or more, either.
+    if len(values) not in (1, 2) or not all(x >= 0 for x in values):
+        wanted = "must be `estimate`, or one or two numbers from 0, between commas"
+        raise argparse.ArgumentTypeError(f"{wanted}, but it is {text!r}")
+    return identify.GaussMarkov(*values)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -135,10 +140,14 @@ def _add_options_of_fit(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--robust", action="store_true", help="leave outliers out")
     command.add_argument(
-        "--plot", metavar="PNG", help="where to draw the fit (needs matplotlib)"
+        "--plot",
+        type=output,
+        metavar="PNG",
+        help="where to draw the fit (needs matplotlib)",
     )
     command.add_argument(
         "--save",
+        type=output,
         metavar="PKL",
         help="where to keep the fit, for `jrigid.identify.load`",
     )
@@ -197,7 +206,9 @@ def _reading(options: argparse.Namespace) -> records.Reading:
     """The file, with the units and columns that the command line names."""
     columns = {}
     for text in options.columns:
-        name, _, headers = text.partition("=")
+        name, sign, headers = text.partition("=")
+        message = f"Argument `--columns` must be NAME=HEADERS, but it is {text!r}."
+        demand(bool(sign), message)
         columns[name] = tuple(headers.split(",")) if "," in headers else headers
     units = dict(map(_unit, options.unit))
     return records.read(options.path, unit=units, columns=columns)

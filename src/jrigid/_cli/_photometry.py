@@ -10,6 +10,7 @@ import numpy as np
 
 from jrigid import photometry, plot
 from jrigid._checks import demand
+from jrigid._cli._arguments import numbers, output
 
 _HOUR = 3600.0
 _DAY = 86400.0
@@ -99,6 +100,7 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--plot",
+        type=output,
         metavar="PNG",
         help="with --report, where to draw curves and best tumbler (needs matplotlib)",
     )
@@ -106,10 +108,10 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
 
 def _elements(text: str) -> list[float]:
     """Seven numbers: the elements of an orbit in the units of catalogues."""
-    numbers = [float(x) for x in text.split(",")]
-    if len(numbers) != len(_ELEMENTS.split(",")):
+    elements = numbers(text)
+    if len(elements) != len(_ELEMENTS.split(",")):
         raise argparse.ArgumentTypeError(f"{_ELEMENTS} are seven numbers")
-    return numbers
+    return elements
 
 
 def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:

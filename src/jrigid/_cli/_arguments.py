@@ -1,0 +1,24 @@
+"""Texts of the command line as values; argparse reports what cannot be read."""
+
+import argparse
+from pathlib import Path
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers between commas; an empty list if one of them is none."""
+    try:
+        return [float(x) for x in text.split(",")]
+    except ValueError:
+        return []
+
+
+def output(text: str) -> str:
+    """A file that can be written: its folder must exist.
+
+    This is checked before a search, which may take minutes.
+    """
+    folder = Path(text).parent
+    if not folder.is_dir():
+        message = f"its folder must exist, but {str(folder)!r} does not"
+        raise argparse.ArgumentTypeError(message)
+    return text
