@@ -25,22 +25,22 @@ def corners_of(grid: Grid) -> dict[str, np.ndarray]:
     return lattice
 
 
-class _Classes(NamedTuple):
-    """Classes of some points.
+class Classes(NamedTuple):
+    """Classes of points.
 
     Attributes:
-        numbers: The class of each point.
+        numbers: The class of each point; None of a map that is not refined.
         names: Of the classes, in the order of their numbers, if they are codes.
     """
 
-    numbers: np.ndarray
-    names: tuple[str, ...]
+    numbers: np.ndarray | None = None
+    names: tuple[str, ...] = ()
 
 
 def _classes(
     classify: Callable[[PyTree], Any], values: PyTree, shape: tuple[int, ...]
-) -> _Classes:
-    """Return the classes of values that have axes of this shape in front."""
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return classes of values that have axes of this shape in front, and names."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
     classes = classify(flat)
     leaves = jtu.tree_leaves(classes)
@@ -51,7 +51,7 @@ def _classes(
         )
     is_code = isinstance(classes, EnumerationItem)
     names = names_of(enumeration_of(classes)) if is_code else ()
-    return _Classes(np.asarray(leaves[0]).reshape(shape), names)
+    return np.asarray(leaves[0]).reshape(shape), names
 
 
 def _changes(corners: SweepResult, lattice: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ class RefinedMap:
         region = self._grid.region(number)
         *arrays, valid = (x[region] for x in self._kept.arrays.values())
         values = jtu.tree_unflatten(self._structure, arrays)
-        self.classes[region] = _classes(self._classify, values, valid.shape).numbers
+        self.classes[region], _ = _classes(self._classify, values, valid.shape)
 
     def _neighbours(self, tiles: Iterable[int]) -> set[int]:
         """Return the tiles that share a face, an edge or a corner with one of these."""

@@ -148,6 +148,7 @@ class Memory:
         self.grid = grid
         self.fills = [x.fill for x in leaves]
         self.attributes: dict[str, dict[str, Any]] = {}
+        self.name = None
         self.arrays = {
             x.name: np.empty((*grid.shape, *x.shape), x.dtype) for x in leaves
         }
@@ -191,6 +192,7 @@ class Store:
     def __init__(self, path: Path, grid: Grid, leaves: list[Leaf]):
         """Name the directory, which is not opened before it is used."""
         self.path = path
+        self.name = str(path)
         self.grid = grid
         self.leaves = leaves
         self._arrays: dict[str, Any] = {}

@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike, PyTree
 from jrigid._checks import check_type, whole_number
 from jrigid.sweep._drive import Submit, meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
-from jrigid.sweep._refine import RefinedMap, corners_of
+from jrigid.sweep._refine import Classes, RefinedMap, corners_of
 from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store, identity, known_block
 from jrigid.sweep._work import (
@@ -129,15 +129,12 @@ def sweep(
     kept = Memory(grid, leaves) if path is None else Store(path, grid, leaves)
     run = _Run(work, kept, executor, progress)
     structure = jtu.tree_structure(values)
-    classes = None
-    names = ()
+    classes = Classes()
     with kept.opened(about | identity(grid, leaves), descriptions):
         if refine is None:
             failures = run.compute(range(math.prod(grid.blocks)))
         else:
-            failures, refined = run.refine(refine, structure)
-            classes = refined.classes
-            names = refined.names
+            failures, classes = run.refine(refine, structure)
         kept.record(failures)
     _warn(failures, run.valid, grid)
     *arrays, valid = kept.arrays.values()
@@ -147,9 +144,9 @@ def sweep(
         axes=grid.axes,
         failures=failures,
         attributes=kept.attributes,
-        store=None if path is None else str(path),
-        classes=classes,
-        class_names=names,
+        store=kept.name,
+        classes=classes.numbers,
+        class_names=classes.names,
     )
 
 
@@ -287,15 +284,15 @@ class _Run:
 
     def refine(
         self, classify: Callable[[PyTree], Any], structure: Any
-    ) -> tuple[tuple[Failure, ...], RefinedMap]:
-        """Compute the tiles with a change of class; return failures and the map."""
+    ) -> tuple[tuple[Failure, ...], Classes]:
+        """Compute the tiles with a change of class; return failures and all classes."""
         grid = self._work.grid
         corners = _corners(self._work.function, grid, self._executor)
         refined = RefinedMap(grid, self._kept, structure, classify, corners)
         failures = refined.refine(self.compute)
         # `valid` decides on a warning alone, so points may count twice.
         self.valid += int(np.sum(corners.valid))
-        return failures, refined
+        return failures, Classes(refined.classes, refined.names)
 
 
 def _failure(grid: Grid, number: int, error: str) -> Failure:
