@@ -692,6 +692,9 @@ def test_arguments_of_another_type_are_named(untyped):
     axes = {"x": np.linspace(0, 1, 5)}
     with pytest.raises(ValueError, match=r"`attributes\['x'\]` must be a Mapping"):
         quiet(lambda x: x, axes, attributes={"x": "rad/s"})
+    for wrong, kind in ((42, "a int"), (ThreadPoolExecutor, "the class")):
+        with pytest.raises(ValueError, match=f"method `submit`, but it is {kind}"):
+            quiet(lambda x: x, axes, executor=wrong)
 
 
 def test_nothing_valid_is_said():

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from jrigid._checks import check_type, whole_number
+from jrigid._checks import check_type, demand, kind_of, whole_number
 from jrigid.sweep._drive import Submit, meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
 from jrigid.sweep._refine import Classes, RefinedMap, corners_of
@@ -329,7 +329,10 @@ def _submitting(
 
 # Any: pools of processes have attributes that `Executor` has not.
 def _prepare(executor: Any) -> None:
-    """Refuse a pool of processes that forks; let its workers end with this process."""
+    """Refuse what is no executor, or forks; let workers end with this process."""
+    can_submit = hasattr(executor, "submit") and not isinstance(executor, type)
+    message = f"must have the method `submit`, but it is {kind_of(executor)}."
+    demand(can_submit, f"Argument `executor` {message}")
     processes = getattr(executor, "_mp_context", None)
     if processes is not None and processes.get_start_method() == "fork":
         raise ValueError(
