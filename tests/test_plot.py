@@ -396,6 +396,8 @@ def test_infinite_numbers_are_white_and_colours_run_over_the_others():
     limits = np.percentile(MAP[MAP >= 0.7], (2, 98))
     np.testing.assert_allclose(ax.collections[0].get_clim(), limits)
     assert colour_at(ax, -0.9, 0.1) == "#ffffff" != colour_at(ax, 0.9, 0.1)
+    masked = jr.plot.chart(np.ma.masked_less(MAP, 0.7), AREA)
+    np.testing.assert_allclose(masked.collections[0].get_clim(), limits)
     nothing = jr.plot.chart(MAP * np.nan, AREA)
     assert colour_at(nothing, 0.9, 0.1) == "#ffffff"
 
@@ -594,6 +596,14 @@ WRONG = {
     "quantities of a named tuple": (
         lambda: PLOT.chart(jr.stability.top_stability(TOP, 3.0), AREA),
         "several: growth_rate_squared, growth_rate",
+    ),
+    "complex numbers": (
+        lambda: PLOT.chart(1j * MAP, AREA),
+        "`values` must be real or codes, but it is of complex128",
+    ),
+    "masked codes": (
+        lambda: PLOT.chart(np.ma.masked_equal(HALVES, 2), AREA),
+        "`values` must hold floats where it is masked",
     ),
     "too many regions": (
         lambda: PLOT.chart(np.arange(41 * 31).reshape(41, 31), AREA),

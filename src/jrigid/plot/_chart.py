@@ -78,8 +78,9 @@ def chart(
     Args:
         values: A `SweepResult` of one quantity (of several
             `result._replace(values=...)`), an `xarray.DataArray`, or an array (n, m):
-            numbers, codes of an enumeration, texts, integers or booleans. NaN and
-            infinity are left white. Of a refined map the classes are drawn.
+            numbers, codes of an enumeration, texts, integers or booleans. NaN,
+            infinity and what is masked are left white. Of a refined map the classes are
+            drawn.
         grid: Of an array names (with units) and points of its axes, as for
             `stability_map`; of others new names.
         ax: Axes.
@@ -232,6 +233,18 @@ def _regions(drawn: _Map, names: Sequence[str]) -> tuple[np.ndarray, list[_Regio
     return values, [_Region(text, values == x, _TINTS[x]) for text, x in tinted]
 
 
+def _unmasked(values: Any) -> np.ndarray:
+    """Values as an array, NaN where numbers are masked."""
+    array = np.asarray(values)
+    message = f"Argument `values` must be real or codes, but it is of {array.dtype}."
+    demand(array.dtype.kind not in "cOMm", message)
+    if not np.ma.is_masked(values):
+        return array
+    message = "Argument `values` must hold floats where it is masked, but it does not."
+    demand(array.dtype.kind == "f", message)
+    return np.ma.filled(values, np.nan)
+
+
 def _demand_one_quantity(values: object) -> None:
     """Raise ValueError for several quantities: a mapping or a named tuple of them."""
     # Also xarray's Dataset is a mapping.
@@ -263,7 +276,7 @@ def _map_of(values: object, grid: Mapping[str, AnyArray] | None) -> _Map:
     if isinstance(values, EnumerationItem):
         kinds = enumeration_of(values).texts
         values = code_of(values)
-    array = np.asarray(values)
+    array = _unmasked(values)
     kinds = ("False", "True") if array.dtype.kind == "b" else kinds
     shape = tuple(np.size(x) for x in axes.values())
     titles = grid or axes
