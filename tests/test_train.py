@@ -49,13 +49,14 @@ class Scene:
         mean = jnp.trace(jnp.asarray(self.tensor)) / 3
         self.body = jr.RigidBody(self.tensor, Table(mean, jnp.zeros(7)))
 
-    def train(self, body=None, **options):
+    def train(self, body=None, optimizer=ADAM, **options):
         given = {
             "key": jax.random.key(0),
             "free": lambda body: body.torque.table,
             "batch": 8,
         }
-        return identify.train(body or self.body, self.trials, ADAM, **given | options)
+        body = body or self.body
+        return identify.train(body, self.trials, optimizer, **given | options)
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +95,17 @@ def test_training_stops_when_validation_has_stopped_to_fall(scene, learnt, capsy
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(ended.training)
     assert lines[0].startswith("epoch 0: training ")
+
+
+def test_training_ends_where_the_parameters_are_not_finite(scene):
+    """At the first step, or after steps of which the best is returned."""
+    with pytest.raises(RuntimeError, match="pass a lower learning rate"):
+        scene.train(optimizer=optax.sgd(1e300), epochs=20)
+    rate = optax.piecewise_constant_schedule(2e-2, {6: 1e300})  # of two epochs
+    ended = scene.train(optimizer=optax.adam(rate), epochs=20)
+    assert ended.epoch == len(ended.validation) - 1 == 2
+    assert np.all(np.isfinite(ended.validation))
+    assert np.all(np.isfinite(ended.system.torque.table))
 
 
 @pytest.mark.slow
@@ -144,8 +156,9 @@ def test_bad_arguments_are_named(scene, untyped):
         ValueError, match="`validation` must be indices of some of 30 trials"
     ):
         train(validation=[30])
-    with pytest.raises(ValueError, match=r"`validation` must be indices .* not all"):
-        train(validation=range(30))
+    for wrong in (range(30), [False] * 29 + [True], [0.5]):
+        with pytest.raises(ValueError, match=r"`validation` must be indices .* all"):
+            train(validation=wrong)
     with pytest.raises(ValueError, match="`free` must pick floating point arrays"):
         train(free=lambda body: body)
     with pytest.raises(ValueError, match="`free` must pick floating point arrays"):

@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import check_type, demand, whole_number
+from jrigid._checks import all_finite, check_type, demand, whole_number
 from jrigid._numerics import product
 from jrigid._stepping.method import method_of
 from jrigid._types import AnyArray, RandomKey
@@ -157,7 +157,7 @@ def train(
             a batch are left out of that epoch.
         epochs: Largest number of epochs.
         patience: Training stops when the validation loss has not fallen for this many
-            epochs.
+            epochs. It also stops at parameters that are not finite.
         progress: Whether to print the losses of each epoch.
 
     Returns:
@@ -165,8 +165,8 @@ def train(
 
     Raises:
         ValueError: An argument has a wrong type, shape or option.
-        RuntimeError: The record or the system has bad values, or the first loss is not
-            finite.
+        RuntimeError: The record or the system has bad values, the first loss is not
+            finite, or the parameters are not before the validation loss has fallen.
 
     Gradients: none.
 
@@ -229,6 +229,7 @@ def _trained(
     memory = task.optimizer.init(params)
     best = _Best(params, np.inf, 0)
     losses: list[tuple[Array, Array]] = []
+    has_diverged = False
     # An epoch reports the validation loss before its first batch, hence one epoch more.
     for epoch in range(epochs + 1):
         after = _epoch(task, params, memory, jax.random.fold_in(key, epoch))
@@ -237,14 +238,22 @@ def _trained(
             _print_losses(epoch, after)
         if float(after.validation) < best.loss:
             best = _Best(params, float(after.validation), epoch)
-        # A loss that is not finite makes all parameters NaN, so that training ends.
         elif epoch - best.epoch >= patience or not np.isfinite(best.loss):
             break
         params = after.params
         memory = after.memory
+        # No step leads back from parameters that are not finite.
+        has_diverged = not all_finite(params)
+        if has_diverged:
+            break
     if not np.isfinite(best.loss):
         raise RuntimeError(
             "Argument `system` must have a finite loss to start from, but has none."
+        )
+    if has_diverged and best.epoch == 0:
+        raise RuntimeError(
+            "Argument `optimizer` must keep the parameters finite, but it does not: "
+            "pass a lower learning rate."
         )
     training, validation = (jnp.stack(x) for x in zip(*losses, strict=True))
     return best, training, validation
@@ -284,12 +293,16 @@ def _held_out(validation: Sequence[int] | None, trials: int) -> np.ndarray:
         "Argument `observations` must hold two trials or more, one of them to judge "
         "by, but it holds one.",
     )
-    default = np.arange(trials)[::-5]
-    chosen = default if validation is None else np.unique(np.asarray(validation))
+    if validation is None:
+        return np.arange(trials)[::-5]
+    chosen = np.unique(np.asarray(validation))
+    # A mask of all trials would count as the trials 0 and 1.
     demand(
-        0 < chosen.size < trials and bool(np.all(np.isin(chosen, np.arange(trials)))),
+        np.issubdtype(chosen.dtype, np.integer)
+        and 0 < chosen.size < trials
+        and bool(np.all(np.isin(chosen, np.arange(trials)))),
         f"Argument `validation` must be indices of some of {trials} trials, not all, "
-        f"but it is {validation!r}.",
+        f"but it is {chosen}.",
     )
     return chosen
 
