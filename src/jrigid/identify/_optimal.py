@@ -8,10 +8,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import demand
+from jrigid._checks import (
+    check_type,
+    demand,
+    float_arrays,
+    is_concrete,
+    whole_number,
+)
 from jrigid._numerics import or_one
 from jrigid._types import Scalar
 from jrigid.identify._compile import quick_jit
@@ -32,7 +39,7 @@ class Optimum(NamedTuple):
     Attributes:
         plan: The plan. Its `bound` and `predicted` state what to expect from it.
         score: The score that was minimised.
-        start_score: Score of the plan that was given.
+        start_score: Score of the plan that was given, moved to within the limits.
         slope: Length of the step that the gradient still asks for within the limits, in
             units of these. It is small at an optimum.
         history: Score after each step from each initial plan, the given plan first.
@@ -85,7 +92,8 @@ def optimal_trial(
         keep each time near its initial value.
 
     Raises:
-        ValueError: The number of limits is not the number of arrays.
+        ValueError: The number of limits is not the number of arrays, or a limit is none.
+        RuntimeError: The score is not finite at any of the initial plans.
 
     Gradients: none.
     Source: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM Journal on Optimization 10
@@ -100,16 +108,67 @@ def optimal_trial(
     >>> print(errors.round(4), abs(best.plan.state.omega).round(2))
     [0.2349 0.0047] [0.41 0.91 0.02]
     """
+    check_type("plan", plan, Plan)
+    whole_number("starts", starts)
+    whole_number("steps", steps)
     arrays = jtu.tree_leaves(choose(plan))
-    entries = [limits] if len(arrays) == 1 else list(limits)
+    demand(
+        bool(arrays) and all(eqx.is_inexact_array(x) for x in arrays),
+        "Argument `choose` must pick floating point arrays of the plan, but it does "
+        "not.",
+    )
+    is_sequence = isinstance(limits, tuple | list)
+    is_single = len(arrays) == 1 and not (is_sequence and len(limits) == 1)
+    entries = [limits] if is_single else list(limits)
     demand(
         len(entries) == len(arrays),
         f"Argument `limits` must have an entry for each of {len(arrays)} arrays that "
         f"`choose` picks, but it has {len(entries)}.",
     )
-    # Numbers would be static, and each new limit would compile the search again.
-    entries = jtu.tree_map(lambda x: x if callable(x) else jnp.asarray(x), entries)
-    return _optimum(plan, choose, entries, score, starts, steps)
+    pairs = zip(entries, arrays, strict=True)
+    entries = [_checked(entry, array) for entry, array in pairs]
+    optimum = _optimum(plan, choose, entries, score, starts, steps)
+    # The search keeps a score that is not a number as infinite.
+    if is_concrete(optimum.score) and not optimum.score < jnp.inf:
+        raise RuntimeError(
+            "Argument `score` must be finite at one of the initial plans, but it is "
+            "not: look at `plan.predicted`, within the limits."
+        )
+    return optimum
+
+
+def _checked(entry: Any, x: Array) -> "_Entry":
+    """An entry of the argument `limits` as arrays, whose values jit does not compile.
+
+    Raises:
+        ValueError: The entry is no limit of an array like `x`.
+    """
+    if callable(entry):
+        return entry
+    is_pair = isinstance(entry, tuple | list)
+    demand(
+        not is_pair or len(entry) == 2,
+        "Argument `limits` must be a pair (low, high), a length or a function for "
+        f"each array, but an entry holds {len(entry) if is_pair else 1}.",
+    )
+    bounds = float_arrays(*entry) if is_pair else float_arrays(entry)
+    for bound in bounds:
+        fits = bound.ndim <= x.ndim and all(
+            a in (1, b) for a, b in zip(bound.shape[::-1], x.shape[::-1], strict=False)
+        )
+        demand(
+            fits,
+            f"Argument `limits` must broadcast to an array of shape {x.shape}, but it "
+            f"has shape {bound.shape}.",
+        )
+    if all(map(is_concrete, bounds)):
+        low, high = bounds if is_pair else (0.0, bounds[0])
+        demand(
+            all(np.all(np.isfinite(y)) for y in bounds) and bool(np.all(low <= high)),
+            "Argument `limits` must be finite, low at most high and a length not "
+            f"negative, but it is {entry}.",
+        )
+    return (bounds[0], bounds[1]) if is_pair else bounds[0]
 
 
 # An entry of the argument `limits`.
