@@ -94,6 +94,34 @@ def test_a_plan_s_bound_has_its_slopes_in_both_modes():
     assert abs(shift) < 1e-9
 
 
+@pytest.mark.parametrize(
+    "limits", [(1.0, -1.0), -1.0, np.nan, (0.0, np.inf), [0.0, 1.0, 2.0], np.ones(2)]
+)
+def test_limits_that_hold_no_plan_are_refused(limits):
+    with pytest.raises(ValueError, match="Argument `limits` must"):
+        identify.optimal_trial(plan_of(np.ones(3)), spin, limits)
+
+
+def test_a_search_without_a_finite_score_is_an_error(untyped):
+    """Of one start: a pair of limits in a list, for arrays in a tuple."""
+    plan = plan_of(np.ones(3))
+    nothing = lambda bound: jnp.nan * bound.covariance[0, 0]  # noqa: E731
+
+    def search(choose=lambda x: (x.t0,), limits=([0.0, 1.0],), **options):
+        options = {"starts": 1, "steps": 1} | options
+        return identify.optimal_trial(plan, choose, limits, score=nothing, **options)
+
+    with pytest.raises(RuntimeError, match="`score` must be finite"):
+        search()
+    for name in ("starts", "steps"):
+        with pytest.raises(ValueError, match=f"`{name}` must be an integer"):
+            search(**{name: 0})
+    with pytest.raises(ValueError, match="`choose` must pick floating point arrays"):
+        search(choose=lambda _: ())
+    with pytest.raises(ValueError, match="`plan` must be a Plan"):
+        identify.optimal_trial(plan.system, spin, 1.0)
+
+
 def test_a_plan_that_says_too_little_is_refused():
     plan = plan_of(np.ones(3))
     with pytest.raises(ValueError, match="an entry for each of 2 arrays"):
@@ -190,3 +218,29 @@ def test_a_plan_at_rest_determines_nothing_in_float32():
     found = identify.Plan(body, start, record).predicted
     assert found.numbers.dtype == np.float32
     assert found.status == identify.Status.UNIDENTIFIABLE
+
+
+def test_the_report_of_a_plan_does_not_depend_on_the_unit_of_a_magnetometer():
+    """In tesla and in nanotesla, with a bias that is zero in the plan."""
+    state = jr.State(UNTURNED, np.array([0.3, 0.5, 0.9]))
+    gyro = identify.Rates(TS, None, NOISE)
+
+    def predicted(unit, t0=0.0, torque=None):
+        north = identify.Magnetometer(unit * np.array([2e-5, 0.0, -4e-5]))
+        compass = identify.Record(north, TS, None, unit * 2e-7)
+        return identify.Plan(
+            jr.RigidBody(NEARLY_SYMMETRIC.inertia, torque),
+            state,
+            (gyro, compass),
+            t0=t0,
+            free=lambda *sensors: sensors[2].bias,
+        ).predicted
+
+    in_tesla, in_nanotesla = predicted(1.0), predicted(1e9)
+    np.testing.assert_allclose(in_nanotesla.errors, in_tesla.errors, rtol=1e-6)
+    for found in (in_tesla, in_nanotesla):
+        assert found.determined == {"inertia": True, "magnetometer.bias": True}
+        assert "not finite" not in str(found)
+    # Under a torque no motion leads back from the state to the first sample.
+    late = predicted(1.0, t0=0.1, torque=jr.torques.LinearDrag(0.01))
+    assert "Predictions are not finite" in str(late)

@@ -273,8 +273,12 @@ def _planned(plan: Plan) -> _Planned:
     # Readings equal to the predictions, so that the residuals are zero. They are data:
     # derivatives of a plan do not go through them.
     values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
-    records = [x.with_values(y) for x, y in zip(records, values, strict=True)]
-    problem = dataclasses.replace(problem, samples=samples_of(records, one))
+    records = tuple(x.with_values(y) for x, y in zip(records, values, strict=True))
+    read = samples_of(records, one)
+    # Errors of sensors get their natural units from the readings, as in a fit.
+    unknowns, numbers = _unknowns(plan, records, read)
+    point = _first_point(plan.state, numbers, unknowns.own_start(trials, dtype))
+    problem = dataclasses.replace(problem, unknowns=unknowns, samples=read)
     rows, links = problems.evaluation(problem, layout)(point)
     if not system.is_free:
         # `simulate` cannot go back from `t0` to an earlier sample.

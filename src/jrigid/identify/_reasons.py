@@ -47,7 +47,7 @@ def _reason(result: FitResult) -> str:
             f"{RESULTS[result.diagnostics.input_result]} The error that a fit raises by "
             "default says which argument it is."
         )
-    if not np.any(np.isfinite(np.asarray(result.diagnostics.history))):
+    if _lacks_predictions(result):
         return (
             "Predictions are not finite at the initial values: `predict` of each sensor "
             "must be finite wherever there is a reading, and `simulate` from `start`."
@@ -84,6 +84,13 @@ def _reason(result: FitResult) -> str:
             "is left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
         )
     return _of_noise(result)
+
+
+def _lacks_predictions(result: FitResult) -> bool:
+    """Whether predictions were finite nowhere."""
+    searched = np.any(np.isfinite(np.asarray(result.diagnostics.history)))
+    # A plan makes no search, and is NOT_CONVERGED only where it has no predictions.
+    return bool(result.status == Status.NOT_CONVERGED) and not searched
 
 
 def _by_gyro(result: FitResult) -> bool:
