@@ -58,6 +58,13 @@ def test_degrees_for_radians_are_named(readings):
     assert "pi / 180" in line
 
 
+def test_a_record_of_three_samples_is_named(readings):
+    readings[3:] = np.nan
+    found, line = first_line(readings, NOISE)
+    assert found.status == Status.BAD_INPUT
+    assert "`observations` must hold 12 numbers at least" in line
+
+
 def test_degrees_for_radians_are_named_where_samples_are_dense(rng):
     """A body whose rates change 57 times too slowly is nearly a sphere."""
     ts = np.linspace(0, 2, 1000)

@@ -128,6 +128,10 @@ class RESULTS(
         "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in "
         "float32), but one is not."
     )
+    invalid_observations = (
+        "Argument `observations` must hold 12 numbers at least, values of unit length "
+        "where they are attitudes or directions, and a positive noise, but it does not."
+    )
     undersampled_rates = (
         "Argument `values` of `Gyro` must be in rad/s and sampled twice a turn, but "
         "the body turns more: are rates in degrees a second, times not in seconds? (1 "

@@ -572,7 +572,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def check_records(findings: Findings, records: tuple[Record, ...]) -> None:
     """Note what is wrong with values, times and noise of records with numpy arrays."""
-    code = RESULTS.invalid_state
+    code = RESULTS.invalid_observations
     for x in records:
         of = f"of `{type(x.sensor).__name__}` must"
         known = x.known
