@@ -65,6 +65,15 @@ def test_fits_of_different_records_are_not_compared(rng):
     assert identify.compare({"one": first, "two": first}).names == ("one", "two")
     with pytest.raises(ValueError, match="same samples"):
         identify.compare({"one": first, "two": second})
+    with pytest.raises(ValueError, match="`results` must hold fits"):
+        identify.compare({})
+
+
+def test_what_is_no_fit_is_not_compared(untyped):
+    with pytest.raises(ValueError, match="`results` must be a Mapping"):
+        identify.compare([1])
+    with pytest.raises(ValueError, match="`results` must be a FitResult"):
+        identify.compare({"one": 1})
 
 
 def test_each_trial_or_group_is_left_out_once():

@@ -437,6 +437,30 @@ def test_free_motion_tells_everything_but_the_scale():
     assert found.null_directions == ("overall scale",)
 
 
+def test_many_fits_name_their_numbers_once_and_other_methods_ask_for_one_fit():
+    one = told(ASYMMETRIC, "bias")
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), one)
+    assert both.names == one.names
+    assert one.names[5:] == ("gyro.bias[0]", "gyro.bias[1]", "gyro.bias[2]")
+    asked = [
+        lambda: both.system,
+        lambda: both.estimates,
+        lambda: both.determined,
+        lambda: both.null_directions,
+        lambda: both.ratios_intervals,
+        lambda: both.predict(1.0),
+        both.residuals,
+        both.observations,
+        both.linearization,
+        lambda: both.spread(jnp.trace),
+        lambda: identify.profile(both, jnp.trace, jnp.ones(1)),
+        lambda: identify.compare({"both": both}),
+    ]
+    for ask in asked:
+        with pytest.raises(ValueError, match=r"must be a single fit, .* \(2,\) fits"):
+            ask()
+
+
 @pytest.mark.parametrize("scale", ["known", "rotor"])
 def test_the_scale_of_a_free_body_is_refused(scale):
     with pytest.raises(ValueError, match="scale"):

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
-from jrigid._checks import demand
+from jrigid._checks import check_type, demand
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._inertia_models import Fixed
 from jrigid.identify._records import Record
-from jrigid.identify._result import FitResult
+from jrigid.identify._result import FitResult, demand_single
 from jrigid.systems import RigidBody
 
 # Level of an unmodelled torque about an axis for which a fit finds none, over the
@@ -113,7 +113,12 @@ def compare(results: Mapping[str, FitResult]) -> Comparison:
     axes known       594.7         595           5         0.0         0.0
     any body         593.0         592           8         4.3        17.5
     """
+    check_type("results", results, Mapping)
     fits = tuple(results.values())
+    demand(bool(fits), "Argument `results` must hold fits, but it is empty.")
+    for x in fits:
+        check_type("results", x, FitResult)
+        demand_single(x)
     first = fits[0]
     noise_known = first.problem.options.noise_known
 

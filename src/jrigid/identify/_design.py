@@ -36,7 +36,7 @@ from jrigid.identify._minimise import (
 )
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
-from jrigid.identify._result import FitResult, result_of
+from jrigid.identify._result import FitResult, demand_single, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
 from jrigid.identify._smoother import Links, Point, Rows
 from jrigid.identify._unknowns import Unknowns, unknowns_of
@@ -392,6 +392,7 @@ def profile(
     >>> print(jr.identify.profile(result, largest_share, values).round(1) + 0)
     [1. 0. 1.]
     """
+    demand_single(result)
     values = jnp.asarray(values, result.numbers.dtype)
     check_shape("values", values, (None,))
     demand(

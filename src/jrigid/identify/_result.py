@@ -105,7 +105,8 @@ class Observations(NamedTuple):
 class FitResult(eqx.Module):
     """Inertia, state and what else was sought, with errors.
 
-    `fit_each` returns one with an axis of fits in front. `print` shows it in words.
+    `fit_each` returns one with an axis of fits in front, of which
+    `jax.tree.map(lambda x: x[0], result)` is the first. `print` shows it in words.
     Errors are standard errors. If no noise was stated, or the residuals exceed it,
     their level is that of the residuals.
 
@@ -222,7 +223,10 @@ class FitResult(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """What each of `numbers` is."""
-        return self.unknowns.names()
+        # The names follow from the shapes of the arrays in a single fit.
+        first = (0,) * (self.numbers.ndim - 1)
+        unknowns = jtu.tree_map(lambda x: x[first], self.unknowns)
+        return unknowns.names()
 
     def spread(self, function: Callable[[Array], Array]) -> Array:
         """Covariance of a function of the tensor, to a vector; of a single fit.
@@ -235,6 +239,7 @@ class FitResult(eqx.Module):
         Args:
             function: Of the tensor.
         """
+        demand_single(self)
         return _spread(self.unknowns, self.numbers, self.numbers_covariance, function)
 
     def interval(
@@ -267,6 +272,7 @@ class FitResult(eqx.Module):
         >>> print(found.interval(share).round(2))
         [0.44 0.44]
         """
+        demand_single(self)
         # As an array: a Python number would be static, and each level would compile
         # anew.
         level_ = jnp.asarray(level, self.numbers.dtype)
@@ -298,15 +304,16 @@ class FitResult(eqx.Module):
 
     @property
     def system(self) -> RigidBody:
-        """The body that was found, that of the first trial."""
+        """The body that was found, that of the first trial; of a single fit."""
         return self.fitted()[0]
 
     def fitted(self, index: Int[_ArrayLike, ""] = 0) -> tuple[Any, ...]:
-        """System and sensors of a trial, as they were found.
+        """System and sensors of a trial, as they were found; of a single fit.
 
         Args:
             index: Which trial.
         """
+        demand_single(self)
         leaves = self.unknowns.leaves_of(index)
         return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves)
 
@@ -358,6 +365,7 @@ class FitResult(eqx.Module):
         >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
         [ 1.6 -2.4  1.2]
         """
+        demand_single(self)
         _check_index("record", record, len(self.problem.samples.values))
         _check_index("trial", trial, self.t0.shape[0])
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
@@ -398,6 +406,7 @@ class FitResult(eqx.Module):
             record: Which record.
             trial: Which trial.
         """
+        demand_single(self)
         part = self.problem.samples.parts[record]
         jacobian = self.diagnostics.jacobian[trial, part]
         return jacobian, self.diagnostics.residuals[trial, part]
@@ -405,11 +414,13 @@ class FitResult(eqx.Module):
     def residuals(self, record: int = 0) -> Float[Array, "trials n degrees"]:
         """Residuals of a record, predicted less observed, in its own units.
 
+        Of a single fit.
         NaN where nothing was seen, and of samples that are saturated or were left out.
 
         Args:
             record: Which record.
         """
+        demand_single(self)
         samples = self.problem.samples
         used = self.kept[..., None] & (samples.weight > 0) & (samples.sign == 0)
         white = samples.whitener[:, samples.parts[record]]
@@ -431,6 +442,7 @@ class FitResult(eqx.Module):
         Args:
             record: Which record.
         """
+        demand_single(self)
         samples = self.problem.samples
         part = samples.parts[record]
         values = samples.values[record]
@@ -462,6 +474,7 @@ class FitResult(eqx.Module):
         that may not be negative and ended at zero has an infinite error: the record
         only bounds it from above.
         """
+        demand_single(self)
         estimates = {}
         for x in self.unknowns.sought:
             numbers, covariance = self._of_sought(x)
@@ -503,6 +516,7 @@ class FitResult(eqx.Module):
         >>> print(found.determined)
         {'inertia': True, 'gyro.bias': True}
         """
+        demand_single(self)
         described = bool((self.status == Status.OK) | (self.status == Status.MISFIT))
         has_errors = described or bool(self.status == Status.UNIDENTIFIABLE)
         verdicts = {"inertia": described}
@@ -537,6 +551,7 @@ class FitResult(eqx.Module):
     @property
     def null_directions(self) -> tuple[str, ...]:
         """What the record does not tell, in words; of a single fit, outside of jit."""
+        demand_single(self)
         # `_words` imports this module.
         from jrigid.identify._words import null_directions
 
@@ -547,6 +562,16 @@ class FitResult(eqx.Module):
         from jrigid.identify._words import report
 
         return report(self)
+
+
+def demand_single(result: FitResult) -> None:
+    """Raise ValueError for the result of `fit_each`, which holds many fits."""
+    shape = result.numbers.shape[:-1]
+    demand(
+        not shape,
+        f"Argument `result` must be a single fit, but it holds {shape} fits: take one "
+        "by `jax.tree.map(lambda x: x[0], result)`.",
+    )
 
 
 def _check_index(name: str, value: int, count: int) -> None:
