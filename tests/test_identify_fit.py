@@ -461,6 +461,27 @@ def test_many_fits_name_their_numbers_once_and_other_methods_ask_for_one_fit():
             ask()
 
 
+def test_trials_records_levels_and_functions_that_are_none_are_refused(untyped):
+    """JAX would read the last trial in the place of one that there is not."""
+    one = told(ASYMMETRIC, "bias")
+    for ask in (one.fitted, one.initial_state):
+        for index in (1, -1):
+            with pytest.raises(ValueError, match="`index` must be at least 0"):
+                ask(index)
+    with pytest.raises(ValueError, match="`trial` must be at least 0 and below 1"):
+        one.linearization(0, 1)
+    for ask in (one.linearization, one.residuals, one.observations):
+        with pytest.raises(ValueError, match="`record` must be at least 0 and below 1"):
+            ask(1)
+    for level in (0.0, 1.0, 95, np.nan):
+        with pytest.raises(ValueError, match="`level` must be above 0 and below 1"):
+            one.interval(jnp.trace, level)
+    with pytest.raises(ValueError, match=r"of 0 axes, but it returns one of shape"):
+        one.interval(jnp.diag)
+    with pytest.raises(ValueError, match=r"of 1 axes, but it returns one of shape"):
+        one.spread(jnp.trace)
+
+
 @pytest.mark.parametrize("scale", ["known", "rotor"])
 def test_the_scale_of_a_free_body_is_refused(scale):
     with pytest.raises(ValueError, match="scale"):

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import Enumeration, demand, float_arrays, is_concrete
+from jrigid._checks import Enumeration, demand, float_arrays, is_concrete, kind_of
 from jrigid._core.third_party import with_codes
 from jrigid._numerics import product
 from jrigid._spectral import eigh
@@ -240,6 +240,7 @@ class FitResult(eqx.Module):
             function: Of the tensor.
         """
         demand_single(self)
+        _check_rank(function, self.inertia, 1)
         return _spread(self.unknowns, self.numbers, self.numbers_covariance, function)
 
     def interval(
@@ -273,6 +274,11 @@ class FitResult(eqx.Module):
         [0.44 0.44]
         """
         demand_single(self)
+        _check_rank(function, self.inertia, 0)
+        demand(
+            not is_concrete(level) or 0 < level < 1,
+            f"Argument `level` must be above 0 and below 1, but it is {level}.",
+        )
         # As an array: a Python number would be static, and each level would compile
         # anew.
         level_ = jnp.asarray(level, self.numbers.dtype)
@@ -314,6 +320,7 @@ class FitResult(eqx.Module):
             index: Which trial.
         """
         demand_single(self)
+        _check_index("index", index, self.own_numbers.shape[0])
         leaves = self.unknowns.leaves_of(index)
         return self.unknowns.parts(self.numbers, self.own_numbers[index], leaves)
 
@@ -334,6 +341,7 @@ class FitResult(eqx.Module):
         >>> print(t0)
         50.0
         """
+        _check_index("index", index, self.t0.shape[-1])
         attitude = self.state.attitude[..., index, :]
         omega = self.state.omega[..., index, :]
         return State(attitude, omega), self.t0[..., index]
@@ -407,6 +415,8 @@ class FitResult(eqx.Module):
             trial: Which trial.
         """
         demand_single(self)
+        _check_index("record", record, len(self.problem.samples.values))
+        _check_index("trial", trial, self.t0.shape[0])
         part = self.problem.samples.parts[record]
         jacobian = self.diagnostics.jacobian[trial, part]
         return jacobian, self.diagnostics.residuals[trial, part]
@@ -421,6 +431,7 @@ class FitResult(eqx.Module):
             record: Which record.
         """
         demand_single(self)
+        _check_index("record", record, len(self.problem.samples.values))
         samples = self.problem.samples
         used = self.kept[..., None] & (samples.weight > 0) & (samples.sign == 0)
         white = samples.whitener[:, samples.parts[record]]
@@ -443,6 +454,7 @@ class FitResult(eqx.Module):
             record: Which record.
         """
         demand_single(self)
+        _check_index("record", record, len(self.problem.samples.values))
         samples = self.problem.samples
         part = samples.parts[record]
         values = samples.values[record]
@@ -574,11 +586,22 @@ def demand_single(result: FitResult) -> None:
     )
 
 
-def _check_index(name: str, value: int, count: int) -> None:
-    """Raise ValueError unless there is such a record or trial."""
+def _check_index(name: str, value: Int[_ArrayLike, ""], count: int) -> None:
+    """Raise ValueError unless there is such a record or trial, if that is known."""
     demand(
-        0 <= value < count,
+        not is_concrete(value) or bool(0 <= value < count),
         f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
+    )
+
+
+def _check_rank(function: Callable[[Array], Any], tensor: Array, rank: int) -> None:
+    """Raise ValueError unless a function of the tensor returns an array of a rank."""
+    value = jax.eval_shape(function, tensor)
+    shape = getattr(value, "shape", None)
+    demand(
+        shape is not None and len(shape) == rank,
+        f"Argument `function` must return an array of {rank} axes, but it returns "
+        f"{kind_of(value) if shape is None else f'one of shape {shape}'}.",
     )
 
 
