@@ -211,6 +211,23 @@ def test_a_plan_knows_nothing_of_what_it_seeks_beforehand():
     assert np.max(np.abs(off)) < 1e-6
 
 
+def test_readings_beyond_the_limit_of_a_gyro_say_little():
+    """A plan counts them hardly more than readings that nobody has."""
+    limit, state = 0.6, jr.State(UNTURNED, np.array([0.3, 0.5, 0.9]))
+    omegas = jr.free_rotation(NEARLY_SYMMETRIC.inertia, state, TS).omega
+    beyond = np.abs(omegas) > limit
+    assert 0.3 < np.mean(beyond) < 0.6
+
+    def errors(gyro, sigma):
+        record = identify.Record(gyro, TS, None, sigma)
+        plan = identify.Plan(NEARLY_SYMMETRIC, state, record)
+        return np.sqrt(np.diagonal(plan.bound.ratios_covariance))
+
+    seen = errors(identify.Gyro(limit=limit), NOISE)
+    without = errors(identify.Gyro(), np.where(beyond, 1e6, NOISE))
+    assert np.all((0.9 * without < seen) & (seen < 1.001 * without))
+
+
 def test_a_plan_at_rest_determines_nothing_in_float32():
     start = jr.State(UNTURNED.astype(np.float32), np.zeros(3, np.float32))
     body = jr.RigidBody(NEARLY_SYMMETRIC.inertia.astype(np.float32))

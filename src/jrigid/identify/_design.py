@@ -252,6 +252,15 @@ def _first_point(state: State, numbers: AnyArray, own: AnyArray) -> Point:
     return Point(numbers, own, attitude, omega, omega[..., :0])
 
 
+def _read(record: Record, predicted: Array) -> Record:
+    """The record of what its sensor reads, which ends at the limit of the sensor."""
+    largest = record.sensor.saturation()
+    if largest is not None:
+        largest = largest.astype(predicted.dtype)[None, None]
+        predicted = jnp.clip(predicted, -largest, largest)
+    return record.with_values(predicted)
+
+
 def _planned(plan: Plan) -> _Planned:
     """Derivatives of a record that agrees exactly with a plan."""
     system = plan.system
@@ -270,10 +279,11 @@ def _planned(plan: Plan) -> _Planned:
     layout = whole(samples, 1, plan.t0)
     # This noise weighs links only, and a plan has none.
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
-    # Readings equal to the predictions, so that the residuals are zero. They are data:
+    # Readings equal to the predictions, so that residuals within the limit of a sensor
+    # are zero. They are data:
     # derivatives of a plan do not go through them.
     values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
-    records = tuple(x.with_values(y) for x, y in zip(records, values, strict=True))
+    records = tuple(_read(x, y) for x, y in zip(records, values, strict=True))
     read = samples_of(records, one)
     # Errors of sensors get their natural units from the readings, as in a fit.
     unknowns, numbers = _unknowns(plan, records, read)
