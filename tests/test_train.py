@@ -178,6 +178,10 @@ def test_bad_arguments_are_named(scene, untyped):
         identify.train(jr.RigidBody(scene.tensor, upright), scene.trials, ADAM, key=key)
     with pytest.raises(RuntimeError, match="`inertia` must"):
         train(jr.RigidBody(-scene.tensor, body.torque))
+    gyro = identify.Gyro(limit=5.0)
+    cut = [(x.ts, np.clip(x.values, -5, 5), x.sigma) for x in scene.trials]
+    with pytest.raises(ValueError, match="must hold no saturated readings"):
+        identify.train(body, [identify.Record(gyro, *x) for x in cut], ADAM, key=key)
     broken = eqx.tree_at(lambda x: x.torque.table, body, np.nan * body.torque.table)
     with pytest.raises(RuntimeError, match="must have a finite loss"):
         train(broken, epochs=1)

@@ -141,7 +141,8 @@ def train(
         system: The body. Its torque holds the initial parameters (an
             `equinox.Module`).
         observations: As for `fit`, of two trials or more. Rates must be observed, and
-            attitudes where the torque or a sensor depends on them.
+            attitudes where the torque or a sensor depends on them. No reading may be
+            saturated.
         optimizer: An `optax.GradientTransformation`.
         key: Random key for the order of the segments. The same key gives the same bits
             on the same machine.
@@ -421,6 +422,11 @@ def _prepared(system: RigidBody, records: tuple[Record, ...]) -> _Prepared:
             "torque or sensor depends on them, attitudes, without parts that move "
             "inside the body, but it does not."
         )
+    demand(
+        not np.any(observed.segments.samples.sign),
+        "Argument `observations` must hold no saturated readings, but it holds some: "
+        "leave out their samples.",
+    )
     # The loss divides by the degrees of freedom: numbers less those of the state.
     numbers = np.sum(observed.segments.samples.weight, axis=(1, 2))
     demand(
