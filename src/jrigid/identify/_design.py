@@ -280,8 +280,7 @@ def _planned(plan: Plan) -> _Planned:
     # This noise weighs links only, and a plan has none.
     problem = problems.Problem(options, unknowns, samples, jnp.ones(6, dtype))
     # Readings equal to the predictions, so that residuals within the limit of a sensor
-    # are zero. They are data:
-    # derivatives of a plan do not go through them.
+    # are zero. They are data: derivatives of a plan do not go through them.
     values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
     records = tuple(_read(x, y) for x, y in zip(records, values, strict=True))
     read = samples_of(records, one)

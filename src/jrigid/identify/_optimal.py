@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -144,7 +144,7 @@ def _checked(entry: Any, x: Array) -> "_Entry":
         ValueError: The entry is no limit of an array like `x`.
     """
     if callable(entry):
-        return entry
+        return cast(Callable[[Array], Array], entry)
     is_pair = isinstance(entry, tuple | list)
     demand(
         not is_pair or len(entry) == 2,

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
@@ -589,7 +590,7 @@ def demand_single(result: FitResult) -> None:
 def _check_index(name: str, value: Int[_ArrayLike, ""], count: int) -> None:
     """Raise ValueError unless there is such a record or trial, if that is known."""
     demand(
-        not is_concrete(value) or bool(0 <= value < count),
+        not is_concrete(value) or 0 <= int(np.asarray(value)) < count,
         f"Argument `{name}` must be at least 0 and below {count}, but it is {value}.",
     )
 
