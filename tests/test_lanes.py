@@ -126,16 +126,16 @@ def _turned(method, angle):
 
 @pytest.mark.parametrize("name", ["Verner9", "Dopri8", "Tsit5", "Bosh3"])
 def test_the_second_estimate_is_smaller_in_smooth_steps(name):
-    """By one order, and equal to the first on a turn by 0.3 rad."""
+    """It is of one order less, and a quarter of the first on a turn by 0.6 rad."""
     solver, order, _ = METHODS[name]
     method = method_of(solver)
     first, second = np.transpose([_turned(method, angle) for angle in (0.3, 0.6)])
-    np.testing.assert_allclose(second[0], first[0], rtol=1e-3)
+    np.testing.assert_allclose(second[1], first[1] / 4, rtol=1e-6)
     np.testing.assert_allclose(np.log2(first[1] / first[0]), order, atol=0.6)
     np.testing.assert_allclose(np.log2(second[1] / second[0]), order - 1, atol=0.6)
 
 
-@pytest.mark.parametrize(("name", "most"), [("Verner9", 160), ("Dopri8", 40)])
+@pytest.mark.parametrize(("name", "most"), [("Verner9", 300), ("Dopri8", 80)])
 def test_an_error_at_a_kink_is_a_bounded_multiple_of_both_estimates(name, most):
     """y' = max(0, t - kink) over a step of length 1 has y = (1 - kink)^2 / 2."""
     method = method_of(METHODS[name][0])

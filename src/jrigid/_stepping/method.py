@@ -12,9 +12,11 @@ from jaxtyping import Float
 # compiled.
 _GROUPS = {4: 1, 8: 2}
 _MOST_GROUPS = 4
-# On a turn by this angle [rad] the two estimates of the error of a step are equal. Most
-# steps of smooth motions turn by more, and there the first estimate is larger.
-_EQUAL_AT = 0.3
+# On a turn by this angle [rad] the second estimate of the error of a step is this part
+# of the first. It is of one order less, so they are equal at a quarter of the angle.
+# Most steps of smooth motions turn by more, and there the first estimate decides.
+_ANGLE = 0.6
+_PART = 0.25
 # Singular values below this part of the largest count as zero.
 _ZERO = 1e-9
 
@@ -113,7 +115,7 @@ def _second_estimate(table: np.ndarray, order: int) -> np.ndarray:
     if not len(others):
         return np.zeros(len(stages))
     # Rates of the stages, times the length of the step, of y' = i y.
-    angle = 1j * _EQUAL_AT
+    angle = 1j * _ANGLE
     ones = np.ones(len(stages))
     rates = np.linalg.solve(np.eye(len(stages)) - angle * stages, angle * ones)
     # Of several, that which is largest here. Combinations that happen to be small here
@@ -121,7 +123,7 @@ def _second_estimate(table: np.ndarray, order: int) -> np.ndarray:
     by_part = np.stack([others @ rates.real, others @ rates.imag], axis=1)
     left, _, _ = np.linalg.svd(by_part)
     second = left[:, 0] @ others
-    return second * abs(table[-1] @ rates) / abs(second @ rates)
+    return second * _PART * abs(table[-1] @ rates) / abs(second @ rates)
 
 
 def _elementary_weights(stages: np.ndarray, nodes: int) -> list[np.ndarray]:
