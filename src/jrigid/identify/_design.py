@@ -252,15 +252,6 @@ def _first_point(state: State, numbers: AnyArray, own: AnyArray) -> Point:
     return Point(numbers, own, attitude, omega, omega[..., :0])
 
 
-def _read(record: Record, predicted: Array) -> Record:
-    """The record of what its sensor reads, which ends at the limit of the sensor."""
-    largest = record.sensor.saturation()
-    if largest is not None:
-        largest = largest.astype(predicted.dtype)[None, None]
-        predicted = jnp.clip(predicted, -largest, largest)
-    return record.with_values(predicted)
-
-
 def _planned(plan: Plan) -> _Planned:
     """Derivatives of a record that agrees exactly with a plan."""
     system = plan.system
@@ -282,7 +273,8 @@ def _planned(plan: Plan) -> _Planned:
     # Readings equal to the predictions, so that residuals within the limit of a sensor
     # are zero. They are data: derivatives of a plan do not go through them.
     values = jax.lax.stop_gradient(problems.predictions(problem, layout, point))
-    records = tuple(_read(x, y) for x, y in zip(records, values, strict=True))
+    pairs = zip(records, values, strict=True)
+    records = tuple(x.with_values(problems.as_read(x.sensor, y)) for x, y in pairs)
     read = samples_of(records, one)
     # Errors of sensors get their natural units from the readings, as in a fit.
     unknowns, numbers = _unknowns(plan, records, read)

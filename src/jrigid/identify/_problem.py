@@ -358,6 +358,15 @@ def whitened(
     return rows * samples.weight
 
 
+def as_read(sensor: AbstractSensor, values: Array) -> Array:
+    """Predicted values (..., k) as a sensor reads them, which ends at its limit."""
+    largest = sensor.saturation()
+    if largest is None:
+        return values
+    largest = jnp.broadcast_to(largest.astype(values.dtype), values.shape)
+    return jnp.clip(values, -largest, largest)
+
+
 def predictions(problem: Problem, layout: Layout, point: Point) -> list[Array]:
     """Predicted values of each record (trials, n, k), with one body in all trials."""
     unknowns = problem.unknowns

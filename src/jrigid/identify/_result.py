@@ -21,7 +21,7 @@ from jrigid.dynamics import State
 from jrigid.identify._compile import quick_jit
 from jrigid.identify._diagnostics import Diagnostics
 from jrigid.identify._intervals import interval
-from jrigid.identify._problem import Problem, shown_by
+from jrigid.identify._problem import Problem, as_read, shown_by
 from jrigid.identify._records import Samples
 from jrigid.identify._unknowns import AbstractSought, Unknowns
 from jrigid.mass import MassProperties
@@ -374,9 +374,7 @@ class FitResult(eqx.Module):
         >>> print(found.predict(100.0).round(1))  # 80 s after the record has ended
         [ 1.6 -2.4  1.2]
         """
-        demand_single(self)
-        _check_index("record", record, len(self.problem.samples.values))
-        _check_index("trial", trial, self.t0.shape[0])
+        self._check_place(record, trial)
         times = float_arrays(ts)[0].astype(self.numbers.dtype)
         after = jnp.all(times >= self.t0[trial])
         options = self.problem.options
@@ -406,6 +404,12 @@ class FitResult(eqx.Module):
             )
         return body
 
+    def _check_place(self, record: int, trial: int = 0) -> None:
+        """Raise ValueError unless this is a single fit with such a record and trial."""
+        demand_single(self)
+        _check_index("record", record, len(self.problem.samples.values))
+        _check_index("trial", trial, self.t0.shape[0])
+
     def linearization(
         self, record: int = 0, trial: int = 0
     ) -> tuple[Float[Array, "n degrees unknowns"], Float[Array, "n degrees"]]:
@@ -415,9 +419,7 @@ class FitResult(eqx.Module):
             record: Which record.
             trial: Which trial.
         """
-        demand_single(self)
-        _check_index("record", record, len(self.problem.samples.values))
-        _check_index("trial", trial, self.t0.shape[0])
+        self._check_place(record, trial)
         part = self.problem.samples.parts[record]
         jacobian = self.diagnostics.jacobian[trial, part]
         return jacobian, self.diagnostics.residuals[trial, part]
@@ -431,8 +433,7 @@ class FitResult(eqx.Module):
         Args:
             record: Which record.
         """
-        demand_single(self)
-        _check_index("record", record, len(self.problem.samples.values))
+        self._check_place(record)
         samples = self.problem.samples
         used = self.kept[..., None] & (samples.weight > 0) & (samples.sign == 0)
         white = samples.whitener[:, samples.parts[record]]
@@ -454,8 +455,7 @@ class FitResult(eqx.Module):
         Args:
             record: Which record.
         """
-        demand_single(self)
-        _check_index("record", record, len(self.problem.samples.values))
+        self._check_place(record)
         samples = self.problem.samples
         part = samples.parts[record]
         values = samples.values[record]
@@ -617,10 +617,7 @@ def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array
     state0, t0 = result.initial_state(trial)
     options = result.problem.options
     (shown,) = shown_by(options, system, [sensor], state0, t0, samples)
-    largest = sensor.saturation()
-    if largest is None:
-        return shown
-    return jax.vmap(lambda x: jnp.clip(x, -largest, largest))(shown)
+    return as_read(sensor, shown)
 
 
 def _of_moments(which: Any, tensor: Array) -> Array:

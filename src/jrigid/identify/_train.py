@@ -230,7 +230,6 @@ def _trained(
     memory = task.optimizer.init(params)
     best = _Best(params, np.inf, 0)
     losses: list[tuple[Array, Array]] = []
-    has_diverged = False
     # An epoch reports the validation loss before its first batch, hence one epoch more.
     for epoch in range(epochs + 1):
         after = _epoch(task, params, memory, jax.random.fold_in(key, epoch))
@@ -244,14 +243,13 @@ def _trained(
         params = after.params
         memory = after.memory
         # No step leads back from parameters that are not finite.
-        has_diverged = not all_finite(params)
-        if has_diverged:
+        if not all_finite(params):
             break
     if not np.isfinite(best.loss):
         raise RuntimeError(
             "Argument `system` must have a finite loss to start from, but has none."
         )
-    if has_diverged and best.epoch == 0:
+    if best.epoch == 0 and not all_finite(params):
         raise RuntimeError(
             "Argument `optimizer` must keep the parameters finite, but it does not: "
             "pass a lower learning rate."
