@@ -12,7 +12,7 @@ import jrigid as jr
 from jrigid._core.lanes_last import lanes_last
 from jrigid._stepping import replay
 from jrigid._stepping.method import method_of
-from jrigid._stepping.step import error_of, pull_back, stages
+from jrigid._stepping.step import combine, error_of, pull_back, stages
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 GRAVITY = jr.torques.UniformGravity(
@@ -106,13 +106,47 @@ def test_a_step_is_that_of_its_method(name, in_lanes):
     @quick_jit
     def ours(t, h, y):
         rates, y1 = stages(method, _field, t, h, y, in_lanes)
-        return y1, error_of(method, rates, h)
+        return y1, h * combine(method, rates, method.stages), error_of(method, rates, h)
 
     term = diffrax.ODETerm(lambda t, y, _: _field(t, y))
     memory = solver.init(term, t, t + h, y, None)
     theirs = solver.step(term, t, t + h, y, None, memory, False)[:2]
-    for found, wanted in zip(ours(t, h, y), theirs, strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-15)
+    *found, size = ours(t, h, y)
+    for x, wanted in zip(found, theirs, strict=True):
+        np.testing.assert_allclose(x, wanted, rtol=1e-13, atol=1e-15)
+    assert np.all(size >= np.abs(found[1]) * (1 - 1e-6))
+
+
+def _turned(method, angle):
+    """Estimates of the error of a step of y' = i y, which turns y by an angle."""
+    table = 1j * angle * method.rows[:-1]
+    rates = np.linalg.solve(np.eye(method.stages) - table, np.ones(method.stages))
+    return [abs(angle * x @ rates) for x in (method.rows[-1], method.second_row)]
+
+
+@pytest.mark.parametrize("name", ["Verner9", "Dopri8", "Tsit5", "Bosh3"])
+def test_the_second_estimate_is_smaller_in_smooth_steps(name):
+    """It is of one order less, and a quarter of the first on a turn by 0.6 rad."""
+    solver, order, _ = METHODS[name]
+    method = method_of(solver)
+    first, second = np.transpose([_turned(method, angle) for angle in (0.3, 0.6)])
+    np.testing.assert_allclose(second[1], first[1] / 4, rtol=1e-6)
+    np.testing.assert_allclose(np.log2(first[1] / first[0]), order, atol=0.6)
+    np.testing.assert_allclose(np.log2(second[1] / second[0]), order - 1, atol=0.6)
+
+
+@pytest.mark.parametrize(("name", "most"), [("Verner9", 300), ("Dopri8", 80)])
+def test_an_error_at_a_kink_is_a_bounded_multiple_of_both_estimates(name, most):
+    """y' = max(0, t - kink) over a step of length 1 has y = (1 - kink)^2 / 2."""
+    method = method_of(METHODS[name][0])
+    kinks = np.linspace(0, 1, 20_001)[1:-1]
+    rates = np.maximum(0, method.times[:, None] - kinks)
+    # The last stage is at the new state.
+    error = abs(method.rows[-2] @ rates - (1 - kinks) ** 2 / 2)
+    first = abs(method.rows[-1] @ rates)
+    second = abs(method.second_row @ rates)
+    assert np.max(error / first) > 10_000
+    assert np.max(error / np.maximum(first, second)) < most
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -263,8 +263,13 @@ def equal_steps(
 
 
 def error_of(method: Method, rates: Float[Array, "stages n"], h: Array) -> Array:
-    """The estimate of the error of a step."""
-    return h * combine(method, rates, method.stages)
+    """The estimate of the size of the error of a step: the larger of two estimates."""
+    size = jnp.abs(combine(method, rates, method.stages))
+    used = np.flatnonzero(method.second_row)
+    if used.size:
+        second = _sum([method.second_row[i] for i in used], [rates[i] for i in used])
+        size = jnp.maximum(size, jnp.abs(second))
+    return h * size
 
 
 def pull_back(
