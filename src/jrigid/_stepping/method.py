@@ -107,11 +107,15 @@ def _second_estimate(table: np.ndarray, order: int) -> np.ndarray:
     nodes = order - 2
     if nodes < 1:
         return np.zeros(len(stages))
+    # The others use the same stages: more terms would cost time in lanes. Coefficients
+    # that are zero but for rounding would cost it too.
+    used = np.flatnonzero(table[-1])
     weights = np.array(_elementary_weights(stages, nodes))
-    first = table[-1] / np.linalg.norm(table[-1])
-    _, sizes, vectors = np.linalg.svd(np.vstack([weights, first]))
+    conditions = np.vstack([weights, table[-1] / np.linalg.norm(table[-1])])
+    _, sizes, vectors = np.linalg.svd(conditions[:, used])
     rank = np.count_nonzero(sizes > _ZERO * sizes[0])
-    others = vectors[rank:]
+    others = np.zeros((len(vectors) - rank, len(stages)))
+    others[:, used] = vectors[rank:]
     if not len(others):
         return np.zeros(len(stages))
     # Rates of the stages, times the length of the step, of y' = i y.
@@ -123,9 +127,6 @@ def _second_estimate(table: np.ndarray, order: int) -> np.ndarray:
     by_part = np.stack([others @ rates.real, others @ rates.imag], axis=1)
     left, _, _ = np.linalg.svd(by_part)
     second = left[:, 0] @ others
-    # Rounding leaves tiny coefficients where they are zero. In lanes, these terms would
-    # take a third of the time of a step.
-    second = np.where(abs(second) < _ZERO * abs(second).max(), 0.0, second)
     return second * _PART * abs(table[-1] @ rates) / abs(second @ rates)
 
 
