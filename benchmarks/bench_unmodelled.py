@@ -1,19 +1,22 @@
-"""A hundred trials of a racquet with drag and a loose mass: is `fit` honest?
+"""A hundred trials with a torque that the model lacks: are the stated errors right?
 
-The trials come from an independent integrator (tests/worlds.py): a flat body of moments
-0.07, 0.93 and 1 (their unit plays no role), 0.5 to 1 s at 100 Hz, 5 to 20 rad/s, about
-any axis or nearly about a principal one; quadratic drag takes 0.3 % of the spin in a
-radian; the gyro's noise is 0.05 % of the spin (0.0025 to 0.01 rad/s), its low-pass has
-3 ms. The lash is white torque, its root spectral density s over the mean moment [rad /
-s^1.5], or a ball of so many parts of the smallest moment on a spring. `fit` is told the
-drag's form, and that there may be a torque (`unmodelled="estimate"`).
+The trials come from an independent integrator (tests/worlds.py). A flat body has the
+moments 0.07, 0.93 and 1 (their unit plays no role). Each trial lasts 0.5 to 1 s at
+100 Hz. The body spins at 5 to 20 rad/s about any axis, or nearly about a principal one.
+Quadratic drag takes 0.3 % of the spin in a radian. The noise of the gyro is 0.05 % of
+the spin (0.0025 to 0.01 rad/s), and its low-pass has a time constant of 3 ms. The
+disturbance is white torque with a root spectral density of s over the mean moment
+[rad / s^1.5], or a ball on a spring whose moment is a part of the smallest moment.
+`fit` receives the form of the drag, and `unmodelled="estimate"` or a level.
 
-Told: the error stated is below a tenth of the ratio. Scatter: rms of the errors of
-I2/I1, of I3/I1 and of the drag over what was stated, of the trials that are told.
-Explained: the fit does not end MISFIT, WRONG_BASIN or NOT_CONVERGED. Errors: those
-stated over the part of the sensor. Halves: two fits of half the trials each; the
-difference of both ratios over its error, and each half's I3/I1 less the truth over its
-error.
+Determined: the fit does not end MISFIT, WRONG_BASIN or NOT_CONVERGED, and the stated
+error of I3/I1 is below a tenth of it. Scatter: root mean square of the errors of I2/I1,
+of I3/I1 and of the drag, over the stated ones, in the determined trials. Explained: the
+fit does not end MISFIT, WRONG_BASIN or NOT_CONVERGED. Over the sensor's: the stated
+error over the part of it that the noise of the sensor alone would cause. Halves: two
+fits of half the trials each. Their columns are the differences of both ratios over
+their errors, the errors of I3/I1 over the stated ones, the stated error, and the
+verdicts.
 """
 
 import pathlib
@@ -46,7 +49,7 @@ SCENE = {
     "sigma": 5e-4,
     "wobble": 0.0,
 }
-LASHES = {
+DISTURBANCES = {
     "none": {},
     "white, s = 0.01": {"kick": 0.01},
     "white, s = 0.03": {"kick": 0.03},
@@ -55,17 +58,19 @@ LASHES = {
     "ball 0.1, 5 Hz": {"wobble": 0.1, "wobble_frequency": 5.0},
 }
 WHITE = "white, s = 0.01"
-SHAPES = {"flat": identify.Flat(), "any": identify.Tensor()}
+MODELS = {"flat": identify.Flat(), "any": identify.Tensor()}
 FAILED = (Status.MISFIT, Status.WRONG_BASIN, Status.NOT_CONVERGED)
 NAMES = [x for x in dir(Status) if isinstance(getattr(Status, x), Status)]
 
 
-def trials_of(lash, count, seed):
-    """Trials of the world with this lash, each a `worlds.Record`."""
-    return worlds.trials(np.random.default_rng(seed), count, **SCENE | LASHES[lash])
+def trials_of(disturbance, count, seed):
+    """Trials with this disturbance, each a `worlds.Record`."""
+    return worlds.trials(
+        np.random.default_rng(seed), count, **SCENE | DISTURBANCES[disturbance]
+    )
 
 
-def fitter(shape, lag, unmodelled):
+def fitter(model, lag, unmodelled):
     """A function that fits each of several sets of trials."""
     body = jr.RigidBody(np.full(3, MEAN), jr.torques.QuadraticDrag(jnp.asarray(1e-3)))
     gyro = identify.Gyro(time_constant=None if lag == "ignored" else jnp.asarray(LAG))
@@ -80,7 +85,7 @@ def fitter(shape, lag, unmodelled):
             for trials in sets
         ]
         return identify.fit_each(
-            body, records, free=free, inertia_model=SHAPES[shape], unmodelled=unmodelled
+            body, records, free=free, inertia_model=MODELS[model], unmodelled=unmodelled
         )
 
     return fit_sets
@@ -97,27 +102,30 @@ def drags_of(found):
     return np.asarray(values), np.asarray(errors)
 
 
+def variances(covariances):
+    """The diagonal of each of several covariances."""
+    return np.diagonal(np.asarray(covariances), axis1=1, axis2=2)
+
+
 def of_singles(found):
-    """Explained %, at boundary %, determined, scatters, error of I3/I1, errors."""
+    """The columns of fits of single trials."""
     ratios = np.asarray(found.ratios)
     errors = np.asarray(found.ratios_errors)
     failed = is_one_of(found.status, FAILED)
     boundary = is_one_of(found.status, [Status.AT_BOUNDARY])
-    told = (errors[:, 1] < 0.1 * RATIOS[1]) & ~failed
+    determined = (errors[:, 1] < 0.1 * RATIOS[1]) & ~failed
     drag, drag_error = drags_of(found)
     pulls = np.column_stack(
         [(ratios - RATIOS) / errors, (drag - DRAG * MEAN) / drag_error]
     )
-    scatter = np.sqrt(np.mean(pulls[told] ** 2, axis=0))
-    size = 100 * np.median(errors[told, 1] / RATIOS[1])
-    whole = np.diagonal(np.asarray(found.numbers_covariance), axis1=1, axis2=2)[told]
-    own = np.diagonal(
-        np.asarray(found.diagnostics.sensor_covariance), axis1=1, axis2=2
-    )[told]
+    scatter = np.sqrt(np.mean(pulls[determined] ** 2, axis=0))
+    size = 100 * np.median(errors[determined, 1] / RATIOS[1])
+    whole = variances(found.numbers_covariance)[determined]
+    own = variances(found.diagnostics.sensor_covariance)[determined]
     return [
         f"{100 * np.mean(~failed):.0f}",
         f"{100 * np.mean(boundary):.0f}",
-        int(told.sum()),
+        int(determined.sum()),
         *(f"{x:.2f}" for x in scatter),
         f"{size:.2f}",
         f"{np.median(np.sqrt(whole / own)):.1f}",
@@ -141,7 +149,7 @@ def of_halves(found):
 
 
 def name_of(unmodelled):
-    """What a fit is told of the unmodelled torque, in a word."""
+    """The option `unmodelled` in a word."""
     if unmodelled == "estimate":
         return "estimate"
     return "known" if unmodelled else "none"
@@ -152,50 +160,50 @@ def main():
     parser.add_argument("--count", type=int, default=100, help="trials")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--any", action="store_true", help="also as a body of any shape"
+        "--any", action="store_true", help="also with any inertia tensor"
     )
     given = parser.parse_args()
-    cases = [("flat", "known", "estimate", lash) for lash in LASHES]
+    cases = [("flat", "known", "estimate", x) for x in DISTURBANCES]
     cases += [("flat", lag, "estimate", WHITE) for lag in ("sought", "ignored")]
     cases += [("flat", "known", level, WHITE) for level in (0.01 * MEAN, 0.0)]
     if given.any:
-        cases += [("any", "known", "estimate", lash) for lash in LASHES]
+        cases += [("any", "known", "estimate", x) for x in DISTURBANCES]
     fits, rows = {}, []
-    for shape, lag, unmodelled, lash in cases:
+    for model, lag, unmodelled, disturbance in cases:
         fit_sets = fits.setdefault(
-            (shape, lag, unmodelled), fitter(shape, lag, unmodelled)
+            (model, lag, unmodelled), fitter(model, lag, unmodelled)
         )
-        trials = trials_of(lash, given.count, given.seed)
+        trials = trials_of(disturbance, given.count, given.seed)
         half = given.count // 2
         start = time.perf_counter()
         singles = of_singles(fit_sets([[x] for x in trials]))
         halves = of_halves(fit_sets([trials[:half], trials[half:]]))
-        rows.append([lash, shape, lag, name_of(unmodelled), *singles, *halves])
+        rows.append([disturbance, model, lag, name_of(unmodelled), *singles, *halves])
         print(*rows[-1], f"{time.perf_counter() - start:.0f} s", sep=" | ", flush=True)
     header = [
-        "lash",
-        "shape",
-        "lag",
+        "disturbance",
+        "inertia model",
+        "time constant",
         "unmodelled",
         "explained %",
         "at boundary %",
-        "told",
+        "determined",
         "scatter I2/I1",
         "I3/I1",
         "drag",
         "error of I3/I1 %",
-        "errors over the sensor's",
-        "halves apart",
-        "off",
-        "error %",
-        "they end",
+        "over the sensor's",
+        "halves: differences",
+        "errors of I3/I1",
+        "stated error %",
+        "verdicts",
     ]
     explained = [" ".join(x.split()) for x in (__doc__ or "").split("\n\n")[1:3]]
     text = "\n\n".join([*explained, common.table(header, rows)])
     packages = ("jax", "equinox", "numpy", "scipy")
     common.report(
         "unmodelled",
-        "A hundred trials with what no model has",
+        "A hundred trials with a torque that the model lacks",
         text,
         packages,
         given.write,

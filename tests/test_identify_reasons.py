@@ -75,6 +75,15 @@ def test_degrees_for_radians_are_named_where_samples_are_dense(rng):
     assert found.ratios[1] < 1.03
 
 
+def test_a_body_at_rest_is_named(rng):
+    bias = np.array([0.3, -0.2, 0.1])
+    readings = bias + NOISE * rng.normal(size=(TS.size, 3))
+    record = identify.Record(identify.Gyro(jnp.asarray(bias)), TS, readings, NOISE)
+    found = identify.fit(BLIND, record, throw=False)
+    assert "The body does not turn" in str(found).splitlines()[0]
+    assert found.status != Status.OK
+
+
 def test_radians_converted_as_if_they_were_degrees_are_named(readings):
     found, line = first_line(readings / DEGREES, NOISE / DEGREES)
     assert found.status != Status.OK

@@ -26,7 +26,7 @@ _CONFINED = 1e-6
 # less: steps are short where a torque is not smooth, and there the estimate is no
 # bound. The share grows with the square of the radians. Shares in proportion to the
 # radians are enough where estimates are bounds; with them the worst of 16 torques of
-# each kind had 3.3 times the promised error of the energy, with squares it has 0.6
+# each kind had 3.3 times the promised error of the energy, with squares it has 0.3
 # times (benchmarks/bench_nonsmooth.py, whose motions were used to choose these
 # numbers). A step can pass a jump because the share has a minimum, and because steps of
 # a few times the shortest length may commit the whole tolerance again.

@@ -57,6 +57,11 @@ def _reason(result: FitResult) -> str:
             "The torque changes too fast for the steps of a fit. Pass its mean over a "
             "step, or a motion of your own (`motion`, and `start`)."
         )
+    if _is_at_rest(result):
+        return (
+            "The body does not turn: the readings are no larger than their noise. "
+            "Inertia shows in rates that change."
+        )
     if _is_nearly_a_sphere(result):
         return (
             "Nearly a sphere: so looks any body whose rates are in degrees a second, "
@@ -105,6 +110,21 @@ def _by_gyro(result: FitResult) -> bool:
 def _is_nearly_a_sphere(result: FitResult) -> bool:
     free = result.problem.options.free_motion
     return bool(free and _by_gyro(result) and result.ratios[1] < _NEARLY_A_SPHERE)
+
+
+def _is_at_rest(result: FitResult) -> bool:
+    """Whether the noise and the bias of the gyro explain its readings."""
+    if not (_by_gyro(result) and result.problem.options.noise_known):
+        return False
+    samples = result.problem.samples
+    part = samples.parts[0]
+    is_seen = np.asarray(samples.seen)[:, part]
+    whitener = np.asarray(samples.whitener)[:, part, :, :3][is_seen]
+    bias = np.asarray(result.fitted()[1].bias)
+    rates = np.asarray(samples.values[0])[is_seen] - bias
+    errors = np.einsum("nij,nj->ni", whitener, rates)
+    # The mean square of white errors scatters by sqrt(2 / n).
+    return bool(np.mean(errors**2) < 1 + GATE * math.sqrt(2 / errors.size))
 
 
 def _of_parameters(result: FitResult) -> str:
