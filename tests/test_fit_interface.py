@@ -550,6 +550,7 @@ def test_what_cannot_be_used_is_said_in_a_sentence(
         (["fit", "a", "--inertia-model", "cube"], "invalid choice"),
         (["fit", "a", "--save", "none/a.pkl"], "argument --save: its folder must"),
         (["fit", "a", "--plot", "none/a.png"], "argument --plot: its folder must"),
+        (["photometry", "a", "--pairs", "0"], "a whole number from 1, but it is '0'"),
     ],
 )
 def test_wrong_arguments_are_argparses_to_tell(arguments, words, capsys):
@@ -559,6 +560,13 @@ def test_wrong_arguments_are_argparses_to_tell(arguments, words, capsys):
     said = capsys.readouterr().err
     assert "usage: jrigid" in said
     assert words in said
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as stop:
+        _cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"jrigid {jr.__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Any
 
 import jax
@@ -72,6 +73,9 @@ def _parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(
         "jrigid", description="The rotation of rigid bodies."
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {version('jrigid')}"
     )
     codes = ", ".join(f"{code} {name}" for name, code in _EXIT.items())
     commands = parser.add_subparsers(required=True)

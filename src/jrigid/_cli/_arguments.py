@@ -22,3 +22,11 @@ def output(text: str) -> str:
         message = f"its folder must exist, but {str(folder)!r} does not"
         raise argparse.ArgumentTypeError(message)
     return text
+
+
+def count(text: str) -> int:
+    """A whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        message = f"it must be a whole number from 1, but it is {text!r}"
+        raise argparse.ArgumentTypeError(message)
+    return int(text)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jrigid import photometry, plot
 from jrigid._checks import demand
-from jrigid._cli._arguments import numbers, output
+from jrigid._cli._arguments import count, numbers, output
 
 _HOUR = 3600.0
 _DAY = 86400.0
@@ -96,7 +96,7 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
         help="whether the moments are those of the ellipsoid that is seen",
     )
     command.add_argument(
-        "--pairs", type=int, default=100, help="pairs of periods to try (100)"
+        "--pairs", type=count, default=100, help="pairs of periods to try (100)"
     )
     command.add_argument(
         "--plot",

@@ -131,6 +131,29 @@ def _consolidate(path: Path) -> None:
         extra("sweep", "zarr").consolidate_metadata(path)
 
 
+@contextlib.contextmanager
+def _exclusive(path: Path) -> Generator[None, None, None]:
+    """Refuse to enter while another process has entered for the same folder.
+
+    Windows has no such lock of folders, and nothing is refused there.
+    """
+    if fcntl is None:
+        yield
+        return
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(folder)
+        text = f"Another process is writing to the store {path}."
+        raise RuntimeError(text) from error
+    try:
+        yield
+    finally:
+        # The system also releases the lock when the process ends or is killed.
+        os.close(folder)
+
+
 def _is_new(path: Path) -> bool:
     return not path.exists() or (path.is_dir() and not any(path.iterdir()))
 
@@ -382,21 +405,11 @@ class Store:
     @contextlib.contextmanager
     def _locked(self) -> Generator[None, None, None]:
         """Lock the store; remove files that a killed process left half-written."""
-        directory = os.open(self.path, os.O_RDONLY)
-        try:
-            try:
-                if fcntl is not None:
-                    # The system releases this lock when the process ends or is killed.
-                    fcntl.flock(directory, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                text = f"Another process is writing to the store {self.path}."
-                raise RuntimeError(text) from error
+        with _exclusive(self.path):
             chunks = self.path.glob("**/c/**/*.partial")
             for partial in (*chunks, self._new_description):
                 partial.unlink(missing_ok=True)
             yield
-        finally:
-            os.close(directory)
 
     @property
     def _new_description(self) -> Path:
