@@ -22,15 +22,14 @@ _TOO_LONG = 2.0
 # switched on at an equilibrium.
 _JUMP = 4.0
 _CONFINED = 1e-6
-# A step of this many radians may commit the whole tolerance. A shorter one may commit
+# The longest step of a motion may commit the whole tolerance. A shorter one may commit
 # less: steps are short where a torque is not smooth, and there the estimate is no
-# bound. The share grows with the square of the radians. Shares in proportion to the
-# radians are enough where estimates are bounds; with them the worst of 16 torques of
+# bound. The share grows with the square of the length. Shares in proportion to the
+# length are enough where estimates are bounds; with them the worst of 16 torques of
 # each kind had 3.3 times the promised error of the energy, with squares it has 0.3
 # times (benchmarks/bench_nonsmooth.py, whose motions were used to choose these
 # numbers). A step can pass a jump because the share has a minimum, and because steps of
 # a few times the shortest length may commit the whole tolerance again.
-_WHOLE = 1.0
 _SMALLEST_SHARE = 3e-3
 _AT_A_JUMP = 8.0
 # Safety factor of a new step, and the factors by which a step may shrink and grow.
@@ -50,6 +49,7 @@ class Limits(NamedTuple):
         atol: Absolute error that a step may commit, in the scales of the components.
         radians: Longest step, in radians of the fastest rate.
         fine: The same where derivatives are taken.
+        whole: A step of this many radians may commit the whole tolerance.
         longest: Longest step.
         shortest: Shortest step; a quarter of it still changes the time.
         start_rate: Fastest rate at the start [rad/s].
@@ -60,6 +60,7 @@ class Limits(NamedTuple):
     atol: Float[Array, ""]
     radians: Float[Array, ""]
     fine: Float[Array, ""]
+    whole: Float[Array, ""]
     longest: Float[Array, ""]
     shortest: Float[Array, ""]
     start_rate: Float[Array, ""]
@@ -114,8 +115,8 @@ def _share_of_tolerance(
     limits: Limits, h: Float[Array, ""], rate: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The share of the tolerance that a step of length `h` may commit."""
-    radians = h * rate / _WHOLE
-    share = jnp.clip(radians * radians, _SMALLEST_SHARE, 1.0)
+    part = h * rate / limits.whole
+    share = jnp.clip(part * part, _SMALLEST_SHARE, 1.0)
     return jnp.where(h < _AT_A_JUMP * limits.shortest, 1.0, share)
 
 

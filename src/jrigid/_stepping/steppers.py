@@ -132,7 +132,7 @@ class ErrorControlled(NamedTuple):
     @property
     def first(self) -> float:
         """The first step is short: the next ones grow as their errors allow."""
-        return 0.1
+        return 0.3
 
     def end(self, t: Array, step: Array, goal: Array) -> Float[Array, ""]:
         """The end of the step, or the goal if the step ends just before it."""

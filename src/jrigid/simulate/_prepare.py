@@ -309,6 +309,7 @@ def limits_of(end: Array, fastest: Array, options: Options) -> Limits:
         atol=atol,
         radians=span,
         fine=fine,
+        whole=span,
         longest=jnp.minimum(longest, options.max_step),
         shortest=_SHORTEST * eps * end,
         start_rate=fastest,
