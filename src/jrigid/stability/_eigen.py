@@ -145,13 +145,13 @@ def null_directions(vectors: Array, operator: Array, tiny: Array) -> Array:
 def _without_symmetries(
     matrix: Array, neutral: Array, conserved: Array, tiny: Array
 ) -> Array:
-    """The matrix, what comes with every motion moved from the axis to -1.
+    """The matrix, with the zero eigenvalues that every motion has moved to -1.
 
-    Moved are the eigenvalues of directions that the matrix takes to zero, of rows that
-    it does, and, where the torque does not look at the attitude, the turn of the body,
-    which all follows. An eigenvalue of a known vector v is moved by adding a multiple
-    of v v^T, which leaves the others where they are, for each value of a parameter and
-    so for derivatives.
+    These are the eigenvalues of columns that the matrix maps to zero (`neutral`), those
+    of rows that it maps to zero (`conserved`), and, where the torque does not depend on
+    the attitude, the three of a turn of the whole body. A multiple of v v^T moves the
+    eigenvalue of a known vector v and leaves the others where they are. This holds for
+    each value of a parameter, so that derivatives are right too.
     """
     blind = jnp.all(matrix[3:, :3] == 0)
     away = -jnp.eye(3, len(matrix), dtype=matrix.dtype)
@@ -169,11 +169,11 @@ def _without_symmetries(
 def margin(matrix: Array, neutral: Array, conserved: Array, accuracy: Array) -> Scalar:
     """The margin of a matrix, in its units.
 
-    Without damping the eigenvalues lie in mirror images about the imaginary axis. Two
-    that meet there, at zero or in a collision of Krein's kind, leave it: ((s - s') /
-    2)^2 of the two goes smoothly from minus the square of half their distance to the
-    square of the growth rate. It is a double eigenvalue of the square of the matrix
-    less their mean, simple in kind where they meet.
+    Without damping the eigenvalues s are in mirror pairs about the imaginary axis. Two
+    that meet on the axis, at zero or in a Krein collision, may leave it. Then
+    ((s - s') / 2)^2 of the two changes smoothly, from minus the square of half their
+    distance to the square of the growth rate. With m the mean of the two, it is a
+    double eigenvalue of (matrix - m)^2, and semisimple where the two meet.
     """
     # Over the size all eigenvalues but those that are moved are within 1/4 of zero.
     size = 4 * (1 + jnp.sqrt(jnp.sum(jax.lax.stop_gradient(matrix) ** 2)))
