@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
@@ -108,6 +109,26 @@ def test_a_bias_that_is_not_sought_is_named(readings, size):
     assert "gyro.bias" in line
     named = np.array([float(x) for x in numbers.group(1).split(",")])
     assert np.linalg.norm(named - bias) < 0.6 * np.linalg.norm(bias)
+
+
+@pytest.mark.parametrize("lag", [0.008, 0.012])
+def test_a_filter_that_is_left_out_is_named(rng, lag):
+    """The residuals of the shorter one are no more than noise."""
+    sigma = 0.002
+    filtered = worlds.gyro(motion, TS, rng, sigma, time_constant=lag)
+    found, line = first_line(filtered, sigma)
+    assert found.status == Status.MISFIT
+    named = re.search(
+        r"time constant of some ([\d.]+) s would explain the residuals", line
+    )
+    assert named, line
+    assert float(named.group(1)) == pytest.approx(lag, rel=0.15)
+    assert "`Gyro(time_constant=...)`" in line
+    truth = MOMENTS[1:] / MOMENTS[0]
+    assert np.all(np.abs(found.ratios - truth) < found.ratios_errors)
+    direct, _ = first_line(motion(TS) + sigma * rng.normal(size=filtered.shape), sigma)
+    assert direct.status == Status.OK
+    assert abs(direct.diagnostics.lag[1]) < 4
 
 
 def test_a_torque_that_swings_is_named_and_is_no_bias(readings):

@@ -21,6 +21,9 @@ class Diagnostics(eqx.Module):
         loudest_band: Power of the residuals in the band of frequencies that stands out
             most, over the mean power, and how many standard deviations that is from the
             power of noise.
+        lag: Time constant [s] of a low-pass filter of the gyroscope that would explain
+            residuals, and how many standard errors its effect is from 0; zeros where it
+            was not sought.
         unexplained: Fraction of the square of what was observed that the fit does not
             explain, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed,
@@ -64,6 +67,7 @@ class Diagnostics(eqx.Module):
     chi_square_by_trial: Float[Array, " trials"]
     whiteness: tuple[Scalar, Scalar]
     loudest_band: tuple[Scalar, Scalar]
+    lag: tuple[Scalar, Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]

@@ -16,7 +16,12 @@ from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
-from jrigid.identify._filter import innovations
+from jrigid.identify._independent import (
+    Independent,
+    condensed_rows,
+    independent_rows,
+)
+from jrigid.identify._lag import NO_LAG, Lag, is_named, lag_of
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._problem import Problem
@@ -30,7 +35,7 @@ from jrigid.identify._result import (
     sigma_points,
     spread_of,
 )
-from jrigid.identify._smoother import Links, Rows
+from jrigid.identify._smoother import Rows
 
 # Of the largest singular value: a change of the state that the record shows.
 SHOWN = 1e-9
@@ -40,33 +45,6 @@ _FEWEST = 8  # trials whose scatter says how large errors are
 _DISAGREEING = 3.0
 # Of the level that moves a rate by its noise: where one of zero is judged.
 _TRIED = 0.03
-
-
-def condensed(rows: Rows, links: Links) -> Rows:
-    """Rows in the first state of each trial, as if nothing acted between segments."""
-    # Where each trial has one node its rows are in the first state already.
-    if not np.any(rows.node):
-        return rows
-    trials, nodes, local = links.gap.shape
-    border = rows.of_border.shape[-1]
-    # Derivatives of the state at a node in the border and in the first state.
-    state = np.zeros((trials, local, border + local), links.gap.dtype)
-    state[:, :, border:] = np.eye(local)
-    states = np.zeros((trials, nodes, local, border + local), links.gap.dtype)
-    # The end of a segment is the start of the next one, so that derivatives chain from
-    # node to node.
-    for node in range(nodes):
-        states[:, node] = state
-        state = links.of_state[:, node] @ state
-        state[:, :, :border] += links.of_border[:, node]
-    of_nodes = np.take_along_axis(states, rows.node[:, :, None, None], axis=1)
-    through = rows.of_state @ of_nodes
-    return Rows(
-        residual=rows.residual,
-        of_border=rows.of_border + through[..., :border],
-        of_state=through[..., border:],
-        node=np.zeros_like(rows.node),
-    )
 
 
 class Precision(NamedTuple):
@@ -192,50 +170,6 @@ def _least_value(dtype: np.dtype) -> float:
     """The least singular value to divide by: the square of the inverse is finite."""
     # The factor leaves room for sums of such squares.
     return 1e4 * float(np.sqrt(np.finfo(dtype).tiny))
-
-
-class Independent(NamedTuple):
-    """Independent rows of a fit, in first states, own numbers and numbers.
-
-    Attributes:
-        rows: Innovations where a torque may have acted, else residuals.
-        weight: Of each row.
-        log_determinant: Of the covariance of what was observed, in units of the noise:
-            with the sum of squares it makes -2 log likelihood.
-    """
-
-    rows: Rows
-    weight: np.ndarray
-    log_determinant: float
-
-
-@quality.once_for_each_fit
-def _condensed_rows(problem: Problem, fit: Fit) -> Rows:
-    """Rows of a minimum in the first state of each trial."""
-    del problem
-    return condensed(fit.minimum.rows, fit.minimum.links)
-
-
-@quality.once_for_each_fit
-def independent_rows(problem: Problem, fit: Fit) -> Independent:
-    """The rows by which a fit is judged, those of what is known beforehand last."""
-    minimum = fit.minimum
-    if not problem.options.dense:
-        return Independent(_condensed_rows(problem, fit), minimum.weight, 0.0)
-    filtered = innovations(quality.linearised(fit), fit.disturbance)
-    columns = np.concatenate(
-        [np.asarray(filtered.rows), quality.columns_of_prior(fit)], axis=1
-    )
-    border = 1 + minimum.links.gap.shape[-1]
-    rows = Rows(
-        residual=columns[..., 0],
-        of_border=columns[..., border:],
-        of_state=columns[..., 1:border],
-        node=np.zeros_like(minimum.rows.node),
-    )
-    # They have their weights already.
-    weight = np.ones_like(minimum.weight)
-    return Independent(rows, weight, float(np.sum(filtered.log_determinant)))
 
 
 class Weakest(NamedTuple):
@@ -538,7 +472,7 @@ def _fields_of_precision(
     sensors = known
     if problem.options.dense:
         # What the sensors alone would determine, without an unmodelled torque.
-        rows = _condensed_rows(problem, fit)
+        rows = condensed_rows(problem, fit)
         own = minimum.point.own.shape[-1]
         sensors = precision_of_rows(rows, minimum.weight, own, minimum.units)
     inflation = judgement.remainder.inflation
@@ -560,7 +494,7 @@ def _fields_of_record(
     minimum = fit.minimum
     point = minimum.point
     parts = problem.samples.parts
-    rows = _condensed_rows(problem, fit)
+    rows = condensed_rows(problem, fit)
     residuals, jacobian = _weighted(fit, rows, point.own.shape[-1])
     history = np.full(HISTORY, np.nan)
     history[: fit.history.size] = fit.history[:HISTORY]
@@ -796,6 +730,7 @@ class _Judgement(NamedTuple):
         unexplained: Of the square of what was observed, beyond the noise.
         whiteness: Correlation of neighbours, and its standard deviations from 0.
         by_trial: Mean square of the residuals of each trial.
+        lag: A low-pass filter of a gyro, sought among the residuals.
     """
 
     status: str
@@ -805,6 +740,7 @@ class _Judgement(NamedTuple):
     unexplained: float
     whiteness: tuple[float, float]
     by_trial: np.ndarray
+    lag: Lag
 
 
 def _judgement(
@@ -824,6 +760,13 @@ def _judgement(
         status = _status_of_misfit(problem, fit, unexplained)
     else:
         status = _status_of_match(problem, fit, remainder, covariance, pure)
+    lag, factor = _lag(problem, fit, remainder, status)
+    if factor != 1:
+        status = "MISFIT"
+        # It moves no number by more standard errors than these.
+        inflation = max(remainder.inflation, factor)
+        remainder = remainder._replace(inflation=inflation)
+        covariance = _inflated(problem, fit, known, scatter, inflation)
     sound = np.all(np.isfinite(covariance)) and remainder.freedom > 0
     # A sum that is not finite: no point was found where all predictions are finite.
     sound = sound and bool(np.isfinite(fit.minimum.square))
@@ -837,7 +780,21 @@ def _judgement(
         unexplained=unexplained,
         whiteness=_whiteness(white, problem.samples.parts),
         by_trial=np.sum(white**2, axis=(1, 2)) / seen,
+        lag=lag,
     )
+
+
+def _lag(
+    problem: Problem, fit: Fit, remainder: _Remainder, status: str
+) -> tuple[Lag, float]:
+    """A low-pass filter of a gyro, and the factor of covariances if it is named."""
+    if status not in ("OK", "MISFIT"):
+        return NO_LAG, 1.0
+    noise = 1.0 if problem.options.noise_known else remainder.noise
+    lag = lag_of(problem, fit, noise)
+    if not is_named(lag, remainder.chi_square / noise, remainder.freedom):
+        return lag, 1.0
+    return lag, noise * (1 + lag.deviations**2)
 
 
 def _inflated(
@@ -897,6 +854,7 @@ def _fields_of_judgement(judgement: _Judgement) -> dict[str, Any]:
         "numbers_covariance": judgement.covariance,
         "whiteness": judgement.whiteness,
         "loudest_band": remainder.band,
+        "lag": tuple(np.asarray(x) for x in judgement.lag),
         "chi_square_by_trial": judgement.by_trial,
         "inflation": np.asarray(remainder.inflation),
         "unexplained": np.asarray(judgement.unexplained),

@@ -11,6 +11,7 @@ import numpy as np
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
+from jrigid.identify._lag import Lag, is_named
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
@@ -74,6 +75,13 @@ def _reason(result: FitResult) -> str:
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
+    lag = Lag(*(float(x) for x in result.diagnostics.lag))
+    if is_named(lag, _chi_square(result), float(result.degrees_of_freedom)):
+        return (
+            "A low-pass filter of the gyro with a time constant of some "
+            f"{lag.time_constant:.2g} s would explain the residuals: pass it "
+            "(`Gyro(time_constant=...)`), or seek it (`free`)."
+        )
     swing = _swing(result)
     if swing > _TOO_FAST:
         return (
@@ -132,6 +140,12 @@ def _of_parameters(result: FitResult) -> str:
     verdicts = result.determined.items()
     names = [name for name, is_determined in verdicts if not is_determined]
     return f"It does not determine {', '.join(names)}." if names else ""
+
+
+def _chi_square(result: FitResult) -> float:
+    """Chi-square in units of the noise, which has the size of the residuals if unknown."""
+    known = result.problem.options.noise_known
+    return float(result.chi_square if known else result.degrees_of_freedom)
 
 
 def _swing(result: FitResult) -> float:
