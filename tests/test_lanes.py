@@ -106,7 +106,7 @@ def test_a_step_is_that_of_its_method(name, in_lanes):
     @quick_jit
     def ours(t, h, y):
         rates, y1 = stages(method, _field, t, h, y, in_lanes)
-        return y1, h * combine(method, rates, method.stages), error_of(method, rates, h)
+        return y1, h * combine(method.rows[-1], rates), error_of(method, rates, h)
 
     term = diffrax.ODETerm(lambda t, y, _: _field(t, y))
     memory = solver.init(term, t, t + h, y, None)

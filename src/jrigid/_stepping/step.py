@@ -29,10 +29,12 @@ Parameters = TypeVar("Parameters")
 Field = Callable[[Float[Array, ""], Float[Array, " n"]], Float[Array, " n"]]
 
 
-def combine(method: Method, rates: Float[Array, "stages n"], row: int) -> Array:
+def combine(
+    row: Float[np.ndarray, " stages"], rates: Float[Array, "stages n"]
+) -> Array:
     """The sum of the rates of the stages with the coefficients of a row."""
-    used = np.flatnonzero(method.rows[row])
-    return _sum([method.rows[row, i] for i in used], [rates[i] for i in used])
+    used = np.flatnonzero(row)
+    return _sum([row[i] for i in used], [rates[i] for i in used])
 
 
 class _Sums(NamedTuple):
@@ -264,11 +266,9 @@ def equal_steps(
 
 def error_of(method: Method, rates: Float[Array, "stages n"], h: Array) -> Array:
     """The estimate of the size of the error of a step: the larger of two estimates."""
-    size = jnp.abs(combine(method, rates, method.stages))
-    used = np.flatnonzero(method.second_row)
-    if used.size:
-        second = _sum([method.second_row[i] for i in used], [rates[i] for i in used])
-        size = jnp.maximum(size, jnp.abs(second))
+    size = jnp.abs(combine(method.rows[method.stages], rates))
+    if np.any(method.second_row):
+        size = jnp.maximum(size, jnp.abs(combine(method.second_row, rates)))
     return h * size
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jrigid.identify import _host as host
+from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import GATE, Fit
@@ -29,7 +30,6 @@ _EXPLAINED = 0.5
 _FREE = 0.8
 # Of the largest singular value: what the record does not show.
 _UNSHOWN = 1e-10
-_FEWEST = 4  # samples of a trial
 
 
 class Lag(NamedTuple):
@@ -90,7 +90,8 @@ def _effects(
     samples = problem.samples
     part = samples.parts[index]
     whitener = np.asarray(samples.whitener)[:, part, :3, :3]
-    used = _used(problem, fit, part)
+    weight = quality.weights_of(problem, fit.kept)[:, part, :3]
+    used = np.all(weight > 0, axis=-1)
     safe = np.where(used[..., None, None], whitener, np.eye(3))
     errors = np.linalg.solve(safe, fit.residual[:, part, :3, None])[..., 0]
     offset = np.asarray(samples.values[index]) + errors - np.asarray(gyro.bias)
@@ -108,15 +109,9 @@ def _effects(
     return columns[0], columns[1]
 
 
-def _used(problem: Problem, fit: Fit, part: slice) -> np.ndarray:
-    """Samples of a gyro that took part in the fit with all three numbers."""
-    samples = problem.samples
-    seen = (samples.weight[:, part, :3] > 0) & (samples.sign[:, part, :3] == 0)
-    return np.all(seen, axis=-1) & (fit.kept[:, part] > 0)
-
-
 def _matrix(gyro: Gyro) -> np.ndarray:
-    """The matrix that turns rates into readings."""
+    """The matrix that turns rates into readings, as in `Gyro.predict`."""
+    # In numpy, since the first fit would wait for JAX to compile it.
     turn = host.to_matrix(host.exp(np.asarray(gyro.misalignment)))
     return np.asarray(gyro.matrix) @ (np.asarray(gyro.scale) * turn).T
 
@@ -184,6 +179,8 @@ def _without(columns: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray:
     """What a change of the predictions does to the independent rows."""
+    if not problem.options.dense:
+        return residual
     minimum = fit.minimum
     links = minimum.links._replace(
         gap=np.zeros_like(minimum.links.gap),

@@ -142,12 +142,11 @@ def _exclusive(path: Path) -> Generator[None, None, None]:
         return
     folder = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(folder)
-        text = f"Another process is writing to the store {path}."
-        raise RuntimeError(text) from error
-    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            text = f"Another process is writing to the store {path}."
+            raise RuntimeError(text) from error
         yield
     finally:
         # The system also releases the lock when the process ends or is killed.
