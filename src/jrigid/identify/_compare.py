@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from jrigid._checks import check_type, demand
 from jrigid.identify._disturbance import GaussMarkov
-from jrigid.identify._errors import SHOWN
 from jrigid.identify._fit import fit
 from jrigid.identify._inertia_models import Fixed
+from jrigid.identify._precision import SHOWN
 from jrigid.identify._records import Record
 from jrigid.identify._result import FitResult, demand_single
 from jrigid.systems import RigidBody

@@ -11,7 +11,6 @@ import jax.tree_util as jtu
 import numpy as np
 
 from jrigid._checks import RESULTS, is_good
-from jrigid._numerics import or_one
 from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
@@ -24,6 +23,13 @@ from jrigid.identify._independent import (
 from jrigid.identify._lag import NO_LAG, Lag, is_named, lag_of
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
+from jrigid.identify._precision import (
+    SHOWN,
+    Precision,
+    least_value,
+    precision,
+    precision_of_rows,
+)
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._records import Samples
@@ -37,139 +43,12 @@ from jrigid.identify._result import (
 )
 from jrigid.identify._smoother import Rows
 
-# Of the largest singular value: a change of the state that the record shows.
-SHOWN = 1e-9
 HISTORY = 512  # steps whose sums of squares are returned
 _FEWEST = 8  # trials whose scatter says how large errors are
 # Scatter of trials over the errors stated, above which something is missing.
 _DISAGREEING = 3.0
 # Of the level that moves a rate by its noise: where one of zero is judged.
 _TRIED = 0.03
-
-
-class Precision(NamedTuple):
-    """What rows determine of the numbers.
-
-    Attributes:
-        values: Singular values of the derivatives in natural units, descending; the
-            inverse of each is an error.
-        directions: In the numbers, columns for the values.
-        covariance: Of the numbers.
-        local: Of a trial's first state and own numbers beside given numbers.
-        sensitivity: Derivative of these in the numbers (trials, local, numbers).
-        of_state: Singular values of each trial's state, of unit columns, descending.
-        scores: What each trial adds to the gradient of half the squares in the numbers.
-    """
-
-    values: np.ndarray
-    directions: np.ndarray
-    covariance: np.ndarray
-    local: np.ndarray
-    sensitivity: np.ndarray
-    of_state: np.ndarray
-    scores: np.ndarray
-
-
-def precision_of_rows(
-    rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
-) -> Precision:
-    """Decompose weighted rows in first states by QR: their squares would lose digits.
-
-    Args:
-        rows: In the first state of each trial, own numbers and numbers.
-        weight: Of each row.
-        own: How many own numbers a trial has.
-        units: Natural units of the numbers.
-    """
-    root = np.sqrt(weight)[..., None]
-    trials, count, width = rows.residual.shape
-    flat = (trials, count * width)
-    residual = (root * rows.residual).reshape(flat)
-    local = np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    local = (root[..., None] * local).reshape(*flat, local.shape[-1])
-    shared = root[..., None] * rows.of_border[..., own:]
-    # numpy's SVD raises an error for NaN. The status then follows from chi-square.
-    shared = np.nan_to_num(shared.reshape(*flat, units.size) * units)
-    states = _decomposed(np.nan_to_num(local))
-    along = np.swapaxes(states.basis, 1, 2) @ shared
-    # What no state can do is left for the numbers.
-    rest = shared - states.basis @ along
-    scores = (residual[:, None] @ rest)[:, 0] / units
-    values, directions, covariance = _of_numbers(rest, units)
-    half = states.half
-    return Precision(
-        values=values,
-        directions=directions,
-        covariance=covariance,
-        local=half @ np.swapaxes(half, 1, 2),
-        sensitivity=-(np.where(states.shown[:, None], half, 0.0) @ along) / units,
-        of_state=states.values,
-        scores=scores,
-    )
-
-
-class _States(NamedTuple):
-    """Singular value decomposition of derivatives in the state and own numbers.
-
-    Attributes:
-        basis: Columns of what the record shows of them (trials, rows, local).
-        values: Singular values of unit columns, descending.
-        shown: Which of them the record shows.
-        half: Of the covariance, which is its product with its transpose.
-    """
-
-    basis: np.ndarray
-    values: np.ndarray
-    shown: np.ndarray
-    half: np.ndarray
-
-
-def _decomposed(local: np.ndarray) -> _States:
-    """Decompose derivatives (trials, rows, local).
-
-    What the record does not show has large errors.
-    """
-    # Rates, turns and own numbers have different units, which would decide what counts
-    # as small beside the largest singular value.
-    scale = or_one(np.linalg.norm(local, axis=1))
-    basis, values, vt = np.linalg.svd(local / scale[:, None], full_matrices=False)
-    shown = values > SHOWN * values[:, :1]
-    eps = np.finfo(local.dtype).eps
-    inverse = 1 / np.where(shown, values, eps * np.maximum(values[:, :1], 1.0))
-    return _States(
-        basis=np.where(shown[:, None], basis, 0.0),
-        values=values,
-        shown=shown,
-        half=np.swapaxes(vt, 1, 2) * inverse[:, None] / scale[:, :, None],
-    )
-
-
-def _of_numbers(
-    rest: np.ndarray, units: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Singular values, directions and covariance of the numbers.
-
-    Args:
-        rest: Derivatives in natural units, without what states can do (trials, rows,
-            numbers).
-        units: Natural units of the numbers.
-    """
-    trials, count, _ = rest.shape
-    # There may be no numbers, so no length can be left to numpy.
-    r = np.linalg.qr(rest.reshape(trials * count, units.size), mode="r")
-    # The triangle has the singular values of all rows and is small.
-    sound = np.all(np.isfinite(r))
-    _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
-    eps = np.finfo(units.dtype).eps
-    floor = 16 * eps * np.max(values, initial=0.0) + _least_value(units.dtype)
-    half = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
-    return values, vt.T, half.T @ half
-
-
-def _least_value(dtype: np.dtype) -> float:
-    """The least singular value to divide by: the square of the inverse is finite."""
-    # The factor leaves room for sums of such squares.
-    return 1e4 * float(np.sqrt(np.finfo(dtype).tiny))
 
 
 class Weakest(NamedTuple):
@@ -190,14 +69,6 @@ class Weakest(NamedTuple):
     error: float
     normal: np.ndarray
     direction: np.ndarray
-
-
-@quality.once_for_each_fit
-def precision(problem: Problem, fit: Fit) -> Precision:
-    """What a fit determines of the numbers."""
-    own = fit.minimum.point.own.shape[-1]
-    rows, weight, _ = independent_rows(problem, fit)
-    return precision_of_rows(rows, weight, own, fit.minimum.units)
 
 
 def weakest(problem: Problem, fit: Fit) -> Weakest:
@@ -597,7 +468,7 @@ def _with_larger_errors(
     known: Precision, factors: np.ndarray, units: np.ndarray
 ) -> np.ndarray:
     """The covariance with errors so many times larger along each direction."""
-    values = np.maximum(known.values, _least_value(units.dtype))
+    values = np.maximum(known.values, least_value(units.dtype))
     directions = known.directions * units[:, None] / values
     # Variances add: a variance of f^2 is the old one and f^2 - 1 more of it.
     more = directions * np.sqrt(factors**2 - 1)
@@ -616,7 +487,7 @@ def _scatter_of_trials(
         return np.ones(units.size)
     # The variance of a score along a direction is the square of its value. If trials
     # scatter by their noise alone, the squares of these sum to about one.
-    values = np.maximum(known.values, _least_value(units.dtype))
+    values = np.maximum(known.values, least_value(units.dtype))
     along = (known.scores[alive] * units) @ known.directions / values
     # At the minimum the scores sum to zero, which takes one degree of freedom.
     return np.sqrt(np.sum(along**2, axis=0) * trials / (trials - 1) / inflation)
