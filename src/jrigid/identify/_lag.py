@@ -14,9 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jrigid._numerics import or_one
 from jrigid.identify import _host as host
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
+from jrigid.identify._precision import precision_of_rows
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import GATE, Fit
 from jrigid.identify._sensors import Gyro
@@ -28,7 +30,7 @@ _EXPLAINED = 0.5
 # Part of the square of the rates' changes that free rotation must explain. Where a
 # torque moves the body as much, the derivatives below are not those of the motion.
 _FREE = 0.8
-# Of the largest singular value: what the record does not show.
+# Part of the square of a filter's effect that nothing else may imitate, to be shown.
 _UNSHOWN = 1e-10
 
 
@@ -148,33 +150,23 @@ def _sought(
     """The filter by its effects beside all numbers and states that were sought."""
     rows, weight, _ = independent_rows(problem, fit)
     own = fit.minimum.point.own.shape[-1]
+    # The coefficients of the two effects are two more numbers, which the fit had at 0.
     columns = [_independent(problem, fit, x)[..., None] for x in effects]
-    columns.append(rows.residual[..., None])
-    root = np.sqrt(weight)[..., None, None]
-    shared = root * np.concatenate([rows.of_border[..., own:], *columns], axis=-1)
-    alone = root * np.concatenate([rows.of_state, rows.of_border[..., :own]], axis=-1)
-    trials = len(shared)
-    shared = shared.reshape(trials, -1, shared.shape[-1])
-    alone = alone.reshape(trials, -1, alone.shape[-1])
-    if not (np.all(np.isfinite(shared)) and np.all(np.isfinite(alone))):
+    border = np.concatenate([rows.of_border, *columns], axis=-1)
+    squares = [np.sum(weight[..., None, None] * x**2) for x in columns]
+    units = np.append(fit.minimum.units, 1 / np.sqrt(or_one(np.array(squares))))
+    known = precision_of_rows(rows._replace(of_border=border), weight, own, units)
+    # One step by Newton's method goes to the minimum in all numbers. Where states can
+    # imitate the first effect exactly, its error is huge and it changes no other step.
+    step = -known.covariance @ np.sum(known.scores, axis=0)
+    half_square = float(step[-1])
+    variance = float(known.covariance[-1, -1])
+    # What the other numbers and the states can imitate is rounding here.
+    is_shown = units[-1] ** 2 > _UNSHOWN * variance
+    if not (is_shown and math.isfinite(half_square)) or noise <= 0:
         return NO_LAG
-    shared = _without(alone, shared).reshape(1, -1, shared.shape[-1])
-    effect, residual = np.moveaxis(_without(shared[..., :-2], shared[..., -2:]), -1, 0)
-    size = float(np.sum(effect**2))
-    # What the numbers and the states can imitate is rounding here.
-    if size <= _UNSHOWN * float(np.sum(shared[..., -2] ** 2)) or noise <= 0:
-        return NO_LAG
-    # Residuals are predicted less observed.
-    half_square = -float(np.sum(effect * residual)) / size
-    time_constant = math.sqrt(2 * max(half_square, 0.0))
-    return Lag(time_constant, half_square * math.sqrt(size / noise))
-
-
-def _without(columns: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Other columns without what these can explain, in each of several matrices."""
-    length = np.sqrt(np.sum(columns**2, axis=1, keepdims=True))
-    unit = columns / np.where(length > 0, length, 1.0)
-    return others - unit @ (np.linalg.pinv(unit, rcond=_UNSHOWN) @ others)
+    deviations = half_square / math.sqrt(noise * variance)
+    return Lag(math.sqrt(2 * max(half_square, 0.0)), deviations)
 
 
 def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray:
