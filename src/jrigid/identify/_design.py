@@ -196,6 +196,7 @@ class Plan(Readable):
         dtype = planned.layout.ts.dtype
         kept = samples.seen.astype(dtype)
         fit = Fit(
+            problem=planned.problem,
             minimum=minimum._replace(rows=rows),
             layout=planned.layout,
             kept=kept,

@@ -331,7 +331,9 @@ def _status(
         return "NOT_CONVERGED"
     if not good_input:
         return "BAD_INPUT"
-    return "UNIDENTIFIABLE" if loose and status == "OK" else status
+    if loose and status in ("OK", "AT_BOUNDARY"):
+        return "UNIDENTIFIABLE"
+    return status
 
 
 def _fields_of_precision(

@@ -712,8 +712,8 @@ def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str,
     # Results of many fits are stacked, so that all are as long as the longest record.
     lengths = [max(x) for x in columns]
     results = []
-    for (case, input_result), best in zip(cases, run(searches), strict=True):
-        fields = conclude(case.problem, best, lengths, input_result)
+    for (_, input_result), best in zip(cases, run(searches), strict=True):
+        fields = conclude(best.problem, best, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
                 raise RuntimeError(Status[status])

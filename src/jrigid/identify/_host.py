@@ -101,13 +101,19 @@ def principal_axes(tensor: AnyArray) -> tuple[AnyArray, AnyArray]:
         # numpy may raise an error for NaN, where JAX returns NaN.
         return np.full(3, np.nan, tensor.dtype), np.full((3, 3), np.nan, tensor.dtype)
     moments, axes = np.linalg.eigh(tensor)
+    return moments, with_signs(axes)
+
+
+def with_signs(axes: np.ndarray) -> np.ndarray:
+    """Orthonormal columns with the signs of `jrigid._spectral.eigh`."""
+    axes = axes.copy()
     # As in `eigh`, 0.9 keeps rounding from deciding between two components that tie.
     for column in (0, 2):
         size = np.abs(axes[:, column])
         leading = axes[np.argmax(size >= 0.9 * np.max(size)), column]
         axes[:, column] *= -1 if leading < 0 else 1
     axes[:, 1] *= -1 if np.linalg.det(axes) < 0 else 1
-    return moments, axes
+    return axes
 
 
 def cholesky(matrix: AnyArray) -> AnyArray:

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import RESULTS, Findings, all_finite, check_option, demand
-from jrigid._numerics import product
+from jrigid._numerics import product, without_gradient
 from jrigid._types import AnyArray, AnyMatrix, Readable, ScalarLike
 from jrigid.identify import _parameters
-from jrigid.identify._host import cholesky, principal_axes
+from jrigid.identify._host import cholesky, principal_axes, with_signs
 from jrigid.mass import MassProperties, inertia_of_second_moment
 
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
@@ -89,6 +89,23 @@ class AbstractInertiaModel(Readable):
     def inertia(self, numbers: Array) -> Array:
         """Tensor that the numbers describe."""
 
+    def in_frame(
+        self, numbers: np.ndarray, like: "AbstractInertiaModel | None" = None
+    ) -> tuple["AbstractInertiaModel", np.ndarray]:
+        """The same tensor, by numbers in another frame.
+
+        Args:
+            numbers: In the frame of this model.
+            like: A model of this kind in the other frame; None chooses the frame in
+                which a search moves best. A model with one frame stays as it is.
+        """
+        del like
+        return self, numbers
+
+    def moved(self, numbers: Array, change: Array) -> Array:
+        """Numbers after a step of the search: for small steps `numbers + change`."""
+        return numbers + change
+
     def units(self) -> Array:
         """Natural units of the numbers: sizes at which an error counts as large."""
         return jnp.ones(len(self.names))
@@ -101,40 +118,6 @@ class AbstractInertiaModel(Readable):
 def _names(count: int) -> tuple[str, ...]:
     """Names of several numbers of a tensor."""
     return tuple(f"inertia[{i}]" for i in range(count))
-
-
-class Tensor(AbstractInertiaModel):
-    """Any real body, by five numbers.
-
-    The second moments of the mass are L L^T with L11 = 1. The numbers are log L22,
-    log L33, L21, L31 and L32.
-
-    >>> import jax.numpy as jnp, jrigid as jr
-    >>> print(jr.identify.Tensor().inertia(jnp.array([0.0, 0.0, 0.5, 0.0, 0.0])))
-    [[ 2.25 -0.5   0.  ]
-     [-0.5   2.    0.  ]
-     [ 0.    0.    2.25]]
-    """
-
-    names: ClassVar[tuple[str, ...]] = _names(5)
-
-    def start(
-        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
-    ) -> tuple["Tensor", AnyArray]:
-        """Return the numbers of the nearest real body."""
-        xp = tensor.__array_namespace__()
-        sigma = real_body(tensor, flattest)
-        # The root of the first second moment is L11, which becomes one: the scale is
-        # left out.
-        lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
-        logarithms = xp.log(xp.diagonal(lower)[1:])
-        return self, xp.concatenate([logarithms, lower[_parameters.SIDES]])
-
-    def inertia(self, numbers: Array) -> Array:
-        """Tensor of an arbitrary trace."""
-        diagonal = jnp.exp(jnp.pad(numbers[:2], (1, 0)))
-        second = _parameters.squared(diagonal, numbers[2:])
-        return inertia_of_second_moment(second)
 
 
 class _InFrame(AbstractInertiaModel):
@@ -157,6 +140,90 @@ class _InFrame(AbstractInertiaModel):
         frame = jnp.eye(3, dtype=numbers.dtype) if self.frame is None else self.frame
         second = product("ik,kl,jl->ij", frame, self.sigma(numbers), frame)
         return inertia_of_second_moment(second)
+
+
+class Tensor(_InFrame):
+    """Any real body, by five numbers.
+
+    The second moments of the mass in the frame are L L^T with L11 = 1. The numbers are
+    log L22, log L33, L21, L31 and L32.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> print(jr.identify.Tensor().inertia(jnp.array([0.0, 0.0, 0.5, 0.0, 0.0])))
+    [[ 2.25 -0.5   0.  ]
+     [-0.5   2.    0.  ]
+     [ 0.    0.    2.25]]
+    """
+
+    names: ClassVar[tuple[str, ...]] = _names(5)
+
+    def start(
+        self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
+    ) -> tuple["Tensor", AnyArray]:
+        """Return the numbers of the nearest real body in its principal axes."""
+        xp = tensor.__array_namespace__()
+        _, axes = principal_axes(without_gradient(real_body(tensor, flattest)))
+        # The largest second moment is the first, since it is the one left out.
+        frame = axes[:, ::-1]
+        sigma = product("ki,kl,lj->ij", frame, real_body(tensor, flattest), frame)
+        lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
+        logarithms = xp.log(xp.diagonal(lower)[1:])
+        return Tensor(frame), xp.concatenate([logarithms, lower[_parameters.SIDES]])
+
+    def sigma(self, numbers: Array) -> Array:
+        """Second moments L L^T."""
+        diagonal = jnp.exp(jnp.pad(numbers[:2], (1, 0)))
+        return _parameters.squared(diagonal, numbers[2:])
+
+    def in_frame(
+        self, numbers: np.ndarray, like: "AbstractInertiaModel | None" = None
+    ) -> tuple["AbstractInertiaModel", np.ndarray]:
+        """The same body by numbers in another frame, by default its principal axes."""
+        lower = np.diag(np.exp(np.pad(numbers[:2], (1, 0))))
+        lower[_parameters.SIDES] = numbers[2:]
+        if self.frame is None or not np.all(np.isfinite(lower)):
+            return self, numbers
+        # A decomposition of L instead of L L^T keeps the digits of a thin body.
+        lower = self.frame @ lower
+        model = like
+        if model is None:
+            # Signs of their own make the numbers of similar fits similar.
+            axes, _, _ = np.linalg.svd(lower)
+            model = Tensor(with_signs(axes[:, ::-1])[:, ::-1])
+        upper = np.linalg.qr(lower.T @ model.frame, mode="r")
+        sizes = np.abs(np.diagonal(upper))
+        lower = upper.T * np.sign(np.diagonal(upper)) / sizes[0]
+        thin = np.finfo(numbers.dtype).eps
+        logarithms = np.log(np.maximum(sizes[1:] / sizes[0], thin))
+        return model, np.concatenate([logarithms, lower[_parameters.SIDES]])
+
+    def moved(self, numbers: Array, change: Array) -> Array:
+        """Numbers after a step that is straight in second moments.
+
+        The motion of a thin body is nearly linear in its small second moments: it is
+        in L22^2 over L11^2, and in what one of the two thin directions has of the
+        other, L33^2 over L22^2 and L32 over L22.
+        """
+        # The logarithms are those of roots of second moments.
+        first = _grown(2 * change[0]) / 2
+        second = _grown(2 * (change[1] - change[0])) / 2
+        side = numbers[4] + (change[4] - numbers[4] * change[0])
+        return jnp.concatenate(
+            [
+                numbers[:2] + jnp.stack([first, first + second]),
+                numbers[2:4] + change[2:4],
+                (side * jnp.exp(first))[None],
+            ]
+        )
+
+
+def _grown(part: Array) -> Array:
+    """Change of the logarithm of a size that grows by this part of itself.
+
+    Below half of it the size falls ever more slowly, since none is negative.
+    """
+    followed = jnp.maximum(part, -0.5)
+    return jnp.log1p(followed) - jnp.log1p(2 * (followed - part))
 
 
 class Moments(_InFrame):

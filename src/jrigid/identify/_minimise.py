@@ -250,6 +250,12 @@ def _evaluate(
     return _Evaluation(point, rows, links, weight, kicks, square, square + kicks)
 
 
+def _moved(problem: Problem, point: Point, move: Move) -> Point:
+    """Return a point after a move, on the path of the inertia model."""
+    numbers = problem.unknowns.moved(point.numbers, move.numbers)
+    return moved(point, move)._replace(numbers=numbers)
+
+
 def _next_step(place: _Evaluation, push: Push, damping: Array) -> tuple[Move, Array]:
     """Return the damped step from a point, and by how much it should lower the cost."""
     rows, links = _torque_included(place.rows, place.links, push, place.point.torque)
@@ -354,7 +360,7 @@ def _iteration(
     loop: _Loop,
 ) -> _Loop:
     """Try the step, keep the better point and compute the next step, in all lanes."""
-    point = over_lanes(moved)(loop.best.point, loop.move)
+    point = over_lanes(_moved)(problem, loop.best.point, loop.move)
     new = over_lanes(_evaluate)(problem, layout, settings, push, point)
     # Residuals are not finite where the motion could not be integrated.
     finite = jnp.all(jnp.isfinite(new.rows.of_border), axis=(1, 2, 3, 4))

@@ -48,6 +48,7 @@ class Fit:
     """A minimum and what was decided on the way to it.
 
     Attributes:
+        problem: The record, with the frame of the inertia model in which it ended.
         minimum: Of one record.
         layout: Its segments.
         kept: 1 for each sample that took part, 0 for the others (trials, samples).
@@ -60,6 +61,7 @@ class Fit:
         computed: Values of functions marked `once_for_each_fit`, by function.
     """
 
+    problem: Problem
     minimum: Minimum
     layout: Layout
     kept: np.ndarray

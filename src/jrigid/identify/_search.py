@@ -163,7 +163,8 @@ class Starts:
         """The numbers of an attempt."""
         if attempt == 0:
             return self._first
-        return self._given.start(self._tensors[attempt], _ROUND)[1]
+        unknowns, numbers = self._given.start(self._tensors[attempt], _ROUND)
+        return unknowns.in_frame(numbers, self.unknowns)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,8 +247,18 @@ def _stages_of_torque(unmodelled: str) -> list[Stage]:
     return [Stage(x, 8, 0.01) for x in weights]
 
 
-def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Search:
-    """All stages from some numbers, each from where the one before ended."""
+def attempt(
+    case: Case, problem: Problem, numbers: np.ndarray, slow: bool, framed: bool = True
+) -> Search:
+    """All stages from some numbers, each from where the one before ended.
+
+    Args:
+        case: The record.
+        problem: The record, with the frame of the numbers, and what a probe holds.
+        numbers: Where to start.
+        slow: Whether to take more stages.
+        framed: Whether each stage may have a frame of its own.
+    """
     options = problem.options
     dtype = case.point.omega.dtype
     kept = problem.samples.seen.astype(dtype)
@@ -265,6 +276,8 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
             scales = scales_of(problem, residual, kept)
             if stage.reject:
                 kept = without_outliers(problem, residual, kept, scales)
+        if framed:
+            problem, point = _in_own_frame(problem, point)
         torque.begin(stage)
         settings = _settings(stage, kept, scales, torque.disturbance)
         layout = case.single if stage.whole else case.cut
@@ -272,6 +285,7 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
         point = minimum.point
         histories.append(history)
         fit = Fit(
+            problem=problem,
             minimum=minimum,
             layout=layout,
             kept=kept,
@@ -285,6 +299,13 @@ def attempt(case: Case, problem: Problem, numbers: np.ndarray, slow: bool) -> Se
         if options.unmodelled == "estimate" and not stage.last:
             kept = torque.sought_anew(fit)
     return fit
+
+
+def _in_own_frame(problem: Problem, point: Point) -> tuple[Problem, Point]:
+    """The same point, by numbers in which a search moves best."""
+    unknowns, numbers = problem.unknowns.in_frame(point.numbers)
+    moved = dataclasses.replace(problem, unknowns=unknowns)
+    return moved, point._replace(numbers=numbers)
 
 
 def _settings(
@@ -411,19 +432,19 @@ def search(case: Case) -> Search:
     counted = np.sum(weights_of(problem, problem.samples.seen.astype(float)))
     few = case.coarse and bool(counted < _FEW)
     best = yield from attempt(case, problem, case.starts[0], slow=False)
-    wrong = misfit(problem, best)
-    weak = weakest(problem, best)
+    wrong = misfit(best.problem, best)
+    weak = weakest(best.problem, best)
     ambiguous = few
     index = 1
     while index < _attempts(case, best, wrong, weak.noise, ambiguous):
         other = yield from attempt(case, problem, case.starts[index], slow=True)
-        other_wrong = misfit(problem, other)
-        other_weak = weakest(problem, other)
+        other_wrong = misfit(other.problem, other)
+        other_weak = weakest(other.problem, other)
         # Squares are compared in units of the noise, which may not have been stated.
         fall = (weak.square - other_weak.square) / other_weak.noise
         better = other_wrong < wrong or (other_wrong <= wrong and fall > 0)
         error = max(weak.error, other_weak.error)
-        apart = _are_apart(best, other, problem.unknowns.judged, error)
+        apart = _are_apart(best, other, error)
         rival = apart and abs(fall) < _RIVAL
         ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
         if better:
@@ -456,6 +477,7 @@ def no_search(case: Case) -> Search:
     )
     minimum = yield Request(case.problem, case.final, case.point, settings)
     return Fit(
+        problem=case.problem,
         minimum=minimum,
         layout=case.final,
         kept=settings.kept,
@@ -474,7 +496,7 @@ def _attempts(
     Two of a misfit that follows the record, all of other failures. A coarse record has
     many bodies that follow it, so its misfits are such failures.
     """
-    problem = case.problem
+    problem = best.problem
     count = len(case.starts)
     if is_pure(problem, best, noise) and wrong < 0.5:  # no misfit
         return 1
@@ -489,7 +511,7 @@ def _attempts(
 
 def _probed(case: Case, best: Fit, at: Weakest) -> Search:
     """The same fit, with what probes show of its weakest direction."""
-    problem = case.problem
+    problem = best.problem
     if not _WEAK < at.error < LARGEST_ERROR or is_pure(problem, best, at.noise):
         return best
     before = best.minimum.point.numbers
@@ -500,7 +522,7 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         normal = _HARD * at.normal
         line = Line(normal, np.sum(normal * numbers))
         held = dataclasses.replace(problem, unknowns=problem.unknowns.holding(line))
-        end = yield from attempt(case, held, numbers, slow=case.long)
+        end = yield from attempt(case, held, numbers, case.long, framed=False)
         growth = (weakest(problem, end).square - at.square) / at.noise
         distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
         error = _error_by_probe(problem, best, end, at.direction, step, distance)
@@ -515,12 +537,13 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
     return dataclasses.replace(best, probes=tuple(probes))
 
 
-def _are_apart(one: Fit, other: Fit, judged: slice, error: float) -> bool:
+def _are_apart(one: Fit, other: Fit, error: float) -> bool:
     """Whether two fits are different minima."""
-    apart = (
-        np.abs(one.minimum.point.numbers - other.minimum.point.numbers)
-        / other.minimum.units
+    judged = other.problem.unknowns.judged
+    _, numbers = one.problem.unknowns.in_frame(
+        one.minimum.point.numbers, other.problem.unknowns
     )
+    apart = np.abs(numbers - other.minimum.point.numbers) / other.minimum.units
     far = np.max(apart[judged], initial=0.0)
     return bool(far > max(_APART, 6 * error))
 

@@ -426,6 +426,24 @@ class Unknowns(eqx.Module):
             tensor = tensor * jnp.exp(numbers[self.slices["scale"].start])
         return tensor
 
+    def in_frame(
+        self, numbers: np.ndarray, like: "Unknowns | None" = None
+    ) -> tuple["Unknowns", np.ndarray]:
+        """The same values by numbers in another frame: as the inertia model's."""
+        part = self.slices["inertia"]
+        model, of_inertia = self.inertia_model.in_frame(
+            numbers[part], None if like is None else like.inertia_model
+        )
+        numbers = np.concatenate([of_inertia, numbers[part.stop :]])
+        return dataclasses.replace(self, inertia_model=model), numbers
+
+    def moved(self, numbers: Array, change: Array) -> Array:
+        """Numbers after a step of the search."""
+        part = self.slices["inertia"]
+        of_inertia = self.inertia_model.moved(numbers[part], change[part])
+        others = numbers[part.stop :] + change[part.stop :]
+        return jnp.concatenate([of_inertia, others]).astype(numbers.dtype)
+
     @property
     def known_tensor(self) -> AnyArray:
         """The tensor of the system that was given, in the first trial."""
