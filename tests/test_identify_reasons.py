@@ -131,6 +131,81 @@ def test_a_filter_that_is_left_out_is_named(rng, lag):
     assert abs(direct.diagnostics.lag[1]) < 4
 
 
+def test_a_filter_is_named_beside_a_drag_that_is_sought(rng):
+    """A change of the states takes up the delay of the filter under a drag, too."""
+    sigma = 0.002
+    drag = 0.01
+    lag = 0.012
+
+    def slope(_, values):
+        omega, reading = values[:3], values[3:]
+        torque = np.cross(MOMENTS * omega, omega) - drag * omega
+        return np.concatenate([torque / MOMENTS, (omega - reading) / lag])
+
+    start = np.array([6.0, 5.0, -6.0] * 2)
+    # A filter has forgotten its start after 20 time constants.
+    ts = TS + 20 * lag
+    solution = solve_ivp(slope, (0, ts[-1]), start, "DOP853", ts, rtol=1e-10)
+    values = solution.y[3:].T + sigma * rng.normal(size=(TS.size, 3))
+    found = identify.fit(
+        jr.RigidBody(np.ones(3), jr.torques.LinearDrag(0.02)),
+        identify.Rates(TS, values, sigma),
+        free=lambda body, _: body.torque.coefficient,
+        throw=False,
+    )
+    assert "A low-pass filter" in str(found).splitlines()[0]
+    assert float(found.diagnostics.lag[0]) == pytest.approx(lag, rel=0.1)
+    # It explains all of the excess of chi-square.
+    excess = float(found.chi_square) - int(found.degrees_of_freedom)
+    assert float(found.diagnostics.lag[1]) ** 2 == pytest.approx(excess, abs=150)
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+def test_a_scale_that_is_left_out_is_named_and_is_no_filter(rng, factor):
+    """A filter would explain 0.7 of the excess of a gyro that reads too little."""
+    sigma = 0.002
+    values = factor * motion(TS) + sigma * rng.normal(size=(TS.size, 3))
+    found, line = first_line(values, sigma)
+    assert found.status == Status.MISFIT
+    named = re.search(r"scale of the gyro that is ([\d.]+) times as large", line)
+    assert named, line
+    assert float(named.group(1)) == pytest.approx(factor, abs=0.003)
+    assert float(found.diagnostics.gain[0]) == pytest.approx(factor, abs=0.003)
+    truth = MOMENTS[1:] / MOMENTS[0]
+    assert np.all(np.abs(found.ratios - truth) < 1.5 * found.ratios_errors)
+
+
+@pytest.mark.parametrize("delay", [0.004, -0.004])
+def test_a_delay_after_another_gyro_is_named(rng, delay):
+    sigma = 0.002
+    ts = np.union1d(TS, TS - delay)
+    both = motion(ts)
+    late = both[np.isin(ts, TS - delay)]
+    values = [
+        x + sigma * rng.normal(size=x.shape) for x in (late, both[np.isin(ts, TS)])
+    ]
+    records = tuple(identify.Rates(TS, x, sigma) for x in values)
+    found = identify.fit(BLIND, records, throw=False)
+    assert found.status == Status.MISFIT
+    line = str(found).splitlines()[0]
+    named = re.search(r"A delay of the gyro by some ([-\d.]+) s", line)
+    assert named, line
+    assert float(named.group(1)) == pytest.approx(delay, rel=0.05)
+
+
+def test_a_bias_that_is_left_out_is_no_filter(rng):
+    """A filter would explain 0.9 of the excess that this bias makes."""
+    sigma = 0.002
+    bias = np.array([0.0, 0.0, 0.03])
+    values = motion(TS) + bias + sigma * rng.normal(size=(TS.size, 3))
+    found, line = first_line(values, sigma)
+    assert found.diagnostics.lag[1] > 6
+    named = re.search(r"A bias of the gyro, some \((.*)\) rad/s", line)
+    assert named, line
+    seen = [float(x) for x in named.group(1).split(",")]
+    assert seen == pytest.approx(bias, abs=0.002)
+
+
 def test_a_torque_that_swings_is_named_and_is_no_bias(readings):
     """Chi-square would not see it: it changes it by less than its gate."""
     swing = NOISE * np.array([1.0, -0.7, 0.4]) * np.sin(23 * TS)[:, None]

@@ -24,6 +24,11 @@ class Diagnostics(eqx.Module):
         lag: Time constant [s] of a low-pass filter of the gyroscope that would explain
             residuals, and how many standard errors its effect is from 0; zeros where it
             was not sought.
+        gain: Factor in the scale of the gyroscope that would explain residuals, and how
+            many standard errors it is from 1; (1, 0) where it was not sought.
+        delay: Delay of the gyroscope [s] after other sensors of the motion that would
+            explain residuals, and its standard errors from 0; zeros without other
+            sensors, or where it was not sought.
         unexplained: Fraction of the square of what was observed that the fit does not
             explain, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed,
@@ -68,6 +73,8 @@ class Diagnostics(eqx.Module):
     whiteness: tuple[Scalar, Scalar]
     loudest_band: tuple[Scalar, Scalar]
     lag: tuple[Scalar, Scalar]
+    gain: tuple[Scalar, Scalar]
+    delay: tuple[Scalar, Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]

@@ -20,7 +20,7 @@ from jrigid.identify._independent import (
     condensed_rows,
     independent_rows,
 )
-from jrigid.identify._lag import NO_LAG, Lag, is_named, lag_of
+from jrigid.identify._lag import NO_ERRORS, GyroErrors, gyro_errors
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._precision import (
@@ -603,7 +603,7 @@ class _Judgement(NamedTuple):
         unexplained: Of the square of what was observed, beyond the noise.
         whiteness: Correlation of neighbours, and its standard deviations from 0.
         by_trial: Mean square of the residuals of each trial.
-        lag: A low-pass filter of a gyro, sought among the residuals.
+        gyro: A filter, a scale and a delay of a gyro, sought among the residuals.
     """
 
     status: str
@@ -613,7 +613,7 @@ class _Judgement(NamedTuple):
     unexplained: float
     whiteness: tuple[float, float]
     by_trial: np.ndarray
-    lag: Lag
+    gyro: GyroErrors
 
 
 def _judgement(
@@ -633,13 +633,13 @@ def _judgement(
         status = _status_of_misfit(problem, fit, unexplained)
     else:
         status = _status_of_match(problem, fit, remainder, covariance, pure)
-    lag, factor = _lag(problem, fit, remainder, status)
-    if factor != 1:
+    gyro, factor, moved = _gyro(problem, fit, remainder, status)
+    if moved is not None:
         status = "MISFIT"
-        # It moves no number by more standard errors than these.
         inflation = max(remainder.inflation, factor)
         remainder = remainder._replace(inflation=inflation)
         covariance = _inflated(problem, fit, known, scatter, inflation)
+        covariance = covariance + np.outer(moved, moved)
     sound = np.all(np.isfinite(covariance)) and remainder.freedom > 0
     # A sum that is not finite: no point was found where all predictions are finite.
     sound = sound and bool(np.isfinite(fit.minimum.square))
@@ -653,21 +653,27 @@ def _judgement(
         unexplained=unexplained,
         whiteness=_whiteness(white, problem.samples.parts),
         by_trial=np.sum(white**2, axis=(1, 2)) / seen,
-        lag=lag,
+        gyro=gyro,
     )
 
 
-def _lag(
+def _gyro(
     problem: Problem, fit: Fit, remainder: _Remainder, status: str
-) -> tuple[Lag, float]:
-    """A low-pass filter of a gyro, and the factor of covariances if it is named."""
+) -> tuple[GyroErrors, float, np.ndarray | None]:
+    """Errors of a gyro, and if one is named, what it does to errors and numbers.
+
+    Returns:
+        The errors; a factor of covariances; by how much the numbers are moved, or None.
+    """
     if status not in ("OK", "MISFIT"):
-        return NO_LAG, 1.0
+        return NO_ERRORS, 1.0, None
     noise = 1.0 if problem.options.noise_known else remainder.noise
-    lag = lag_of(problem, fit, noise)
-    if not is_named(lag, remainder.chi_square / noise, remainder.freedom):
-        return lag, 1.0
-    return lag, noise * (1 + lag.deviations**2)
+    errors = gyro_errors(problem, fit, noise)
+    named = errors.named(remainder.chi_square / noise, remainder.freedom)
+    if not named:
+        return errors, 1.0, None
+    factor = noise * (1 + named[0].deviations ** 2)
+    return errors, factor, errors.moved_by(named[0])
 
 
 def _inflated(
@@ -727,7 +733,9 @@ def _fields_of_judgement(judgement: _Judgement) -> dict[str, Any]:
         "numbers_covariance": judgement.covariance,
         "whiteness": judgement.whiteness,
         "loudest_band": remainder.band,
-        "lag": tuple(np.asarray(x) for x in judgement.lag),
+        "lag": tuple(np.asarray(x) for x in judgement.gyro.lag),
+        "gain": tuple(np.asarray(x) for x in judgement.gyro.gain),
+        "delay": tuple(np.asarray(x) for x in judgement.gyro.delay),
         "chi_square_by_trial": judgement.by_trial,
         "inflation": np.asarray(remainder.inflation),
         "unexplained": np.asarray(judgement.unexplained),

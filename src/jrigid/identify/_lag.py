@@ -1,4 +1,4 @@
-"""Whether a gyroscope has a low-pass filter that the fit leaves out.
+"""Whether a gyroscope has a filter, a scale or a delay that the fit leaves out.
 
 A first-order filter with a time constant tau makes y - tau y' + tau^2 y'' - ... of the
 rates y. The second term is a delay, and states that are sought take it up. A delay by
@@ -6,10 +6,16 @@ tau has half of the third term. The other half, tau^2 y'' / 2, attenuates the wo
 and looks like another inertia. It may be much less than the noise of a reading, and
 many errors of what a long record says of the inertia. So it is sought among the
 residuals, beside all that the fit has sought, as one more number.
+
+A scale that is off by a few parts in a thousand leaves residuals of nearly the same
+shape. Therefore it is sought in the same way, and whichever explains more is named.
+Beside another sensor, whose readings are not late, a delay is a third such number.
 """
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +24,19 @@ from jrigid._numerics import or_one
 from jrigid.identify import _host as host
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
-from jrigid.identify._precision import precision_of_rows
+from jrigid.identify._precision import of_numbers, without_states
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import GATE, Fit
 from jrigid.identify._sensors import Gyro
 
-# Standard errors of the number beyond which it is no chance.
+# Standard errors of a number beyond which it is no chance.
 _SURE = 6.0
-# Part of what the fit does not explain, for a filter to be named.
+# Part of what the fit does not explain, for an error of the gyroscope to be named.
 _EXPLAINED = 0.5
 # Part of the square of the rates' changes that free rotation must explain. Where a
 # torque moves the body as much, the derivatives below are not those of the motion.
 _FREE = 0.8
-# Part of the square of a filter's effect that nothing else may imitate, to be shown.
+# Part of the square of an effect that nothing else may imitate, to be shown.
 _UNSHOWN = 1e-10
 
 
@@ -46,26 +52,81 @@ class Lag(NamedTuple):
     deviations: float
 
 
-NO_LAG = Lag(0.0, 0.0)
+class Gain(NamedTuple):
+    """A factor in the scale of a gyroscope that would explain residuals.
 
-
-def is_named(lag: Lag, chi_square: float, freedom: float) -> bool:
-    """Whether a filter is sure, and explains most of what the fit does not.
-
-    Args:
-        lag: The filter.
-        chi_square: Of the fit, in units of the noise.
-        freedom: Its degrees of freedom.
+    Attributes:
+        factor: Of all readings without their bias.
+        deviations: Standard errors from 1.
     """
+
+    factor: float
+    deviations: float
+
+
+class Delay(NamedTuple):
+    """A delay of a gyroscope that would explain residuals.
+
+    Attributes:
+        seconds: Of its readings, after those of the other sensors [s].
+        deviations: Standard errors from 0.
+    """
+
+    seconds: float
+    deviations: float
+
+
+class GyroErrors(NamedTuple):
+    """Errors of a gyroscope that are not sought, each as if there were no other.
+
+    Attributes:
+        lag: A low-pass filter.
+        gain: A factor in the scale.
+        delay: A delay.
+        moved: By how much the filter, the factor and the delay move the numbers that
+            were sought, in this order.
+    """
+
+    lag: Lag
+    gain: Gain
+    delay: Delay
+    moved: tuple[np.ndarray, ...] = ()
+
+    def named(self, chi_square: float, freedom: float) -> list[Lag | Gain | Delay]:
+        """The errors that are sure, the one that explains most first.
+
+        Args:
+            chi_square: Of the fit, in units of the noise.
+            freedom: Its degrees of freedom.
+        """
+        # No filter amplifies, but a scale or a delay may be wrong either way.
+        sizes = (
+            (self.lag.deviations, self.lag),
+            (abs(self.gain.deviations), self.gain),
+            (abs(self.delay.deviations), self.delay),
+        )
+        sure = [x for x in sizes if _is_sure(x[0], chi_square, freedom)]
+        return [error for _, error in sorted(sure, key=itemgetter(0), reverse=True)]
+
+    def moved_by(self, error: Lag | Gain | Delay) -> np.ndarray:
+        """By how much an error moves the numbers that were sought."""
+        return self.moved[(Lag, Gain, Delay).index(type(error))]
+
+
+NO_ERRORS = GyroErrors(Lag(0.0, 0.0), Gain(1.0, 0.0), Delay(0.0, 0.0))
+
+
+def _is_sure(deviations: float, chi_square: float, freedom: float) -> bool:
+    """Whether a number is sure, and explains most of what the fit does not."""
     # Noise alone makes chi-square as large as this.
     chance = freedom + GATE * math.sqrt(2 * max(freedom, 1.0))
     # One more number lowers chi-square by the square of its standard errors.
-    explains = lag.deviations**2 > _EXPLAINED * (chi_square - chance)
-    return lag.deviations > _SURE and explains
+    explains = deviations**2 > _EXPLAINED * (chi_square - chance)
+    return deviations > _SURE and explains
 
 
-def lag_of(problem: Problem, fit: Fit, noise: float) -> Lag:
-    """The filter of the first gyroscope without a time constant.
+def gyro_errors(problem: Problem, fit: Fit, noise: float) -> GyroErrors:
+    """The errors of the first gyroscope without a time constant.
 
     Args:
         problem: The record.
@@ -76,18 +137,31 @@ def lag_of(problem: Problem, fit: Fit, noise: float) -> Lag:
     for index, sensor in enumerate(sensors):
         if isinstance(sensor, Gyro) and sensor.time_constant is None:
             effects = _effects(problem, fit, index, sensor)
-            return NO_LAG if effects is None else _sought(problem, fit, effects, noise)
-    return NO_LAG
+            if effects is None:
+                return NO_ERRORS
+            return _sought(problem, fit, effects, noise)
+    return NO_ERRORS
 
 
-def _effects(
-    problem: Problem, fit: Fit, index: int, gyro: Gyro
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Whitened first and second derivatives of the readings, of all rows.
+class _Effects(NamedTuple):
+    """Whitened effects of errors of a gyroscope on all rows.
 
-    They are those of free rotation at the predicted rates. Differences of predictions
-    would follow the noise where a torque is unmodelled. None where the body does not
-    rotate freely.
+    Attributes:
+        reading: Readings without their bias.
+        first: Their first derivative.
+        second: Their second derivative.
+    """
+
+    reading: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+def _effects(problem: Problem, fit: Fit, index: int, gyro: Gyro) -> _Effects | None:
+    """Effects of errors of a gyroscope, or None where the body does not rotate freely.
+
+    The derivatives are those of free rotation at the predicted rates. Differences of
+    predictions would follow the noise where a torque is unmodelled.
     """
     samples = problem.samples
     part = samples.parts[index]
@@ -103,12 +177,12 @@ def _effects(
     if not _rotates_freely(np.asarray(samples.ts)[:, part], rates, first, used):
         return None
     columns = []
-    for derivative in (first, second):
+    for rate in (rates, first, second):
         column = np.zeros_like(fit.minimum.rows.residual)
-        effect = (whitener @ matrix @ derivative[..., None])[..., 0]
+        effect = (whitener @ matrix @ rate[..., None])[..., 0]
         column[:, part, :3] = np.where(used[..., None], effect, 0.0)
         columns.append(column)
-    return columns[0], columns[1]
+    return _Effects(*columns)
 
 
 def _matrix(gyro: Gyro) -> np.ndarray:
@@ -144,29 +218,95 @@ def _rotates_freely(
     return bool(total > 0 and missing <= (1 - _FREE) * total)
 
 
-def _sought(
-    problem: Problem, fit: Fit, effects: tuple[np.ndarray, np.ndarray], noise: float
-) -> Lag:
-    """The filter by its effects beside all numbers and states that were sought."""
+def _sought(problem: Problem, fit: Fit, effects: _Effects, noise: float) -> GyroErrors:
+    """The errors by their effects beside all numbers and states that were sought."""
+    table = _table(problem, fit, effects)
+    if noise <= 0 or not np.all(np.isfinite(table.rows)):
+        return NO_ERRORS
+    # A change of the states delays all sensors of a trial. Only beside other sensors is
+    # a delay of the gyroscope one more number, which is sought with the others.
+    delays = (1,) if len(problem.samples.parts) > 1 else ()
+    lag = table.explained((*delays, 2), noise)
+    filtered = Lag(math.sqrt(2 * max(lag.multiple, 0.0)), lag.deviations)
+    if problem.options.dense:
+        # Rates that follow an unmodelled torque follow the noise of the readings, too,
+        # which would seem to be a scale or a delay.
+        return NO_ERRORS._replace(lag=filtered, moved=(lag.moved,))
+    gain = table.explained((*delays, 0), noise)
+    late = table.explained(delays, noise)
+    return GyroErrors(
+        lag=filtered,
+        gain=Gain(1 + gain.multiple, gain.deviations),
+        # A late reading has less of the derivative.
+        delay=Delay(-late.multiple, -late.deviations),
+        moved=(lag.moved, gain.moved, late.moved),
+    )
+
+
+class _Explained(NamedTuple):
+    """The multiple of an effect that explains residuals best.
+
+    Attributes:
+        multiple: Of the effect.
+        deviations: Its standard errors from zero.
+        moved: By how much it moves the numbers that were sought.
+    """
+
+    multiple: float
+    deviations: float
+    moved: np.ndarray
+
+
+class _Table(NamedTuple):
+    """Small rows with the products of all rows, without what states can explain.
+
+    Attributes:
+        rows: In the numbers, the effects and the residual, columns.
+        units: Of the numbers and the effects.
+    """
+
+    rows: np.ndarray
+    units: np.ndarray
+
+    def explained(self, places: Sequence[int], noise: float) -> _Explained:
+        """Explain residuals by the last of these effects, beside all that was sought.
+
+        Args:
+            places: Of the effects, which become more numbers; the fit had them at zero.
+            noise: Variance of a residual.
+        """
+        count = self.units.size - len(_Effects._fields)
+        nothing = _Explained(0.0, 0.0, np.zeros(count))
+        if not places:
+            return nothing
+        columns = [*range(count), *(count + x for x in places)]
+        units = self.units[columns]
+        slopes = self.rows[:, columns]
+        _, _, covariance = of_numbers(slopes[None], units)
+        # One step by Newton's method goes to the minimum in all numbers.
+        step = -covariance @ (slopes.T @ self.rows[:, -1] / units)
+        variance = float(covariance[-1, -1])
+        # What the other numbers and the states can imitate is rounding here.
+        if not units[-1] ** 2 > _UNSHOWN * variance:
+            return nothing
+        deviations = float(step[-1]) / math.sqrt(noise * variance)
+        return _Explained(float(step[-1]), deviations, step[:count])
+
+
+def _table(problem: Problem, fit: Fit, effects: _Effects) -> _Table:
+    """Effects, and all that was sought, in one table."""
     rows, weight, _ = independent_rows(problem, fit)
     own = fit.minimum.point.own.shape[-1]
-    # The coefficients of the two effects are two more numbers, which the fit had at 0.
-    columns = [_independent(problem, fit, x)[..., None] for x in effects]
-    border = np.concatenate([rows.of_border, *columns], axis=-1)
-    squares = [np.sum(weight[..., None, None] * x**2) for x in columns]
-    units = np.append(fit.minimum.units, 1 / np.sqrt(or_one(np.array(squares))))
-    known = precision_of_rows(rows._replace(of_border=border), weight, own, units)
-    # One step by Newton's method goes to the minimum in all numbers. Where states can
-    # imitate the first effect exactly, its error is huge and it changes no other step.
-    step = -known.covariance @ np.sum(known.scores, axis=0)
-    half_square = float(step[-1])
-    variance = float(known.covariance[-1, -1])
-    # What the other numbers and the states can imitate is rounding here.
-    is_shown = units[-1] ** 2 > _UNSHOWN * variance
-    if not (is_shown and math.isfinite(half_square)) or noise <= 0:
-        return NO_LAG
-    deviations = half_square / math.sqrt(noise * variance)
-    return Lag(math.sqrt(2 * max(half_square, 0.0)), deviations)
+    columns = np.stack([_independent(problem, fit, x) for x in effects], axis=-1)
+    border = np.concatenate([rows.of_border, columns], axis=-1)
+    squares = np.sum(weight[..., None, None] * columns**2, axis=(0, 1, 2))
+    units = np.append(fit.minimum.units, 1 / np.sqrt(or_one(squares)))
+    reduced = without_states(rows._replace(of_border=border), weight, own, units)
+    table = np.concatenate([reduced.of_numbers, reduced.residual[..., None]], axis=-1)
+    table = table.reshape(-1, table.shape[-1])
+    if not np.all(np.isfinite(table)):
+        return _Table(table, units)
+    return _Table(np.linalg.qr(table, mode="r"), units)
 
 
 def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray:

@@ -52,6 +52,44 @@ def precision_of_rows(
         own: How many own numbers a trial has.
         units: Natural units of the numbers.
     """
+    reduced = without_states(rows, weight, own, units)
+    scores = (reduced.residual[:, None] @ reduced.of_numbers)[:, 0] / units
+    values, directions, covariance = of_numbers(reduced.of_numbers, units)
+    states = reduced.states
+    half = states.half
+    seen = np.where(states.shown[:, None], half, 0.0)
+    return Precision(
+        values=values,
+        directions=directions,
+        covariance=covariance,
+        local=half @ np.swapaxes(half, 1, 2),
+        sensitivity=-(seen @ reduced.along) / units,
+        of_state=states.values,
+        scores=scores,
+    )
+
+
+class Reduced(NamedTuple):
+    """Weighted rows, without what changes of the states and own numbers can do.
+
+    Attributes:
+        residual: As it was, weighted (trials, rows).
+        of_numbers: Derivatives in natural units, that part removed (trials, rows,
+            numbers).
+        along: What was removed, in the basis of the states.
+        states: The decomposition of the derivatives in the states.
+    """
+
+    residual: np.ndarray
+    of_numbers: np.ndarray
+    along: np.ndarray
+    states: "_States"
+
+
+def without_states(
+    rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
+) -> Reduced:
+    """Rows as the numbers alone move them; arguments as for `precision_of_rows`."""
     root = np.sqrt(weight)[..., None]
     trials, count, width = rows.residual.shape
     flat = (trials, count * width)
@@ -63,20 +101,7 @@ def precision_of_rows(
     shared = np.nan_to_num(shared.reshape(*flat, units.size) * units)
     states = _decomposed(np.nan_to_num(local))
     along = np.swapaxes(states.basis, 1, 2) @ shared
-    # What no state can do is left for the numbers.
-    rest = shared - states.basis @ along
-    scores = (residual[:, None] @ rest)[:, 0] / units
-    values, directions, covariance = _of_numbers(rest, units)
-    half = states.half
-    return Precision(
-        values=values,
-        directions=directions,
-        covariance=covariance,
-        local=half @ np.swapaxes(half, 1, 2),
-        sensitivity=-(np.where(states.shown[:, None], half, 0.0) @ along) / units,
-        of_state=states.values,
-        scores=scores,
-    )
+    return Reduced(residual, shared - states.basis @ along, along, states)
 
 
 class _States(NamedTuple):
@@ -115,7 +140,7 @@ def _decomposed(local: np.ndarray) -> _States:
     )
 
 
-def _of_numbers(
+def of_numbers(
     rest: np.ndarray, units: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Singular values, directions and covariance of the numbers.

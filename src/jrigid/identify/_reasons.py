@@ -5,13 +5,14 @@ that is not sought, or something that swings.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
-from jrigid.identify._lag import Lag, is_named
+from jrigid.identify._lag import Delay, Gain, GyroErrors, Lag
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
@@ -24,6 +25,8 @@ _TOO_FAST = 3.0
 _LOUD = 0.2  # part of the power that a swing has at its frequency
 # Gain of chi-square by the three numbers of a bias that is no chance.
 _GAINED = 36.0
+# Difference of chi-square within which two errors of a gyro explain about as much.
+_LIKE = 16.0
 _EXPLAINED = 0.5  # part of what the fit does not explain, for a bias to be named
 _WHITE = 0.1  # correlation of neighbours
 _WHITE_SURE = 5.0  # standard deviations of that
@@ -75,13 +78,6 @@ def _reason(result: FitResult) -> str:
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
-    lag = Lag(*(float(x) for x in result.diagnostics.lag))
-    if is_named(lag, _chi_square(result), float(result.degrees_of_freedom)):
-        return (
-            "A low-pass filter of the gyro with a time constant of some "
-            f"{lag.time_constant:.2g} s would explain the residuals: pass it "
-            "(`Gyro(time_constant=...)`), or seek it (`free`)."
-        )
     swing = _swing(result)
     if swing > _TOO_FAST:
         return (
@@ -89,14 +85,63 @@ def _reason(result: FitResult) -> str:
             "body does: they are too small. Pass them in rad/s (were they converted "
             "twice, or times not in seconds?)."
         )
+    return _of_gyro(result) or _of_noise(result)
+
+
+def _of_gyro(result: FitResult) -> str:
+    """The error of a gyro that explains most, or an empty text without one.
+
+    Those that explain the residuals about as well follow.
+    """
+    diagnostics = result.diagnostics
+    errors = GyroErrors(
+        lag=Lag(*(float(x) for x in diagnostics.lag)),
+        gain=Gain(*(float(x) for x in diagnostics.gain)),
+        delay=Delay(*(float(x) for x in diagnostics.delay)),
+    )
+    named = errors.named(_chi_square(result), float(result.degrees_of_freedom))
+    causes = [(x.deviations**2, _of_gyro_error(x)) for x in named]
     bias = _bias(result)
     if bias is not None:
-        numbers = ", ".join(f"{x:.2g}" for x in bias)
+        # Noise alone gains 1 in the mean for each number that is sought, of which a
+        # bias has two more.
+        causes.append((bias.gained - 2, _of_bias(bias)))
+    if not causes:
+        return ""
+    causes.sort(reverse=True)
+    sentences = [text for gained, text in causes if gained > causes[0][0] - _LIKE]
+    if len(sentences) > 1:
+        sentences.append("The record hardly tells which of them it is.")
+    return " ".join(sentences)
+
+
+def _of_bias(bias: "_Bias") -> str:
+    """The sentence about a bias."""
+    numbers = ", ".join(f"{x:.2g}" for x in bias.values)
+    return (
+        f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what "
+        "is left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
+    )
+
+
+def _of_gyro_error(error: Lag | Gain | Delay) -> str:
+    """The sentence about a filter, a scale or a delay."""
+    if isinstance(error, Lag):
         return (
-            f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what "
-            "is left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
+            "A low-pass filter of the gyro with a time constant of some "
+            f"{error.time_constant:.2g} s would explain the residuals: pass it "
+            "(`Gyro(time_constant=...)`), or seek it (`free`)."
         )
-    return _of_noise(result)
+    if isinstance(error, Delay):
+        return (
+            f"A delay of the gyro by some {error.seconds:.2g} s, after the other "
+            "sensors, would explain most of what is left: pass it (`Gyro(delay=...)`), "
+            "or seek it (`free`). A low-pass filter delays by its time constant."
+        )
+    return (
+        f"A scale of the gyro that is {error.factor:.4g} times as large would explain "
+        "the residuals: pass it (`Gyro(scale=...)`), or seek it (`free`)."
+    )
 
 
 def _lacks_predictions(result: FitResult) -> bool:
@@ -175,7 +220,14 @@ def _swing(result: FitResult) -> float:
     return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
 
 
-def _bias(result: FitResult) -> np.ndarray | None:
+class _Bias(NamedTuple):
+    """A bias, and by how much it lowers chi-square."""
+
+    values: np.ndarray
+    gained: float
+
+
+def _bias(result: FitResult) -> _Bias | None:
     """A bias that explains most of what the fit does not, where none was sought."""
     options = result.problem.options
     gyros = [i for i, x in enumerate(result.fitted()[1:]) if isinstance(x, Gyro)]
@@ -201,7 +253,7 @@ def _bias(result: FitResult) -> np.ndarray | None:
     # A bias as large as the readings only imitates them.
     if gain < max(_EXPLAINED * excess, _GAINED) or np.max(np.abs(bias)) > fastest:
         return None
-    return bias
+    return _Bias(bias, float(gain))
 
 
 def _slopes_in_bias(
