@@ -459,6 +459,43 @@ def a_problem(*records, free=None):
     return Problem(Options(False, True), unknowns, samples, np.ones(6))
 
 
+def test_numbers_of_a_tensor_in_another_frame_are_those_of_the_same_body(rng):
+    unknowns, _ = identify.Tensor().start(np.eye(3), np.eye(3), 1e-3)
+    for numbers in (rng.normal(size=5), np.array([-9.0, -4.0, 0.3, -0.2, 1e-3])):
+        own, diagonal = unknowns.in_frame(numbers)
+        back, same = own.in_frame(diagonal, unknowns)
+        np.testing.assert_allclose(diagonal[2:], 0, atol=1e-12)
+        assert 0 > diagonal[0] > diagonal[1]
+        np.testing.assert_allclose(same, numbers, rtol=1e-8, atol=1e-12)
+        for model, values in ((own, diagonal), (back, same)):
+            expected = unknowns.inertia(jnp.asarray(numbers))
+            inertia = model.inertia(jnp.asarray(values))
+            scaled = inertia * (jnp.trace(expected) / jnp.trace(inertia))
+            np.testing.assert_allclose(scaled, expected, atol=1e-13)
+
+
+def test_a_step_of_a_tensor_is_straight_in_its_second_moments(rng):
+    model = identify.Tensor()
+    numbers = jnp.asarray(rng.normal(size=5))
+    change = jnp.asarray([0.2, 0.3, -0.5, 0.4, 0.7])
+
+    def lower(part):
+        x = model.moved(numbers, part * change)
+        return jnp.exp(x[0]), jnp.exp(x[1]), x[2], x[3], x[4]
+
+    slope = jax.jacfwd(lambda part: model.moved(numbers, part * change))(0.0)
+    np.testing.assert_allclose(slope, change, rtol=1e-12)
+
+    def straight(part):
+        second, third, left, right, side = lower(part)
+        return jnp.stack([second**2, (third / second) ** 2, left, right, side / second])
+
+    start, middle, end = (straight(x) for x in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(middle, (start + end) / 2, rtol=1e-12)
+    # A second moment that would become negative stays positive.
+    assert np.all(np.isfinite(model.moved(numbers, -1e6 * jnp.ones(5))))
+
+
 def test_the_signal_of_a_sensor_does_not_depend_on_the_others(rng):
     """A radian for attitudes and directions, the variation of values for the others."""
     ts, sigma = np.arange(20.0), 0.01

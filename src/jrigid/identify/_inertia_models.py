@@ -161,11 +161,13 @@ class Tensor(_InFrame):
         self, tensor: AnyArray, known: AnyArray, flattest: ScalarLike
     ) -> tuple["Tensor", AnyArray]:
         """Return the numbers of the nearest real body in its principal axes."""
-        xp = tensor.__array_namespace__()
-        _, axes = principal_axes(without_gradient(real_body(tensor, flattest)))
+        body = real_body(tensor, flattest)
+        # The numbers of a plan have no derivatives by way of the frame.
+        _, axes = principal_axes(without_gradient(body))
         # The largest second moment is the first, since it is the one left out.
         frame = axes[:, ::-1]
-        sigma = product("ki,kl,lj->ij", frame, real_body(tensor, flattest), frame)
+        sigma = product("ki,kl,lj->ij", frame, body, frame)
+        xp = tensor.__array_namespace__()
         lower = cholesky(sigma) / xp.sqrt(sigma[0, 0])
         logarithms = xp.log(xp.diagonal(lower)[1:])
         return Tensor(frame), xp.concatenate([logarithms, lower[_parameters.SIDES]])
@@ -185,17 +187,18 @@ class Tensor(_InFrame):
             return self, numbers
         # A decomposition of L instead of L L^T keeps the digits of a thin body.
         lower = self.frame @ lower
-        model = like
-        if model is None:
-            # Signs of their own make the numbers of similar fits similar.
+        if isinstance(like, Tensor) and like.frame is not None:
+            frame = np.asarray(like.frame)
+        else:
             axes, _, _ = np.linalg.svd(lower)
-            model = Tensor(with_signs(axes[:, ::-1])[:, ::-1])
-        upper = np.linalg.qr(lower.T @ model.frame, mode="r")
+            # Signs of their own make the numbers of similar fits similar.
+            frame = with_signs(axes[:, ::-1])[:, ::-1]
+        upper = np.asarray(np.linalg.qr(lower.T @ frame, mode="r"))
         sizes = np.abs(np.diagonal(upper))
         lower = upper.T * np.sign(np.diagonal(upper)) / sizes[0]
         thin = np.finfo(numbers.dtype).eps
         logarithms = np.log(np.maximum(sizes[1:] / sizes[0], thin))
-        return model, np.concatenate([logarithms, lower[_parameters.SIDES]])
+        return Tensor(frame), np.concatenate([logarithms, lower[_parameters.SIDES]])
 
     def moved(self, numbers: Array, change: Array) -> Array:
         """Numbers after a step that is straight in second moments.

@@ -306,7 +306,7 @@ def _table(problem: Problem, fit: Fit, effects: _Effects) -> _Table:
     table = table.reshape(-1, table.shape[-1])
     if not np.all(np.isfinite(table)):
         return _Table(table, units)
-    return _Table(np.linalg.qr(table, mode="r"), units)
+    return _Table(np.asarray(np.linalg.qr(table, mode="r")), units)
 
 
 def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray:

@@ -66,6 +66,13 @@ def _reason(result: FitResult) -> str:
             "The body does not turn: the readings are no larger than their noise. "
             "Inertia shows in rates that change."
         )
+    swing = _swing(result)
+    if result.status != Status.OK and swing > _TOO_FAST:
+        return (
+            f"The rates swing {swing:.2g} times as fast as the body turns, which no "
+            "body does: they are too small. Pass them in rad/s (were they converted "
+            "twice, or times not in seconds?)."
+        )
     if _is_nearly_a_sphere(result):
         return (
             "Nearly a sphere: so looks any body whose rates are in degrees a second, "
@@ -77,13 +84,6 @@ def _reason(result: FitResult) -> str:
         return (
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
-        )
-    swing = _swing(result)
-    if swing > _TOO_FAST:
-        return (
-            f"The rates swing {swing:.2g} times as fast as the body turns, which no "
-            "body does: they are too small. Pass them in rad/s (were they converted "
-            "twice, or times not in seconds?)."
         )
     return _of_gyro(result) or _of_noise(result)
 
