@@ -15,12 +15,12 @@ from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
+from jrigid.identify._gyro_errors import NO_ERRORS, GyroErrors, gyro_errors
 from jrigid.identify._independent import (
     Independent,
     condensed_rows,
     independent_rows,
 )
-from jrigid.identify._lag import NO_ERRORS, GyroErrors, gyro_errors
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._precision import (

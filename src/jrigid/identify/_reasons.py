@@ -11,8 +11,8 @@ import numpy as np
 
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
+from jrigid.identify._gyro_errors import Delay, Gain, GyroErrors, Lag
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
-from jrigid.identify._lag import Delay, Gain, GyroErrors, Lag
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
