@@ -206,7 +206,7 @@ class Plan(Readable):
             history=np.zeros(0, dtype),
         )
         lengths = [x.shape[1] for x in samples.values]
-        return result_of(conclude(planned.problem, fit, lengths))
+        return result_of(conclude(fit, lengths))
 
 
 class _Planned(NamedTuple):

@@ -71,19 +71,21 @@ class Weakest(NamedTuple):
     direction: np.ndarray
 
 
-def weakest(problem: Problem, fit: Fit) -> Weakest:
+def weakest(fit: Fit) -> Weakest:
     """The direction in the numbers that the record determines least."""
     minimum = fit.minimum
     units = minimum.units
     square = float(minimum.square + minimum.kicks)
     noise = 1.0
-    if not problem.options.noise_known:
+    if not fit.problem.options.noise_known:
         trials, _, local = minimum.links.gap.shape
-        count = quality.sums_of(problem, fit).count
+        count = quality.sums_of(fit).count
         # A noise that is not known has the variance of the residuals.
         noise = square / max(count - units.size - local * trials, 1.0)
-    covariance = precision(problem, fit).covariance
-    error, normal, direction = weakest_of(problem.unknowns.judged, covariance, units)
+    covariance = precision(fit).covariance
+    error, normal, direction = weakest_of(
+        fit.problem.unknowns.judged, covariance, units
+    )
     return Weakest(square, noise, np.sqrt(noise) * error, normal, direction)
 
 
@@ -120,8 +122,9 @@ def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
     return float(problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0))
 
 
-def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.ndarray]:
+def _of_torque(fit: Fit, inflation: float) -> dict[str, np.ndarray]:
     """Level and correlation time of the unmodelled torque, with errors."""
+    problem = fit.problem
     none = np.zeros(3)
     fields = {
         "level": none,
@@ -133,7 +136,7 @@ def _of_torque(problem: Problem, fit: Fit, inflation: float) -> dict[str, np.nda
     if not problem.options.dense:
         return fields
     first = first_level(problem, fit.layout, fit.minimum.tensor)
-    search = levels.Search(problem, fit.layout, first)
+    search = levels.Search(fit.layout, first)
     torque = fit.torque
     if torque is None:
         level = np.asarray(fit.disturbance.level[0], float)
@@ -266,7 +269,6 @@ def _at_least_probed(
 
 @np.errstate(all="ignore")  # what is not finite is judged below
 def conclude(
-    problem: Problem,
     fit: Fit,
     lengths: Sequence[int],
     input_result: Any = RESULTS.successful,
@@ -274,26 +276,25 @@ def conclude(
     """The fields of a `FitResult`, in numpy, from a fit at its minimum.
 
     Args:
-        problem: The record, filled up to a rounded number of samples.
         fit: The minimum.
         lengths: How many samples of each record to return.
         input_result: What is wrong with the input.
     """
-    independent = independent_rows(problem, fit)
-    known = precision(problem, fit)
-    judgement = _judgement(problem, fit, known, _white(fit, independent))
+    independent = independent_rows(fit)
+    known = precision(fit)
+    judgement = _judgement(fit, known, _white(fit, independent))
     numbers = fit.minimum.point.numbers
-    derived = derive(problem, numbers, judgement.covariance, fit.probes)
-    of_torque = _of_torque(problem, fit, judgement.remainder.inflation)
+    derived = derive(fit.problem, numbers, judgement.covariance, fit.probes)
+    of_torque = _of_torque(fit, judgement.remainder.inflation)
     fields = derived | of_torque
     fields |= _fields_of_judgement(judgement)
-    fields |= _fields_of_precision(problem, fit, known, judgement)
-    fields |= _fields_of_record(problem, fit, lengths)
+    fields |= _fields_of_precision(fit, known, judgement)
+    fields |= _fields_of_record(fit, lengths)
     fields["log_determinant"] = np.asarray(independent.log_determinant)
     good = is_good(input_result)
     error = 0.0
     if good:
-        error = integration_error(problem, fit.layout, fit.minimum.point)
+        error = integration_error(fit.problem, fit.layout, fit.minimum.point)
     fields["integration_error"] = np.asarray(error)
     fields = _of_dtype(fields, good, fit.minimum.units.dtype)
     status = _status(judgement.status, good, error, derived, of_torque)
@@ -337,15 +338,15 @@ def _status(
 
 
 def _fields_of_precision(
-    problem: Problem, fit: Fit, known: Precision, judgement: "_Judgement"
+    fit: Fit, known: Precision, judgement: "_Judgement"
 ) -> dict[str, np.ndarray]:
     """Fields that say what determines the numbers and the states."""
     minimum = fit.minimum
     # Without an unmodelled torque all errors are those of the sensors.
     sensors = known
-    if problem.options.dense:
+    if fit.problem.options.dense:
         # What the sensors alone would determine, without an unmodelled torque.
-        rows = condensed_rows(problem, fit)
+        rows = condensed_rows(fit)
         own = minimum.point.own.shape[-1]
         sensors = precision_of_rows(rows, minimum.weight, own, minimum.units)
     inflation = judgement.remainder.inflation
@@ -360,14 +361,13 @@ def _fields_of_precision(
     }
 
 
-def _fields_of_record(
-    problem: Problem, fit: Fit, lengths: Sequence[int]
-) -> dict[str, Any]:
+def _fields_of_record(fit: Fit, lengths: Sequence[int]) -> dict[str, Any]:
     """Fields that hold the estimates, the residuals and the record as it was given."""
+    problem = fit.problem
     minimum = fit.minimum
     point = minimum.point
     parts = problem.samples.parts
-    rows = condensed_rows(problem, fit)
+    rows = condensed_rows(fit)
     residuals, jacobian = _weighted(fit, rows, point.own.shape[-1])
     history = np.full(HISTORY, np.nan)
     history[: fit.history.size] = fit.history[:HISTORY]
@@ -507,9 +507,9 @@ def _whiteness(rows: np.ndarray, parts: Sequence[slice]) -> tuple[float, float]:
     return float(like), float(np.abs(like) * np.sqrt(np.sum(both)))
 
 
-def _kicks(problem: Problem, fit: Fit) -> float:
+def _kicks(fit: Fit) -> float:
     """Sum of squares of what an unmodelled torque did; 0 where there is none."""
-    return float(fit.minimum.kicks) if problem.options.dense else 0.0
+    return float(fit.minimum.kicks) if fit.problem.options.dense else 0.0
 
 
 class _Remainder(NamedTuple):
@@ -535,23 +535,21 @@ class _Remainder(NamedTuple):
     inflation: float
 
 
-def _remainder(
-    problem: Problem, fit: Fit, known: Precision, white: np.ndarray
-) -> _Remainder:
+def _remainder(fit: Fit, known: Precision, white: np.ndarray) -> _Remainder:
     """Compare chi-square, and the loudest band, with those of noise."""
-    chi_square, freedom = _chi_square(problem, fit, known)
+    chi_square, freedom = _chi_square(fit, known)
     noise = chi_square / max(freedom, 1.0)
-    band = _band(problem, fit, white)
+    band = _band(fit, white)
     coloured = colour.stands_out(*band)
     more = less = False
-    if problem.options.noise_known:
+    if fit.problem.options.noise_known:
         # Over n degrees of freedom the mean square of white noise scatters by
         # sqrt(2/n).
         gate = quality.GATE * np.sqrt(2 / max(freedom, 1.0))
         more = noise > 1 + gate or np.max(fit.scales) > 2
         less = 0 < noise < 1 - gate  # a plan has no residuals
     inflation = 1.0
-    if not problem.options.noise_known:
+    if not fit.problem.options.noise_known:
         inflation = noise
     elif more:
         inflation = max(noise, 1.0)
@@ -569,27 +567,28 @@ def _remainder(
     )
 
 
-def _chi_square(problem: Problem, fit: Fit, known: Precision) -> tuple[float, float]:
+def _chi_square(fit: Fit, known: Precision) -> tuple[float, float]:
     """Chi-square and its degrees of freedom."""
-    sums = quality.sums_of(problem, fit)
+    sums = quality.sums_of(fit)
     rows = fit.minimum.rows.residual
     # The last rows only hold a fit near its start.
-    prior = rows[:, fit.kept.shape[1] : rows.shape[1] - problem.held]
+    prior = rows[:, fit.kept.shape[1] : rows.shape[1] - fit.problem.held]
     takes_part = np.any(fit.kept > 0, axis=1)[:, None]
     # A change of a state that the record does not show takes no degree of freedom.
     is_shown = known.of_state > SHOWN * known.of_state[:, :1]
     sought = fit.minimum.units.size + np.sum(is_shown & takes_part)
-    freedom = sums.count + problem.priors(int(np.sum(takes_part))) - sought
-    chi_square = sums.residual + float(np.sum(prior**2)) + _kicks(problem, fit)
+    freedom = sums.count + fit.problem.priors(int(np.sum(takes_part))) - sought
+    chi_square = sums.residual + float(np.sum(prior**2)) + _kicks(fit)
     return chi_square, float(freedom)
 
 
-def _band(problem: Problem, fit: Fit, white: np.ndarray) -> tuple[float, float]:
+def _band(fit: Fit, white: np.ndarray) -> tuple[float, float]:
     """Power in the band that stands out most, and its standard deviations."""
+    problem = fit.problem
     if problem.options.dense or np.any(problem.samples.sign):
         return colour.loudest_band(white, problem.samples.parts)
     # The search has computed it from the same residuals.
-    return quality.loudest_band_of(problem, fit)
+    return quality.loudest_band_of(fit)
 
 
 class _Judgement(NamedTuple):
@@ -616,29 +615,27 @@ class _Judgement(NamedTuple):
     gyro: GyroErrors
 
 
-def _judgement(
-    problem: Problem, fit: Fit, known: Precision, white: np.ndarray
-) -> _Judgement:
+def _judgement(fit: Fit, known: Precision, white: np.ndarray) -> _Judgement:
     """Judge a fit by its whitened residuals, or innovations."""
-    remainder = _remainder(problem, fit, known, white)
+    remainder = _remainder(fit, known, white)
     takes_part = np.any(fit.kept > 0, axis=1)
     units = fit.minimum.units
     scatter = _scatter_of_trials(known, takes_part, units, remainder.inflation)
-    covariance = _inflated(problem, fit, known, scatter, remainder.inflation)
-    pure = quality.is_pure(problem, fit, remainder.inflation)
-    unexplained = quality.unexplained(problem, fit, _kicks(problem, fit))
+    covariance = _inflated(fit, known, scatter, remainder.inflation)
+    pure = quality.is_pure(fit, remainder.inflation)
+    unexplained = quality.unexplained(fit, _kicks(fit))
     misfit = remainder.misfit or bool(np.any(scatter > _DISAGREEING))
     seen = np.maximum(np.sum(white != 0, axis=(1, 2)), 1)
     if misfit:
-        status = _status_of_misfit(problem, fit, unexplained)
+        status = _status_of_misfit(fit, unexplained)
     else:
-        status = _status_of_match(problem, fit, remainder, covariance, pure)
-    gyro, factor, moved = _gyro(problem, fit, remainder, status)
+        status = _status_of_match(fit, remainder, covariance, pure)
+    gyro, factor, moved = _gyro(fit, remainder, status)
     if moved is not None:
         status = "MISFIT"
         inflation = max(remainder.inflation, factor)
         remainder = remainder._replace(inflation=inflation)
-        covariance = _inflated(problem, fit, known, scatter, inflation)
+        covariance = _inflated(fit, known, scatter, inflation)
         covariance = covariance + np.outer(moved, moved)
     sound = np.all(np.isfinite(covariance)) and remainder.freedom > 0
     # A sum that is not finite: no point was found where all predictions are finite.
@@ -651,14 +648,14 @@ def _judgement(
         covariance=covariance,
         pure=pure,
         unexplained=unexplained,
-        whiteness=_whiteness(white, problem.samples.parts),
+        whiteness=_whiteness(white, fit.problem.samples.parts),
         by_trial=np.sum(white**2, axis=(1, 2)) / seen,
         gyro=gyro,
     )
 
 
 def _gyro(
-    problem: Problem, fit: Fit, remainder: _Remainder, status: str
+    fit: Fit, remainder: _Remainder, status: str
 ) -> tuple[GyroErrors, float, np.ndarray | None]:
     """Errors of a gyro, and if one is named, what it does to errors and numbers.
 
@@ -667,8 +664,8 @@ def _gyro(
     """
     if status not in ("OK", "MISFIT"):
         return NO_ERRORS, 1.0, None
-    noise = 1.0 if problem.options.noise_known else remainder.noise
-    errors = gyro_errors(problem, fit, noise)
+    noise = 1.0 if fit.problem.options.noise_known else remainder.noise
+    errors = gyro_errors(fit, noise)
     named = errors.named(remainder.chi_square / noise, remainder.freedom)
     if not named:
         return errors, 1.0, None
@@ -677,7 +674,6 @@ def _gyro(
 
 
 def _inflated(
-    problem: Problem,
     fit: Fit,
     known: Precision,
     scatter: np.ndarray,
@@ -688,22 +684,21 @@ def _inflated(
     factors = np.maximum(scatter, 1.0)
     covariance = inflation * _with_larger_errors(known, factors, units)
     if fit.probes:
-        judged = problem.unknowns.judged
+        judged = fit.problem.unknowns.judged
         probed = max(x.error for x in fit.probes)
         covariance = _with_error(judged, covariance, units, probed)
     return covariance
 
 
-def _status_of_misfit(problem: Problem, fit: Fit, unexplained: float) -> str:
+def _status_of_misfit(fit: Fit, unexplained: float) -> str:
     """The status of a fit whose residuals are more than noise."""
     follows = unexplained <= quality.FOLLOWED
-    if follows and not quality.is_at_boundary(problem, fit):
+    if follows and not quality.is_at_boundary(fit):
         return "MISFIT"
     return "WRONG_BASIN" if fit.minimum.settled else "NOT_CONVERGED"
 
 
 def _status_of_match(
-    problem: Problem,
     fit: Fit,
     remainder: _Remainder,
     covariance: np.ndarray,
@@ -712,9 +707,9 @@ def _status_of_match(
     """The status of a fit whose residuals are no more than noise."""
     if pure or fit.ambiguous:
         return "UNIDENTIFIABLE"
-    if quality.is_at_boundary(problem, fit):
+    if quality.is_at_boundary(fit):
         return "AT_BOUNDARY"
-    judged = problem.unknowns.judged
+    judged = fit.problem.unknowns.judged
     largest, _, _ = weakest_of(judged, covariance, fit.minimum.units)
     # A fit that creeps along what is not determined is good.
     if largest > LARGEST_ERROR:

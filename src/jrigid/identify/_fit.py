@@ -713,7 +713,7 @@ def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str,
     lengths = [max(x) for x in columns]
     results = []
     for (_, input_result), best in zip(cases, run(searches), strict=True):
-        fields = conclude(best.problem, best, lengths, input_result)
+        fields = conclude(best, lengths, input_result)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
                 raise RuntimeError(Status[status])

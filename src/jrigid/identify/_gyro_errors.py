@@ -25,7 +25,6 @@ from jrigid.identify import _host as host
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
 from jrigid.identify._precision import of_numbers, without_states
-from jrigid.identify._problem import Problem
 from jrigid.identify._quality import GATE, Fit
 from jrigid.identify._sensors import Gyro
 
@@ -125,21 +124,20 @@ def _is_sure(deviations: float, chi_square: float, freedom: float) -> bool:
     return deviations > _SURE and explains
 
 
-def gyro_errors(problem: Problem, fit: Fit, noise: float) -> GyroErrors:
+def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
     """The errors of the first gyroscope without a time constant.
 
     Args:
-        problem: The record.
         fit: Its minimum.
         noise: Variance of a whitened residual.
     """
-    sensors = problem.unknowns.original(0)[1:]
+    sensors = fit.problem.unknowns.original(0)[1:]
     for index, sensor in enumerate(sensors):
         if isinstance(sensor, Gyro) and sensor.time_constant is None:
-            effects = _effects(problem, fit, index, sensor)
+            effects = _effects(fit, index, sensor)
             if effects is None:
                 return NO_ERRORS
-            return _sought(problem, fit, effects, noise)
+            return _sought(fit, effects, noise)
     return NO_ERRORS
 
 
@@ -157,16 +155,16 @@ class _Effects(NamedTuple):
     second: np.ndarray
 
 
-def _effects(problem: Problem, fit: Fit, index: int, gyro: Gyro) -> _Effects | None:
+def _effects(fit: Fit, index: int, gyro: Gyro) -> _Effects | None:
     """Effects of errors of a gyroscope, or None where the body does not rotate freely.
 
     The derivatives are those of free rotation at the predicted rates. Differences of
     predictions would follow the noise where a torque is unmodelled.
     """
-    samples = problem.samples
+    samples = fit.problem.samples
     part = samples.parts[index]
     whitener = np.asarray(samples.whitener)[:, part, :3, :3]
-    weight = quality.weights_of(problem, fit.kept)[:, part, :3]
+    weight = quality.weights_of(fit.problem, fit.kept)[:, part, :3]
     used = np.all(weight > 0, axis=-1)
     safe = np.where(used[..., None, None], whitener, np.eye(3))
     errors = np.linalg.solve(safe, fit.residual[:, part, :3, None])[..., 0]
@@ -218,17 +216,17 @@ def _rotates_freely(
     return bool(total > 0 and missing <= (1 - _FREE) * total)
 
 
-def _sought(problem: Problem, fit: Fit, effects: _Effects, noise: float) -> GyroErrors:
+def _sought(fit: Fit, effects: _Effects, noise: float) -> GyroErrors:
     """The errors by their effects beside all numbers and states that were sought."""
-    table = _table(problem, fit, effects)
+    table = _table(fit, effects)
     if noise <= 0 or not np.all(np.isfinite(table.rows)):
         return NO_ERRORS
     # A change of the states delays all sensors of a trial. Only beside other sensors is
     # a delay of the gyroscope one more number, which is sought with the others.
-    delays = (1,) if len(problem.samples.parts) > 1 else ()
+    delays = (1,) if len(fit.problem.samples.parts) > 1 else ()
     lag = table.explained((*delays, 2), noise)
     filtered = Lag(math.sqrt(2 * max(lag.multiple, 0.0)), lag.deviations)
-    if problem.options.dense:
+    if fit.problem.options.dense:
         # Rates that follow an unmodelled torque follow the noise of the readings, too,
         # which would seem to be a scale or a delay.
         return NO_ERRORS._replace(lag=filtered, moved=(lag.moved,))
@@ -293,11 +291,11 @@ class _Table(NamedTuple):
         return _Explained(float(step[-1]), deviations, step[:count])
 
 
-def _table(problem: Problem, fit: Fit, effects: _Effects) -> _Table:
+def _table(fit: Fit, effects: _Effects) -> _Table:
     """Effects, and all that was sought, in one table."""
-    rows, weight, _ = independent_rows(problem, fit)
+    rows, weight, _ = independent_rows(fit)
     own = fit.minimum.point.own.shape[-1]
-    columns = np.stack([_independent(problem, fit, x) for x in effects], axis=-1)
+    columns = np.stack([_independent(fit, x) for x in effects], axis=-1)
     border = np.concatenate([rows.of_border, columns], axis=-1)
     squares = np.sum(weight[..., None, None] * columns**2, axis=(0, 1, 2))
     units = np.append(fit.minimum.units, 1 / np.sqrt(or_one(squares)))
@@ -309,9 +307,9 @@ def _table(problem: Problem, fit: Fit, effects: _Effects) -> _Table:
     return _Table(np.asarray(np.linalg.qr(table, mode="r")), units)
 
 
-def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray:
+def _independent(fit: Fit, residual: np.ndarray) -> np.ndarray:
     """What a change of the predictions does to the independent rows."""
-    if not problem.options.dense:
+    if not fit.problem.options.dense:
         return residual
     minimum = fit.minimum
     links = minimum.links._replace(
@@ -322,4 +320,4 @@ def _independent(problem: Problem, fit: Fit, residual: np.ndarray) -> np.ndarray
     changed = dataclasses.replace(
         fit, minimum=minimum._replace(rows=rows, links=links), computed={}
     )
-    return independent_rows(problem, changed).rows.residual
+    return independent_rows(changed).rows.residual

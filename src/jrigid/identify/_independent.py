@@ -6,7 +6,6 @@ import numpy as np
 
 from jrigid.identify import _quality as quality
 from jrigid.identify._filter import innovations
-from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._smoother import Links, Rows
 
@@ -54,18 +53,17 @@ class Independent(NamedTuple):
 
 
 @quality.once_for_each_fit
-def condensed_rows(problem: Problem, fit: Fit) -> Rows:
+def condensed_rows(fit: Fit) -> Rows:
     """Rows of a minimum in the first state of each trial."""
-    del problem
     return condensed(fit.minimum.rows, fit.minimum.links)
 
 
 @quality.once_for_each_fit
-def independent_rows(problem: Problem, fit: Fit) -> Independent:
+def independent_rows(fit: Fit) -> Independent:
     """The rows by which a fit is judged, those of what is known beforehand last."""
     minimum = fit.minimum
-    if not problem.options.dense:
-        return Independent(condensed_rows(problem, fit), minimum.weight, 0.0)
+    if not fit.problem.options.dense:
+        return Independent(condensed_rows(fit), minimum.weight, 0.0)
     filtered = innovations(quality.linearised(fit), fit.disturbance)
     columns = np.concatenate(
         [np.asarray(filtered.rows), quality.columns_of_prior(fit)], axis=1

@@ -14,7 +14,6 @@ import numpy as np
 from jrigid.identify._disturbance import Disturbance, GaussMarkov
 from jrigid.identify._filter import TrialLikelihoods, likelihood
 from jrigid.identify._layout import Layout
-from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit, columns_of_prior, linearised, weights_of
 
 FAINT = 1e-4  # part of the first level below which there is no torque
@@ -112,20 +111,20 @@ def known(level: np.ndarray, time: np.ndarray, trials: int) -> Torque:
 class Likelihood:
     """-2 log likelihood of torques for a record, linearised where a fit ended."""
 
-    def __init__(self, problem: Problem, fit: Fit):
+    def __init__(self, fit: Fit):
         """Compute what does not depend on the torque."""
         record = linearised(fit)
         prior = columns_of_prior(fit)
         trials = record.weight.shape[0]
         own = record.links.gap.shape[-1] + record.own.shape[-1]
         unknown = fit.minimum.point.numbers.size + trials * own
-        freedom = max(float(np.sum(weights_of(problem, fit.kept))) - unknown, 1.0)
+        freedom = max(float(np.sum(weights_of(fit.problem, fit.kept))) - unknown, 1.0)
         self._dtype = record.tensor.dtype
         self._arguments = (
             record,
             np.einsum("tndi,tndj->tij", prior, prior),
             np.asarray(freedom, self._dtype),
-            np.asarray(problem.options.noise_known),
+            np.asarray(fit.problem.options.noise_known),
         )
         layout = fit.layout
         shortest = np.min((layout.end - layout.start)[layout.linked], initial=1.0)
@@ -245,14 +244,12 @@ class Search:
     """The search for the torque of a record.
 
     Args:
-        problem: The record.
-        layout: Its segments.
+        layout: Segments of the record.
         first: A level that moves a rate by its noise from node to node.
     """
 
-    def __init__(self, problem: Problem, layout: Layout, first: float):
+    def __init__(self, layout: Layout, first: float):
         """Set the bounds of levels and times."""
-        self._problem = problem
         span = np.where(layout.linked, layout.end - layout.start, np.inf)
         end = np.where(layout.linked, layout.end, -np.inf).max(axis=1)
         duration = np.max(end - layout.start[:, 0], initial=0.0)
@@ -269,7 +266,7 @@ class Search:
 
     def improved(self, torque: Torque, fit: Fit) -> Torque:
         """The most likely torque of the same form, with the same sizes in trials."""
-        return self._descended(torque, Likelihood(self._problem, fit))
+        return self._descended(torque, Likelihood(fit))
 
     def _bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the numbers of a form."""
@@ -307,7 +304,7 @@ class Search:
             fit: Where the record is linearised.
             spins: Rms rate of each trial [rad/s].
         """
-        likelihood = Likelihood(self._problem, fit)
+        likelihood = Likelihood(fit)
         best = self._descended(torque, likelihood)
         if np.all(self.are_faint(best)):
             return best
@@ -375,7 +372,7 @@ class Search:
         numbers = fit.minimum.point.numbers.size
         if np.sum(used) < _FEWEST or not numbers:
             return none
-        fall = Likelihood(self._problem, fit).as_of_another_body(torque)
+        fall = Likelihood(fit).as_of_another_body(torque)
         # Under a torque that is not quite of this form all trials differ.
         usual = max(float(np.median(fall[used])) / numbers, 1.0)
         # In a trial of the same body the fall is about chi-square of as many degrees of
@@ -386,7 +383,7 @@ class Search:
 
     def errors(self, torque: Torque, fit: Fit) -> np.ndarray:
         """Standard errors of the logarithms of levels and times."""
-        likelihood = Likelihood(self._problem, fit)
+        likelihood = Likelihood(fit)
 
         def slope(numbers: np.ndarray) -> np.ndarray:
             return likelihood(torque.form, numbers, torque.trials)[1]

@@ -10,7 +10,6 @@ import numpy as np
 from jrigid._numerics import or_one
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
-from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 from jrigid.identify._smoother import Rows
 
@@ -169,8 +168,8 @@ def least_value(dtype: np.dtype) -> float:
 
 
 @quality.once_for_each_fit
-def precision(problem: Problem, fit: Fit) -> Precision:
+def precision(fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
     own = fit.minimum.point.own.shape[-1]
-    rows, weight, _ = independent_rows(problem, fit)
+    rows, weight, _ = independent_rows(fit)
     return precision_of_rows(rows, weight, own, fit.minimum.units)

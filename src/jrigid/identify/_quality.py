@@ -71,7 +71,7 @@ class Fit:
     history: np.ndarray
     ambiguous: bool = False
     probes: tuple[Probe, ...] = ()
-    computed: dict[Any, tuple[Problem, Any]] = dataclasses.field(default_factory=dict)
+    computed: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def residual(self) -> np.ndarray:
@@ -83,8 +83,8 @@ _Value = TypeVar("_Value")
 
 
 def once_for_each_fit(
-    function: Callable[[Problem, Fit], _Value],
-) -> Callable[[Problem, Fit], _Value]:
+    function: Callable[[Fit], _Value],
+) -> Callable[[Fit], _Value]:
     """Keep the value of a function of the minimum with the fit.
 
     The search and the conclusion ask the same questions. The function must not depend
@@ -92,12 +92,10 @@ def once_for_each_fit(
     """
 
     @wraps(function)
-    def call(problem: Problem, fit: Fit) -> _Value:
-        known, value = fit.computed.get(function, (None, None))
-        if known is not problem:
-            value = function(problem, fit)
-            fit.computed[function] = problem, value
-        return value  # type: ignore[return-value]
+    def call(fit: Fit) -> _Value:
+        if function not in fit.computed:
+            fit.computed[function] = function(fit)
+        return fit.computed[function]
 
     return call
 
@@ -188,26 +186,27 @@ class Sums(NamedTuple):
 
 
 @once_for_each_fit
-def sums_of(problem: Problem, fit: Fit) -> Sums:
+def sums_of(fit: Fit) -> Sums:
     """Sums over the samples that a fit is judged by."""
-    weight = weights_of(problem, fit.kept)
+    weight = weights_of(fit.problem, fit.kept)
     return Sums(
         count=float(np.sum(weight)),
         residual=float(np.sum(weight * fit.residual**2)),
-        signal=float(np.sum(weight * signal_of(problem, weight) ** 2)),
+        signal=float(np.sum(weight * signal_of(fit.problem, weight) ** 2)),
     )
 
 
 @once_for_each_fit
-def loudest_band_of(problem: Problem, fit: Fit) -> tuple[float, float]:
+def loudest_band_of(fit: Fit) -> tuple[float, float]:
     """`loudest_band` of the residuals, without those of saturated numbers."""
-    white = np.sqrt(weights_of(problem, fit.kept)) * fit.residual
-    return loudest_band(white, problem.samples.parts)
+    white = np.sqrt(weights_of(fit.problem, fit.kept)) * fit.residual
+    return loudest_band(white, fit.problem.samples.parts)
 
 
-def misfit(problem: Problem, fit: Fit) -> float:
+def misfit(fit: Fit) -> float:
     """0 for a fit that may be kept; else how wrong it is."""
-    sums = sums_of(problem, fit)
+    problem = fit.problem
+    sums = sums_of(fit)
     numbers = fit.minimum.point.numbers.size
     # An approximate count: of a trial's own unknowns only its three rates.
     freedom = max(sums.count - numbers - 3.0 * fit.kept.shape[0], 1.0)
@@ -216,11 +215,11 @@ def misfit(problem: Problem, fit: Fit) -> float:
     if problem.options.noise_known and not problem.options.robust:
         good = good and ratio < 1 + GATE * np.sqrt(2 / freedom)
         if good and not problem.options.dense:
-            good = not stands_out(*loudest_band_of(problem, fit))
+            good = not stands_out(*loudest_band_of(fit))
     if good:
         # So small a number that a good fit inside replaces this one, but no misfit
         # does.
-        return _AT_BOUNDARY if is_at_boundary(problem, fit) else 0.0
+        return _AT_BOUNDARY if is_at_boundary(fit) else 0.0
     return ratio if np.isfinite(ratio) else np.finfo(float).max
 
 
@@ -249,22 +248,22 @@ def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
     return np.concatenate(signals, axis=1)
 
 
-def unexplained(problem: Problem, fit: Fit, kicks: float = 0.0) -> float:
+def unexplained(fit: Fit, kicks: float = 0.0) -> float:
     """Fraction of the square of the record that the fit does not explain.
 
     It counts what is beyond the noise if that is known.
     """
-    sums = sums_of(problem, fit)
+    sums = sums_of(fit)
     excess = sums.residual + kicks
-    if problem.options.noise_known:
+    if fit.problem.options.noise_known:
         excess = excess - sums.count
     return excess / (sums.signal if sums.signal > 0 else 1.0)
 
 
 @once_for_each_fit
-def is_at_boundary(problem: Problem, fit: Fit) -> bool:
+def is_at_boundary(fit: Fit) -> bool:
     """Whether all mass lies in a plane or on a line, though it need not."""
-    if isinstance(problem.unknowns.inertia_model, Fixed | Flat):
+    if isinstance(fit.problem.unknowns.inertia_model, Fixed | Flat):
         return False
     tensor = np.asarray(fit.minimum.tensor, float)
     if not np.all(np.isfinite(tensor)):
@@ -275,16 +274,16 @@ def is_at_boundary(problem: Problem, fit: Fit) -> bool:
     return bool(1 - 2 * shares[-1] < BOUNDARY)
 
 
-def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
+def is_pure(fit: Fit, noise: float) -> bool:
     """Whether a constant rate in each trial describes a gyro's record as well.
 
     Where the rates do not vary the Fisher information at the estimate is no guide: a
     motion fitted to the noise seems to determine what the true one does not. The best
     of many wobbles gains something from any noise, the more the longer the record.
     """
-    if not _may_be_pure(problem, fit):
+    if not _may_be_pure(fit):
         return False
-    sums = sums_of(problem, fit)
+    sums = sums_of(fit)
     # Five numbers gain chi-square of five degrees of freedom from noise: its mean is 5
     # and its standard deviation sqrt(10).
     chance = 5 + GATE * 10**0.5 + 4 * np.log(max(sums.count, 1.0))
@@ -293,10 +292,9 @@ def is_pure(problem: Problem, fit: Fit, noise: float) -> bool:
 
 
 @once_for_each_fit
-def _may_be_pure(problem: Problem, fit: Fit) -> bool:
+def _may_be_pure(fit: Fit) -> bool:
     """Whether the inertia is sought from sensors whose values are rates."""
-    del fit
-    sensors = problem.unknowns.original(0)[1:]
-    return bool(problem.unknowns.inertia_model.names) and not any(
+    sensors = fit.problem.unknowns.original(0)[1:]
+    return bool(fit.problem.unknowns.inertia_model.names) and not any(
         x.depends_on_attitude or x.width != 3 for x in sensors
     )

@@ -341,7 +341,7 @@ class _Torque:
         self._kind = problem.options.unmodelled
         trials = case.point.omega.shape[0]
         self._first = first_level(problem, case.cut, case.tensor)
-        self._search = levels.Search(problem, case.cut, self._first)
+        self._search = levels.Search(case.cut, self._first)
         # Beside a noise that is not known a level far too large is nearly as likely as
         # another.
         level = (10 if problem.options.noise_known else 1) * self._first
@@ -432,14 +432,14 @@ def search(case: Case) -> Search:
     counted = np.sum(weights_of(problem, problem.samples.seen.astype(float)))
     few = case.coarse and bool(counted < _FEW)
     best = yield from attempt(case, problem, case.starts[0], slow=False)
-    wrong = misfit(best.problem, best)
-    weak = weakest(best.problem, best)
+    wrong = misfit(best)
+    weak = weakest(best)
     ambiguous = few
     index = 1
     while index < _attempts(case, best, wrong, weak.noise, ambiguous):
         other = yield from attempt(case, problem, case.starts[index], slow=True)
-        other_wrong = misfit(other.problem, other)
-        other_weak = weakest(other.problem, other)
+        other_wrong = misfit(other)
+        other_weak = weakest(other)
         # Squares are compared in units of the noise, which may not have been stated.
         fall = (weak.square - other_weak.square) / other_weak.noise
         better = other_wrong < wrong or (other_wrong <= wrong and fall > 0)
@@ -496,15 +496,14 @@ def _attempts(
     Two of a misfit that follows the record, all of other failures. A coarse record has
     many bodies that follow it, so its misfits are such failures.
     """
-    problem = best.problem
     count = len(case.starts)
-    if is_pure(problem, best, noise) and wrong < 0.5:  # no misfit
+    if is_pure(best, noise) and wrong < 0.5:  # no misfit
         return 1
     if ambiguous and wrong == 0:
         return 1
     if wrong > 0:
-        lost = wrong > _FAR or is_at_boundary(problem, best)
-        lost = lost or unexplained(problem, best) > FOLLOWED
+        lost = wrong > _FAR or is_at_boundary(best)
+        lost = lost or unexplained(best) > FOLLOWED
         return count if lost or case.coarse else min(2, count)
     return min(4, count) if case.coarse else 1
 
@@ -512,7 +511,7 @@ def _attempts(
 def _probed(case: Case, best: Fit, at: Weakest) -> Search:
     """The same fit, with what probes show of its weakest direction."""
     problem = best.problem
-    if not _WEAK < at.error < LARGEST_ERROR or is_pure(problem, best, at.noise):
+    if not _WEAK < at.error < LARGEST_ERROR or is_pure(best, at.noise):
         return best
     before = best.minimum.point.numbers
     probes: list[Probe] = []
@@ -523,9 +522,9 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         line = Line(normal, np.sum(normal * numbers))
         held = dataclasses.replace(problem, unknowns=problem.unknowns.holding(line))
         end = yield from attempt(case, held, numbers, case.long, framed=False)
-        growth = (weakest(problem, end).square - at.square) / at.noise
+        growth = (weakest(end).square - at.square) / at.noise
         distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
-        error = _error_by_probe(problem, best, end, at.direction, step, distance)
+        error = _error_by_probe(best, end, at.direction, step, distance)
         # Beyond six standard errors a probe says nothing of those that are stated.
         if growth < _SURE:
             probes.append(Probe(end.minimum.tensor, distance, error))
@@ -549,7 +548,6 @@ def _are_apart(one: Fit, other: Fit, error: float) -> bool:
 
 
 def _error_by_probe(
-    problem: Problem,
     best: Fit,
     end: Fit,
     direction: np.ndarray,
@@ -560,7 +558,7 @@ def _error_by_probe(
     tensor = best.minimum.tensor
     h = 1e-4
     near = best.minimum.point.numbers + h * np.stack([direction, -direction])
-    ahead, back = np.asarray(tensors_at(problem.unknowns, near))
+    ahead, back = np.asarray(tensors_at(best.problem.unknowns, near))
     slope = (ahead - back) / (2 * h)
     square = np.sum(slope * slope)
     if square > 0:
