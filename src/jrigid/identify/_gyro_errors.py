@@ -128,7 +128,7 @@ def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
     """The errors of the first gyroscope without a time constant.
 
     Args:
-        fit: Its minimum.
+        fit: Where the search ended.
         noise: Variance of a whitened residual.
     """
     sensors = fit.problem.unknowns.original(0)[1:]

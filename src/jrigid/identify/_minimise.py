@@ -253,7 +253,7 @@ def _evaluate(
 def _moved(problem: Problem, point: Point, move: Move) -> Point:
     """Return a point after a move, on the path of the inertia model."""
     numbers = problem.unknowns.moved(point.numbers, move.numbers)
-    return moved(point, move)._replace(numbers=numbers)
+    return moved(point, move, numbers)
 
 
 def _next_step(place: _Evaluation, push: Push, damping: Array) -> tuple[Move, Array]:

@@ -66,8 +66,8 @@ def _reason(result: FitResult) -> str:
             "The body does not turn: the readings are no larger than their noise. "
             "Inertia shows in rates that change."
         )
-    swing = _swing(result)
-    if result.status != Status.OK and swing > _TOO_FAST:
+    swing = 0.0 if result.status == Status.OK else _swing(result)
+    if swing > _TOO_FAST:
         return (
             f"The rates swing {swing:.2g} times as fast as the body turns, which no "
             "body does: they are too small. Pass them in rad/s (were they converted "

@@ -392,8 +392,8 @@ def step_of(equations: NormalEquations, own: int, damping: Array) -> tuple[Move,
     return Move(numbers, owns, states), gain
 
 
-def moved(point: Point, move: Move) -> Point:
-    """Return a point after a move."""
+def moved(point: Point, move: Move, numbers: Array) -> Point:
+    """Return a point after a move, which has led to these numbers of all trials."""
     states = move.states
     attitude = point.attitude
     # States without an attitude have three numbers beside the torque.
@@ -403,7 +403,7 @@ def moved(point: Point, move: Move) -> Point:
         turn = jax.vmap(jax.vmap(lambda q, v: normalize(multiply(q, exp(v)))))
         attitude = turn(attitude, states[..., 3:6])
     return Point(
-        numbers=point.numbers + move.numbers,
+        numbers=numbers,
         own=point.own + move.own,
         attitude=attitude,
         omega=point.omega + states[..., :3],
