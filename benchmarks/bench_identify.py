@@ -122,9 +122,8 @@ def grid():
                         status == Status.NOT_CONVERGED
                     )
                     good = np.asarray(status == Status.OK)
-                    flat = ~good & ~np.asarray(
-                        bad
-                    )  # at the boundary, or said not to be told
+                    # At the boundary, or not determined by the record.
+                    undetermined = ~good & ~np.asarray(bad)
                     error = np.asarray(found) - np.asarray(of_elements(tensor))
                     converged = 1 - np.mean(np.asarray(bad))
                     cell = f"{name}, {turns} turns of {a_turn}, {100 * noise:g} %"
@@ -132,7 +131,7 @@ def grid():
                         apart.append((cell, float(relative), converged))
                         continue
                     worst_cell = min(worst_cell, converged)
-                    if not good.any():  # each fit says that it is not told
+                    if not good.any():  # each fit says that it is not determined
                         silent.append(cell)
                         continue
                     scaled = error[good] / np.sqrt(np.diagonal(true_spread))
@@ -153,12 +152,12 @@ def grid():
                             rms,
                             squared.mean(),
                             inside.mean(),
-                            flat.sum(),
+                            undetermined.sum(),
                         )
                     )
                     print(cell, [f"{x:.3g}" for x in cells[-1]], flush=True)
                 if cells:
-                    bounds, ok, rms, squared, inside, flat = np.array(cells).T
+                    bounds, ok, rms, squared, inside, undetermined = np.array(cells).T
                     rows.append(
                         [
                             f"{turns} turns of {a_turn}, {100 * noise:g} %",
@@ -169,7 +168,7 @@ def grid():
                             rms.max(),
                             squared.mean(),
                             100 * inside.mean(),
-                            int(flat.sum()),
+                            int(undetermined.sum()),
                         ]
                     )
     for noise, parts in pooled.items():
@@ -334,12 +333,14 @@ def beside_a_wheel(rng, count, drawn):
     )
     tensors, moved = scene(rng, count, SECOND, spin=5.0, wheel=profile()[0])
     values = moved.omega + 0.02 * rng.normal(size=moved.omega.shape)
-    told = [profile(1 / a, -b)[1](CLOCK)[0] for a, b in zip(scale, delay, strict=True)]
+    predicted = [
+        profile(1 / a, -b)[1](CLOCK)[0] for a, b in zip(scale, delay, strict=True)
+    ]
     name = "drawn from their priors" if drawn else "1 % and 5 ms"
     return covered(
         f"a wheel's scale and delay: {name}",
         with_wheel,
-        (values, np.stack(told)),
+        (values, np.stack(predicted)),
         tensors,
         {"scale": scale, "delay": delay, "trace": 3.0},
         True,
@@ -499,7 +500,7 @@ def main(write: bool, short: bool, trials: int) -> None:
             "worst cell",
             "normalised error squared",
             "95 % interval covers %",
-            "of which said not told",
+            "of which not determined",
         ]
         text = ", ".join(
             f"{cell} ({bound:.2g}; {100 * ok:.0f} %)" for cell, bound, ok in apart
@@ -507,7 +508,9 @@ def main(write: bool, short: bool, trials: int) -> None:
         parts.append(common.table(header, rows))
         parts.append(f"Worst cell: {100 * worst:.1f} % converged.")
         parts.append(
-            "Left out, each fit says that it is not told: " + ", ".join(silent) + "."
+            "Left out, since each fit says that the record does not determine it: "
+            + ", ".join(silent)
+            + "."
         )
         parts.append(
             "Apart, bound above 0.3 of a ratio (bound; converged): " + text + "."

@@ -15,17 +15,17 @@ the gyro are turned by 2.4 degrees, about a random axis for each session of 28 t
 with `--cases both`, turned and foreign.
 
 Groups of 16 trials are interleaved (every seventh trial) or blocks of consecutive
-trials. Each group is one fit of a list of records, which is told the form of the drag
-and that there may be a torque (`unmodelled="estimate"`), of the flat body that it is
-flat, and of turned trials which of them are of one session: the axes are those of the
-first session of the group, the turns of others are sought
-(`each(gyro.misalignment, sessions)`). Errors: rms over groups of the estimate less the
-truth over the error stated, of I2/I1, I3/I1 and the drag. Between: root of chi-square
-over its degrees of freedom of the groups of a world about their weighted mean. Both are
-1 where errors are right, and are of the fits that do not end WRONG_BASIN, NOT_CONVERGED
-or BAD_INPUT. Over the sensor's: errors stated over the part of the sensors, median of
-all fits and numbers. Named: trials of the other body that the fits left out
-(`rejected_trials`), of all such trials;
+trials. Each group is one fit of a list of records. It is given the form of the drag,
+that there may be a torque (`unmodelled="estimate"`), that the flat body is flat, and
+which of the turned trials are of one session. The axes are those of the first session
+of the group, and the turns of others are sought (`each(gyro.misalignment, sessions)`).
+
+Errors: rms over groups of the estimate less the truth over the error stated, of I2/I1,
+I3/I1 and the drag. Between: root of chi-square over its degrees of freedom of the
+groups of a world about their weighted mean. Both are 1 where errors are right, and are
+of the fits that do not end WRONG_BASIN, NOT_CONVERGED or BAD_INPUT. Over the sensor's:
+errors stated over the part of the sensors, median of all fits and numbers. Named:
+trials of the other body that the fits left out (`rejected_trials`), of all such trials;
 wrongly: the body's own trials that they left out. Seconds include compilation.
 
 `python benchmarks/bench_trials.py` makes the table of the flat body, with
