@@ -22,13 +22,16 @@ class Diagnostics(eqx.Module):
             most, over the mean power, and how many standard deviations that is from the
             power of noise.
         lag: Time constant [s] of a low-pass filter of the gyroscope that would explain
-            residuals, and how many standard errors its effect is from 0; zeros where it
-            was not sought.
+            residuals, and how many standard errors its effect is from 0, negative for
+            what no filter does; zeros where it was not sought.
         gain: Factor in the scale of the gyroscope that would explain residuals, and how
             many standard errors it is from 1; (1, 0) where it was not sought.
         delay: Delay of the gyroscope [s] after other sensors of the motion that would
             explain residuals, and its standard errors from 0; zeros without other
             sensors, or where it was not sought.
+        bias: Bias of the gyroscope [rad/s] that would explain residuals, and how many
+            standard errors it is from 0; zeros where it was not sought, and where the
+            fit seeks a bias.
         unexplained: Fraction of the square of what was observed that the fit does not
             explain, beyond the noise.
         singular_values: Of the derivatives in the numbers, the states' part removed,
@@ -75,6 +78,7 @@ class Diagnostics(eqx.Module):
     lag: tuple[Scalar, Scalar]
     gain: tuple[Scalar, Scalar]
     delay: tuple[Scalar, Scalar]
+    bias: tuple[Float[Array, "3"], Scalar]
     unexplained: Scalar
     singular_values: Float[Array, " numbers"]
     directions: Float[Array, "numbers numbers"]

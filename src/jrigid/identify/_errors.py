@@ -15,7 +15,7 @@ from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
-from jrigid.identify._gyro_errors import NO_ERRORS, GyroErrors, gyro_errors
+from jrigid.identify._gyro_errors import GyroErrors, gyro_errors
 from jrigid.identify._independent import (
     Independent,
     condensed_rows,
@@ -28,7 +28,8 @@ from jrigid.identify._precision import (
     Precision,
     least_value,
     precision,
-    precision_of_rows,
+    precision_of,
+    without_states,
 )
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
@@ -348,7 +349,8 @@ def _fields_of_precision(
         # What the sensors alone would determine, without an unmodelled torque.
         rows = condensed_rows(fit)
         own = minimum.point.own.shape[-1]
-        sensors = precision_of_rows(rows, minimum.weight, own, minimum.units)
+        of_sensors = without_states(rows, minimum.weight, own, minimum.units)
+        sensors = precision_of(of_sensors, minimum.units)
     inflation = judgement.remainder.inflation
     return {
         "singular_values": known.values,
@@ -602,7 +604,7 @@ class _Judgement(NamedTuple):
         unexplained: Of the square of what was observed, beyond the noise.
         whiteness: Correlation of neighbours, and its standard deviations from 0.
         by_trial: Mean square of the residuals of each trial.
-        gyro: A filter, a scale and a delay of a gyro, sought among the residuals.
+        gyro: Errors of a gyro, sought among the residuals.
     """
 
     status: str
@@ -662,15 +664,16 @@ def _gyro(
     Returns:
         The errors; a factor of covariances; by how much the numbers are moved, or None.
     """
-    if status not in ("OK", "MISFIT"):
-        return NO_ERRORS, 1.0, None
     noise = 1.0 if fit.problem.options.noise_known else remainder.noise
+    # A fit may describe a record of unknown noise exactly.
+    if not noise > 0:
+        return GyroErrors(), 1.0, None
     errors = gyro_errors(fit, noise)
     named = errors.named(remainder.chi_square / noise, remainder.freedom)
-    if not named:
+    if not named or status not in ("OK", "MISFIT"):
         return errors, 1.0, None
-    factor = noise * (1 + named[0].deviations ** 2)
-    return errors, factor, errors.moved_by(named[0])
+    first = next(iter(named.values()))
+    return errors, noise * (1 + first.deviations**2), first.moved
 
 
 def _inflated(
@@ -722,15 +725,16 @@ def _status_of_match(
 def _fields_of_judgement(judgement: _Judgement) -> dict[str, Any]:
     """Fields that say how well the fit describes the record."""
     remainder = judgement.remainder
-    return {
+    gyro = {
+        name: (error.value, np.asarray(error.deviations))
+        for name, error in judgement.gyro._asdict().items()
+    }
+    return gyro | {
         "chi_square": remainder.chi_square,
         "degrees_of_freedom": np.asarray(int(remainder.freedom)),
         "numbers_covariance": judgement.covariance,
         "whiteness": judgement.whiteness,
         "loudest_band": remainder.band,
-        "lag": tuple(np.asarray(x) for x in judgement.gyro.lag),
-        "gain": tuple(np.asarray(x) for x in judgement.gyro.gain),
-        "delay": tuple(np.asarray(x) for x in judgement.gyro.delay),
         "chi_square_by_trial": judgement.by_trial,
         "inflation": np.asarray(remainder.inflation),
         "unexplained": np.asarray(judgement.unexplained),

@@ -8,14 +8,13 @@ many errors of what a long record says of the inertia. So it is sought among the
 residuals, beside all that the fit has sought, as one more number.
 
 A scale that is off by a few parts in a thousand leaves residuals of nearly the same
-shape. Therefore it is sought in the same way, and whichever explains more is named.
-Beside another sensor, whose readings are not late, a delay is a third such number.
+shape, and so may a bias. Therefore they are sought in the same way, and whichever
+explains most is named. Beside another sensor, whose readings are not late, a delay is
+one more such number.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from jrigid._numerics import or_one
 from jrigid.identify import _host as host
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
-from jrigid.identify._precision import of_numbers, without_states
+from jrigid.identify._precision import of_numbers, reduced
 from jrigid.identify._quality import GATE, Fit
 from jrigid.identify._sensors import Gyro
 
@@ -39,127 +38,89 @@ _FREE = 0.8
 _UNSHOWN = 1e-10
 
 
-class Lag(NamedTuple):
-    """A low-pass filter that would explain residuals of a gyroscope.
+class GyroError(NamedTuple):
+    """An error of a gyroscope that would explain residuals.
 
     Attributes:
-        time_constant: Of the filter [s]; 0 if the residuals show the opposite.
-        deviations: Standard errors of its effect; negative if they show the opposite.
+        value: Of the error, in its unit.
+        deviations: Standard errors of its effect. They are zero where it was not
+            sought, and negative for what no filter does.
+        moved: By how much it moves the numbers that were sought.
     """
 
-    time_constant: float
+    value: np.ndarray
     deviations: float
+    moved: np.ndarray
+
+    @property
+    def gained(self) -> float:
+        """By how much it lowers chi-square more than one number does by chance."""
+        # In noise each number lowers chi-square by 1 in the mean.
+        return self.deviations**2 - (self.value.size - 1)
 
 
-class Gain(NamedTuple):
-    """A factor in the scale of a gyroscope that would explain residuals.
-
-    Attributes:
-        factor: Of all readings without their bias.
-        deviations: Standard errors from 1.
-    """
-
-    factor: float
-    deviations: float
-
-
-class Delay(NamedTuple):
-    """A delay of a gyroscope that would explain residuals.
-
-    Attributes:
-        seconds: Of its readings, after those of the other sensors [s].
-        deviations: Standard errors from 0.
-    """
-
-    seconds: float
-    deviations: float
+_NOTHING = np.zeros(0)
 
 
 class GyroErrors(NamedTuple):
     """Errors of a gyroscope that are not sought, each as if there were no other.
 
     Attributes:
-        lag: A low-pass filter.
-        gain: A factor in the scale.
-        delay: A delay.
-        moved: By how much the filter, the factor and the delay move the numbers that
-            were sought, in this order.
+        lag: Time constant of a low-pass filter [s].
+        gain: Factor of all readings without their bias.
+        delay: Of the readings, after those of other sensors [s].
+        bias: Added to all readings [rad/s].
     """
 
-    lag: Lag
-    gain: Gain
-    delay: Delay
-    moved: tuple[np.ndarray, ...] = ()
+    lag: GyroError = GyroError(np.zeros(()), 0.0, _NOTHING)
+    gain: GyroError = GyroError(np.ones(()), 0.0, _NOTHING)
+    delay: GyroError = GyroError(np.zeros(()), 0.0, _NOTHING)
+    bias: GyroError = GyroError(np.zeros(3), 0.0, _NOTHING)
 
-    def named(self, chi_square: float, freedom: float) -> list[Lag | Gain | Delay]:
+    def named(self, chi_square: float, freedom: float) -> dict[str, GyroError]:
         """The errors that are sure, the one that explains most first.
 
         Args:
             chi_square: Of the fit, in units of the noise.
             freedom: Its degrees of freedom.
         """
-        # No filter amplifies, but a scale or a delay may be wrong either way.
-        sizes = (
-            (self.lag.deviations, self.lag),
-            (abs(self.gain.deviations), self.gain),
-            (abs(self.delay.deviations), self.delay),
-        )
-        sure = [x for x in sizes if _is_sure(x[0], chi_square, freedom)]
-        return [error for _, error in sorted(sure, key=itemgetter(0), reverse=True)]
-
-    def moved_by(self, error: Lag | Gain | Delay) -> np.ndarray:
-        """By how much an error moves the numbers that were sought."""
-        return self.moved[(Lag, Gain, Delay).index(type(error))]
+        errors = self._asdict()
+        sure = [x for x in errors if _is_sure(errors[x], chi_square, freedom)]
+        sure.sort(key=lambda x: errors[x].gained, reverse=True)
+        return {x: errors[x] for x in sure}
 
 
-NO_ERRORS = GyroErrors(Lag(0.0, 0.0), Gain(1.0, 0.0), Delay(0.0, 0.0))
-
-
-def _is_sure(deviations: float, chi_square: float, freedom: float) -> bool:
-    """Whether a number is sure, and explains most of what the fit does not."""
+def _is_sure(error: GyroError, chi_square: float, freedom: float) -> bool:
+    """Whether an error is no chance, and explains most of what the fit does not."""
     # Noise alone makes chi-square as large as this.
     chance = freedom + GATE * math.sqrt(2 * max(freedom, 1.0))
-    # One more number lowers chi-square by the square of its standard errors.
-    explains = deviations**2 > _EXPLAINED * (chi_square - chance)
-    return deviations > _SURE and explains
+    explains = error.deviations**2 > _EXPLAINED * (chi_square - chance)
+    return error.deviations > _SURE and explains
 
 
 def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
-    """The errors of the first gyroscope without a time constant.
+    """The errors of the first gyroscope.
 
     Args:
         fit: Where the search ended.
         noise: Variance of a whitened residual.
     """
     sensors = fit.problem.unknowns.original(0)[1:]
-    for index, sensor in enumerate(sensors):
-        if isinstance(sensor, Gyro) and sensor.time_constant is None:
-            effects = _effects(fit, index, sensor)
-            if effects is None:
-                return NO_ERRORS
-            return _sought(fit, effects, noise)
-    return NO_ERRORS
+    gyros = [i for i, sensor in enumerate(sensors) if isinstance(sensor, Gyro)]
+    if not (gyros and np.isfinite(fit.minimum.square)):
+        return GyroErrors()
+    effects = _effects(fit, gyros[0], sensors[gyros[0]])
+    table = _table(fit, effects)
+    if not np.all(np.isfinite(table.rows)):
+        return GyroErrors()
+    readings = np.nan_to_num(fit.problem.samples.values[gyros[0]])
+    return _sought(fit, table, noise, float(np.max(np.abs(readings))))
 
 
-class _Effects(NamedTuple):
+def _effects(fit: Fit, index: int, gyro: Gyro) -> dict[str, np.ndarray]:
     """Whitened effects of errors of a gyroscope on all rows.
 
-    Attributes:
-        reading: Readings without their bias.
-        first: Their first derivative.
-        second: Their second derivative.
-    """
-
-    reading: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-
-
-def _effects(fit: Fit, index: int, gyro: Gyro) -> _Effects | None:
-    """Effects of errors of a gyroscope, or None where the body does not rotate freely.
-
-    The derivatives are those of free rotation at the predicted rates. Differences of
-    predictions would follow the noise where a torque is unmodelled.
+    An error may be several numbers (trials, rows, degrees, numbers).
     """
     samples = fit.problem.samples
     part = samples.parts[index]
@@ -169,18 +130,46 @@ def _effects(fit: Fit, index: int, gyro: Gyro) -> _Effects | None:
     safe = np.where(used[..., None, None], whitener, np.eye(3))
     errors = np.linalg.solve(safe, fit.residual[:, part, :3, None])[..., 0]
     offset = np.asarray(samples.values[index]) + errors - np.asarray(gyro.bias)
+    shape = fit.minimum.rows.residual.shape
+    effects = {}
+    for name, change in _changes(fit, index, gyro, offset, used).items():
+        effect = np.zeros((*shape, change.shape[-1]))
+        effect[:, part, :3] = np.where(used[..., None, None], whitener @ change, 0.0)
+        effects[name] = effect
+    return effects
+
+
+def _changes(
+    fit: Fit, index: int, gyro: Gyro, offset: np.ndarray, used: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What errors of a gyroscope do to its readings (trials, samples, 3, numbers).
+
+    Args:
+        fit: Where the search ended.
+        index: Of the gyroscope's record.
+        gyro: The gyroscope.
+        offset: Predicted readings without their bias.
+        used: Which of them take part.
+    """
+    samples = fit.problem.samples
     matrix = _matrix(gyro)
     rates = np.linalg.solve(matrix, offset[..., None])[..., 0]
+    # The derivatives are those of free rotation at the predicted rates. Differences of
+    # predictions would follow the noise where a torque is unmodelled.
     first, second = _derivatives(np.asarray(fit.minimum.tensor), rates)
-    if not _rotates_freely(np.asarray(samples.ts)[:, part], rates, first, used):
-        return None
-    columns = []
-    for rate in (rates, first, second):
-        column = np.zeros_like(fit.minimum.rows.residual)
-        effect = (whitener @ matrix @ rate[..., None])[..., 0]
-        column[:, part, :3] = np.where(used[..., None], effect, 0.0)
-        columns.append(column)
-    return _Effects(*columns)
+    times = np.asarray(samples.ts)[:, samples.parts[index]]
+    of_rates = {}
+    # Behind a filter that is known, readings are not the rates of a free body.
+    if gyro.time_constant is None and _rotates_freely(times, rates, first, used):
+        of_rates = {"gain": rates, "lag": second}
+        # A change of the states delays all sensors of a trial. Only beside other
+        # sensors is a delay of the gyroscope one more number.
+        if len(samples.parts) > 1:
+            # A late reading has less of the derivative.
+            of_rates["delay"] = -first
+    changes = {name: matrix @ rate[..., None] for name, rate in of_rates.items()}
+    changes["bias"] = np.broadcast_to(np.eye(3), (*rates.shape, 3))
+    return changes
 
 
 def _matrix(gyro: Gyro) -> np.ndarray:
@@ -194,7 +183,8 @@ def _derivatives(
     tensor: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """First and second derivatives of the rates of a free body, by Euler's equations."""
-    inverse = np.linalg.inv(tensor)
+    # A fit may end at a body without a third moment.
+    inverse = np.linalg.pinv(tensor)
     momentum = rates @ tensor
     first = np.cross(momentum, rates) @ inverse
     change = np.cross(first @ tensor, rates) + np.cross(momentum, first)
@@ -216,43 +206,35 @@ def _rotates_freely(
     return bool(total > 0 and missing <= (1 - _FREE) * total)
 
 
-def _sought(fit: Fit, effects: _Effects, noise: float) -> GyroErrors:
-    """The errors by their effects beside all numbers and states that were sought."""
-    table = _table(fit, effects)
-    if noise <= 0 or not np.all(np.isfinite(table.rows)):
-        return NO_ERRORS
-    # A change of the states delays all sensors of a trial. Only beside other sensors is
-    # a delay of the gyroscope one more number, which is sought with the others.
-    delays = (1,) if len(fit.problem.samples.parts) > 1 else ()
-    lag = table.explained((*delays, 2), noise)
-    filtered = Lag(math.sqrt(2 * max(lag.multiple, 0.0)), lag.deviations)
+def _sought(fit: Fit, table: "_Table", noise: float, largest: float) -> GyroErrors:
+    """The errors by their effects beside all numbers and states that were sought.
+
+    Args:
+        fit: Where the search ended.
+        table: Of the effects.
+        noise: Variance of a whitened residual.
+        largest: Of the readings [rad/s].
+    """
+    none = GyroErrors()
+    lag = table.explained("lag", noise)
+    # The effect of a filter is half of the square of its time constant.
+    constant = np.sqrt(2 * np.maximum(lag.value[0], 0.0))
+    errors = none._replace(lag=lag._replace(value=constant))
     if fit.problem.options.dense:
         # Rates that follow an unmodelled torque follow the noise of the readings, too,
-        # which would seem to be a scale or a delay.
-        return NO_ERRORS._replace(lag=filtered, moved=(lag.moved,))
-    gain = table.explained((*delays, 0), noise)
-    late = table.explained(delays, noise)
-    return GyroErrors(
-        lag=filtered,
-        gain=Gain(1 + gain.multiple, gain.deviations),
-        # A late reading has less of the derivative.
-        delay=Delay(-late.multiple, -late.deviations),
-        moved=(lag.moved, gain.moved, late.moved),
+        # which would seem to be a scale, a delay or a bias.
+        return errors
+    gain = table.explained("gain", noise)
+    delay = table.explained("delay", noise)
+    bias = table.explained("bias", noise)
+    # A bias as large as the readings only imitates them.
+    if np.max(np.abs(bias.value)) > largest:
+        bias = none.bias
+    return errors._replace(
+        gain=gain._replace(value=1 + gain.value[0]),
+        delay=delay._replace(value=delay.value[0]),
+        bias=bias,
     )
-
-
-class _Explained(NamedTuple):
-    """The multiple of an effect that explains residuals best.
-
-    Attributes:
-        multiple: Of the effect.
-        deviations: Its standard errors from zero.
-        moved: By how much it moves the numbers that were sought.
-    """
-
-    multiple: float
-    deviations: float
-    moved: np.ndarray
 
 
 class _Table(NamedTuple):
@@ -261,50 +243,72 @@ class _Table(NamedTuple):
     Attributes:
         rows: In the numbers, the effects and the residual, columns.
         units: Of the numbers and the effects.
+        numbers: How many numbers were sought.
+        places: Columns of each effect.
     """
 
     rows: np.ndarray
     units: np.ndarray
+    numbers: int
+    places: dict[str, range]
 
-    def explained(self, places: Sequence[int], noise: float) -> _Explained:
-        """Explain residuals by the last of these effects, beside all that was sought.
+    def explained(self, name: str, noise: float) -> GyroError:
+        """Explain residuals by an effect, beside all that was sought.
+
+        Its numbers become more numbers of the fit, which had them at zero. A delay is
+        sought beside every other effect.
 
         Args:
-            places: Of the effects, which become more numbers; the fit had them at zero.
+            name: Of the effect.
             noise: Variance of a residual.
         """
-        count = self.units.size - len(_Effects._fields)
-        nothing = _Explained(0.0, 0.0, np.zeros(count))
-        if not places:
-            return nothing
-        columns = [*range(count), *(count + x for x in places)]
+        own = self.places.get(name, range(0))
+        late = self.places.get("delay", range(0))
+        beside = range(0) if name == "delay" else late
+        columns = [*range(self.numbers), *beside, *own]
         units = self.units[columns]
         slopes = self.rows[:, columns]
         _, _, covariance = of_numbers(slopes[None], units)
         # One step by Newton's method goes to the minimum in all numbers.
         step = -covariance @ (slopes.T @ self.rows[:, -1] / units)
-        variance = float(covariance[-1, -1])
+        last = slice(len(columns) - len(own), None)
+        of_effect = covariance[last, last]
         # What the other numbers and the states can imitate is rounding here.
-        if not units[-1] ** 2 > _UNSHOWN * variance:
-            return nothing
-        deviations = float(step[-1]) / math.sqrt(noise * variance)
-        return _Explained(float(step[-1]), deviations, step[:count])
+        is_shown = units[last] ** 2 > _UNSHOWN * np.diag(of_effect)
+        if not own or not np.all(is_shown):
+            return GyroError(np.zeros(3 if name == "bias" else 1), 0.0, _NOTHING)
+        value = step[last]
+        deviations = math.sqrt(value @ np.linalg.solve(of_effect, value) / noise)
+        # The effect of a filter is positive.
+        sign = -1.0 if name == "lag" and value[0] < 0 else 1.0
+        return GyroError(value, sign * deviations, step[: self.numbers])
 
 
-def _table(fit: Fit, effects: _Effects) -> _Table:
+def _table(fit: Fit, effects: dict[str, np.ndarray]) -> _Table:
     """Effects, and all that was sought, in one table."""
-    rows, weight, _ = independent_rows(fit)
-    own = fit.minimum.point.own.shape[-1]
-    columns = np.stack([_independent(fit, x) for x in effects], axis=-1)
-    border = np.concatenate([rows.of_border, columns], axis=-1)
-    squares = np.sum(weight[..., None, None] * columns**2, axis=(0, 1, 2))
-    units = np.append(fit.minimum.units, 1 / np.sqrt(or_one(squares)))
-    reduced = without_states(rows._replace(of_border=border), weight, own, units)
-    table = np.concatenate([reduced.of_numbers, reduced.residual[..., None]], axis=-1)
+    weight = independent_rows(fit).weight
+    known = reduced(fit)
+    numbers = fit.minimum.units.size
+    places = {}
+    columns = [known.of_numbers]
+    units = [fit.minimum.units]
+    end = numbers
+    for name, effect in effects.items():
+        places[name] = range(end, end + effect.shape[-1])
+        end += effect.shape[-1]
+        for column in np.moveaxis(effect, -1, 0):
+            weighted = np.sqrt(weight)[..., None] * _independent(fit, column)
+            weighted = weighted.reshape(weight.shape[0], -1, 1)
+            unit = 1 / or_one(np.sqrt(np.sum(weighted**2)))
+            columns.append(known.rest(unit * weighted))
+            units.append(np.reshape(unit, 1))
+    columns.append(known.residual[..., None])
+    table = np.concatenate(columns, axis=-1)
     table = table.reshape(-1, table.shape[-1])
-    if not np.all(np.isfinite(table)):
-        return _Table(table, units)
-    return _Table(np.asarray(np.linalg.qr(table, mode="r")), units)
+    if np.all(np.isfinite(table)):
+        # The triangle has the products of all rows and is small.
+        table = np.asarray(np.linalg.qr(table, mode="r"))
+    return _Table(table, np.concatenate(units), numbers, places)
 
 
 def _independent(fit: Fit, residual: np.ndarray) -> np.ndarray:

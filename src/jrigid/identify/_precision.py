@@ -40,18 +40,13 @@ class Precision(NamedTuple):
     scores: np.ndarray
 
 
-def precision_of_rows(
-    rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
-) -> Precision:
-    """Decompose weighted rows in first states by QR: their squares would lose digits.
+def precision_of(reduced: "Reduced", units: np.ndarray) -> Precision:
+    """Decompose rows without what the states explain.
 
     Args:
-        rows: In the first state of each trial, own numbers and numbers.
-        weight: Of each row.
-        own: How many own numbers a trial has.
+        reduced: Those rows.
         units: Natural units of the numbers.
     """
-    reduced = without_states(rows, weight, own, units)
     scores = (reduced.residual[:, None] @ reduced.of_numbers)[:, 0] / units
     values, directions, covariance = of_numbers(reduced.of_numbers, units)
     states = reduced.states
@@ -84,11 +79,23 @@ class Reduced(NamedTuple):
     along: np.ndarray
     states: "_States"
 
+    def rest(self, columns: np.ndarray) -> np.ndarray:
+        """Columns (trials, rows, n) without what changes of the states can do."""
+        basis = self.states.basis
+        return columns - basis @ (np.swapaxes(basis, 1, 2) @ columns)
+
 
 def without_states(
     rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
 ) -> Reduced:
-    """Rows as the numbers alone move them; arguments as for `precision_of_rows`."""
+    """Rows as the numbers alone move them.
+
+    Args:
+        rows: In the first state of each trial, own numbers and numbers.
+        weight: Of each row.
+        own: How many own numbers a trial has.
+        units: Natural units of the numbers.
+    """
     root = np.sqrt(weight)[..., None]
     trials, count, width = rows.residual.shape
     flat = (trials, count * width)
@@ -168,8 +175,14 @@ def least_value(dtype: np.dtype) -> float:
 
 
 @quality.once_for_each_fit
-def precision(fit: Fit) -> Precision:
-    """What a fit determines of the numbers."""
+def reduced(fit: Fit) -> Reduced:
+    """Independent rows of a fit, without what changes of the states can do."""
     own = fit.minimum.point.own.shape[-1]
     rows, weight, _ = independent_rows(fit)
-    return precision_of_rows(rows, weight, own, fit.minimum.units)
+    return without_states(rows, weight, own, fit.minimum.units)
+
+
+@quality.once_for_each_fit
+def precision(fit: Fit) -> Precision:
+    """What a fit determines of the numbers."""
+    return precision_of(reduced(fit), fit.minimum.units)

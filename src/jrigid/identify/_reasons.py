@@ -5,13 +5,12 @@ that is not sought, or something that swings.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from jrigid._checks import RESULTS
 from jrigid.identify._colour import stands_out
-from jrigid.identify._gyro_errors import Delay, Gain, GyroErrors, Lag
+from jrigid.identify._gyro_errors import GyroErrors
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
@@ -23,11 +22,8 @@ _NEARLY_A_SPHERE = 1.03
 # Radians of a swing while the body turns by one: no free body does that.
 _TOO_FAST = 3.0
 _LOUD = 0.2  # part of the power that a swing has at its frequency
-# Gain of chi-square by the three numbers of a bias that is no chance.
-_GAINED = 36.0
 # Difference of chi-square within which two errors of a gyro explain about as much.
 _LIKE = 16.0
-_EXPLAINED = 0.5  # part of what the fit does not explain, for a bias to be named
 _WHITE = 0.1  # correlation of neighbours
 _WHITE_SURE = 5.0  # standard deviations of that
 _FEWEST = 16  # samples whose spectrum says something
@@ -93,54 +89,49 @@ def _of_gyro(result: FitResult) -> str:
 
     Those that explain the residuals about as well follow.
     """
-    diagnostics = result.diagnostics
-    errors = GyroErrors(
-        lag=Lag(*(float(x) for x in diagnostics.lag)),
-        gain=Gain(*(float(x) for x in diagnostics.gain)),
-        delay=Delay(*(float(x) for x in diagnostics.delay)),
-    )
-    named = errors.named(_chi_square(result), float(result.degrees_of_freedom))
-    causes = [(x.deviations**2, _of_gyro_error(x)) for x in named]
-    bias = _bias(result)
-    if bias is not None:
-        # Noise alone gains 1 in the mean for each number that is sought, of which a
-        # bias has two more.
-        causes.append((bias.gained - 2, _of_bias(bias)))
-    if not causes:
+    errors = GyroErrors()._asdict()
+    for name, error in errors.items():
+        value, deviations = getattr(result.diagnostics, name)
+        sought = error._replace(value=np.asarray(value), deviations=float(deviations))
+        errors[name] = sought
+    freedom = float(result.degrees_of_freedom)
+    named = GyroErrors(**errors).named(_chi_square(result), freedom)
+    if not named:
         return ""
-    causes.sort(reverse=True)
-    sentences = [text for gained, text in causes if gained > causes[0][0] - _LIKE]
+    most = max(error.gained for error in named.values())
+    sentences = [
+        _of_gyro_error(name, error.value)
+        for name, error in named.items()
+        if error.gained > most - _LIKE
+    ]
     if len(sentences) > 1:
         sentences.append("The record hardly tells which of them it is.")
     return " ".join(sentences)
 
 
-def _of_bias(bias: "_Bias") -> str:
-    """The sentence about a bias."""
-    numbers = ", ".join(f"{x:.2g}" for x in bias.values)
-    return (
-        f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what "
-        "is left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
-    )
-
-
-def _of_gyro_error(error: Lag | Gain | Delay) -> str:
-    """The sentence about a filter, a scale or a delay."""
-    if isinstance(error, Lag):
+def _of_gyro_error(name: str, value: np.ndarray) -> str:
+    """The sentence about an error in a field of `GyroErrors`."""
+    numbers = ", ".join(f"{x:.2g}" for x in np.atleast_1d(value))
+    if name == "lag":
         return (
-            "A low-pass filter of the gyro with a time constant of some "
-            f"{error.time_constant:.2g} s would explain the residuals: pass it "
-            "(`Gyro(time_constant=...)`), or seek it (`free`)."
+            f"A low-pass filter of the gyro with a time constant of some {numbers} s "
+            "would explain the residuals: pass it (`Gyro(time_constant=...)`), or seek "
+            "it (`free`)."
         )
-    if isinstance(error, Delay):
+    if name == "delay":
         return (
-            f"A delay of the gyro by some {error.seconds:.2g} s, after the other "
-            "sensors, would explain most of what is left: pass it (`Gyro(delay=...)`), "
-            "or seek it (`free`). A low-pass filter delays by its time constant."
+            f"A delay of the gyro by some {numbers} s, after the other sensors, would "
+            "explain most of what is left: pass it (`Gyro(delay=...)`), or seek it "
+            "(`free`). A low-pass filter delays by its time constant."
+        )
+    if name == "gain":
+        return (
+            f"A scale of the gyro that is {float(value):.4g} times as large would "
+            "explain the residuals: pass it (`Gyro(scale=...)`), or seek it (`free`)."
         )
     return (
-        f"A scale of the gyro that is {error.factor:.4g} times as large would explain "
-        "the residuals: pass it (`Gyro(scale=...)`), or seek it (`free`)."
+        f"A bias of the gyro, some ({numbers}) rad/s, would explain most of what is "
+        "left: seek it (`free`), by `free=lambda body, gyro: gyro.bias`."
     )
 
 
@@ -218,76 +209,6 @@ def _swing(result: FitResult) -> float:
     duration = float(ts[-1] - ts[0]) * ts.size / (ts.size - 1)
     size = math.sqrt(np.mean(np.sum(rates**2, axis=1)))
     return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
-
-
-class _Bias(NamedTuple):
-    """A bias, and by how much it lowers chi-square."""
-
-    values: np.ndarray
-    gained: float
-
-
-def _bias(result: FitResult) -> _Bias | None:
-    """A bias that explains most of what the fit does not, where none was sought."""
-    options = result.problem.options
-    gyros = [i for i, x in enumerate(result.fitted()[1:]) if isinstance(x, Gyro)]
-    sought = any(x.name.endswith("bias") for x in result.unknowns.sought)
-    if not gyros or sought or options.dense or not options.noise_known:
-        return None
-    residuals = np.asarray(result.diagnostics.residuals)
-    jacobian = np.asarray(result.diagnostics.jacobian)
-    before = np.sum(residuals**2)
-    excess = before - int(result.degrees_of_freedom)
-    if not excess > 0 or not np.all(np.isfinite(jacobian)):
-        return None
-    of_bias = _slopes_in_bias(result, gyros[0], residuals)
-    count = result.numbers.size
-    trials = zip(residuals, jacobian, of_bias, strict=True)
-    columns = np.concatenate([_without_state(count, *x) for x in trials])
-    slopes = columns[:, :-1]
-    residual = columns[:, -1]
-    solution = np.linalg.lstsq(slopes, -residual, rcond=1e-12)[0]
-    bias = solution[-3:]
-    gain = before - np.sum((residual + slopes @ solution) ** 2)
-    fastest = np.nanmax(np.abs(result.problem.samples.values[gyros[0]]))
-    # A bias as large as the readings only imitates them.
-    if gain < max(_EXPLAINED * excess, _GAINED) or np.max(np.abs(bias)) > fastest:
-        return None
-    return _Bias(bias, float(gain))
-
-
-def _slopes_in_bias(
-    result: FitResult, record: int, residuals: np.ndarray
-) -> np.ndarray:
-    """Derivatives of residuals in the bias of a gyro (trials, n, degrees, 3)."""
-    part = result.problem.samples.parts[record]
-    whitener = np.asarray(result.problem.samples.whitener)[:, part, :, :3]
-    slopes = np.zeros((*residuals.shape, 3))
-    # Residuals are those of what is predicted, to which a bias is added.
-    slopes[:, part] = (residuals != 0)[:, part, :, None] * whitener
-    return slopes
-
-
-def _without_state(
-    count: int, residuals: np.ndarray, jacobian: np.ndarray, of_bias: np.ndarray
-) -> np.ndarray:
-    """Columns of a trial, without what a change of its own state can do.
-
-    Args:
-        count: How many numbers are sought for all trials.
-        residuals: Whitened (n, degrees).
-        jacobian: Their derivatives in the numbers and the state.
-        of_bias: Their derivatives in the bias.
-
-    Returns:
-        Columns of the numbers, of the bias and of the residuals.
-    """
-    derivatives = jacobian.reshape(-1, jacobian.shape[-1])
-    numbers = derivatives[:, :count]
-    state = derivatives[:, count:]
-    others = [numbers, of_bias.reshape(-1, 3), residuals.reshape(-1, 1)]
-    columns = np.concatenate(others, axis=1)
-    return columns - state @ np.linalg.lstsq(state, columns, rcond=1e-12)[0]
 
 
 def _of_noise(result: FitResult) -> str:
