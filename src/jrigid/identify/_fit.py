@@ -271,7 +271,8 @@ def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
         yield _late_lines()
         return
     # The number of stages is not known beforehand, so that the bar has no end.
-    with tqdm(unit=" stages", delay=_PATIENCE, leave=False) as bar:
+    bar = tqdm(unit=" stages", delay=_PATIENCE, leave=False, mininterval=0, miniters=1)
+    with bar:
 
         def show(line: str) -> None:
             bar.set_postfix_str(line, refresh=False)
