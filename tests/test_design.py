@@ -197,10 +197,12 @@ def test_a_wheel_s_profile_is_chosen_within_its_limits():
 def test_a_plan_knows_nothing_of_what_it_seeks_beforehand():
     """Without a prior all errors are proportional to the noise, however large it is."""
 
+    def free(_, gyro):
+        return gyro.bias
+
     def covariance(noise):
         start = jr.State(UNTURNED, np.array([0.3, 0.5, 0.9]))
         record = identify.Rates(TS, None, noise)
-        free = lambda _, gyro: gyro.bias  # noqa: E731
         plan = identify.Plan(NEARLY_SYMMETRIC, start, record, free=free)
         return np.asarray(plan.bound.covariance)
 
@@ -242,6 +244,9 @@ def test_the_report_of_a_plan_does_not_depend_on_the_unit_of_a_magnetometer():
     state = jr.State(UNTURNED, np.array([0.3, 0.5, 0.9]))
     gyro = identify.Rates(TS, None, NOISE)
 
+    def free(_, __, magnetometer):
+        return magnetometer.bias
+
     def predicted(unit, t0=0.0, torque=None):
         north = identify.Magnetometer(unit * np.array([2e-5, 0.0, -4e-5]))
         compass = identify.Record(north, TS, None, unit * 2e-7)
@@ -250,7 +255,7 @@ def test_the_report_of_a_plan_does_not_depend_on_the_unit_of_a_magnetometer():
             state,
             (gyro, compass),
             t0=t0,
-            free=lambda *sensors: sensors[2].bias,
+            free=free,
         ).predicted
 
     in_tesla, in_nanotesla = predicted(1.0), predicted(1e9)

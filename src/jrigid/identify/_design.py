@@ -20,7 +20,7 @@ from jrigid._types import AnyArray, Matrix, Readable, Real, Scalar
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify import _problem as problems
-from jrigid.identify._compile import Static, program, quick_jit
+from jrigid.identify._compile import Static, program, small_jit
 from jrigid.identify._disturbance import no_disturbance
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import needs_attitude
@@ -139,36 +139,18 @@ class Plan(Readable):
         self.inertia_model = inertia_model
 
     @property
-    @quick_jit
     def information(self) -> Float[Array, "all all"]:
         """Fisher information about all unknowns and the states at `t0`.
 
         The state of each trial counts by its rates and, if it has an effect, a small
         turn of its attitude.
         """
-        jacobian = _jacobian(_planned(self).minimum)
-        return product("ri,rj->ij", jacobian, jacobian)
+        return _information(_planned(self))
 
     @property
-    @quick_jit
     def bound(self) -> Bound:
         """The smallest errors: the inverse of the information."""
-        planned = _planned(self)
-        unknowns = planned.problem.unknowns
-        numbers = planned.minimum.point.numbers
-        root = _inverse_root(_jacobian(planned.minimum))
-
-        def ratios(numbers: Array) -> Array:
-            moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
-            return moments[1:] / moments[0]
-
-        slopes = jax.jacfwd(ratios)(numbers)
-        # The derivatives have the numbers in their first columns, before the states.
-        of_ratios = product("ij,jk->ik", slopes, root[: numbers.size])
-        return Bound(
-            covariance=product("ij,kj->ik", root, root),
-            ratios_covariance=product("ij,kj->ik", of_ratios, of_ratios),
-        )
+        return _bound(_planned(self))
 
     @property
     def predicted(self) -> FitResult:
@@ -188,7 +170,7 @@ class Plan(Readable):
         >>> print(plan.predicted.null_directions)
         ('overall scale', 'I3/I1 against gyro scale')
         """
-        planned = jtu.tree_map(np.asarray, _planned_once(self))
+        planned = jtu.tree_map(np.asarray, _planned(self))
         minimum = planned.minimum
         samples = planned.problem.samples
         # Residuals are rounding errors only. NaN stays, where there is no motion.
@@ -253,6 +235,7 @@ def _first_point(state: State, numbers: AnyArray, own: AnyArray) -> Point:
     return Point(numbers, own, attitude, omega, omega[..., :0])
 
 
+@small_jit
 def _planned(plan: Plan) -> _Planned:
     """Derivatives of a record that agrees exactly with a plan."""
     system = plan.system
@@ -290,7 +273,31 @@ def _planned(plan: Plan) -> _Planned:
     return _Planned(problem, minimum, layout)
 
 
-_planned_once = quick_jit(_planned)
+@small_jit
+def _information(planned: _Planned) -> Array:
+    """Fisher information about all unknowns and the states at `t0`."""
+    jacobian = _jacobian(planned.minimum)
+    return product("ri,rj->ij", jacobian, jacobian)
+
+
+@small_jit
+def _bound(planned: _Planned) -> Bound:
+    """The inverse of the information."""
+    unknowns = planned.problem.unknowns
+    numbers = planned.minimum.point.numbers
+    root = _inverse_root(_jacobian(planned.minimum))
+
+    def ratios(numbers: Array) -> Array:
+        moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
+        return moments[1:] / moments[0]
+
+    slopes = jax.jacfwd(ratios)(numbers)
+    # The derivatives have the numbers in their first columns, before the states.
+    of_ratios = product("ij,jk->ik", slopes, root[: numbers.size])
+    return Bound(
+        covariance=product("ij,kj->ik", root, root),
+        ratios_covariance=product("ij,kj->ik", of_ratios, of_ratios),
+    )
 
 
 def _minimum_at(

@@ -448,11 +448,13 @@ def minimise(
     def iteration(loop: _Loop) -> _Loop:
         return _iteration(over_lanes, problem, layout, settings, push, loop)
 
-    loop = jax.lax.while_loop(
-        lambda loop: jnp.any(loop.going),
-        iteration,
-        over_lanes(_initial_loop)(problem, point, settings),
-    )
+    def goes_on(loop: _Loop) -> Array:
+        # A condition on one array alone makes XLA look for a counter: it copies all of
+        # the loop's body again and again, which takes a sixth of the time to compile.
+        return jnp.any(loop.going & (loop.steps < STEPS))
+
+    start = over_lanes(_initial_loop)(problem, point, settings)
+    loop = jax.lax.while_loop(goes_on, iteration, start)
     return over_lanes(_minimum)(problem, loop)
 
 

@@ -18,7 +18,7 @@ from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import AnyArray, Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
-from jrigid.identify._compile import quick_jit
+from jrigid.identify._compile import small_jit
 from jrigid.identify._diagnostics import Diagnostics
 from jrigid.identify._intervals import interval
 from jrigid.identify._problem import Problem, as_read, shown_by
@@ -606,7 +606,7 @@ def _check_rank(function: Callable[[Array], Any], tensor: Array, rank: int) -> N
     )
 
 
-@quick_jit
+@small_jit
 def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array:
     """Readings of a sensor in a trial (n, k), with its limit."""
     system, *sensors = result.fitted(trial)
