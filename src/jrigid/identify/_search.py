@@ -6,6 +6,7 @@ whose requests share compiled calls.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -55,10 +56,9 @@ _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
-_LANES = 8  # the most records of one compiled call, where there are several
-# Samples of all lanes together. On a CPU lanes only share the overhead of a call, which
-# is small for longer records: there each call takes one, as `fit` does.
-_SAMPLES = 512
+# The most records of one compiled call on a GPU. On a CPU each call takes one, as `fit`
+# does: lanes wait for the slowest, which costs more than the overhead that they share.
+_LANES = 8
 # Steps of one call. A call lasts until its slowest lane has ended, so that a record
 # which needs hundreds of steps makes others wait; but most stages end in one call.
 _IN_A_CALL = 32
@@ -70,7 +70,7 @@ _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 _FLAT = 1e-3  # least second moment of the body that the first attempt starts from
 _ROUND = 0.1  # ... that others start from, since the first led nowhere
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
-_PROBES = (-1.0, 1.0, -0.25, 0.25)  # natural units, along the weakest direction
+_PROBES = (0.25, 1.0)  # natural units, along the weakest direction and against it
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
@@ -515,8 +515,12 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         return best
     before = best.minimum.point.numbers
     probes: list[Probe] = []
-    for step in _PROBES:
-        numbers = before + step * at.direction
+    beyond = set()
+    for step, side in itertools.product(_PROBES, (-1.0, 1.0)):
+        # Chi-square grows along a valley, so that a longer step leads farther away.
+        if side in beyond:
+            continue
+        numbers = before + side * step * at.direction
         # A miss of one natural unit along the direction is a residual of this weight.
         normal = _HARD * at.normal
         line = Line(normal, np.sum(normal * numbers))
@@ -524,10 +528,12 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         end = yield from attempt(case, held, numbers, case.long, framed=False)
         growth = (weakest(end).square - at.square) / at.noise
         distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
-        error = _error_by_probe(best, end, at.direction, step, distance)
+        error = _error_by_probe(best, end, at.direction, side * step, distance)
         # Beyond six standard errors a probe says nothing of those that are stated.
-        if growth < _SURE:
-            probes.append(Probe(end.minimum.tensor, distance, error))
+        if growth >= _SURE:
+            beyond.add(side)
+            continue
+        probes.append(Probe(end.minimum.tensor, distance, error))
         largest = max((x.error for x in probes), default=0.0)
         if largest > _BENT * at.error:
             return dataclasses.replace(best, ambiguous=True, probes=tuple(probes))
@@ -571,7 +577,8 @@ def _error_by_probe(
 def run(searches: Iterable[Search]) -> list[Fit]:
     """Carry out a search, or many side by side: their requests share compiled calls."""
     searches = list(searches)
-    several = len(searches) > 1
+    is_batched = len(searches) > 1 and jax.default_backend() != "cpu"
+    lanes = _LANES if is_batched else 1
     fits: list[Any] = [None] * len(searches)
     # What can be answered in one call, by shapes: requests by the index of the search.
     waiting: dict[Any, dict[int, Request]] = {}
@@ -590,19 +597,11 @@ def run(searches: Iterable[Search]) -> list[Fit]:
         # Lanes cost time whether they are used or not, so that the fullest call is
         # next: a few requests wait until other searches ask for the same shapes.
         requests = max(waiting.values(), key=len)
-        lanes = _lanes(next(iter(requests.values()))) if several else 1
         indices = list(requests)[:lanes]
         together = [requests.pop(i) for i in indices]
         for index, minimum in zip(indices, minima(together, lanes), strict=True):
             go_on(index, minimum)
     return fits
-
-
-def _lanes(request: Request) -> int:
-    """How many requests one call answers."""
-    if jax.default_backend() != "cpu":
-        return _LANES
-    return int(np.clip(_SAMPLES // request.problem.samples.ts.size, 1, _LANES))
 
 
 def _shapes(request: Request) -> Any:
