@@ -53,7 +53,8 @@ def alcdef(tmp_path):
 
 def table(inversion=None):
     """A table as `find_tumblers` returns it, without a search."""
-    given = {"follows": True, "determined": False} | (inversion or {})
+    given = {"correlation": 0.0, "follows": True, "determined": False}
+    given |= inversion or {}
     return ph.Inversion([], [], EPOCH, 0.02, 1.0, 20, span=3 * DAY, **given)
 
 

@@ -190,14 +190,16 @@ def test_a_tumbler_of_another_code_is_found(inversion):
 def test_the_tumbler_that_is_found_has_the_residuals_that_are_stated(inversion):
     curves, _, found = inversion
     best = found.aliases[0]
-    residuals = []
-    for curve in curves:
-        elapsed = (curve.epoch - found.epoch) * 86400.0
-        light = best.tumbler.light_curve(
-            curve.ts + elapsed, curve.to_sun, curve.to_observer
-        )
-        magnitudes = -2.5 * np.log10(curve.brightness / np.asarray(light))
-        residuals.append(magnitudes - magnitudes.mean())
+    # All curves in one call, since each number of epochs compiles a program.
+    light = best.tumbler.light_curve(
+        np.concatenate([x.ts + (x.epoch - found.epoch) * 86400.0 for x in curves]),
+        np.concatenate([x.to_sun for x in curves]),
+        np.concatenate([x.to_observer for x in curves]),
+    )
+    observed = np.concatenate([x.brightness for x in curves])
+    magnitudes = -2.5 * np.log10(observed / np.asarray(light))
+    ends = np.cumsum([len(x.ts) for x in curves])[:-1]
+    residuals = [x - x.mean() for x in np.split(magnitudes, ends)]
     np.testing.assert_allclose(np.concatenate(residuals), best.residuals, atol=1e-5)
 
 
@@ -207,6 +209,27 @@ def test_a_report_says_which_tumblers_explain_the_curves(inversion):
     assert report.startswith("One tumbler explains the light curves: ")
     assert "1. long-axis" in report
     assert "P_psi" in report
+
+
+def test_a_noise_that_is_not_stated_does_not_hide_a_light_curve_that_is_missed(
+    inversion,
+):
+    """The noise that is found holds the misfit, so that chi-square cannot tell."""
+    curves, _, found = inversion
+    assert abs(found.correlation) < 0.2
+    wrong = ph.find_tumblers(
+        curves,
+        shortest=8 * HOUR,
+        longest=400 * HOUR,
+        modes=["principal-axis"],
+        pairs=10,
+    )
+    assert wrong.reduced_chi_square == 1.0
+    assert wrong.noise > 0.03
+    assert wrong.correlation > 0.3
+    assert not wrong.follows
+    assert not wrong.determined
+    assert wrong.report().startswith("No tumbler was found")
 
 
 def test_the_weight_of_an_alias_does_not_depend_on_how_its_periods_are_linked(

@@ -96,6 +96,7 @@ def inversion(untyped):
         noise=0.01,
         reduced_chi_square=1.0,
         degrees_of_freedom=20,
+        correlation=0.0,
         follows=True,
         determined=False,
         span=3 * DAY,

@@ -31,6 +31,9 @@ _ROUND = (
     "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
     "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
 )
+# Standard deviations: a correlation of neighbouring residuals, or a chi-square, that is
+# no chance.
+_SURE = 5.0
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -46,7 +49,10 @@ class Inversion:
         noise: Standard deviation of a point [mag], stated or found.
         reduced_chi_square: Chi-square of the best alias over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
-        follows: Whether the best alias follows the curves to their noise.
+        correlation: Of the best alias's residuals at neighbouring points of a curve. It
+            is near 0 for noise, and near 1 for a light curve that is missed.
+        follows: Whether the best alias follows the curves to their noise, as far as it
+            is known: if it is not stated, its residuals need only be uncorrelated.
         determined: Whether one tumbler alone explains the curves: the best one follows
             them, and there is no other alias.
         span: Time from the first epoch to the last [s].
@@ -58,6 +64,7 @@ class Inversion:
     noise: float
     reduced_chi_square: float
     degrees_of_freedom: int
+    correlation: float
     follows: bool
     determined: bool
     span: float
@@ -107,7 +114,7 @@ def find_tumblers(
     Args:
         curves: Light curves, corrected for the light time.
         noise: Standard deviation of a point [mag]. None: it is what the best tumbler
-            leaves, and a misfit cannot be seen.
+            leaves, and only a correlation of the residuals shows a misfit.
         shortest: Shortest period of precession or rotation [s].
         longest: Longest period [s].
         modes: Kinds of motion to try: "principal-axis", "short-axis", "long-axis".
@@ -152,7 +159,8 @@ def find_tumblers(
     for mode in modes:
         check_option("modes", mode, tuple(MODES))
     whole_number("pairs", pairs)
-    points = points_of(curves)
+    # Too few points are an error.
+    points_of(curves)
     stated = noise is not None
     readings, epoch = readings_of(curves, noise if stated else _FIRST_NOISE)
     lowest, highest = cycles_within(float(readings.span), shortest, longest)
@@ -164,19 +172,15 @@ def find_tumblers(
         inertia == "homogeneous",
         pairs,
     )
-    # Columns of zeros fill the array up to a few sizes.
-    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
     width = highest - lowest
-    return _inversion(
-        found, readings, epoch, points - factors, stated, threshold, width
-    )
+    return _inversion(found, readings, epoch, curves, stated, threshold, width)
 
 
 def _inversion(
     found: Found,
     readings: Readings,
     epoch: float,
-    points: int,
+    curves: Sequence[LightCurve],
     stated: bool,
     threshold: float,
     width: float,
@@ -187,13 +191,16 @@ def _inversion(
         found: What the search found.
         readings: The light curves.
         epoch: Time 0 of the readings.
-        points: Their number, less the factors of the curves.
+        curves: The same as they were given.
         stated: Whether the noise is known.
         threshold: Largest growth of chi-square of an alias.
         width: Of the range of frequencies that were searched [cycles].
     """
     tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
-    freedom = points - int(np.count_nonzero(independent(tasks[0])))
+    # Columns of zeros fill the array up to a few sizes.
+    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
+    unknown = factors + int(np.count_nonzero(independent(tasks[0])))
+    freedom = sum(len(x.ts) for x in curves) - unknown
     demand(
         freedom > 0,
         "Argument `curves` must hold more points than the tumbler has numbers, but it "
@@ -220,9 +227,11 @@ def _inversion(
         # `weights` has only the first tumblers, those near the least chi-square.
         for alias, weight in zip(every, weights / weights.sum(), strict=False)
     ]
+    correlation, deviations = _correlation(every[0].residuals, curves)
     # Within the noise, chi-square over its degrees of freedom has the standard
-    # deviation sqrt(2 / freedom). Five of them are allowed.
-    follows = not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)
+    # deviation sqrt(2 / freedom). A noise that was found makes it 1.
+    gate = 1 + _SURE * np.sqrt(2 / freedom)
+    follows = reduced < gate if stated else deviations < _SURE
     # Rows that only fill the arrays have no weight, hence the maximum.
     noise = 1 / (MAGNITUDE * float(readings.weights.max()))
     return Inversion(
@@ -232,10 +241,29 @@ def _inversion(
         noise=noise if stated else noise * np.sqrt(reduced),
         reduced_chi_square=reduced if stated else 1.0,
         degrees_of_freedom=freedom,
+        correlation=correlation,
         follows=bool(follows),
         determined=bool(near == 1 and follows),
         span=float(readings.span),
     )
+
+
+def _correlation(
+    residuals: Float[np.ndarray, " points"], curves: Sequence[LightCurve]
+) -> tuple[float, float]:
+    """Correlation of residuals at neighbouring points of a curve.
+
+    Returns:
+        The correlation, and how many standard deviations it is above that of noise.
+    """
+    ends = np.cumsum([len(x.ts) for x in curves])
+    of_curves = np.split(residuals, ends[:-1])
+    products = np.concatenate([x[1:] * x[:-1] for x in of_curves])
+    if products.size == 0 or not np.any(residuals):
+        return 0.0, 0.0
+    correlation = np.mean(products) / np.mean(residuals**2)
+    # The correlation of n pairs of white residuals scatters by 1 / sqrt(n).
+    return float(correlation), float(correlation * np.sqrt(products.size))
 
 
 def _apart(
@@ -292,8 +320,9 @@ def _verdict(inversion: Inversion) -> str:
     if not inversion.follows:
         return (
             "No tumbler was found that follows the light curves to their noise: "
-            f"{value}. The noise is larger than stated, the body is no ellipsoid, or "
-            "its periods were not among the `pairs`."
+            f"{value}, and what is left at neighbouring points correlates by "
+            f"{inversion.correlation:.2f}. A stated noise is too small, the body is no "
+            "ellipsoid, or its periods were not among the `pairs`."
         )
     if inversion.determined:
         return f"One tumbler explains the light curves: {value}."
