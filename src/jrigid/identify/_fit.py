@@ -191,10 +191,11 @@ def fit_each(
     max_steps: int = 400,
     throw: bool = False,
 ) -> FitResult:
-    """Fit each of many records side by side, with shared compiled programs.
+    """Fit each of many records, with shared compiled programs.
 
-    The results are those of `fit` in a loop, in a fraction of the time. Use it for
-    studies of coverage, or for a catalogue of bodies. Records may differ in length.
+    The results are those of `fit` in a loop, with an axis of fits in front. On a GPU
+    several records share each call. Use it for studies of coverage, or for a catalogue
+    of bodies. Records may differ in length.
 
     Args:
         system: The body for all fits; or a sequence of what `fit` takes, once for each
