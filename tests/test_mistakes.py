@@ -305,6 +305,10 @@ MISTAKES = {
         lambda: fit([BLIND] * 3, [rates(), rates()]),
         "`system` must hold one body for each of 2 trials, but it holds 3",
     ),
+    "`free` of more sensors than there are": (
+        lambda: fit(BLIND, rates(), free=lambda body, gyro, other: gyro.bias),
+        r"`free` must be a function of the system and 1 sensor\(s\), .* 3 arguments",
+    ),
     "`free` that picks the inertia": (
         lambda: fit(BLIND, rates(), free=lambda body, gyro: body.inertia),
         "`free` must .* beside the inertia, which is always sought",

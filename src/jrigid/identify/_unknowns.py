@@ -325,6 +325,11 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
     marked = eqx.combine(arrays.structure.unflatten(map(_Pick, indices)), arrays.rest)
     accepts = inspect.signature(free).parameters.values()
     takes_all = any(x.kind == x.VAR_POSITIONAL for x in accepts)
+    demand(
+        takes_all or len(accepts) <= len(marked),
+        f"Argument `free` must be a function of the system and {len(marked) - 1} "
+        f"sensor(s), but it takes {len(accepts)} arguments.",
+    )
     chosen = jtu.tree_leaves(free(*marked[: None if takes_all else len(accepts)]))
     # A body that is picked as a whole contains the inertia, which the model seeks
     # already.
