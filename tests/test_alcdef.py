@@ -263,6 +263,7 @@ def test_light_time_of_an_orbit():
         ((AU, 1.0, 0.0), "`eccentricity` must be from 0 to below 1"),
         ((AU, -0.1, 0.0), "`eccentricity` must be from 0 to below 1"),
         ((AU, 0.1, np.nan), "`inclination` must be finite"),
+        ((AU, 0.1, 3.331), "`inclination` must be from 0 to pi, in radians"),
     ],
 )
 def test_elements_that_are_no_ellipse(changes, words):

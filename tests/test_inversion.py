@@ -11,6 +11,7 @@ import tumbler_reference
 import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _alias as alias
+from jrigid.photometry import _inversion
 from jrigid.photometry import _model as model
 from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
@@ -80,14 +81,18 @@ def test_a_tumbler_has_the_periods_and_the_pole_that_it_is_given(mode):
     np.testing.assert_allclose(pole, expected, atol=1e-12)
 
 
-def synthetic(tumbler, rng, noise=0.01, points=60, curves=4):
-    """Relative light curves of a tumbler by the exact flow, from a moving observer."""
+def synthetic(tumbler, rng, noise=0.01, points=60, curves=4, height=0.1):
+    """Relative light curves of a tumbler by the exact flow, from a moving observer.
+
+    All directions are in a plane if the height is zero.
+    """
     found = []
     for k in range(curves):
         ts = 86400.0 * (3.0 * k + np.sort(rng.uniform(0.0, 2.0, points)))
         angle = ts / 86400.0 * 0.03
-        sun = 1e11 * np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * angle], axis=1)
-        observer = 1e11 * np.stack([0 * ts, 1 + 0 * ts, angle], axis=1)
+        up = height + 0 * angle
+        sun = 1e11 * np.stack([np.cos(angle), np.sin(angle), up], axis=1)
+        observer = 1e11 * np.stack([0 * ts, 1 + 0 * ts, 10 * up * angle], axis=1)
         light = np.asarray(tumbler.light_curve(ts, sun, observer))
         light = light * np.exp(
             rng.normal() + noise * readings.MAGNITUDE * rng.normal(size=points)
@@ -230,6 +235,48 @@ def test_a_noise_that_is_not_stated_does_not_hide_a_light_curve_that_is_missed(
     assert not wrong.follows
     assert not wrong.determined
     assert wrong.report().startswith("No tumbler was found")
+
+
+@pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
+def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
+    tumbler = body(mode)
+
+    def tumbler_and_mirror(height):
+        # As many points as a tumbler of the reference fills, for the same program.
+        curves = synthetic(tumbler, rng, points=90, height=height)
+        data, epoch = readings.readings_of(curves, 0.01)
+        task = model.Task(
+            frame=np.eye(3)[None],
+            mode=np.array([int(model.Mode[mode.replace("-", "_")])]),
+            homogeneous=np.array([True]),
+            link=np.array([search._TIGHT]),
+        )
+        numbers = numbers_of(tumbler, data, epoch)[None]
+        found = search._minimised(data, numbers, task, search._LAST_STEPS)
+        scale = found.quadratic.chi_square[0] / 360
+        assert 0.7 < scale < 1.3
+        best = alias.alias_of(
+            found.numbers[0], model.Task(*(x[0] for x in task)), data, scale
+        )
+        return best, _inversion._mirror(found, data, scale, 25.0)
+
+    best, mirror = tumbler_and_mirror(0.0)
+    assert abs(mirror.chi_square - best.chi_square) < 1e-6
+    # Its momentum is on the other side, as high above the plane.
+    turn = mirror.estimates.longitude - best.estimates.longitude
+    assert np.cos(turn) == pytest.approx(-1, abs=1e-9)
+    assert mirror.estimates.latitude == pytest.approx(best.estimates.latitude)
+    assert mirror.estimates.moments == pytest.approx(best.estimates.moments)
+    _, mirror = tumbler_and_mirror(0.3)
+    assert mirror is None
+
+
+def test_a_report_names_a_mirror(inversion):
+    _, _, found = inversion
+    assert found.mirror is None
+    assert "mirror" not in found.report()
+    both = dataclasses.replace(found, mirror=found.aliases[0])
+    assert "The mirror of the first has the same periods" in both.report()
 
 
 def test_the_weight_of_an_alias_does_not_depend_on_how_its_periods_are_linked(

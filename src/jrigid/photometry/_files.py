@@ -133,7 +133,15 @@ def read_light_curves(
                 "a light curve must have at least 1 point and the kind 0 (relative) or 1 "
                 f"(absolute), but it has {points} and {absolute}."
             )
-        rows = [_point(lines, index) for _ in range(points)]
+        rows: list[list[Decimal]] = []
+        for _ in range(points):
+            row = _point(lines, index)
+            if rows and row[0] < rows[-1][0]:
+                raise lines.error(
+                    f"the dates of light curve {index + 1} must ascend, but {row[0]} "
+                    f"follows {rows[-1][0]}."
+                )
+            rows.append(row)
         zero = rows[0][0] if zero is None else zero
         curve = _curve(rows, zero, absolute == 0)
         if (

@@ -19,7 +19,7 @@ from jrigid.photometry._files import LightCurve
 from jrigid.photometry._model import Task, independent
 from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
-from jrigid.photometry._search import Found, search
+from jrigid.photometry._search import Found, mirrored, search
 
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.
@@ -34,6 +34,8 @@ _ROUND = (
 # Standard deviations: a correlation of neighbouring residuals, or a chi-square, that is
 # no chance.
 _SURE = 5.0
+# Radians between the momenta of a tumbler and of its mirror within which they are one.
+_ONE_POLE = 0.2
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -53,8 +55,10 @@ class Inversion:
             is near 0 for noise, and near 1 for a light curve that is missed.
         follows: Whether the best alias follows the curves to their noise, as far as it
             is known: if it is not stated, its residuals need only be uncorrelated.
-        determined: Whether one tumbler alone explains the curves: the best one follows
-            them, and there is no other alias.
+        determined: Whether one tumbler alone explains the curves, but for its mirror:
+            the best one follows them, and there is no other alias.
+        mirror: The best alias mirrored by the plane from which the body was seen, whose
+            momentum is elsewhere. None if its chi-square is not near the least one.
         span: Time from the first epoch to the last [s].
     """
 
@@ -68,6 +72,7 @@ class Inversion:
     follows: bool
     determined: bool
     span: float
+    mirror: Alias | None = None
 
     def report(self) -> str:
         """The table in words."""
@@ -245,6 +250,41 @@ def _inversion(
         follows=bool(follows),
         determined=bool(near == 1 and follows),
         span=float(readings.span),
+        mirror=_mirror(found, readings, scale, threshold),
+    )
+
+
+def _mirror(
+    found: Found, readings: Readings, scale: float, threshold: float
+) -> Alias | None:
+    """The best tumbler's mirror, where it explains the light curves as well.
+
+    Args:
+        found: What the search found.
+        readings: The light curves.
+        scale: Chi-square of the best tumbler over its degrees of freedom.
+        threshold: Largest growth of chi-square of an alias.
+    """
+    other = mirrored(readings, found)
+    if not len(other.numbers):
+        return None
+    growth = other.quadratic.chi_square[0] - found.quadratic.chi_square[0]
+    both = [
+        alias_of(x.numbers[0], Task(*(y[0] for y in x.tasks)), readings, scale)
+        for x in (found, other)
+    ]
+    poles = [_direction(x.estimates.longitude, x.estimates.latitude) for x in both]
+    is_apart = float(poles[0] @ poles[1]) < np.cos(_ONE_POLE)
+    return both[1] if is_apart and growth <= threshold * scale else None
+
+
+def _direction(
+    longitude: Float[AnyArray, ""], latitude: Float[AnyArray, ""]
+) -> np.ndarray:
+    """A unit vector from angles [rad]."""
+    equator = np.cos(latitude)
+    return np.array(
+        [equator * np.cos(longitude), equator * np.sin(longitude), np.sin(latitude)]
     )
 
 
@@ -302,6 +342,16 @@ def report_of(inversion: Inversion) -> str:
     lines = [_verdict(inversion)]
     for rank, alias in enumerate(inversion.aliases, 1):
         lines += ["", *_described(rank, alias)]
+    if inversion.mirror is not None:
+        x, error = inversion.mirror.estimates, inversion.mirror.errors
+        grown = inversion.mirror.chi_square - inversion.aliases[0].chi_square
+        lines += [
+            "",
+            "The mirror of the first has the same periods and its angular momentum "
+            f"towards longitude {in_degrees(x.longitude, error.longitude)}, latitude "
+            f"{in_degrees(x.latitude, error.latitude)}. Its chi-square is larger by "
+            f"{grown:.1f}: the curves do not tell the two apart.",
+        ]
     if inversion.rejected:
         best = inversion.aliases[0].chi_square
         grown = inversion.rejected[0].chi_square - best

@@ -43,7 +43,7 @@ class Orbit(Readable):
     Attributes:
         semi_major_axis: [m], positive.
         eccentricity: From 0 to below 1.
-        inclination: To the ecliptic [rad].
+        inclination: To the ecliptic, from 0 to pi [rad].
         node: Longitude of the ascending node [rad].
         argument_of_perihelion: From the node [rad].
         mean_anomaly: At the epoch [rad].
@@ -77,6 +77,11 @@ class Orbit(Readable):
             self.semi_major_axis > 0,
             "Argument `semi_major_axis` must be positive, but it is "
             f"{self.semi_major_axis}.",
+        )
+        demand(
+            0 <= self.inclination <= np.pi,
+            "Argument `inclination` must be from 0 to pi, in radians, but it is "
+            f"{self.inclination}. (Angles of catalogues are in degrees.)",
         )
         demand(
             0 <= self.eccentricity < 1,

@@ -113,6 +113,21 @@ def search(
     return _settled(readings, _joined(found), homogeneous)
 
 
+def mirrored(readings: Readings, found: Found) -> Found:
+    """The best point, mirrored by the plane from which the body was seen, and refined.
+
+    Let M reflect vectors at that plane. Directions in the plane stay as they are, and
+    an ellipsoid looks the same from opposite sides. Therefore the rotation -M R has the
+    light curves of R. Its momentum is -M L. It has the same periods and moments.
+    """
+    directions = np.concatenate([readings.to_sun, readings.to_observer])
+    _, _, axes = np.linalg.svd(directions, full_matrices=False)
+    reflection = np.eye(3) - 2 * np.outer(axes[2], axes[2])
+    best = _chosen(found, [0])
+    tasks = best.tasks._replace(frame=-best.tasks.frame @ reflection)
+    return _minimised(readings, best.numbers, tasks, _LAST_STEPS)
+
+
 def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
     """Candidates with frequencies half a cycle to each side."""
     either = (-0.5, 0.0, 0.5)
