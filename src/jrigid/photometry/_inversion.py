@@ -221,17 +221,7 @@ def _inversion(
         every.append(alias_of(numbers, task, readings, scale))
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
-    logarithms = np.array(
-        [log_evidence(x, growth[i], width) for i, x in enumerate(every[:near])]
-    )
-    # Only ratios of weights matter. Without the largest one the exponentials stay in
-    # range.
-    weights = np.exp(logarithms - logarithms.max())
-    aliases = [
-        dataclasses.replace(alias, weight=float(weight))
-        # `weights` has only the first tumblers, those near the least chi-square.
-        for alias, weight in zip(every, weights / weights.sum(), strict=False)
-    ]
+    aliases = _weighted(every[:near], growth, width)
     correlation, deviations = _correlation(every[0].residuals, curves)
     # Within the noise, chi-square over its degrees of freedom has the standard
     # deviation sqrt(2 / freedom). A noise that was found makes it 1.
@@ -252,6 +242,28 @@ def _inversion(
         span=float(readings.span),
         mirror=_mirror(found, readings, scale, threshold),
     )
+
+
+def _weighted(
+    aliases: list[Alias], growth: Float[np.ndarray, " points"], width: float
+) -> list[Alias]:
+    """Aliases with their posterior weights.
+
+    Args:
+        aliases: Those near the least chi-square.
+        growth: Of chi-square, of these first.
+        width: Of the range of frequencies that were searched [cycles].
+    """
+    logarithms = np.array(
+        [log_evidence(alias, growth[i], width) for i, alias in enumerate(aliases)]
+    )
+    # Only ratios of weights matter. Without the largest one the exponentials stay in
+    # range.
+    weights = np.exp(logarithms - logarithms.max())
+    return [
+        dataclasses.replace(alias, weight=float(weight))
+        for alias, weight in zip(aliases, weights / weights.sum(), strict=True)
+    ]
 
 
 def _mirror(
