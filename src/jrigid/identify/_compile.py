@@ -50,7 +50,8 @@ def _without_collection() -> Iterator[None]:
     """Python's garbage collector stands still.
 
     Tracing makes objects by the million, nearly all of which stay. The collector would
-    look through them for cycles again and again, in a sixth of the time of a first fit.
+    look through them for cycles again and again, in a seventh of the time of a first
+    fit.
     """
     if not gc.isenabled():
         yield

@@ -110,6 +110,8 @@ def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
     if not (gyros and np.isfinite(fit.minimum.square)):
         return GyroErrors()
     effects = _effects(fit, gyros[0], sensors[gyros[0]])
+    if not effects:
+        return GyroErrors()
     table = _table(fit, effects)
     if not np.all(np.isfinite(table.rows)):
         return GyroErrors()
@@ -132,7 +134,11 @@ def _effects(fit: Fit, index: int, gyro: Gyro) -> dict[str, np.ndarray]:
     offset = np.asarray(samples.values[index]) + errors - np.asarray(gyro.bias)
     shape = fit.minimum.rows.residual.shape
     effects = {}
-    for name, change in _changes(fit, index, gyro, offset, used).items():
+    changes = _changes(fit, index, gyro, offset, used)
+    if fit.problem.options.dense:
+        # Only a filter is sought there, beside a delay. Each effect costs a filter run.
+        changes = {x: y for x, y in changes.items() if x in ("lag", "delay")}
+    for name, change in changes.items():
         effect = np.zeros((*shape, change.shape[-1]))
         effect[:, part, :3] = np.where(used[..., None, None], whitener @ change, 0.0)
         effects[name] = effect

@@ -6,7 +6,6 @@ whose requests share compiled calls.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -70,7 +69,7 @@ _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 _FLAT = 1e-3  # least second moment of the body that the first attempt starts from
 _ROUND = 0.1  # ... that others start from, since the first led nowhere
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
-_PROBES = (0.25, 1.0)  # natural units, along the weakest direction and against it
+_PROBES = (-0.25, 0.25, -1.0, 1.0)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
@@ -515,12 +514,13 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         return best
     before = best.minimum.point.numbers
     probes: list[Probe] = []
-    beyond = set()
-    for step, side in itertools.product(_PROBES, (-1.0, 1.0)):
+    sides_beyond = set()
+    for step in _PROBES:
+        side = np.sign(step)
         # Chi-square grows along a valley, so that a longer step leads farther away.
-        if side in beyond:
+        if side in sides_beyond:
             continue
-        numbers = before + side * step * at.direction
+        numbers = before + step * at.direction
         # A miss of one natural unit along the direction is a residual of this weight.
         normal = _HARD * at.normal
         line = Line(normal, np.sum(normal * numbers))
@@ -528,13 +528,13 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         end = yield from attempt(case, held, numbers, case.long, framed=False)
         growth = (weakest(end).square - at.square) / at.noise
         distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
-        error = _error_by_probe(best, end, at.direction, side * step, distance)
+        error = _error_by_probe(best, end, at.direction, step, distance)
         # Beyond six standard errors a probe says nothing of those that are stated.
         if growth >= _SURE:
-            beyond.add(side)
+            sides_beyond.add(side)
             continue
         probes.append(Probe(end.minimum.tensor, distance, error))
-        largest = max((x.error for x in probes), default=0.0)
+        largest = max(x.error for x in probes)
         if largest > _BENT * at.error:
             return dataclasses.replace(best, ambiguous=True, probes=tuple(probes))
         if largest >= LARGEST_ERROR:
