@@ -258,7 +258,7 @@ def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
         best = alias.alias_of(
             found.numbers[0], model.Task(*(x[0] for x in task)), data, scale
         )
-        return best, _inversion._mirror(found, data, scale, 25.0)
+        return best, _inversion._mirror(best, found, data, scale, 25.0)
 
     best, mirror = tumbler_and_mirror(0.0)
     assert abs(mirror.chi_square - best.chi_square) < 1e-6

@@ -18,6 +18,7 @@ from jrigid.photometry._alias import (
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._model import Task, independent
 from jrigid.photometry._periodogram import cycles_within, points_of
+from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
 from jrigid.photometry._search import Found, mirrored, search
 
@@ -205,7 +206,7 @@ def _inversion(
     # Columns of zeros fill the array up to a few sizes.
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
     unknown = factors + int(np.count_nonzero(independent(tasks[0])))
-    freedom = sum(len(x.ts) for x in curves) - unknown
+    freedom = points_of(curves) - unknown
     demand(
         freedom > 0,
         "Argument `curves` must hold more points than the tumbler has numbers, but it "
@@ -240,7 +241,7 @@ def _inversion(
         follows=bool(follows),
         determined=bool(near == 1 and follows),
         span=float(readings.span),
-        mirror=_mirror(found, readings, scale, threshold),
+        mirror=_mirror(every[0], found, readings, scale, threshold),
     )
 
 
@@ -267,11 +268,12 @@ def _weighted(
 
 
 def _mirror(
-    found: Found, readings: Readings, scale: float, threshold: float
+    best: Alias, found: Found, readings: Readings, scale: float, threshold: float
 ) -> Alias | None:
     """The best tumbler's mirror, where it explains the light curves as well.
 
     Args:
+        best: The best tumbler.
         found: What the search found.
         readings: The light curves.
         scale: Chi-square of the best tumbler over its degrees of freedom.
@@ -281,23 +283,16 @@ def _mirror(
     if not len(other.numbers):
         return None
     growth = other.quadratic.chi_square[0] - found.quadratic.chi_square[0]
-    both = [
-        alias_of(x.numbers[0], Task(*(y[0] for y in x.tasks)), readings, scale)
-        for x in (found, other)
+    if growth > threshold * scale:
+        return None
+    task = Task(*(x[0] for x in other.tasks))
+    mirror = alias_of(other.numbers[0], task, readings, scale)
+    poles = [
+        direction_of_pole(x.longitude, x.latitude)
+        for x in (best.estimates, mirror.estimates)
     ]
-    poles = [_direction(x.estimates.longitude, x.estimates.latitude) for x in both]
-    is_apart = float(poles[0] @ poles[1]) < np.cos(_ONE_POLE)
-    return both[1] if is_apart and growth <= threshold * scale else None
-
-
-def _direction(
-    longitude: Float[AnyArray, ""], latitude: Float[AnyArray, ""]
-) -> np.ndarray:
-    """A unit vector from angles [rad]."""
-    equator = np.cos(latitude)
-    return np.array(
-        [equator * np.cos(longitude), equator * np.sin(longitude), np.sin(latitude)]
-    )
+    is_apart = poles[0] @ poles[1] < np.cos(_ONE_POLE)
+    return mirror if is_apart else None
 
 
 def _correlation(

@@ -1,6 +1,8 @@
 """Principal-axis rotation by its pole, as tables of asteroids give it."""
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from jrigid._checks import shaped
 from jrigid._types import Quaternion, Scalar, ScalarLike
@@ -45,6 +47,16 @@ def state_of_pole(
     tilted = attitude_of_pole(longitude, latitude)
     attitude = multiply(tilted, from_axis_angle(z, angle))
     return State(attitude, 2 * jnp.pi / period * z)
+
+
+def direction_of_pole(
+    longitude: Float[np.ndarray, "*many"], latitude: Float[np.ndarray, "*many"]
+) -> Float[np.ndarray, "*many 3"]:
+    """Unit vector towards a pole, on the host."""
+    across = np.cos(latitude)
+    return np.stack(
+        [across * np.cos(longitude), across * np.sin(longitude), np.sin(latitude)], -1
+    )
 
 
 def attitude_of_pole(longitude: Scalar, latitude: Scalar) -> Quaternion:

@@ -19,6 +19,7 @@ from jrigid.photometry._convex import (
     unpacked_spin,
 )
 from jrigid.photometry._periodogram import unlike
+from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
 from jrigid.photometry._refine import Quadratic, damped_step
 from jrigid.photometry._scan import fewer_epochs
@@ -85,10 +86,7 @@ def poles_of(
 ) -> Float[np.ndarray, "many 3"]:
     """Directions of the poles in space."""
     longitude, latitude = unpacked_spin(numbers).pole.T
-    across = np.cos(latitude)
-    inside = np.stack(
-        [across * np.cos(longitude), across * np.sin(longitude), np.sin(latitude)], 1
-    )
+    inside = direction_of_pole(longitude, latitude)
     return np.einsum("ni,nij->nj", inside, frames)
 
 
