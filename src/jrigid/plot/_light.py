@@ -343,7 +343,9 @@ def period_map(
     >>> import numpy as np, jrigid as jr
     >>> pairs = jr.photometry.PeriodPairs(
     ...     np.array([9e4, 1e5]), np.array([9e5, 8e5]), np.array([0.9, 0.8]))
-    >>> none = jr.photometry.Inversion([], [], 0.0, 0.02, 1.0, 10, True, False, 1e6)
+    >>> none = jr.photometry.Inversion(
+    ...     [], [], separation=0.0, noise=0.02, chi_square=1.0, readings=10,
+    ...     explained=True, determined=False, span=1e6)
     >>> ax = jr.plot.period_map(none, pairs)  # pass what find_tumblers returned
     >>> print(ax.get_title(loc="left"))
     Aliases by rank
