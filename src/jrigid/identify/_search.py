@@ -55,6 +55,8 @@ _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
+_APART = 3  # stages in which the parts of a coarse record are not linked
+_GAP = 3.5  # radians between nodes: a segment without samples, longer than others are
 # The most records of one compiled call on a GPU. On a CPU each call takes one, as `fit`
 # does: lanes wait for the slowest, which costs more than the overhead that they share.
 _LANES = 8
@@ -74,7 +76,7 @@ _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
-_APART = 0.1  # natural units between two minima
+_DISTINCT = 0.1  # natural units between two minima
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
 # Times what Fisher's information says: a valley that no covariance describes.
 _BENT = 2.0
@@ -103,6 +105,7 @@ class Stage(NamedTuple):
         enough: A gain that is not worth a step.
         horizon: Fraction of the record that takes part.
         whole: From one state a trial.
+        apart: Parts of the record between long gaps have states of their own.
         soft: With Cauchy's loss.
         reject: Samples too far off are left out from here on.
         last: The torque is no longer changed.
@@ -113,6 +116,7 @@ class Stage(NamedTuple):
     enough: float
     horizon: float = 2.0
     whole: bool = False
+    apart: bool = False
     soft: bool = False
     reject: bool = False
     last: bool = False
@@ -231,6 +235,10 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
         weights = _SLOW if slow else _WEIGHTS[options.free_motion]
         steps = 2 * _IN_A_STAGE if slow else _IN_A_STAGE
         stages = [Stage(min(x, largest), steps, _ROUGH) for x in weights]
+        if case.coarse:
+            # The number of turns in a gap is counted by the body that the parts of the
+            # record tell.
+            stages = [*(x._replace(apart=True) for x in stages[:_APART]), *stages]
     stages = [x._replace(soft=options.robust) for x in (*stages, end)]
     if options.robust:
         stages.append(end._replace(soft=False, reject=True))
@@ -280,6 +288,8 @@ def attempt(
         torque.begin(stage)
         settings = _settings(stage, kept, scales, torque.disturbance)
         layout = case.single if stage.whole else case.cut
+        if stage.apart:
+            layout = _without_gaps(layout, point)
         minimum, history = yield from _stage(Request(problem, layout, point, settings))
         point = minimum.point
         histories.append(history)
@@ -298,6 +308,12 @@ def attempt(
         if options.unmodelled == "estimate" and not stage.last:
             kept = torque.sought_anew(fit)
     return fit
+
+
+def _without_gaps(layout: Layout, point: Point) -> Layout:
+    """The layout without links between nodes that are many radians apart."""
+    turned = np.linalg.norm(point.omega, axis=-1) * (layout.end - layout.start)
+    return layout._replace(linked=layout.linked & (turned < _GAP))
 
 
 def _in_own_frame(problem: Problem, point: Point) -> tuple[Problem, Point]:
@@ -550,7 +566,7 @@ def _are_apart(one: Fit, other: Fit, error: float) -> bool:
     )
     apart = np.abs(numbers - other.minimum.point.numbers) / other.minimum.units
     far = np.max(apart[judged], initial=0.0)
-    return bool(far > max(_APART, 6 * error))
+    return bool(far > max(_DISTINCT, 6 * error))
 
 
 def _error_by_probe(
