@@ -194,7 +194,9 @@ def test_derivatives_are_those_of_central_differences():
     curves = observed(0.01, False, 0.2, nights=6)
     taken, _ = readings.readings_of(curves, 0.01)
     start = ph.Mixture(0.2, amplitude=0.4, width=0.1, slope=-0.5)
-    surface = convex.surface_of(3, 80, start, convex.SCATTERING, True, 0.01)
+    surface = convex.surface_of(
+        np.ones(3, bool), 3, 80, start, convex.SCATTERING, True, 0.01
+    )
     # Arrays of JAX, as those of a compiled program are.
     on_device, data = jax.tree.map(jnp.asarray, (surface, taken))
     rng = np.random.default_rng(1)

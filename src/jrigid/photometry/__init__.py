@@ -7,8 +7,8 @@ order, but for an ellipsoid at a phase angle of 0 of first order. Vectors to the
 to the observer start at the body. They are in space axes where a state is given, and in
 body axes where a shape alone is. Bodies are convex: nothing here casts a shadow.
 `find_tumblers` goes the other way: it finds the tumblers that explain light curves.
-`find_spin` finds the pole, the period and the convex shape of a body that rotates
-steadily.
+`fit_shape` fits the convex shape and the surface of one of them. `find_spin` finds the
+pole, the period and the convex shape of a body that rotates steadily.
 """
 
 from jrigid.photometry._alcdef import read_alcdef as read_alcdef
@@ -35,6 +35,9 @@ from jrigid.photometry._scattering import Geometric as Geometric
 from jrigid.photometry._scattering import Lambert as Lambert
 from jrigid.photometry._scattering import LommelSeeliger as LommelSeeliger
 from jrigid.photometry._scattering import Mixture as Mixture
+from jrigid.photometry._shape_fit import ShapeEstimates as ShapeEstimates
+from jrigid.photometry._shape_fit import ShapeFit as ShapeFit
+from jrigid.photometry._shape_fit import fit_shape as fit_shape
 from jrigid.photometry._spin import Spin as Spin
 from jrigid.photometry._spin import SpinEstimates as SpinEstimates
 from jrigid.photometry._spin import SpinInversion as SpinInversion

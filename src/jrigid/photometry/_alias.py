@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -109,7 +109,7 @@ def alias_of(
     # The last row is no point, but the equation between the periods.
     residuals = np.asarray(rows)[:-1][there] / (readings.weights[there] * MAGNITUDE)
     return Alias(
-        tumbler=_tumbler(numbers, task, estimates),
+        tumbler=tumbler_of(numbers, task, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
         errors=errors,
         chi_square=float(np.sum(np.asarray(rows) ** 2)),
@@ -183,11 +183,11 @@ def _estimates_and_slopes(
     numbers: Array, task: Task, span: Array
 ) -> tuple[Estimates, Estimates]:
     """Estimates and their derivatives in the numbers."""
-    estimates = functools.partial(_estimates, task=task, span=span)
+    estimates = functools.partial(estimates_at, task=task, span=span)
     return estimates(numbers), jax.jacfwd(estimates)(numbers)
 
 
-def _estimates(vector: Array, task: Task, span: Array) -> Estimates:
+def estimates_at(vector: Array, task: Task, span: Array) -> Estimates:
     """What observers quote."""
     numbers = unpacked(vector)
     tumbles = task.mode != Mode.principal_axis
@@ -215,8 +215,14 @@ def _estimates(vector: Array, task: Task, span: Array) -> Estimates:
     )
 
 
-def _tumbler(vector: np.ndarray, task: Task, estimates: Estimates) -> Tumbler:
-    """The body in space axes."""
+def tumbler_of(vector: np.ndarray, task: Task, estimates: Any) -> Tumbler:
+    """The body in space axes.
+
+    Args:
+        vector: The numbers of a fit.
+        task: How they are read.
+        estimates: `Estimates`, or what else has the periods and the pole.
+    """
     numbers = unpacked(jnp.asarray(vector))
     geometry = _geometry(vector, task)
     pole = jnp.stack([estimates.longitude, estimates.latitude])

@@ -1,4 +1,4 @@
-"""Light curves of a convex body that rotates steadily, in the numbers of a fit.
+"""Light curves of a convex body, in the numbers of a fit.
 
 The shape is its Gaussian image: normals are even on the sphere, and the logarithm of
 the area of each facet is a sum of spherical harmonics at its normal.
@@ -8,6 +8,8 @@ and K. Muinonen, Icarus 153 (2001) 37.
 """
 
 import functools
+import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -34,44 +36,47 @@ _LEAST = 1e-12  # of a weight that is given as 0
 _SPREAD_OF_SHAPE = 1.0
 _SPREAD_OF_ALBEDO = 1.0
 _SPREAD_OF_SCATTERING = (2.0, np.inf, 1.0, np.inf)
-# A sphere has no long axis from which the first step could begin.
-_FIRST_AXES = np.array([1.05, 1.0, 0.95])
+# Semi-axes of the first body: a sphere has no long axis from which the first step could
+# begin.
+FIRST_AXES = np.array([1.05, 1.0, 0.95])
 
 
-class SpinNumbers(NamedTuple):
+# Numbers of the motion of a steady rotation: turns within the span, and longitude and
+# latitude of the pole, in the axes of the fit [rad].
+SPIN = 3
+# Numbers of the albedo and of the scattering, which follow those of the motion.
+_OF_SURFACE = 7
+
+
+class ConvexNumbers(NamedTuple):
     """What a fit seeks; leaves may have lanes in front.
 
     Attributes:
-        cycles: Turns within the span.
-        pole: Longitude and latitude, in the axes of the fit [rad].
+        motion: Numbers of the motion, at least.
         albedo: The logarithm of the albedo is the product of this and the normal.
         scattering: Logarithm of lambert, amplitude, logarithm of width, slope.
         shape: Coefficients of the harmonics of degree 1 and more.
     """
 
-    cycles: Float[AnyArray, "*lanes 1"]
-    pole: Float[AnyArray, "*lanes 2"]
+    motion: Float[AnyArray, "*lanes motion"]
     albedo: Float[AnyArray, "*lanes 3"]
     scattering: Float[AnyArray, "*lanes 4"]
     shape: Float[AnyArray, "*lanes harmonics"]
 
 
-_MOTION = slice(0, 3)
-_SLICES = SpinNumbers(
-    slice(0, 1), slice(1, 3), slice(3, 6), slice(6, 10), slice(10, None)
-)
-
-
-def unpacked_spin(vector: Float[AnyArray, "*lanes numbers"]) -> SpinNumbers:
-    """The numbers of a vector."""
-    return SpinNumbers(*(vector[..., part] for part in _SLICES))
+def unpacked_convex(
+    vector: Float[AnyArray, "*lanes numbers"], motion: int
+) -> ConvexNumbers:
+    """The numbers of a vector, of which so many are those of the motion."""
+    ends = (0, motion, motion + 3, motion + _OF_SURFACE, None)
+    return ConvexNumbers(*(vector[..., i:j] for i, j in itertools.pairwise(ends)))
 
 
 class Surface(NamedTuple):
     """The facets of all bodies of a fit, and what is known of their numbers.
 
     Attributes:
-        normals: Unit vectors, body axes: z is the axis of rotation.
+        normals: Unit vectors, body axes.
         harmonics: At each normal, of degree 1 and more, of mean square 1.
         sought: Which numbers a fit seeks.
         centre: Expected numbers.
@@ -87,8 +92,14 @@ class Surface(NamedTuple):
     stiffness: Float[AnyArray, " numbers"]
     closure: Float[AnyArray, ""]
 
+    @property
+    def motion(self) -> int:
+        """How many numbers describe the motion."""
+        return self.sought.shape[-1] - _OF_SURFACE - self.harmonics.shape[-1]
+
 
 def surface_of(
+    motion: Bool[np.ndarray, " motion"],
     degree: int,
     facets: int,
     scattering: Mixture,
@@ -96,7 +107,18 @@ def surface_of(
     albedo: bool,
     closure: float,
 ) -> Surface:
-    """The facets of a fit, whose `centre` is where it starts but for the motion."""
+    """The facets of a fit, whose `centre` is where it starts but for the motion.
+
+    Args:
+        motion: Which numbers of the motion are sought.
+        degree: Largest degree of the harmonics.
+        facets: How many.
+        scattering: The law, or where its fit starts.
+        fitted: Names of its parameters that are fitted.
+        albedo: Whether the albedo is fitted.
+        closure: Standard deviation of the sum of the areas as vectors, over their sum
+            as numbers.
+    """
     normals = even_directions(facets)
     harmonics = real_harmonics(normals, degree)
     given = np.array([float(getattr(scattering, name)) for name in SCATTERING])
@@ -109,17 +131,19 @@ def surface_of(
         harmonics=harmonics,
         sought=np.concatenate(
             [
-                np.ones(3, bool),
+                motion,
                 np.full(3, albedo),
                 is_fitted,
                 np.ones(coefficients, bool),
             ]
         ),
-        centre=np.concatenate([np.zeros(6), given, np.zeros(coefficients)]),
+        centre=np.concatenate(
+            [np.zeros(len(motion) + 3), given, np.zeros(coefficients)]
+        ),
         stiffness=np.concatenate(
             [
-                # Nothing is known beforehand of the period and the pole.
-                np.zeros(3),
+                # Nothing is known beforehand of the motion.
+                np.zeros(len(motion)),
                 np.full(3, 1 / _SPREAD_OF_ALBEDO),
                 1 / np.array(_SPREAD_OF_SCATTERING),
                 np.full(coefficients, 1 / _SPREAD_OF_SHAPE),
@@ -198,20 +222,22 @@ def degrees_of_harmonics(count: int) -> np.ndarray:
     return np.floor(np.sqrt(np.arange(1, count + 1))).astype(int)
 
 
-def first_shape(surface: Surface) -> Float[np.ndarray, " harmonics"]:
-    """Harmonics of an ellipsoid that is nearly a sphere.
+def ellipsoid_harmonics(
+    surface: Surface, axes: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, " harmonics"]:
+    """Harmonics of an ellipsoid with given semi-axes.
 
     The area of an ellipsoid with semi-axes a for a unit of solid angle of its normals n
     is (product of a)^2 / (sum of a^2 n^2)^2.
     """
-    logarithms = -2 * np.log(np.square(surface.normals) @ np.square(_FIRST_AXES))
+    logarithms = -2 * np.log(np.square(surface.normals) @ np.square(axes))
     centred = logarithms - logarithms.mean()
     return np.linalg.lstsq(surface.harmonics, centred, rcond=None)[0]
 
 
 def facets_of(vector: Float[Array, " numbers"], surface: Surface) -> Facets:
     """The body; the sum of its areas is that of a unit sphere."""
-    numbers = unpacked_spin(vector)
+    numbers = unpacked_convex(vector, surface.motion)
     areas = _areas(numbers.shape, surface)
     # Curves have unknown factors, so that the size of the body is arbitrary.
     areas = areas * (4 * jnp.pi / jnp.sum(areas))
@@ -239,10 +265,24 @@ def openness(shape: Float[Array, " harmonics"], surface: Surface) -> Float[Array
     return product("f,fi->i", areas, surface.normals) / jnp.sum(areas)
 
 
-def _directions(
-    motion: Float[Array, "3"], frame: Matrix, readings: Readings
-) -> Float[Array, "epochs 2 3"]:
-    """Directions to the Sun and to the observer at each epoch, body axes.
+class Placed(NamedTuple):
+    """What numbers of the motion lead to.
+
+    Attributes:
+        directions: To the Sun and to the observer at each epoch, body axes.
+        gaps: What should be 0, over its spread: equations between the numbers.
+    """
+
+    directions: Float[Array, "epochs 2 3"]
+    gaps: Float[Array, " gaps"]
+
+
+# Where the Sun and the observer are, as a function of the numbers of the motion.
+Motion = Callable[[Array], Placed]
+
+
+def _steady(motion: Float[Array, "3"], frame: Matrix, readings: Readings) -> Placed:
+    """What a steady rotation about the z axis of the body shows.
 
     At time 0 the x axis of the body points south of the pole, in the axes of the fit.
     """
@@ -253,7 +293,8 @@ def _directions(
     cosine = jnp.cos(angle)
     sine = jnp.sin(angle)
     # Seen from the body, directions in space turn the other way.
-    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
+    turned = jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
+    return Placed(turned, jnp.zeros(0, turned.dtype))
 
 
 class _Light(NamedTuple):
@@ -309,7 +350,7 @@ def _light(
 
 
 def _light_in_blocks(
-    numbers: SpinNumbers, surface: Surface, directions: Float[Array, "epochs 2 3"]
+    numbers: ConvexNumbers, surface: Surface, directions: Float[Array, "epochs 2 3"]
 ) -> _Light:
     """Brightness at all epochs, a block of them at a time, which fits in the cache."""
     reflecting = _areas(numbers.shape, surface) * _albedo(numbers.albedo, surface)
@@ -333,17 +374,19 @@ def _log_phase(scattering: Float[Array, "4"], angle: Scalar) -> Scalar:
     return jnp.log(law_of(scattering).phase_factor(angle))
 
 
-def spin_rows(
+def convex_rows(
     vector: Float[Array, " numbers"],
-    frame: Matrix,
+    placed: Motion,
     surface: Surface,
     readings: Readings,
 ) -> Rows:
-    """Readings less the model, over the noise, and derivatives in the numbers."""
-    numbers = unpacked_spin(vector)
-    placed = functools.partial(_directions, frame=frame, readings=readings)
-    motion = vector[_MOTION]
-    directions = placed(motion)
+    """Readings less the model, over the noise, and derivatives in the numbers.
+
+    Gaps of the motion come last.
+    """
+    numbers = unpacked_convex(vector, surface.motion)
+    directions, gaps = placed(numbers.motion)
+    moved = jax.jacfwd(placed)(numbers.motion)
     light = _light_in_blocks(numbers, surface, directions)
     # The phase angle is that of the vectors in space: the motion does not change it, so
     # that `of_motion` has no part from the phase function.
@@ -351,9 +394,7 @@ def spin_rows(
     phases = jax.vmap(_log_phase, (None, 0))(numbers.scattering, angles)
     of_phases = jax.vmap(jax.jacfwd(_log_phase), (None, 0))(numbers.scattering, angles)
     of_directions = jnp.stack([light.of_sun, light.of_observer], axis=1)
-    of_motion = jnp.sum(
-        of_directions[..., None] * jax.jacfwd(placed)(motion), axis=(1, 2)
-    )
+    of_motion = jnp.sum(of_directions[..., None] * moved.directions, axis=(1, 2))
     lambert = law_of(numbers.scattering).lambert
     # The readings are logarithms, whose derivatives are those of the light over it.
     inverse = 1 / light.value[:, None]
@@ -370,20 +411,24 @@ def spin_rows(
     )
     model = readings.projected(jnp.log(light.value) + phases)
     projected = jax.vmap(readings.projected, -1, -1)(slopes)
-    return Rows(readings.values - model, -projected)
+    of_gaps = jnp.pad(moved.gaps, ((0, 0), (0, vector.size - numbers.motion.size)))
+    return Rows(
+        residuals=jnp.concatenate([readings.values - model, gaps]),
+        slopes=jnp.concatenate([-projected, of_gaps]),
+    )
 
 
-def spin_quadratic(
+def convex_quadratic(
     vector: Float[Array, " numbers"],
-    frame: Matrix,
+    placed: Motion,
     surface: Surface,
     readings: Readings,
 ) -> Quadratic:
     """Chi-square of one lane and its derivatives, with closure and expectations."""
-    residuals, slopes = spin_rows(vector, frame, surface, readings)
+    residuals, slopes = convex_rows(vector, placed, surface, readings)
     sought = surface.sought
     of_shape = functools.partial(openness, surface=surface)
-    shape = unpacked_spin(vector).shape
+    shape = unpacked_convex(vector, surface.motion).shape
     gap = surface.closure * of_shape(shape)
     # Three results depend on many numbers, hence reverse mode.
     of_gap = surface.closure * jax.jacrev(of_shape)(shape)
@@ -398,3 +443,25 @@ def spin_quadratic(
         slope=product("rn,r->n", slopes, rows) + stiffness * strain,
         normal=product("rn,rm->nm", slopes, slopes) + jnp.diag(stiffness**2),
     )
+
+
+def spin_rows(
+    vector: Float[Array, " numbers"],
+    frame: Matrix,
+    surface: Surface,
+    readings: Readings,
+) -> Rows:
+    """`convex_rows` of a steady rotation, in the axes of a frame."""
+    placed = functools.partial(_steady, frame=frame, readings=readings)
+    return convex_rows(vector, placed, surface, readings)
+
+
+def spin_quadratic(
+    vector: Float[Array, " numbers"],
+    frame: Matrix,
+    surface: Surface,
+    readings: Readings,
+) -> Quadratic:
+    """`convex_quadratic` of a steady rotation, in the axes of a frame."""
+    placed = functools.partial(_steady, frame=frame, readings=readings)
+    return convex_quadratic(vector, placed, surface, readings)

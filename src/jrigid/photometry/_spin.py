@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,14 @@ from jrigid._types import AnyArray, Matrix
 from jrigid.photometry._alias import inverse_normal
 from jrigid.photometry._convex import (
     SCATTERING,
+    SPIN,
     Surface,
     facets_of,
     law_of,
     openness,
     spin_rows,
     surface_of,
-    unpacked_spin,
+    unpacked_convex,
 )
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
@@ -41,7 +42,7 @@ from jrigid.photometry._tumbler import Tumbler
 
 # Noise of the search where none is given [mag]; what the best solution leaves replaces
 # it.
-_FIRST_NOISE = 0.02
+FIRST_NOISE = 0.02
 _MOST_PERIODS = 50_000
 _MOST_DEGREE = 12
 # A mirror has the other longitude by half a turn, but for what the inclination of the
@@ -206,24 +207,25 @@ def find_spin(
     6.0
     """
     law = Mixture() if scattering is None else scattering
-    _check_curves(curves, noise, fitted)
-    _check_options(degree, facets, law, fitted, closure)
-    readings, epoch = readings_of(curves, _FIRST_NOISE if noise is None else noise)
+    check_curves(curves, noise, fitted)
+    check_options(degree, facets, law, fitted, closure)
+    readings, epoch = readings_of(curves, FIRST_NOISE if noise is None else noise)
     turns = _turns(float(readings.span), shortest, longest)
     make = functools.partial(
         surface_of,
+        np.ones(SPIN, bool),
         scattering=law,
         fitted=tuple(fitted),
         albedo=albedo,
         closure=closure,
     )
-    surface = make(degree, facets)
-    coarse = make(min(degree, COARSE_DEGREE), min(facets, COARSE_FACETS))
+    surface = make(degree=degree, facets=facets)
+    coarse = make(degree=min(degree, COARSE_DEGREE), facets=min(facets, COARSE_FACETS))
     # This refuses curves with too few points before the search.
-    freedom = _freedom(readings, surface)
+    free = freedom(readings, surface)
     spins = search_spins(readings, surface, coarse, *turns)
     if noise is None:
-        noise_found = _FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / freedom)
+        noise_found = FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / free)
         # Closure and expectations are weighed against the noise, so that the minimum
         # moves with it.
         readings, epoch = readings_of(curves, float(noise_found))
@@ -231,7 +233,7 @@ def find_spin(
     return _inversion(spins, surface, readings, epoch, noise is not None, threshold)
 
 
-def _check_curves(
+def check_curves(
     curves: Sequence[LightCurve], noise: float | None, fitted: Sequence[str]
 ) -> None:
     """Raise ValueError for curves that do not determine what is fitted."""
@@ -252,7 +254,7 @@ def _check_curves(
     )
 
 
-def _check_options(
+def check_options(
     degree: int, facets: int, law: Mixture, fitted: Sequence[str], closure: float
 ) -> None:
     """Raise ValueError for options from which nothing follows."""
@@ -290,7 +292,7 @@ def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
     return turns
 
 
-def _freedom(readings: Readings, surface: Surface) -> int:
+def freedom(readings: Readings, surface: Surface) -> int:
     """Points less unknown factors and numbers."""
     points = int(np.count_nonzero(readings.weights))
     factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
@@ -303,13 +305,22 @@ def _freedom(readings: Readings, surface: Surface) -> int:
     return points - unknown
 
 
-_rows_at = jax.jit(spin_rows)
+@jax.jit
+def _residuals(
+    vector: Float[Array, " numbers"],
+    frame: Matrix,
+    surface: Surface,
+    readings: Readings,
+) -> Float[Array, " rows"]:
+    """Readings less the model, over the noise."""
+    # The compiler leaves out the derivatives, which nobody takes.
+    return spin_rows(vector, frame, surface, readings).residuals
 
 
 def _light(spins: Spins, surface: Surface, readings: Readings) -> float:
     """Chi-square of the light of the best solution."""
-    rows, _ = _rows_at(spins.numbers[0], spins.frames[0], surface, readings)
-    return float(np.sum(np.square(rows)))
+    residuals = _residuals(spins.numbers[0], spins.frames[0], surface, readings)
+    return float(np.sum(np.square(residuals)))
 
 
 def _inversion(
@@ -321,8 +332,8 @@ def _inversion(
     threshold: float,
 ) -> SpinInversion:
     """The table of what a search found."""
-    freedom = _freedom(readings, surface)
-    reduced = _light(spins, surface, readings) / freedom
+    free = freedom(readings, surface)
+    reduced = _light(spins, surface, readings) / free
     scale = max(reduced, 1.0)
     every = [
         _spin(spins.rows([i]), surface, readings, scale)
@@ -338,10 +349,10 @@ def _inversion(
         epoch=epoch,
         noise=1 / (MAGNITUDE * float(readings.weights.max())),
         reduced_chi_square=reduced,
-        degrees_of_freedom=freedom,
+        degrees_of_freedom=free,
         # Within the noise, chi-square over its degrees of freedom has the standard
         # deviation sqrt(2 / freedom). Five of them are allowed.
-        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / freedom)),
+        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / free)),
     )
 
 
@@ -368,10 +379,11 @@ def _spin(one: Spins, surface: Surface, readings: Readings, scale: float) -> Spi
     errors = jax.tree.map(
         lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
     )
-    rows, _ = _rows_at(vector, frame, surface, readings)
     there = readings.weights > 0
-    residuals = np.asarray(rows)[there] / (readings.weights[there] * MAGNITUDE)
-    shape = unpacked_spin(jnp.asarray(vector)).shape
+    residuals = np.asarray(_residuals(vector, frame, surface, readings))[there] / (
+        readings.weights[there] * MAGNITUDE
+    )
+    shape = unpacked_convex(jnp.asarray(vector), SPIN).shape
     return Spin(
         body=_body(vector, frame, surface, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
@@ -394,11 +406,11 @@ def _estimates_and_slopes(
 
 def _estimates(vector: Array, frame: Matrix, span: Array) -> SpinEstimates:
     """What observers quote."""
-    numbers = unpacked_spin(vector)
-    pole = product("ij,i->j", frame, axes_of_momentum(numbers.pole)[2])
+    numbers = unpacked_convex(vector, SPIN)
+    pole = product("ij,i->j", frame, axes_of_momentum(numbers.motion[1:])[2])
     law = law_of(numbers.scattering)
     return SpinEstimates(
-        period=span / numbers.cycles[0],
+        period=span / numbers.motion[0],
         longitude=jnp.arctan2(pole[1], pole[0]) % (2 * jnp.pi),
         latitude=jnp.arcsin(jnp.clip(pole[2], -1.0, 1.0)),
         scattering=jnp.stack([law.lambert, law.amplitude, law.width, law.slope]),
@@ -410,8 +422,10 @@ def _body(
     vector: np.ndarray, frame: np.ndarray, surface: Surface, estimates: SpinEstimates
 ) -> Tumbler:
     """The body in space axes."""
-    numbers = unpacked_spin(jnp.asarray(vector))
-    axes = product("ij,jk->ik", axes_of_momentum(numbers.pole), jnp.asarray(frame))
+    numbers = unpacked_convex(jnp.asarray(vector), SPIN)
+    axes = product(
+        "ij,jk->ik", axes_of_momentum(numbers.motion[1:]), jnp.asarray(frame)
+    )
     pole = jnp.stack([estimates.longitude, estimates.latitude])
     # The angle of rotation counts from the axis that points south of the pole.
     south = product("ij,kj->ik", axes, axes_of_momentum(pole))[0]
@@ -494,13 +508,24 @@ def _described(head: str, spin: Spin) -> list[str]:
     """One solution in words."""
     x = spin.estimates
     error = spin.errors
-    lines = [
+    return [
         f"{head} period {in_hours(x.period, error.period)}, chi-square "
         f"{spin.chi_square:.1f}",
         f"   pole at longitude {in_degrees(x.longitude, error.longitude)}, latitude "
         f"{in_degrees(x.latitude, error.latitude)}",
-        f"   the areas fail to close by {100 * spin.open_share:.2g} % of their sum",
+        *of_surface(x, error, spin.open_share),
     ]
+
+
+def of_surface(x: Any, error: Any, open_share: float) -> list[str]:
+    """What was found of a surface, in words.
+
+    Args:
+        x: Estimates, with `scattering` and `albedo`.
+        error: Their standard errors.
+        open_share: Length of the sum of the areas as vectors, over their sum.
+    """
+    lines = [f"   the areas fail to close by {100 * open_share:.2g} % of their sum"]
     for name, value, spread in zip(
         SCATTERING, x.scattering, error.scattering, strict=True
     ):

@@ -1,7 +1,8 @@
 """The search for steady rotations that explain light curves."""
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +12,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jrigid._numerics import product
 from jrigid._types import AnyArray
 from jrigid.photometry._convex import (
+    FIRST_AXES,
+    SPIN,
     Surface,
     degrees_of_harmonics,
+    ellipsoid_harmonics,
     even_directions,
-    first_shape,
     spin_quadratic,
-    unpacked_spin,
+    unpacked_convex,
 )
 from jrigid.photometry._periodogram import unlike
 from jrigid.photometry._pole import direction_of_pole
@@ -85,7 +88,7 @@ def poles_of(
     numbers: Float[np.ndarray, "many numbers"], frames: Float[np.ndarray, "many 3 3"]
 ) -> Float[np.ndarray, "many 3"]:
     """Directions of the poles in space."""
-    longitude, latitude = unpacked_spin(numbers).pole.T
+    longitude, latitude = unpacked_convex(numbers, SPIN).motion[..., 1:].T
     inside = direction_of_pole(longitude, latitude)
     return np.einsum("ni,nij->nj", inside, frames)
 
@@ -115,7 +118,7 @@ def search_spins(
     """
     few = fewer_epochs(readings, _EPOCHS)
     numbers, frames = starts(coarse, lowest, highest)
-    is_motion = np.arange(coarse.centre.size) < 3
+    is_motion = np.arange(coarse.centre.size) < SPIN
     still = coarse._replace(sought=coarse.sought & ~is_motion)
     scanned = minimise(numbers, frames, still, few, _SHAPE_STEPS, _COARSE_LANES)
     scanned = minimise(scanned.numbers, frames, coarse, few, _SCAN_STEPS, _COARSE_LANES)
@@ -147,7 +150,7 @@ def starts(
     cycles = lowest + (highest - lowest) * (np.arange(count) + 0.5) / count
     frames = np.stack([frame_of_pole(pole) for pole in even_directions(_POLES)])
     first = surface.centre.copy()
-    first[10:] = first_shape(surface)
+    first[10:] = ellipsoid_harmonics(surface, FIRST_AXES)
     numbers = np.tile(first, (count * _POLES, 1))
     numbers[:, 0] = np.repeat(cycles, _POLES)
     return numbers, np.tile(frames, (count, 1, 1))
@@ -199,8 +202,13 @@ def minimise(
     for first in range(0, len(numbers), lanes):
         rows = np.arange(first, min(first + lanes, len(numbers)))
         block = np.resize(rows, lanes)
-        result = _minimised(
-            numbers[block], frames[block], surface, readings, np.asarray(steps)
+        result = minimised(
+            spin_quadratic,
+            numbers[block],
+            frames[block],
+            surface,
+            readings,
+            np.asarray(steps),
         )
         spins = Spins(result[0], frames[block], result[1])
         blocks.append(spins.rows(np.arange(len(rows))))
@@ -218,10 +226,11 @@ class _Loop(NamedTuple):
     steps: Int[Array, ""]
 
 
-@jax.jit
-def _minimised(
+@functools.partial(jax.jit, static_argnames="quadratic")
+def minimised(
+    quadratic: Callable[[Array, Any, Surface, Readings], Quadratic],
     numbers: Float[Array, "lanes numbers"],
-    frames: Float[Array, "lanes 3 3"],
+    tasks: Any,
     surface: Surface,
     readings: Readings,
     steps: Int[Array, ""],
@@ -231,13 +240,21 @@ def _minimised(
     The areas are exponentials of the numbers, and a damping that heeds how well a step
     was predicted takes half of the steps that one with fixed factors takes.
 
+    Args:
+        quadratic: Chi-square about the numbers of a lane.
+        numbers: Starting points.
+        tasks: What `quadratic` takes second, with lanes in front.
+        surface: What it takes third, the same for all lanes.
+        readings: The light curves.
+        steps: The largest number of steps; one program serves all.
+
     Source: K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least
     squares problems, 2nd ed., 2004, algorithm 3.16.
     """
-    each = jax.vmap(spin_quadratic, (0, 0, None, None))
+    each = jax.vmap(quadratic, (0, 0, None, None))
 
     def evaluate(numbers: Array) -> Quadratic:
-        return each(numbers, frames, surface, readings)
+        return each(numbers, tasks, surface, readings)
 
     def next_loop(loop: _Loop) -> _Loop:
         return _iteration(loop, evaluate)

@@ -1,0 +1,435 @@
+"""The convex shape, the albedo and the scattering of a body that tumbles."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jrigid._checks import demand
+from jrigid._numerics import product
+from jrigid._types import AnyArray
+from jrigid.photometry._alias import MODES, estimates_at, inverse_normal, tumbler_of
+from jrigid.photometry._convex import (
+    Motion,
+    Placed,
+    Surface,
+    convex_quadratic,
+    convex_rows,
+    ellipsoid_harmonics,
+    facets_of,
+    law_of,
+    openness,
+    surface_of,
+    unpacked_convex,
+)
+from jrigid.photometry._ellipsoid import Ellipsoid
+from jrigid.photometry._files import LightCurve
+from jrigid.photometry._inversion import in_degrees, in_hours
+from jrigid.photometry._model import (
+    Numbers,
+    Task,
+    directions_of_axes,
+    gap_of_periods,
+    geometry_of,
+    unpacked,
+)
+from jrigid.photometry._pole import direction_of_pole
+from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._refine import Quadratic
+from jrigid.photometry._scattering import Mixture
+from jrigid.photometry._spin import (
+    FIRST_NOISE,
+    check_curves,
+    check_options,
+    freedom,
+    of_surface,
+)
+from jrigid.photometry._spin_search import frame_of_pole, minimised
+from jrigid.photometry._tumbler import Tumbler
+from jrigid.photometry._tumbling import tumbling
+
+_DAY = 86400.0
+_STEPS = 200  # for each of these weights
+# Weights of the equation between the periods and the moments: loose first, so that
+# the numbers find each other, then to a millionth.
+_LINKS = (300.0, 1e4, 1e6)
+# A ratio of semi-axes that is 1 or 0 has no logit.
+_LEAST_RATIO = 1e-3
+# Of the numbers of the motion, two are the axes of an ellipsoid, which facets replace.
+_SOUGHT = np.concatenate(
+    Numbers(
+        cycles=np.ones(2, bool),
+        angles=np.ones(2, bool),
+        pole=np.ones(2, bool),
+        log_tangent=np.ones(1, bool),
+        shape=np.zeros(2, bool),
+        inertia=np.ones(2, bool),
+    )
+)
+
+
+class ShapeEstimates(NamedTuple):
+    """What observers quote of a tumbler and its surface, or the standard errors.
+
+    Attributes:
+        precession_period: P_phi [s].
+        rotation_period: P_psi [s].
+        longitude: Of the angular momentum, space axes [rad].
+        latitude: Of the angular momentum [rad].
+        energy_ratio: E/E0.
+        moments: Ratios I1/I3 and I2/I3.
+        scattering: `lambert`, `amplitude`, `width` and `slope` of the `Mixture`; an
+            error of 0 where they are given.
+        albedo: Slope of the logarithm of the albedo along the body axes.
+    """
+
+    precession_period: Float[AnyArray, ""]
+    rotation_period: Float[AnyArray, ""]
+    longitude: Float[AnyArray, ""]
+    latitude: Float[AnyArray, ""]
+    energy_ratio: Float[AnyArray, ""]
+    moments: Float[AnyArray, "2"]
+    scattering: Float[AnyArray, "4"]
+    albedo: Float[AnyArray, "3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapeFit:
+    """A tumbler of convex shape that was fitted to light curves.
+
+    Attributes:
+        tumbler: The body with its facets and its scattering law. The sum of the areas
+            is that of a unit sphere. Its time 0 is at `epoch`.
+        estimates: Its periods, momentum, moments and scattering.
+        errors: Their standard errors, near this minimum of chi-square. They hold if the
+            errors of the points are independent, and are enlarged where chi-square is
+            too large.
+        epoch: Julian date of time 0 of the tumbler.
+        noise: Standard deviation of a point [mag], stated or found.
+        chi_square: Sum of squares of the residuals over the noise, and of what the areas
+            and the numbers deviate from what is expected, over its spread.
+        reduced_chi_square: Chi-square of the light over its degrees of freedom.
+        degrees_of_freedom: Points less unknown numbers.
+        open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
+            closed surface.
+        residuals: Of each point of the curves, in their order [mag].
+    """
+
+    tumbler: Tumbler
+    estimates: ShapeEstimates
+    errors: ShapeEstimates
+    epoch: float
+    noise: float
+    chi_square: float
+    reduced_chi_square: float
+    degrees_of_freedom: int
+    open_share: float
+    residuals: Float[np.ndarray, " epochs"] = dataclasses.field(repr=False)
+
+    def report(self) -> str:
+        """The fit in words."""
+        return _report(self)
+
+
+def fit_shape(
+    curves: Sequence[LightCurve],
+    tumbler: Tumbler,
+    noise: float | None = None,
+    *,
+    epoch: float,
+    degree: int = 4,
+    facets: int = 256,
+    scattering: Mixture | None = None,
+    fitted: Sequence[str] = (),
+    albedo: bool = False,
+    closure: float = 0.01,
+) -> ShapeFit:
+    """Fit a convex shape, the albedo and the scattering of a tumbler to light curves.
+
+    `find_tumblers` tells tumblers apart as ellipsoids. This takes one of its aliases,
+    or a solution that is published, and fits its motion, its moments of inertia and a
+    convex surface at once. To compare aliases, fit each one and compare the values of
+    `chi_square`. The moments are sought apart from the shape.
+
+    Args:
+        curves: Light curves, corrected for the light time.
+        tumbler: Where the fit starts. It is a short-axis or long-axis mode, and its
+            periods count the turns within the curves rightly. The shape starts as its
+            ellipsoid; facets are replaced by an ellipsoid with the tumbler's moments.
+        noise: Standard deviation of a point [mag]. None: it is what the fit leaves, and
+            a misfit cannot be seen.
+        epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
+        degree: Largest degree of the harmonics of the areas.
+        facets: Number of facets.
+        scattering: The law, or where its fit starts; `Mixture()` where it is None.
+        fitted: Names of parameters of `scattering` that are fitted: "lambert",
+            "amplitude", "width", "slope". All but the first need curves that are not
+            relative.
+        albedo: Whether the albedo varies as an exponential along one direction, which
+            is what closure can determine.
+        closure: Standard deviation of the sum of the areas as vectors, over their sum
+            as numbers.
+
+    Returns:
+        The fit.
+
+    Raises:
+        ValueError: Curves or options from which nothing follows, or a steady rotation,
+            for which there is `find_spin`.
+
+    Source: the shape of M. Kaasalainen, J. Torppa and K. Muinonen, Icarus 153 (2001)
+    37; the motion of M. Kaasalainen, Astron. Astrophys. 376 (2001) 302.
+
+    >>> import jax.numpy as jnp, numpy as np, jrigid as jr
+    >>> shape = jr.photometry.Ellipsoid(jnp.array([1.0, 0.6, 0.5]))
+    >>> hour = 3600.0
+    >>> body = jr.photometry.Tumbler(
+    ...     shape.moments, 5 * hour, 20 * hour, 1.0, 0.5, 0.0, 0.0, shape)
+    >>> ts = np.linspace(0.0, 100 * hour, 200)
+    >>> angle = ts / 4e5
+    >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.2 + 0 * ts], axis=1)
+    >>> earth = np.stack([np.sin(angle), np.cos(angle), 0.1 + 0 * ts], axis=1)
+    >>> noise = 0.01 * np.random.default_rng(0).normal(size=200)
+    >>> light = np.asarray(body.light_curve(ts, sun, earth)) * 10 ** (-0.4 * noise)
+    >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
+    >>> found = jr.photometry.fit_shape(
+    ...     [curve], body, 0.01, epoch=0.0, degree=3, facets=64)
+    >>> print((found.estimates.rotation_period / hour).round(1))
+    20.0
+    """
+    law = Mixture() if scattering is None else scattering
+    demand(
+        tumbler.mode != "principal-axis",
+        "Argument `tumbler` must be in a short-axis or a long-axis mode, but it is in "
+        "principal-axis rotation: use `find_spin`.",
+    )
+    check_curves(curves, noise, fitted)
+    check_options(degree, facets, law, fitted, closure)
+    surface = surface_of(_SOUGHT, degree, facets, law, tuple(fitted), albedo, closure)
+    readings, middle = readings_of(curves, FIRST_NOISE if noise is None else noise)
+    free = freedom(readings, surface)
+    later = (middle - epoch) * _DAY
+    task = _task(tumbler)
+    start = _start(tumbler, surface, later, float(readings.span))
+    vector, quadratic = _minimum(start, task, surface, readings)
+    if noise is None:
+        found = FIRST_NOISE * np.sqrt(_light(vector, task, surface, readings) / free)
+        # Closure and expectations are weighed against the noise, so that the minimum
+        # moves with it.
+        readings, _ = readings_of(curves, float(found))
+        vector, quadratic = _minimum(vector, task, surface, readings)
+    return _fit(vector, quadratic, task, surface, readings, middle)
+
+
+def _task(tumbler: Tumbler) -> Task:
+    """How the numbers of the motion are read: the momentum is near the x axis."""
+    pole = direction_of_pole(
+        np.asarray(tumbler.longitude), np.asarray(tumbler.latitude)
+    )
+    return Task(
+        frame=frame_of_pole(pole),
+        mode=np.asarray(int(MODES[tumbler.mode])),
+        homogeneous=np.asarray(False),
+        link=np.asarray(_LINKS[-1]),
+    )
+
+
+def _start(
+    tumbler: Tumbler, surface: Surface, later: float, span: float
+) -> Float[np.ndarray, " numbers"]:
+    """Numbers of a tumbler.
+
+    Args:
+        tumbler: The tumbler.
+        surface: What is fitted.
+        later: Time 0 of the fit, by the time of the tumbler [s].
+        span: Time from the first epoch to the last [s].
+    """
+    moments = np.asarray(tumbler.moments)
+    # Semi-axes of the homogeneous ellipsoid with these moments.
+    of_moments = np.sqrt(np.maximum(moments.sum() / 2 - moments, 0.0))
+    periods = np.stack([tumbler.precession_period, tumbler.rotation_period])
+    phases = np.stack([tumbler.precession_angle / (2 * np.pi), tumbler.rotation_phase])
+    tilt = tumbling(moments, tumbler.state.omega).tilt_max
+    motion = Numbers(
+        cycles=span / periods,
+        angles=2 * np.pi * (phases + later / periods),
+        # The frame has the momentum on its x axis.
+        pole=np.zeros(2),
+        log_tangent=np.log(np.tan(np.asarray(tilt)))[None],
+        shape=np.zeros(2),
+        inertia=_logits(of_moments),
+    )
+    vector = surface.centre.copy()
+    vector[: surface.motion] = np.concatenate(motion)
+    is_ellipsoid = isinstance(tumbler.shape, Ellipsoid)
+    axes = np.asarray(tumbler.shape.semi_axes) if is_ellipsoid else of_moments
+    vector[surface.motion + 7 :] = ellipsoid_harmonics(surface, axes)
+    return vector
+
+
+def _logits(axes: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
+    """Logits of the ratios b/a and c/b."""
+    ratios = np.clip(axes[1:] / axes[:-1], _LEAST_RATIO, 1 - _LEAST_RATIO)
+    return np.log(ratios / (1 - ratios))
+
+
+def _moved(motion: Float[Array, "11"], task: Task, readings: Readings) -> Placed:
+    """What a tumbler shows."""
+    numbers = unpacked(motion)
+    geometry = geometry_of(numbers, task)
+    of_time = functools.partial(directions_of_axes, geometry, task.mode)
+    axes = jax.vmap(of_time)(readings.ts / readings.span)
+    body = product("eij,jk->eik", axes, geometry.to_momentum)
+    lines = jnp.stack([readings.to_sun, readings.to_observer], axis=1)
+    gap = task.link * gap_of_periods(numbers, geometry.motion, task)
+    return Placed(jnp.einsum("eij,esj->esi", body, lines), gap[None])
+
+
+def _motion_of(task: Task, readings: Readings) -> Motion:
+    """The motion of a task as `convex_rows` takes it."""
+    return functools.partial(_moved, task=task, readings=readings)
+
+
+def _quadratic(
+    vector: Float[Array, " numbers"], task: Task, surface: Surface, readings: Readings
+) -> Quadratic:
+    """`convex_quadratic` of a tumbler."""
+    return convex_quadratic(vector, _motion_of(task, readings), surface, readings)
+
+
+@jax.jit
+def _residuals(
+    vector: Float[Array, " numbers"], task: Task, surface: Surface, readings: Readings
+) -> Float[Array, " epochs"]:
+    """Readings less the model, over the noise."""
+    # The compiler leaves out the derivatives, which nobody takes. The last row is no
+    # epoch, but the equation between the periods.
+    rows = convex_rows(vector, _motion_of(task, readings), surface, readings)
+    return rows.residuals[:-1]
+
+
+def _minimum(
+    start: np.ndarray, task: Task, surface: Surface, readings: Readings
+) -> tuple[np.ndarray, Quadratic]:
+    """The numbers of least chi-square near a start, and chi-square about them."""
+    lane = jax.tree.map(lambda x: x[None], task)
+    steps = np.asarray(_STEPS)
+    numbers = start[None]
+    quadratic = None
+    for link in _LINKS:
+        linked = lane._replace(link=np.asarray([link]))
+        numbers, quadratic = minimised(
+            _quadratic, numbers, linked, surface, readings, steps
+        )
+    return jax.tree.map(lambda x: np.asarray(x)[0], (numbers, quadratic))
+
+
+def _light(
+    vector: np.ndarray, task: Task, surface: Surface, readings: Readings
+) -> float:
+    """Chi-square of the light."""
+    residuals = _residuals(vector, task, surface, readings)
+    return float(np.sum(np.square(residuals)))
+
+
+def _fit(
+    vector: np.ndarray,
+    quadratic: Quadratic,
+    task: Task,
+    surface: Surface,
+    readings: Readings,
+    middle: float,
+) -> ShapeFit:
+    """What was found."""
+    free = freedom(readings, surface)
+    reduced = _light(vector, task, surface, readings) / free
+    sought = np.ix_(surface.sought, surface.sought)
+    covariance = np.zeros((vector.size, vector.size))
+    covariance[sought] = max(reduced, 1.0) * inverse_normal(quadratic.normal[sought])
+    estimates, slopes = _estimates_and_slopes(vector, task, surface, readings)
+    errors = jax.tree.map(
+        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
+    )
+    there = readings.weights > 0
+    residuals = np.asarray(_residuals(vector, task, surface, readings))[there]
+    numbers = unpacked_convex(jnp.asarray(vector), surface.motion)
+    return ShapeFit(
+        tumbler=_tumbler(vector, task, surface, estimates),
+        estimates=jax.tree.map(np.asarray, estimates),
+        errors=errors,
+        epoch=middle,
+        noise=1 / (MAGNITUDE * float(readings.weights.max())),
+        chi_square=float(quadratic.chi_square),
+        reduced_chi_square=reduced,
+        degrees_of_freedom=free,
+        open_share=float(np.linalg.norm(openness(numbers.shape, surface))),
+        # A magnitude falls where the logarithm of the brightness grows.
+        residuals=-residuals / (readings.weights[there] * MAGNITUDE),
+    )
+
+
+@jax.jit
+def _estimates_and_slopes(
+    vector: Array, task: Task, surface: Surface, readings: Readings
+) -> tuple[ShapeEstimates, ShapeEstimates]:
+    """Estimates and their derivatives in the numbers."""
+
+    def estimates(vector: Array) -> ShapeEstimates:
+        numbers = unpacked_convex(vector, surface.motion)
+        quoted = estimates_at(numbers.motion, task, readings.span)
+        law = law_of(numbers.scattering)
+        return ShapeEstimates(
+            precession_period=quoted.precession_period,
+            rotation_period=quoted.rotation_period,
+            longitude=quoted.longitude,
+            latitude=quoted.latitude,
+            energy_ratio=quoted.energy_ratio,
+            moments=quoted.moments,
+            scattering=jnp.stack([law.lambert, law.amplitude, law.width, law.slope]),
+            albedo=numbers.albedo,
+        )
+
+    return estimates(vector), jax.jacfwd(estimates)(vector)
+
+
+def _tumbler(
+    vector: np.ndarray, task: Task, surface: Surface, estimates: ShapeEstimates
+) -> Tumbler:
+    """The body in space axes."""
+    numbers = unpacked_convex(jnp.asarray(vector), surface.motion)
+    return dataclasses.replace(
+        tumbler_of(np.asarray(numbers.motion), task, estimates),
+        shape=facets_of(jnp.asarray(vector), surface),
+        scattering=law_of(numbers.scattering),
+    )
+
+
+def _report(fit: ShapeFit) -> str:
+    """The fit in words."""
+    x, error = fit.estimates, fit.errors
+    moments = ", ".join(
+        f"{name} {value:.3f} +- {spread:.3f}"
+        for name, value, spread in zip(
+            ("I1/I3", "I2/I3"), x.moments, error.moments, strict=True
+        )
+    )
+    return "\n".join(
+        [
+            f"{fit.tumbler.mode} mode of a convex body: chi-square over "
+            f"{fit.degrees_of_freedom} degrees of freedom is "
+            f"{fit.reduced_chi_square:.2f} for a noise of {fit.noise:.4f} mag",
+            f"   P_phi {in_hours(x.precession_period, error.precession_period)}, P_psi "
+            f"{in_hours(x.rotation_period, error.rotation_period)}",
+            "   angular momentum towards longitude "
+            f"{in_degrees(x.longitude, error.longitude)}, latitude "
+            f"{in_degrees(x.latitude, error.latitude)}",
+            f"   E/E0 {x.energy_ratio:.4f} +- {error.energy_ratio:.4f}, {moments}",
+            *of_surface(x, error, fit.open_share),
+        ]
+    )
