@@ -189,7 +189,7 @@ def fit_shape(
     >>> shape = jr.photometry.Ellipsoid(jnp.array([1.0, 0.6, 0.5]))
     >>> hour = 3600.0
     >>> body = jr.photometry.Tumbler(
-    ...     shape.moments, 5 * hour, 20 * hour, 1.0, 0.5, 0.0, 0.0, shape)
+    ...     shape.moments, 5 * hour, 25 * hour, 1.0, 0.5, 0.0, 0.0, shape)
     >>> ts = np.linspace(0.0, 100 * hour, 200)
     >>> angle = ts / 4e5
     >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.2 + 0 * ts], axis=1)
@@ -200,7 +200,7 @@ def fit_shape(
     >>> found = jr.photometry.fit_shape(
     ...     [curve], body, 0.01, epoch=0.0, degree=3, facets=64)
     >>> print((found.estimates.rotation_period / hour).round(1))
-    20.0
+    25.0
     """
     law = Mixture() if scattering is None else scattering
     demand(
@@ -267,8 +267,8 @@ def _start(
     )
     vector = surface.centre.copy()
     vector[: surface.motion] = np.concatenate(motion)
-    is_ellipsoid = isinstance(tumbler.shape, Ellipsoid)
-    axes = np.asarray(tumbler.shape.semi_axes) if is_ellipsoid else of_moments
+    shape = tumbler.shape
+    axes = np.asarray(shape.semi_axes) if isinstance(shape, Ellipsoid) else of_moments
     vector[surface.motion + 7 :] = ellipsoid_harmonics(surface, axes)
     return vector
 

@@ -344,8 +344,9 @@ def period_map(
     >>> pairs = jr.photometry.PeriodPairs(
     ...     np.array([9e4, 1e5]), np.array([9e5, 8e5]), np.array([0.9, 0.8]))
     >>> none = jr.photometry.Inversion(
-    ...     [], [], separation=0.0, noise=0.02, chi_square=1.0, readings=10,
-    ...     explained=True, determined=False, span=1e6)
+    ...     aliases=[], rejected=[], epoch=0.0, noise=0.02, reduced_chi_square=1.0,
+    ...     degrees_of_freedom=10, correlation=0.0, follows=True, determined=False,
+    ...     span=1e6)
     >>> ax = jr.plot.period_map(none, pairs)  # pass what find_tumblers returned
     >>> print(ax.get_title(loc="left"))
     Aliases by rank
