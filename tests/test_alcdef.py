@@ -76,6 +76,32 @@ def test_apparent_magnitudes_come_back(tmp_path, delimiter, positions):
     np.testing.assert_allclose(curve.brightness, expected / expected.mean(), rtol=1e-10)
     np.testing.assert_array_equal(curve.to_sun, to_sun)
     np.testing.assert_array_equal(curve.to_observer, to_observer)
+    np.testing.assert_array_equal(curve.errors, 0.01)
+
+
+def test_errors_are_taken_where_each_point_has_one(tmp_path):
+    rows = [("2457100.5", "15.0", "0.01"), ("2457100.6", "15.1", "")]
+    (curve,) = ph.read_alcdef(write(tmp_path, block(rows)), linear)
+    assert curve.errors is None
+    wrong = [("2457100.5", "15.0", "bad")]
+    with pytest.raises(ValueError, match="the error must be a number"):
+        ph.read_alcdef(write(tmp_path, block(wrong)), linear)
+
+
+def test_a_table_gives_the_vectors_of_an_orbit(untyped):
+    """Splines of a table of days are good to a hundredth of a second of light time."""
+    orbit = ph.geometry_of_orbit(ORBIT)
+    days = 2457100.5 + np.arange(-3.0, 6.0)
+    table = ph.geometry_of_table(days, *orbit(days))
+    dates = np.array(DATES, dtype=float)
+    for found, expected in zip(table(dates), orbit(dates), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=0.01 * LIGHT)
+    with pytest.raises(ValueError, match=r"within the table, from 2457097\.5 to"):
+        table(dates + 100)
+    with pytest.raises(ValueError, match="four dates or more that increase"):
+        ph.geometry_of_table(days[::-1], *orbit(days))
+    with pytest.raises(ValueError, match=r"finite and have the shape \(9, 3\)"):
+        ph.geometry_of_table(days, *orbit(days[1:]))
 
 
 @pytest.mark.parametrize("applied", ["AVERAGE", "POINT", "point"])

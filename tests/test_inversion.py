@@ -313,13 +313,93 @@ def test_a_report_says_where_a_body_is_round_about_the_axis_it_circles(inversion
     assert "nearly round" in dataclasses.replace(found, aliases=[round_one]).report()
 
 
-def test_a_planned_curve_tells_the_best_alias_from_a_rejected_one(inversion):
+def test_planned_curves_tell_aliases_apart(inversion):
     curves, _, found = inversion
-    both = dataclasses.replace(found, aliases=[found.aliases[0], found.rejected[0]])
-    apart = both.separation(curves[:2], 0.02)
-    assert apart.shape == (2, 2)
-    np.testing.assert_allclose(apart[:, 0], 0.0, atol=1e-9)
-    assert np.all(apart[:, 1] > 0)
+    several = dataclasses.replace(
+        found, aliases=[found.aliases[0], *found.rejected[:2]]
+    )
+    apart = several.separation(curves[:4], 0.02)
+    assert apart.shape == (4, 3, 3)
+    np.testing.assert_array_equal(apart, np.swapaxes(apart, 1, 2))
+    np.testing.assert_array_equal(np.diagonal(apart, axis1=1, axis2=2), 0.0)
+    plan = several.choose_nights(curves[:4], 0.02)
+    # What one curve says is the same alone and in a plan of this curve only.
+    single = several.choose_nights(curves[:4], 0.02, threshold=1e-3)
+    np.testing.assert_allclose(single.growth, apart[single.chosen[0]], rtol=1e-9)
+    # More curves never say less.
+    assert np.all(plan.growth >= np.max(apart[plan.chosen], axis=0) - 1e-6)
+    upper = np.triu_indices(3, 1)
+    assert np.all(plan.growth[upper] > 25) or len(plan.chosen) == 4
+    text = plan.report()
+    for index, pairs in zip(plan.chosen, plan.first, strict=True):
+        assert f"curve {index}, JD 24562" in text or f"curve {index}, JD 24563" in text
+        for i, j in pairs:
+            assert f"{i} from {j} (" in text
+    assert sum(len(x) for x in plan.first) == np.sum(plan.growth[upper] > 25)
+
+
+def test_a_growth_is_that_of_curves_which_are_observed(inversion):
+    """Chi-square of the wrong alias, fitted again to simulated nights of the right one.
+
+    A second fit moves the numbers by one Gauss-Newton step of all curves, old and new.
+    """
+    curves, _, found = inversion
+    right, wrong = found.aliases[0], found.rejected[0]
+    several = dataclasses.replace(found, aliases=[right, wrong])
+    planned = curves[:3]
+    expected = several.choose_nights(planned, 0.02, threshold=1e9).growth[0, 1]
+    predicted = several._predictions(planned, 0.02)
+    difference = predicted.rows[1] - predicted.rows[0]
+    # The numbers of both may change: their old curves hold them by the covariances.
+    rows = [difference]
+    slopes = [np.concatenate([predicted.slopes[1], -predicted.slopes[0]], axis=1)]
+    for k, one in enumerate((wrong, right)):
+        seeks = np.diag(one.covariance) > 0
+        inverse = np.linalg.inv(one.covariance[np.ix_(seeks, seeks)])
+        root = np.linalg.cholesky(inverse).T
+        block = np.zeros((root.shape[0], 22))
+        block[:, 11 * k + np.flatnonzero(seeks)] = root
+        rows.append(np.zeros(len(root)))
+        slopes.append(block)
+    stacked, target = np.concatenate(slopes), -np.concatenate(rows)
+    change = np.linalg.lstsq(stacked, target, rcond=None)[0]
+    left = np.sum((stacked @ change - target) ** 2)
+    np.testing.assert_allclose(left, expected, rtol=1e-3)
+
+
+def test_errors_weigh_points_and_factors_of_bands_are_taken_out(rng):
+    tumbler = body("short-axis")
+    curves = [
+        dataclasses.replace(x, is_relative=False, band="RV"[k % 2])
+        for k, x in enumerate(synthetic(tumbler, rng, noise=0.01))
+    ]
+    noisy = [
+        dataclasses.replace(x, errors=rng.uniform(0.005, 0.02, len(x.ts)))
+        for x in curves
+    ]
+    errors = np.concatenate([x.errors for x in noisy])
+    assert readings.stated_noise(curves, None) is None
+    np.testing.assert_array_equal(readings.stated_noise(noisy, None), errors)
+    assert readings.stated_noise(noisy, 0.03) == 0.03
+    data, _ = readings.readings_of(noisy, errors)
+    scale = readings.MAGNITUDE * errors
+    np.testing.assert_allclose(data.weights[: len(errors)], 1 / scale)
+    np.testing.assert_allclose(data.typical_noise(), np.median(errors))
+    # A factor for each band drops out; a factor of one curve of a band does not.
+    by_band = [
+        dataclasses.replace(
+            x, brightness=x.brightness * (3.0 if x.band == "R" else 7.0)
+        )
+        for x in noisy
+    ]
+    same, _ = readings.readings_of(by_band, errors)
+    np.testing.assert_allclose(same.values, data.values, atol=1e-9)
+    one = dataclasses.replace(noisy[0], brightness=1.1 * noisy[0].brightness)
+    other, _ = readings.readings_of([one, *noisy[1:]], errors)
+    assert np.max(np.abs(other.values - data.values)) > 1.0
+    wrong = [dataclasses.replace(noisy[0], errors=0 * noisy[0].errors), *noisy[1:]]
+    with pytest.raises(ValueError, match="must have positive `errors`, one for each"):
+        readings.stated_noise(wrong, None)
 
 
 def test_candidates_hold_the_pair_of_a_tumbler(inversion):

@@ -131,10 +131,12 @@ def test_gradients_are_those_of_central_differences(law, rng):
         np.testing.assert_allclose(found, difference, rtol=0, atol=1e-8)
 
 
+CUBE = np.concatenate([np.eye(3), -np.eye(3)])  # normals; it is seen from the front
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_facets_edge_on_and_in_the_dark_have_finite_derivatives(law):
-    normals = np.concatenate([np.eye(3), -np.eye(3)])  # a cube, seen from the front
-    cube = ph.Facets(np.ones(6), normals)
+    cube = ph.Facets(np.ones(6), CUBE)
     x, y, _ = jnp.eye(3)
 
     def brightness(sun, observer):
@@ -144,6 +146,56 @@ def test_facets_edge_on_and_in_the_dark_have_finite_derivatives(law):
         for derivative in (jax.jacfwd, jax.jacrev):
             for slope in derivative(brightness, argnums=(0, 1))(sun, observer):
                 assert np.all(np.isfinite(slope))
+
+
+@pytest.mark.parametrize("law", ["lommel_seeliger", "lambert", "mixture"])
+def test_a_facet_edge_on_has_the_derivative_of_one_that_is_dark(law):
+    """The observer is in the plane of one facet, which the Sun lights.
+
+    The brightness has a kink there. Its derivative is that of the side where the facet
+    is hidden, for each component by a difference of second order on this side.
+    """
+    facet = ph.Facets(np.ones(2), np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]]))
+    sun, observer = jnp.array([0.5, 0.3, 0.9]), jnp.array([0.0, 0.8, 0.6])
+
+    @jax.jit
+    def brightness(sun, observer):
+        return ph.brightness(facet, sun, observer, LAWS[law])
+
+    # Towards negative x the first facet is hidden, and along the others it stays
+    # edge-on.
+    h = 1e-5
+    for axis, side in enumerate((-1.0, 1.0, 1.0)):
+        step = side * h * jnp.eye(3)[axis]
+        values = [brightness(sun, observer + k * step) for k in range(3)]
+        expected = side * (-3 * values[0] + 4 * values[1] - values[2]) / (2 * h)
+        for derivative in (jax.jacfwd, jax.jacrev):
+            found = derivative(brightness, argnums=1)(sun, observer)[axis]
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+
+
+def test_gradients_of_the_ellipsoid_are_those_of_its_facets(rng):
+    shape = ph.Ellipsoid(SEMI_AXES)
+    sun, observer = directions(rng, 1)[:, 0]
+
+    def slopes(rows):
+        """Derivatives in the semi-axes and in both directions, of facets or exact."""
+
+        def brightness(axes, sun, observer):
+            body = ph.Ellipsoid(axes)
+            return ph.brightness(
+                body if rows is None else body.facets(rows), sun, observer
+            )
+
+        gradient = jax.jit(jax.grad(brightness, argnums=(0, 1, 2)))
+        return np.concatenate(gradient(shape.semi_axes, sun, observer))
+
+    exact = slopes(None)
+    errors = [np.max(np.abs(slopes(rows) - exact)) for rows in (24, 96)]
+    scale = np.max(np.abs(exact))
+    # A facet that turns into the dark at once is an error of first order in its size.
+    assert errors[1] < 5e-3 * scale
+    assert errors[1] < errors[0]
 
 
 def test_the_ellipsoid_has_derivatives_at_opposition():
@@ -320,26 +372,79 @@ def test_periods_and_angular_velocity_are_inverses(mode, rng):
     assert np.isnan(there_and_back(np.array([0.99 * least]))[0][0])
 
 
-def test_inverse_has_derivatives_of_two_orders():
-    def omega(x):
-        return ph.omega_from_periods(APOPHIS * jnp.array([1.0, x[0], 1.0]), x[1], x[2])
+@pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
+def test_energy_and_angular_velocity_are_inverses(mode):
+    """From small wobbles to the separatrix; the tilts follow from a second formula."""
+    turn = Rotation.random(random_state=1).as_matrix()
+    tensor = turn @ np.diag(APOPHIS) @ turn.T
+    smallest, middle, largest = APOPHIS
+    circled = largest / (largest if mode == "short-axis" else smallest)
+    separatrix = largest / middle
+    parts = np.array([1e-8, 0.1, 0.7, 1 - 1e-6])
+    ratios = circled + parts * (separatrix - circled)
 
     @quick_jit
-    def orders(x):
-        slope = jax.jacfwd(omega)
-        return omega(x), slope(x), jax.jacfwd(slope)(x)
+    @jax.vmap
+    def there_and_back(ratio):
+        omega = ph.omega_from_energy(tensor, ratio, 3.0, mode)
+        terms = ph.tumbling(tensor, omega)
+        return terms.precession_period, terms.energy_ratio, terms.tilt_max
 
-    x, h = np.array([1.0, 27.38, 263.0]), 1e-5
-    step = np.array([1.0, 27.38, 263.0]) * h * np.eye(3)
-    derivatives = orders(x)[1:]
-    ahead = [orders(x + e)[:2] for e in step]
-    back = [orders(x - e)[:2] for e in step]
-    for order, tolerance in ((0, 1e-6), (1, 1e-5)):
+    precession, found, tilt = there_and_back(ratios)
+    np.testing.assert_allclose(precession, 3.0, rtol=1e-12)
+    np.testing.assert_allclose(found, ratios, rtol=1e-12)
+    np.testing.assert_allclose(np.sin(tilt) ** 2, parts, rtol=1e-6)
+    beyond = circled + np.array([-0.01, 1.01]) * (separatrix - circled)
+    assert np.all(np.isnan(there_and_back(beyond)[0]))
+
+
+def test_energy_of_apophis_has_its_published_period():
+    """The derivative in the energy is that of the periods, reversed."""
+
+    def rotation_period(energy_ratio):
+        omega = ph.omega_from_energy(APOPHIS, energy_ratio, 27.38)
+        return ph.tumbling(APOPHIS, omega).rotation_period
+
+    def energy_ratio(period):
+        omega = ph.omega_from_periods(APOPHIS, 27.38, period)
+        return ph.tumbling(APOPHIS, omega).energy_ratio
+
+    ratio, slope = jax.value_and_grad(energy_ratio)(263.0)
+    period, inverse = jax.value_and_grad(rotation_period)(ratio)
+    np.testing.assert_allclose(period, 263.0, rtol=1e-9)
+    np.testing.assert_allclose(inverse * slope, 1.0, rtol=1e-6)
+
+
+def slopes_of_inverse(mode, orders):
+    """Derivatives of `omega_from_periods` of rising order, and central differences."""
+
+    def omega(x):
+        moments = APOPHIS * jnp.array([1.0, x[0], 1.0])
+        return ph.omega_from_periods(moments, x[1], x[2], mode)
+
+    @quick_jit
+    def every(x):
+        functions = [omega]
+        for _ in range(orders):
+            functions.append(jax.jacfwd(functions[-1]))
+        return [function(x) for function in functions]
+
+    # Of Apophis; in a long-axis mode P_psi may be shorter.
+    x = np.array([1.0, 27.38, 263.0 if mode == "short-axis" else 70.0])
+    step = 1e-5 * x * np.eye(3)
+    ahead = [every(x + e) for e in step]
+    back = [every(x - e) for e in step]
+    for order, derivative in enumerate(every(x)[1:]):
         differences = [a[order] - b[order] for a, b in zip(ahead, back, strict=True)]
-        difference = np.stack(differences, axis=-1) / (2 * np.diagonal(step))
+        yield derivative, np.stack(differences, axis=-1) / (2 * np.diagonal(step))
+
+
+@pytest.mark.parametrize(("mode", "orders"), [("short-axis", 2), ("long-axis", 1)])
+def test_inverse_has_derivatives(mode, orders):
+    pairs = slopes_of_inverse(mode, orders)
+    for (found, difference), tolerance in zip(pairs, (1e-6, 1e-5), strict=False):
         scale = np.max(np.abs(difference), axis=tuple(range(difference.ndim - 1)))
-        off = np.abs(derivatives[order] - difference)
-        assert np.max(off / scale) < tolerance
+        assert np.max(np.abs(found - difference) / scale) < tolerance
 
 
 @pytest.mark.parametrize(
@@ -438,6 +543,10 @@ def test_mistakes_say_what_to_pass_instead(untyped):
         ph.Facets(np.ones(2), np.eye(3))
     with pytest.raises(RuntimeError, match="`moments` must be in rising order"):
         ph.Tumbler(np.array([3.0, 2.0, 1.0]), 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, ball)
+    with pytest.raises(RuntimeError, match="`longitude` must be in radians"):
+        ph.Tumbler(np.ones(3), 1.0, 2.0, 253.0, 0.0, 0.0, 0.0, ball)
+    with pytest.raises(RuntimeError, match="`latitude` must be in radians"):
+        ph.state_of_pole(0.0, -15.0, 1.0, 0.0)
     state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), x)
     with pytest.raises(ValueError, match="must have one entry for each epoch"):
         ph.light_curve(np.ones(3), state, np.zeros(2), x[None], x[None], ball)

@@ -24,9 +24,11 @@ from jrigid.photometry._inversion import Inversion as Inversion
 from jrigid.photometry._inversion import find_tumblers as find_tumblers
 from jrigid.photometry._light_curve import brightness as brightness
 from jrigid.photometry._light_curve import light_curve as light_curve
+from jrigid.photometry._nights import NightPlan as NightPlan
 from jrigid.photometry._orbit import Orbit as Orbit
 from jrigid.photometry._orbit import earth_position as earth_position
 from jrigid.photometry._orbit import geometry_of_orbit as geometry_of_orbit
+from jrigid.photometry._orbit import geometry_of_table as geometry_of_table
 from jrigid.photometry._periodogram import PeriodPairs as PeriodPairs
 from jrigid.photometry._periodogram import period_pairs as period_pairs
 from jrigid.photometry._pole import state_of_pole as state_of_pole
@@ -44,5 +46,6 @@ from jrigid.photometry._spin import SpinInversion as SpinInversion
 from jrigid.photometry._spin import find_spin as find_spin
 from jrigid.photometry._tumbler import Tumbler as Tumbler
 from jrigid.photometry._tumbling import Tumbling as Tumbling
+from jrigid.photometry._tumbling import omega_from_energy as omega_from_energy
 from jrigid.photometry._tumbling import omega_from_periods as omega_from_periods
 from jrigid.photometry._tumbling import tumbling as tumbling

@@ -30,6 +30,8 @@ class _Session:
     metadata: dict[str, tuple[int, str]] = dataclasses.field(default_factory=dict)
     dates: list[Decimal] = dataclasses.field(default_factory=list)
     magnitudes: list[float] = dataclasses.field(default_factory=list)
+    # 0 where none is stated.
+    errors: list[float] = dataclasses.field(default_factory=list)
 
 
 class _Parser:
@@ -134,6 +136,9 @@ class _Parser:
             )
         session.dates.append(date)
         session.magnitudes.append(float(magnitude))
+        has_error = len(words) > 2 and bool(words[2].strip())
+        error = self._number("the error", words[2]) if has_error else Decimal(0)
+        session.errors.append(float(error))
 
     def _delimiter(self, session: _Session) -> str:
         """What stands between the values of a point."""
@@ -177,12 +182,12 @@ def read_alcdef(
         path: The file.
         positions: A function of the Julian dates of observation. It returns vectors
             from the body, where the light left it, to the Sun and to the observer
-            [m, ecliptic]: `geometry_of_orbit` makes one, or interpolate a table.
+            [m, ecliptic]: `geometry_of_orbit` or `geometry_of_table` makes one.
         epoch: Julian date of time 0; the first one in the file if None.
 
     Returns:
         A light curve for each session, all with the same epoch. Their `band` is MAGBAND,
-        or else FILTER.
+        or else FILTER. Their `errors` are those of the points, if each point has one.
 
     Raises:
         ValueError: A line that does not hold what it should, with the file and the line;
@@ -231,6 +236,7 @@ def _curve(
         magnitudes = magnitudes - _distance_modulus(to_sun, to_observer)
     # From the brightest point, so that no power overflows.
     brightness = 10 ** (-0.4 * (magnitudes - magnitudes.min()))
+    errors = np.array(session.errors)
     _, filter_ = session.metadata.get("FILTER", (0, ""))
     _, band = session.metadata.get("MAGBAND", (0, filter_))
     return LightCurve(
@@ -241,6 +247,7 @@ def _curve(
         to_observer=to_observer,
         is_relative=True,
         band=band or filter_,
+        errors=errors if np.all(errors > 0) else None,
     )
 
 

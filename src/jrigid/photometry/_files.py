@@ -28,6 +28,7 @@ class LightCurve:
         is_relative: Whether the scale of the brightness is unknown. Curves that are not
             relative have one scale, in each band.
         band: Name of the filter.
+        errors: Standard deviations of the points [mag], where they are stated.
     """
 
     epoch: float
@@ -37,6 +38,7 @@ class LightCurve:
     to_observer: Float[np.ndarray, "epochs 3"]
     is_relative: bool
     band: str = ""
+    errors: Float[np.ndarray, " epochs"] | None = None
 
 
 class _Lines:

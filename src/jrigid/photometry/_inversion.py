@@ -13,13 +13,19 @@ from jrigid.photometry._alias import (
     Alias,
     alias_of,
     log_evidence,
-    rows_at,
 )
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._model import Task, independent
+from jrigid.photometry._nights import (
+    NightPlan,
+    Predictions,
+    chosen_nights,
+    growths,
+    predictions,
+)
 from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._readings import Readings, readings_of, stated_noise
 from jrigid.photometry._search import Found, mirrored, search
 
 _INERTIA = ("homogeneous", "free")
@@ -49,7 +55,8 @@ class Inversion:
         aliases: The tumblers whose chi-square is near the least one.
         rejected: The best of the others.
         epoch: Julian date of time 0 of the tumblers.
-        noise: Standard deviation of a point [mag], stated or found.
+        noise: Standard deviation of a point [mag], stated or found; the median if they
+            differ.
         reduced_chi_square: Chi-square of the best alias over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
         correlation: Of the best alias's residuals at neighbouring points of a curve. It
@@ -81,8 +88,8 @@ class Inversion:
 
     def separation(
         self, curves: Sequence[LightCurve], noise: float
-    ) -> Float[np.ndarray, "curves aliases"]:
-        """How well future light curves would tell the best alias from each other one.
+    ) -> Float[np.ndarray, "curves aliases aliases"]:
+        """How well each of several future light curves would tell aliases apart.
 
         Args:
             curves: Light curves with the epochs and the geometry that are planned;
@@ -90,12 +97,35 @@ class Inversion:
             noise: Standard deviation of a point [mag].
 
         Returns:
-            Expected growth of chi-square of each alias if the best one is true, after
-            both are fitted again. Above 25 the curve decides; the best has 0.
+            For each curve and pair of aliases, the expected growth of chi-square if one
+            of the pair is true, after both are fitted again. Above 25 the curve decides.
         """
+        predicted = self._predictions(curves, noise)
         return np.array(
-            [[_apart(self, x, curve, noise) for x in self.aliases] for curve in curves]
+            [growths(predicted, self.aliases, [k]) for k in range(len(curves))]
         )
+
+    def choose_nights(
+        self, curves: Sequence[LightCurve], noise: float, threshold: float = 25.0
+    ) -> NightPlan:
+        """Choose planned light curves that tell all aliases apart together.
+
+        Args:
+            curves: Light curves with the epochs and the geometry that are possible;
+                their brightness is not used.
+            noise: Standard deviation of a point [mag].
+            threshold: Expected growth of chi-square at which a pair is apart.
+
+        Returns:
+            The chosen curves. They are few, but another choice may be as short: each
+            curve is the best one beside those before it.
+        """
+        predicted = self._predictions(curves, noise)
+        return chosen_nights(predicted, self.aliases, curves, threshold)
+
+    def _predictions(self, curves: Sequence[LightCurve], noise: float) -> Predictions:
+        """What the aliases predict."""
+        return predictions(self.aliases, curves, noise, self.epoch, self.span)
 
 
 def find_tumblers(
@@ -119,8 +149,9 @@ def find_tumblers(
 
     Args:
         curves: Light curves, corrected for the light time.
-        noise: Standard deviation of a point [mag]. None: it is what the best tumbler
-            leaves, and only a correlation of the residuals shows a misfit.
+        noise: Standard deviation of a point [mag]. None: the `errors` of the curves if
+            all have them. Else it is what the best tumbler leaves, and only a
+            correlation of the residuals shows a misfit.
         shortest: Shortest period of precession or rotation [s].
         longest: Longest period [s].
         modes: Kinds of motion to try: "principal-axis", "short-axis", "long-axis".
@@ -167,8 +198,9 @@ def find_tumblers(
     whole_number("pairs", pairs)
     # Too few points are an error.
     points_of(curves)
-    stated = noise is not None
-    readings, epoch = readings_of(curves, noise if stated else _FIRST_NOISE)
+    known = stated_noise(curves, noise)
+    stated = known is not None
+    readings, epoch = readings_of(curves, _FIRST_NOISE if known is None else known)
     lowest, highest = cycles_within(float(readings.span), shortest, longest)
     found = search(
         readings,
@@ -228,8 +260,7 @@ def _inversion(
     # deviation sqrt(2 / freedom). A noise that was found makes it 1.
     gate = 1 + _SURE * np.sqrt(2 / freedom)
     follows = reduced < gate if stated else deviations < _SURE
-    # Rows that only fill the arrays have no weight, hence the maximum.
-    noise = 1 / (MAGNITUDE * float(readings.weights.max()))
+    noise = readings.typical_noise()
     return Inversion(
         aliases=aliases,
         rejected=every[near : near + 5],
@@ -311,37 +342,6 @@ def _correlation(
     correlation = np.mean(products) / np.mean(residuals**2)
     # The correlation of n pairs of white residuals scatters by 1 / sqrt(n).
     return float(correlation), float(correlation * np.sqrt(products.size))
-
-
-def _apart(
-    inversion: Inversion, other: Alias, curve: LightCurve, noise: float
-) -> float:
-    """Expected growth of chi-square of another alias in a light curve to come.
-
-    The difference of the predictions is compared with the noise and with what both
-    predictions may still change by, each by its own covariance.
-    """
-    best = inversion.aliases[0]
-    readings, _ = readings_of([curve], noise)
-    day = 86400.0
-    shift = (curve.epoch - inversion.epoch) * day + curve.ts
-    # The numbers count cycles within the span of the inversion, from its epoch.
-    ts = np.zeros_like(readings.ts)
-    ts[: len(shift)] = shift
-    readings = readings._replace(ts=ts, span=np.asarray(inversion.span))
-    # The last row is no point, but the equation between the periods.
-    first, of_first = (
-        np.asarray(x)[:-1] for x in rows_at(best.numbers, best.task, readings)
-    )
-    second, of_second = (
-        np.asarray(x)[:-1] for x in rows_at(other.numbers, other.task, readings)
-    )
-    # The rows are over the noise, which therefore has unit variance.
-    spread = np.eye(len(first))
-    for slopes, alias in ((of_first, best), (of_second, other)):
-        spread = spread + slopes @ alias.covariance @ slopes.T
-    difference = second - first
-    return float(difference @ np.linalg.solve(spread, difference))
 
 
 def report_of(inversion: Inversion) -> str:

@@ -5,10 +5,10 @@ from typing import TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from jrigid._checks import demand
-from jrigid._types import Readable
+from jrigid._types import Readable, Real
 from jrigid.photometry._files import ASTRONOMICAL_UNIT
 
 SPEED_OF_LIGHT = 299792458.0  # m / s
@@ -172,6 +172,65 @@ def geometry_of_orbit(orbit: Orbit) -> Positions:
             light_days = light_time(earth - body) / _DAY
             body = orbit.position(julian_dates - light_days)
         return -body, earth - body
+
+    return positions
+
+
+def geometry_of_table(
+    julian_dates: Real[ArrayLike, " rows"],
+    to_sun: Real[ArrayLike, "rows 3"],
+    to_observer: Real[ArrayLike, "rows 3"],
+) -> Positions:
+    """Directions of the Sun and of the observer from a table, as of an ephemeris.
+
+    Args:
+        julian_dates: Of observation, increasing; a row a day or more often.
+        to_sun: From the body, where the light left it, to the Sun [m, ecliptic].
+        to_observer: From the body to the observer [m, ecliptic].
+
+    Returns:
+        A function of the Julian dates of observation. It returns both vectors [m] by
+        cubic splines, and raises ValueError for dates outside of the table.
+
+    Raises:
+        ValueError: Fewer than four rows, dates that do not increase, or vectors that do
+            not fit them.
+
+    >>> import numpy as np, jrigid as jr
+    >>> orbit = jr.photometry.Orbit(3e11, 0.1, 0.0, 0.0, 0.0, 0.0, 2451545.0)
+    >>> positions = jr.photometry.geometry_of_orbit(orbit)
+    >>> dates = 2451545.0 + np.arange(10)
+    >>> table = jr.photometry.geometry_of_table(dates, *positions(dates))
+    >>> print(table(np.array([2451548.5]))[1].round(-9) / 1e9)
+    [[-305.  136.   -0.]]
+    """
+    # Imported where it is used: scipy takes a second, which `import jrigid` must not.
+    from scipy.interpolate import CubicSpline
+
+    dates = np.asarray(julian_dates, dtype=float)
+    vectors = np.stack([np.asarray(x, dtype=float) for x in (to_sun, to_observer)], 1)
+    demand(
+        len(dates) >= 4 and bool(np.all(np.diff(dates) > 0)),
+        "Argument `julian_dates` must hold four dates or more that increase, but it does "
+        "not.",
+    )
+    demand(
+        vectors.shape == (len(dates), 2, 3) and bool(np.all(np.isfinite(vectors))),
+        "Arguments `to_sun` and `to_observer` must be finite and have the shape "
+        f"({len(dates)}, 3), but they are not.",
+    )
+    # Small numbers keep the digits of a time of day, which a Julian date loses.
+    spline = CubicSpline(dates - dates[0], vectors)
+
+    def positions(wanted: Float[np.ndarray, " epochs"]) -> tuple[Vectors, Vectors]:
+        """Vectors to the Sun and to the observer at Julian dates."""
+        demand(
+            bool(np.all((wanted >= dates[0]) & (wanted <= dates[-1]))),
+            f"Dates must be within the table, from {dates[0]} to {dates[-1]}, but they "
+            f"are from {wanted.min()} to {wanted.max()}.",
+        )
+        sun, observer = np.moveaxis(spline(wanted - dates[0]), 1, 0)
+        return sun, observer
 
     return positions
 

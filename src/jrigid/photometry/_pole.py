@@ -4,10 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jrigid._checks import shaped
+from jrigid._checks import is_concrete, shaped
 from jrigid._types import Quaternion, Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.rotation import from_axis_angle, multiply
+
+# Of a quarter or a full turn in single precision.
+_ROUNDING = 1e-6
 
 
 def state_of_pole(
@@ -28,6 +31,10 @@ def state_of_pole(
     Returns:
         The state at that epoch.
 
+    Raises:
+        RuntimeError: A latitude beyond pi / 2 or a longitude beyond 2 pi, which must be
+            degrees, if they are known when the function is called.
+
     Gradients: exact.
     Source: J. Durech, V. Sidorin and M. Kaasalainen, Astron. Astrophys. 513 (2010)
     A46, eq. 1.
@@ -43,10 +50,22 @@ def state_of_pole(
         period=(period,),
         angle=(angle,),
     )
+    demand_radians(longitude, latitude)
     z = jnp.asarray([0.0, 0.0, 1.0], period.dtype)
     tilted = attitude_of_pole(longitude, latitude)
     attitude = multiply(tilted, from_axis_angle(z, angle))
     return State(attitude, 2 * jnp.pi / period * z)
+
+
+def demand_radians(longitude: Scalar, latitude: Scalar) -> None:
+    """Raise RuntimeError for a pole whose numbers must be degrees, if it is known."""
+    limits = {"longitude": (longitude, 2 * np.pi), "latitude": (latitude, np.pi / 2)}
+    for name, (angle, largest) in limits.items():
+        if is_concrete(angle) and np.abs(angle) > largest * (1 + _ROUNDING):
+            raise RuntimeError(
+                f"Argument `{name}` must be in radians, at most {largest:.4f} in size, "
+                f"but it is {angle}: convert degrees by `numpy.deg2rad`."
+            )
 
 
 def direction_of_pole(

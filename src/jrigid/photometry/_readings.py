@@ -50,17 +50,46 @@ class Readings(NamedTuple):
         whitened = logarithms * self.weights
         return whitened - self.factors(whitened)
 
+    def typical_noise(self) -> float:
+        """Median of the standard deviations of the points [mag]."""
+        # Rows that only fill the arrays have no weight.
+        there = np.asarray(self.weights)[np.asarray(self.weights) > 0]
+        return float(np.median(1 / (MAGNITUDE * there)))
+
     def factors(self, whitened: Float[Array, " epochs"]) -> Float[Array, " epochs"]:
         """The part of a whitened vector that unknown factors explain."""
         return product("ef,f->e", self.basis, product("ef,e->f", self.basis, whitened))
 
 
-def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, float]:
+def stated_noise(
+    curves: Sequence[LightCurve], noise: float | None
+) -> float | Float[np.ndarray, " epochs"] | None:
+    """The noise that is given, or else that which all curves state, or else None.
+
+    Raises:
+        ValueError: Errors of a curve that are not positive, or not one for each point.
+    """
+    errors = [x.errors for x in curves if x.errors is not None]
+    if noise is not None or not curves or len(errors) < len(curves):
+        return noise
+    for curve, of_curve in zip(curves, errors, strict=True):
+        demand(
+            of_curve.shape == curve.ts.shape
+            and bool(np.all(np.isfinite(of_curve) & (of_curve > 0))),
+            "Argument `curves` must have positive `errors`, one for each point, but a "
+            "curve has not: pass `noise`, or leave out such points.",
+        )
+    return np.concatenate(errors)
+
+
+def readings_of(
+    curves: Sequence[LightCurve], noise: float | Float[np.ndarray, " epochs"]
+) -> tuple[Readings, float]:
     """All curves in one vector.
 
     Args:
         curves: At least one, with three points or more in all.
-        noise: Standard deviation of each point [mag].
+        noise: Standard deviation of each point [mag], one for all or for each.
 
     Returns:
         The readings, and the Julian date of their time 0.
@@ -72,7 +101,7 @@ def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, f
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
     demand(
-        bool(0 < noise < np.inf),
+        bool(np.all((noise > 0) & np.isfinite(noise))),
         f"Argument `noise` must be positive and finite, but it is {noise}.",
     )
     epoch = curves[0].epoch
@@ -85,7 +114,7 @@ def readings_of(curves: Sequence[LightCurve], noise: float) -> tuple[Readings, f
         bool(np.all(np.isfinite(brightness) & (brightness > 0))),
         "Argument `curves` must hold positive brightness, but a point is not positive.",
     )
-    weights = np.full(len(ts), 1 / (noise * MAGNITUDE))
+    weights = np.broadcast_to(1 / (noise * MAGNITUDE), ts.shape)
     basis = _basis(curves, weights)
     whitened = np.log(brightness) * weights
     readings = Readings(

@@ -39,7 +39,12 @@ from jrigid.photometry._model import (
     unpacked,
 )
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._readings import (
+    MAGNITUDE,
+    Readings,
+    readings_of,
+    stated_noise,
+)
 from jrigid.photometry._refine import Quadratic
 from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin import (
@@ -110,7 +115,8 @@ class ShapeFit:
             errors of the points are independent, and are enlarged where chi-square is
             too large.
         epoch: Julian date of time 0 of the tumbler.
-        noise: Standard deviation of a point [mag], stated or found.
+        noise: Standard deviation of a point [mag], stated or found; the median if they
+            differ.
         chi_square: Sum of squares of the residuals over the noise, and of what the areas
             and the numbers deviate from what is expected, over its spread.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
@@ -161,8 +167,8 @@ def fit_shape(
         tumbler: Where the fit starts. It is a short-axis or long-axis mode, and its
             periods count the turns within the curves rightly. The shape starts as its
             ellipsoid; facets are replaced by an ellipsoid with the tumbler's moments.
-        noise: Standard deviation of a point [mag]. None: it is what the fit leaves, and
-            a misfit cannot be seen.
+        noise: Standard deviation of a point [mag]. None: the `errors` of the curves if
+            all have them. Else it is what the fit leaves, and a misfit cannot be seen.
         epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
         degree: Largest degree of the harmonics of the areas.
         facets: Number of facets.
@@ -211,13 +217,14 @@ def fit_shape(
     check_curves(curves, noise, fitted)
     check_options(degree, facets, law, fitted, closure)
     surface = surface_of(_SOUGHT, degree, facets, law, tuple(fitted), albedo, closure)
-    readings, middle = readings_of(curves, FIRST_NOISE if noise is None else noise)
+    known = stated_noise(curves, noise)
+    readings, middle = readings_of(curves, FIRST_NOISE if known is None else known)
     free = freedom(readings, surface)
     later = (middle - epoch) * _DAY
     task = _task(tumbler)
     start = _start(tumbler, surface, later, float(readings.span))
     vector, quadratic = _minimum(start, task, surface, readings)
-    if noise is None:
+    if known is None:
         found = FIRST_NOISE * np.sqrt(_light(vector, task, surface, readings) / free)
         # Closure and expectations are weighed against the noise, so that the minimum
         # moves with it.
@@ -364,7 +371,7 @@ def _fit(
         estimates=jax.tree.map(np.asarray, estimates),
         errors=errors,
         epoch=middle,
-        noise=1 / (MAGNITUDE * float(readings.weights.max())),
+        noise=readings.typical_noise(),
         chi_square=float(quadratic.chi_square),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,

@@ -28,7 +28,12 @@ from jrigid.photometry._convex import (
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
 from jrigid.photometry._model import axes_of_momentum
-from jrigid.photometry._readings import MAGNITUDE, Readings, readings_of
+from jrigid.photometry._readings import (
+    MAGNITUDE,
+    Readings,
+    readings_of,
+    stated_noise,
+)
 from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin_search import (
     COARSE_DEGREE,
@@ -113,7 +118,8 @@ class SpinInversion:
             from the plane of the ecliptic do not tell it from the first solution. None
             if a fit that starts there goes elsewhere.
         epoch: Julian date of time 0 of the bodies.
-        noise: Standard deviation of a point [mag], stated or found.
+        noise: Standard deviation of a point [mag], stated or found; the median if they
+            differ.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
         follows: Whether the best solution follows the curves to their noise.
@@ -160,8 +166,9 @@ def find_spin(
 
     Args:
         curves: Light curves, corrected for the light time.
-        noise: Standard deviation of a point [mag]. None: it is what the best solution
-            leaves, and a misfit cannot be seen.
+        noise: Standard deviation of a point [mag]. None: the `errors` of the curves if
+            all have them. Else it is what the best solution leaves, and a misfit cannot
+            be seen.
         shortest: Shortest sidereal period [s].
         longest: Longest sidereal period [s]. The cost grows with the number of periods,
             2.5 times the span of the curves over `shortest` less that over `longest`.
@@ -209,7 +216,8 @@ def find_spin(
     law = Mixture() if scattering is None else scattering
     check_curves(curves, noise, fitted)
     check_options(degree, facets, law, fitted, closure)
-    readings, epoch = readings_of(curves, FIRST_NOISE if noise is None else noise)
+    known = stated_noise(curves, noise)
+    readings, epoch = readings_of(curves, FIRST_NOISE if known is None else known)
     turns = _turns(float(readings.span), shortest, longest)
     make = functools.partial(
         surface_of,
@@ -224,13 +232,13 @@ def find_spin(
     # This refuses curves with too few points before the search.
     free = freedom(readings, surface)
     spins = search_spins(readings, surface, coarse, *turns)
-    if noise is None:
+    if known is None:
         noise_found = FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / free)
         # Closure and expectations are weighed against the noise, so that the minimum
         # moves with it.
         readings, epoch = readings_of(curves, float(noise_found))
         spins = settled(spins, surface, readings)
-    return _inversion(spins, surface, readings, epoch, noise is not None, threshold)
+    return _inversion(spins, surface, readings, epoch, known is not None, threshold)
 
 
 def check_curves(
@@ -347,7 +355,7 @@ def _inversion(
         rejected=every[near:],
         mirror=None if mirror is None else every[mirror],
         epoch=epoch,
-        noise=1 / (MAGNITUDE * float(readings.weights.max())),
+        noise=readings.typical_noise(),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
         # Within the noise, chi-square over its degrees of freedom has the standard

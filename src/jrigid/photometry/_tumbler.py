@@ -15,7 +15,7 @@ from jrigid.free import free_rotation
 from jrigid.photometry._ellipsoid import Ellipsoid
 from jrigid.photometry._facets import Facets
 from jrigid.photometry._light_curve import light_curve
-from jrigid.photometry._pole import attitude_of_pole, state_of_pole
+from jrigid.photometry._pole import attitude_of_pole, demand_radians, state_of_pole
 from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
 from jrigid.photometry._tumbling import omega_from_periods
 from jrigid.rotation import from_axis_angle, multiply
@@ -50,8 +50,8 @@ class Tumbler(Readable):
 
     Raises:
         ValueError: A mode that does not exist, or an array of a wrong shape.
-        RuntimeError: The moments are not in rising order, and they are known when the
-            object is built.
+        RuntimeError: The moments are not in rising order, or the pole is in degrees, and
+            they are known when the object is built.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> shape = jr.photometry.Ellipsoid(jnp.array([3.0, 2.0, 1.5]))
@@ -80,8 +80,9 @@ class Tumbler(Readable):
     mode: str = eqx.field(static=True, default="short-axis")
 
     def __check_init__(self) -> None:
-        """Raise an error for a mode that does not exist, or moments out of order."""
+        """Raise an error for an unknown mode, degrees, or moments out of order."""
         check_option("mode", self.mode, MODES)
+        demand_radians(self.longitude, self.latitude)
         if is_concrete(self.moments) and np.any(np.diff(np.asarray(self.moments)) < 0):
             raise RuntimeError(
                 "Argument `moments` must be in rising order, but it is not: turn the "

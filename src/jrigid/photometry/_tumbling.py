@@ -214,6 +214,75 @@ def _excess(long_axis: bool, y: Scalar, moments: Vector, wanted: Scalar) -> Scal
 _EXCESS = {mode: functools.partial(_excess, mode) for mode in (False, True)}
 
 
+def omega_from_energy(
+    inertia: InertiaLike,
+    energy_ratio: ScalarLike,
+    precession_period: ScalarLike,
+    mode: str = "short-axis",
+) -> Vector:
+    """Angular velocity of the free rotation with a given E/E0: `tumbling` reversed.
+
+    Args:
+        inertia: Principal moments or tensor [kg m^2].
+        energy_ratio: E/E0, from 1 to I3/I2 in a short-axis mode, and from I3/I2 to
+            I3/I1 in a long-axis mode.
+        precession_period: P_phi [s].
+        mode: "short-axis" or "long-axis": the axis that the angular momentum circles.
+
+    Returns:
+        Angular velocity, body components [rad/s], at the largest tilt: the angular
+        momentum is in the plane of the circled axis and the middle one. NaN where no
+        motion of the mode has this energy, at the separatrix, and outside positive
+        definite inertia and positive periods.
+
+    Gradients: right, but for E/E0 of a steady rotation, from which the tilt grows as a
+    square root.
+    Source: P. Pravec et al., Icarus 233 (2014) 48 for E/E0; the tilt follows from 2 E /
+    L^2, the sum of n_i^2 / I_i with n a unit vector along the angular momentum.
+
+    >>> import jax.numpy as jnp, jrigid as jr
+    >>> apophis = jnp.array([0.61, 0.965, 1.0])
+    >>> omega = jr.photometry.omega_from_energy(apophis, 1.0236, 27.38 * 3600)
+    >>> terms = jr.photometry.tumbling(apophis, omega)
+    >>> print((terms.rotation_period / 3600).round(0))
+    263.0
+    """
+    check_option("mode", mode, _MODES)
+    inertia, energy_ratio, precession_period = shaped(
+        inertia=(inertia, *INERTIA),
+        energy_ratio=(energy_ratio,),
+        precession_period=(precession_period,),
+    )
+    ok = is_inertia(inertia) & all_positive((energy_ratio, precession_period))
+    solve = functools.partial(_of_energy, mode == "long-axis")
+    return where_defined(ok, solve, inertia, energy_ratio, precession_period)
+
+
+def _of_energy(
+    long_axis: bool, inertia: Array, energy_ratio: Scalar, precession_period: Scalar
+) -> Vector:
+    """The angular velocity of `omega_from_energy`; NaN where there is none."""
+    principal = principal_axes(inertia)
+    smallest, middle, largest = principal.moments
+    # E/E0 of a rotation about the middle axis, and about the one that is circled.
+    highest = largest / middle
+    circled = largest / smallest if long_axis else jnp.ones_like(largest)
+    # How far the energy is from that about the circled axis to that about the middle
+    # one: the square of the sine of the tilt.
+    width = highest - circled
+    part = (energy_ratio - circled) / jnp.where(width != 0, width, 1.0)
+    exists = (part >= 0) & (part < 1) & (width != 0)
+    part = jnp.where(exists, part, 0.5)
+    sine = root_of_positive(part)
+    cosine = jnp.sqrt(1 - part)
+    zero = jnp.zeros_like(part)
+    momentum = [cosine, sine, zero] if long_axis else [zero, sine, cosine]
+    omega = jnp.stack(momentum) / principal.moments
+    period = 2 * jnp.pi / mean_precession_rate(principal.moments, omega)
+    omega = omega * period / precession_period
+    return jnp.where(exists, product("ij,j->i", principal.axes, omega), jnp.nan)
+
+
 def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
     """Angular velocity for a unit angular momentum whose tilt has the tangent exp(y)."""
     # The squares of sine and cosine are 1 / (1 + exp(-2 y)) and 1 / (1 + exp(2 y)):

@@ -1,0 +1,169 @@
+"""Light curves that are planned: which ones would tell tumblers apart."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jrigid._checks import demand
+from jrigid.photometry._alias import Alias, rows_at
+from jrigid.photometry._files import LightCurve
+from jrigid.photometry._readings import readings_of
+
+_DAY = 86400.0
+
+
+@dataclasses.dataclass(frozen=True)
+class NightPlan:
+    """A choice of planned light curves that tells aliases apart.
+
+    Attributes:
+        chosen: Indices of the curves, the most useful one first.
+        growth: Expected growth of chi-square by all of them for each pair of aliases,
+            if one of the pair is true and the other one is fitted.
+        first: Pairs of aliases (ranks from 1) that each chosen curve tells apart first.
+        threshold: Growth above which a pair is apart.
+        dates: Julian dates of the first and last point of each chosen curve.
+    """
+
+    chosen: list[int]
+    growth: Float[np.ndarray, "aliases aliases"]
+    first: list[list[tuple[int, int]]]
+    threshold: float
+    dates: list[tuple[float, float]]
+
+    def report(self) -> str:
+        """The plan in words."""
+        return _report(self)
+
+
+class Predictions(NamedTuple):
+    """What aliases predict for planned light curves, over the noise.
+
+    Attributes:
+        rows: Of each alias, but for what all predictions have in common.
+        slopes: Derivatives in the numbers of the alias.
+        of_curve: Index of the curve of each point.
+    """
+
+    rows: Float[np.ndarray, "aliases points"]
+    slopes: Float[np.ndarray, "aliases points 11"]
+    of_curve: np.ndarray
+
+
+def predictions(
+    aliases: Sequence[Alias],
+    curves: Sequence[LightCurve],
+    noise: float,
+    epoch: float,
+    span: float,
+) -> Predictions:
+    """What aliases predict for planned light curves.
+
+    Args:
+        aliases: The aliases.
+        curves: Planned light curves; their brightness is not used.
+        noise: Standard deviation of a point [mag].
+        epoch: Julian date of time 0 of the aliases.
+        span: Time within which their numbers count cycles [s].
+    """
+    plain = [dataclasses.replace(x, brightness=np.ones(len(x.ts))) for x in curves]
+    readings, middle = readings_of(plain, noise)
+    there = readings.weights > 0
+    ts = np.where(there, readings.ts + (middle - epoch) * _DAY, 0.0)
+    readings = readings._replace(ts=ts, span=np.asarray(span))
+    # The last row is no point, but the equation between the periods.
+    pairs = [rows_at(x.numbers, x.task, readings) for x in aliases]
+    return Predictions(
+        rows=np.stack([np.asarray(rows)[:-1][there] for rows, _ in pairs]),
+        slopes=np.stack([np.asarray(slopes)[:-1][there] for _, slopes in pairs]),
+        of_curve=np.repeat(np.arange(len(curves)), [len(x.ts) for x in curves]),
+    )
+
+
+def growths(
+    predicted: Predictions, aliases: Sequence[Alias], chosen: Sequence[int]
+) -> Float[np.ndarray, "aliases aliases"]:
+    """Expected growth of chi-square by some of the curves together, for each pair.
+
+    The difference of the predictions is compared with the noise and with what both
+    predictions may still change by, each by its own covariance.
+    """
+    points = np.isin(predicted.of_curve, chosen)
+    rows = predicted.rows[:, points]
+    slopes = predicted.slopes[:, points]
+    count = len(aliases)
+    result = np.zeros((count, count))
+    for i, j in itertools.combinations(range(count), 2):
+        # The rows are over the noise, which therefore has unit variance.
+        spread = np.eye(rows.shape[1])
+        for k in (i, j):
+            spread = spread + slopes[k] @ aliases[k].covariance @ slopes[k].T
+        difference = rows[j] - rows[i]
+        result[i, j] = difference @ np.linalg.solve(spread, difference)
+    return result + result.T
+
+
+def chosen_nights(
+    predicted: Predictions,
+    aliases: Sequence[Alias],
+    curves: Sequence[LightCurve],
+    threshold: float,
+) -> NightPlan:
+    """Choose curves one after the other until all pairs of aliases are apart.
+
+    Each choice is the curve with which the growths, cut off at the threshold, have the
+    largest sum.
+    """
+    demand(
+        threshold > 0, f"Argument `threshold` must be positive, but it is {threshold}."
+    )
+    chosen: list[int] = []
+    first: list[list[tuple[int, int]]] = []
+    growth = np.zeros((len(aliases), len(aliases)))
+    upper = np.triu(np.ones_like(growth, bool), 1)
+    while np.any(growth[upper] < threshold) and len(chosen) < len(curves):
+        left = [k for k in range(len(curves)) if k not in chosen]
+        trials = [growths(predicted, aliases, [*chosen, k]) for k in left]
+        gains = [np.sum(np.minimum(x[upper], threshold)) for x in trials]
+        best = int(np.argmax(gains))
+        apart = upper & (trials[best] >= threshold) & (growth < threshold)
+        growth = trials[best]
+        chosen.append(left[best])
+        first.append([(int(i) + 1, int(j) + 1) for i, j in np.argwhere(apart)])
+    times = [curves[k].epoch + curves[k].ts[[0, -1]] / _DAY for k in chosen]
+    dates = [(float(start), float(end)) for start, end in times]
+    return NightPlan(chosen, growth, first, threshold, dates)
+
+
+def _report(plan: NightPlan) -> str:
+    """The plan in words."""
+    lines = []
+    for index, (start, end), pairs in zip(
+        plan.chosen, plan.dates, plan.first, strict=True
+    ):
+        told = ", ".join(
+            f"{i} from {j} ({plan.growth[i - 1, j - 1]:.0f})" for i, j in pairs
+        )
+        lines.append(
+            f"curve {index}, JD {start:.2f} to {end:.2f}: "
+            + (f"tells {told} apart" if told else "helps")
+        )
+    count = len(plan.growth)
+    missed = [
+        f"{i + 1} and {j + 1} ({plan.growth[i, j]:.0f})"
+        for i, j in itertools.combinations(range(count), 2)
+        if plan.growth[i, j] < plan.threshold
+    ]
+    if missed:
+        lines.append(f"These curves do not tell apart {', '.join(missed)}.")
+    elif count < 2:
+        lines.append("There is one alias, so that nothing must be told apart.")
+    lines.append(
+        "In brackets: the expected growth of chi-square by all of these curves, of "
+        f"which {plan.threshold:g} decides."
+    )
+    return "\n".join(lines)
