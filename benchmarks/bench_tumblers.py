@@ -49,11 +49,25 @@ def same(alias, truth, span):
     return all(abs(span / float(a) - span / b) < _ONE for a, b in pairs)
 
 
-def pulls(alias, truth):
-    """Errors over stated errors: periods, moments, ratios of axes, latitude."""
+def pulls(alias, mirror, truth):
+    """Errors over stated errors of what an alias says.
+
+    Its momentum is that of the mirror if that is nearer: both are named.
+    """
     estimates, errors = alias.estimates, alias.errors
     moments = truth.moments[:2] / truth.moments[2]
     ratios = truth.semi_axes[1:] / truth.semi_axes[:2]
+    omega = ph.omega_from_periods(
+        truth.moments, truth.precession_period, truth.rotation_period, truth.mode
+    )
+    energy = ph.tumbling(truth.moments, omega).energy_ratio
+    longitude = np.arctan2(truth.pole[1], truth.pole[0])
+    poles = [alias] if mirror is None else [alias, mirror]
+    of_longitude = []
+    for one in poles:
+        off = one.estimates.longitude - longitude
+        off = (off + np.pi) % (2 * np.pi) - np.pi
+        of_longitude.append(off / one.errors.longitude)
     rows = [
         (
             estimates.precession_period,
@@ -64,8 +78,10 @@ def pulls(alias, truth):
         (estimates.latitude, errors.latitude, np.arcsin(truth.pole[2])),
         *zip(estimates.moments, errors.moments, moments, strict=True),
         *zip(estimates.axis_ratios, errors.axis_ratios, ratios, strict=True),
+        (estimates.energy_ratio, errors.energy_ratio, energy),
     ]
-    return np.array([float((value - true) / error) for value, error, true in rows])
+    found = [float((value - true) / error) for value, error, true in rows]
+    return np.array([*found, float(min(of_longitude, key=abs))])
 
 
 def one_body(seed, mode, case):
@@ -79,7 +95,8 @@ def one_body(seed, mode, case):
     span = max(x.ts.max() for x in curves)
     right = [same(alias, truth, span) for alias in found.aliases]
     rank = right.index(True) if any(right) else None
-    return found, rank, pulls(found.aliases[rank or 0], truth), seconds
+    pull = pulls(found.aliases[rank or 0], found.mirror, truth)
+    return found, rank, pull, seconds
 
 
 def main(bodies, case, write):
@@ -120,6 +137,7 @@ def main(bodies, case, write):
         ("more than one tumbler fits", sum(len(x[2].aliases) > 1 for x in rows)),
     ]
     names = ["P_phi", "P_psi", "latitude", "I1/I3", "I2/I3", "b/a", "c/b"]
+    names += ["E/E0", "longitude of the momentum or of its mirror"]
     shares = ", ".join(f"{n} {x:.2f}" for n, x in zip(names, covered, strict=True))
     text = (
         common.table(["what", f"of {bodies} bodies"], counts)

@@ -68,8 +68,9 @@ def tumbling(inertia: InertiaLike, omega: VectorLike) -> Tumbling:
         inertia and finite rates.
 
     Gradients: as those of `free.polhode_period` and `free.mean_precession_rate`.
-    Source: N. H. Samarasinha and M. F. A'Hearn, Icarus 93 (1991) 194; M. Kaasalainen,
-    Astron. Astrophys. 376 (2001) 302; P. Pravec et al., Icarus 173 (2005) 108.
+    Source: N. H. Samarasinha and M. F. A'Hearn, Icarus 93 (1991) 194, for the modes; M.
+    Kaasalainen, Astron. Astrophys. 376 (2001) 302, and P. Pravec et al., Icarus 173
+    (2005) 108, for the periods; P. Pravec et al., Icarus 233 (2014) 48, for E/E0.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> apophis = jnp.array([0.61, 0.965, 1.0])
