@@ -297,6 +297,24 @@ def test_a_tumbler_is_that_of_another_integrator():
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+def test_a_body_under_a_torque_has_the_light_of_its_motion():
+    """Drag about the axis of rotation: the angle is 1 - exp(-t) times the first rate."""
+    shape = ph.Ellipsoid(SEMI_AXES)
+    body = jr.RigidBody(np.ones(3), jr.torques.LinearDrag(1.0))
+    start = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 2.0]))
+    ts = np.linspace(0.0, 3.0, 7)
+    sun, observer = (np.tile(x, (7, 1)) for x in ([1.0, 0.3, 0.2], [0.9, -0.2, 0.1]))
+    found = ph.light_curve(body, start, ts, sun, observer, shape, light_time=False)
+    turned = Rotation.from_rotvec(
+        np.stack([0 * ts, 0 * ts, 2.0 * (1 - np.exp(-ts))], axis=1)
+    )
+    expected = [
+        ph.brightness(shape, *x)
+        for x in zip(turned.inv().apply(sun), turned.inv().apply(observer), strict=True)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
 def test_a_light_curve_has_derivatives_in_all_that_a_fit_seeks():
     moments, state, ts, sun, observer = tumbler()
 

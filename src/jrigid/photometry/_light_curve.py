@@ -16,6 +16,8 @@ from jrigid.photometry._facets import Facets, as_unit
 from jrigid.photometry._orbit import SPEED_OF_LIGHT
 from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
 from jrigid.rotation import rotate_inverse
+from jrigid.simulate import simulate
+from jrigid.systems import RigidBody
 
 
 def brightness(
@@ -64,7 +66,7 @@ def phase_angle(to_sun: Vector, to_observer: Vector) -> Scalar:
 
 
 def light_curve(
-    inertia: InertiaLike,
+    inertia: InertiaLike | RigidBody,
     state0: State,
     ts: Real[ArrayLike, " epochs"],
     to_sun: Real[ArrayLike, "epochs 3"],
@@ -75,15 +77,17 @@ def light_curve(
     t0: ScalarLike = 0.0,
     light_time: bool = True,
 ) -> Float[Array, " epochs"]:
-    """Brightness of a free body at many epochs, by the exact flow.
+    """Brightness of a rotating body at many epochs.
 
-    An epoch after a thousand turns costs the same as one after the first. For a body
-    under torques, evaluate `brightness` at the states of a `simulate` run.
+    The motion of a free body, given by its inertia, is the exact flow: an epoch after a
+    thousand turns costs the same as one after the first. A `RigidBody` with a torque
+    moves by `simulate`.
 
     Args:
-        inertia: Principal moments, or a symmetric tensor in body axes [kg m^2].
+        inertia: Principal moments, or a symmetric tensor in body axes [kg m^2]; or a
+            `RigidBody`, whose torque needs no `args`.
         state0: State at `t0`.
-        ts: Epochs [s], in any order.
+        ts: Epochs [s], in any order; of a `RigidBody` rising, from `t0` on.
         to_sun: Vectors from the body to the Sun at the epochs, space axes [m].
         to_observer: Vectors from the body to the observer, space axes [m].
         shape: `Facets` or an `Ellipsoid`, in body axes.
@@ -99,6 +103,7 @@ def light_curve(
 
     Gradients: exact in all arguments, as those of `free_rotation` and `brightness`.
     They are of any order, but for an ellipsoid at a phase angle of 0 of first order.
+    Those of a `RigidBody` are as by `simulate`: of first order, by reverse mode.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> cigar = jr.photometry.Ellipsoid(jnp.array([3.0, 1.0, 1.0]))
@@ -119,11 +124,16 @@ def light_curve(
     if light_time:
         ts = ts - safe_norm(to_observer) / SPEED_OF_LIGHT
     # An invalid motion raises no error here: its curve is NaN below.
-    motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
+    if isinstance(inertia, RigidBody):
+        run = simulate(inertia, state0, ts, t0=t0, throw=False)
+        attitude, result = run.states.attitude, run.result
+    else:
+        motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
+        attitude, result = motion.attitude, motion.result
     seen = functools.partial(_seen_from_space, shape, scattering)
-    curve = jax.vmap(seen)(motion.attitude, to_sun, to_observer)
+    curve = jax.vmap(seen)(attitude, to_sun, to_observer)
     # Some invalid motions have finite attitudes.
-    return nan_where(motion.result != RESULTS.successful, curve)
+    return nan_where(result != RESULTS.successful, curve)
 
 
 def _seen_from_space(
