@@ -174,5 +174,8 @@ def test_mistakes_say_what_to_pass(relative):
     with pytest.raises(ValueError, match="principal-axis rotation: use `find_spin`"):
         ph.fit_shape(curves, steady, NOISE, epoch=EPOCH)
     start = start_of("short-axis")
+    swapped = dataclasses.replace(start, rotation_period=start.precession_period)
+    with pytest.raises(ValueError, match="must have periods of a motion of its mode"):
+        ph.fit_shape(curves, swapped, NOISE, epoch=EPOCH)
     with pytest.raises(ValueError, match="say nothing of the phase function"):
         ph.fit_shape(curves, start, NOISE, epoch=EPOCH, fitted=("slope",))

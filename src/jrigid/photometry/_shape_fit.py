@@ -185,8 +185,8 @@ def fit_shape(
         The fit.
 
     Raises:
-        ValueError: Curves or options from which nothing follows, or a steady rotation,
-            for which there is `find_spin`.
+        ValueError: Curves or options from which nothing follows, periods that no motion
+            has, or a steady rotation, for which there is `find_spin`.
 
     Source: the shape of M. Kaasalainen, J. Torppa and K. Muinonen, Icarus 153 (2001)
     37; the motion of M. Kaasalainen, Astron. Astrophys. 376 (2001) 302.
@@ -263,6 +263,11 @@ def _start(
     periods = np.stack([tumbler.precession_period, tumbler.rotation_period])
     phases = np.stack([tumbler.precession_angle / (2 * np.pi), tumbler.rotation_phase])
     tilt = tumbling(moments, tumbler.state.omega).tilt_max
+    demand(
+        bool(np.isfinite(tilt)),
+        "Argument `tumbler` must have periods of a motion of its mode with its moments, "
+        "but there is none: see `omega_from_periods`.",
+    )
     motion = Numbers(
         cycles=span / periods,
         angles=2 * np.pi * (phases + later / periods),
