@@ -2,14 +2,19 @@
 
     python benchmarks/bench_convex.py FOLDER [--write] [--repeats 3]
 
-FOLDER is a copy of https://github.com/mkretlow/DAMIT-convex (CC-BY-4.0) with its folder
-`convexinv` built by `make`. Its test asteroid is (43) Ariadne: 37 relative light curves
-of 1,541 points. Both programs search the same range of periods with harmonics to degree
-6 and 512 facets, and then refine to the end: `period_scan` and `convexinv`, and
-`find_spin`.
+FOLDER is a copy of https://github.com/mkretlow/DAMIT-convex (CC-BY-4.0) with the
+programs of its folders `convexinv`, `fortran` and `lcgenerator` built there. Its test
+asteroid is (43) Ariadne: 37 relative light curves of 1,541 points. Both programs search
+the same range of periods with harmonics to degree 6 and 512 facets, and then refine to
+the end: `period_scan` and `convexinv`, and `find_spin`.
+
+The package makes its own model of the asteroid with `convexinv`, `minkowski` and
+`standardtri`. The brightness of that model by `light_curve` is compared with that by
+`lcgenerator` at all epochs.
 """
 
 import pathlib
+import re
 import resource
 import subprocess
 import tempfile
@@ -28,6 +33,7 @@ PERIOD = 5.761985  # h
 POLES = ((253.0, -15.0), (73.0, -15.0))
 # Starting poles of convexinv [deg], as many as its scan of periods has.
 STARTS = ((0, 0), (180, 0), (90, 60), (240, 60), (90, -60), (240, -60))
+ROUNDING = 0.5e-6  # of lcgenerator, which writes six decimals
 
 
 def seconds_of(command, text, folder):
@@ -64,6 +70,64 @@ def by_convexinv(package, scratch):
         deviation = float(output.split(" dev ")[-1].split()[0])
         solutions.append((deviation, *(float(x) for x in words[:3])))
     return min(solutions), len(periods), seconds
+
+
+def write_model(package, scratch):
+    """Write the spin and the shape that the package's example of convexinv ends with.
+
+    convexinv gives areas and normals of facets. minkowski makes a polyhedron of them,
+    and standardtri cuts its faces into triangles.
+    """
+    curves = (package / "test_lcs_rel").read_text()
+    command = [package / "convexinv" / "convexinv", "-o", "areas", "-p", "spin"]
+    command += [package / "input_convexinv", "curves"]
+    seconds_of(command, curves, scratch)
+    areas = (scratch / "areas").read_text()
+    polyhedron, _ = seconds_of([package / "fortran" / "minkowski"], areas, scratch)
+    command = [package / "fortran" / "standardtri"]
+    triangles, _ = seconds_of(command, polyhedron, scratch)
+    (scratch / "shape").write_text(triangles)
+
+
+def model_of(scratch):
+    """Epoch, state, shape and scattering law of the files of `write_model`."""
+    numbers = [float(x) for x in (scratch / "spin").read_text().split()]
+    longitude, latitude, period, epoch, angle, *phase, lambert = numbers
+    pole = np.deg2rad([longitude, latitude])
+    state = ph.state_of_pole(*pole, period * HOUR, np.deg2rad(angle))
+    amplitude, width, slope = phase
+    law = ph.Mixture(lambert, amplitude=amplitude, width=width, slope=slope)
+    return epoch, state, ph.read_shape(scratch / "shape"), law
+
+
+def compare_brightness(package, scratch):
+    """A row of the table of brightness: the package's own model at all epochs."""
+    write_model(package, scratch)
+    # lcgenerator divides a relative curve by its mean, so all are made absolute.
+    relative = (package / "test_lcs_rel").read_text()
+    text = re.sub(r"(?m)^(\d+) 0 *$", r"\1 1", relative)
+    command = [package / "lcgenerator" / "lcgenerator", "spin", "shape", "light"]
+    seconds_of(command, text, scratch)
+    theirs = np.loadtxt(scratch / "light")
+    epoch, state, shape, law = model_of(scratch)
+    curves = ph.read_light_curves(package / "test_lcs_rel", epoch=epoch)
+    ours = ph.light_curve(
+        np.ones(3),  # a steady rotation is the same for all moments
+        state,
+        np.concatenate([x.ts for x in curves]),
+        np.concatenate([x.to_sun for x in curves]),
+        np.concatenate([x.to_observer for x in curves]),
+        shape,
+        law,
+        light_time=False,  # the file is corrected for it
+    )
+    return [
+        len(theirs),
+        len(shape.areas),
+        f"{theirs.min():.2f} to {theirs.max():.2f}",
+        f"{ROUNDING / theirs.min():.1e}",
+        f"{np.max(np.abs(ours / theirs - 1)):.1e}",
+    ]
 
 
 def by_jrigid(curves, **options):
@@ -138,6 +202,7 @@ def main(package, repeats, write):
             ours.append(seconds)
             theirs.append(by_convexinv(package, pathlib.Path(folder)))
             print("jrigid", ours, "convexinv", theirs, flush=True)
+        light = compare_brightness(package, pathlib.Path(folder))
     found, seconds = by_jrigid(curves)
     first = ours[0]
     ours = [*ours[1:], seconds]
@@ -160,6 +225,13 @@ def main(package, repeats, write):
         "rms relative residual",
         "CPU s, min, median",
     ]
+    header_of_light = [
+        "epochs",
+        "facets",
+        "brightness",
+        "largest relative rounding by lcgenerator",
+        "largest relative deviation",
+    ]
     separation = 0.5 * PERIOD**2 / (float(np.ptp([x.ts[0] for x in curves])) / HOUR)
     text = (
         "The command takes the folder of DAMIT's package, as its docstring says.\n\n"
@@ -173,7 +245,11 @@ def main(package, repeats, write):
         "with 24 poles. Neighbouring minima of chi-square are "
         f"{1e6 * separation:.0f}e-6 h apart. convexinv then takes 300 steps from each "
         f"of 6 poles. Times: {repeats} runs in turns, of `find_spin` without the first "
-        f"one, which compiles and took {first:.0f} CPU s."
+        f"one, which compiles and took {first:.0f} CPU s.\n\n"
+        "Brightness by `light_curve`, compared with that by lcgenerator, which writes "
+        "six decimals. The spin and the shape are those that the package's example of "
+        "convexinv ends with. The brightness is in the unit of area of the shape.\n\n"
+        + common.table(header_of_light, [light])
     )
     title = "Inversion to a spin and a convex shape"
     common.report("convex", title, text, ["jax", "numpy"], write)
