@@ -21,6 +21,7 @@ import tempfile
 import time
 
 import common
+import jax.numpy as jnp
 import numpy as np
 
 from jrigid import photometry as ph
@@ -94,9 +95,8 @@ def model_of(scratch):
     numbers = [float(x) for x in (scratch / "spin").read_text().split()]
     longitude, latitude, period, epoch, angle, *phase, lambert = numbers
     pole = np.deg2rad([longitude, latitude])
-    state = ph.state_of_pole(*pole, period * HOUR, np.deg2rad(angle))
-    amplitude, width, slope = phase
-    law = ph.Mixture(lambert, amplitude=amplitude, width=width, slope=slope)
+    state = ph.state_of_pole(pole[0], pole[1], period * HOUR, np.deg2rad(angle))
+    law = ph.Mixture(*(jnp.asarray(x) for x in (lambert, *phase)))
     return epoch, state, ph.read_shape(scratch / "shape"), law
 
 

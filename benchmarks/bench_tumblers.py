@@ -49,10 +49,23 @@ def same(alias, truth, span):
     return all(abs(span / float(a) - span / b) < _ONE for a, b in pairs)
 
 
+def direction(estimates):
+    """Unit vector along the momentum."""
+    across = np.cos(estimates.latitude)
+    longitude = estimates.longitude
+    return np.array(
+        [
+            across * np.cos(longitude),
+            across * np.sin(longitude),
+            np.sin(estimates.latitude),
+        ]
+    )
+
+
 def pulls(alias, mirror, truth):
     """Errors over stated errors of what an alias says.
 
-    Its momentum is that of the mirror if that is nearer: both are named.
+    Its momentum is that of the mirror if that is nearer to the true one.
     """
     estimates, errors = alias.estimates, alias.errors
     moments = truth.moments[:2] / truth.moments[2]
@@ -61,13 +74,11 @@ def pulls(alias, mirror, truth):
         truth.moments, truth.precession_period, truth.rotation_period, truth.mode
     )
     energy = ph.tumbling(truth.moments, omega).energy_ratio
-    longitude = np.arctan2(truth.pole[1], truth.pole[0])
     poles = [alias] if mirror is None else [alias, mirror]
-    of_longitude = []
-    for one in poles:
-        off = one.estimates.longitude - longitude
-        off = (off + np.pi) % (2 * np.pi) - np.pi
-        of_longitude.append(off / one.errors.longitude)
+    nearest = max(poles, key=lambda x: direction(x.estimates) @ truth.pole)
+    pole, spread = nearest.estimates, nearest.errors
+    off = pole.longitude - np.arctan2(truth.pole[1], truth.pole[0])
+    off = (off + np.pi) % (2 * np.pi) - np.pi
     rows = [
         (
             estimates.precession_period,
@@ -75,13 +86,13 @@ def pulls(alias, mirror, truth):
             truth.precession_period,
         ),
         (estimates.rotation_period, errors.rotation_period, truth.rotation_period),
-        (estimates.latitude, errors.latitude, np.arcsin(truth.pole[2])),
+        (pole.latitude, spread.latitude, np.arcsin(truth.pole[2])),
         *zip(estimates.moments, errors.moments, moments, strict=True),
         *zip(estimates.axis_ratios, errors.axis_ratios, ratios, strict=True),
         (estimates.energy_ratio, errors.energy_ratio, energy),
+        (off, spread.longitude, 0.0),
     ]
-    found = [float((value - true) / error) for value, error, true in rows]
-    return np.array([*found, float(min(of_longitude, key=abs))])
+    return np.array([float((value - true) / error) for value, error, true in rows])
 
 
 def one_body(seed, mode, case):
@@ -137,7 +148,7 @@ def main(bodies, case, write):
         ("more than one tumbler fits", sum(len(x[2].aliases) > 1 for x in rows)),
     ]
     names = ["P_phi", "P_psi", "latitude", "I1/I3", "I2/I3", "b/a", "c/b"]
-    names += ["E/E0", "longitude of the momentum or of its mirror"]
+    names += ["E/E0", "longitude"]
     shares = ", ".join(f"{n} {x:.2f}" for n, x in zip(names, covered, strict=True))
     text = (
         common.table(["what", f"of {bodies} bodies"], counts)

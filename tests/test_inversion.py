@@ -13,6 +13,7 @@ from jrigid import photometry as ph
 from jrigid.photometry import _alias as alias
 from jrigid.photometry import _inversion
 from jrigid.photometry import _model as model
+from jrigid.photometry import _periodogram as periodogram
 from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
 from jrigid.photometry import _search as search
@@ -331,24 +332,26 @@ def test_planned_curves_tell_aliases_apart(inversion):
     upper = np.triu_indices(3, 1)
     assert np.all(plan.growth[upper] > 25) or len(plan.chosen) == 4
     text = plan.report()
-    for index, pairs in zip(plan.chosen, plan.first, strict=True):
+    for index, pairs in zip(plan.chosen, plan.decided, strict=True):
         assert f"curve {index}, JD 24562" in text or f"curve {index}, JD 24563" in text
         for i, j in pairs:
             assert f"{i} from {j} (" in text
-    assert sum(len(x) for x in plan.first) == np.sum(plan.growth[upper] > 25)
+    assert sum(len(x) for x in plan.decided) == np.sum(plan.growth[upper] > 25)
 
 
-def test_a_growth_is_that_of_curves_which_are_observed(inversion):
-    """Chi-square of the wrong alias, fitted again to simulated nights of the right one.
-
-    A second fit moves the numbers by one Gauss-Newton step of all curves, old and new.
-    """
+def test_a_growth_is_the_least_one_of_two_aliases_that_may_change(inversion):
+    """By least squares in the numbers of both, which their old curves hold."""
     curves, _, found = inversion
     right, wrong = found.aliases[0], found.rejected[0]
     several = dataclasses.replace(found, aliases=[right, wrong])
     planned = curves[:3]
     expected = several.choose_nights(planned, 0.02, threshold=1e9).growth[0, 1]
     predicted = several._predictions(planned, 0.02)
+    # Of relative curves, a factor each is unknown.
+    points = [predicted.of_curve == k for k in range(3)]
+    for values in (predicted.rows.T, np.moveaxis(predicted.slopes, 1, 0)):
+        for of_curve in points:
+            values[of_curve] -= values[of_curve].mean(axis=0)
     difference = predicted.rows[1] - predicted.rows[0]
     # The numbers of both may change: their old curves hold them by the covariances.
     rows = [difference]
@@ -365,6 +368,62 @@ def test_a_growth_is_that_of_curves_which_are_observed(inversion):
     change = np.linalg.lstsq(stacked, target, rcond=None)[0]
     left = np.sum((stacked @ change - target) ** 2)
     np.testing.assert_allclose(left, expected, rtol=1e-3)
+
+
+def test_calibrated_curves_of_a_plan_share_a_factor_of_the_chosen_ones(inversion):
+    curves, _, found = inversion
+    several = dataclasses.replace(found, aliases=[found.aliases[0], found.rejected[0]])
+    calibrated = [dataclasses.replace(x, is_relative=False) for x in curves[:3]]
+    apart = several.separation(calibrated, 0.02)
+    for k, curve in enumerate(calibrated):
+        alone = several.separation([curve], 0.02)[0]
+        np.testing.assert_allclose(apart[k], alone, rtol=1e-6, atol=1e-9)
+        # Alone, a factor of its own is as unknown as one that is shared.
+        relative = several.separation([curves[k]], 0.02)[0]
+        np.testing.assert_allclose(alone, relative, rtol=1e-6, atol=1e-9)
+    # Curves of huge noise are worth no night.
+    hopeless = several.choose_nights(calibrated, 50.0)
+    assert hopeless.chosen == []
+    assert "No choice of these curves tells apart 1 and 2 (0)" in hopeless.report()
+    empty = dataclasses.replace(
+        curves[0],
+        **{
+            name: getattr(curves[0], name)[:0]
+            for name in ("ts", "brightness", "to_sun", "to_observer")
+        },
+    )
+    with pytest.raises(ValueError, match="Curve 1 of `curves` must have a point"):
+        several.choose_nights([curves[0], empty], 0.02)
+    lost = dataclasses.replace(curves[0], to_sun=0 * curves[0].to_sun)
+    with pytest.raises(ValueError, match="Curve 0 of `curves` must have finite times"):
+        several.separation([lost], 0.02)
+
+
+def test_few_points_have_candidates_by_constant_coefficients(inversion):
+    """Of a third of the points, a series that is modulated follows too many pairs."""
+    curves, truth, _ = inversion
+    few = [
+        dataclasses.replace(
+            x,
+            **{
+                name: getattr(x, name)[::3]
+                for name in ("ts", "brightness", "to_sun", "to_observer")
+            },
+        )
+        for x in curves
+    ]
+    data, _ = readings.readings_of(few, 0.02)
+    assert np.all(periodogram.modulations(data)[:, 1:] == 0)
+    data, _ = readings.readings_of(curves, 0.02)
+    assert np.any(periodogram.modulations(data)[:, 1:] != 0)
+    pairs = ph.period_pairs(few, 8 * HOUR, 400 * HOUR, count=150)
+    span = max(x.ts.max() for x in curves) - min(x.ts.min() for x in curves)
+    apart = np.maximum(
+        abs(span / pairs.precession_period - span / truth.precession_period),
+        abs(span / pairs.rotation_period - span / truth.rotation_period),
+    )
+    # The search looks half a cycle to each side, too.
+    assert apart.min() < 1.0
 
 
 def test_errors_weigh_points_and_factors_of_bands_are_taken_out(rng):

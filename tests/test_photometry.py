@@ -313,6 +313,13 @@ def test_a_body_under_a_torque_has_the_light_of_its_motion():
         for x in zip(turned.inv().apply(sun), turned.inv().apply(observer), strict=True)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
+    # In another order, and seen later by the light time.
+    turn = np.array([3, 0, 6, 1, 2, 5, 4])
+    far = 299792458.0 * observer / np.linalg.norm(observer[0])
+    later = ph.light_curve(body, start, ts[turn] + 1.0, sun, far, shape)
+    np.testing.assert_allclose(later, np.array(expected)[turn], rtol=1e-6)
+    with pytest.raises(ValueError, match="must not be later than the first light"):
+        ph.light_curve(body, start, ts, sun, far, shape)
 
 
 def test_a_light_curve_has_derivatives_in_all_that_a_fit_seeks():

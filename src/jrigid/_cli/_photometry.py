@@ -81,7 +81,10 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
         "--report", action="store_true", help="find the tumblers, with errors"
     )
     command.add_argument(
-        "--noise", type=float, metavar="MAG", help="of a point; else it is estimated"
+        "--noise",
+        type=float,
+        metavar="MAG",
+        help="of a point; else that of the file, or it is estimated",
     )
     command.add_argument(
         "--mode",

@@ -207,7 +207,7 @@ def estimates_at(vector: Array, task: Task, span: Array) -> Estimates:
         rotation_period=jnp.where(
             tumbles, span / jnp.where(tumbles, numbers.cycles[1], 1.0), jnp.nan
         ),
-        longitude=jnp.arctan2(pole[1], pole[0]),
+        longitude=jnp.arctan2(pole[1], pole[0]) % (2 * jnp.pi),
         latitude=jnp.arcsin(jnp.clip(pole[2], -1.0, 1.0)),
         energy_ratio=jnp.where(tumbles, energy, 1.0),
         moments=jnp.where(tumbles, moments[:2], jnp.nan),

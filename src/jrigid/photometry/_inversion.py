@@ -97,8 +97,9 @@ class Inversion:
             noise: Standard deviation of a point [mag].
 
         Returns:
-            For each curve and pair of aliases, the expected growth of chi-square if one
-            of the pair is true, after both are fitted again. Above 25 the curve decides.
+            For each curve and pair of aliases, by how much the chi-square of the wrong
+            one grows at least: both may still change within their errors, and are taken
+            where they are nearest. Above 25 the curve decides.
         """
         predicted = self._predictions(curves, noise)
         return np.array(
@@ -114,11 +115,11 @@ class Inversion:
             curves: Light curves with the epochs and the geometry that are possible;
                 their brightness is not used.
             noise: Standard deviation of a point [mag].
-            threshold: Expected growth of chi-square at which a pair is apart.
+            threshold: Growth of chi-square at which a pair is apart.
 
         Returns:
             The chosen curves. They are few, but another choice may be as short: each
-            curve is the best one beside those before it.
+            curve is the best one beside those before it. The mirror is not considered.
         """
         predicted = self._predictions(curves, noise)
         return chosen_nights(predicted, self.aliases, curves, threshold)
@@ -373,7 +374,10 @@ def _verdict(inversion: Inversion) -> str:
     """What the table says, in a sentence."""
     count = len(inversion.aliases)
     points = f"chi-square over {inversion.degrees_of_freedom} degrees of freedom"
-    value = f"{points} is {inversion.reduced_chi_square:.2f}"
+    value = (
+        f"{points} is {inversion.reduced_chi_square:.2f} for a noise of "
+        f"{inversion.noise:.4f} mag"
+    )
     if not inversion.follows:
         return (
             "No tumbler was found that follows the light curves to their noise: "

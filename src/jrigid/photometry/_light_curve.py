@@ -4,9 +4,10 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jrigid._checks import RESULTS, demand, nan_where, shaped
+from jrigid._checks import RESULTS, demand, is_concrete, nan_where, shaped
 from jrigid._numerics import product, safe_arctan2, safe_norm
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State
@@ -87,7 +88,8 @@ def light_curve(
         inertia: Principal moments, or a symmetric tensor in body axes [kg m^2]; or a
             `RigidBody`, whose torque needs no `args`.
         state0: State at `t0`.
-        ts: Epochs [s], in any order; of a `RigidBody` rising, from `t0` on.
+        ts: Epochs [s], in any order. The light of a `RigidBody` must leave it at `t0` or
+            later.
         to_sun: Vectors from the body to the Sun at the epochs, space axes [m].
         to_observer: Vectors from the body to the observer, space axes [m].
         shape: `Facets` or an `Ellipsoid`, in body axes.
@@ -100,6 +102,10 @@ def light_curve(
     Returns:
         Brightness at unit distances [m^2], as by `brightness`. NaN for an inertia, a
         state or times that no body has.
+
+    Raises:
+        ValueError: Not one vector for each epoch, or light of a `RigidBody` from before
+            `t0`, if both are known when the function is called.
 
     Gradients: exact in all arguments, as those of `free_rotation` and `brightness`.
     They are of any order, but for an ellipsoid at a phase angle of 0 of first order.
@@ -125,8 +131,16 @@ def light_curve(
         ts = ts - safe_norm(to_observer) / SPEED_OF_LIGHT
     # An invalid motion raises no error here: its curve is NaN below.
     if isinstance(inertia, RigidBody):
-        run = simulate(inertia, state0, ts, t0=t0, throw=False)
-        attitude, result = run.states.attitude, run.result
+        demand(
+            not (is_concrete(ts) and is_concrete(t0)) or bool(np.all(ts >= t0)),
+            "Argument `t0` must not be later than the first light that is seen, but it "
+            "is. (With `light_time` the light left the body before `ts`.)",
+        )
+        order = jnp.argsort(ts)
+        run = simulate(inertia, state0, ts[order], t0=t0, throw=False)
+        attitude = jnp.zeros_like(run.states.attitude)
+        attitude = attitude.at[order].set(run.states.attitude)
+        result = run.result
     else:
         motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
         attitude, result = motion.attitude, motion.result

@@ -14,6 +14,10 @@ from jrigid.photometry._files import LightCurve
 from jrigid.photometry._readings import readings_of
 
 _DAY = 86400.0
+# Of a column of factors in the chosen points; its size in all of them is 1.
+_LEAST_SIZE = 1e-9
+# Gain of all growths of chi-square that is worth a curve, over the threshold.
+_LEAST_GAIN = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,16 +26,16 @@ class NightPlan:
 
     Attributes:
         chosen: Indices of the curves, the most useful one first.
-        growth: Expected growth of chi-square by all of them for each pair of aliases,
-            if one of the pair is true and the other one is fitted.
-        first: Pairs of aliases (ranks from 1) that each chosen curve tells apart first.
+        growth: For each pair of aliases, the growth of chi-square by all of these
+            curves that the wrong one of the pair has at least.
+        decided: Pairs of aliases (ranks from 1) that each chosen curve tells apart first.
         threshold: Growth above which a pair is apart.
         dates: Julian dates of the first and last point of each chosen curve.
     """
 
     chosen: list[int]
     growth: Float[np.ndarray, "aliases aliases"]
-    first: list[list[tuple[int, int]]]
+    decided: list[list[tuple[int, int]]]
     threshold: float
     dates: list[tuple[float, float]]
 
@@ -44,13 +48,15 @@ class Predictions(NamedTuple):
     """What aliases predict for planned light curves, over the noise.
 
     Attributes:
-        rows: Of each alias, but for what all predictions have in common.
+        rows: Of each alias, but for the sign.
         slopes: Derivatives in the numbers of the alias.
+        basis: Columns that unknown factors of the curves add.
         of_curve: Index of the curve of each point.
     """
 
     rows: Float[np.ndarray, "aliases points"]
     slopes: Float[np.ndarray, "aliases points 11"]
+    basis: Float[np.ndarray, "points factors"]
     of_curve: np.ndarray
 
 
@@ -74,12 +80,20 @@ def predictions(
     readings, middle = readings_of(plain, noise)
     there = readings.weights > 0
     ts = np.where(there, readings.ts + (middle - epoch) * _DAY, 0.0)
-    readings = readings._replace(ts=ts, span=np.asarray(span))
+    basis = readings.basis
+    # Unknown factors are taken out later, of the curves that are chosen.
+    readings = readings._replace(
+        ts=ts,
+        span=np.asarray(span),
+        values=np.zeros_like(readings.values),
+        basis=np.zeros_like(basis),
+    )
     # The last row is no point, but the equation between the periods.
     pairs = [rows_at(x.numbers, x.task, readings) for x in aliases]
     return Predictions(
         rows=np.stack([np.asarray(rows)[:-1][there] for rows, _ in pairs]),
         slopes=np.stack([np.asarray(slopes)[:-1][there] for _, slopes in pairs]),
+        basis=basis[there],
         of_curve=np.repeat(np.arange(len(curves)), [len(x.ts) for x in curves]),
     )
 
@@ -87,14 +101,20 @@ def predictions(
 def growths(
     predicted: Predictions, aliases: Sequence[Alias], chosen: Sequence[int]
 ) -> Float[np.ndarray, "aliases aliases"]:
-    """Expected growth of chi-square by some of the curves together, for each pair.
+    """Least growth of chi-square by some of the curves together, for each pair.
 
     The difference of the predictions is compared with the noise and with what both
-    predictions may still change by, each by its own covariance.
+    predictions may still change by, each by its own covariance: both aliases move until
+    they are as near as they can be.
     """
     points = np.isin(predicted.of_curve, chosen)
     rows = predicted.rows[:, points]
     slopes = predicted.slopes[:, points]
+    # Factors are known from the chosen points alone.
+    left, sizes, _ = np.linalg.svd(predicted.basis[points], full_matrices=False)
+    factors = left[:, sizes > _LEAST_SIZE]
+    rows = rows - (rows @ factors) @ factors.T
+    slopes = slopes - np.einsum("pf,qf,aqn->apn", factors, factors, slopes)
     count = len(aliases)
     result = np.zeros((count, count))
     for i, j in itertools.combinations(range(count), 2):
@@ -122,7 +142,7 @@ def chosen_nights(
         threshold > 0, f"Argument `threshold` must be positive, but it is {threshold}."
     )
     chosen: list[int] = []
-    first: list[list[tuple[int, int]]] = []
+    decided: list[list[tuple[int, int]]] = []
     growth = np.zeros((len(aliases), len(aliases)))
     upper = np.triu(np.ones_like(growth, bool), 1)
     while np.any(growth[upper] < threshold) and len(chosen) < len(curves):
@@ -130,20 +150,23 @@ def chosen_nights(
         trials = [growths(predicted, aliases, [*chosen, k]) for k in left]
         gains = [np.sum(np.minimum(x[upper], threshold)) for x in trials]
         best = int(np.argmax(gains))
+        gain = gains[best] - np.sum(np.minimum(growth[upper], threshold))
+        if gain < _LEAST_GAIN * threshold:
+            break
         apart = upper & (trials[best] >= threshold) & (growth < threshold)
         growth = trials[best]
         chosen.append(left[best])
-        first.append([(int(i) + 1, int(j) + 1) for i, j in np.argwhere(apart)])
-    times = [curves[k].epoch + curves[k].ts[[0, -1]] / _DAY for k in chosen]
+        decided.append([(int(i) + 1, int(j) + 1) for i, j in np.argwhere(apart)])
+    times = [curves[k].epoch + np.sort(curves[k].ts)[[0, -1]] / _DAY for k in chosen]
     dates = [(float(start), float(end)) for start, end in times]
-    return NightPlan(chosen, growth, first, threshold, dates)
+    return NightPlan(chosen, growth, decided, threshold, dates)
 
 
 def _report(plan: NightPlan) -> str:
     """The plan in words."""
     lines = []
     for index, (start, end), pairs in zip(
-        plan.chosen, plan.dates, plan.first, strict=True
+        plan.chosen, plan.dates, plan.decided, strict=True
     ):
         told = ", ".join(
             f"{i} from {j} ({plan.growth[i - 1, j - 1]:.0f})" for i, j in pairs
@@ -159,11 +182,11 @@ def _report(plan: NightPlan) -> str:
         if plan.growth[i, j] < plan.threshold
     ]
     if missed:
-        lines.append(f"These curves do not tell apart {', '.join(missed)}.")
+        lines.append(f"No choice of these curves tells apart {', '.join(missed)}.")
     elif count < 2:
         lines.append("There is one alias, so that nothing must be told apart.")
     lines.append(
-        "In brackets: the expected growth of chi-square by all of these curves, of "
-        f"which {plan.threshold:g} decides."
+        "In brackets: by how much the chi-square of the wrong one grows at least, by all "
+        f"of these curves; {plan.threshold:g} decides."
     )
     return "\n".join(lines)

@@ -44,9 +44,9 @@ class Orbit(Readable):
         semi_major_axis: [m], positive.
         eccentricity: From 0 to below 1.
         inclination: To the ecliptic, from 0 to pi [rad].
-        node: Longitude of the ascending node [rad].
-        argument_of_perihelion: From the node [rad].
-        mean_anomaly: At the epoch [rad].
+        node: Longitude of the ascending node, from -2 pi to 2 pi [rad].
+        argument_of_perihelion: From the node, from -2 pi to 2 pi [rad].
+        mean_anomaly: At the epoch, from -2 pi to 2 pi [rad].
         epoch: Julian date of the mean anomaly (TDB).
 
     Raises:
@@ -83,6 +83,13 @@ class Orbit(Readable):
             "Argument `inclination` must be from 0 to pi, in radians, but it is "
             f"{self.inclination}. (Angles of catalogues are in degrees.)",
         )
+        for name in ("node", "argument_of_perihelion", "mean_anomaly"):
+            angle = getattr(self, name)
+            demand(
+                abs(angle) <= 2 * np.pi * (1 + 1e-9),
+                f"Argument `{name}` must be from -2 pi to 2 pi, in radians, but it is "
+                f"{angle}. (Angles of catalogues are in degrees.)",
+            )
         demand(
             0 <= self.eccentricity < 1,
             "Argument `eccentricity` must be from 0 to below 1, but it is "
@@ -184,7 +191,8 @@ def geometry_of_table(
     """Directions of the Sun and of the observer from a table, as of an ephemeris.
 
     Args:
-        julian_dates: Of observation, increasing; a row a day or more often.
+        julian_dates: Of observation, increasing. A row a day is good for a body in the
+            main belt, and one an hour for one that passes the Earth.
         to_sun: From the body, where the light left it, to the Sun [m, ecliptic].
         to_observer: From the body to the observer [m, ecliptic].
 

@@ -37,6 +37,9 @@ _APART = 0.5
 _LINES_APART = 0.6
 # A bisector that moves by less than this [rad, root mean square] modulates nothing.
 _LEAST_MOTION = 0.02
+# Points for each number of a series, below which its coefficients stay constant: with
+# fewer the series of many wrong pairs follow the curves.
+_POINTS_A_NUMBER = 5
 # Added to the diagonal of the normal equations, as a fraction of its mean: some series
 # hold the same line twice.
 _RIDGE = 1e-4
@@ -74,7 +77,7 @@ def period_pairs(
 
     A light curve of a tumbler is a Fourier series in its two frequencies, with
     coefficients that change with the direction from which it is seen: they are linear
-    in that direction here. One of the strongest lines of the periodogram is taken for
+    in that direction here, but constant if there are few points. One of the strongest lines of the periodogram is taken for
     one of the lines 2 f_phi, 2 (f_phi - f_psi) and others; the second frequency is then
     sought on a grid.
 
@@ -199,8 +202,15 @@ def unlike(
 
 
 def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
-    """1, and how far the bisector is along the two directions in which it moves most."""
+    """1, and how far the bisector is along the two directions in which it moves most.
+
+    Few points have 0 in place of these.
+    """
     there = readings.weights > 0
+    factors = np.count_nonzero(np.any(readings.basis != 0, axis=0))
+    numbers = 3 * 2 * len(_SERIES) + factors
+    if np.count_nonzero(there) < _POINTS_A_NUMBER * numbers:
+        return np.stack([there, 0 * there, 0 * there], axis=1).astype(float)
     both = (readings.to_sun + readings.to_observer)[there]
     # Zero where the Sun is straight behind the body, where there is no light either.
     length = np.linalg.norm(both, axis=1, keepdims=True)

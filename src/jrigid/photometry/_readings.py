@@ -100,6 +100,7 @@ def readings_of(
     demand(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
+    _check_geometry(curves)
     demand(
         bool(np.all((noise > 0) & np.isfinite(noise))),
         f"Argument `noise` must be positive and finite, but it is {noise}.",
@@ -127,6 +128,27 @@ def readings_of(
         span=np.asarray(np.ptp(ts)),
     )
     return filled(readings), epoch + middle / _DAY
+
+
+def _check_geometry(curves: Sequence[LightCurve]) -> None:
+    """Raise ValueError for a curve without points, or with what is no direction."""
+    for index, curve in enumerate(curves):
+        count = np.size(curve.ts)
+        vectors = [np.asarray(x) for x in (curve.to_sun, curve.to_observer)]
+        demand(
+            count > 0
+            and np.shape(curve.brightness) == (count,)
+            and all(x.shape == (count, 3) for x in vectors),
+            f"Curve {index} of `curves` must have a point or more, and a brightness and "
+            "two vectors for each point, but it has not.",
+        )
+        lengths = np.linalg.norm(vectors, axis=-1)
+        demand(
+            bool(np.all(np.isfinite(curve.ts)))
+            and bool(np.all(np.isfinite(lengths) & (lengths > 0))),
+            f"Curve {index} of `curves` must have finite times and vectors other than 0, "
+            "but it has not.",
+        )
 
 
 def filled(readings: Readings) -> Readings:

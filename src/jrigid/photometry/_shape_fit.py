@@ -65,6 +65,8 @@ _STEPS = 200  # for each of these weights
 _LINKS = (300.0, 1e4, 1e6)
 # A ratio of semi-axes that is 1 or 0 has no logit.
 _LEAST_RATIO = 1e-3
+# Ratios of semi-axes nearer to 0 or 1 than this are at their limit.
+_AT_LIMIT = 0.02
 # Of the numbers of the motion, two are the axes of an ellipsoid, which facets replace.
 _SOUGHT = np.concatenate(
     Numbers(
@@ -121,6 +123,10 @@ class ShapeFit:
             and the numbers deviate from what is expected, over its spread.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
+        follows: Whether the fit follows the curves to their noise, if that is stated.
+            Else nothing is known of it, and it is True.
+        is_at_limit: Whether the moments are those of a flat or a round body, at the
+            limit of real ones: the fit may have gone astray.
         open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
             closed surface.
         residuals: Of each point of the curves, in their order [mag].
@@ -134,6 +140,8 @@ class ShapeFit:
     chi_square: float
     reduced_chi_square: float
     degrees_of_freedom: int
+    follows: bool
+    is_at_limit: bool
     open_share: float
     residuals: Float[np.ndarray, " epochs"] = dataclasses.field(repr=False)
 
@@ -159,14 +167,15 @@ def fit_shape(
 
     `find_tumblers` tells tumblers apart as ellipsoids. This takes one of its aliases,
     or a solution that is published, and fits its motion, its moments of inertia and a
-    convex surface at once. To compare aliases, fit each one and compare the values of
-    `chi_square`. The moments are sought apart from the shape.
+    convex surface at once. To compare aliases, fit each one with the same stated noise
+    and compare the values of `chi_square`; with a noise that each fit finds for itself,
+    compare `noise`. The moments are sought apart from the shape.
 
     Args:
         curves: Light curves, corrected for the light time.
         tumbler: Where the fit starts. It is a short-axis or long-axis mode, and its
-            periods count the turns within the curves rightly. The shape starts as its
-            ellipsoid; facets are replaced by an ellipsoid with the tumbler's moments.
+            periods count the turns within the curves rightly. Its moments must be near:
+            far ones may end in another minimum. The shape starts as its ellipsoid; facets are replaced by an ellipsoid with the tumbler's moments.
         noise: Standard deviation of a point [mag]. None: the `errors` of the curves if
             all have them. Else it is what the fit leaves, and a misfit cannot be seen.
         epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
@@ -230,7 +239,8 @@ def fit_shape(
         # moves with it.
         readings, _ = readings_of(curves, float(found))
         vector, quadratic = _minimum(vector, task, surface, readings)
-    return _fit(vector, quadratic, task, surface, readings, middle)
+    stated = known is not None
+    return _fit(vector, quadratic, task, surface, readings, middle, stated)
 
 
 def _task(tumbler: Tumbler) -> Task:
@@ -357,6 +367,7 @@ def _fit(
     surface: Surface,
     readings: Readings,
     middle: float,
+    stated: bool,
 ) -> ShapeFit:
     """What was found."""
     free = freedom(readings, surface)
@@ -380,10 +391,20 @@ def _fit(
         chi_square=float(quadratic.chi_square),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
+        # Within the noise, chi-square over its degrees of freedom has the standard
+        # deviation sqrt(2 / free). Five of them are allowed.
+        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / free)),
+        is_at_limit=_is_at_limit(np.asarray(numbers.motion)),
         open_share=float(np.linalg.norm(openness(numbers.shape, surface))),
         # A magnitude falls where the logarithm of the brightness grows.
         residuals=-residuals / (readings.weights[there] * MAGNITUDE),
     )
+
+
+def _is_at_limit(motion: Float[np.ndarray, " 11"]) -> bool:
+    """Whether the ellipsoid of the moments is flat, or round about an axis."""
+    ratios = 1 / (1 + np.exp(-unpacked(motion).inertia))
+    return bool(np.any((ratios < _AT_LIMIT) | (ratios > 1 - _AT_LIMIT)))
 
 
 @jax.jit
@@ -431,8 +452,21 @@ def _report(fit: ShapeFit) -> str:
             ("I1/I3", "I2/I3"), x.moments, error.moments, strict=True
         )
     )
+    warnings = []
+    if not fit.follows:
+        warnings.append(
+            "The fit does not follow the light curves to their noise: its periods, the "
+            "epoch or the moments of the start are wrong, the noise is larger than "
+            "stated, or the body is far from convex. The errors mean nothing."
+        )
+    if fit.is_at_limit:
+        warnings.append(
+            "The moments are those of a flat body, or of one that is round about an "
+            "axis: the fit may have gone astray. Start from other moments."
+        )
     return "\n".join(
         [
+            *warnings,
             f"{fit.tumbler.mode} mode of a convex body: chi-square over "
             f"{fit.degrees_of_freedom} degrees of freedom is "
             f"{fit.reduced_chi_square:.2f} for a noise of {fit.noise:.4f} mag",
