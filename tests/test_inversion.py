@@ -13,6 +13,7 @@ from jrigid import photometry as ph
 from jrigid.photometry import _alias as alias
 from jrigid.photometry import _inversion
 from jrigid.photometry import _model as model
+from jrigid.photometry import _nights as nights
 from jrigid.photometry import _periodogram as periodogram
 from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
@@ -345,8 +346,8 @@ def test_a_growth_is_the_least_one_of_two_aliases_that_may_change(inversion):
     right, wrong = found.aliases[0], found.rejected[0]
     several = dataclasses.replace(found, aliases=[right, wrong])
     planned = curves[:3]
-    expected = several.choose_nights(planned, 0.02, threshold=1e9).growth[0, 1]
     predicted = several._predictions(planned, 0.02)
+    expected = nights.growths(predicted, several.aliases, range(3))[0, 1]
     # Of relative curves, a factor each is unknown.
     points = [predicted.of_curve == k for k in range(3)]
     for values in (predicted.rows.T, np.moveaxis(predicted.slopes, 1, 0)):
