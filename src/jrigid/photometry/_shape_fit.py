@@ -214,6 +214,7 @@ def fit_shape(
     >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
     >>> found = jr.photometry.fit_shape(
     ...     [curve], body, 0.01, epoch=0.0, degree=3, facets=64)
+    >>> # found.estimates and found.errors are ShapeEstimates
     >>> print((found.estimates.rotation_period / hour).round(1))
     25.0
     """
