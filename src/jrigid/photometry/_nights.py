@@ -31,6 +31,12 @@ class NightPlan:
         decided: Pairs of aliases (ranks from 1) that each chosen curve tells apart first.
         threshold: Growth above which a pair is apart.
         dates: Julian dates of the first and last point of each chosen curve.
+
+    >>> import numpy as np, jrigid as jr
+    >>> growth = np.array([[0.0, 80.0], [80.0, 0.0]])
+    >>> plan = jr.photometry.NightPlan([3], growth, [[(1, 2)]], 25.0, [(10.5, 10.6)])
+    >>> print(plan.report().splitlines()[0])  # as `Inversion.choose_nights` returns it
+    curve 3, JD 10.50 to 10.60: tells 1 from 2 (80) apart
     """
 
     chosen: list[int]
