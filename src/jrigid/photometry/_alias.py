@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ from jrigid._numerics import product
 from jrigid._types import AnyArray
 from jrigid.photometry._ellipsoid import Ellipsoid
 from jrigid.photometry._model import (
-    COUNT,
     Geometry,
     Mode,
     Numbers,
@@ -27,7 +26,7 @@ from jrigid.photometry._model import (
     sought,
     unpacked,
 )
-from jrigid.photometry._readings import MAGNITUDE, Readings
+from jrigid.photometry._readings import Readings
 from jrigid.photometry._tumbler import Tumbler
 
 MODES = {
@@ -35,6 +34,7 @@ MODES = {
     "short-axis": Mode.short_axis,
     "long-axis": Mode.long_axis,
 }
+Errors = TypeVar("Errors")
 _NAMES = {mode: name for name, mode in MODES.items()}
 # Least eigenvalue of a scaled normal matrix: no error is more than this^-1/2 larger.
 _LEAST = 1e-15
@@ -94,28 +94,18 @@ def alias_of(
 ) -> Alias:
     """One row of the table, without its weight."""
     rows, slopes = rows_at(numbers, task, readings)
-    seeks = np.asarray(sought(task))
     normal = np.asarray(slopes).T @ np.asarray(slopes)
-    covariance = np.zeros((COUNT, COUNT))
-    covariance[np.ix_(seeks, seeks)] = scale * inverse_normal(
-        normal[np.ix_(seeks, seeks)]
-    )
+    covariance = scale * covariance_of(normal, np.asarray(sought(task)))
     span = np.asarray(readings.span)
     estimates, of_numbers = _estimates_and_slopes(numbers, task, span)
-    errors = jax.tree.map(
-        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), of_numbers
-    )
-    there = readings.weights > 0
-    # The last row is no point, but the equation between the periods.
-    residuals = np.asarray(rows)[:-1][there] / (readings.weights[there] * MAGNITUDE)
     return Alias(
         tumbler=tumbler_of(numbers, task, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
-        errors=errors,
+        errors=errors_of(of_numbers, covariance),
         chi_square=float(np.sum(np.asarray(rows) ** 2)),
         weight=0.0,
-        # A magnitude falls where the logarithm of the brightness grows.
-        residuals=-residuals,
+        # The last row is no point, but the equation between the periods.
+        residuals=readings.in_magnitudes(np.asarray(rows)[:-1]),
         numbers=numbers,
         task=task,
         covariance=covariance,
@@ -125,7 +115,22 @@ def alias_of(
 rows_at = jax.jit(rows_of)
 
 
-def inverse_normal(normal: np.ndarray) -> np.ndarray:
+def covariance_of(normal: np.ndarray, seeks: np.ndarray) -> np.ndarray:
+    """Covariance of the numbers that are sought; 0 of the others."""
+    covariance = np.zeros_like(normal)
+    inside = np.ix_(seeks, seeks)
+    covariance[inside] = _inverse_normal(normal[inside])
+    return covariance
+
+
+def errors_of(slopes: Errors, covariance: np.ndarray) -> Errors:
+    """Standard errors of estimates, from their derivatives in the numbers."""
+    return jax.tree.map(
+        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
+    )
+
+
+def _inverse_normal(normal: np.ndarray) -> np.ndarray:
     """Inverse of a normal matrix, by its scale.
 
     Along what is not determined it is finite, and at most 1e15 in units in which the

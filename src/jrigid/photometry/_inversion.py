@@ -25,7 +25,12 @@ from jrigid.photometry._nights import (
 )
 from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import Readings, readings_of, stated_noise
+from jrigid.photometry._readings import (
+    Readings,
+    is_within_noise,
+    readings_of,
+    stated_noise,
+)
 from jrigid.photometry._search import Found, mirrored, search
 
 _INERTIA = ("homogeneous", "free")
@@ -38,8 +43,7 @@ _ROUND = (
     "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
     "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
 )
-# Standard deviations: a correlation of neighbouring residuals, or a chi-square, that is
-# no chance.
+# Standard deviations of a correlation of neighbouring residuals that is no chance.
 _SURE = 5.0
 # Radians between the momenta of a tumbler and of its mirror within which they are one.
 _ONE_POLE = 0.2
@@ -236,9 +240,7 @@ def _inversion(
         width: Of the range of frequencies that were searched [cycles].
     """
     tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
-    # Columns of zeros fill the array up to a few sizes.
-    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
-    unknown = factors + int(np.count_nonzero(independent(tasks[0])))
+    unknown = readings.factor_count() + int(np.count_nonzero(independent(tasks[0])))
     freedom = points_of(curves) - unknown
     demand(
         freedom > 0,
@@ -257,10 +259,8 @@ def _inversion(
     near = int(np.count_nonzero(growth <= threshold))
     aliases = _weighted(every[:near], growth, width)
     correlation, deviations = _correlation(every[0].residuals, curves)
-    # Within the noise, chi-square over its degrees of freedom has the standard
-    # deviation sqrt(2 / freedom). A noise that was found makes it 1.
-    gate = 1 + _SURE * np.sqrt(2 / freedom)
-    follows = reduced < gate if stated else deviations < _SURE
+    # A noise that was found makes chi-square over its degrees of freedom 1.
+    follows = is_within_noise(reduced, freedom) if stated else deviations < _SURE
     noise = readings.typical_noise()
     return Inversion(
         aliases=aliases,

@@ -11,11 +11,9 @@ from jaxtyping import Float
 from jrigid._checks import demand
 from jrigid.photometry._alias import Alias, rows_at
 from jrigid.photometry._files import LightCurve
-from jrigid.photometry._readings import readings_of
+from jrigid.photometry._readings import orthonormal, readings_of
 
 _DAY = 86400.0
-# Of a column of factors in the chosen points; its size in all of them is 1.
-_LEAST_SIZE = 1e-9
 # Gain of all growths of chi-square that is worth a curve, over the threshold.
 _LEAST_GAIN = 0.04
 
@@ -117,8 +115,7 @@ def growths(
     rows = predicted.rows[:, points]
     slopes = predicted.slopes[:, points]
     # Factors are known from the chosen points alone.
-    left, sizes, _ = np.linalg.svd(predicted.basis[points], full_matrices=False)
-    factors = left[:, sizes > _LEAST_SIZE]
+    factors = orthonormal(predicted.basis[points])
     rows = rows - (rows @ factors) @ factors.T
     slopes = slopes - np.einsum("pf,qf,aqn->apn", factors, factors, slopes)
     count = len(aliases)

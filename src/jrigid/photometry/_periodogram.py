@@ -77,9 +77,9 @@ def period_pairs(
 
     A light curve of a tumbler is a Fourier series in its two frequencies, with
     coefficients that change with the direction from which it is seen: they are linear
-    in that direction here, but constant if there are few points. One of the strongest lines of the periodogram is taken for
-    one of the lines 2 f_phi, 2 (f_phi - f_psi) and others; the second frequency is then
-    sought on a grid.
+    in that direction here, but constant if there are few points. One of the strongest
+    lines of the periodogram is taken for one of the lines 2 f_phi, 2 (f_phi - f_psi)
+    and others; the second frequency is then sought on a grid.
 
     Args:
         curves: Light curves, relative or absolute.
@@ -207,8 +207,7 @@ def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
     Few points have 0 in place of these.
     """
     there = readings.weights > 0
-    factors = np.count_nonzero(np.any(readings.basis != 0, axis=0))
-    numbers = 3 * 2 * len(_SERIES) + factors
+    numbers = 3 * 2 * len(_SERIES) + readings.factor_count()
     if np.count_nonzero(there) < _POINTS_A_NUMBER * numbers:
         return np.stack([there, 0 * there, 0 * there], axis=1).astype(float)
     both = (readings.to_sun + readings.to_observer)[there]

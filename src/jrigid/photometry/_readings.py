@@ -16,6 +16,10 @@ MAGNITUDE = 0.4 * np.log(10.0)
 _DAY = 86400.0
 EPOCHS = 128  # arrays are filled up to whole blocks of epochs
 _FACTORS = 16  # and of unknown factors
+# Of a column of the basis, in the epochs that were chosen; its size in all is 1.
+_LEAST_SIZE = 1e-9
+# Standard deviations of chi-square that are no chance.
+_SURE = 5.0
 
 
 class Readings(NamedTuple):
@@ -49,6 +53,19 @@ class Readings(NamedTuple):
         """Logarithms over the noise, without the unknown factors."""
         whitened = logarithms * self.weights
         return whitened - self.factors(whitened)
+
+    def factor_count(self) -> int:
+        """How many unknown factors there are."""
+        # Columns of zeros fill the array up to a few sizes.
+        return int(np.count_nonzero(np.any(self.basis != 0, axis=0)))
+
+    def in_magnitudes(
+        self, rows: Float[np.ndarray, " epochs"]
+    ) -> Float[np.ndarray, " points"]:
+        """Residuals of the points [mag], from those of the logarithm over the noise."""
+        there = self.weights > 0
+        # A magnitude falls where the logarithm of the brightness grows.
+        return -rows[there] / (self.weights[there] * MAGNITUDE)
 
     def typical_noise(self) -> float:
         """Median of the standard deviations of the points [mag]."""
@@ -149,6 +166,22 @@ def _check_geometry(curves: Sequence[LightCurve]) -> None:
             f"Curve {index} of `curves` must have finite times and vectors other than 0, "
             "but it has not.",
         )
+
+
+def is_within_noise(reduced: float, freedom: int) -> bool:
+    """Whether chi-square over its degrees of freedom may be that of noise.
+
+    Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
+    """
+    return bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
+
+
+def orthonormal(
+    columns: Float[np.ndarray, "rows columns"],
+) -> Float[np.ndarray, "rows columns"]:
+    """Orthonormal columns that span the same, or zero: rows of a basis are no basis."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return left * (sizes > _LEAST_SIZE)
 
 
 def filled(readings: Readings) -> Readings:

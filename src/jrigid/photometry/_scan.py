@@ -23,14 +23,12 @@ from jrigid.photometry._model import (
     geometry_of,
     unpacked,
 )
-from jrigid.photometry._readings import EPOCHS, Readings, filled
+from jrigid.photometry._readings import EPOCHS, Readings, filled, orthonormal
 
 _POLES = 24
 _ANGLES = 8
 _LANES = 4  # motions at once: each has all directions as lanes of its own
 _KEPT = 2  # best directions of each motion
-# Of a column of the basis, in the epochs that were chosen; its size in all is 1.
-_LEAST_SIZE = 1e-9
 
 
 class Directions(NamedTuple):
@@ -64,9 +62,7 @@ def fewer_epochs(readings: Readings, count: int = EPOCHS) -> Readings:
     there = np.flatnonzero(readings.weights)
     even = np.linspace(0, len(there) - 1, min(count, len(there)))
     chosen = there[even.astype(int)]
-    # Some rows of orthonormal columns are not orthonormal.
-    left, sizes, _ = np.linalg.svd(readings.basis[chosen], full_matrices=False)
-    basis = left * (sizes > _LEAST_SIZE)
+    basis = orthonormal(readings.basis[chosen])
     values = readings.values[chosen]
     few = Readings(
         ts=readings.ts[chosen],

@@ -13,7 +13,13 @@ from jaxtyping import Array, Float
 from jrigid._checks import demand
 from jrigid._numerics import product
 from jrigid._types import AnyArray
-from jrigid.photometry._alias import MODES, estimates_at, inverse_normal, tumbler_of
+from jrigid.photometry._alias import (
+    MODES,
+    covariance_of,
+    errors_of,
+    estimates_at,
+    tumbler_of,
+)
 from jrigid.photometry._convex import (
     Motion,
     Placed,
@@ -40,8 +46,8 @@ from jrigid.photometry._model import (
 )
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
-    MAGNITUDE,
     Readings,
+    is_within_noise,
     readings_of,
     stated_noise,
 )
@@ -235,7 +241,8 @@ def fit_shape(
     start = _start(tumbler, surface, later, float(readings.span))
     vector, quadratic = _minimum(start, task, surface, readings)
     if known is None:
-        found = FIRST_NOISE * np.sqrt(_light(vector, task, surface, readings) / free)
+        residuals = np.asarray(_residuals(vector, task, surface, readings))
+        found = FIRST_NOISE * np.sqrt(np.sum(np.square(residuals)) / free)
         # Closure and expectations are weighed against the noise, so that the minimum
         # moves with it.
         readings, _ = readings_of(curves, float(found))
@@ -292,7 +299,7 @@ def _start(
     vector[: surface.motion] = np.concatenate(motion)
     shape = tumbler.shape
     axes = np.asarray(shape.semi_axes) if isinstance(shape, Ellipsoid) else of_moments
-    vector[surface.motion + 7 :] = ellipsoid_harmonics(surface, axes)
+    vector[-surface.harmonics.shape[1] :] = ellipsoid_harmonics(surface, axes)
     return vector
 
 
@@ -353,14 +360,6 @@ def _minimum(
     return jax.tree.map(lambda x: np.asarray(x)[0], (numbers, quadratic))
 
 
-def _light(
-    vector: np.ndarray, task: Task, surface: Surface, readings: Readings
-) -> float:
-    """Chi-square of the light."""
-    residuals = _residuals(vector, task, surface, readings)
-    return float(np.sum(np.square(residuals)))
-
-
 def _fit(
     vector: np.ndarray,
     quadratic: Quadratic,
@@ -372,33 +371,25 @@ def _fit(
 ) -> ShapeFit:
     """What was found."""
     free = freedom(readings, surface)
-    reduced = _light(vector, task, surface, readings) / free
-    sought = np.ix_(surface.sought, surface.sought)
-    covariance = np.zeros((vector.size, vector.size))
-    covariance[sought] = max(reduced, 1.0) * inverse_normal(quadratic.normal[sought])
+    residuals = np.asarray(_residuals(vector, task, surface, readings))
+    reduced = float(np.sum(np.square(residuals))) / free
+    covariance = covariance_of(quadratic.normal, surface.sought)
+    covariance = max(reduced, 1.0) * covariance
     estimates, slopes = _estimates_and_slopes(vector, task, surface, readings)
-    errors = jax.tree.map(
-        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
-    )
-    there = readings.weights > 0
-    residuals = np.asarray(_residuals(vector, task, surface, readings))[there]
     numbers = unpacked_convex(jnp.asarray(vector), surface.motion)
     return ShapeFit(
         tumbler=_tumbler(vector, task, surface, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
-        errors=errors,
+        errors=errors_of(slopes, covariance),
         epoch=middle,
         noise=readings.typical_noise(),
         chi_square=float(quadratic.chi_square),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
-        # Within the noise, chi-square over its degrees of freedom has the standard
-        # deviation sqrt(2 / free). Five of them are allowed.
-        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / free)),
+        follows=not stated or is_within_noise(reduced, free),
         is_at_limit=_is_at_limit(np.asarray(numbers.motion)),
         open_share=float(np.linalg.norm(openness(numbers.shape, surface))),
-        # A magnitude falls where the logarithm of the brightness grows.
-        residuals=-residuals / (readings.weights[there] * MAGNITUDE),
+        residuals=readings.in_magnitudes(residuals),
     )
 
 

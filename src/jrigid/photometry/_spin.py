@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jrigid._checks import check_option, demand, whole_number
 from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix
-from jrigid.photometry._alias import inverse_normal
+from jrigid.photometry._alias import covariance_of, errors_of
 from jrigid.photometry._convex import (
     SCATTERING,
     SPIN,
@@ -29,8 +29,8 @@ from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
 from jrigid.photometry._model import axes_of_momentum
 from jrigid.photometry._readings import (
-    MAGNITUDE,
     Readings,
+    is_within_noise,
     readings_of,
     stated_noise,
 )
@@ -303,8 +303,7 @@ def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
 def freedom(readings: Readings, surface: Surface) -> int:
     """Points less unknown factors and numbers."""
     points = int(np.count_nonzero(readings.weights))
-    factors = int(np.count_nonzero(np.any(readings.basis != 0, axis=0)))
-    unknown = factors + int(np.count_nonzero(surface.sought))
+    unknown = readings.factor_count() + int(np.count_nonzero(surface.sought))
     demand(
         points > unknown,
         f"Argument `curves` must hold more points than there are unknown numbers, but "
@@ -358,9 +357,7 @@ def _inversion(
         noise=readings.typical_noise(),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
-        # Within the noise, chi-square over its degrees of freedom has the standard
-        # deviation sqrt(2 / freedom). Five of them are allowed.
-        follows=bool(not stated or reduced < 1 + 5 * np.sqrt(2 / free)),
+        follows=not stated or is_within_noise(reduced, free),
     )
 
 
@@ -379,27 +376,18 @@ def _spin(one: Spins, surface: Surface, readings: Readings, scale: float) -> Spi
     """One row of the table."""
     vector = one.numbers[0]
     frame = one.frames[0]
-    sought = np.ix_(surface.sought, surface.sought)
-    covariance = np.zeros((vector.size, vector.size))
-    covariance[sought] = scale * inverse_normal(one.quadratic.normal[0][sought])
+    covariance = scale * covariance_of(one.quadratic.normal[0], surface.sought)
     span = np.asarray(readings.span)
     estimates, slopes = _estimates_and_slopes(vector, frame, span)
-    errors = jax.tree.map(
-        lambda x: np.sqrt(np.einsum("...i,ij,...j->...", x, covariance, x)), slopes
-    )
-    there = readings.weights > 0
-    residuals = np.asarray(_residuals(vector, frame, surface, readings))[there] / (
-        readings.weights[there] * MAGNITUDE
-    )
+    residuals = np.asarray(_residuals(vector, frame, surface, readings))
     shape = unpacked_convex(jnp.asarray(vector), SPIN).shape
     return Spin(
         body=_body(vector, frame, surface, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
-        errors=errors,
+        errors=errors_of(slopes, covariance),
         chi_square=float(one.quadratic.chi_square[0]),
         open_share=float(np.linalg.norm(openness(shape, surface))),
-        # A magnitude falls where the logarithm of the brightness grows.
-        residuals=-residuals,
+        residuals=readings.in_magnitudes(residuals),
     )
 
 
