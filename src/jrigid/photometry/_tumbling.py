@@ -199,8 +199,7 @@ def _of_periods(
     omega = _at_largest_tilt(moments, jnp.where(found, y, 0.0), long_axis)
     # The ratio of the periods fixes the direction of the angular momentum, and its size
     # scales both.
-    period = 2 * jnp.pi / mean_precession_rate(moments, omega)
-    omega = omega * period / precession_period
+    omega = _with_precession(moments, omega, precession_period)
     return jnp.where(found, product("ij,j->i", principal.axes, omega), jnp.nan)
 
 
@@ -276,11 +275,8 @@ def _of_energy(
     part = jnp.where(exists, part, 0.5)
     sine = root_of_positive(part)
     cosine = jnp.sqrt(1 - part)
-    zero = jnp.zeros_like(part)
-    momentum = [cosine, sine, zero] if long_axis else [zero, sine, cosine]
-    omega = jnp.stack(momentum) / principal.moments
-    period = 2 * jnp.pi / mean_precession_rate(principal.moments, omega)
-    omega = omega * period / precession_period
+    omega = _of_tilt(principal.moments, sine, cosine, long_axis)
+    omega = _with_precession(principal.moments, omega, precession_period)
     return jnp.where(exists, product("ij,j->i", principal.axes, omega), jnp.nan)
 
 
@@ -290,6 +286,19 @@ def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
     # neither is a difference, so that both keep their digits at all tilts.
     sine = jnp.sqrt(jax.nn.sigmoid(2 * y))
     cosine = jnp.sqrt(jax.nn.sigmoid(-2 * y))
-    zero = jnp.zeros_like(y)
+    return _of_tilt(moments, sine, cosine, long_axis)
+
+
+def _of_tilt(moments: Vector, sine: Scalar, cosine: Scalar, long_axis: bool) -> Vector:
+    """Angular velocity for a unit angular momentum, from sine and cosine of its tilt."""
+    zero = jnp.zeros_like(sine)
     momentum = [cosine, sine, zero] if long_axis else [zero, sine, cosine]
     return jnp.stack(momentum) / moments
+
+
+def _with_precession(
+    moments: Vector, omega: Vector, precession_period: Scalar
+) -> Vector:
+    """The same motion, but so fast that its precession has a given period."""
+    period = 2 * jnp.pi / mean_precession_rate(moments, omega)
+    return omega * period / precession_period
