@@ -60,15 +60,32 @@ def table(inversion=None):
 
 def test_pairs_of_periods_of_a_file(damit, capsys):
     assert _cli.main(["photometry", str(damit), *PERIODS]) == 0
-    first, head, *rows = capsys.readouterr().out.splitlines()
+    first, tried, head, *rows = capsys.readouterr().out.splitlines()
     assert first == (
         "2 light curves, of which 2 are relative, with 30 points in 3.3 days from JD "
         "2451545.0000"
     )
+    assert tried == "periods from 4 to 20 hours are tried"
     assert head.split("  ")[0] == "P_phi [h]"
     assert len(rows) == 10
     best = re.fullmatch(r" *([\d.]+) +([\d.]+) +([\d.]+) %", rows[0])
     assert float(best[3]) > 99
+
+
+def test_periods_from_two_hours_to_the_span_are_tried_by_themselves(
+    damit, monkeypatch, capsys
+):
+    asked = []
+
+    def find_tumblers(curves, noise, **options):
+        asked.append((options["shortest"], options["longest"]))
+        return table({"determined": True})
+
+    monkeypatch.setattr(ph, "find_tumblers", find_tumblers)
+    assert _cli.main(["photometry", str(damit), "--report"]) == 0
+    # Two nights of 0.3 days, 3 days apart.
+    np.testing.assert_allclose(asked, [[2 * HOUR, 3.3 * DAY]])
+    assert "periods from 2 to 79.2 hours are tried" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -182,7 +199,7 @@ def test_mistakes_are_said_in_a_sentence(
     ("arguments", "words"),
     [
         (["photometry"], "required: path"),
-        (["photometry", "a.txt", "--shortest", "1"], "required: --longest"),
+        (["photometry", "a.txt", "--shortest", "x"], "--shortest: invalid float"),
         (["photometry", "a.txt", *PERIODS, "--mode", "spin"], "invalid choice"),
         (
             ["photometry", "a.txt", *PERIODS, "--report", "--pairs", "0"],

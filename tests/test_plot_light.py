@@ -1,5 +1,7 @@
 """Pictures of light curves: what is drawn is the model and the data that it shows."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -272,6 +274,16 @@ def test_a_tumbler_is_seen_at_its_time():
         np.testing.assert_allclose(np.array(one), np.array(other), atol=1e-9)
 
 
+def test_facets_alone_are_drawn_as_the_body_that_has_them():
+    ts = np.array([7 * HOUR])
+    sun, observer = geometry(ts)
+    whole = jr.plot.appearance(TUMBLER, sun[0], observer[0], time=ts[0])
+    faceted = dataclasses.replace(TUMBLER, shape=SHAPE.facets(20))
+    ax = jr.plot.appearance(faceted, sun[0], observer[0], time=ts[0])
+    areas = [outline_area(greys_and_corners(x)[1]) for x in (ax, whole)]
+    np.testing.assert_allclose(*areas, rtol=0.03)
+
+
 def test_a_film_is_seen_from_the_observer_above_its_curve(tmp_path):
     film = jr.plot.animate_light_curve(
         CURVES[1], TUMBLER, epoch=EPOCH, seconds=2.0, fps=3.0
@@ -304,6 +316,7 @@ FACETS = ph.Tumbler(
     SHAPE.moments, 6 * HOUR, 1.0, 0.5, 1.2, 0.3, 0.0, SHAPE.facets(4), mode=SPINNER.mode
 )
 X = np.eye(3)[0]
+PLATE = dataclasses.replace(FACETS, shape=ph.Facets(np.ones(1), X[None]))
 WRONG = {
     "no curves": (
         lambda: jr.plot.light_curves([], TUMBLER),
@@ -314,8 +327,8 @@ WRONG = {
         "`axes` must be one of",
     ),
     "facets": (
-        lambda: jr.plot.appearance(FACETS, X, X),
-        "`mesh` must be the vertices and faces of a body with `Facets`",
+        lambda: jr.plot.appearance(PLATE, X, X),
+        "`facets` must have normals in all directions",
     ),
     "no attitude": (
         lambda: jr.plot.appearance(SHAPE, X, X),

@@ -1,6 +1,7 @@
 """A convex shape of a tumbler: bodies made by plain numpy and DOP853 are found."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -124,6 +125,11 @@ def test_a_tumbler_of_any_convex_shape_is_found(relative):
     text = found.report()
     assert text.startswith("short-axis mode of a convex body: chi-square over 6")
     assert "I1/I3 0.55" in text
+    # The moments of a homogeneous ellipsoid are sums of the squares of its semi-axes.
+    a, b, c = SEMI_AXES**2
+    found = re.findall(r"this shape has I1/I3 ([\d.]+), I2/I3 ([\d.]+)", text)
+    expected = [(b + c) / (a + b), (a + c) / (a + b)]
+    np.testing.assert_allclose(np.array(found[0], float), expected, atol=0.03)
 
 
 def test_the_tumbler_has_the_light_of_the_fit(relative):
@@ -179,3 +185,6 @@ def test_mistakes_say_what_to_pass(relative):
         ph.fit_shape(curves, swapped, NOISE, epoch=EPOCH)
     with pytest.raises(ValueError, match="say nothing of the phase function"):
         ph.fit_shape(curves, start, NOISE, epoch=EPOCH, fitted=("slope",))
+    one = [dataclasses.replace(curves[0], is_relative=False), *curves[1:]]
+    with pytest.raises(ValueError, match="without two curves that are not relative"):
+        ph.fit_shape(one, start, NOISE, epoch=EPOCH, fitted=("slope",))

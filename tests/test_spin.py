@@ -249,7 +249,7 @@ def test_a_tumbler_is_refused_by_its_misfit():
         ({"degree": 13}, "`degree` must be at most 12, but it is 13"),
         ({"facets": 20}, "`facets` must be"),
         ({"fitted": ["colour"]}, "`fitted`"),
-        ({"fitted": ["slope"]}, "must be empty or `lambert` where all curves are"),
+        ({"fitted": ["slope"]}, "must be empty or `lambert` without two curves that"),
         ({"closure": 0.0}, "`closure` must be positive"),
         ({"scattering": ph.Mixture(-0.1)}, "must have a positive `lambert`"),
         ({"scattering": ph.Mixture(0.1, width=0.0)}, "must have a positive `width`"),

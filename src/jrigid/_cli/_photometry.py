@@ -14,6 +14,9 @@ from jrigid._cli._arguments import count, numbers, output
 
 _HOUR = 3600.0
 _DAY = 86400.0
+# Faster asteroids of more than some hundred metres would fly apart: P. Pravec and
+# A. W. Harris, Icarus 148 (2000) 12.
+_SHORTEST = 2.0  # h
 # Exact, by the definition of the International Astronomical Union of 2012.
 _AU = 149597870700.0  # m
 # Of the first word of an ALCDEF file.
@@ -58,10 +61,17 @@ def add_command(commands: Any) -> argparse.ArgumentParser:
         "and Earth; or an ALCDEF file, with --orbit",
     )
     command.add_argument(
-        "--shortest", type=float, required=True, metavar="HOURS", help="shortest period"
+        "--shortest",
+        type=float,
+        default=_SHORTEST,
+        metavar="HOURS",
+        help=f"shortest period ({_SHORTEST:g})",
     )
     command.add_argument(
-        "--longest", type=float, required=True, metavar="HOURS", help="longest period"
+        "--longest",
+        type=float,
+        metavar="HOURS",
+        help="longest period; without it, the time that the curves span",
     )
     command.add_argument(
         "--orbit",
@@ -146,6 +156,11 @@ def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
     return photometry.read_alcdef(path, photometry.geometry_of_orbit(orbit))
 
 
+def _span(curves: list[photometry.LightCurve]) -> float:
+    """Time from the first point to the last [s]."""
+    return float(np.ptp(np.concatenate([x.ts for x in curves])))
+
+
 def _summary(curves: list[photometry.LightCurve]) -> str:
     """What was read, in a sentence."""
     ts = np.concatenate([x.ts for x in curves])
@@ -154,7 +169,7 @@ def _summary(curves: list[photometry.LightCurve]) -> str:
     first = curves[0].epoch + ts.min() / _DAY
     return (
         f"{len(curves)} light curves, of which {relative} are relative, with {len(ts)} "
-        f"points in {np.ptp(ts) / _DAY:.1f} days from JD {first:.4f}"
+        f"points in {_span(curves) / _DAY:.1f} days from JD {first:.4f}"
     )
 
 
@@ -175,7 +190,8 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     curves = _curves(options)
     say(_summary(curves))
     shortest = _HOUR * options.shortest
-    longest = _HOUR * options.longest
+    longest = _span(curves) if options.longest is None else _HOUR * options.longest
+    say(f"periods from {shortest / _HOUR:g} to {longest / _HOUR:.5g} hours are tried")
     if not options.report:
         say(_table(photometry.period_pairs(curves, shortest, longest, count=10)))
         return 0

@@ -32,6 +32,7 @@ from jrigid.photometry._orbit import geometry_of_table as geometry_of_table
 from jrigid.photometry._periodogram import PeriodPairs as PeriodPairs
 from jrigid.photometry._periodogram import period_pairs as period_pairs
 from jrigid.photometry._pole import state_of_pole as state_of_pole
+from jrigid.photometry._polyhedron import mesh_from_facets as mesh_from_facets
 from jrigid.photometry._scattering import AbstractScattering as AbstractScattering
 from jrigid.photometry._scattering import Geometric as Geometric
 from jrigid.photometry._scattering import Lambert as Lambert

@@ -16,7 +16,7 @@ from jrigid._checks import (
     shaped,
 )
 from jrigid._numerics import product, safe_norm
-from jrigid._types import Readable, Real, Scalar, Vector
+from jrigid._types import AnyArray, Readable, Real, Scalar, Vector
 from jrigid.photometry._scattering import AbstractScattering
 
 # How far a corner may lie outside of a facet's plane, over the size of the body: shape
@@ -148,17 +148,25 @@ def facets_from_mesh(
         # Which corners span the hull has no derivative.
         known = jax.lax.stop_gradient(vertices)
         check_known("vertices", known)
-        faces = _hull(np.asarray(known))
+        faces = hull_of(np.asarray(known))
+    areas, normals = _areas_and_normals(vertices, faces)
+    if is_concrete(vertices) and not hull:
+        _demand_convex(np.asarray(vertices)[faces], np.asarray(normals))
+    return Facets(areas, normals, albedo)
+
+
+@jax.jit  # outside of jit each operation is a program of its own
+def _areas_and_normals(
+    vertices: Float[Array, "vertices 3"], faces: Int[AnyArray, "faces 3"]
+) -> tuple[Float[Array, " faces"], Float[Array, "faces 3"]]:
+    """Areas and outward normals of triangles."""
     corners = vertices[faces]
     across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = safe_norm(across)
-    normals = across / jnp.where(twice > 0, twice, 1.0)[:, None]
-    if is_concrete(vertices) and not hull:
-        _demand_convex(np.asarray(corners), np.asarray(normals))
-    return Facets(twice / 2, normals, albedo)
+    return twice / 2, across / jnp.where(twice > 0, twice, 1.0)[:, None]
 
 
-def _hull(vertices: np.ndarray) -> np.ndarray:
+def hull_of(vertices: np.ndarray) -> np.ndarray:
     """Triangles of the convex hull, counter-clockwise seen from outside."""
     # Imported where it is used: scipy would add a second to `import jrigid`.
     from scipy.spatial import ConvexHull

@@ -468,6 +468,6 @@ def _report(fit: ShapeFit) -> str:
             f"{in_degrees(x.longitude, error.longitude)}, latitude "
             f"{in_degrees(x.latitude, error.latitude)}",
             f"   E/E0 {x.energy_ratio:.4f} +- {error.energy_ratio:.4f}, {moments}",
-            *of_surface(x, error, fit.open_share),
+            *of_surface(x, error, fit.open_share, fit.tumbler.shape),
         ]
     )

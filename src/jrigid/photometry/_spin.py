@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jrigid._checks import check_option, demand, whole_number
 from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix
+from jrigid.mass import from_mesh
 from jrigid.photometry._alias import covariance_of, errors_of
 from jrigid.photometry._convex import (
     SCATTERING,
@@ -25,9 +26,12 @@ from jrigid.photometry._convex import (
     surface_of,
     unpacked_convex,
 )
+from jrigid.photometry._ellipsoid import Ellipsoid
+from jrigid.photometry._facets import Facets
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
 from jrigid.photometry._model import axes_of_momentum
+from jrigid.photometry._polyhedron import MOST_OPEN, mesh_from_facets
 from jrigid.photometry._readings import (
     Readings,
     is_within_noise,
@@ -254,11 +258,13 @@ def check_curves(
     )
     for name in fitted:
         check_option("fitted", name, SCATTERING)
-    scaled = not all(curve.is_relative for curve in curves)
+    # Within one curve the phase angle hardly changes.
+    scaled = sum(not curve.is_relative for curve in curves) > 1
     demand(
         scaled or not set(fitted) & set(_NEEDS_SCALE),
-        "Argument `fitted` must be empty or `lambert` where all curves are relative, "
-        f"since these say nothing of the phase function, but it is {tuple(fitted)}.",
+        "Argument `fitted` must be empty or `lambert` without two curves that are not "
+        "relative: others say nothing of the phase function. It is "
+        f"{tuple(fitted)}.",
     )
 
 
@@ -509,17 +515,20 @@ def _described(head: str, spin: Spin) -> list[str]:
         f"{spin.chi_square:.1f}",
         f"   pole at longitude {in_degrees(x.longitude, error.longitude)}, latitude "
         f"{in_degrees(x.latitude, error.latitude)}",
-        *of_surface(x, error, spin.open_share),
+        *of_surface(x, error, spin.open_share, spin.body.shape),
     ]
 
 
-def of_surface(x: Any, error: Any, open_share: float) -> list[str]:
+def of_surface(
+    x: Any, error: Any, open_share: float, shape: Facets | Ellipsoid
+) -> list[str]:
     """What was found of a surface, in words.
 
     Args:
         x: Estimates, with `scattering` and `albedo`.
         error: Their standard errors.
         open_share: Length of the sum of the areas as vectors, over their sum.
+        shape: The body.
     """
     lines = [f"   the areas fail to close by {100 * open_share:.2g} % of their sum"]
     for name, value, spread in zip(
@@ -531,4 +540,18 @@ def of_surface(x: Any, error: Any, open_share: float) -> list[str]:
         # The logarithm of the albedo runs from minus to plus the length of this slope.
         contrast = np.exp(2 * np.linalg.norm(x.albedo))
         lines.append(f"   albedo varies by a factor of {contrast:.2f}")
+    if isinstance(shape, Facets) and open_share < MOST_OPEN:
+        lines.append(_of_homogeneous(shape))
     return lines
+
+
+def _of_homogeneous(facets: Facets) -> str:
+    """The inertia of a homogeneous body of a fitted shape, in words."""
+    principal = from_mesh(*mesh_from_facets(facets)).principal_axes()
+    first, second, third = np.asarray(principal.moments)
+    # The motion is about the z axis, or that is its axis of the largest moment.
+    angle = np.degrees(np.arccos(min(abs(float(principal.axes[2, 2])), 1.0)))
+    return (
+        f"   a homogeneous body of this shape has I1/I3 {first / third:.3f}, I2/I3 "
+        f"{second / third:.3f}, and its axis of I3 is {angle:.1f} degrees from z"
+    )

@@ -307,7 +307,8 @@ def animate_light_curve(
         model: An `Inversion`, or a `Tumbler`.
         alias: Which alias of an inversion.
         epoch: Of a `Tumbler`, the Julian date of its time 0; None: that of the curve.
-        mesh: Vertices and faces of a body whose shape is `Facets`.
+        mesh: Of a body whose shape is `Facets`, vertices and faces to show in place of
+            the convex body that has these facets.
         seconds: How long it plays.
         fps: Frames a second.
 
@@ -316,7 +317,8 @@ def animate_light_curve(
         writes it. Its times count from the first point.
 
     Raises:
-        ValueError: A curve of a single time, no such alias, or facets without a mesh.
+        ValueError: A curve of a single time, no such alias, or facets that do not
+            close.
 
     >>> import jax.numpy as jnp, numpy as np, jrigid as jr
     >>> shape = jr.photometry.Ellipsoid(jnp.array([1.0, 0.6, 0.5]))

@@ -15,6 +15,7 @@ from jrigid.photometry import (
     Facets,
     LommelSeeliger,
     Tumbler,
+    mesh_from_facets,
 )
 from jrigid.plot._body import rings
 from jrigid.plot._common import Axes, Rotating, flat_axes, turned
@@ -70,7 +71,8 @@ def appearance(
         to_observer: Vector from the body to the observer, space axes.
         attitude: Quaternion or state; of a `Tumbler` none.
         time: Of a `Tumbler`, since its time 0 [s].
-        mesh: Of a `Tumbler` with `Facets`, the mesh that they were made of.
+        mesh: Of a `Tumbler` with `Facets`, vertices and faces to draw in place of the
+            convex body that has these facets.
         scattering: The law, `LommelSeeliger()` if None; of a `Tumbler` its own.
         ax: Axes.
 
@@ -79,7 +81,7 @@ def appearance(
 
     Raises:
         ImportError: Without the extra `jrigid[plot]`.
-        ValueError: Facets without a mesh, a body without an attitude, or vectors of
+        ValueError: Facets that do not close, a body without an attitude, or vectors of
             another shape.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -115,10 +117,7 @@ def outline_of(body: Tumbler | Ellipsoid | Mesh, mesh: Mesh | None) -> Outline:
     shape = body.shape if isinstance(body, Tumbler) else body
     shape = shape if mesh is None else mesh
     if isinstance(shape, Facets):
-        raise ValueError(
-            "Argument `mesh` must be the vertices and faces of a body with `Facets`, "
-            "which do not say where they are, but it is None."
-        )
+        shape = mesh_from_facets(shape)
     if isinstance(shape, Ellipsoid):
         # At a pole itself two corners of a face would coincide, and it would have no
         # normal.
