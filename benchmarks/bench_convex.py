@@ -232,6 +232,9 @@ def main(package, repeats, write):
         "largest relative rounding by lcgenerator",
         "largest relative deviation",
     ]
+    span = float(np.ptp(np.concatenate([x.ts for x in curves]))) / HOUR
+    # `find_spin` tries a period every 0.4 turns within the span.
+    trials = round(span * (1 / SHORTEST - 1 / LONGEST) / 0.4) + 1
     separation = 0.5 * PERIOD**2 / (float(np.ptp([x.ts[0] for x in curves])) / HOUR)
     text = (
         "The command takes the folder of DAMIT's package, as its docstring says.\n\n"
@@ -241,8 +244,8 @@ def main(package, repeats, write):
         "that pole.\n\n"
         + common.table(header, table)
         + f"\n\nRange of periods: {SHORTEST} to {LONGEST} h, in which period_scan "
-        f"takes {periods} trial periods with 6 poles and 50 steps, and `find_spin` 17 "
-        "with 24 poles. Neighbouring minima of chi-square are "
+        f"takes {periods} trial periods with 6 poles and 50 steps, and `find_spin` "
+        f"{trials} with 24 poles. Neighbouring minima of chi-square are "
         f"{1e6 * separation:.0f}e-6 h apart. convexinv then takes 300 steps from each "
         f"of 6 poles. Times: {repeats} runs in turns, of `find_spin` without the first "
         f"one, which compiles and took {first:.0f} CPU s.\n\n"

@@ -100,6 +100,10 @@ def test_a_table_gives_the_vectors_of_an_orbit(untyped):
         table(dates + 100)
     with pytest.raises(ValueError, match="four dates or more that increase"):
         ph.geometry_of_table(days[::-1], *orbit(days))
+    with pytest.raises(ValueError, match="four dates or more that increase"):
+        ph.geometry_of_table(days[0], *orbit(days[:1]))
+    with pytest.raises(ValueError, match=r"finite and have the shape \(9, 3\)"):
+        ph.geometry_of_table(days, orbit(days)[0], orbit(days[1:])[1])
     with pytest.raises(ValueError, match=r"finite and have the shape \(9, 3\)"):
         ph.geometry_of_table(days, *orbit(days[1:]))
 

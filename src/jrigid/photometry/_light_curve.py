@@ -1,11 +1,10 @@
 """The brightness of a body in a state, and of a free body as it turns."""
 
-import functools
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import RESULTS, demand, is_concrete, nan_where, shaped
 from jrigid._numerics import product, safe_arctan2, safe_norm
@@ -53,6 +52,17 @@ def brightness(
     """
     to_sun, to_observer = shaped(to_sun=(to_sun, 3), to_observer=(to_observer, 3))
     scattering = LommelSeeliger() if scattering is None else scattering
+    return _brightness(shape, scattering, to_sun, to_observer)
+
+
+@eqx.filter_jit  # outside of jit each operation is a program of its own
+def _brightness(
+    shape: Facets | Ellipsoid,
+    scattering: AbstractScattering,
+    to_sun: Vector,
+    to_observer: Vector,
+) -> Scalar:
+    """The brightness of `brightness`."""
     sun = as_unit(to_sun)
     observer = as_unit(to_observer)
     surface = shape.brightness(scattering, sun, observer)
@@ -144,20 +154,27 @@ def light_curve(
     else:
         motion = free_rotation(inertia, state0, ts, t0=t0, throw=False)
         attitude, result = motion.attitude, motion.result
-    seen = functools.partial(_seen_from_space, shape, scattering)
-    curve = jax.vmap(seen)(attitude, to_sun, to_observer)
-    # Some invalid motions have finite attitudes.
-    return nan_where(result != RESULTS.successful, curve)
+    scattering = LommelSeeliger() if scattering is None else scattering
+    ok = result == RESULTS.successful
+    return _seen_from_space(shape, scattering, attitude, to_sun, to_observer, ok)
 
 
+@eqx.filter_jit  # outside of jit each operation is a program of its own
 def _seen_from_space(
     shape: Facets | Ellipsoid,
-    scattering: AbstractScattering | None,
-    attitude: Array,
-    to_sun: Vector,
-    to_observer: Vector,
-) -> Scalar:
-    """Brightness for directions in space axes."""
-    sun = rotate_inverse(attitude, to_sun)
-    observer = rotate_inverse(attitude, to_observer)
-    return brightness(shape, sun, observer, scattering)
+    scattering: AbstractScattering,
+    attitude: Float[Array, "epochs 4"],
+    to_sun: Float[Array, "epochs 3"],
+    to_observer: Float[Array, "epochs 3"],
+    ok: Bool[Array, ""],
+) -> Float[Array, " epochs"]:
+    """Brightness for directions in space axes; NaN for a motion that is not ok."""
+
+    def at(attitude: Array, to_sun: Vector, to_observer: Vector) -> Scalar:
+        sun = rotate_inverse(attitude, to_sun)
+        observer = rotate_inverse(attitude, to_observer)
+        return _brightness(shape, scattering, sun, observer)
+
+    curve = jax.vmap(at)(attitude, to_sun, to_observer)
+    # Some invalid motions have finite attitudes.
+    return nan_where(~ok, curve)

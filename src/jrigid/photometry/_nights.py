@@ -14,8 +14,6 @@ from jrigid.photometry._files import LightCurve
 from jrigid.photometry._readings import orthonormal, readings_of
 
 _DAY = 86400.0
-# Gain of all growths of chi-square that is worth a curve, over the threshold.
-_LEAST_GAIN = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,10 +134,11 @@ def chosen_nights(
     curves: Sequence[LightCurve],
     threshold: float,
 ) -> NightPlan:
-    """Choose curves one after the other until all pairs of aliases are apart.
+    """Choose curves one after the other until the pairs of aliases are apart.
 
     Each choice is the curve with which the growths, cut off at the threshold, have the
-    largest sum.
+    largest sum. More curves never let a growth fall, so a pair that all curves together
+    leave below the threshold is not sought.
     """
     demand(
         threshold > 0, f"Argument `threshold` must be positive, but it is {threshold}."
@@ -147,16 +146,13 @@ def chosen_nights(
     chosen: list[int] = []
     decided: list[list[tuple[int, int]]] = []
     growth = np.zeros((len(aliases), len(aliases)))
-    upper = np.triu(np.ones_like(growth, bool), 1)
-    while np.any(growth[upper] < threshold) and len(chosen) < len(curves):
+    possible = np.triu(growths(predicted, aliases, range(len(curves))) >= threshold, 1)
+    while np.any(growth[possible] < threshold):
         left = [k for k in range(len(curves)) if k not in chosen]
         trials = [growths(predicted, aliases, [*chosen, k]) for k in left]
-        gains = [np.sum(np.minimum(x[upper], threshold)) for x in trials]
+        gains = [np.sum(np.minimum(x[possible], threshold)) for x in trials]
         best = int(np.argmax(gains))
-        gain = gains[best] - np.sum(np.minimum(growth[upper], threshold))
-        if gain < _LEAST_GAIN * threshold:
-            break
-        apart = upper & (trials[best] >= threshold) & (growth < threshold)
+        apart = possible & (trials[best] >= threshold) & (growth < threshold)
         growth = trials[best]
         chosen.append(left[best])
         decided.append([(int(i) + 1, int(j) + 1) for i, j in np.argwhere(apart)])
@@ -185,7 +181,7 @@ def _report(plan: NightPlan) -> str:
         if plan.growth[i, j] < plan.threshold
     ]
     if missed:
-        lines.append(f"No choice of these curves tells apart {', '.join(missed)}.")
+        lines.append(f"Not even all curves together tell apart {', '.join(missed)}.")
     elif count < 2:
         lines.append("There is one alias, so that nothing must be told apart.")
     lines.append(

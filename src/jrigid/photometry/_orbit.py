@@ -216,19 +216,20 @@ def geometry_of_table(
     from scipy.interpolate import CubicSpline
 
     dates = np.asarray(julian_dates, dtype=float)
-    vectors = np.stack([np.asarray(x, dtype=float) for x in (to_sun, to_observer)], 1)
+    vectors = [np.asarray(x, dtype=float) for x in (to_sun, to_observer)]
     demand(
-        len(dates) >= 4 and bool(np.all(np.diff(dates) > 0)),
+        dates.ndim == 1 and dates.size >= 4 and bool(np.all(np.diff(dates) > 0)),
         "Argument `julian_dates` must hold four dates or more that increase, but it does "
         "not.",
     )
+    shape = (len(dates), 3)
     demand(
-        vectors.shape == (len(dates), 2, 3) and bool(np.all(np.isfinite(vectors))),
-        "Arguments `to_sun` and `to_observer` must be finite and have the shape "
-        f"({len(dates)}, 3), but they are not.",
+        all(x.shape == shape and bool(np.all(np.isfinite(x))) for x in vectors),
+        f"Arguments `to_sun` and `to_observer` must be finite and have the shape {shape}, "
+        "but they are not.",
     )
     # Small numbers keep the digits of a time of day, which a Julian date loses.
-    spline = CubicSpline(dates - dates[0], vectors)
+    spline = CubicSpline(dates - dates[0], np.stack(vectors, axis=1))
 
     def positions(wanted: Float[np.ndarray, " epochs"]) -> tuple[Vectors, Vectors]:
         """Vectors to the Sun and to the observer at Julian dates."""

@@ -1,5 +1,6 @@
 """Principal-axis rotation by its pole, as tables of asteroids give it."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -51,6 +52,12 @@ def state_of_pole(
         angle=(angle,),
     )
     demand_radians(longitude, latitude)
+    return _state(longitude, latitude, period, angle)
+
+
+@jax.jit  # outside of jit each operation is a program of its own
+def _state(longitude: Scalar, latitude: Scalar, period: Scalar, angle: Scalar) -> State:
+    """The state of `state_of_pole`."""
     z = jnp.asarray([0.0, 0.0, 1.0], period.dtype)
     tilted = attitude_of_pole(longitude, latitude)
     attitude = multiply(tilted, from_axis_angle(z, angle))

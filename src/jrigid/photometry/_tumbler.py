@@ -1,15 +1,17 @@
 """A free body and its surface: everything that its light curves depend on."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import array_of_shape, check_option, is_concrete
-from jrigid._types import Readable, Real
+from jrigid._types import Quaternion, Readable, Real, Scalar, Vector
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.photometry._ellipsoid import Ellipsoid
@@ -102,34 +104,17 @@ class Tumbler(Readable):
                 self.precession_period,
                 self.precession_angle,
             )
-        x, _, z = jnp.eye(3, dtype=self.moments.dtype)
         omega = omega_from_periods(
             self.moments, self.precession_period, self.rotation_period, self.mode
         )
-        # The momentum lies in the plane of the circled axis and of the middle one.
-        momentum = self.moments * omega
-        if self.mode == "short-axis":
-            # This turn about x takes the angular momentum to z.
-            tilt = jnp.arctan2(momentum[1], momentum[2])
-            upright = from_axis_angle(x, tilt)
-        else:
-            # `swap` reverses y. With y reversed here too, the same turn makes both
-            # modes upright.
-            omega = omega * jnp.asarray([1.0, -1.0, 1.0], omega.dtype)
-            tilt = jnp.arctan2(momentum[1], momentum[0])
-            half = jnp.sqrt(jnp.asarray(0.5, omega.dtype))
-            swap = jnp.stack([0 * half, half, 0 * half, half])  # x to z, y to -y
-            upright = multiply(from_axis_angle(x, tilt), swap)
+        start = _upright(self.moments, omega, self.mode == "long-axis")
         elapsed = self.rotation_phase * self.rotation_period
-        start = State(upright, omega)
         later = free_rotation(self.moments, start, elapsed[None], throw=False)
         # The mean precession of that time is not a part of the angle.
         back = 2 * jnp.pi * elapsed / self.precession_period
-        turned = multiply(
-            from_axis_angle(z, self.precession_angle - back), later.attitude[0]
-        )
-        tilted = attitude_of_pole(self.longitude, self.latitude)
-        return State(multiply(tilted, turned), later.omega[0])
+        angle = self.precession_angle - back
+        attitude = _placed(self.longitude, self.latitude, angle, later.attitude[0])
+        return State(attitude, later.omega[0])
 
     def light_curve(
         self,
@@ -154,3 +139,38 @@ class Tumbler(Readable):
             self.scattering,
             light_time=False,
         )
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _upright(moments: Vector, omega: Vector, long_axis: bool) -> State:
+    """A state whose angular momentum is along z in space.
+
+    Args:
+        moments: Principal moments.
+        omega: Angular velocity at the largest tilt.
+        long_axis: Whether the momentum circles the axis of the smallest moment.
+    """
+    x = jnp.asarray([1.0, 0.0, 0.0], omega.dtype)
+    # The momentum lies in the plane of the circled axis and of the middle one.
+    momentum = moments * omega
+    if not long_axis:
+        # This turn about x takes the angular momentum to z.
+        tilt = jnp.arctan2(momentum[1], momentum[2])
+        return State(from_axis_angle(x, tilt), omega)
+    # `swap` reverses y. With y reversed here too, the same turn makes both modes
+    # upright.
+    omega = omega * jnp.asarray([1.0, -1.0, 1.0], omega.dtype)
+    tilt = jnp.arctan2(momentum[1], momentum[0])
+    half = jnp.sqrt(jnp.asarray(0.5, omega.dtype))
+    swap = jnp.stack([0 * half, half, 0 * half, half])  # x to z, y to -y
+    return State(multiply(from_axis_angle(x, tilt), swap), omega)
+
+
+@jax.jit
+def _placed(
+    longitude: Scalar, latitude: Scalar, angle: Scalar, attitude: Quaternion
+) -> Quaternion:
+    """An attitude, turned by an angle about z and then tilted with z to a pole."""
+    z = jnp.asarray([0.0, 0.0, 1.0], attitude.dtype)
+    turned = multiply(from_axis_angle(z, angle), attitude)
+    return multiply(attitude_of_pole(longitude, latitude), turned)

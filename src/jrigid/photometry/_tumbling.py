@@ -1,6 +1,7 @@
 """Tumbling in the observers' terms: two periods, a mode, the tilt and the energy."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -79,7 +80,12 @@ def tumbling(inertia: InertiaLike, omega: VectorLike) -> Tumbling:
     >>> print(terms.energy_ratio.round(4), jr.free.REGIMES[terms.regime])
     1.0236 about the axis of the largest moment
     """
-    inertia, omega = shaped(inertia=(inertia, *INERTIA), omega=(omega, 3))
+    return _terms(*shaped(inertia=(inertia, *INERTIA), omega=(omega, 3)))
+
+
+@jax.jit  # outside of jit each operation is a program of its own
+def _terms(inertia: Array, omega: Vector) -> Tumbling:
+    """The terms of `tumbling`."""
     kind = regime(inertia, omega)
     ok = kind != REGIMES.undefined
     tilts, ratio = where_defined(ok, _tilts_and_energy, inertia, omega)
@@ -173,14 +179,21 @@ def omega_from_periods(
     51.2
     """
     check_option("mode", mode, _MODES)
-    inertia, precession_period, rotation_period = shaped(
+    arguments = shaped(
         inertia=(inertia, *INERTIA),
         precession_period=(precession_period,),
         rotation_period=(rotation_period,),
     )
-    ok = is_inertia(inertia) & all_positive((precession_period, rotation_period))
-    solve = functools.partial(_of_periods, mode == "long-axis")
-    return where_defined(ok, solve, inertia, precession_period, rotation_period)
+    return _where_positive(_of_periods, mode == "long-axis", *arguments)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _where_positive(
+    formula: Callable[..., Vector], long_axis: bool, inertia: Array, *numbers: Scalar
+) -> Vector:
+    """A formula of a mode, for positive numbers and an inertia that a body has."""
+    ok = is_inertia(inertia) & all_positive(numbers)
+    return where_defined(ok, functools.partial(formula, long_axis), inertia, *numbers)
 
 
 def _of_periods(
@@ -248,14 +261,12 @@ def omega_from_energy(
     263.0
     """
     check_option("mode", mode, _MODES)
-    inertia, energy_ratio, precession_period = shaped(
+    arguments = shaped(
         inertia=(inertia, *INERTIA),
         energy_ratio=(energy_ratio,),
         precession_period=(precession_period,),
     )
-    ok = is_inertia(inertia) & all_positive((energy_ratio, precession_period))
-    solve = functools.partial(_of_energy, mode == "long-axis")
-    return where_defined(ok, solve, inertia, energy_ratio, precession_period)
+    return _where_positive(_of_energy, mode == "long-axis", *arguments)
 
 
 def _of_energy(
