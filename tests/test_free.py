@@ -228,7 +228,7 @@ def derivatives():
 @pytest.mark.parametrize(
     ("duration", "per_regime"),
     [
-        (20.0, 2),
+        (20.0, 1),
         pytest.param(20.0, 5, marks=pytest.mark.slow),
         pytest.param(-200.0, 2, marks=pytest.mark.slow),
     ],

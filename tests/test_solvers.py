@@ -379,7 +379,10 @@ def test_steps_of_splitting_are_as_many_as_asked_for_and_equal(dtype):
             assert np.all(np.isfinite(omega))
 
 
-@pytest.mark.parametrize("mode", ["reverse", "forward", "direct"])
+@pytest.mark.parametrize(
+    "mode",
+    ["reverse", "forward", pytest.param("direct", marks=pytest.mark.slow)],
+)
 def test_derivatives_of_splitting_are_those_of_the_motion(mode):
     adjoint = {"forward": diffrax.ForwardMode(), "direct": diffrax.DirectAdjoint()}.get(
         mode
@@ -434,6 +437,7 @@ def test_derivatives_of_splitting_are_those_of_its_own_steps():
     np.testing.assert_allclose(same, value, rtol=1e-14)
 
 
+@pytest.mark.slow  # without an event it is tested above
 def test_reverse_mode_of_splitting_reverses_the_steps_to_an_event():
     """They divide the time to the next output, and not the time to the event."""
     event = diffrax.Event(lambda t, _state, _args, **_: t - 3.17)

@@ -250,6 +250,7 @@ def planar(orbits):
     ]
 
 
+@pytest.mark.slow  # a map in full size
 def test_hyperion_is_chaotic_where_it_is_said_to_be():
     """... and stays in its plane, for 250 orbits."""
     spectrum, indicator = planar(250)[0]
