@@ -13,9 +13,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
 import bench_flights  # pyright: ignore[reportMissingImports]
 
 
-@pytest.fixture(
-    scope="module", params=[40, pytest.param(100, marks=pytest.mark.slow)]
-)
+@pytest.fixture(scope="module", params=[40, pytest.param(100, marks=pytest.mark.slow)])
 def thrown(request):
     """Trials that the detector was not tuned on."""
     return bench_flights.cases(request.param, seed=3)
