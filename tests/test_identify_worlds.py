@@ -50,10 +50,10 @@ def smoothed():
     [
         (0.0, 12),
         (1.0, 12),
-        pytest.param(0.0, 40, marks=pytest.mark.slow),
-        pytest.param(0.1, 40, marks=pytest.mark.slow),
-        pytest.param(1.0, 40, marks=pytest.mark.slow),
-        pytest.param(10.0, 40, marks=pytest.mark.slow),
+        pytest.param(0.0, 40, marks=pytest.mark.slow, id="0.0"),
+        pytest.param(0.1, 40, marks=pytest.mark.slow, id="0.1"),
+        pytest.param(1.0, 40, marks=pytest.mark.slow, id="1.0"),
+        pytest.param(10.0, 40, marks=pytest.mark.slow, id="10.0"),
     ],
 )
 def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, lanes, rng):

@@ -39,7 +39,7 @@ _HALVINGS = 40
 _EXACT = 1e-12
 _ENOUGH = 1e-6
 # Added to the diagonal of the second derivatives, over its mean: they are 0 where the
-# body is moved, and for planes that do not touch it.
+# body is moved.
 _RIDGE = 1e-10
 
 
@@ -80,7 +80,7 @@ def mesh_from_facets(
         are changed by as much, so that they close.
 
     Raises:
-        ValueError: Areas that are not positive, that are far from closed, or whose
+        ValueError: Areas that are negative, that are far from closed, or whose
             normals lie in a plane; facets that `jit` or `vmap` traces.
 
     >>> import numpy as np, jrigid as jr
