@@ -10,6 +10,10 @@ import nbclient
 import nbformat
 
 HERE = pathlib.Path(__file__).parent
+# The set-up of tests makes XLA's code generator quicker, here for the kernels.
+sys.path.insert(0, str(HERE.parent))
+import conftest  # noqa: F401
+
 TARGET = HERE.parent / "outputs" / "notebooks"
 FIGURES = {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}  # into the executed copy
 
