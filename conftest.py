@@ -41,20 +41,9 @@ if os.environ.get("JRIGID_TEST_CACHE"):
 # as long to compile. Compiled programs stay when the texts are let go. No public
 # function does it, and a version of jax without these caches needs no care.
 _LOWERED = [
-    getattr(module, name)
-    for module, name in (
-        (pjit, "_pjit_lower"),
-        (pxla, "_cached_lowering_to_hlo"),
-    )
-    if hasattr(getattr(module, name, None), "cache_clear")
+    getattr(pjit, "_pjit_lower", None),
+    getattr(pxla, "_cached_lowering_to_hlo", None),
 ]
-
-
-def _forget_lowered():
-    """Let go of the texts of programs."""
-    for cache in _LOWERED:
-        cache.cache_clear()
-
 
 # Each compiled function keeps memory maps of its own, and Linux allows a process 65530:
 # beyond them XLA's compiler dies. The suite compiles more than that, so now and then
@@ -69,7 +58,9 @@ def pytest_runtest_teardown():
     """Let go of what grows with each program, after one test in eight."""
     if next(_TESTS) % 8 != 0:
         return
-    _forget_lowered()
+    for cache in _LOWERED:
+        if cache is not None:
+            cache.cache_clear()
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
         jax.clear_caches()
         gc.collect()

@@ -32,13 +32,14 @@ def of_axes(record):
     return {"known axes": known, "any axes": identify.fit(BLIND, record, throw=False)}
 
 
-def test_three_numbers_too_many_are_distinguished_from_three_too_few(rng):
-    for turn, best, least in ((0.0, "known axes", 4), (0.3, "any axes", 5)):
+@pytest.mark.parametrize("count", [5, pytest.param(10, marks=pytest.mark.slow)])
+def test_three_numbers_too_many_are_distinguished_from_three_too_few(count, rng):
+    for turn, best, share in ((0.0, "known axes", 0.8), (0.3, "any axes", 1.0)):
         tables = [
-            identify.compare(of_axes(trials(rng, turn=turn)[0])) for _ in range(5)
+            identify.compare(of_axes(trials(rng, turn=turn)[0])) for _ in range(count)
         ]
         wins = [x.names[int(jnp.argmin(x.bic))] == best for x in tables]
-        assert sum(wins) >= least, wins
+        assert sum(wins) >= share * count, wins
     one = tables[0]
     np.testing.assert_array_equal(one.unknowns, [2 + 3, 5 + 3])
     np.testing.assert_array_equal(

@@ -102,7 +102,7 @@ def test_every_body_is_found_blind_at_the_bound(blind_fit, noise, trials, rng):
     normalised = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors) / 5
     # Chi-square of 5 degrees of freedom each: of 60 fits 1 +- 0.08.
     scatter = np.sqrt(2 / 5 / len(normalised))
-    assert abs(normalised.mean() - 1) < 3.7 * scatter
+    assert abs(normalised.mean() - 1) < 3.67 * scatter
     per_body = normalised.reshape(len(BODIES), trials).mean(axis=1)
     assert np.all(per_body < 1 + 4 * np.sqrt(2 / 5 / trials)), per_body
     chi_square = np.asarray(found.reduced_chi_square)
@@ -1096,9 +1096,10 @@ def test_too_few_samples_and_wrong_options(untyped):
         identify.fit(BLIND, star)
 
 
-def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, rng):
+@pytest.mark.parametrize("trials", [4, pytest.param(12, marks=pytest.mark.slow)])
+def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, trials, rng):
     _, omegas, _ = rates(ASYMMETRIC)
-    records = omegas + 0.05 * rng.normal(size=(4, *omegas.shape))
+    records = omegas + 0.05 * rng.normal(size=(trials, *omegas.shape))
     found = blind_fit(records, 0.01)  # five times the noise that is stated
     assert bool(jnp.all(found.status == Status.MISFIT))
     honest = blind_fit(records, 0.05)

@@ -68,7 +68,7 @@ def test_an_unmodelled_torque_is_found_and_counted(smoothed, kick, lanes, rng):
         np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)[good] / 5
     )
     # 5 degrees of freedom each: of 40 fits 1 +- 0.1.
-    scatter = np.sqrt(2 / 5 / len(square))
+    scatter = np.sqrt(2 / 5 / lanes)
     assert 1 - 4 * scatter < square.mean() < 1 + 5 * scatter
     level, error = (
         np.asarray(found.level)[good, 0],

@@ -266,7 +266,10 @@ def _between(
 def _centre(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "triangles 3"]
 ) -> Float[np.ndarray, "3"]:
-    """Centre of mass of a homogeneous body."""
+    """Centre of mass of a homogeneous body.
+
+    `from_mesh` gives it too, but would compile a program for each number of corners.
+    """
     corners = vertices[faces]
     volumes = np.linalg.det(corners)
     # A tetrahedron with a corner at the point 0 has its centre at a fourth of the sum.
