@@ -1,5 +1,7 @@
 """ALCDEF files and Kepler orbits: known geometry, light time, and errors by line."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -7,6 +9,8 @@ from scipy.integrate import solve_ivp
 import jrigid as jr
 
 ph = jr.photometry
+# Astropy says so half a year after its last update.
+pytestmark = pytest.mark.filterwarnings("ignore:leap-second file is expired")
 
 AU = 149597870700.0
 LIGHT = 299792458.0
@@ -299,3 +303,142 @@ def test_light_time_of_an_orbit():
 def test_elements_that_are_no_ellipse(changes, words):
     with pytest.raises(ValueError, match=words):
         ph.Orbit(*changes, 0.0, 0.0, 0.0, J2000)
+
+
+@pytest.fixture(autouse=True)
+def _no_network(monkeypatch):
+    """Tests look for no newer tables of the Earth's rotation."""
+    iers = pytest.importorskip("astropy.utils.iers")
+    monkeypatch.setattr(iers.conf, "auto_download", False)
+
+
+def sky(frame, positions, dates, scale="tdb"):
+    """Coordinates of astropy from positions [m] at Julian dates."""
+    coordinates = pytest.importorskip("astropy.coordinates")
+    units = pytest.importorskip("astropy.units")
+    time = pytest.importorskip("astropy.time")
+    times = time.Time(dates, format="jd", scale=scale)
+    x, y, z = np.asarray(positions).T * units.m
+    return coordinates.SkyCoord(
+        x, y, z, representation_type="cartesian", frame=frame, obstime=times
+    )
+
+
+def test_heliocentric_coordinates_are_those_of_an_orbit(tmp_path):
+    """The Earth's mean elements are good to 1e-4 au."""
+    orbit = ph.geometry_of_orbit(ORBIT)
+    days = 2457100.5 + np.arange(-3.0, 6.0)
+    body = sky("heliocentriceclipticiau76", -orbit(days)[0], days)
+    positions = ph.geometry_of_coordinates(body)
+    dates = np.array(DATES, dtype=float)
+    to_sun, to_observer = positions(dates)
+    expected, to_earth = orbit(dates)
+    np.testing.assert_allclose(to_sun, expected, rtol=0, atol=0.01 * LIGHT)
+    np.testing.assert_allclose(to_observer, to_earth, rtol=0, atol=2e-4 * AU)
+    path = write(tmp_path, block([(date, "15.0") for date in DATES]))
+    (curve,) = ph.read_alcdef(path, positions)
+    np.testing.assert_array_equal(curve.to_sun, to_sun)
+
+
+def test_the_earth_of_astropy_agrees_with_vsop87():
+    """The check value of the test above, now for the Earth's centre itself."""
+    days = J2000 + np.arange(-2.0, 3.0)
+    body = sky("heliocentriceclipticiau76", np.full((5, 3), AU), days)
+    to_sun, to_observer = ph.geometry_of_coordinates(body)(np.array([J2000]))
+    x, y, z = (to_observer - to_sun)[0] / AU
+    longitude, distance = np.arctan2(y, x), np.sqrt(x**2 + y**2 + z**2)
+    assert abs(longitude - 1.7519238681) < 1e-6
+    assert abs(z / distance + 0.0000039656) < 1e-6
+    assert abs(distance - 0.9833276819) < 1e-6
+
+
+def test_equatorial_coordinates_are_turned_by_the_obliquity():
+    """Up to aberration, 1e-4 rad."""
+    days = 2457100.5 + np.arange(4.0)
+    rng = np.random.default_rng(0)
+    from_earth = AU * rng.normal(size=(4, 3))
+    _, to_observer = ph.geometry_of_coordinates(sky("gcrs", from_earth, days))(days)
+    obliquity = np.radians(84381.448 / 3600)
+    cosine, sine = np.cos(obliquity), np.sin(obliquity)
+    turn = np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
+    np.testing.assert_allclose(
+        to_observer, -from_earth @ turn.T, rtol=0, atol=5e-4 * AU
+    )
+
+
+def test_an_observer_is_away_from_the_centre_of_the_earth():
+    """At J2000 the sidereal time of Greenwich was 280.46 degrees."""
+    coordinates = pytest.importorskip("astropy.coordinates")
+    units = pytest.importorskip("astropy.units")
+    days = J2000 + np.arange(-2.0, 3.0)
+    body = sky("heliocentriceclipticiau76", np.full((5, 3), AU), days, scale="utc")
+    site = coordinates.EarthLocation.from_geocentric(6.4e6, 0, 0, units.m)
+    from_site = ph.geometry_of_coordinates(body, site.get_itrs(body.obstime))
+    # The dates of the table are those of TDB.
+    dates = body.obstime.tdb.jd
+    from_centre = ph.geometry_of_coordinates(body)
+    offset = (from_site(dates)[1] - from_centre(dates)[1])[2]
+    x, y, z = offset
+    obliquity = np.radians(84381.448 / 3600)
+    ascension = np.arctan2(np.cos(obliquity) * y - np.sin(obliquity) * z, x)
+    assert abs(np.linalg.norm(offset) - 6.4e6) < 2e3
+    assert abs(np.degrees(ascension) % 360 - 280.46) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("time_scale", "behind"), [("utc", 68.184), ("tai", 32.184), ("tt", 0.0)]
+)
+def test_a_time_scale_becomes_that_of_seconds(tmp_path, time_scale, behind):
+    """A leap second was at the end of 2016, 2457754.5. TDB and TT agree to 2 ms."""
+    dates = ["2457753.25", "2457755.25"]
+    path = write(tmp_path, block([(date, "15.0") for date in dates], LTCAPP="POINT"))
+    asked = []
+
+    def positions(julian_dates):
+        asked.append(julian_dates)
+        return linear(julian_dates)
+
+    (curve,) = ph.read_alcdef(path, positions, epoch=2457753.25, time_scale=time_scale)
+    assert abs(curve.ts[0] - behind) < 2e-3
+    leap = 1.0 if time_scale == "utc" else 0.0
+    assert abs(curve.ts[1] - curve.ts[0] - 2 * DAY - leap) < 1e-4
+    # Positions are asked for at dates of TDB.
+    np.testing.assert_allclose((asked[0] - 2457753.25) * DAY, curve.ts, atol=1e-3)
+
+
+def test_times_of_another_scale_keep_their_digits(tmp_path):
+    rows = [("2457754.250000000012", "15.0"), ("2457754.250000000112", "15.0")]
+    path = write(tmp_path, block(rows, LTCAPP="POINT"))
+    (curve,) = ph.read_alcdef(path, linear, time_scale="tai")
+    np.testing.assert_allclose(curve.ts, [0, 1e-10 * DAY], rtol=1e-4)
+
+
+def test_mistakes_with_coordinates_are_named(tmp_path):
+    days = J2000 + np.arange(5.0)
+    body = sky("icrs", np.full((5, 3), AU), days)
+    for wrong in (body[:3], body[::-1]):
+        with pytest.raises(ValueError, match="at least 4 times that increase"):
+            ph.geometry_of_coordinates(wrong)
+    coordinates = pytest.importorskip("astropy.coordinates")
+    with pytest.raises(ValueError, match="at least 4 times that increase"):
+        ph.geometry_of_coordinates(coordinates.SkyCoord(body.cartesian, frame="icrs"))
+    sphere = body.represent_as("unitspherical")
+    direction = coordinates.SkyCoord(sphere, obstime=body.obstime)
+    with pytest.raises(
+        ValueError, match="`body` must have a distance for each of the 5"
+    ):
+        ph.geometry_of_coordinates(direction)
+    with pytest.raises(ValueError, match="`observer` must have a distance for each"):
+        ph.geometry_of_coordinates(body, body[1:])
+    path = write(tmp_path, block([(DATES[0], "15.0")]))
+    with pytest.raises(
+        ValueError, match="`time_scale` must be one of tdb, tt, tai, utc"
+    ):
+        ph.read_alcdef(path, linear, time_scale="UTC")
+
+
+def test_another_scale_without_astropy_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "astropy", None)
+    path = write(tmp_path, block([(DATES[0], "15.0")]))
+    with pytest.raises(ImportError, match=r'pip install "jrigid\[photometry\]"'):
+        ph.read_alcdef(path, linear, time_scale="utc")

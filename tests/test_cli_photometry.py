@@ -132,13 +132,18 @@ def test_an_orbit_gives_an_alcdef_file_its_vectors(alcdef, monkeypatch, capsys):
         return ph.PeriodPairs(np.ones(1), np.ones(1), np.ones(1))
 
     monkeypatch.setattr(ph, "period_pairs", period_pairs)
-    assert _cli.main(["photometry", str(alcdef), *PERIODS, "--orbit", ORBIT]) == 0
+    command = ["photometry", str(alcdef), *PERIODS, "--orbit", ORBIT]
+    assert _cli.main(command) == 0
+    assert _cli.main([*command, "--time-scale", "tai"]) == 0
     assert "30 points" in capsys.readouterr().out
     angles = np.radians([10, 60, 140, 40])
     orbit = ph.Orbit(2.3 * AU, 0.35, *angles, 2451500.5)
-    expected = ph.read_alcdef(alcdef, ph.geometry_of_orbit(orbit))
-    np.testing.assert_array_equal(read[0].to_sun, expected[0].to_sun)
-    np.testing.assert_array_equal(read[0].ts, expected[0].ts)
+    for curve, time_scale in zip(read, ("tdb", "tai"), strict=True):
+        (expected,) = ph.read_alcdef(
+            alcdef, ph.geometry_of_orbit(orbit), time_scale=time_scale
+        )
+        np.testing.assert_array_equal(curve.to_sun, expected.to_sun)
+        np.testing.assert_array_equal(curve.ts, expected.ts)
 
 
 def test_the_best_tumbler_is_drawn(damit, tmp_path, monkeypatch):
@@ -166,7 +171,12 @@ def test_the_best_tumbler_is_drawn(damit, tmp_path, monkeypatch):
     [
         (["none.txt"], "No such file"),
         (["curves.txt", "--orbit", ORBIT], "Argument `--orbit` must be left out"),
+        (["curves.txt", "--time-scale", "utc"], "Argument `--time-scale` must be left"),
         (["night.txt"], "Argument `--orbit` must be given for an ALCDEF file"),
+        (
+            ["night.txt", "--orbit", ORBIT, "--time-scale", "gps"],
+            "Argument `--time-scale` must be one of tdb, tt, tai, utc",
+        ),
         (
             ["night.txt", "--orbit", ORBIT.replace("0.35", "1.2")],
             "Argument `--orbit` (eccentricity) must be from 0 to below 1",

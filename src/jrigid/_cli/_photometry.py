@@ -35,6 +35,7 @@ OPTIONS = (
     (r"`longest`", "`--longest`"),
     (r"`noise`", "`--noise`"),
     (r"`pairs`", "`--pairs`"),
+    (r"`time_scale`", "`--time-scale`"),
     (r": pass positions of your own for an open orbit", ""),
     (
         r"`(semi_major_axis|eccentricity|inclination|node|argument_of_perihelion"
@@ -80,6 +81,12 @@ def add_command(commands: Any) -> argparse.ArgumentParser:
         help="of an ALCDEF file: semi-major axis [au], eccentricity, inclination, "
         "node, argument of perihelion and mean anomaly [degrees, ecliptic of J2000], "
         "Julian date of the anomaly",
+    )
+    command.add_argument(
+        "--time-scale",
+        metavar="SCALE",
+        help="of the dates of an ALCDEF file: tdb (without it), tt, tai or utc, which "
+        "need astropy",
     )
     _add_options_of_inversion(command)
     return command
@@ -136,8 +143,10 @@ def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
     lines = (line.strip() for line in text.splitlines())
     first = next((x for x in lines if x and not x.startswith("#")), "")
     if not first.upper().startswith(_ALCDEF):
-        message = "Argument `--orbit` must be left out for a file with vectors."
-        demand(options.orbit is None, message)
+        for name in ("orbit", "time_scale"):
+            option = "--" + name.replace("_", "-")
+            message = f"Argument `{option}` must be left out for a file with vectors."
+            demand(getattr(options, name) is None, message)
         return photometry.read_light_curves(path)
     message = (
         "Argument `--orbit` must be given for an ALCDEF file, which has no vectors."
@@ -153,7 +162,11 @@ def _curves(options: argparse.Namespace) -> list[photometry.LightCurve]:
         mean_anomaly=np.radians(anomaly),
         epoch=epoch,
     )
-    return photometry.read_alcdef(path, photometry.geometry_of_orbit(orbit))
+    return photometry.read_alcdef(
+        path,
+        photometry.geometry_of_orbit(orbit),
+        time_scale=options.time_scale or "tdb",
+    )
 
 
 def _span(curves: list[photometry.LightCurve]) -> float:

@@ -14,6 +14,9 @@ pole, the period and the convex shape of a body that rotates steadily.
 from jrigid.photometry._alcdef import read_alcdef as read_alcdef
 from jrigid.photometry._alias import Alias as Alias
 from jrigid.photometry._alias import Estimates as Estimates
+from jrigid.photometry._astropy import (
+    geometry_of_coordinates as geometry_of_coordinates,
+)
 from jrigid.photometry._ellipsoid import Ellipsoid as Ellipsoid
 from jrigid.photometry._facets import Facets as Facets
 from jrigid.photometry._facets import facets_from_mesh as facets_from_mesh

@@ -7,6 +7,8 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 from jaxtyping import Float
 
+from jrigid._checks import demand
+from jrigid.photometry._astropy import TDB, TIME_SCALES, in_tdb
 from jrigid.photometry._files import ASTRONOMICAL_UNIT, LightCurve
 from jrigid.photometry._orbit import Positions, Vectors, light_time
 
@@ -164,7 +166,11 @@ class _Parser:
 
 
 def read_alcdef(
-    path: str | pathlib.Path, positions: Positions, *, epoch: float | None = None
+    path: str | pathlib.Path,
+    positions: Positions,
+    *,
+    epoch: float | None = None,
+    time_scale: str = TDB,
 ) -> list[LightCurve]:
     r"""Read a file in the Asteroid Lightcurve Data Exchange Format.
 
@@ -182,8 +188,14 @@ def read_alcdef(
         path: The file.
         positions: A function of the Julian dates of observation. It returns vectors
             from the body, where the light left it, to the Sun and to the observer
-            [m, ecliptic]: `geometry_of_orbit` or `geometry_of_table` makes one.
+            [m, ecliptic]: `geometry_of_orbit`, `geometry_of_table` or
+            `geometry_of_coordinates` makes one.
         epoch: Julian date of time 0; the first one in the file if None.
+        time_scale: That of the dates of the file: "tdb", "tt", "tai" or "utc". Dates of
+            another scale than "tdb" become those of TDB, for which astropy must be
+            installed. Observers state UTC as a rule, which is 69 s behind since 2017.
+            If it is taken as TDB, a curve is shifted by that, and each leap second is
+            missing between the times before it and those after it.
 
     Returns:
         A light curve for each session, all with the same epoch. Their `band` is MAGBAND,
@@ -191,7 +203,8 @@ def read_alcdef(
 
     Raises:
         ValueError: A line that does not hold what it should, with the file and the line;
-            or positions that are not vectors.
+            positions that are not vectors; or another `time_scale`.
+        ImportError: Another scale than "tdb" without the extra `jrigid[photometry]`.
 
     Source: ALCDEF, Definition and standards, v. 2.2.7 (alcdef.org).
 
@@ -206,7 +219,15 @@ def read_alcdef(
     >>> print(curve.band, curve.brightness.round(3))
     V [1.046 0.954]
     """
+    demand(
+        time_scale in TIME_SCALES,
+        f"Argument `time_scale` must be one of {', '.join(TIME_SCALES)}, but it is "
+        f"{time_scale!r}.",
+    )
     parser = _Parser(path)
+    if time_scale != TDB:
+        for session in parser.sessions:
+            session.dates = in_tdb(session.dates, time_scale)
     zero = parser.sessions[0].dates[0]
     if epoch is not None:
         # `repr` gives the digits that were typed, not those of the binary fraction.
