@@ -15,7 +15,7 @@ SkyCoord = Any  # `astropy.coordinates.SkyCoord`
 Time = Any  # `astropy.time.Time`
 
 TDB = "tdb"
-# Scales of Julian dates; between the others and TDB are up to 69 s.
+# Of Julian dates. These scales differ by up to 69 s.
 TIME_SCALES = (TDB, "tt", "tai", "utc")
 # A cubic spline needs as many points.
 _LEAST_ROWS = 4
