@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import jrigid as jr
 from jrigid import identify
 from jrigid.identify import Status
+from jrigid.identify import _host as host
 from jrigid.identify._reasons import reason
 
 MOMENTS = np.array([0.5, 0.8, 1.0])
@@ -275,3 +276,99 @@ def test_a_noise_stated_a_little_too_small_is_no_scatter_between_trials(readings
         other = (Status.MISFIT, jnp.asarray(12000 * square), jnp.asarray(12000))
         line = reason(eqx.tree_at(fields, found, other))
         assert text in line
+
+
+# Conventions of other programs
+
+
+def attitudes_of(rates, ts):
+    """Attitudes from body to space and angular velocities, by scipy."""
+
+    def kinematics(t, q):
+        w, x, y, z = q
+        a, b, c = rates(t)
+        return 0.5 * np.array(
+            [
+                -x * a - y * b - z * c,
+                w * a + y * c - z * b,
+                w * b + z * a - x * c,
+                w * c + x * b - y * a,
+            ]
+        )
+
+    start = np.array([0.5, -0.5, 0.1, 0.7])
+    start = start / np.linalg.norm(start)
+    return solve_ivp(kinematics, ts[[0, -1]], start, "DOP853", ts, rtol=1e-10).y.T
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """Times, noisy attitudes and noisy rates of a free body."""
+    ts = np.linspace(0, 12, 60)
+    rng = np.random.default_rng(3)
+
+    def euler(_, omega):
+        return np.cross(MOMENTS * omega, omega) / MOMENTS
+
+    solved = solve_ivp(
+        euler, ts[[0, -1]], [0.4, 0.9, 0.5], "DOP853", rtol=1e-10, dense_output=True
+    )
+    q = attitudes_of(solved.sol, ts)
+    turns = 0.01 * rng.normal(size=(60, 3))
+    noisy = host.multiply(q, host.exp(turns))
+    return ts, noisy, solved.sol(ts).T + 0.01 * rng.normal(size=(60, 3))
+
+
+def conjugated(q):
+    return q * np.array([1, -1, -1, -1])
+
+
+def scalar_last(q):
+    return q[:, [1, 2, 3, 0]]
+
+
+@pytest.mark.parametrize(
+    ("attitudes", "words"),
+    [
+        (scalar_last, "scalar last: pass (w, x, y, z), by `jr.rotation.from_scipy`"),
+        (conjugated, "space to body: pass those from body to space"),
+    ],
+)
+def test_the_convention_of_attitudes_beside_rates_is_named(turning, attitudes, words):
+    ts, q, rates = turning
+    records = (
+        identify.Attitudes(ts, attitudes(q), 0.01),
+        identify.Rates(ts, rates, 0.01),
+    )
+    found = identify.fit(BLIND, [records], throw=False)
+    assert found.status in (Status.WRONG_BASIN, Status.MISFIT)
+    assert words in reason(found)
+
+
+@pytest.mark.parametrize("attitudes", [scalar_last, conjugated])
+def test_attitudes_alone_do_not_tell_which_convention(turning, attitudes):
+    """(x, y, z, w) is a conjugate of (w, x, y, z), between two fixed rotations."""
+    ts, q, _ = turning
+    with pytest.raises(RuntimeError, match="scalar last, or from space to body"):
+        identify.fit(BLIND, identify.Attitudes(ts, attitudes(q), 0.01))
+
+
+def test_rates_in_degrees_beside_attitudes_are_named(turning):
+    ts, q, rates = turning
+    gyro = identify.Rates(ts, DEGREES * rates, DEGREES * 0.01)
+    found = identify.fit(BLIND, [(identify.Attitudes(ts, q, 0.01), gyro)], throw=False)
+    assert reason(found).startswith("The rates would fit if they were in degrees")
+
+
+def test_rates_along_space_axes_are_named(turning):
+    ts, q, rates = turning
+    along = np.einsum("nij,nj->ni", host.to_matrix(q), rates)
+    gyro = identify.Rates(ts, along, 0.01)
+    found = identify.fit(BLIND, [(identify.Attitudes(ts, q, 0.01), gyro)], throw=False)
+    assert "along space axes" in reason(found)
+    # Fits side by side have the same verdicts.
+    right = identify.Rates(ts, rates, 0.01)
+    both = [[(identify.Attitudes(ts, q, 0.01), x)] for x in (gyro, right)]
+    many = identify.fit_each(BLIND, both)
+    expected = [[False, False, False, True], [False] * 4]
+    np.testing.assert_array_equal(many.diagnostics.conventions, expected)

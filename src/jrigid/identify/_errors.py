@@ -13,6 +13,7 @@ import numpy as np
 from jrigid._checks import RESULTS, is_good
 from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
+from jrigid.identify import _conventions as conventions
 from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
 from jrigid.identify._gyro_errors import GyroErrors, gyro_errors
@@ -297,6 +298,7 @@ def conclude(
     if good:
         error = integration_error(fit.problem, fit.layout, fit.minimum.point)
     fields["integration_error"] = np.asarray(error)
+    fields["conventions"] = np.zeros(conventions.COUNT, bool)
     fields = _of_dtype(fields, good, fit.minimum.units.dtype)
     status = _status(judgement.status, good, error, derived, of_torque)
     return fields | {"status": getattr(Status, status), "input_result": input_result}

@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jrigid._checks import check_option, check_type, demand, is_good
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
+from jrigid.identify import _conventions as conventions
 from jrigid.identify._disturbance import GaussMarkov
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import needs_attitude
@@ -46,6 +47,7 @@ from jrigid.identify._layout import (
 )
 from jrigid.identify._minimise import tensors_at
 from jrigid.identify._problem import Options, Problem
+from jrigid.identify._quality import Fit
 from jrigid.identify._records import (
     Record,
     Samples,
@@ -56,7 +58,16 @@ from jrigid.identify._records import (
 )
 from jrigid.identify._resolution import is_resolved
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
-from jrigid.identify._search import Case, Effort, Line, Starts, no_search, run, search
+from jrigid.identify._search import (
+    Case,
+    Effort,
+    Line,
+    Starts,
+    attempt,
+    no_search,
+    run,
+    search,
+)
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, unknowns_of
@@ -714,13 +725,34 @@ def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str,
     # Results of many fits are stacked, so that all are as long as the longest record.
     lengths = [max(x) for x in columns]
     results = []
-    for (_, input_result), best in zip(cases, run(searches), strict=True):
+    for task, case, best in zip(tasks, cases, run(searches), strict=True):
+        _, input_result = case
         fields = conclude(best, lengths, input_result)
+        if is_good(input_result):
+            fields["conventions"] = _conventions(task, best, effort)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
-                raise RuntimeError(Status[status])
+                text = conventions.in_words(fields["conventions"])
+                raise RuntimeError(f"{Status[status]} {text}".strip())
         results.append(fields)
     return results
+
+
+def _conventions(
+    task: _Task, best: Fit, effort: Effort
+) -> Bool[np.ndarray, " conventions"]:
+    """In which other conventions the record would fit; in none if it is not far."""
+    found = np.zeros(conventions.COUNT, bool)
+    if not conventions.is_far(best):
+        return found
+    for index, records in conventions.readings(on_host(task.records)):
+        case, input_result = _case(task._replace(records=records), effort, False)
+        if is_good(input_result):
+            # A record that is read rightly needs no second search.
+            first = attempt(case, case.problem, case.starts[0], slow=False)
+            (other,) = run([first])
+            found[index] = conventions.explains(other, best)
+    return found
 
 
 def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:

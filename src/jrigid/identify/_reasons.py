@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from jrigid._checks import RESULTS
+from jrigid.identify import _conventions as conventions
 from jrigid.identify._colour import stands_out
 from jrigid.identify._gyro_errors import GyroErrors
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
@@ -52,6 +53,9 @@ def _reason(result: FitResult) -> str:
             "Predictions are not finite at the initial values: `predict` of each sensor "
             "must be finite wherever there is a reading, and `simulate` from `start`."
         )
+    of_conventions = conventions.in_words(np.asarray(result.diagnostics.conventions))
+    if of_conventions:
+        return of_conventions
     if result.diagnostics.integration_error > UNRESOLVED:
         return (
             "The torque changes too fast for the steps of a fit. Pass its mean over a "
